@@ -1,0 +1,47 @@
+"""ament_python package; ``pip install .[ros]`` brings ROS itself from wheels where there is none."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+PACKAGE = 'thermal_fiducial'
+NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf')
+
+
+def files(folder: str, pattern: str) -> list[str]:
+    """Paths in ``folder``, in a stable order."""
+    return sorted(str(path) for path in Path(folder).glob(pattern))
+
+
+setup(
+    name=PACKAGE,
+    version='0.1.0',
+    packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
+    package_data={PACKAGE: ['py.typed', '**/*.xml', '**/*.yaml', '**/*.html', '**/*.json']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
+        (f'share/{PACKAGE}', ['package.xml']),
+        (f'share/{PACKAGE}/config', files('config', '*')),
+        (f'share/{PACKAGE}/launch', files('launch', '*.launch.py')),
+    ],
+    install_requires=['numpy>=1.26', 'opencv-python-headless>=4.10', 'filterpy>=2.0.0', 'pyyaml', 'rosbags>=0.11'],
+    extras_require={
+        'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-common-interfaces==5.3.6'],
+        'tools': ['scipy', 'rich', 'matplotlib', 'ezdxf', 'jinja2'],
+        'test': ['pytest', 'hypothesis', 'pytest-benchmark', 'pytest-xdist', 'evo'],
+        'lint': ['ruff', 'mypy', 'import-linter', 'types-PyYAML'],
+        'colcon': ['colcon-core', 'colcon-ros', 'colcon-python-setup-py', 'colcon-bash'],
+    },
+    python_requires='>=3.11',
+    zip_safe=False,
+    license='BSD-3-Clause',
+    description='Thermal-inertial localization from acrylic ArUco markers in smoke and fog',
+    maintainer='thermal_fiducial maintainers',
+    maintainer_email='maintainers@thermal-fiducial.org',
+    entry_points={
+        'console_scripts': [
+            *(f'{node} = {PACKAGE}.nodes.{node}:main' for node in NODES),
+            f'thermal-fiducial = {PACKAGE}.cli.main:main',
+        ],
+    },
+)

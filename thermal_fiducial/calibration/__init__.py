@@ -1,0 +1,1 @@
+"""Intrinsics and camera-to-IMU calibration."""

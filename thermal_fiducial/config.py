@@ -1,0 +1,250 @@
+"""Every parameter of the four nodes: default, range, unit, description.
+
+The nodes declare these as ROS parameters, the offline pipeline takes the same objects, and
+``config/thermal_fiducial.yaml`` is checked against them, so a default lives in one place.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, Field, field, fields, MISSING
+from typing import Any, TypeVar
+
+from thermal_fiducial.errors import InputError
+
+Config = TypeVar('Config')
+
+
+def param(
+    default: Any,
+    description: str,
+    *,
+    unit: str = '',
+    minimum: float | None = None,
+    maximum: float | None = None,
+    choices: tuple[str, ...] = (),
+    length: int | None = None,
+    live: bool = False,
+) -> Any:
+    """One parameter: a dataclass field with what ROS wants to know of it.
+
+    Parameters
+    ----------
+    default : bool, int, float, str, or a tuple of floats, ints or strings
+    description : one sentence for ``ros2 param describe``
+    unit : appended to the description in brackets
+    minimum, maximum : inclusive range of a number or of each number of a tuple
+    choices : the allowed values of a string
+    length : number of elements of a tuple of floats
+    live : whether it may be set while the node runs; otherwise it is declared read-only
+    """
+    metadata = {
+        'description': f'{description} [{unit}]' if unit else description,
+        'minimum': minimum,
+        'maximum': maximum,
+        'choices': choices,
+        'length': length,
+        'live': live,
+    }
+    return field(default=default, metadata=metadata)
+
+
+def group(kind: type) -> Any:
+    """Parameters of dataclass ``kind`` under the field's name and a dot."""
+    return field(default_factory=kind)
+
+
+def parameters(config: Any, prefix: str = '') -> Iterator[tuple[str, 'Field[Any]', Any]]:
+    """All parameters of a config (class or instance) as (ROS name, field, value or default)."""
+    for item in fields(config):
+        if item.default_factory is not MISSING:
+            nested = item.default_factory() if isinstance(config, type) else getattr(config, item.name)
+            yield from parameters(nested, f'{prefix}{item.name}.')
+        else:
+            value = item.default if isinstance(config, type) else getattr(config, item.name)
+            yield prefix + item.name, item, value
+
+
+def from_mapping(kind: type[Config], values: dict[str, Any]) -> Config:
+    """Config of dataclass ``kind`` with ``values`` (ROS name to value) in place of the defaults.
+
+    Names that ``kind`` doesn't have are left alone: one parameter file serves all nodes.
+
+    Raises
+    ------
+    InputError
+        A value of the wrong type, out of range, or not among the choices.
+    """
+    return _build(kind, values, '')
+
+
+def _build(kind: type[Config], values: dict[str, Any], prefix: str) -> Config:
+    arguments: dict[str, Any] = {}
+    for item in fields(kind):  # type: ignore[arg-type]
+        name = prefix + item.name
+        if item.default_factory is not MISSING:
+            arguments[item.name] = _build(type(item.default_factory()), values, name + '.')
+        elif name in values:
+            arguments[item.name] = checked(name, item, values[name])
+    return kind(**arguments)
+
+
+def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
+    """``value`` as the type of the parameter's default.
+
+    Raises
+    ------
+    InputError
+        Wrong type, out of range, or not among the choices.
+    """
+    limits = item.metadata
+    result = _typed(name, item.default, limits['length'], value)
+    if limits['choices'] and result not in limits['choices']:
+        raise InputError(f'parameter {name}: {result!r} is not one of {", ".join(limits["choices"])}')
+    low, high = limits['minimum'], limits['maximum']
+    for element in result if isinstance(result, tuple) else (result,):
+        if (low is not None and not element >= low) or (high is not None and not element <= high):
+            raise InputError(f'parameter {name}: {element!r} is outside {low} .. {high}')
+    return result
+
+
+def _typed(name: str, default: Any, length: int | None, value: Any) -> Any:
+    if isinstance(default, tuple):
+        if isinstance(value, str) or not hasattr(value, '__iter__'):
+            raise InputError(f'parameter {name}: {value!r} is not a list')
+        elements = tuple(value)
+        if length is not None and len(elements) != length:
+            raise InputError(f'parameter {name}: {len(elements)} values, not {length}')
+        return elements if length is None else tuple(_number(name, element) for element in elements)
+    if isinstance(default, float):
+        return _number(name, value)
+    if not isinstance(value, type(default)) or (isinstance(value, bool) and not isinstance(default, bool)):
+        raise InputError(f'parameter {name}: {value!r} is not of type {type(default).__name__}')
+    return value
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(f'parameter {name}: {value!r} is not a number')
+    return float(value)
+
+
+# --- parameters that several nodes share --------------------------------------------------------------
+
+
+def _dictionary() -> Any:
+    return param('DICT_4X4_50', 'ArUco dictionary: a name of OpenCV, or the path of a dictionary file of ours.')
+
+
+def _marker_size() -> Any:
+    return param(0.30, 'Side of the black square of a marker.', unit='m', minimum=0.005, maximum=10.0)
+
+
+def _marker_size_overrides() -> Any:
+    return param((), 'Sides of single markers, strings "ID:SIZE", e.g. ["7:0.50"].', unit='m')
+
+
+def _map_file() -> Any:
+    return param('', 'Marker map (YAML). Empty: no map.')
+
+
+def _mode() -> Any:
+    return param(
+        'mapping',
+        'mapping: new markers enter the map; localization: the map never changes.',
+        choices=('mapping', 'localization'),
+    )
+
+
+def _camera_position() -> Any:
+    return param((0.0, 0.0, 0.0), 'Position of the camera in base_link (the IMU frame).', unit='m', length=3)
+
+
+def _camera_orientation() -> Any:
+    return param(
+        (-0.5, 0.5, -0.5, 0.5),
+        'Orientation of thermal_camera_optical in base_link, quaternion x y z w. Default: looks forward.',
+        length=4,
+    )
+
+
+def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
+    """Marker ID to side [m] from strings "ID:SIZE".
+
+    Raises
+    ------
+    InputError
+        An entry that is not of this form, or a side that is not positive.
+    """
+    sizes: dict[int, float] = {}
+    for entry in entries:
+        marker_id, _, size = entry.partition(':')
+        try:
+            sizes[int(marker_id)] = float(size)
+        except ValueError:
+            raise InputError(f'parameter marker_size_overrides: {entry!r} is not "ID:SIZE"') from None
+        if not 0.0 < sizes[int(marker_id)] < 100.0:
+            raise InputError(f'parameter marker_size_overrides: {entry!r} has no usable size')
+    return sizes
+
+
+# --- the four nodes -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Tau2CameraConfig:
+    """Ingestion of raw thermal frames."""
+
+    calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
+    bad_pixel_file: str = param('', 'List of dead pixels: a text file, "column row" a line. Empty: none.')
+    find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.')
+    frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
+
+
+@dataclass(frozen=True)
+class ArucoDetectorConfig:
+    """Detection of markers and the pose of each."""
+
+    dictionary: str = _dictionary()
+    marker_size: float = _marker_size()
+    marker_size_overrides: tuple[str, ...] = _marker_size_overrides()
+    camera_position: tuple[float, ...] = _camera_position()
+    camera_orientation: tuple[float, ...] = _camera_orientation()
+
+
+@dataclass(frozen=True)
+class MarkerMapperConfig:
+    """The incremental marker map."""
+
+    dictionary: str = _dictionary()
+    marker_size: float = _marker_size()
+    marker_size_overrides: tuple[str, ...] = _marker_size_overrides()
+    map_file: str = _map_file()
+    mode: str = _mode()
+    map_frame: str = param('map', 'Frame of the map.')
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Continuous noise densities of the IMU, under Kalibr's names and units."""
+
+    gyroscope_noise_density: float = param(1.7e-4, 'Gyroscope white noise.', unit='rad/s/sqrt(Hz)', minimum=0.0)
+    accelerometer_noise_density: float = param(2.0e-3, 'Accelerometer white noise.', unit='m/s^2/sqrt(Hz)', minimum=0.0)
+    gyroscope_random_walk: float = param(2.0e-5, 'Gyroscope bias random walk.', unit='rad/s^2/sqrt(Hz)', minimum=0.0)
+    accelerometer_random_walk: float = param(
+        3.0e-4, 'Accelerometer bias random walk.', unit='m/s^3/sqrt(Hz)', minimum=0.0
+    )
+
+
+@dataclass(frozen=True)
+class PoseEkfConfig:
+    """The filter."""
+
+    camera_position: tuple[float, ...] = _camera_position()
+    camera_orientation: tuple[float, ...] = _camera_orientation()
+    camera_time_offset: float = param(
+        0.0, 'Clock offset of the camera, t_imu = t_camera + offset.', unit='s', minimum=-1.0, maximum=1.0
+    )
+    estimate_time_offset: bool = param(True, 'Estimate what is left of the time offset while running.')
+    imu: ImuNoise = group(ImuNoise)  # noqa: RUF009
+    gravity: float = param(9.80665, 'Local gravity.', unit='m/s^2', minimum=9.7, maximum=9.9)
+    map_frame: str = param('map', 'Frame of the pose.')
+    base_frame: str = param('base_link', 'Frame of the robot: that of the IMU.')

@@ -1,0 +1,224 @@
+"""Camera models of ROS camera_info: plumb_bob, rational_polynomial and equidistant.
+
+Pixels have their centres at integers, (0, 0) is the centre of the top-left one. Sources: OpenCV's
+``projectPoints`` (plumb_bob, rational_polynomial, without the thin-prism and tilt terms) and
+J. Kannala, S. Brandt, "A generic camera model and calibration method for conventional, wide-angle and
+fish-eye lenses", 2006, as ``cv2.fisheye`` has it (equidistant).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.errors import InputError
+
+#: Number of coefficients that each model takes (shorter lists are filled up with zeros).
+MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
+
+# Newton's iteration gains two digits or more a step; ten leave nothing, also at the edge of a wide lens.
+_NEWTON_STEPS = 10
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one camera.
+
+    Parameters
+    ----------
+    width, height : image size [px]
+    K : (3, 3) camera matrix [px]
+    model : a key of :data:`MODELS`
+    D : distortion coefficients in the order of camera_info
+
+    Raises
+    ------
+    InputError
+        Unknown model, wrong number of coefficients, or a K that can't be one (not finite, no focal length).
+    """
+
+    width: int
+    height: int
+    K: FloatArray
+    model: str = 'plumb_bob'
+    D: FloatArray = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        K = np.array(self.K, dtype=np.float64).reshape(3, 3)
+        D = np.zeros(0) if self.D is None else np.array(self.D, dtype=np.float64).reshape(-1)
+        if self.model not in MODELS:
+            raise InputError(f'distortion model {self.model!r} is not one of {", ".join(MODELS)}')
+        if len(D) > MODELS[self.model] and np.any(D[MODELS[self.model] :]):
+            raise InputError(f'{self.model} takes {MODELS[self.model]} coefficients, not {len(D)}')
+        if not (np.all(np.isfinite(K)) and np.all(np.isfinite(D)) and K[0, 0] > 0 and K[1, 1] > 0):
+            raise InputError('camera matrix without a focal length: the camera is not calibrated')
+        if self.width <= 0 or self.height <= 0:
+            raise InputError(f'image size {self.width}x{self.height} in the calibration')
+        filled = np.zeros(MODELS[self.model])
+        filled[: min(len(D), len(filled))] = D[: len(filled)]
+        object.__setattr__(self, 'K', K)
+        object.__setattr__(self, 'D', filled)
+
+    @property
+    def focal_px(self) -> float:
+        """Geometric mean of the two focal lengths [px]."""
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+    def matches(self, other: 'Camera') -> bool:
+        """Whether ``other`` is the same calibration."""
+        return (
+            (self.width, self.height, self.model) == (other.width, other.height, other.model)
+            and np.array_equal(self.K, other.K)
+            and np.array_equal(self.D, other.D)
+        )
+
+    def project(self, points: npt.ArrayLike) -> FloatArray:
+        """Pixels (..., 2) of points (..., 3) in the camera frame [m].
+
+        A point that the lens cannot show (behind a perspective camera, or beyond the radius where the
+        model folds back) gives NaN.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        x, visible = self._normalised(points)
+        uv = self._to_pixels(self._distort(x)[0])
+        return np.where(visible[..., None], uv, np.nan)
+
+    def project_jacobian(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Pixels (..., 2) of points (..., 3), and their derivative (..., 2, 3) [px/m]."""
+        points = np.asarray(points, dtype=np.float64)
+        x, visible = self._normalised(points)
+        distorted, dd_dx = self._distort(x)
+        uv = np.where(visible[..., None], self._to_pixels(distorted), np.nan)
+        inverse_z = 1.0 / points[..., 2]
+        dx_dp = np.zeros((*points.shape[:-1], 2, 3))
+        dx_dp[..., 0, 0] = dx_dp[..., 1, 1] = inverse_z
+        dx_dp[..., :, 2] = -x * inverse_z[..., None]
+        return uv, self.K[:2, :2] @ dd_dx @ dx_dp
+
+    def distort(self, normalised: npt.ArrayLike) -> FloatArray:
+        """Pixels (..., 2) of normalised image coordinates x/z, y/z (..., 2)."""
+        return self._to_pixels(self._distort(np.asarray(normalised, dtype=np.float64))[0])
+
+    def distort_jacobian(self, normalised: npt.ArrayLike) -> FloatArray:
+        """Derivative (..., 2, 2) [px] of :meth:`distort`."""
+        return np.asarray(self.K[:2, :2] @ self._distort(np.asarray(normalised, dtype=np.float64))[1])
+
+    def normalise(self, uv: npt.ArrayLike) -> FloatArray:
+        """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`.
+
+        Newton's method on the distortion, which at the rim of a fisheye converges where OpenCV's fixed-point
+        iteration does not.
+        """
+        uv = np.asarray(uv, dtype=np.float64)
+        target = (uv - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
+        x = self._undistortion_start(target)
+        for _ in range(_NEWTON_STEPS):
+            distorted, J = self._distort(x)
+            a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
+            determinant = a * d - b * c
+            determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+            e0, e1 = target[..., 0] - distorted[..., 0], target[..., 1] - distorted[..., 1]
+            step = np.stack([(d * e0 - b * e1) / determinant, (a * e1 - c * e0) / determinant], axis=-1)
+            x = x + step
+            if np.all(np.abs(step) < 1e-14):
+                break
+        return x
+
+    def rays(self, uv: npt.ArrayLike) -> FloatArray:
+        """Unit viewing directions (..., 3) of pixels (..., 2)."""
+        x = self.normalise(uv)
+        ray = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
+        return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
+
+    def contains(self, uv: npt.ArrayLike, margin_px: float = 0.0) -> BoolArray:
+        """Whether pixels (..., 2) lie in the image, ``margin_px`` away from its rim; False for NaN."""
+        uv = np.asarray(uv, dtype=np.float64)
+        u, v = uv[..., 0], uv[..., 1]
+        inside = (u >= margin_px) & (u <= self.width - 1 - margin_px)
+        return np.asarray(inside & (v >= margin_px) & (v <= self.height - 1 - margin_px))
+
+    def _to_pixels(self, x: FloatArray) -> FloatArray:
+        return np.asarray(x @ self.K[:2, :2].T + self.K[:2, 2])
+
+    def _normalised(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
+        z = points[..., 2]
+        in_front = z > 1e-9
+        x = points[..., :2] / np.where(in_front, z, 1.0)[..., None]
+        return x, np.asarray(in_front & (np.sum(x * x, axis=-1) < self._fold_radius**2))
+
+    @cached_property
+    def _fold_radius(self) -> float:
+        """Normalised radius up to which the distorted radius grows: beyond it two points share a pixel."""
+        r = np.linspace(0.0, 12.0, 4801)
+        radial = self._distort(np.stack([r, np.zeros_like(r)], axis=-1))[0][:, 0]
+        if self.model != 'equidistant':
+            radial = r * _radial_factor(r * r, self._radial_coefficients)[0]
+        falling = np.flatnonzero(np.diff(radial) <= 0.0)
+        return float(r[falling[0]]) if len(falling) else np.inf
+
+    @cached_property
+    def _radial_coefficients(self) -> FloatArray:
+        """k1 k2 k3 k4 k5 k6."""
+        k = np.zeros(6)
+        k[:2], k[2] = self.D[:2], self.D[4]
+        k[3:] = self.D[5:8] if self.model == 'rational_polynomial' else 0.0
+        return k
+
+    def _undistortion_start(self, target: FloatArray) -> FloatArray:
+        if self.model != 'equidistant':
+            return target.copy()
+        theta = np.linalg.norm(target, axis=-1)
+        safe = np.where(theta < 1e-12, 1.0, theta)
+        scale = np.where(theta < 1e-12, 1.0, np.tan(np.minimum(safe, 1.45)) / safe)
+        return np.asarray(target * scale[..., None])
+
+    def _distort(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Distorted normalised coordinates (..., 2) and their derivative (..., 2, 2)."""
+        if self.model == 'equidistant':
+            return _distort_equidistant(x, self.D)
+        return _distort_polynomial(x, self._radial_coefficients, float(self.D[2]), float(self.D[3]))
+
+
+def _radial_factor(r2: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Radial factor of the (rational) polynomial and its derivative with respect to r^2."""
+    top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))
+    bottom = 1.0 + r2 * (k[3] + r2 * (k[4] + r2 * k[5]))
+    d_top = k[0] + r2 * (2.0 * k[1] + 3.0 * k[2] * r2)
+    d_bottom = k[3] + r2 * (2.0 * k[4] + 3.0 * k[5] * r2)
+    return top / bottom, (d_top * bottom - top * d_bottom) / bottom**2
+
+
+def _distort_polynomial(x: FloatArray, k: FloatArray, p1: float, p2: float) -> tuple[FloatArray, FloatArray]:
+    a, b = x[..., 0], x[..., 1]
+    r2 = a * a + b * b
+    factor, d_factor = _radial_factor(r2, k)
+    distorted = np.stack(
+        [
+            a * factor + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a),
+            b * factor + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b,
+        ],
+        axis=-1,
+    )
+    J = np.empty((*x.shape[:-1], 2, 2))
+    J[..., 0, 0] = factor + 2.0 * a * a * d_factor + 2.0 * p1 * b + 6.0 * p2 * a
+    J[..., 0, 1] = J[..., 1, 0] = 2.0 * a * b * d_factor + 2.0 * p1 * a + 2.0 * p2 * b
+    J[..., 1, 1] = factor + 2.0 * b * b * d_factor + 6.0 * p1 * b + 2.0 * p2 * a
+    return distorted, J
+
+
+def _distort_equidistant(x: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
+    r2 = np.sum(x * x, axis=-1)
+    r = np.sqrt(r2)
+    theta = np.arctan(r)
+    t2 = theta * theta
+    theta_d = theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+    d_theta_d = 1.0 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3])))
+    near = r < 1e-6
+    safe = np.where(near, 1.0, r)
+    scale = np.where(near, 1.0, theta_d / safe)
+    # d(scale)/d(r^2): theta_d / r to second order at the axis is 1 + (k1 - 1/3) r^2.
+    d_scale = np.where(near, k[0] - 1 / 3, (d_theta_d / (1.0 + r2) - scale) / (2.0 * safe * safe))
+    J = scale[..., None, None] * np.eye(2) + 2.0 * d_scale[..., None, None] * x[..., :, None] * x[..., None, :]
+    return x * scale[..., None], J

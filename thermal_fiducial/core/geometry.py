@@ -1,0 +1,167 @@
+"""Rotations and rigid transforms.
+
+``T_a_b`` is 4x4 and maps coordinates in b to coordinates in a, ``p_a = T_a_b @ p_b``; inner names cancel.
+Rotation vectors are in radians. All functions accept leading batch dimensions unless they say otherwise.
+
+Source of the closed forms: J. Sola, J. Deray, D. Atchuthan, "A micro Lie theory for state estimation in
+robotics", 2018, appendices B and D.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from thermal_fiducial.core.types import FloatArray
+
+# Below this angle [rad] the Taylor series is exact to double precision (the next term is angle^6 / 5040).
+SMALL_ANGLE = 1e-2
+
+
+def skew(v: npt.ArrayLike) -> FloatArray:
+    """Cross-product matrix.
+
+    Parameters
+    ----------
+    v : (..., 3) vectors
+
+    Returns
+    -------
+    (..., 3, 3) with ``skew(v) @ w == cross(v, w)``
+    """
+    v = np.asarray(v, dtype=np.float64)
+    matrix = np.zeros((*v.shape, 3))
+    matrix[..., 0, 1], matrix[..., 0, 2] = -v[..., 2], v[..., 1]
+    matrix[..., 1, 0], matrix[..., 1, 2] = v[..., 2], -v[..., 0]
+    matrix[..., 2, 0], matrix[..., 2, 1] = -v[..., 1], v[..., 0]
+    return matrix
+
+
+def _series(angle: FloatArray, exact: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
+    """Choose the Taylor polynomial in angle^2 where the closed form would divide by nearly zero."""
+    a2 = angle * angle
+    polynomial = np.zeros_like(a2)
+    for coefficient in reversed(coefficients):
+        polynomial = polynomial * a2 + coefficient
+    return np.where(angle < SMALL_ANGLE, polynomial, exact)
+
+
+def _exp_coefficients(angle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3."""
+    a = np.where(angle < SMALL_ANGLE, 1.0, angle)
+    sine = np.sin(a)
+    half = np.sin(0.5 * a)
+    return (
+        _series(angle, sine / a, (1.0, -1 / 6, 1 / 120, -1 / 5040)),
+        _series(angle, 2.0 * half * half / a**2, (1 / 2, -1 / 24, 1 / 720, -1 / 40320)),
+        _series(angle, (a - sine) / a**3, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880)),
+    )
+
+
+def so3_exp(phi: npt.ArrayLike) -> FloatArray:
+    """Rotation matrix (..., 3, 3) of rotation vectors (..., 3) [rad]."""
+    phi = np.asarray(phi, dtype=np.float64)
+    angle = np.linalg.norm(phi, axis=-1)
+    a, b, _ = _exp_coefficients(angle)
+    K = skew(phi)
+    return np.asarray(np.eye(3) + a[..., None, None] * K + b[..., None, None] * (K @ K))
+
+
+def so3_log(R: npt.ArrayLike) -> FloatArray:
+    """Rotation vector (..., 3) [rad] of rotation matrices (..., 3, 3), its norm at most pi."""
+    q = quaternion_from_rotation(R)
+    w, v = q[..., 3], q[..., :3]
+    flip = np.where(w < 0.0, -1.0, 1.0)
+    w, v = w * flip, v * flip[..., None]
+    norm = np.linalg.norm(v, axis=-1)
+    angle = 2.0 * np.arctan2(norm, w)
+    safe = np.where(norm < 1e-9, 1.0, norm)
+    scale = np.where(norm < 1e-9, 2.0 / np.where(w == 0.0, 1.0, w), angle / safe)
+    return np.asarray(scale[..., None] * v)
+
+
+def so3_left_jacobian(phi: npt.ArrayLike) -> FloatArray:
+    """J_l (..., 3, 3) with ``exp(phi + d) ~ exp(J_l(phi) d) exp(phi)`` (Sola et al., eq. 145)."""
+    phi = np.asarray(phi, dtype=np.float64)
+    angle = np.linalg.norm(phi, axis=-1)
+    _, b, c = _exp_coefficients(angle)
+    K = skew(phi)
+    return np.asarray(np.eye(3) + b[..., None, None] * K + c[..., None, None] * (K @ K))
+
+
+def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
+    """Inverse of :func:`so3_left_jacobian` (Sola et al., eq. 146), for norms below 2 pi."""
+    phi = np.asarray(phi, dtype=np.float64)
+    angle = np.linalg.norm(phi, axis=-1)
+    a = np.where(angle < SMALL_ANGLE, 1.0, angle)
+    exact = 1.0 / a**2 - 1.0 / (2.0 * a * np.tan(0.5 * a))
+    c = _series(angle, exact, (1 / 12, 1 / 720, 1 / 30240))
+    K = skew(phi)
+    return np.asarray(np.eye(3) - 0.5 * K + c[..., None, None] * (K @ K))
+
+
+def transform(R: npt.ArrayLike, p: npt.ArrayLike) -> FloatArray:
+    """T_a_b (..., 4, 4) of R_a_b (..., 3, 3) and the origin of b in a (..., 3)."""
+    R = np.asarray(R, dtype=np.float64)
+    p = np.asarray(p, dtype=np.float64)
+    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], p.shape[:-1]), 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = p
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def inverse(T: npt.ArrayLike) -> FloatArray:
+    """T_b_a of T_a_b, (..., 4, 4)."""
+    T = np.asarray(T, dtype=np.float64)
+    R_transposed = np.swapaxes(T[..., :3, :3], -1, -2)
+    return transform(R_transposed, -(R_transposed @ T[..., :3, 3:])[..., 0])
+
+
+def apply(T: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
+    """Points (..., N, 3) in b moved to a by T_a_b (..., 4, 4)."""
+    T = np.asarray(T, dtype=np.float64)
+    points = np.asarray(points, dtype=np.float64)
+    return np.asarray(points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
+
+
+def rotation_from_quaternion(q_xyzw: npt.ArrayLike) -> FloatArray:
+    """Rotation matrix (..., 3, 3) of quaternions x y z w (..., 4); they are normalised first."""
+    q = np.asarray(q_xyzw, dtype=np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    v, w = q[..., :3], q[..., 3]
+    K = skew(v)
+    return np.asarray(np.eye(3) + 2.0 * (w[..., None, None] * K + K @ K))
+
+
+def quaternion_from_rotation(R: npt.ArrayLike) -> FloatArray:
+    """Unit quaternion x y z w (..., 4) of rotation matrices (..., 3, 3), w never negative.
+
+    Bar-Itzhack's choice among four expressions by the largest component, so it is accurate at any angle.
+    """
+    R = np.asarray(R, dtype=np.float64)
+    d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    squares = np.stack([1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2, 1 + d0 + d1 + d2], axis=-1)
+    sums = [R[..., i, j] + R[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
+    differences = [R[..., i, j] - R[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))]
+    rows = np.stack(
+        [
+            np.stack([squares[..., 0], sums[0], sums[1], differences[0]], axis=-1),
+            np.stack([sums[0], squares[..., 1], sums[2], differences[1]], axis=-1),
+            np.stack([sums[1], sums[2], squares[..., 2], differences[2]], axis=-1),
+            np.stack([differences[0], differences[1], differences[2], squares[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = np.argmax(squares, axis=-1)
+    q = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., 3:] < 0.0, -q, q))
+
+
+def transform_from_quaternion(position: npt.ArrayLike, q_xyzw: npt.ArrayLike) -> FloatArray:
+    """T_a_b (..., 4, 4) of a position (..., 3) [m] and a quaternion x y z w (..., 4)."""
+    return transform(rotation_from_quaternion(q_xyzw), position)
+
+
+def rotation_angle(R: npt.ArrayLike) -> FloatArray:
+    """Angle (...) [rad] of rotation matrices (..., 3, 3)."""
+    return np.asarray(np.linalg.norm(so3_log(R), axis=-1))

@@ -1,0 +1,90 @@
+"""What the stages hand to each other: the rows and records that travel on the topics.
+
+Pose covariances, here and in every message and file, are in the ROS convention: order (x, y, z, rotation
+about x, y, z), both expressed in the parent frame ``a`` of ``T_a_b``, so that the true pose is
+``p = p_hat + d[:3]`` and ``R = exp(d[3:]) @ R_hat``.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from thermal_fiducial.core.types import FloatArray
+
+_F4 = '<f4'
+CORNER_FIELDS = tuple(f'{axis}{corner}' for corner in range(4) for axis in 'uv')
+CORNER_COVARIANCE_FIELDS = tuple(f'c{corner}{term}' for corner in range(4) for term in ('uu', 'uv', 'vv'))
+
+#: A row of the ``markers`` topic: the layout of DESIGN.md section 5 followed by the corner covariances
+#: ``c0uu c0uv c0vv ...`` [px^2].
+MARKER_DTYPE = np.dtype(
+    [('x', _F4), ('y', _F4), ('z', _F4), ('id', '<u4')]
+    + [(name, _F4) for name in CORNER_FIELDS]
+    + [('sigma_px', _F4)]
+    + [(name, _F4) for name in ('qx', 'qy', 'qz', 'qw', 'rms_px')]
+    + [(name, _F4) for name in ('ax', 'ay', 'az', 'aqx', 'aqy', 'aqz', 'aqw', 'arms_px')]
+    + [('contrast_counts', _F4)]
+    + [(name, _F4) for name in CORNER_COVARIANCE_FIELDS]
+)
+
+#: The structured array of the markers of one frame, shape (N,) of :data:`MARKER_DTYPE`.
+Markers = np.ndarray
+
+
+def columns(markers: Markers, names: tuple[str, ...]) -> FloatArray:
+    """Fields ``names`` of ``markers`` as a float64 matrix (N, len(names))."""
+    return np.stack([markers[name].astype(np.float64) for name in names], axis=-1)
+
+
+def corners_px(markers: Markers) -> FloatArray:
+    """Corners (N, 4, 2) [px] in the raw image, clockwise from the marker's top-left."""
+    return columns(markers, CORNER_FIELDS).reshape(-1, 4, 2)
+
+
+def corner_covariances(markers: Markers) -> FloatArray:
+    """Corner covariances (N, 4, 2, 2) [px^2]."""
+    terms = columns(markers, CORNER_COVARIANCE_FIELDS).reshape(-1, 4, 3)
+    return np.stack([terms[..., [0, 1]], terms[..., [1, 2]]], axis=-2)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSample:
+    """One IMU message, in ``base_link`` (x forward, y left, z up)."""
+
+    stamp_ns: int
+    #: (3,) [rad/s]
+    angular_velocity: FloatArray
+    #: (3,) specific force [m/s^2]: +9.81 on z at rest
+    linear_acceleration: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPose:
+    """The camera in the map from the markers of one frame."""
+
+    stamp_ns: int
+    #: (4, 4)
+    T_map_camera: FloatArray
+    #: (6, 6), ROS convention, in ``map`` [m, rad]
+    covariance: FloatArray
+    #: markers that it rests on
+    marker_ids: tuple[int, ...] = field(default=())
+    #: re-projection error, rms over their corners [px]
+    rms_px: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Odometry:
+    """The robot's state at the stamp of one IMU message."""
+
+    stamp_ns: int
+    #: (4, 4)
+    T_map_body: FloatArray
+    #: (3,) velocity in ``base_link`` [m/s]
+    velocity_body: FloatArray
+    #: (3,) bias-free angular velocity in ``base_link`` [rad/s]
+    angular_velocity_body: FloatArray
+    #: (6, 6), ROS convention, in ``map`` [m, rad]
+    pose_covariance: FloatArray
+    #: (6, 6), linear then angular, in ``base_link`` [m/s, rad/s]
+    twist_covariance: FloatArray

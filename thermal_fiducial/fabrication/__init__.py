@@ -1,0 +1,1 @@
+"""Markers that can be cut."""

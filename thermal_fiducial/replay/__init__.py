@@ -1,0 +1,1 @@
+"""Recorded bags through the real nodes."""

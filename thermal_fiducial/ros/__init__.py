@@ -1,0 +1,1 @@
+"""What all four nodes share: conversions, parameters, QoS, diagnostics, the run loop."""
