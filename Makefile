@@ -1,0 +1,51 @@
+# make demo    set everything up and run the main job: simulate, replay through the four nodes, score, report
+# make test    set everything up, check the code and run all tests
+# make bench   accuracy and speed against OpenCV and a batch smoother, in the same run
+PYTHON ?= $(firstword $(foreach version,3.12 3.11,$(if $(shell python$(version) -c 'import venv, ensurepip' 2>/dev/null && echo yes),python$(version))) python3)
+VENV ?= .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+# Traffic stays on this machine; small matrices are slower on many threads than on one.
+export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
+export OPENBLAS_NUM_THREADS := 1
+export OMP_NUM_THREADS := 1
+
+.PHONY: help demo test lint bench format clean
+
+help:
+	@sed -n 's/^# //p' Makefile
+
+$(READY): setup.py
+	@echo '== Setting up $(VENV) with $(PYTHON): about 500 MB of packages, once'
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or 3.12 is needed: make PYTHON=python3.12")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip 'setuptools<80' wheel
+	$(BIN)/python -m pip install --progress-bar on --quiet --editable '.[ros,tools,test,lint,colcon]'
+	@touch $@
+
+demo: $(READY)
+	@echo '== Demo: a flight through fog, replayed through the four nodes'
+	$(BIN)/python -m thermal_fiducial demo
+
+lint: $(READY)
+	@echo '== Style, types, layers'
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+test: lint
+	@echo '== Tests (real data are used where THERMAL_FIDUCIAL_DATA names their folder)'
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --durations 15 $(PYTEST_ARGS)
+
+bench: $(READY)
+	@echo '== Benchmarks, one thread'
+	$(BIN)/python -m pytest test/bench --benchmark-only --benchmark-columns=median,min,max,rounds $(PYTEST_ARGS)
+
+format: $(READY)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build install log runs .mypy_cache .ruff_cache .pytest_cache .hypothesis
