@@ -14,7 +14,7 @@ export OMP_NUM_THREADS := 1
 .PHONY: help demo test lint bench format clean
 
 help:
-	@sed -n 's/^# //p' Makefile
+	@sed -n 's/^# \(make .*\)/\1/p' Makefile
 
 $(READY): setup.py
 	@echo '== Setting up $(VENV) with $(PYTHON): about 500 MB of packages, once'

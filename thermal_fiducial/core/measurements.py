@@ -27,6 +27,14 @@ MARKER_DTYPE = np.dtype(
     + [(name, _F4) for name in CORNER_COVARIANCE_FIELDS]
 )
 
+#: A row of the ``marker_map`` topic: pose and side of a marker in ``map``, one-sigma position, error and number of
+#: observations, and whether it is fixed (surveyed), used for poses, and in view of the frame that published it.
+MAP_DTYPE = np.dtype(
+    [('x', _F4), ('y', _F4), ('z', _F4), ('id', '<u4')]
+    + [(name, _F4) for name in ('qx', 'qy', 'qz', 'qw', 'size', 'sigma_m', 'rms_px')]
+    + [('observations', '<u4'), ('fixed', '<u1'), ('trusted', '<u1'), ('in_view', '<u1')]
+)
+
 #: The structured array of the markers of one frame, shape (N,) of :data:`MARKER_DTYPE`.
 Markers = np.ndarray
 
