@@ -1,0 +1,68 @@
+"""Dictionaries: names of OpenCV, our own files, and every way in which a file can be wrong."""
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.dictionary import load_dictionary, save_dictionary
+
+NAMES = ['DICT_4X4_50', 'DICT_5X5_1000', 'DICT_6X6_250', 'DICT_7X7_50', 'DICT_APRILTAG_36h11', 'DICT_APRILTAG_16h5']
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_bits_are_what_opencv_draws(name):
+    dictionary = load_dictionary(name)
+    bits = marker_bits(dictionary)
+    cells = dictionary.markerSize + 2
+    for marker_id in (0, 3, len(bits) - 1):
+        drawn = cv2.aruco.generateImageMarker(dictionary, marker_id, 4 * cells)[2::4, 2::4] > 0
+        np.testing.assert_array_equal(bits[marker_id], drawn[1:-1, 1:-1])
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_file_gives_the_same_dictionary(name, tmp_path):
+    dictionary = load_dictionary(name)
+    save_dictionary(tmp_path / 'own.yaml', 'OWN', dictionary)
+    again = load_dictionary(tmp_path / 'own.yaml')
+    np.testing.assert_array_equal(again.bytesList, dictionary.bytesList)
+    assert (again.markerSize, again.maxCorrectionBits) == (dictionary.markerSize, dictionary.maxCorrectionBits)
+
+
+GOOD = {'format': 'thermal_fiducial/dictionary', 'version': 1, 'marker_size': 2, 'markers': [['01', '11']]}
+
+
+@pytest.mark.parametrize(
+    ('change', 'words'),
+    [
+        ({'format': 'other'}, 'not of format'),
+        ({'version': 2}, 'version 2'),
+        ({'marker_size': '2'}, 'whole numbers'),
+        ({'max_correction_bits': -1}, 'whole numbers'),
+        ({'markers': []}, 'no markers'),
+        ({'markers': [['01', '1']]}, 'marker 0'),
+        ({'markers': [['01', '12']]}, 'marker 0'),
+        ({'markers': [['01', '11'], 7]}, 'marker 1'),
+    ],
+)
+def test_wrong_file_says_what_is_wrong(change, words, tmp_path):
+    path = tmp_path / 'own.yaml'
+    path.write_text(yaml.safe_dump(GOOD | change))
+    with pytest.raises(InputError, match=words):
+        load_dictionary(path)
+
+
+@pytest.mark.parametrize('content', [b'{', b'\xff\xfe\x00'])
+def test_unreadable_file(content, tmp_path):
+    path = tmp_path / 'own.yaml'
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r'own\.yaml'):
+        load_dictionary(path)
+
+
+@pytest.mark.parametrize('name', ['DICT_4X4_51', 'getPredefinedDictionary', '/nowhere/at/all.yaml', ''])
+def test_unknown_name(name):
+    with pytest.raises(InputError, match='neither'):
+        load_dictionary(name)

@@ -1,0 +1,86 @@
+"""Marker dictionaries: those of OpenCV by name, and files of our own.
+
+A dictionary file is YAML::
+
+    format: thermal_fiducial/dictionary
+    version: 1
+    name: STENCIL_4X4_20        # what parameter `dictionary` may say when the package ships the file
+    marker_size: 4              # bits along one side, without the black border of one bit
+    max_correction_bits: 1      # bit errors that still name a marker
+    markers:                    # IDs 0, 1, 2 ... each its rows from the top, 1 for white (hot, cut out)
+      - ['0110', '1011', '0010', '1101']
+"""
+
+import os
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.errors import InputError
+
+FORMAT = 'thermal_fiducial/dictionary'
+#: Folder of the dictionaries that the package ships, loadable by their bare name.
+PACKAGED = Path(__file__).resolve().parent.parent / 'dictionaries'
+
+
+def load_dictionary(name_or_path: str | os.PathLike[str]) -> cv2.aruco.Dictionary:
+    """Dictionary by OpenCV's name (``DICT_4X4_50``), a packaged name, or the path of a dictionary file.
+
+    Raises
+    ------
+    InputError
+        Neither a known name nor a readable file, or a file that is not a dictionary.
+    """
+    name = str(name_or_path)
+    predefined = getattr(cv2.aruco, name, None) if name.startswith('DICT_') else None
+    if predefined is not None:
+        return cv2.aruco.getPredefinedDictionary(predefined)
+    packaged = PACKAGED / f'{name}.yaml'
+    path = packaged if '/' not in name and packaged.is_file() else Path(name)
+    try:
+        document = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError):
+        raise InputError(f'dictionary {name!r}: neither a dictionary of OpenCV nor a readable file') from None
+    except yaml.YAMLError as error:
+        raise InputError(f'dictionary file {name}: not YAML: {" ".join(str(error).split())}') from None
+    return _from_document(name, document)
+
+
+def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: cv2.aruco.Dictionary) -> None:
+    """Write ``dictionary`` as a dictionary file."""
+    document = {
+        'format': FORMAT,
+        'version': 1,
+        'name': name,
+        'marker_size': int(dictionary.markerSize),
+        'max_correction_bits': int(dictionary.maxCorrectionBits),
+        'markers': [[''.join(map(str, row)) for row in bits] for bits in marker_bits(dictionary).tolist()],
+    }
+    Path(path).write_text(yaml.safe_dump(document, sort_keys=False, width=120), encoding='utf-8')
+
+
+def _from_document(name: str, document: Any) -> cv2.aruco.Dictionary:
+    if not isinstance(document, dict) or document.get('format') != FORMAT:
+        raise InputError(f'dictionary file {name}: not of format {FORMAT}')
+    if document.get('version') != 1:
+        raise InputError(f'dictionary file {name}: version {document.get("version")!r} is not 1')
+    size, correction = document.get('marker_size'), document.get('max_correction_bits', 0)
+    if type(size) is not int or not 2 <= size <= 10 or type(correction) is not int or correction < 0:
+        raise InputError(f'dictionary file {name}: marker_size and max_correction_bits must be whole numbers')
+    markers = document.get('markers')
+    if not isinstance(markers, list) or not markers:
+        raise InputError(f'dictionary file {name}: no markers')
+    packed = [_packed(name, index, rows, size) for index, rows in enumerate(markers)]
+    return cv2.aruco.Dictionary(np.concatenate(packed), size, correction)
+
+
+def _packed(name: str, index: int, rows: Any, size: int) -> Any:
+    right = isinstance(rows, list) and len(rows) == size
+    if not right or any(not isinstance(row, str) or len(row) != size or set(row) - {'0', '1'} for row in rows):
+        raise InputError(f'dictionary file {name}: marker {index} is not {size} strings of {size} bits')
+    bits = np.array([[int(bit) for bit in row] for row in rows], dtype=np.uint8)
+    return cv2.aruco.Dictionary.getByteListFromBits(bits)
