@@ -196,6 +196,19 @@ class Tau2CameraConfig:
     calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
     bad_pixel_file: str = param('', 'List of dead pixels: a text file, "column row" a line. Empty: none.')
     find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.')
+    bits: int = param(14, 'Significant bits of a 16-bit pixel; flags above them are masked.', minimum=8, maximum=16)
+    settle_frames: int = param(
+        1, 'Frames withheld after a shutter event, while they may still hold old counts.', minimum=0, maximum=30
+    )
+    view_tail_percent: float = param(
+        0.5, '8-bit view: share of the pixels beyond either end of the scale.', unit='%', minimum=0.0, maximum=25.0
+    )
+    view_smoothing: float = param(
+        0.05, '8-bit view: share of a new frame in the scale; small values follow slowly.', minimum=0.001, maximum=1.0
+    )
+    view_minimum_span: float = param(
+        40.0, '8-bit view: narrowest scale, so that noise alone does not fill it.', unit='counts', minimum=1.0
+    )
     frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
 
 
@@ -220,6 +233,19 @@ class MarkerMapperConfig:
     map_file: str = _map_file()
     mode: str = _mode()
     map_frame: str = param('map', 'Frame of the map.')
+    camera_position: tuple[float, ...] = _camera_position()
+    camera_orientation: tuple[float, ...] = _camera_orientation()
+    bridge_duration: float = param(
+        3.0,
+        'How long after the last known marker new ones may still be placed from the odometry.',
+        unit='s',
+        minimum=0.0,
+        maximum=60.0,
+    )
+    keyframe_budget: int = param(800, 'Frames kept for the joint refinement.', minimum=10, maximum=20000)
+    refinement_period: float = param(
+        2.0, 'Shortest time between two joint refinements; 0: never.', unit='s', minimum=0.0, maximum=3600.0
+    )
 
 
 @dataclass(frozen=True)
@@ -231,6 +257,14 @@ class ImuNoise:
     gyroscope_random_walk: float = param(2.0e-5, 'Gyroscope bias random walk.', unit='rad/s^2/sqrt(Hz)', minimum=0.0)
     accelerometer_random_walk: float = param(
         3.0e-4, 'Accelerometer bias random walk.', unit='m/s^3/sqrt(Hz)', minimum=0.0
+    )
+    gyroscope_range: float = param(34.9, 'Readings beyond this are saturated.', unit='rad/s', minimum=0.1)
+    accelerometer_range: float = param(156.0, 'Readings beyond this are saturated.', unit='m/s^2', minimum=10.0)
+    vibration: float = param(
+        0.5,
+        'Share of the sample-to-sample noise that counts as white noise where it exceeds the densities; 0: none.',
+        minimum=0.0,
+        maximum=1.0,
     )
 
 
@@ -244,7 +278,60 @@ class PoseEkfConfig:
         0.0, 'Clock offset of the camera, t_imu = t_camera + offset.', unit='s', minimum=-1.0, maximum=1.0
     )
     estimate_time_offset: bool = param(True, 'Estimate what is left of the time offset while running.')
+    time_offset_std: float = param(
+        0.03,
+        'How far camera_time_offset may be wrong (standard deviation); when it is not estimated, what is allowed for.',
+        unit='s',
+        minimum=0.0,
+        maximum=0.2,
+    )
+    time_offset_random_walk: float = param(
+        5.0e-5, 'Drift of the two clocks against each other.', unit='s/sqrt(s)', minimum=0.0
+    )
+    stamp_jitter: float = param(0.0005, 'Jitter of the camera stamps.', unit='s', minimum=0.0, maximum=0.05)
+    estimate_extrinsics: bool = param(False, 'Refine camera_position and camera_orientation while running.')
+    extrinsics_position_std: float = param(0.02, 'Standard deviation of camera_position.', unit='m', minimum=0.0)
+    extrinsics_orientation_std: float = param(
+        0.02, 'Standard deviation of camera_orientation.', unit='rad', minimum=0.0
+    )
     imu: ImuNoise = group(ImuNoise)  # noqa: RUF009
     gravity: float = param(9.80665, 'Local gravity.', unit='m/s^2', minimum=9.7, maximum=9.9)
+    map_tilt_std: float = param(
+        0.005,
+        'How far z of the map may be off the vertical; the tilt is estimated. 0: exactly vertical.',
+        unit='rad',
+        minimum=0.0,
+        maximum=0.2,
+    )
+    initial_velocity_std: float = param(3.0, 'Speed at the first pose.', unit='m/s', minimum=0.01)
+    initial_gyroscope_bias_std: float = param(0.02, 'Gyroscope bias at the start.', unit='rad/s', minimum=0.0)
+    initial_accelerometer_bias_std: float = param(0.2, 'Accelerometer bias at the start.', unit='m/s^2', minimum=0.0)
+    initial_poses: int = param(3, 'Poses that must agree before the filter starts.', minimum=1, maximum=100)
+    pose_noise_scale: float = param(
+        1.0, 'Factor on the standard deviation of the camera poses, for errors that last over many frames.', minimum=0.1
+    )
+    position_floor: float = param(0.001, 'Least standard deviation of a camera pose, position.', unit='m', minimum=0.0)
+    attitude_floor: float = param(
+        0.0003, 'Least standard deviation of a camera pose, attitude.', unit='rad', minimum=0.0
+    )
+    gate: float = param(
+        22.5,
+        'A pose is refused beyond this squared Mahalanobis distance (22.5: 99.9 % of chi-square, 6 d.o.f.).',
+        minimum=1.0,
+    )
+    reset_after: float = param(
+        1.0, 'Start afresh when refused poses have agreed with each other for so long.', unit='s', minimum=0.0
+    )
+    max_delay: float = param(1.0, 'Poses that arrive later than this are refused.', unit='s', minimum=0.0, maximum=10.0)
+    max_imu_gap: float = param(1.0, 'Start afresh after an IMU gap or clock jump beyond this.', unit='s', minimum=0.01)
+    lost_position_std: float = param(
+        0.3, 'The pose counts as lost when its position is known no better than this.', unit='m', minimum=0.001
+    )
+    reinitialise_after: float = param(
+        60.0, 'Start afresh after so long without an accepted pose.', unit='s', minimum=1.0
+    )
+    smoothing_time: float = param(
+        0.0, 'Spread corrections of the smooth output over this time; 0: no smooth output.', unit='s', minimum=0.0
+    )
     map_frame: str = param('map', 'Frame of the pose.')
     base_frame: str = param('base_link', 'Frame of the robot: that of the IMU.')

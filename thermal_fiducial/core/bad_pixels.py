@@ -1,0 +1,162 @@
+"""Dead, stuck and hot pixels of a bolometer array: finding them while running and filling them in.
+
+A pixel is bad when it stands out from all of its neighbours. The lens forbids that to the scene: its
+point spread, even a sharp one, puts part of any hot point on the pixels beside it, and on an edge or at
+the corner of a marker a pixel always has neighbours of its own kind.
+"""
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.core.types import BoolArray, Counts, IntArray
+from thermal_fiducial.errors import InputError
+
+_RING = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8)
+
+# Opposite neighbours (row, column), near ones first: the pixel lies in the middle of each pair.
+_PAIRS = np.array([(0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (2, 2), (2, -2), (1, 2), (2, 1), (1, -2), (2, -1)])
+_NEAR_PAIRS = 4
+# A far pair is taken only where no near one is whole: its difference counts this much more.
+_FAR_PENALTY_COUNTS = 1 << 16
+
+
+class BadPixelFinder:
+    """Finds pixels that do not follow the scene, from one frame in ``interval``.
+
+    A frame votes for a pixel that exceeds (or falls below) all eight neighbours by ``sigmas`` times the noise and by
+    twice the neighbours' own spread; votes fade in the frames where it doesn't. A pixel that keeps one value
+    while the scene around it changes is stuck, whatever stands beside it.
+    """
+
+    VOTE = 4
+    ENOUGH = 12
+    SPREADS = 2
+    WINDOW = 16
+
+    def __init__(self, shape: tuple[int, int], interval: int = 10, sigmas: float = 8.0) -> None:
+        self._votes = np.zeros(shape, np.uint8)
+        self._stuck = np.zeros(shape, np.bool_)
+        self._interval = interval
+        self._sigmas = sigmas
+        self._frames = 0
+        self._watched = 0
+
+    def add(self, counts: Counts) -> IntArray | None:
+        """Take a live frame; the bad pixels (N, 2) as column, row where this frame may have changed them."""
+        self._frames += 1
+        # The first frames are all looked at: a bad pixel should disturb no more than a moment of the flight.
+        if self._frames > self.ENOUGH // self.VOTE + 1 and self._frames % self._interval:
+            return None
+        noise = pixel_noise(counts)
+        outlying = _stands_out(counts, self._sigmas * noise, self.SPREADS)
+        self._votes = cv2.subtract(self._votes, np.ones_like(self._votes))  # type: ignore[assignment]
+        self._votes[outlying] = np.minimum(self._votes[outlying] + self.VOTE + 1, 4 * self.ENOUGH)
+        self._watch(counts, self._sigmas * noise)
+        rows, columns = np.nonzero((self._votes >= self.ENOUGH) | self._stuck)
+        return np.stack([columns, rows], axis=-1)
+
+    def _watch(self, counts: Counts, moved_counts: float) -> None:
+        """Mark pixels that kept one value over a window in which the median of their surroundings moved."""
+        surroundings = cv2.medianBlur(counts, 3)
+        if self._watched == 0:
+            self._first, self._lowest, self._highest = counts.copy(), surroundings, surroundings
+            self._constant = np.ones(counts.shape, np.bool_)
+        self._constant &= counts == self._first
+        self._lowest, self._highest = cv2.min(self._lowest, surroundings), cv2.max(self._highest, surroundings)
+        self._watched += 1
+        if self._watched == self.WINDOW:
+            moved = cv2.subtract(self._highest, self._lowest) > moved_counts
+            # A scene that stands still says nothing: what was known of its pixels stays.
+            self._stuck = np.where(moved, self._constant, self._stuck & self._constant)
+            self._watched = 0
+
+
+def pixel_noise(counts: Counts) -> float:
+    """Standard deviation of the noise between neighbouring pixels [counts], robust, at least half a count."""
+    difference = np.abs(counts[::4, 1::4].astype(np.int32) - counts[::4, 0::4])
+    return max(0.5, 1.4826 * float(np.median(difference)) / float(np.sqrt(2.0)))
+
+
+def _stands_out(counts: Counts, margin_counts: float, spreads: int) -> BoolArray:
+    highest = cv2.dilate(counts, _RING)
+    lowest = cv2.erode(counts, _RING)
+    # Unsigned differences saturate at zero, so what is left is the excess.
+    excess = cv2.max(cv2.subtract(counts, highest), cv2.subtract(lowest, counts))
+    candidates = excess > margin_counts
+    candidates[candidates] = excess[candidates] > spreads * (highest[candidates].astype(np.int64) - lowest[candidates])
+    return np.asarray(candidates)
+
+
+class BadPixelFiller:
+    """Fills given pixels of every frame from their sound neighbours.
+
+    Each is the mean of that pair of opposite neighbours that differ least: the pair along an edge, so an edge that
+    passes a bad pixel keeps its place.
+
+    Parameters
+    ----------
+    pixels : (N, 2) column, row
+    shape : height and width of the frames
+
+    Raises
+    ------
+    InputError
+        A pixel outside the frame, or more than a tenth of the frame.
+    """
+
+    def __init__(self, pixels: IntArray, shape: tuple[int, int]) -> None:
+        pixels = np.asarray(pixels, dtype=np.int64).reshape(-1, 2)
+        height, width = shape
+        outside = np.any((pixels < 0) | (pixels >= (width, height)), axis=1)
+        if np.any(outside):
+            column, row = pixels[np.argmax(outside)]
+            raise InputError(f'bad pixel {column} {row} lies outside the {width}x{height} frame')
+        if 10 * len(pixels) > height * width:
+            raise InputError(f'{len(pixels)} bad pixels are more than a tenth of the frame')
+        bad = np.zeros(shape, np.bool_)
+        bad[pixels[:, 1], pixels[:, 0]] = True
+        rows, columns = np.nonzero(bad)
+        self.pixels: IntArray = np.stack([columns, rows], axis=-1)
+        self._target = rows * width + columns
+        self._first, self._second, self._penalty = _sound_pairs(rows, columns, bad)
+
+    def fill(self, counts: Counts) -> None:
+        """Replace the pixels of ``counts`` (a contiguous frame) in place."""
+        if not len(self._target):
+            return
+        flat = counts.reshape(-1)
+        first, second = flat[self._first].astype(np.int32), flat[self._second].astype(np.int32)
+        best = np.argmin(np.abs(first - second) + self._penalty, axis=1)[:, None]
+        total = np.take_along_axis(first, best, axis=1) + np.take_along_axis(second, best, axis=1)
+        flat[self._target] = (total[:, 0] + 1) // 2
+
+
+def _sound_pairs(rows: IntArray, columns: IntArray, bad: BoolArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Flat indices (N, P) of the two ends of each pair, and a penalty (N, P) that keeps unsound pairs out."""
+    height, width = bad.shape
+    unsound = 1 << 20
+    ends, usable = [], np.ones((len(rows), len(_PAIRS)), np.bool_)
+    for sign in (1, -1):
+        r, c = rows[:, None] + sign * _PAIRS[:, 0], columns[:, None] + sign * _PAIRS[:, 1]
+        usable &= (r >= 0) & (r < height) & (c >= 0) & (c < width)
+        r, c = np.clip(r, 0, height - 1), np.clip(c, 0, width - 1)
+        usable &= ~bad[r, c]
+        ends.append(r * width + c)
+    penalty = np.where(usable, 0, unsound)
+    penalty[:, _NEAR_PAIRS:] += _FAR_PENALTY_COUNTS
+    # At the rim and inside clusters no pair may be whole: the nearest sound pixel stands in.
+    nearest = _nearest_sound(bad)[rows, columns][:, None]
+    fallback = np.full_like(nearest, unsound - 1)
+    first, second = (np.concatenate([end, nearest], axis=1) for end in ends)
+    return first, second, np.concatenate([penalty, fallback], axis=1)
+
+
+def _nearest_sound(bad: BoolArray) -> IntArray:
+    """Flat index of the sound pixel nearest to each pixel."""
+    _, labels = cv2.distanceTransformWithLabels(
+        bad.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    index = np.zeros(int(labels.max()) + 1, np.int64)
+    sound = np.flatnonzero(~bad)
+    index[labels.reshape(-1)[sound]] = sound
+    return np.asarray(index[labels])

@@ -1,0 +1,256 @@
+"""Raw long-wave infrared frames: what is cut off, masked, filled in or withheld before anybody looks for markers.
+
+Shutter behaviour follows the FLIR Tau 2 user's manual: during a flat-field correction (FFC, under half a second) a
+digital stream repeats the last frame, shows the shutter, or pauses, depending on the driver.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.config import Tau2CameraConfig
+from thermal_fiducial.core.bad_pixels import BadPixelFiller, BadPixelFinder, pixel_noise
+from thermal_fiducial.core.types import BoolArray, Counts, Gray, IntArray
+from thermal_fiducial.errors import InputError
+
+FROZEN = 'frozen'
+SHUTTER = 'FFC'
+SETTLING = 'settling after FFC'
+STALE_STAMP = 'stamp not after the last one'
+
+# Rows of an image; a frame with up to MAX_TELEMETRY_ROWS more carries telemetry.
+STANDARD_HEIGHTS = (1024, 512, 480, 256, 240, 128, 120)
+MAX_TELEMETRY_ROWS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class CleanFrame:
+    """A frame to look at, or why there is none."""
+
+    #: (height, width) counts without telemetry, flags and bad pixels; None: withheld
+    counts: Counts | None
+    #: in words, empty for a frame that is passed on
+    reason: str = ''
+
+
+class FrameCleaner:
+    """Turns what the camera sends into counts that show the scene at their stamp.
+
+    Parameters
+    ----------
+    config : bits, bad pixels, settling
+    bad_pixels : (N, 2) column, row of pixels known to be bad
+    """
+
+    def __init__(self, config: Tau2CameraConfig, bad_pixels: IntArray | None = None) -> None:
+        self._config = config
+        self._known_bad: IntArray = np.reshape([] if bad_pixels is None else bad_pixels, (-1, 2)).astype(np.int64)
+        self._telemetry = _TelemetryRows()
+        self._restart((0, 0))
+
+    def _restart(self, shape: tuple[int, int]) -> None:
+        self._shape = shape
+        self._stamp_ns: int | None = None
+        self._live_ns: int | None = None
+        self._freeze = _FreezeDetector()
+        self._shutter = _ShutterDetector()
+        self._settling = 0
+        self._finder = BadPixelFinder(shape)
+        self._found: IntArray = np.zeros((0, 2), np.int64)
+        self._filler = BadPixelFiller(self._known_bad, shape) if shape != (0, 0) else None
+
+    @property
+    def bad_pixels(self) -> IntArray:
+        """Pixels (N, 2), column and row, that are filled in at present."""
+        return self._known_bad if self._filler is None else self._filler.pixels
+
+    def process(self, stamp_ns: int, counts: Counts | Gray) -> CleanFrame:
+        """Clean the next frame.
+
+        Parameters
+        ----------
+        stamp_ns : its stamp
+        counts : (height, width) uint16 or uint8, telemetry rows and flag bits included; left as it is
+
+        Raises
+        ------
+        InputError
+            Not an image of 8 or 16 bit, or one too small to hold a scene; a listed bad pixel outside it.
+        """
+        image = self._image(counts)
+        if image.shape != self._shape or self._jumped_back(stamp_ns):
+            self._restart(image.shape)
+        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
+            return CleanFrame(None, STALE_STAMP)
+        self._stamp_ns = stamp_ns
+        reason = self._stale(stamp_ns, image)
+        if reason:
+            return CleanFrame(None, reason)
+        self._live_ns = stamp_ns
+        self._replace_bad_pixels(image)
+        return CleanFrame(image)
+
+    def _image(self, counts: Counts | Gray) -> Counts:
+        """A copy of the image rows as counts."""
+        if counts.ndim != 2 or counts.dtype not in (np.uint8, np.uint16):
+            raise InputError(f'frame of {counts.dtype} with shape {counts.shape} is not an 8 or 16 bit image')
+        image = self._telemetry.cut(counts)
+        if min(image.shape) < 16:
+            raise InputError(f'frame of {image.shape[1]}x{image.shape[0]} pixels is too small')
+        return image.astype(np.uint16) & np.uint16((1 << self._config.bits) - 1)
+
+    def _jumped_back(self, stamp_ns: int) -> bool:
+        """Whether the clock was set back or a recording starts anew, rather than a frame coming out of order."""
+        return self._stamp_ns is not None and stamp_ns < self._stamp_ns - 1_000_000_000
+
+    def _stale(self, stamp_ns: int, image: Counts) -> str:
+        if self._freeze.repeats(image):
+            reason = FROZEN
+        elif self._shutter.closed(stamp_ns, image):
+            reason = SHUTTER
+        elif self._settling > 0:
+            self._settling -= 1
+            return SETTLING
+        else:
+            return ''
+        # A single repeated frame is a driver that runs faster than the camera. After a longer stop the first new
+        # frame may still hold old counts: in the bolometers, which lag, and in the driver's buffers.
+        if self._live_ns is not None and stamp_ns - self._live_ns > 90_000_000:
+            self._settling = self._config.settle_frames
+        return reason
+
+    def _replace_bad_pixels(self, image: Counts) -> None:
+        assert self._filler is not None
+        if self._config.find_bad_pixels:
+            found = self._finder.add(image)
+            if found is not None and not np.array_equal(found, self._found) and 100 * len(found) < image.size:
+                self._found = found
+                self._filler = BadPixelFiller(np.concatenate([self._known_bad, found]), self._shape)
+        self._filler.fill(image)
+
+
+class _TelemetryRows:
+    """Cuts the rows that carry no image, from the side where the picture breaks off."""
+
+    def __init__(self) -> None:
+        self._top_votes = 0
+
+    def cut(self, frame: Counts | Gray) -> Counts | Gray:
+        height = frame.shape[0]
+        extra = next((height - h for h in STANDARD_HEIGHTS if 0 < height - h <= MAX_TELEMETRY_ROWS), 0)
+        if not extra:
+            return frame
+        top, bottom = _break_between(frame, extra), _break_between(frame, height - extra)
+        self._top_votes = int(np.clip(self._top_votes + (1 if top > 2 * bottom else -1), -10, 10))
+        return frame[extra:] if self._top_votes > 0 else frame[: height - extra]
+
+
+def _break_between(frame: Counts | Gray, row: int) -> float:
+    """Mean difference between ``row`` and the one above it [counts]."""
+    return float(np.mean(np.abs(frame[row].astype(np.int32) - frame[row - 1])))
+
+
+class _FreezeDetector:
+    """Recognises repeated counts: noise never lets two frames of a living bolometer array agree."""
+
+    ROW_STEP = 8
+    # A pixel in 300 may flicker; a quarter of the rows repeated is a frame torn between old and new.
+    FLICKER = 1 / 300
+    TORN = 0.25
+
+    def __init__(self) -> None:
+        # Two, because a double-buffered driver that gets nothing new may send its two frames in turn.
+        self._recent: deque[Counts] = deque(maxlen=2)
+
+    def repeats(self, image: Counts) -> bool:
+        sample = image[:: self.ROW_STEP].copy()
+        repeated = any(self._agree(sample, earlier) for earlier in self._recent)
+        if not repeated:
+            self._recent.append(sample)
+        return repeated
+
+    def _agree(self, sample: Counts, earlier: Counts) -> bool:
+        changed = np.mean(sample != earlier, axis=1) <= self.FLICKER
+        if not changed.any():
+            return False
+        clipped = sample.max(axis=1) == sample.min(axis=1)
+        return bool(np.mean(_without(changed, clipped)) > self.TORN)
+
+
+def _without(rows: BoolArray, clipped: BoolArray) -> BoolArray:
+    """``rows`` that are not ``clipped``: a row at the end of the scale repeats without being stale."""
+    return rows if clipped.all() else rows[~clipped]
+
+
+class _ShutterDetector:
+    """Recognises the closed shutter: from one frame to the next all structure is gone."""
+
+    FLAT_SIGMAS = 4.0
+    COLLAPSE = 0.25
+    # The longest that a shutter stays closed; after it a flat picture is taken for a flat scene.
+    LONGEST_NS = 1_500_000_000
+    SMOOTHING = 0.2
+
+    def __init__(self) -> None:
+        self._live_structure: float | None = None
+        self._closed_ns: int | None = None
+
+    def closed(self, stamp_ns: int, image: Counts) -> bool:
+        structure = _structure(image)
+        before = self._live_structure
+        if before is not None and structure < min(self.COLLAPSE * before, self.FLAT_SIGMAS * pixel_noise(image)):
+            self._closed_ns = stamp_ns if self._closed_ns is None else self._closed_ns
+            if stamp_ns - self._closed_ns < self.LONGEST_NS:
+                return True
+            before = None
+        self._closed_ns = None
+        self._live_structure = structure if before is None else before + self.SMOOTHING * (structure - before)
+        return False
+
+
+def _structure(image: Counts) -> float:
+    """Steps between neighbouring patches [counts]: the tenth largest, so that a small marker is enough.
+
+    The median takes out bad pixels, the mean most of the noise.
+    """
+    patches = cv2.resize(cv2.medianBlur(np.ascontiguousarray(image[::4, ::4]), 3), None, fx=0.5, fy=0.5)
+    steps = np.abs(np.diff(patches.astype(np.int32), axis=0)).ravel()
+    steps = np.concatenate([steps, np.abs(np.diff(patches.astype(np.int32), axis=1)).ravel()])
+    return float(np.partition(steps, -10)[-10])
+
+
+class EightBitView:
+    """Counts as an 8-bit picture whose scale follows the scene slowly.
+
+    The scale runs between two percentiles of a sub-sample, smoothed over frames: an object that enters or leaves
+    doesn't make the rest of the picture pump.
+    """
+
+    STEP = 8
+
+    def __init__(self, config: Tau2CameraConfig) -> None:
+        self._config = config
+        self._range: tuple[float, float] | None = None
+
+    def __call__(self, counts: Counts) -> Gray:
+        """Picture (height, width) uint8 of ``counts`` (height, width)."""
+        low, high = self._follow(counts)
+        span = max(high - low, self._config.view_minimum_span)
+        # What falls below the scale saturates at zero in the unsigned difference, what exceeds it in the conversion.
+        start = max(0.0, 0.5 * (low + high - span))
+        above = cv2.subtract(counts, np.array([start]))
+        return np.asarray(cv2.convertScaleAbs(above, alpha=255.0 / span), dtype=np.uint8)
+
+    def _follow(self, counts: Counts) -> tuple[float, float]:
+        sample = counts[:: self.STEP, :: self.STEP].ravel()
+        share = self._config.view_tail_percent / 100.0
+        ranks = (int(share * (sample.size - 1)), int((1.0 - share) * (sample.size - 1)))
+        part = np.partition(sample, ranks)
+        now = float(part[ranks[0]]), float(part[ranks[1]])
+        if self._range is not None:
+            a = self._config.view_smoothing
+            now = tuple((1.0 - a) * old + a * new for old, new in zip(self._range, now, strict=True))  # type: ignore[assignment]
+        self._range = now
+        return now

@@ -1,0 +1,38 @@
+"""Lists of bad pixels: a text file with "column row" a line; ``#`` starts a comment."""
+
+from pathlib import Path
+
+import numpy as np
+
+from thermal_fiducial.core.types import IntArray
+from thermal_fiducial.errors import InputError
+
+
+def load_bad_pixels(path: str | Path) -> IntArray:
+    """Pixels (N, 2) as column, row.
+
+    Raises
+    ------
+    InputError
+        Unreadable, or a line that is not two whole numbers from 0 up.
+    """
+    try:
+        lines = Path(path).read_text(encoding='utf-8').splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else 'not a text file'
+        raise InputError(f'bad pixel list {path}: {reason}') from None
+    pixels = [_pixel(path, number, line) for number, line in enumerate(lines, 1) if line.partition('#')[0].strip()]
+    return np.array(pixels, dtype=np.int64).reshape(-1, 2)
+
+
+def _pixel(path: str | Path, number: int, line: str) -> tuple[int, int]:
+    words = line.partition('#')[0].replace(',', ' ').split()
+    if len(words) != 2 or not all(word.isdecimal() for word in words):
+        raise InputError(f'bad pixel list {path}, line {number}: {line.strip()!r} is not "column row"')
+    return int(words[0]), int(words[1])
+
+
+def save_bad_pixels(path: str | Path, pixels: IntArray) -> None:
+    """Write pixels (N, 2) so that :func:`load_bad_pixels` reads them."""
+    lines = ['# column row', *(f'{column} {row}' for column, row in np.asarray(pixels).reshape(-1, 2))]
+    Path(path).write_text('\n'.join(lines) + '\n', encoding='utf-8')
