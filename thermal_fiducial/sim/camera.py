@@ -1,0 +1,211 @@
+"""The camera's frames over a flight: rendering, sensor, shutter, truth."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thermal_fiducial.core.types import Counts, FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.sim.imu import ImuRecord
+from thermal_fiducial.sim.lens import Lens
+from thermal_fiducial.sim.render import Quality, Renderer
+from thermal_fiducial.sim.scenario import named, Scenario
+from thermal_fiducial.sim.scene import Marker
+from thermal_fiducial.sim.sensor import IDEAL
+
+#: Stamp of the start of every flight.
+START_NS = 1_700_000_000_000_000_000
+#: Frames that are rendered in one go: a chunk begins with a warm-up, whoever renders it, so that bytes don't depend
+#: on the number of workers.
+CHUNK = 30
+
+
+@dataclass(frozen=True)
+class SimFrame:
+    """One frame and the truth about it.
+
+    Parameters
+    ----------
+    stamp_ns : when it was read out, by the camera's clock
+    seconds : the same since the start, by the IMU's clock
+    counts : (height, width) uint16
+    shutter : whether the counts are no live view
+    T_map_camera : (4, 4) at the stamp
+    corners_px : ID to true corners (4, 2) at the stamp, for each marker that lies wholly in the image and shows
+        its face, also when the shutter is closed
+    """
+
+    stamp_ns: int
+    seconds: float
+    counts: Counts
+    shutter: bool
+    T_map_camera: FloatArray
+    corners_px: dict[int, FloatArray]
+
+
+@dataclass(frozen=True)
+class FlightPlan:
+    """A scenario with its length and seed.
+
+    Parameters
+    ----------
+    noise : False: no noise, no fixed pattern, no bad pixels, no shutter
+    quality : of the renderer
+    """
+
+    scenario: Scenario
+    seconds: float
+    seed: int
+    noise: bool = True
+    quality: Quality = Quality()  # noqa: RUF009
+
+    @property
+    def sensor_scenario(self) -> Scenario:
+        """The scenario, its sensor without noise when that is wanted."""
+        if self.noise:
+            return self.scenario
+        sensor = self.scenario.sensor
+        kept = ('lag', 'psf_sigma_px', 'counts_per_kelvin', 'offset_counts', 'frame_rate')
+        return replace(self.scenario, sensor=replace(IDEAL, **{name: getattr(sensor, name) for name in kept}))
+
+    @property
+    def frame_count(self) -> int:
+        """Number of exposures."""
+        return int(self.seconds * self.scenario.sensor.frame_rate)
+
+    def frame_time(self, index: int) -> float:
+        """Read-out of frame ``index`` since the start, by the IMU's clock [s]."""
+        return (index + 1) / self.scenario.sensor.frame_rate
+
+    def stamp_ns(self, index: int) -> int:
+        """The camera's stamp of it."""
+        return START_NS + round((self.frame_time(index) - self.scenario.camera_time_offset) * 1e9)
+
+    def imu_stamps(self) -> tuple[FloatArray, np.ndarray]:
+        """Times [s] and stamps [ns] of the IMU's samples."""
+        rate = self.scenario.imu.rate
+        ticks = np.arange(int(self.seconds * rate) + 1, dtype=np.int64)
+        nanoseconds = np.round(ticks * (1e9 / rate)).astype(np.int64)
+        return nanoseconds * 1e-9, nanoseconds + START_NS
+
+
+def plan(
+    scenario: Scenario | str, seconds: float | None = None, seed: int = 0, *, noise: bool = True, samples: int = 23
+) -> FlightPlan:
+    """A flight of ``scenario`` (an object or a name), by default of its own length."""
+    chosen = named(scenario) if isinstance(scenario, str) else scenario
+    return FlightPlan(chosen, seconds or chosen.seconds, seed, noise, Quality(samples=samples))
+
+
+def render_frames(
+    scenario: Scenario | str,
+    seconds: float | None = None,
+    seed: int = 0,
+    *,
+    noise: bool = True,
+    samples: int = 23,
+    start: int = 0,
+    stop: int | None = None,
+) -> Iterator[SimFrame]:
+    """Frames ``start`` to ``stop`` of a flight, in order.
+
+    With ``ffc_behaviour`` ``dropped`` those of the closed shutter are missing.
+    """
+    flight = plan(scenario, seconds, seed, noise=noise, samples=samples)
+    camera = ThermalCamera(flight)
+    yield from camera.frames(start, flight.frame_count if stop is None else min(stop, flight.frame_count))
+
+
+def simulate_imu(scenario: Scenario | str, seconds: float | None = None, seed: int = 0) -> ImuRecord:
+    """The IMU's samples of the same flight."""
+    flight = plan(scenario, seconds, seed)
+    times, stamps = flight.imu_stamps()
+    trajectory = flight.scenario.trajectory(flight.seconds, seed)
+    return flight.scenario.imu.sample(trajectory, times, stamps, seed)
+
+
+def true_corners(
+    lens: Lens, markers: tuple[Marker, ...], T_map_camera: FloatArray, margin_px: float = 1.0
+) -> dict[int, FloatArray]:
+    """ID to corners (4, 2) [px] of the markers wholly in the image that show their face."""
+    R, origin = T_map_camera[:3, :3], T_map_camera[:3, 3]
+    corners: dict[int, FloatArray] = {}
+    for marker in markers:
+        T = marker.T_map_marker
+        points = (marker.corners_map - origin) @ R
+        if (origin - T[:3, 3]) @ T[:3, 2] <= 0 or np.any(points[:, 2] < 0.05):
+            continue
+        pixels = lens.project(points)
+        high = np.array([lens.width, lens.height]) - 1 - margin_px
+        if np.all((pixels >= margin_px) & (pixels <= high)) and np.all(_unfolded(lens, points, pixels)):
+            corners[marker.id] = pixels
+    return corners
+
+
+def _unfolded(lens: Lens, points: FloatArray, pixels: FloatArray) -> np.ndarray:
+    """Whether the lens maps the pixels back to the points: beyond its field the distortion folds them into it."""
+    slopes = points[:, :2] / points[:, 2:]
+    return np.linalg.norm(lens.slopes(pixels) - slopes, axis=1) < 1e-6 * (1.0 + np.linalg.norm(slopes, axis=1))
+
+
+class ThermalCamera:
+    """Frames of one flight."""
+
+    def __init__(self, flight: FlightPlan) -> None:
+        scenario = flight.sensor_scenario
+        self._flight, self._scenario, self._sensor = flight, scenario, scenario.sensor
+        self._renderer = Renderer(
+            scenario.lens,
+            scenario.plates,
+            scenario.room,
+            scenario.fog,
+            scenario.acrylic,
+            scenario.trajectory(flight.seconds, flight.seed),
+            scenario.T_body_camera,
+            1.0 / scenario.sensor.frame_rate,
+            scenario.sensor.lag,
+            flight.quality,
+        )
+        self._last: tuple[int, Counts] | None = None
+
+    def frames(self, start: int, stop: int) -> Iterator[SimFrame]:
+        """Frames ``start`` to ``stop``, whole chunks at a time."""
+        for index in range(start, stop):
+            if index % CHUNK == 0:
+                self._renderer.forget()
+                self._last = None
+            frame = self._frame(index)
+            if frame is not None:
+                yield frame
+
+    def _frame(self, index: int) -> SimFrame | None:
+        t = self._flight.frame_time(index)
+        shutter = self._sensor.in_ffc(t)
+        if shutter and self._sensor.ffc_behaviour == 'dropped':
+            return None
+        counts = self._shutter_counts(index, t) if shutter else self._live_counts(index)
+        T_map_camera = self._renderer.camera_poses(np.array([t]))[0]
+        corners = true_corners(self._scenario.lens, self._scenario.markers, T_map_camera)
+        return SimFrame(self._flight.stamp_ns(index), t, counts, shutter, T_map_camera, corners)
+
+    def _live_counts(self, index: int) -> Counts:
+        t = self._flight.frame_time(index)
+        counts = self._sensor.counts(self._renderer.frame(t), t, index, self._flight.seed)
+        self._last = index, counts
+        return counts
+
+    def _shutter_counts(self, index: int, t: float) -> Counts:
+        if self._sensor.ffc_behaviour == 'shutter':
+            lens = self._scenario.lens
+            flat = np.full((lens.height, lens.width), self._sensor.shutter_excess, np.float32)
+            return self._sensor.counts(flat, t, index, self._flight.seed)
+        if self._sensor.ffc_behaviour != 'frozen':
+            raise InputError(f'driver behaviour {self._sensor.ffc_behaviour!r}: not frozen, dropped or shutter')
+        last = index
+        while last > 0 and self._sensor.in_ffc(self._flight.frame_time(last)):
+            last -= 1
+        if self._last is None or self._last[0] != last:
+            return self._live_counts(last)
+        return self._last[1]
+

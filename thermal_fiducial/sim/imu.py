@@ -1,0 +1,68 @@
+"""An IMU on the simulated body: exact rates and specific force, white noise, wandering biases."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.config import ImuNoise
+from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.sim.trajectory import GRAVITY, Trajectory
+
+
+@dataclass(frozen=True)
+class ImuRecord:
+    """Samples of one flight, leading dimension (N,)."""
+
+    stamps_ns: IntArray
+    #: [rad/s], body
+    angular_velocity: FloatArray
+    #: specific force [m/s^2], body
+    linear_acceleration: FloatArray
+    #: the true biases
+    gyroscope_bias: FloatArray
+    accelerometer_bias: FloatArray
+
+
+@dataclass(frozen=True)
+class ImuModel:
+    """Noise of the IMU.
+
+    Parameters
+    ----------
+    noise : densities and random walks (Kalibr's)
+    rate : [Hz]
+    gyroscope_bias_sigma, accelerometer_bias_sigma : of the biases at switch-on [rad/s], [m/s^2]
+    """
+
+    noise: ImuNoise = ImuNoise()
+    rate: float = 200.0
+    gyroscope_bias_sigma: float = 0.003
+    accelerometer_bias_sigma: float = 0.04
+
+    def sample(self, trajectory: Trajectory, times: FloatArray, stamps_ns: IntArray, seed: int) -> ImuRecord:
+        """What the IMU answers at ``times`` (N,) [s] of a flight.
+
+        A discrete sample of white noise of density n at rate f has deviation n sqrt(f), a bias of random walk
+        w moves by w / sqrt(f) a sample (Kalibr's IMU noise model).
+        """
+        rng = np.random.default_rng([seed, 2])
+        motion, noise, root = trajectory(times), self.noise, np.sqrt(self.rate)
+        gravity_up = np.array([0.0, 0.0, GRAVITY])
+        force = motion.rotation.inv().apply(motion.acceleration + gravity_up)
+
+        def bias(start: float, walk: float) -> FloatArray:
+            steps = rng.normal(0.0, walk / root, (len(times), 3))
+            return np.asarray(rng.normal(0.0, start, 3) + np.cumsum(steps, axis=0))
+
+        def white(density: float) -> FloatArray:
+            return rng.normal(0.0, density * root, (len(times), 3))
+
+        gyroscope_bias = bias(self.gyroscope_bias_sigma, noise.gyroscope_random_walk)
+        accelerometer_bias = bias(self.accelerometer_bias_sigma, noise.accelerometer_random_walk)
+        return ImuRecord(
+            stamps_ns,
+            motion.angular_velocity_body + gyroscope_bias + white(noise.gyroscope_noise_density),
+            force + accelerometer_bias + white(noise.accelerometer_noise_density),
+            gyroscope_bias,
+            accelerometer_bias,
+        )

@@ -1,0 +1,192 @@
+"""Named flights: the rig, the room with its markers, the path, the weather."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.sim.imu import ImuModel
+from thermal_fiducial.sim.lens import Lens
+from thermal_fiducial.sim.scene import Acrylic, Clutter, clutter_plate, Fog, Marker, marker_plate, Plate, Room
+from thermal_fiducial.sim.sensor import Sensor
+from thermal_fiducial.sim.trajectory import Flight, pose_matrix, Trajectory
+
+#: Lenses of a Tau 2 (17 um pixels) by name.
+LENSES = {
+    '7.5mm': Lens((441.3, 440.9), (321.7, 252.4), 'equidistant', (0.0143, -0.0218, 0.0312, -0.0174)),
+    '9mm': Lens((529.8, 529.2), (317.2, 259.1), 'rational_polynomial', (0.31, 0.05, 3e-4, -2e-4, 0.01, 0.64, 0.12, 0.02)),
+    '13mm': Lens((765.2, 764.6), (322.9, 251.3), 'plumb_bob', (-0.29, 0.11, 4e-4, -3e-4, 0.0)),
+    '19mm': Lens((1117.8, 1117.1), (316.4, 258.2), 'plumb_bob', (-0.18, 0.07, -2e-4, 3e-4, 0.0)),
+}
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """Everything that a simulated flight depends on besides its seed.
+
+    Parameters
+    ----------
+    name, description : for the command line
+    markers : the first one is the fixed one of the map that mapping starts with
+    camera_position, camera_orientation : of the camera in the body (IMU) frame [m], quaternion x y z w
+    camera_time_offset : clock of the camera, t_imu = t_camera + offset [s]
+    dictionary : name of an OpenCV dictionary
+    seconds : default length
+    """
+
+    name: str
+    description: str
+    markers: tuple[Marker, ...]
+    lens: Lens = LENSES['13mm']
+    camera_position: tuple[float, float, float] = (0.12, 0.02, -0.04)
+    camera_orientation: tuple[float, float, float, float] = (-0.49, 0.51, -0.495, 0.505)
+    camera_time_offset: float = 0.0
+    dictionary: str = 'DICT_4X4_50'
+    flight: Flight = Flight()  # noqa: RUF009
+    acrylic: Acrylic = Acrylic()  # noqa: RUF009
+    fog: Fog = Fog()  # noqa: RUF009
+    room: Room = Room()  # noqa: RUF009
+    clutter: tuple[Clutter, ...] = ()
+    sensor: Sensor = Sensor()  # noqa: RUF009
+    imu: ImuModel = ImuModel()  # noqa: RUF009
+    seconds: float = 30.0
+
+    @property
+    def T_body_camera(self) -> FloatArray:
+        """(4, 4)."""
+        return pose_matrix(Rotation.from_quat(self.camera_orientation), self.camera_position)
+
+    @property
+    def aruco_dictionary(self) -> cv2.aruco.Dictionary:
+        """The dictionary by its name.
+
+        Raises
+        ------
+        InputError
+            OpenCV has none of that name.
+        """
+        number = getattr(cv2.aruco, self.dictionary, None)
+        if not self.dictionary.startswith('DICT_') or number is None:
+            raise InputError(f'OpenCV has no dictionary {self.dictionary}')
+        return cv2.aruco.getPredefinedDictionary(number)
+
+    @property
+    def plates(self) -> list[Plate]:
+        """Everything flat in the room."""
+        markers = [marker_plate(marker, self.aruco_dictionary, self.acrylic) for marker in self.markers]
+        return markers + [clutter_plate(item) for item in self.clutter]
+
+    def trajectory(self, seconds: float, seed: int) -> Trajectory:
+        """The flight."""
+        return self.flight.trajectory(seconds, seed)
+
+
+def _wall() -> tuple[Marker, ...]:
+    """Eight markers between 2.5 and 4.5 m in front of home, at different depths and angles."""
+    depth = (3.2, 2.9, 3.5, 4.4, 3.0, 3.8, 2.8, 4.1)
+    yaw = (180, 165, 190, 172, 200, 183, 160, 195)
+    tilt = (0, 8, -6, 4, -10, 5, 12, -3)
+    markers = []
+    for index in range(8):
+        column, row = index % 4, index // 4
+        y = (1.5 - column) * 0.52 * depth[index] / 3.2
+        z = 1.25 + (0.5 - row) * 0.62 * depth[index] / 3.2
+        markers.append(Marker(index + 2, (depth[index], round(y, 3), round(z, 3)), yaw[index], tilt[index], 3.0 * index - 8))
+    return tuple(markers)
+
+
+def _room() -> tuple[Marker, ...]:
+    """Three rows of markers round the walls of the default room, every 0.9 m or so, at changing heights."""
+    markers = []
+    walls = ((4.9, 180.0, 1), (3.9, -90.0, 0), (-3.9, 0.0, 1), (-3.9, 90.0, 0))
+    for wall, (distance, yaw, axis) in enumerate(walls):
+        for step in range(6):
+            along = (-2.5 + step) * (1.05 if axis else 1.25) + (0.0 if axis else 0.5)
+            height = (1.0, 1.75, 1.3)[(step + wall) % 3]
+            x, y = (distance, along) if axis else (along, distance)
+            turn = ((7 * step + 5 * wall) % 5 - 2) * 6.0
+            markers.append(Marker(len(markers) + 2, (x, y, height), yaw + turn, 3.0 * (step % 3 - 1), 0.0, 0.40))
+    return tuple(markers)
+
+
+_PEOPLE = (
+    Clutter('person', (4.6, -1.9, 0.85), 180.0, 0.55, 1.7, 11.0),
+    Clutter('heater', (4.95, 1.9, 0.4), 180.0, 1.0, 0.6, 30.0),
+    Clutter('pipe', (4.98, 0.0, 2.6), 180.0, 6.0, 0.06, 18.0),
+    Clutter('plate', (2.0, 3.95, 1.5), -90.0, 0.8, 0.8, 9.0),
+    Clutter('person', (-1.0, -3.6, 0.85), 90.0, 0.5, 1.75, 12.0),
+)
+
+_TURNS = ((9.0, 1.9, 110.0), (12.5, 1.5, -95.0), (16.5, 3.5, 180.0), (21.5, 3.5, 165.0))
+
+_SCENARIOS = (
+    Scenario(
+        'fog',
+        'demo flight: eight markers in front of a wall, fog, people and heaters',
+        _wall(),
+        fog=Fog(0.25),
+        clutter=_PEOPLE,
+    ),
+    Scenario('wall', 'eight 0.3 m markers at 2.5 to 4.5 m, clear air', _wall(), seconds=20.0),
+    Scenario(
+        'room',
+        'markers on all four walls, the robot turns all round',
+        _room(),
+        lens=LENSES['9mm'],
+        flight=Flight(amplitude=(1.2, 1.2, 0.3), period=(13.0, 11.0, 6.0), turns=((8.0, 12.0, 360.0),)),
+        clutter=_PEOPLE,
+    ),
+    Scenario(
+        'fast',
+        '7.5 mm equidistant lens, 1 to 2 m/s, turns up to 140 deg/s',
+        _room(),
+        lens=LENSES['7.5mm'],
+        flight=Flight(amplitude=(1.8, 1.7, 0.4), period=(8.5, 7.5, 4.0), turns=_TURNS),
+        clutter=_PEOPLE,
+    ),
+    Scenario(
+        'dropout',
+        'markers in one half of the view only: twice none is seen for more than two seconds',
+        _wall(),
+        flight=Flight(turns=((9.0, 1.5, 75.0), (12.8, 1.5, -75.0), (18.5, 1.5, -80.0), (22.3, 1.5, 80.0))),
+    ),
+    Scenario(
+        'low_contrast', 'the wall at 2 K', _wall(), acrylic=Acrylic(contrast=2.0, steady=0.1), seconds=20.0
+    ),
+)
+
+SCENARIOS = {scenario.name: scenario for scenario in _SCENARIOS}
+
+
+def named(name: str) -> Scenario:
+    """The scenario of that name.
+
+    Raises
+    ------
+    InputError
+        There is none.
+    """
+    if name not in SCENARIOS:
+        raise InputError(f'scenario {name!r} is not one of {", ".join(SCENARIOS)}')
+    return SCENARIOS[name]
+
+
+def with_contrast(scenario: Scenario, contrast: float) -> Scenario:
+    """The scenario with plates ``contrast`` [K] warmer than cold sheets."""
+    return replace(scenario, acrylic=replace(scenario.acrylic, contrast=contrast))
+
+
+def with_lens(scenario: Scenario, name: str) -> Scenario:
+    """The scenario through another lens.
+
+    Raises
+    ------
+    InputError
+        There is no lens of that name.
+    """
+    if name not in LENSES:
+        raise InputError(f'lens {name!r} is not one of {", ".join(LENSES)}')
+    return replace(scenario, lens=LENSES[name])

@@ -1,0 +1,132 @@
+"""A Tau 2's electronics: noise, fixed pattern, bad pixels, shutter, drift, 14 bits.
+
+Numbers: NETD below 50 mK (FLIR), fixed pattern that grows after the shutter's correction to about 0.1 K within
+minutes, large-scale non-uniformity up to 0.6 K, a shutter event of less than half a second.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.core.types import Counts, Float32Array
+
+FULL_SCALE = 16383
+_SHADING_GRID = 4
+_GROWTH_TIME = 180.0
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """The focal plane and its read-out.
+
+    Parameters
+    ----------
+    lag : thermal time constant of the bolometers [s]
+    psf_sigma_px : of optics and pixel together [px]
+    netd : temporal noise [K]
+    counts_per_kelvin, offset_counts : scale, and counts of something at ambient temperature
+    drift_counts, drift_period : of the offset with the housing's temperature [counts], [s]
+    pixel_pattern, pixel_growth : fixed pattern just after the shutter, and what it grows by in three minutes [K]
+    column_pattern, column_growth : the same of whole columns [K]
+    shading : low-order non-uniformity [K]
+    bad_pixel_share : half of them dead, half stuck at random counts
+    ffc_period, ffc_first, ffc_duration : of the shutter [s]; period 0: never
+    ffc_behaviour : what the driver does then: ``frozen`` repeats the last frame under new stamps, ``dropped`` sends
+        nothing, ``shutter`` sends the view of the closed shutter
+    shutter_excess : temperature of the shutter above ambient [K]
+    frame_rate : [Hz]
+    """
+
+    lag: float = 0.010
+    psf_sigma_px: float = 0.6
+    netd: float = 0.05
+    counts_per_kelvin: float = 30.0
+    offset_counts: float = 3600.0
+    drift_counts: float = 60.0
+    drift_period: float = 90.0
+    pixel_pattern: float = 0.02
+    pixel_growth: float = 0.10
+    column_pattern: float = 0.025
+    column_growth: float = 0.05
+    shading: float = 0.4
+    bad_pixel_share: float = 0.0005
+    ffc_period: float = 12.0
+    ffc_first: float = 7.0
+    ffc_duration: float = 0.4
+    ffc_behaviour: str = 'frozen'
+    shutter_excess: float = 4.0
+    frame_rate: float = 30.0
+
+    def ffc_index(self, t: float) -> int:
+        """Number of shutter events that have begun until ``t`` [s]."""
+        if self.ffc_period <= 0:
+            return 0
+        return max(0, int(np.floor((t - self.ffc_first) / self.ffc_period)) + 1)
+
+    def ffc_start(self, index: int) -> float:
+        """When shutter event ``index`` (from 1) begins [s]; for 0 a correction long before the flight."""
+        return self.ffc_first + (index - 1) * self.ffc_period if index > 0 else -60.0
+
+    def in_ffc(self, t: float) -> bool:
+        """Whether the shutter is closed at ``t`` [s]."""
+        index = self.ffc_index(t)
+        return index > 0 and t - self.ffc_start(index) < self.ffc_duration
+
+    def counts(self, temperature: Float32Array, t: float, frame: int, seed: int) -> Counts:
+        """14-bit counts (height, width) of the temperatures [K] that the bolometers reached at ``t`` [s]."""
+        kelvin = cv2.GaussianBlur(temperature, (0, 0), self.psf_sigma_px) if self.psf_sigma_px > 0 else temperature
+        rng = np.random.default_rng([seed, 4, frame])
+        kelvin = kelvin + self._pattern(t, kelvin.shape, seed)  # type: ignore[arg-type]
+        if self.netd > 0:
+            kelvin += rng.standard_normal(kelvin.shape, dtype=np.float32) * np.float32(self.netd)
+        offset = self.offset_counts + self.drift_counts * float(np.sin(2 * np.pi * t / self.drift_period))
+        counts = np.clip(np.rint(kelvin * np.float32(self.counts_per_kelvin) + offset), 0, FULL_SCALE).astype(np.uint16)
+        where, stuck = _bad_pixels(kelvin.shape, self.bad_pixel_share, seed)  # type: ignore[arg-type]
+        counts.reshape(-1)[where] = stuck
+        return counts
+
+    def _pattern(self, t: float, shape: tuple[int, int], seed: int) -> Float32Array:
+        index = self.ffc_index(t)
+        growth = np.float32((max(0.0, t - self.ffc_start(index)) / _GROWTH_TIME) ** 0.8)
+        after, growing = _patterns(self, shape, seed, index)
+        return after + growth * growing
+
+
+@lru_cache(maxsize=2)
+def _patterns(sensor: Sensor, shape: tuple[int, int], seed: int, index: int) -> tuple[Float32Array, Float32Array]:
+    """Fixed pattern (height, width) [K] just after shutter event ``index``, and its growth in three minutes."""
+    rng = np.random.default_rng([seed, 5, index])
+
+    def pattern(pixel: float, column: float) -> Float32Array:
+        whole = rng.standard_normal(shape, dtype=np.float32) * np.float32(pixel)
+        return whole + rng.standard_normal(shape[1], dtype=np.float32) * np.float32(column)
+
+    coarse = rng.standard_normal((_SHADING_GRID, _SHADING_GRID), dtype=np.float32) * np.float32(sensor.shading / 2)
+    shading = cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
+    after = shading + pattern(sensor.pixel_pattern, sensor.column_pattern)
+    return after, pattern(sensor.pixel_growth, sensor.column_growth)
+
+
+@lru_cache(maxsize=2)
+def _bad_pixels(shape: tuple[int, int], share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Flat indices of bad pixels and what they always say: 0 or full scale (dead), or anything (stuck)."""
+    rng = np.random.default_rng([seed, 6])
+    count = round(share * shape[0] * shape[1])
+    where = rng.choice(shape[0] * shape[1], count, replace=False)
+    stuck = np.where(rng.random(count) < 0.5, rng.choice([0, FULL_SCALE], count), rng.integers(0, FULL_SCALE, count))
+    return where, stuck.astype(np.uint16)
+
+
+IDEAL = Sensor(
+    netd=0.0,
+    drift_counts=0.0,
+    pixel_pattern=0.0,
+    pixel_growth=0.0,
+    column_pattern=0.0,
+    column_growth=0.0,
+    shading=0.0,
+    bad_pixel_share=0.0,
+    ffc_period=0.0,
+)
