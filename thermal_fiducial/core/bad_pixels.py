@@ -52,7 +52,7 @@ class BadPixelFinder:
         self._votes = cv2.subtract(self._votes, np.ones_like(self._votes))  # type: ignore[assignment]
         self._votes[outlying] = np.minimum(self._votes[outlying] + self.VOTE + 1, 4 * self.ENOUGH)
         self._watch(counts, self._sigmas * noise)
-        rows, columns = np.nonzero((self._votes >= self.ENOUGH) | self._stuck)
+        rows, columns = np.divmod(np.flatnonzero((self._votes >= self.ENOUGH) | self._stuck), counts.shape[1])
         return np.stack([columns, rows], axis=-1)
 
     def _watch(self, counts: Counts, moved_counts: float) -> None:
@@ -73,7 +73,7 @@ class BadPixelFinder:
 
 def pixel_noise(counts: Counts) -> float:
     """Standard deviation of the noise between neighbouring pixels [counts], robust, at least half a count."""
-    difference = np.abs(counts[::4, 1::4].astype(np.int32) - counts[::4, 0::4])
+    difference = np.abs(counts[::8, 1::4].astype(np.int32) - counts[::8, 0::4])
     return max(0.5, 1.4826 * float(np.median(difference)) / float(np.sqrt(2.0)))
 
 

@@ -200,7 +200,8 @@ class _ShutterDetector:
     def closed(self, stamp_ns: int, image: Counts) -> bool:
         structure = _structure(image)
         before = self._live_structure
-        if before is not None and structure < min(self.COLLAPSE * before, self.FLAT_SIGMAS * pixel_noise(image)):
+        collapsed = before is not None and structure < self.COLLAPSE * before
+        if collapsed and structure < self.FLAT_SIGMAS * pixel_noise(image):
             self._closed_ns = stamp_ns if self._closed_ns is None else self._closed_ns
             if stamp_ns - self._closed_ns < self.LONGEST_NS:
                 return True
