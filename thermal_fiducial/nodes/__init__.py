@@ -1,1 +1,1 @@
-"""The four ROS 2 nodes: convert, one call into the core, publish."""
+"""The four nodes: convert, one core call, publish. Run them with ``ros2 run thermal_fiducial NODE``."""

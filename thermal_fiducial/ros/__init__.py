@@ -1,1 +1,1 @@
-"""What all four nodes share: conversions, parameters, QoS, diagnostics, the run loop."""
+"""What every node shares: message <-> numpy, parameters, QoS, the run loop. See :mod:`thermal_fiducial.ros.node`."""

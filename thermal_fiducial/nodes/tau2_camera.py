@@ -1,0 +1,70 @@
+"""Node ``tau2_camera``: raw thermal frames to clean counts."""
+
+from collections import Counter
+import sys
+from typing import Any
+
+from sensor_msgs.msg import CameraInfo, Image
+
+from thermal_fiducial.config import Tau2CameraConfig
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.thermal import EightBitView, FrameCleaner
+from thermal_fiducial.files.bad_pixels import load_bad_pixels
+from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.node import OK, StageNode, WARN
+from thermal_fiducial.ros.run import run
+
+
+class Tau2Camera(StageNode[Tau2CameraConfig]):
+    """Cuts telemetry, fills in bad pixels, withholds shutter and frozen frames, publishes a calibration from file."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__('tau2_camera', Tau2CameraConfig, **kwargs)
+        config = self.config
+        bad_pixels = (
+            self.attempt(lambda: load_bad_pixels(config.bad_pixel_file), None) if config.bad_pixel_file else None
+        )
+        self.cleaner = FrameCleaner(config, bad_pixels)
+        self.view = EightBitView(config)
+        self._calibration: Camera | None = None
+        if config.calibration_file:
+            self._calibration = self.attempt(lambda: load_camera(config.calibration_file), None)
+            self._camera_info = self.advertise(CameraInfo, 'thermal/camera_info', qos.IMAGE_OUTPUT)
+        self._image = self.advertise(Image, 'thermal/image', qos.IMAGE_OUTPUT)
+        self._image_mono8 = self.advertise(Image, 'thermal/image_mono8', qos.IMAGE_OUTPUT)
+        self._withheld: Counter[str] = Counter()
+        self._reason = ''
+        self.subscribe(Image, 'thermal/image_raw', self._on_image, qos.CAMERA_INPUT)
+
+    def _on_image(self, message: Image) -> None:
+        stamp = convert.stamp_ns(message.header.stamp)
+        frame = self.cleaner.process(stamp, convert.image_array(message))
+        self._reason = frame.reason
+        if frame.counts is None:
+            self._withheld[frame.reason] += 1
+            return
+        head = convert.header(stamp, self.config.frame_id)
+        if self._calibration is not None:
+            self._camera_info.send(convert.camera_info(self._calibration, head))
+        self._image.send(convert.image(frame.counts, head))
+        if self._image_mono8.listeners:
+            self._image_mono8.send(convert.image(self.view(frame.counts), head))
+
+    def state(self) -> tuple[bytes, str]:
+        """Why the last frame was withheld."""
+        return (WARN, self._reason) if self._reason else (OK, 'ok')
+
+    def figures(self) -> dict[str, object]:
+        """Withheld frames by reason, and bad pixels."""
+        withheld: dict[str, object] = {f'withheld: {reason}': count for reason, count in self._withheld.items()}
+        return withheld | {'bad pixels': len(self.cleaner.bad_pixels)}
+
+
+def main() -> int:
+    """Run the node."""
+    return run(Tau2Camera)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

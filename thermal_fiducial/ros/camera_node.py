@@ -1,0 +1,62 @@
+"""Base of the nodes that look at markers: the camera's calibration, and the filter's odometry as a hint."""
+
+from typing import Any, TypeVar
+
+from nav_msgs.msg import Odometry as OdometryMessage
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo
+
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.node import StageNode
+
+Config = TypeVar('Config')
+
+
+class CameraStageNode(StageNode[Config]):
+    """A stage node that follows ``thermal/camera_info`` (the last usable calibration counts) and ``odometry``."""
+
+    def __init__(self, name: str, kind: type[Config], **kwargs: Any) -> None:
+        super().__init__(name, kind, **kwargs)
+        self._camera: Camera | None = None
+        self._calibrations = 0
+        self._odometry = b''
+
+    def follow_hints(self) -> None:
+        """Subscribe to calibration and odometry; after the node's main input."""
+        self.subscribe(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
+        self.subscribe(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT, raw=True)
+
+    def camera(self) -> Camera:
+        """The calibration.
+
+        Raises
+        ------
+        InputError
+            None has come yet.
+        """
+        if self._camera is None:
+            raise InputError('no camera_info')
+        return self._camera
+
+    def odometry(self) -> Odometry | None:
+        """The filter's last state, if it has one; deserialised only here, at frame rate rather than at IMU rate."""
+        return convert.odometry(deserialize_message(self._odometry, OdometryMessage)) if self._odometry else None
+
+    def figures(self) -> dict[str, object]:
+        """How many different calibrations came."""
+        return {'calibrations': self._calibrations}
+
+    def _on_odometry(self, message: bytes) -> None:
+        self._odometry = message
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        camera = convert.camera(message)
+        if self._camera is not None and camera.matches(self._camera):
+            return
+        self._camera = camera
+        self._calibrations += 1
+        if self._calibrations > 1:
+            self.get_logger().warning('camera_info has changed: the new calibration is used from here on')

@@ -1,0 +1,91 @@
+"""ROS parameters out of the config dataclasses: declared, described, checked, some of them live."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import Field
+from typing import Any, get_args, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from thermal_fiducial.config import from_mapping, parameters
+from thermal_fiducial.errors import InputError
+
+Config = TypeVar('Config')
+
+_ARRAYS = {
+    float: Parameter.Type.DOUBLE_ARRAY,
+    int: Parameter.Type.INTEGER_ARRAY,
+    str: Parameter.Type.STRING_ARRAY,
+}
+_UNBOUNDED = 1e300
+
+
+def declare(node: Node, kind: type[Config]) -> Config:
+    """Declare all parameters of config dataclass ``kind`` on ``node``; their values from file and command line.
+
+    Raises
+    ------
+    InputError
+        A value of the wrong type, out of range, or not among the choices.
+    """
+    for name, item, default in parameters(kind):
+        try:
+            node.declare_parameter(name, _declared(item, default), _descriptor(item))
+        except ParameterException as error:
+            reason = str(error).removesuffix(f': {name}')
+            raise InputError(f'parameter {name}: {reason}') from None
+    return from_mapping(kind, current_values(node, kind))
+
+
+def follow(node: Node, kind: type[Config], apply: Callable[[Config], None]) -> None:
+    """Call ``apply`` with the new config whenever a live parameter is set; refuse what the config refuses."""
+
+    def on_set(changes: Iterable[Parameter]) -> SetParametersResult:
+        values = current_values(node, kind) | {change.name: change.value for change in changes}
+        try:
+            apply(from_mapping(kind, values))
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(on_set)
+
+
+def current_values(node: Node, kind: type) -> dict[str, Any]:
+    """Name to value of the parameters of ``kind`` as they are set on ``node``."""
+    values = {name: node.get_parameter_or(name).value for name, _, _ in parameters(kind)}
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _declared(item: 'Field[Any]', default: Any) -> Any:
+    """The default as ROS wants it; for an empty list only its type, which ROS could not tell from the value."""
+    if not isinstance(default, tuple):
+        return default
+    return list(default) if default else _ARRAYS[get_args(item.type)[0]]
+
+
+def _descriptor(item: 'Field[Any]') -> ParameterDescriptor:
+    limits = item.metadata
+    descriptor = ParameterDescriptor(description=limits['description'], read_only=not limits['live'])
+    if limits['choices']:
+        descriptor.additional_constraints = 'one of: ' + ', '.join(limits['choices'])
+    low, high = limits['minimum'], limits['maximum']
+    if low is None and high is None:
+        return descriptor
+    kind = item.default[0] if isinstance(item.default, tuple) and item.default else item.default
+    if isinstance(kind, int):
+        descriptor.integer_range = [
+            IntegerRange(
+                from_value=int(-(2**62) if low is None else low), to_value=int(2**62 if high is None else high)
+            )
+        ]
+    else:
+        descriptor.floating_point_range = [
+            FloatingPointRange(
+                from_value=-_UNBOUNDED if low is None else float(low),
+                to_value=_UNBOUNDED if high is None else float(high),
+            )
+        ]
+    return descriptor

@@ -1,0 +1,30 @@
+"""Quality of service of the topics.
+
+Sensor inputs are best effort, which matches any publisher; what we publish is reliable. The IMU's queue holds half a
+second or more, so a stall of the process loses no sample.
+"""
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+
+def _profile(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProfile:
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+#: subscription to images and camera_info of any publisher
+CAMERA_INPUT = _profile(5, reliable=False)
+#: subscription to the IMU of any publisher
+IMU_INPUT = _profile(400, reliable=False)
+#: our images
+IMAGE_OUTPUT = _profile(5)
+#: results at frame rate, and subscriptions to them
+RESULT = _profile(30)
+#: results at IMU rate
+IMU_RATE_RESULT = _profile(400)
+#: what a late subscriber must get too: the map
+LATCHED = _profile(1, latched=True)
