@@ -1,0 +1,175 @@
+"""Pose of markers and of the camera: exact without noise, honest covariances with it."""
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.pose import (
+    choose_branch,
+    ippe_square,
+    marker_corners,
+    solve_camera_pose,
+    solve_marker_pose,
+    solve_marker_poses,
+)
+from thermal_fiducial.errors import InputError
+
+K = [[529.0, 0, 319.5], [0, 527.0, 255.5], [0, 0, 1]]
+CAMERAS = {
+    'plumb_bob': Camera(640, 512, K, 'plumb_bob', [-0.3, 0.1, 1e-3, -5e-4, 0.01]),
+    'rational_polynomial': Camera(640, 512, K, 'rational_polynomial', [0.3, 0.05, 1e-3, -5e-4, 0.01, 0.5, 0.1, 0.02]),
+    'equidistant': Camera(640, 512, K, 'equidistant', [-0.12, -0.016, 0.0055, 0.0019]),
+}
+FACING = np.diag([1.0, -1.0, -1.0])  # marker z towards the camera, marker y up
+ISOTROPIC = np.broadcast_to(0.1**2 * np.eye(2), (4, 2, 2))
+
+
+def pose(tilt_rad, position):
+    return geometry.transform(geometry.so3_exp(tilt_rad) @ FACING, position)
+
+
+def image(camera, T_camera_marker, size=0.3):
+    return camera.project(geometry.apply(T_camera_marker, marker_corners(size)))
+
+
+@pytest.mark.parametrize('model', CAMERAS)
+@pytest.mark.parametrize('tilt', [(0, 0, 0), (1e-9, 0, 0), (0.3, 0, 0), (0, -0.9, 0.4), (0.5, 0.5, 3.0), (0, 0, 1.57)])
+@pytest.mark.parametrize('position', [(0, 0, 1.0), (0.3, -0.2, 2.0), (-0.6, 0.4, 1.5)])
+def test_noiseless_is_exact(model, tilt, position):
+    camera, T = CAMERAS[model], pose(tilt, position)
+    found = solve_marker_pose(image(camera, T), ISOTROPIC, 0.3, camera)
+    # The branches differ by over 1e-3 px unless they meet; the error left is rounding times the conditioning of a
+    # front-parallel square, which is quadratic in its tilt.
+    best = min((found.T_camera_marker, found.T_alternative), key=lambda X: np.abs(X - T).max())
+    np.testing.assert_allclose(best, T, atol=1e-5)
+    assert found.rms_px < 1e-7
+    assert found.rms_px <= found.alternative_rms_px
+
+
+def test_front_parallel_branches_are_both_proper():
+    poses = ippe_square(np.array([[[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]]), np.array([0.3]))[0]
+    for T in poses:
+        np.testing.assert_allclose(T, geometry.transform(FACING, [0, 0, 1.5]), atol=1e-7)
+
+
+def test_alternative_is_the_mirrored_tilt():
+    camera, T = CAMERAS['plumb_bob'], pose((0.4, 0.0, 0.0), (0.0, 0.0, 4.0))
+    found = solve_marker_pose(image(camera, T), ISOTROPIC, 0.3, camera)
+    tilt = geometry.so3_log(found.T_alternative[:3, :3] @ FACING.T)
+    np.testing.assert_allclose(tilt, (-0.4, 0.0, 0.0), atol=0.05)
+    assert 0.01 < found.alternative_rms_px < 1.0
+    assert choose_branch(found, found.T_alternative, ratio=1e9).rms_px == found.alternative_rms_px
+    assert choose_branch(found, found.T_camera_marker).rms_px == found.rms_px
+
+
+def test_expectation_cannot_choose_a_branch_that_the_image_excludes():
+    camera, T = CAMERAS['plumb_bob'], pose((0.7, 0.0, 0.0), (0.0, 0.0, 1.0))
+    found = solve_marker_pose(image(camera, T), ISOTROPIC, 0.3, camera)
+    assert choose_branch(found, found.T_alternative).rms_px == found.rms_px
+
+
+@pytest.mark.parametrize(
+    'corners',
+    [np.full((4, 2), np.nan), np.tile([300.0, 200.0], (4, 1)), [[9, 9], [50, 9], [50, 9], [9, 9]]],
+)
+def test_degenerate_corners_have_no_pose(corners):
+    with pytest.raises(InputError, match='no pose'):
+        solve_marker_pose(corners, ISOTROPIC, 0.3, CAMERAS['plumb_bob'])
+
+
+def test_degenerate_marker_leaves_the_others_alone():
+    camera, T = CAMERAS['equidistant'], pose((0.3, 0.2, 0.1), (0.1, 0.2, 2.0))
+    corners = np.stack([np.full((4, 2), np.nan), image(camera, T)])
+    bad, good = solve_marker_poses(corners, np.stack([ISOTROPIC, ISOTROPIC]), np.array([0.3, 0.3]), camera)
+    assert bad.rms_px == np.inf
+    np.testing.assert_allclose(good.T_camera_marker, T, atol=1e-9)
+
+
+def scene(camera):
+    rng = np.random.default_rng(3)
+    T_map_camera = geometry.transform(geometry.so3_exp([0.4, -1.0, 0.3]), [1.0, -2.0, 0.5])
+    T_camera_markers = [
+        pose(rng.normal(0, 0.4, 3), p) for p in [(-0.5, -0.3, 2.0), (0.5, 0.2, 2.5), (0.0, 0.4, 3.0), (0.4, -0.5, 2.2)]
+    ]
+    in_camera = np.stack([geometry.apply(T, marker_corners(0.3)) for T in T_camera_markers])
+    return T_map_camera, geometry.apply(T_map_camera, in_camera), camera.project(in_camera)
+
+
+@pytest.mark.parametrize('model', CAMERAS)
+@pytest.mark.parametrize('count', [1, 4])
+def test_joint_pose_is_exact_without_noise(model, count):
+    T_map_camera, squares, corners = scene(CAMERAS[model])
+    covs = np.broadcast_to(ISOTROPIC, (count, 4, 2, 2))
+    found = solve_camera_pose(corners[:count], covs, squares[:count], CAMERAS[model])
+    np.testing.assert_allclose(found.T_map_camera, T_map_camera, atol=1e-8)
+    assert found.rms_px < 1e-8
+
+
+def test_joint_pose_survives_a_wrong_prediction_and_a_wrong_marker():
+    camera = CAMERAS['plumb_bob']
+    T_map_camera, squares, corners = scene(camera)
+    covs = np.broadcast_to(ISOTROPIC, (4, 4, 2, 2))
+    wrong = T_map_camera @ geometry.transform(geometry.so3_exp([0.2, 0.3, -0.2]), [0.2, 0.1, 0.3])
+    found = solve_camera_pose(corners, covs, squares, camera, initial=wrong)
+    np.testing.assert_allclose(found.T_map_camera, T_map_camera, atol=1e-8)
+    shifted = corners.copy()
+    shifted[2] += (15.0, -8.0)
+    robust = solve_camera_pose(shifted, covs, squares, camera)
+    # Huber leaves an outlier an influence of 3 sigma (0.1 px) a corner: millimetres here, not the 70 mm of its shift.
+    assert np.linalg.norm(robust.T_map_camera[:3, 3] - T_map_camera[:3, 3]) < 0.012
+    weighted = solve_camera_pose(shifted, covs, squares, camera, weights=[1, 1, 0, 1])
+    np.testing.assert_allclose(weighted.T_map_camera, T_map_camera, atol=1e-7)
+
+
+def test_prediction_decides_between_the_branches_of_a_lone_marker():
+    camera, T = CAMERAS['plumb_bob'], pose((0.25, 0.0, 0.0), (0.0, 0.0, 5.0))
+    covs = np.broadcast_to(25.0 * ISOTROPIC, (1, 4, 2, 2))
+    corners, squares = image(camera, T)[None], marker_corners(0.3)[None]
+    other = solve_marker_pose(corners[0], covs[0], 0.3, camera).T_alternative
+    for expected in (T, other):
+        found = solve_camera_pose(corners, covs, squares, camera, initial=geometry.inverse(expected))
+        np.testing.assert_allclose(found.T_map_camera, geometry.inverse(expected), atol=1e-5)
+
+
+def test_no_markers():
+    with pytest.raises(InputError, match='no markers'):
+        solve_camera_pose(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros((0, 4, 3)), CAMERAS['plumb_bob'])
+
+
+def correlated_covariances(count, rng, sigma):
+    L = sigma * (np.eye(2) + 0.4 * rng.normal(size=(count, 4, 2, 2)))
+    return L @ np.swapaxes(L, -1, -2)
+
+
+def test_marker_covariance_is_honest():
+    camera, T = CAMERAS['equidistant'], pose((0.5, -0.4, 0.2), (0.2, 0.1, 1.5))
+    rng = np.random.default_rng(11)
+    count = 2000
+    covs = correlated_covariances(count, rng, 0.1)
+    noise = np.linalg.cholesky(covs) @ rng.normal(size=(count, 4, 2, 1))
+    poses = solve_marker_poses(image(camera, T) + noise[..., 0], covs, np.full(count, 0.3), camera)
+    found = np.stack([p.T_camera_marker for p in poses])
+    error = np.concatenate(
+        [T[:3, 3] - found[:, :3, 3], geometry.so3_log(T[:3, :3] @ np.swapaxes(found[:, :3, :3], -1, -2))], axis=-1
+    )
+    nees = np.einsum('bi,bij,bj->b', error, np.linalg.inv(np.stack([p.covariance for p in poses])), error)
+    # Chi-square of 6: standard deviation of the mean over 2000 is 0.08; 4 of them.
+    assert np.mean(nees) == pytest.approx(6.0, abs=0.31)
+    assert np.mean([p.chi2 for p in poses]) == pytest.approx(2.0, abs=0.18)
+
+
+def test_joint_covariance_is_honest():
+    camera = CAMERAS['plumb_bob']
+    T, squares, corners = scene(camera)
+    rng = np.random.default_rng(5)
+    nees = []
+    for _ in range(300):
+        covs = correlated_covariances(4, rng, 0.1)
+        noise = np.linalg.cholesky(covs) @ rng.normal(size=(4, 4, 2, 1))
+        found = solve_camera_pose(corners + noise[..., 0], covs, squares, camera)
+        R = T[:3, :3] @ found.T_map_camera[:3, :3].T
+        error = np.concatenate([T[:3, 3] - found.T_map_camera[:3, 3], geometry.so3_log(R)])
+        nees.append(error @ np.linalg.solve(found.covariance, error))
+    # Standard deviation of the mean over 300: 0.2; Huber clips 1 % of the corners, which costs under 0.1.
+    assert np.mean(nees) == pytest.approx(6.0, abs=0.8)
