@@ -208,4 +208,3 @@ class ThermalCamera:
         if self._last is None or self._last[0] != last:
             return self._live_counts(last)
         return self._last[1]
-

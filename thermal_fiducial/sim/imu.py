@@ -34,7 +34,7 @@ class ImuModel:
     gyroscope_bias_sigma, accelerometer_bias_sigma : of the biases at switch-on [rad/s], [m/s^2]
     """
 
-    noise: ImuNoise = ImuNoise()
+    noise: ImuNoise = ImuNoise()  # noqa: RUF009
     rate: float = 200.0
     gyroscope_bias_sigma: float = 0.003
     accelerometer_bias_sigma: float = 0.04

@@ -1,7 +1,7 @@
 """The scene as the focal plane sees it: sampled from the plates' own planes, in space and in time.
 
-A pixel wholly inside one cell of a plate at all times of a sub-frame needs one sample. Every other pixel gets the points
-of a rank-1 lattice over its area and the sub-frame: each point is back-projected through the lens with the camera pose
+A pixel wholly inside one cell of a plate at all times of a sub-frame needs one sample. Every other pixel gets the
+points of a rank-1 lattice over its area and the sub-frame: each point is back-projected through the lens with the camera pose
 of its own time and looked up in the plate. Its time is drawn from the exponential by which the bolometer forgets
 within the sub-frame, so that the sum over sub-frames y <- e y + (1 - e) x is the lag's true response,
 y(t) = integral of x(t - a) exp(-a / tau) / tau da, and a moving edge is smeared without steps.
@@ -69,7 +69,7 @@ class Renderer:
         T_body_camera: FloatArray,
         interval: float = 1 / 30,
         lag: float = 0.010,
-        quality: Quality = Quality(),  # noqa: B008
+        quality: Quality = Quality(),
     ) -> None:
         if quality.samples not in LATTICES:
             raise InputError(f'{quality.samples} samples a pixel: choose one of {", ".join(map(str, LATTICES))}')
@@ -229,10 +229,8 @@ def _homographies(plate: Plate, poses: FloatArray) -> tuple[FloatArray, bool]:
     return plate.to_cells @ metres, True
 
 
-def _look_up(
-    rays: Float32Array, H: FloatArray, offsets: FloatArray
-) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Column, row and inverse depth (..., N) where ``rays`` (..., 3 or 7), moved by ``offsets`` (N, 2) [px], meet it."""
+def _look_up(rays: Float32Array, H: FloatArray, offsets: FloatArray) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Column, row and inverse depth (..., N) where ``rays`` (..., 3 or 7), moved by ``offsets`` (N, 2) [px], hit."""
     terms = [H[:, :, 0], H[:, :, 1], H[:, :, 2]]
     if rays.shape[-1] == 7:
         dx, dy = offsets[:, :1], offsets[:, 1:]

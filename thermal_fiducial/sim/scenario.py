@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import cv2
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thermal_fiducial.core.types import FloatArray
@@ -17,7 +16,9 @@ from thermal_fiducial.sim.trajectory import Flight, pose_matrix, Trajectory
 #: Lenses of a Tau 2 (17 um pixels) by name.
 LENSES = {
     '7.5mm': Lens((441.3, 440.9), (321.7, 252.4), 'equidistant', (0.0143, -0.0218, 0.0312, -0.0174)),
-    '9mm': Lens((529.8, 529.2), (317.2, 259.1), 'rational_polynomial', (0.31, 0.05, 3e-4, -2e-4, 0.01, 0.64, 0.12, 0.02)),
+    '9mm': Lens(
+        (529.8, 529.2), (317.2, 259.1), 'rational_polynomial', (0.31, 0.05, 3e-4, -2e-4, 0.01, 0.64, 0.12, 0.02)
+    ),
     '13mm': Lens((765.2, 764.6), (322.9, 251.3), 'plumb_bob', (-0.29, 0.11, 4e-4, -3e-4, 0.0)),
     '19mm': Lens((1117.8, 1117.1), (316.4, 258.2), 'plumb_bob', (-0.18, 0.07, -2e-4, 3e-4, 0.0)),
 }
@@ -94,7 +95,9 @@ def _wall() -> tuple[Marker, ...]:
         column, row = index % 4, index // 4
         y = (1.5 - column) * 0.52 * depth[index] / 3.2
         z = 1.25 + (0.5 - row) * 0.62 * depth[index] / 3.2
-        markers.append(Marker(index + 2, (depth[index], round(y, 3), round(z, 3)), yaw[index], tilt[index], 3.0 * index - 8))
+        markers.append(
+            Marker(index + 2, (depth[index], round(y, 3), round(z, 3)), yaw[index], tilt[index], 3.0 * index - 8)
+        )
     return tuple(markers)
 
 
@@ -153,9 +156,7 @@ _SCENARIOS = (
         _wall(),
         flight=Flight(turns=((9.0, 1.5, 75.0), (12.8, 1.5, -75.0), (18.5, 1.5, -80.0), (22.3, 1.5, 80.0))),
     ),
-    Scenario(
-        'low_contrast', 'the wall at 2 K', _wall(), acrylic=Acrylic(contrast=2.0, steady=0.1), seconds=20.0
-    ),
+    Scenario('low_contrast', 'the wall at 2 K', _wall(), acrylic=Acrylic(contrast=2.0, steady=0.1), seconds=20.0),
 )
 
 SCENARIOS = {scenario.name: scenario for scenario in _SCENARIOS}

@@ -197,9 +197,9 @@ class Plate:
     def outline_map(self) -> FloatArray:
         """(4, 3) corners in ``map`` [m]."""
         w, h = self.width / 2, self.height / 2
-        return np.asarray((np.array([[-w, h, 0, 1], [w, h, 0, 1], [w, -h, 0, 1], [-w, -h, 0, 1.0]]) @ self.T_map_plate.T))[
-            :, :3
-        ]
+        return np.asarray(
+            np.array([[-w, h, 0, 1], [w, h, 0, 1], [w, -h, 0, 1], [-w, -h, 0, 1.0]]) @ self.T_map_plate.T
+        )[:, :3]
 
 
 def marker_plate(marker: Marker, dictionary: cv2.aruco.Dictionary, acrylic: Acrylic) -> Plate:
@@ -212,9 +212,7 @@ def marker_plate(marker: Marker, dictionary: cv2.aruco.Dictionary, acrylic: Acry
     side = marker.size * (cells + 2) / cells
     direction = np.random.default_rng([marker.id, 3]).uniform(0, 2 * np.pi)
     gradient = (acrylic.gradient * float(np.cos(direction)), acrylic.gradient * float(np.sin(direction)))
-    return Plate(
-        marker.T_map_marker, side, side, bits, np.ones_like(bits), acrylic.contrast, None, gradient
-    )
+    return Plate(marker.T_map_marker, side, side, bits, np.ones_like(bits), acrylic.contrast, None, gradient)
 
 
 def clutter_plate(item: Clutter) -> Plate:

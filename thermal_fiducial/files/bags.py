@@ -1,0 +1,317 @@
+"""Bags: rosbag2 (mcap and sqlite3) read and written, ROS 1 bags read. No ROS is needed for it.
+
+Topics carry the names of the package's interface, relative and without the leading slash: a bag recorded with a
+leading slash or in a namespace needs nothing, other names need a remap, as in ROS.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag1 import Reader as Rosbag1Reader
+from rosbags.rosbag2 import Reader as Rosbag2Reader
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
+from rosbags.typesys.store import Typestore
+
+from thermal_fiducial.errors import InputError
+
+IMAGE_TOPIC = 'thermal/image_raw'
+CAMERA_INFO_TOPIC = 'thermal/camera_info'
+IMU_TOPIC = 'imu/data'
+TRUTH_TOPIC = 'ground_truth/odometry'
+
+#: Names that are looked for in any namespace of the bag.
+INTERFACE_TOPICS = (IMAGE_TOPIC, CAMERA_INFO_TOPIC, IMU_TOPIC, TRUTH_TOPIC)
+
+STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
+
+
+@dataclass(frozen=True)
+class BagMessage:
+    """One recorded message.
+
+    Parameters
+    ----------
+    topic : name of the interface, see :func:`resolve_topics`
+    msgtype : e.g. ``sensor_msgs/msg/Image``
+    stamp_ns : when the bag got it (not the header's stamp)
+    cdr : serialised, as rclpy's ``publish`` takes it
+    """
+
+    topic: str
+    msgtype: str
+    stamp_ns: int
+    cdr: bytes
+    _typestore: Typestore
+
+    @cached_property
+    def message(self) -> Any:
+        """The deserialised message, an object with the fields of the ROS type.
+
+        Raises
+        ------
+        InputError
+            Bytes that are no message of this type.
+        """
+        try:
+            return self._typestore.deserialize_cdr(self.cdr, self.msgtype)
+        except Exception as error:  # the library lets through whatever reading garbage raises
+            raise InputError(f'{self.topic} at {self.stamp_ns}: no {self.msgtype}: {one_line(error)}') from None
+
+
+def one_line(error: BaseException) -> str:
+    """The first line of what an exception says, or its name."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0]
+
+
+def resolve_topics(recorded: Iterable[str], remap: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Recorded topic to the name it is known by here.
+
+    A remapped topic gets its new name. Else, a topic ``/any/namespace/imu/data`` is ``imu/data`` unless the bag has
+    that name itself; everything else just loses its leading slash.
+
+    Raises
+    ------
+    InputError
+        A remap of a topic that isn't there, or two topics for one name.
+    """
+    plain = {topic.strip('/'): topic for topic in recorded}
+    renamed = {source.strip('/'): target.strip('/') for source, target in (remap or {}).items()}
+    for source in renamed:
+        if source not in plain:
+            raise InputError(f'no topic {source} to remap; the bag has: {", ".join(sorted(plain)) or "none"}')
+    names = {topic: renamed.get(name, name) for name, topic in plain.items()}
+    for wanted in INTERFACE_TOPICS:
+        matches = [topic for topic, name in names.items() if name.endswith('/' + wanted)]
+        if wanted in names.values():
+            continue
+        if len(matches) > 1:
+            raise InputError(f'{" and ".join(sorted(matches))} could both be {wanted}: choose one with a remap')
+        names.update(dict.fromkeys(matches, wanted))
+    doubles = sorted(name for name in set(names.values()) if list(names.values()).count(name) > 1)
+    if doubles:
+        raise InputError(f'several topics of the bag became {doubles[0]}: check the remaps')
+    return names
+
+
+def parse_remaps(arguments: Iterable[str]) -> dict[str, str]:
+    """Remaps of the command line, ``from:=to`` each.
+
+    Raises
+    ------
+    InputError
+        An argument of another form.
+    """
+    remaps = {}
+    for argument in arguments:
+        source, separator, target = argument.partition(':=')
+        if not (separator and source.strip('/') and target.strip('/')):
+            raise InputError(f'remap {argument!r} is not from:=to')
+        remaps[source] = target
+    return remaps
+
+
+class BagReader:
+    """A recorded bag, opened by ``with``.
+
+    Parameters
+    ----------
+    path : a rosbag2 folder, a single ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``
+    remap : topic of the bag to name of the interface
+
+    Raises
+    ------
+    InputError
+        On entering and while reading: missing, empty, truncated or otherwise unreadable bag, ambiguous topics.
+    """
+
+    def __init__(self, path: str | Path, remap: Mapping[str, str] | None = None) -> None:
+        self.path = Path(path)
+        self._remap = remap
+        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._names: dict[str, str] = {}
+        self._reader: Rosbag1Reader | Rosbag2Reader | None = None
+
+    def __enter__(self) -> Self:
+        if not self.path.exists():
+            raise InputError(f'{self.path}: no such bag')
+        if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
+            raise InputError(f'{self.path}: no bag, the folder has no metadata.yaml')
+        with self._readable():
+            reader = Rosbag1Reader(self.path) if self.path.suffix == '.bag' else Rosbag2Reader(self.path)
+            reader.open()
+        self._reader = reader
+        try:
+            if reader.message_count == 0:
+                raise InputError(f'{self.path}: the bag is empty')
+            self._names = resolve_topics({connection.topic for connection in reader.connections}, self._remap)
+        except InputError:
+            reader.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._open.close()
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Name of the interface to message type."""
+        return {self._names[connection.topic]: connection.msgtype for connection in self._open.connections}
+
+    @property
+    def start_ns(self) -> int:
+        """Bag stamp of the first message."""
+        return int(self._open.start_time)
+
+    @property
+    def duration_ns(self) -> int:
+        """From the first to the last message."""
+        return max(0, int(self._open.duration) - 1)  # the library's ends one after the last
+
+    def require(self, topics: Mapping[str, str]) -> None:
+        """Check that the bag has ``topics`` (name to message type).
+
+        Raises
+        ------
+        InputError
+            One is missing (what there is, is named), has another type, or no message.
+        """
+        there = self.topics
+        for topic, msgtype in topics.items():
+            if topic not in there:
+                listed = ', '.join(sorted(f'{name} ({kind})' for name, kind in there.items()))
+                raise InputError(f'{self.path}: no topic {topic} (remap another to it?); the bag has {listed}')
+            if there[topic] != msgtype:
+                raise InputError(f'{self.path}: topic {topic} is {there[topic]}, not {msgtype}')
+            if self.message_count([topic]) == 0:
+                raise InputError(f'{self.path}: no message on topic {topic}')
+
+    def message_count(self, topics: Iterable[str] | None = None) -> int:
+        """Number of messages on ``topics`` (default: all)."""
+        return sum(connection.msgcount for connection in self._connections(topics))
+
+    def messages(self, topics: Iterable[str] | None = None) -> Iterator[BagMessage]:
+        """Messages on ``topics`` (default: all) in recorded order.
+
+        Raises
+        ------
+        InputError
+            The bag ends or becomes unreadable on the way.
+        """
+        connections = self._connections(topics)
+        if not connections:
+            return
+        with self._readable():
+            for connection, stamp_ns, raw in self._open.messages(connections):
+                name = self._names[connection.topic]
+                yield BagMessage(name, connection.msgtype, stamp_ns, self._cdr(connection, raw), self._typestore)
+
+    @property
+    def _open(self) -> Rosbag1Reader | Rosbag2Reader:
+        if self._reader is None:
+            raise RuntimeError('the bag is not open')
+        return self._reader
+
+    def _connections(self, topics: Iterable[str] | None) -> list[Connection]:
+        wanted = None if topics is None else set(topics)
+        return [item for item in self._open.connections if wanted is None or self._names[item.topic] in wanted]
+
+    def _cdr(self, connection: Connection, raw: bytes | memoryview) -> bytes:
+        self._learn(connection)
+        if isinstance(self._reader, Rosbag1Reader):
+            return bytes(self._typestore.ros1_to_cdr(raw, connection.msgtype))
+        return bytes(raw)
+
+    def _learn(self, connection: Connection) -> None:
+        """Take the definition of a type that ROS does not bring from the bag, where it has one."""
+        text = connection.msgdef.data
+        if connection.msgtype in self._typestore.fielddefs or not text:
+            return
+        idl = connection.msgdef.format.name == 'IDL'
+        types = get_types_from_idl(text) if idl else get_types_from_msg(text, connection.msgtype)
+        known = self._typestore.fielddefs
+        self._typestore.register({name: fields for name, fields in types.items() if name not in known})
+
+    @contextmanager
+    def _readable(self) -> Iterator[None]:
+        """Whatever the library lets through on a damaged file becomes one line."""
+        try:
+            yield
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f'{self.path}: the bag cannot be read: {one_line(error)}') from None
+
+
+class BagWriter:
+    """A new rosbag2, opened by ``with``; the same messages give the same bytes.
+
+    Parameters
+    ----------
+    path : folder to create
+    storage : a key of :data:`STORAGES`
+
+    Raises
+    ------
+    InputError
+        The folder exists, cannot be made, or the storage is unknown.
+    """
+
+    def __init__(self, path: str | Path, storage: str = 'mcap') -> None:
+        if storage not in STORAGES:
+            raise InputError(f'storage {storage!r} is not one of {", ".join(STORAGES)}')
+        if Path(path).exists():
+            raise InputError(f'{path} exists already')
+        self._path = Path(path)
+        self._typestore = get_typestore(Stores.ROS2_JAZZY)
+        self._writer = Writer(path, version=9, storage_plugin=STORAGES[storage])
+        self._connections: dict[str, Connection] = {}
+
+    def __enter__(self) -> Self:
+        try:
+            self._writer.open()
+        except OSError as error:
+            raise InputError(f'{self._path}: {error.strerror}') from None
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._writer.close()
+
+    def add_topic(self, topic: str, msgtype: str) -> None:
+        """Record that there is ``topic``, also if it never gets a message.
+
+        Raises
+        ------
+        InputError
+            A type that ROS 2 Jazzy does not bring.
+        """
+        if msgtype not in self._typestore.fielddefs:
+            raise InputError(f'{topic}: message type {msgtype} is unknown')
+        name = topic if topic.startswith('/') else '/' + topic
+        self._connections[topic] = self._writer.add_connection(name, msgtype, typestore=self._typestore)
+
+    def write(self, topic: str, stamp_ns: int, message: Any, msgtype: str | None = None) -> None:
+        """Append a message.
+
+        Parameters
+        ----------
+        topic : as :meth:`add_topic` got it; a new one is added
+        stamp_ns : bag stamp
+        message : one of rosbags' message objects, or its CDR bytes together with ``msgtype``
+        """
+        kind = msgtype or message.__msgtype__
+        if topic not in self._connections:
+            self.add_topic(topic, kind)
+        is_raw = isinstance(message, (bytes, bytearray, memoryview))
+        cdr = message if is_raw else self._typestore.serialize_cdr(message, kind)
+        self._writer.write(self._connections[topic], stamp_ns, cdr)

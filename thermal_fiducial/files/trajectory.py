@@ -1,0 +1,75 @@
+"""TUM trajectories: ``timestamp tx ty tz qx qy qz qw`` a line, stamps exact to the nanosecond."""
+
+from collections.abc import Iterable
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.errors import InputError
+
+_NS = 1_000_000_000
+
+
+def tum_line(stamp_ns: int, position: Iterable[float], orientation_xyzw: Iterable[float]) -> str:
+    """One line without its end: nine decimals of the stamp, values to the nanometre."""
+    seconds, rest = divmod(int(stamp_ns), _NS)
+    values = ' '.join(f'{float(value):.9f}' for value in (*position, *orientation_xyzw))
+    return f'{seconds}.{rest:09d} {values}'
+
+
+def save_tum(path: str | Path, stamps_ns: Iterable[int], positions: FloatArray, quaternions: FloatArray) -> None:
+    """Write poses: stamps (N,), positions (N, 3) [m], quaternions x y z w (N, 4).
+
+    Raises
+    ------
+    InputError
+        The file cannot be written.
+    """
+    lines = [tum_line(*pose) for pose in zip(stamps_ns, positions, quaternions, strict=True)]
+    try:
+        Path(path).write_text(''.join(line + '\n' for line in lines), encoding='ascii')
+    except OSError as error:
+        raise InputError(f'{path}: {error.strerror}') from None
+
+
+def load_tum(path: str | Path) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Stamps [ns] (N,), positions (N, 3) [m] and unit quaternions x y z w (N, 4) of a TUM file.
+
+    Values may be separated by blanks or commas; lines that start with ``#`` are comments.
+
+    Raises
+    ------
+    InputError
+        Unreadable, empty, a line that isn't eight finite numbers, a quaternion of no length, stamps that go back.
+    """
+    try:
+        text = Path(path).read_text(encoding='utf-8')
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f'{path}: {getattr(error, "strerror", None) or "no text"}') from None
+    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != '#']
+    if not lines:
+        raise InputError(f'{path}: no poses')
+    rows = [_row(path, number, line) for number, line in lines]
+    stamps = np.array([stamp for stamp, _ in rows], dtype=np.int64)
+    back = np.flatnonzero(np.diff(stamps) < 0)
+    if len(back):
+        raise InputError(f'{path} line {lines[back[0] + 1][0]}: the stamp goes back')
+    values = np.array([row for _, row in rows])
+    quaternions = values[:, 3:]
+    return stamps, values[:, :3], quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
+
+
+def _row(path: str | Path, number: int, line: str) -> tuple[int, list[float]]:
+    words = line.replace(',', ' ').split()
+    try:
+        stamp = int((Decimal(words[0]) * _NS).to_integral_value())
+        values = [float(word) for word in words[1:]]
+    except (InvalidOperation, ValueError, OverflowError):
+        raise InputError(f'{path} line {number}: not numbers') from None
+    if len(values) != 7 or not np.all(np.isfinite(values)):
+        raise InputError(f'{path} line {number}: {len(words)} values, or not finite ones; a pose has 8')
+    if np.linalg.norm(values[3:]) < 1e-6:
+        raise InputError(f'{path} line {number}: a quaternion of no length')
+    return stamp, values
