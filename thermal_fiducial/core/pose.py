@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
 
 _MAX_STEPS = 20
@@ -322,7 +322,7 @@ def _minimise(evaluate: Callable[[FloatArray], _Evaluation], T: FloatArray) -> _
         step = -_solve(information, damping, gradient)
         trial = _move(T, step)
         new = _finite(evaluate(trial))
-        better = np.asarray(new[0] <= cost)
+        better: BoolArray = np.atleast_1d(new[0] <= cost)
         T = np.where(better[:, None, None], trial, T)
         gradient = np.where(better[:, None], new[1], gradient)
         information = np.where(better[:, None, None], new[2], information)
