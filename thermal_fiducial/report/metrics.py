@@ -1,0 +1,266 @@
+"""How good a trajectory is: errors against ground truth, jitter, consistency, gaps, latency.
+
+Truth is interpolated at the stamps of the estimate (nearest neighbours within 10 ms, as some tools take them, are a
+phantom error of 10 mm at 1 m/s). Errors are ``d`` of the package's covariance convention: the true pose is
+``p_hat + d[:3]``, ``exp(d[3:]) R_hat``, all in ``map``; the accuracy is that in the map, not after an alignment.
+
+Terms: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 2012 (absolute and relative
+error); S. Umeyama, "Least-squares estimation of transformation parameters", 1991 (alignment); Y. Bar-Shalom et al.,
+"Estimation with applications to tracking and navigation", 2001, 5.4 (NEES).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.core.geometry import inverse, so3_exp, so3_log, transform
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.files.trajectory import Trajectory
+
+#: Interval of the jitter: a period of the camera [ns].
+FRAME_NS = 33_333_333
+#: Interval of the relative pose error [ns].
+RELATIVE_NS = 1_000_000_000
+#: Two fiducial poses farther apart than this have a gap between them [ns].
+GAP_NS = 300_000_000
+#: Truth is not interpolated over holes longer than this [ns].
+TRUTH_HOLE_NS = 200_000_000
+#: 95 % point of chi-square, by degrees of freedom.
+CHI2_95 = {3: 7.815, 6: 12.592}
+
+
+def interpolate(truth: Trajectory, stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
+    """Poses (N, 4, 4) of ``truth`` at stamps, linear in position and SLERP in attitude, and which of them exist (N,).
+
+    No pose exists before the first, after the last, and in holes of more than :data:`TRUTH_HOLE_NS`.
+    """
+    if len(truth) < 2:
+        return np.tile(np.eye(4), (len(stamps_ns), 1, 1)), np.zeros(len(stamps_ns), np.bool_)
+    right = np.clip(np.searchsorted(truth.stamps_ns, stamps_ns), 1, len(truth) - 1)
+    t0, t1 = truth.stamps_ns[right - 1], truth.stamps_ns[right]
+    T0, T1 = truth.T_map_body[right - 1], truth.T_map_body[right]
+    share = ((stamps_ns - t0) / (t1 - t0))[:, None]
+    R0, R1 = T0[:, :3, :3], T1[:, :3, :3]
+    R = R0 @ so3_exp(share * so3_log(np.swapaxes(R0, 1, 2) @ R1))
+    p = (1.0 - share) * T0[:, :3, 3] + share * T1[:, :3, 3]
+    exists = (stamps_ns >= t0) & (stamps_ns <= t1) & (t1 - t0 <= TRUTH_HOLE_NS)
+    return transform(R, p), exists
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of a trajectory where truth is known.
+
+    Parameters
+    ----------
+    stamps_ns : (N,)
+    d : (N, 6) position [m] and rotation [rad] from the estimate to the truth, in ``map``
+    estimate, truth : (N, 4, 4) T_map_body
+    """
+
+    stamps_ns: IntArray
+    d: FloatArray
+    estimate: FloatArray
+    truth: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+    @property
+    def position_m(self) -> FloatArray:
+        """(N,) distances [m]."""
+        return np.asarray(np.linalg.norm(self.d[:, :3], axis=1))
+
+    @property
+    def attitude_deg(self) -> FloatArray:
+        """(N,) angles [deg]."""
+        return np.asarray(np.rad2deg(np.linalg.norm(self.d[:, 3:], axis=1)))
+
+
+def errors(estimate: Trajectory, truth: Trajectory) -> Errors:
+    """Errors of ``estimate`` at its own stamps, where ``truth`` knows them."""
+    T_true, exists = interpolate(truth, estimate.stamps_ns)
+    T_true, T_hat = T_true[exists], estimate.T_map_body[exists]
+    rotation = so3_log(T_true[:, :3, :3] @ np.swapaxes(T_hat[:, :3, :3], 1, 2))
+    d = np.concatenate([T_true[:, :3, 3] - T_hat[:, :3, 3], rotation], axis=1)
+    return Errors(estimate.stamps_ns[exists], d, T_hat, T_true)
+
+
+def accuracy(e: Errors) -> dict[str, float]:
+    """Absolute errors in the map: rms, median, 95 % and largest [mm, deg]; and after alignment in position [mm]."""
+    if not len(e):
+        return {}
+    return {
+        **_spread('position', 'mm', 1e3 * e.position_m),
+        **_spread('attitude', 'deg', e.attitude_deg),
+        'position_aligned_rms_mm': 1e3 * _rms(np.linalg.norm(aligned_residuals(e), axis=1)),
+    }
+
+
+def _spread(name: str, unit: str, values: FloatArray) -> dict[str, float]:
+    return {
+        f'{name}_rms_{unit}': _rms(values),
+        f'{name}_median_{unit}': float(np.median(values)),
+        f'{name}_p95_{unit}': float(np.percentile(values, 95)),
+        f'{name}_max_{unit}': float(values.max()),
+    }
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def aligned_residuals(e: Errors) -> FloatArray:
+    """Position residuals (N, 3) [m] after the best rigid alignment of the estimate to the truth (no scale)."""
+    p_hat, p_true = e.estimate[:, :3, 3], e.truth[:, :3, 3]
+    centre_hat, centre_true = p_hat.mean(axis=0), p_true.mean(axis=0)
+    U, _, Vt = np.linalg.svd((p_true - centre_true).T @ (p_hat - centre_hat))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
+    return np.asarray(p_true - centre_true - (p_hat - centre_hat) @ R.T)
+
+
+def pairs_apart(stamps_ns: IntArray, interval_ns: int) -> tuple[IntArray, IntArray]:
+    """Indices i and j of samples that lie ``interval_ns`` apart, within a fifth of it."""
+    if len(stamps_ns) < 2:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    wanted = stamps_ns + interval_ns
+    right = np.clip(np.searchsorted(stamps_ns, wanted), 1, len(stamps_ns) - 1)
+    j = np.where(wanted - stamps_ns[right - 1] < stamps_ns[right] - wanted, right - 1, right)
+    i = np.arange(len(stamps_ns))
+    close = (np.abs(stamps_ns[j] - wanted) <= interval_ns // 5) & (j > i)
+    return i[close], j[close]
+
+
+def jitter(e: Errors) -> dict[str, float]:
+    """What a controller feels: rms of the change of the error over one camera period [mm, deg]."""
+    i, j = pairs_apart(e.stamps_ns, FRAME_NS)
+    if not len(i):
+        return {}
+    turned = so3_log(so3_exp(e.d[j, 3:]) @ np.swapaxes(so3_exp(e.d[i, 3:]), 1, 2))
+    moved = np.linalg.norm(e.d[j, :3] - e.d[i, :3], axis=1)
+    return {
+        'position_mm': 1e3 * _rms(moved),
+        'position_p95_mm': 1e3 * float(np.percentile(moved, 95)),
+        'attitude_deg': float(np.rad2deg(_rms(np.linalg.norm(turned, axis=1)))),
+    }
+
+
+def relative_pose_error(e: Errors, interval_ns: int = RELATIVE_NS) -> dict[str, float]:
+    """Drift over ``interval_ns``: rms of the relative pose error [mm, deg]."""
+    i, j = pairs_apart(e.stamps_ns, interval_ns)
+    if not len(i):
+        return {}
+    true_step = inverse(e.truth[i]) @ e.truth[j]
+    step = inverse(e.estimate[i]) @ e.estimate[j]
+    E = inverse(true_step) @ step
+    return {
+        'interval_s': interval_ns * 1e-9,
+        'position_mm': 1e3 * _rms(np.linalg.norm(E[:, :3, 3], axis=1)),
+        'attitude_deg': float(np.rad2deg(_rms(np.linalg.norm(so3_log(E[:, :3, :3]), axis=1)))),
+    }
+
+
+def consistency(e: Errors, covariances: FloatArray) -> dict[str, float]:
+    """NEES of the pose and of its two halves: mean (1 a degree of freedom is perfect) and share within 95 %.
+
+    Parameters
+    ----------
+    e : N errors
+    covariances : (N, 6, 6) of the estimates, ROS convention
+    """
+    usable = np.linalg.eigvalsh(covariances)[:, 0] > 0.0 if len(e) else np.zeros(0, np.bool_)
+    if not np.any(usable):
+        return {}
+    result: dict[str, float] = {'samples': int(np.sum(usable))}
+    for name, part in (('pose', slice(0, 6)), ('position', slice(0, 3)), ('attitude', slice(3, 6))):
+        d, P = e.d[usable, part], covariances[usable, part, part]
+        nees = np.einsum('ni,ni->n', d, np.linalg.solve(P, d[..., None])[..., 0])
+        result[f'{name}_nees_per_dof'] = float(np.mean(nees)) / d.shape[1]
+        result[f'{name}_within_95'] = float(np.mean(nees <= CHI2_95[d.shape[1]]))
+    return result
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A time without a fiducial pose."""
+
+    start_ns: int
+    end_ns: int
+    #: poses that the filter gave in it
+    fused_poses: int
+    #: change of the fused position at its end, when markers are seen again [mm]
+    step_mm: float
+    #: error at its end [mm, deg], where truth is known
+    error_mm: float | None = None
+    error_deg: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        """Its length."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+
+def gaps(fused: Trajectory, fiducial: Trajectory, fused_errors: Errors | None) -> list[Gap]:
+    """The times without fiducial poses, and what the filter made of them."""
+    ends = np.flatnonzero(np.diff(fiducial.stamps_ns) > GAP_NS)
+    return [
+        _gap(fused, int(fiducial.stamps_ns[i]), int(fiducial.stamps_ns[i + 1]), fused_errors)
+        for i in ends
+        if len(fused)
+    ]
+
+
+def _gap(fused: Trajectory, start_ns: int, end_ns: int, e: Errors | None) -> Gap:
+    inside = (fused.stamps_ns > start_ns) & (fused.stamps_ns <= end_ns)
+    # The frame that ends the gap corrects the filter a few tens of milliseconds later, when it has been worked on.
+    after = (fused.stamps_ns > end_ns) & (fused.stamps_ns <= end_ns + 3 * FRAME_NS)
+    steps = (
+        _steps(fused.take(after | (fused.stamps_ns == fused.stamps_ns[inside][-1]))) if inside.any() else np.zeros(0)
+    )
+    error_mm = error_deg = None
+    if e is not None and np.any(at := (e.stamps_ns > start_ns) & (e.stamps_ns <= end_ns)):
+        error_mm, error_deg = 1e3 * float(e.position_m[at][-1]), float(e.attitude_deg[at][-1])
+    return Gap(start_ns, end_ns, int(inside.sum()), 1e3 * float(steps.max(initial=0.0)), error_mm, error_deg)
+
+
+def _steps(trajectory: Trajectory) -> FloatArray:
+    """How far each position lies from where the two before it led to [m]: the steps that corrections make."""
+    p = trajectory.positions
+    if len(p) < 3:
+        return np.zeros(0)
+    dt = np.diff(trajectory.stamps_ns).astype(np.float64)
+    predicted = p[1:-1] + (p[1:-1] - p[:-2]) * (dt[1:] / dt[:-1])[:, None]
+    return np.asarray(np.linalg.norm(p[2:] - predicted, axis=1))
+
+
+def output(trajectory: Trajectory) -> dict[str, float]:
+    """Rate and smoothness of the output itself, without truth: rate, longest pause, steps between poses."""
+    if len(trajectory) < 3:
+        return {'poses': len(trajectory)}
+    dt = np.diff(trajectory.stamps_ns)
+    steps = 1e3 * _steps(trajectory)
+    return {
+        'poses': len(trajectory),
+        'rate_hz': 1e9 / float(np.median(dt)),
+        'longest_pause_ms': 1e-6 * float(dt.max()),
+        'step_p95_mm': float(np.percentile(steps, 95)),
+        'step_max_mm': float(steps.max()),
+        'way_m': way(trajectory),
+    }
+
+
+def way(trajectory: Trajectory) -> float:
+    """Way flown [m], from positions a tenth of a second apart, so that noise adds little."""
+    if not len(trajectory):
+        return 0.0
+    stamps = trajectory.stamps_ns
+    picked = np.searchsorted(stamps, np.arange(stamps[0], stamps[-1], 100_000_000))
+    return float(np.sum(np.linalg.norm(np.diff(trajectory.positions[picked], axis=0), axis=1)))
+
+
+def latency(milliseconds: FloatArray) -> dict[str, float]:
+    """Median, 99 % and largest latency [ms]."""
+    if not len(milliseconds):
+        return {}
+    p50, p99 = np.percentile(milliseconds, [50, 99])
+    return {'p50_ms': float(p50), 'p99_ms': float(p99), 'max_ms': float(milliseconds.max())}
