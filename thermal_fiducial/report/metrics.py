@@ -15,7 +15,7 @@ import numpy as np
 
 from thermal_fiducial.core.geometry import inverse, so3_exp, so3_log, transform
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
-from thermal_fiducial.files.trajectory import Trajectory
+from thermal_fiducial.report.trajectory import Trajectory
 
 #: Interval of the jitter: a period of the camera [ns].
 FRAME_NS = 33_333_333
