@@ -314,7 +314,7 @@ def _move(T: FloatArray, step: FloatArray) -> FloatArray:
 
 def _minimise(evaluate: Callable[[FloatArray], _Evaluation], T: FloatArray) -> _Evaluation:
     """Levenberg-Marquardt on a batch: poses (B, 4, 4), their costs (B,) and information matrices (B, 6, 6)."""
-    possible = np.isfinite(T).all(axis=(-1, -2))
+    possible: BoolArray = np.asarray(np.isfinite(T).all(axis=(-1, -2)))
     T = np.where(possible[:, None, None], T, _AHEAD)
     cost, gradient, information = _finite(evaluate(T))
     damping = np.full(len(T), 1e-6)
@@ -322,7 +322,7 @@ def _minimise(evaluate: Callable[[FloatArray], _Evaluation], T: FloatArray) -> _
         step = -_solve(information, damping, gradient)
         trial = _move(T, step)
         new = _finite(evaluate(trial))
-        better: BoolArray = np.atleast_1d(new[0] <= cost)
+        better = new[0] <= cost
         T = np.where(better[:, None, None], trial, T)
         gradient = np.where(better[:, None], new[1], gradient)
         information = np.where(better[:, None, None], new[2], information)
