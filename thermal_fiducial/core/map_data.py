@@ -1,0 +1,78 @@
+"""The marker map as data: what is known of each marker, and the frame in which it is known."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from thermal_fiducial.core.geometry import quaternion_from_rotation
+from thermal_fiducial.core.measurements import MAP_DTYPE
+from thermal_fiducial.core.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class MapMarker:
+    """A marker whose pose in the map is known.
+
+    Instances are immutable, so that a snapshot of a map may be handed to another thread as it is.
+    """
+
+    id: int
+    #: side of the black square [m]
+    size: float
+    #: a fixed marker never moves: it is the gauge of the map
+    fixed: bool
+    #: (4, 4)
+    T_map_marker: FloatArray
+    #: (6, 6), ROS convention, in the map frame [m, rad]
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    #: running rms of the re-projection error of its corners [px]; 0 before the first observation
+    reprojection_error_px: float = 0.0
+    observations: int = 0
+    #: stamps of the first and the last sight; 0 when never seen
+    first_seen_ns: int = 0
+    last_seen_ns: int = 0
+    #: False: in quarantine, because it persistently disagrees with the others; no pose rests on it
+    trusted: bool = True
+
+
+@dataclass
+class MarkerMap:
+    """Markers by ID, all in one frame.
+
+    ``version`` grows with every change of the geometry; statistics leave it alone.
+    """
+
+    markers: dict[int, MapMarker] = field(default_factory=dict)
+    frame_id: str = 'map'
+    dictionary: str = 'DICT_4X4_50'
+    version: int = 1
+
+    def copy(self) -> 'MarkerMap':
+        """A map that shares the (immutable) markers but not the table of them."""
+        return replace(self, markers=dict(self.markers))
+
+    def geometry(self) -> dict[int, tuple[FloatArray, float]]:
+        """Marker ID to (T_map_marker, size): what a detector needs to look for them."""
+        return {marker.id: (marker.T_map_marker, marker.size) for marker in self.markers.values()}
+
+    def rows(self, in_view: Collection[int] = ()) -> np.ndarray:
+        """Rows (N,) of :data:`MAP_DTYPE`, ordered by ID; ``in_view`` are the IDs that the frame at hand shows."""
+        markers = [self.markers[key] for key in sorted(self.markers)]
+        rows = np.zeros(len(markers), MAP_DTYPE)
+        if not markers:
+            return rows
+        T = np.stack([marker.T_map_marker for marker in markers])
+        _fill(rows, 'xyz', T[:, :3, 3])
+        _fill(rows, ('qx', 'qy', 'qz', 'qw'), quaternion_from_rotation(T[:, :3, :3]))
+        rows['sigma_m'] = [np.sqrt(max(np.trace(marker.covariance[:3, :3]) / 3.0, 0.0)) for marker in markers]
+        rows['rms_px'] = [marker.reprojection_error_px for marker in markers]
+        for name in ('id', 'size', 'observations', 'fixed', 'trusted'):
+            rows[name] = [getattr(marker, name) for marker in markers]
+        rows['in_view'] = [marker.id in in_view for marker in markers]
+        return rows
+
+
+def _fill(rows: np.ndarray, names: Collection[str], values: FloatArray) -> None:
+    for name, column in zip(names, values.T, strict=True):
+        rows[name] = column

@@ -1,0 +1,103 @@
+"""Which markers of the map can be trusted: running errors, and quarantine of those that persistently disagree.
+
+A marker that was moved, hangs twice, or was put in the map wrongly re-projects badly against a pose that rests on the
+others. One bad frame is an outlier; most of a second of them is a fact about the marker.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.core.map_data import MapMarker
+
+#: Weight of a new frame in the running error and in the share of disagreeing frames: a memory of 20 frames.
+MEMORY = 0.05
+#: Share of disagreeing frames that puts a marker in quarantine, and the share below which it comes out again.
+QUARANTINE, RELEASE = 0.7, 0.1
+#: Ratio of an error to what its covariance explains that counts as disagreement.
+DISAGREEMENT = 4.0
+
+
+@dataclass
+class _Record:
+    mean_square_px: float
+    observations: int
+    disagreement: float = 0.0
+
+
+class Trust:
+    """Running errors and disagreement of every marker seen so far."""
+
+    def __init__(self) -> None:
+        self._records: dict[int, _Record] = {}
+
+    def running_errors(self, markers: Iterable[MapMarker]) -> np.ndarray:
+        """Running rms re-projection error of each of ``markers`` [px]."""
+        return np.sqrt([self._record(marker).mean_square_px for marker in markers])
+
+    def running_error(self, marker: MapMarker) -> float:
+        """Running rms re-projection error of ``marker`` [px]."""
+        return float(np.sqrt(self._record(marker).mean_square_px))
+
+    def add_errors(self, markers: Iterable[MapMarker], errors_px: np.ndarray) -> None:
+        """Take in the rms error [px] of each of ``markers`` in one frame."""
+        for marker, error in zip(markers, errors_px, strict=True):
+            record = self._record(marker)
+            record.observations += 1
+            gain = max(1.0 / record.observations, MEMORY)
+            record.mean_square_px += gain * (float(error) ** 2 - record.mean_square_px)
+
+    def judge(self, markers: Iterable[MapMarker], disagrees: Iterable[bool]) -> dict[int, bool]:
+        """Take in which of ``markers`` disagree with the others in one frame.
+
+        Returns
+        -------
+        Marker ID to its new standing (trusted or not), for those whose standing changes.
+        """
+        changes: dict[int, bool] = {}
+        for marker, bad in zip(markers, disagrees, strict=True):
+            record = self._record(marker)
+            record.disagreement += MEMORY * (float(bad) - record.disagreement)
+            if marker.trusted and record.disagreement > QUARANTINE:
+                changes[marker.id] = False
+            elif not marker.trusted and record.disagreement < RELEASE:
+                changes[marker.id] = True
+        return changes
+
+    def forget(self, ids: Iterable[int]) -> None:
+        """Start anew with ``ids``: their poses have changed."""
+        for marker_id in ids:
+            self._records.pop(marker_id, None)
+
+    def _record(self, marker: MapMarker) -> _Record:
+        record = self._records.get(marker.id)
+        if record is None:
+            # A marker that comes out of a file in quarantine stays there until it has proved itself.
+            record = _Record(marker.reprojection_error_px**2, marker.observations, 0.0 if marker.trusted else 1.0)
+            self._records[marker.id] = record
+        return record
+
+
+def culprits(disagrees: np.ndarray, trusted: np.ndarray, markers: list[MapMarker]) -> np.ndarray:
+    """Which of the disagreeing markers are to blame, (N,) bool.
+
+    Among three or more the majority decides, which a robust pose already follows. Of two that disagree a fixed one
+    is believed, then the one seen more often by far; else nobody can tell and neither is blamed.
+    """
+    if np.count_nonzero(trusted) != 2 or not np.any(disagrees & trusted):
+        return disagrees
+    a, b = np.flatnonzero(trusted)
+    blamed = disagrees & ~trusted
+    preference = _preference(markers[a], markers[b])
+    if preference:
+        blamed[b if preference > 0 else a] = True
+    return blamed
+
+
+def _preference(a: MapMarker, b: MapMarker) -> int:
+    if a.fixed != b.fixed:
+        return 1 if a.fixed else -1
+    if a.observations > 4 * b.observations:
+        return 1
+    return -1 if b.observations > 4 * a.observations else 0
