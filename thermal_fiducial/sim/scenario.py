@@ -9,6 +9,7 @@ from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.sim.imu import ImuModel
 from thermal_fiducial.sim.lens import Lens
+from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.scene import Acrylic, Clutter, clutter_plate, Fog, Marker, marker_plate, Plate, Room
 from thermal_fiducial.sim.sensor import Sensor
 from thermal_fiducial.sim.trajectory import Flight, pose_matrix, Trajectory
@@ -46,7 +47,7 @@ class Scenario:
     camera_orientation: tuple[float, float, float, float] = (-0.49, 0.51, -0.495, 0.505)
     camera_time_offset: float = 0.0
     dictionary: str = 'DICT_4X4_50'
-    flight: Flight = Flight()  # noqa: RUF009
+    flight: Flight | RecordedFlight = Flight()  # noqa: RUF009
     acrylic: Acrylic = Acrylic()  # noqa: RUF009
     fog: Fog = Fog()  # noqa: RUF009
     room: Room = Room()  # noqa: RUF009

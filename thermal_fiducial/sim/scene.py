@@ -41,9 +41,14 @@ class Marker:
     size: float = 0.30
 
     @property
+    def rotation(self) -> Rotation:
+        """R_map_marker."""
+        return facing(self.yaw_deg, self.tilt_deg, self.roll_deg)
+
+    @property
     def T_map_marker(self) -> FloatArray:
         """(4, 4)."""
-        return pose_matrix(facing(self.yaw_deg, self.tilt_deg, self.roll_deg), self.position)
+        return pose_matrix(self.rotation, self.position)
 
     @property
     def corners_map(self) -> FloatArray:

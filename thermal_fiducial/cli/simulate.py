@@ -1,0 +1,83 @@
+"""``simulate OUT``: a synthetic thermal bag with ground truth."""
+
+import argparse
+from dataclasses import replace
+import os
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress, TimeElapsedColumn
+
+from thermal_fiducial.files.bags import STORAGES
+from thermal_fiducial.sim.camera import FlightPlan, plan
+from thermal_fiducial.sim.recorded import RecordedFlight
+from thermal_fiducial.sim.scenario import LENSES, named, Scenario, SCENARIOS, with_contrast, with_lens
+from thermal_fiducial.sim.writer import write_flight
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    scenarios = '\n'.join(f'  {name:14}{item.description} ({item.seconds:g} s)' for name, item in SCENARIOS.items())
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = (
+        f'scenarios:\n{scenarios}\n\nOUT becomes a rosbag2 with ground_truth.tum, map_true.yaml, map_one.yaml (one fixed '
+        'marker)\nand params.yaml (the rig) in it. The same options and seed give the same bytes.'
+    )
+    parser.add_argument('out', type=Path, metavar='OUT', help='folder to create')
+    parser.add_argument('--scenario', default='fog', metavar='NAME', help='see below (default: fog)')
+    parser.add_argument('--seconds', type=float, help="length of the flight [s] (default: the scenario's)")
+    parser.add_argument('--seed', type=int, default=0, help='of path and noise (default: 0)')
+    parser.add_argument('--storage', choices=sorted(STORAGES), default='mcap', help='of the bag (default: mcap)')
+    parser.add_argument('--lens', help=f'another lens: {", ".join(LENSES)}')
+    parser.add_argument('--contrast', type=float, metavar='K', help='warm plates over cold acrylic [K]')
+    parser.add_argument('--inverted', action='store_true', help='warm code on a cold ground')
+    parser.add_argument('--fog', type=float, metavar='E', help='extinction in the long-wave infrared [1/m]')
+    parser.add_argument('--ffc', choices=('frozen', 'dropped', 'shutter', 'never'), help='what a shutter event sends')
+    parser.add_argument('--time-offset', type=float, metavar='S', help="camera's clock: t_imu = t_camera + S [s]")
+    parser.add_argument('--trajectory', type=Path, metavar='TUM', help='fly these poses of base_link in map instead')
+    parser.add_argument('--workers', type=int, default=_cores(), help='processes (default: one a core)')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate and say how to replay."""
+    scenario = _scenario(args)
+    flight = plan(scenario, args.seconds, args.seed)
+    console = Console(stderr=True)
+    with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console) as progress:
+        task = progress.add_task(f'{scenario.name}, {flight.seconds:g} s', total=flight.frame_count)
+        write_flight(args.out, flight, args.storage, args.workers, lambda n: progress.advance(task, n))
+    print(_summary(args.out, flight))
+    return 0
+
+
+def _scenario(args: argparse.Namespace) -> Scenario:
+    scenario = named(args.scenario)
+    if args.lens is not None:
+        scenario = with_lens(scenario, args.lens)
+    if args.contrast is not None:
+        scenario = with_contrast(scenario, args.contrast)
+    if args.inverted:
+        scenario = replace(scenario, acrylic=replace(scenario.acrylic, inverted=True))
+    if args.fog is not None:
+        scenario = replace(scenario, fog=replace(scenario.fog, extinction=args.fog))
+    if args.ffc == 'never':
+        scenario = replace(scenario, sensor=replace(scenario.sensor, ffc_period=0.0))
+    elif args.ffc is not None:
+        scenario = replace(scenario, sensor=replace(scenario.sensor, ffc_behaviour=args.ffc))
+    if args.time_offset is not None:
+        scenario = replace(scenario, camera_time_offset=args.time_offset)
+    if args.trajectory is not None:
+        recorded = RecordedFlight.load(args.trajectory)
+        scenario = replace(scenario, flight=recorded, seconds=recorded.seconds)
+    return scenario
+
+
+def _summary(out: Path, flight: FlightPlan) -> str:
+    return (
+        f'{out}: {flight.scenario.name}, {flight.seconds:g} s, seed {flight.seed}\n'
+        f'replay it with: thermal-fiducial replay {out} --params {out}/params.yaml --map {out}/map_one.yaml --out RUN'
+    )
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))

@@ -1,0 +1,65 @@
+"""A flight along recorded poses."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.trajectory import load_tum
+from thermal_fiducial.sim.trajectory import Trajectory
+
+# Ten poses a second carry what a drone or a hand does, and little of the noise of the poses' source: at a millimetre
+# it becomes 0.1 m/s^2 in the simulated accelerometer.
+_KNOTS_PER_SECOND = 10
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFlight:
+    """Poses of the body in ``map``, flown through at ten a second by a smooth curve.
+
+    Parameters
+    ----------
+    times : (N,) since the first [s]
+    positions : (N, 3) [m]
+    quaternions : (N, 4) x y z w
+    """
+
+    times: FloatArray
+    positions: FloatArray
+    quaternions: FloatArray
+
+    @classmethod
+    def load(cls, path: Path) -> 'RecordedFlight':
+        """The flight of a TUM file.
+
+        Raises
+        ------
+        InputError
+            Unreadable, or shorter than two seconds.
+        """
+        stamps, positions, quaternions = load_tum(path)
+        stamps, first = np.unique(stamps, return_index=True)
+        times = (stamps - stamps[0]) * 1e-9
+        if times[-1] < 2.0:
+            raise InputError(f'{path}: {times[-1]:g} s of poses are too few to fly')
+        return cls(times, positions[first], quaternions[first])
+
+    @property
+    def seconds(self) -> float:
+        """Length [s]."""
+        return float(self.times[-1])
+
+    def trajectory(self, seconds: float, seed: int) -> Trajectory:
+        """The flight; afterwards it stands still, the seed changes nothing.
+
+        Raises
+        ------
+        InputError
+            Never, for poses from :meth:`load`.
+        """
+        knots = np.linspace(0.0, self.seconds, round(self.seconds * _KNOTS_PER_SECOND) + 1)
+        positions = np.stack([np.interp(knots, self.times, column) for column in self.positions.T], axis=1)
+        return Trajectory(knots, positions, Slerp(self.times, Rotation.from_quat(self.quaternions))(knots))
