@@ -221,6 +221,10 @@ class ArucoDetectorConfig:
     marker_size_overrides: tuple[str, ...] = _marker_size_overrides()
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
+    min_side_px: float = param(12.0, 'Shortest side of a marker.', unit='px', minimum=8.0, maximum=400.0)
+    error_correction_rate: float = param(
+        0.6, 'Share of the bit errors that the dictionary can correct that are accepted.', minimum=0.0, maximum=1.0
+    )
 
 
 @dataclass(frozen=True)

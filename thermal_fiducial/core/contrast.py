@@ -1,0 +1,72 @@
+"""An 8-bit view of raw counts in which markers of any contrast look alike, and noise stays below the threshold.
+
+The local mean is taken out and the local spread divided by, down to a floor of a few times the noise: next to strong
+structures little is amplified, on flat walls a marker of twice the noise fills the range.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.core.types import Counts, Float32Array, Gray
+
+# Mean and spread are taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
+_SHRINK = 4
+_LOCAL = 17
+# Levels that one local standard deviation fills.
+_GAIN = 60.0
+# 1 / (sqrt(2) * 0.6745): standard deviation from the median absolute difference of two pixels.
+_MAD_OF_DIFFERENCE = 1.0484
+
+
+@dataclass(frozen=True, slots=True)
+class NormalisedView:
+    """What the candidate search looks at."""
+
+    #: (height, width)
+    gray: Gray
+    #: (height, width) the counts as float32
+    counts: Float32Array
+    #: standard deviation of the noise of a pixel [counts]
+    noise: float
+
+
+def noise_of(counts: Float32Array) -> float:
+    """Standard deviation of pixel noise [counts]: median absolute difference of vertical neighbours, sparsely.
+
+    Differences along a column leave the column pattern out.
+    """
+    rows = counts[4::8, ::3]
+    below = counts[5::8, ::3]
+    count = min(len(rows), len(below))
+    difference = np.abs(rows[:count] - below[:count]).ravel()
+    middle = difference.size // 2
+    # Whole counts: half a count of quantisation is what a median of 0 can mean.
+    return max(float(np.partition(difference, middle)[middle]) * _MAD_OF_DIFFERENCE, 0.3)
+
+
+def normalise(image: Counts | Gray, smoothing_px: float, floor: float) -> NormalisedView:
+    """8-bit view of ``image``.
+
+    Parameters
+    ----------
+    image : (height, width) counts or gray levels
+    smoothing_px : standard deviation of the Gaussian before the search, 0 for none
+    floor : smallest spread that is divided by, in standard deviations of the noise of a pixel
+    """
+    counts = image.astype(np.float32)
+    noise = noise_of(counts)
+    smooth = cv2.GaussianBlur(counts, (0, 0), smoothing_px) if smoothing_px > 0 else counts
+    height, width = counts.shape
+    small = cv2.resize(counts, (width // _SHRINK, height // _SHRINK), interpolation=cv2.INTER_AREA)
+    mean = cv2.blur(small, (_LOCAL, _LOCAL))
+    deviation = small - mean
+    variance = cv2.blur(deviation * deviation, (_LOCAL, _LOCAL))
+    gain = _GAIN / np.sqrt(variance + (floor * noise) ** 2)
+    offset = 128.0 - mean * gain
+    full_gain = cv2.resize(gain, (width, height), interpolation=cv2.INTER_LINEAR)
+    full_offset = cv2.resize(offset, (width, height), interpolation=cv2.INTER_LINEAR)
+    np.multiply(smooth, full_gain, out=full_gain)
+    gray = cv2.add(full_gain, full_offset, dtype=cv2.CV_8U)
+    return NormalisedView(gray, counts, noise)
