@@ -114,7 +114,7 @@ def image_array(message: Image) -> Counts | Gray:
         )
     kind = 'u1' if itemsize == 1 else '>u2' if message.is_bigendian else '<u2'
     pixels: npt.NDArray[Any] = np.ndarray((height, width), kind, message.data, strides=(step, itemsize))
-    return np.ascontiguousarray(pixels, dtype=np.uint8 if itemsize == 1 else np.uint16)
+    return np.ascontiguousarray(pixels, np.uint8) if itemsize == 1 else np.ascontiguousarray(pixels, np.uint16)
 
 
 def image(pixels: npt.NDArray[Any], head: Header) -> Image:
@@ -170,7 +170,7 @@ def camera_info(calibration: Camera, head: Header) -> CameraInfo:
 
 def cloud(rows: npt.NDArray[Any], head: Header) -> PointCloud2:
     """PointCloud2 with one point a row of a structured array, fields as in its dtype."""
-    layout = rows.dtype.fields or {}
+    layout: Mapping[str, Any] = rows.dtype.fields or {}
     return PointCloud2(
         header=head,
         height=1,

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -47,6 +48,16 @@ class Input:
     def __init__(self, topic: str) -> None:
         self.topic = topic
         self.count = 0
+        self._subscription: Any = None
+
+    def attach(self, subscription: Any) -> None:
+        """Remember the subscription that counts here."""
+        self._subscription = subscription
+
+    @property
+    def publishers(self) -> int:
+        """Number of matched publishers."""
+        return int(self._subscription.get_publisher_count())
 
 
 class CountingNode(Node):
@@ -73,7 +84,7 @@ class CountingNode(Node):
             source.count += 1
             self.guard(callback, message)
 
-        self.create_subscription(kind, topic, receive, profile, raw=raw)
+        source.attach(self.create_subscription(kind, topic, receive, profile, raw=raw))
         self.inputs.append(source)
         return source
 

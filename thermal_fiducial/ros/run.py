@@ -9,6 +9,7 @@ from typing import Any
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.utilities import ok, try_shutdown
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.node import StageNode
@@ -30,7 +31,7 @@ def make_executor(context: Context | None = None) -> Any:
     Never the MultiThreadedExecutor: it loses two thirds of a 200 Hz stream.
     """
     try:
-        from rclpy.experimental import EventsExecutor
+        from rclpy.experimental.events_executor import EventsExecutor
     except ImportError:
         return SingleThreadedExecutor(context=context)
     return EventsExecutor(context=context)
@@ -69,13 +70,13 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
         node = make_node()
     except InputError as error:
         print(f'{Path(sys.argv[0]).name}: {error}', file=sys.stderr)
-        rclpy.try_shutdown()
+        try_shutdown()
         return 2
     executor = make_executor()
     executor.add_node(node)
     try:
         # EventsExecutor.spin() and spin_once(None) fire nothing on some builds.
-        while rclpy.ok():
+        while ok():
             executor.spin_once(timeout_sec=1.0)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
@@ -83,5 +84,5 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
         node.close()
         executor.shutdown()
         node.destroy_node()
-        rclpy.try_shutdown()
+        try_shutdown()
     return 0

@@ -1,0 +1,80 @@
+"""Command ``replay``: play a recorded bag through the four nodes."""
+
+import argparse
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+import importlib
+from pathlib import Path
+import sys
+import time
+
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import parse_remaps
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of the command."""
+    parser.add_argument('bag', type=Path, metavar='BAG', help='rosbag2 folder, .mcap or .db3 file, or ROS 1 .bag')
+    parser.add_argument('--out', type=Path, required=True, metavar='RUN', help='folder for the results')
+    parser.add_argument('--params', type=Path, metavar='FILE', help='ROS parameter file for the nodes')
+    parser.add_argument('--map', type=Path, metavar='FILE', help='marker map to start from')
+    parser.add_argument('--mode', choices=('mapping', 'localization'), help='whether new markers enter the map')
+    parser.add_argument(
+        '--transport',
+        choices=('lockstep', 'processes'),
+        default='lockstep',
+        help='one process, deterministic, as fast as it goes (default); or one process a node, in real time',
+    )
+    parser.add_argument('--rate', type=float, default=1.0, metavar='X', help='processes: times real time (default 1)')
+    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bag')
+    parser.add_argument('--images', action='store_true', help='record the cleaned images too (as large as the bag)')
+    parser.add_argument('--no-report', action='store_true', help='write no report.html')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay, write the run folder, say how fast it went."""
+    if not 0.0 < args.rate <= 100.0:
+        raise InputError(f'--rate {args.rate:g} is not between 0 and 100')
+    replay = importlib.import_module('thermal_fiducial.replay.replay')
+    options = replay.Options(
+        bag=args.bag,
+        run=args.out,
+        params=args.params,
+        map_file=args.map,
+        mode=args.mode,
+        transport=args.transport,
+        rate=args.rate,
+        images=args.images,
+        remaps=parse_remaps(args.remap),
+    )
+    started = time.monotonic()
+    with progress_bar(f'replay {args.bag.name}') as progress:
+        summary = replay.replay(options, progress, _warn)
+    seconds = time.monotonic() - started
+    out = summary['messages_out']
+    print(
+        f'{args.out}: {out.get("pose", 0)} poses, {out.get("camera_pose", 0)} camera poses, '
+        f'{summary["markers_in_map"]} markers in the map; {summary["duration_s"]:.1f} s of bag in {seconds:.1f} s'
+    )
+    if not args.no_report:
+        importlib.import_module('thermal_fiducial.report').write_report(args.out, truth=None)
+    return 0
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
+    """A progress bar on a terminal; elsewhere, or without rich, nothing. Yields what takes the share done."""
+    try:
+        from rich.console import Console
+        from rich.progress import Progress
+    except ImportError:
+        yield lambda share: None
+        return
+    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task(title, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+        bar.update(task, completed=1.0)
+
+
+def _warn(line: str) -> None:
+    print(f'warning: {line}', file=sys.stderr)

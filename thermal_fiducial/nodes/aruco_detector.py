@@ -1,0 +1,85 @@
+"""Node ``aruco_detector``: clean counts to markers with sub-pixel corners and poses."""
+
+import sys
+from typing import Any
+
+from geometry_msgs.msg import PoseArray
+import numpy as np
+from sensor_msgs.msg import Image, PointCloud2
+
+from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.thermal import EightBitView
+from thermal_fiducial.core.types import Counts, Gray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.ros import convert, display, qos
+from thermal_fiducial.ros.camera_node import CameraStageNode
+from thermal_fiducial.ros.node import OK
+from thermal_fiducial.ros.run import run
+
+
+class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
+    """Finds markers; with the map and the filter's odometry it looks where they must be."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__('aruco_detector', ArucoDetectorConfig, **kwargs)
+        self.detector = self.attempt(self._make_detector, None)
+        self.view = EightBitView(Tau2CameraConfig())
+        self._seen = 0
+        self._markers = self.advertise(PointCloud2, 'markers')
+        self._marker_poses = self.advertise(PoseArray, 'marker_poses')
+        self._annotated = self.advertise(Image, 'thermal/image_markers', qos.IMAGE_OUTPUT)
+        self.subscribe(Image, 'thermal/image', self._on_image, qos.CAMERA_INPUT)
+        self.follow_hints()
+        self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
+
+    def _make_detector(self) -> MarkerDetector | None:
+        return MarkerDetector(self.config, load_dictionary(self.config.dictionary))
+
+    def configure(self, config: ArucoDetectorConfig) -> None:
+        """Take over live parameters."""
+        super().configure(config)
+        if self.detector is not None:
+            self.detector.config = config
+
+    def _on_image(self, message: Image) -> None:
+        if self.detector is None:
+            return
+        stamp = convert.stamp_ns(message.header.stamp)
+        counts = convert.image_array(message)
+        camera = self.camera()
+        _check_size(counts, camera)
+        markers = self.detector.detect(stamp, counts, camera, self.odometry())
+        self._seen = len(markers)
+        self._markers.send(convert.cloud(markers, message.header))
+        self._marker_poses.send(convert.marker_poses(markers, message.header))
+        if self._annotated.listeners:
+            self._annotated.send(convert.image(display.annotated(self._gray(counts), markers), message.header))
+
+    def _gray(self, counts: Counts | Gray) -> Gray:
+        return self.view(counts.astype(np.uint16, copy=False))
+
+    def _on_map(self, message: PointCloud2) -> None:
+        if self.detector is not None:
+            self.detector.set_map(convert.map_poses(message))
+
+    def state(self) -> tuple[bytes, str]:
+        """Number of markers in the last frame."""
+        return OK, f'{self._seen} markers'
+
+
+def _check_size(counts: Counts | Gray, camera: Camera) -> None:
+    if counts.shape != (camera.height, camera.width):
+        size = f'{counts.shape[1]}x{counts.shape[0]}'
+        raise InputError(f'image of {size}, camera_info of {camera.width}x{camera.height} pixels')
+
+
+def main() -> int:
+    """Run the node."""
+    return run(ArucoDetector)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

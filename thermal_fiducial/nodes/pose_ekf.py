@@ -1,0 +1,86 @@
+"""Node ``pose_ekf``: IMU and camera poses to the robot's pose and odometry, one for every IMU message."""
+
+from collections import deque
+import sys
+from typing import Any
+
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry as OdometryMessage
+from nav_msgs.msg import Path
+from sensor_msgs.msg import Imu
+from std_srvs.srv import Trigger
+
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.ekf import PoseEkf
+from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.node import OK, StageNode, WARN
+from thermal_fiducial.ros.run import run
+
+_PATH_STEP_NS = 200_000_000
+_PATH_LENGTH = 3000
+
+
+class PoseEkfNode(StageNode[PoseEkfConfig]):
+    """The filter behind topics."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__('pose_ekf', PoseEkfConfig, **kwargs)
+        self.filter = PoseEkf(self.config)
+        self._path: deque[tuple[int, Pose]] = deque(maxlen=_PATH_LENGTH)
+        self._refused_poses = 0
+        self._last_update = 'no camera_pose yet'
+        self._pose = self.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
+        self._odometry = self.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
+        self._path_output = self.advertise(Path, 'path')
+        self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT)
+        self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
+        self.create_service(Trigger, '~/reset', self._on_reset)
+
+    def _on_imu(self, message: Imu) -> None:
+        odometry = self.filter.add_imu(convert.imu_sample(message))
+        if odometry is None:
+            return
+        head = convert.header(odometry.stamp_ns, self.config.map_frame)
+        result = convert.odometry_message(odometry, head, self.config.base_frame)
+        self._odometry.send(result)
+        self._pose.send(PoseWithCovarianceStamped(header=head, pose=result.pose))
+        self._extend_path(odometry.stamp_ns, result.pose.pose)
+
+    def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
+        update = self.filter.add_pose(convert.camera_pose(message))
+        self._refused_poses += not update.accepted
+        self._last_update = update.reason
+
+    def _extend_path(self, stamp: int, pose: Pose) -> None:
+        if not self._path or not 0 <= stamp - self._path[-1][0] < _PATH_STEP_NS:
+            self._path.append((stamp, pose))
+
+    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        self.filter.reset()
+        self._path.clear()
+        response.success, response.message = True, 'waiting for the first camera_pose'
+        return response
+
+    def diagnose(self, stamp_ns: int) -> None:
+        """Publish the diagnostics and, while someone listens, the path."""
+        super().diagnose(stamp_ns)
+        if self._path and self._path_output.listeners:
+            self._path_output.send(convert.path(self._path, convert.header(self._path[-1][0], self.config.map_frame)))
+
+    def state(self) -> tuple[bytes, str]:
+        """What the filter says of itself, or why it refused the last pose."""
+        reason = self.filter.status or self._last_update
+        return (WARN, reason) if reason else (OK, 'ok')
+
+    def figures(self) -> dict[str, object]:
+        """Refused poses."""
+        return {'refused camera poses': self._refused_poses}
+
+
+def main() -> int:
+    """Run the node."""
+    return run(PoseEkfNode)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

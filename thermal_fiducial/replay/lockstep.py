@@ -1,0 +1,159 @@
+"""Lock-step: the real nodes in one process, over real DDS, deterministic, as fast as they go.
+
+After each message of the bag the executor runs until everything that was published has been received: each
+subscription's count equals the count of the publishers on its topic. So no queue ever holds more than one step, nothing
+is lost or reordered, and time does not matter.
+"""
+
+from collections.abc import Callable, Sequence
+import time
+from typing import Any
+
+from rclpy.context import Context
+from rclpy.serialization import deserialize_message
+
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import BagMessage, BagReader
+from thermal_fiducial.nodes.aruco_detector import ArucoDetector
+from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
+from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
+from thermal_fiducial.nodes.tau2_camera import Tau2Camera
+from thermal_fiducial.replay.domain import own_domain
+from thermal_fiducial.replay.recorder import Recorder, RunFiles
+from thermal_fiducial.replay.topics import PLAYED, Topics
+from thermal_fiducial.ros.node import CountingNode, Input, Output, StageNode
+from thermal_fiducial.ros.run import initialise, make_executor
+
+_SECOND_NS = 1_000_000_000
+_PATIENCE_S = 30.0
+
+
+def replay_lockstep(
+    bag: BagReader,
+    played: Sequence[str],
+    files: RunFiles,
+    recorded: Topics,
+    ros_arguments: Sequence[str],
+    progress: Callable[[int], None],
+) -> dict[str, Any]:
+    """Play topics ``played`` of ``bag`` through the four nodes into ``files``.
+
+    Parameters
+    ----------
+    bag : the bag, open
+    played : topics to play
+    files : what takes the published messages
+    recorded : the topics that it takes
+    ros_arguments : for the nodes, after ``--ros-args``
+    progress : called with the bag's time [ns since its start]
+
+    Returns
+    -------
+    Nothing to add to the summary: there is no time in lock-step.
+
+    Raises
+    ------
+    InputError
+        A parameter that a node refuses, something configured that it cannot use, or a damaged bag.
+    """
+    context = Context()
+    with own_domain() as domain:
+        initialise(['--ros-args', *ros_arguments], context, domain)
+        graph = None
+        try:
+            graph = _Graph(context, recorded)
+            graph.play(bag, played, files, progress)
+        finally:
+            if graph is not None:
+                graph.close()
+            context.try_shutdown()
+    return {}
+
+
+class _Graph:
+    """The four nodes, a player and a recorder in one executor."""
+
+    def __init__(self, context: Context, recorded: Topics) -> None:
+        self._arrived: list[tuple[str, bytes]] = []
+        self._order = {topic: index for index, topic in enumerate(recorded)}
+        quiet: dict[str, Any] = {'context': context, 'enable_rosout': False, 'start_parameter_services': False}
+        self._stages: list[StageNode[Any]] = []
+        for kind in (Tau2Camera, ArucoDetector, MarkerMapperNode, PoseEkfNode):
+            self._stages.append(kind(live=False, **quiet))
+        self._player = CountingNode('player', use_global_arguments=False, **quiet)
+        recorder = Recorder(self._take, recorded, use_global_arguments=False, **quiet)
+        self._nodes: list[CountingNode] = [*self._stages, self._player, recorder]
+        self._executor = make_executor(context)
+        for node in self._nodes:
+            self._executor.add_node(node)
+
+    def play(self, bag: BagReader, played: Sequence[str], files: RunFiles, progress: Callable[[int], None]) -> None:
+        """Play it all, with diagnostics once a second of the bag's time."""
+        faults = [fault for stage in self._stages for fault in stage.faults]
+        if faults:
+            raise InputError('; '.join(faults))
+        outputs = {topic: self._player.advertise(PLAYED[topic][0], topic, PLAYED[topic][1]) for topic in played}
+        self._connect()
+        self._settle(bag.start_ns, files)
+        next_diagnosis = bag.start_ns + _SECOND_NS
+        for message in bag.messages(played):
+            while message.stamp_ns >= next_diagnosis:
+                self._diagnose(next_diagnosis, files)
+                progress(next_diagnosis - bag.start_ns)
+                next_diagnosis += _SECOND_NS
+            _check(message)
+            outputs[message.topic].send(message.cdr)
+            self._settle(message.stamp_ns, files)
+        self._diagnose(next_diagnosis, files)
+
+    def _diagnose(self, time_ns: int, files: RunFiles) -> None:
+        for stage in self._stages:
+            stage.diagnose(time_ns)
+        self._settle(time_ns, files)
+
+    def _take(self, topic: str, data: bytes) -> None:
+        self._arrived.append((topic, data))
+
+    def _connect(self) -> None:
+        """Pair the topics' two ends, and wait until DDS has done so too, at both of them."""
+        inputs = [source for node in self._nodes for source in node.inputs]
+        outputs = [output for node in self._nodes for output in node.outputs]
+        self._pairs = [(source, [o for o in outputs if o.topic == source.topic]) for source in inputs]
+        readers = [(output, sum(source.topic == output.topic for source in inputs)) for output in outputs]
+        self._wait(lambda: all(output.listeners == expected for output, expected in readers))
+        self._wait(lambda: all(source.publishers == len(writers) for source, writers in self._pairs))
+
+    def _settle(self, time_ns: int, files: RunFiles) -> None:
+        """Run callbacks until nothing is under way; hand what was recorded on in a fixed order of topics."""
+        self._wait(lambda: all(_received_all(source, writers) for source, writers in self._pairs))
+        self._arrived.sort(key=lambda entry: self._order[entry[0]])
+        for topic, data in self._arrived:
+            files.add(topic, time_ns, data)
+        self._arrived.clear()
+
+    def _wait(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + _PATIENCE_S
+        while not condition():
+            self._executor.spin_once(timeout_sec=0.1)
+            if time.monotonic() > deadline:
+                raise RuntimeError('messages were lost between nodes in lock-step')
+
+    def close(self) -> None:
+        """Have the nodes finish (the map is saved) and destroy them."""
+        for stage in self._stages:
+            stage.close()
+        self._executor.shutdown()
+        for node in self._nodes:
+            node.destroy_node()
+
+
+def _received_all(source: Input, writers: list[Output]) -> bool:
+    return source.count == sum(writer.count for writer in writers)
+
+
+def _check(message: BagMessage) -> None:
+    """Raise for bytes that are no message: DDS would drop them silently."""
+    try:
+        deserialize_message(message.cdr, PLAYED[message.topic][0])
+    except Exception:  # rclpy's own error class is private
+        raise InputError(f'message on {message.topic} recorded at {message.stamp_ns} cannot be decoded') from None

@@ -1,0 +1,168 @@
+"""One process a node, in real time: what the robot would see, with latencies and processor load measured."""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+import time
+from typing import Any
+
+from rclpy.context import Context
+
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.replay.children import NodeProcesses
+from thermal_fiducial.replay.domain import own_domain
+from thermal_fiducial.replay.latency import header_stamp_ns, LatencyMeter
+from thermal_fiducial.replay.recorder import Recorder, RunFiles
+from thermal_fiducial.replay.topics import PLAYED, Topics
+from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.run import initialise, make_executor
+
+_PATIENCE_S = 30.0
+#: After both ends of each topic are known to the graph, the nodes still need a moment to match among themselves.
+_MATCHING_S = 0.7
+#: The replay is over when nothing has come for so long.
+_SILENCE_S = 1.5
+#: With less time than this to the next message, nothing is written to disk before it.
+_SPARE_NS = 2_000_000
+_KINDS = {IMAGE_TOPIC: 'image', IMU_TOPIC: 'imu'}
+
+
+def replay_processes(
+    bag: BagReader,
+    played: Sequence[str],
+    files: RunFiles,
+    recorded: Topics,
+    ros_arguments: Sequence[str],
+    progress: Callable[[int], None],
+    rate: float,
+) -> dict[str, Any]:
+    """Play topics ``played`` of ``bag`` at ``rate`` times real time; otherwise as in lock-step.
+
+    Returns
+    -------
+    ``latency_ms`` and ``cpu_percent`` for the summary, and how late the player was at worst.
+
+    Raises
+    ------
+    InputError
+        A parameter that a node refuses, or a damaged bag.
+    """
+    context = Context()
+    with own_domain() as domain:
+        initialise(None, context, domain)
+        try:
+            with NodeProcesses(domain, ros_arguments) as nodes:
+                player = _Player(context, played, files, recorded)
+                try:
+                    player.connect(nodes)
+                    return player.play(bag, nodes, rate, progress)
+                finally:
+                    player.close()
+        finally:
+            context.try_shutdown()
+
+
+class _Player:
+    """Publishes the bag on time, and between its messages takes what the nodes publish."""
+
+    def __init__(self, context: Context, played: Sequence[str], files: RunFiles, recorded: Topics) -> None:
+        quiet: dict[str, Any] = {
+            'context': context,
+            'use_global_arguments': False,
+            'enable_rosout': False,
+            'start_parameter_services': False,
+        }
+        self._files = files
+        self._arrived: deque[tuple[str, bytes, int]] = deque()
+        self._latency = LatencyMeter()
+        self._player = CountingNode('player', **quiet)
+        self._recorder = Recorder(self._take, recorded, **quiet)
+        self._outputs = {topic: self._player.advertise(PLAYED[topic][0], topic, PLAYED[topic][1]) for topic in played}
+        self._executor = make_executor(context)
+        self._executor.add_node(self._player)
+        self._executor.add_node(self._recorder)
+
+    def connect(self, nodes: NodeProcesses) -> None:
+        """Wait until the four nodes are there."""
+        # camera_info has two readers, the detector and the mapper.
+        readers = {topic: 2 if topic == CAMERA_INFO_TOPIC else 1 for topic in self._outputs}
+        deadline = time.monotonic() + _PATIENCE_S
+        while not (
+            all(output.listeners >= readers[topic] for topic, output in self._outputs.items())
+            and all(source.publishers >= 1 for source in self._recorder.inputs)
+        ):
+            nodes.check()
+            self._executor.spin_once(timeout_sec=0.05)
+            if time.monotonic() > deadline:
+                raise RuntimeError(f'the nodes were not up after {_PATIENCE_S:.0f} s')
+        deadline = time.monotonic() + _MATCHING_S
+        while time.monotonic() < deadline:
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def play(
+        self, bag: BagReader, nodes: NodeProcesses, rate: float, progress: Callable[[int], None]
+    ) -> dict[str, Any]:
+        """Publish the bag; then wait for the last results."""
+        self._bag_start_ns, self._rate = bag.start_ns, rate
+        cpu = nodes.cpu_seconds()
+        self._start_ns, late_ns, next_check = time.monotonic_ns(), 0, 0
+        for message in bag.messages(self._outputs):
+            elapsed = message.stamp_ns - bag.start_ns
+            due_ns = self._start_ns + round(elapsed / rate)
+            self._spin_until(due_ns)
+            now = time.monotonic_ns()
+            late_ns = max(late_ns, now - due_ns)
+            if message.topic in _KINDS:
+                self._latency.sent(_KINDS[message.topic], header_stamp_ns(message.cdr), now)
+            self._outputs[message.topic].send(message.cdr)
+            if elapsed >= next_check:
+                nodes.check()
+                progress(elapsed)
+                next_check = elapsed + 1_000_000_000
+        seconds = (time.monotonic_ns() - self._start_ns) * 1e-9
+        used = {node: total - cpu[node] for node, total in nodes.cpu_seconds().items()}
+        self._drain()
+        self._latency.write(self._files.folder / 'latency.csv')
+        return {
+            'rate': rate,
+            'latency_ms': self._latency.summary(),
+            'cpu_percent': {node: 100.0 * value / seconds for node, value in used.items()},
+            'player_late_ms': late_ns * 1e-6,
+        }
+
+    def _drain(self) -> None:
+        heard = -1
+        while heard != (heard := sum(source.count for source in self._results())):
+            self._spin_until(time.monotonic_ns() + round(_SILENCE_S * 1e9))
+        while self._arrived:
+            self._file_one()
+
+    def _results(self) -> list[Any]:
+        """Inputs that fall silent when the bag ends, as diagnostics don't."""
+        return [source for source in self._recorder.inputs if source.topic != '/diagnostics']
+
+    def _take(self, topic: str, data: bytes) -> None:
+        now = time.monotonic_ns()
+        self._arrived.append((topic, data, now))
+        if topic == 'pose':
+            self._latency.pose(header_stamp_ns(data), now)
+        elif topic == 'camera_pose':
+            self._latency.camera_pose(header_stamp_ns(data), now)
+
+    def _spin_until(self, due_ns: int) -> None:
+        while (left := due_ns - time.monotonic_ns()) > 0:
+            if self._arrived and left > _SPARE_NS:
+                self._executor.spin_once(timeout_sec=0.0)
+                self._file_one()
+            else:
+                self._executor.spin_once(timeout_sec=left * 1e-9)
+
+    def _file_one(self) -> None:
+        topic, data, now = self._arrived.popleft()
+        elapsed = max(0, round((now - self._start_ns) * self._rate))
+        self._files.add(topic, self._bag_start_ns + elapsed, data)
+
+    def close(self) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self._player.destroy_node()
+        self._recorder.destroy_node()

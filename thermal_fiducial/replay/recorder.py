@@ -1,0 +1,124 @@
+"""What the nodes publish, gathered into a run folder while it comes."""
+
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+import shutil
+from typing import Any, Self, TextIO
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import PointCloud2
+
+from thermal_fiducial.core.geometry import inverse, quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.measurements import CORNER_FIELDS
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.files.bags import BagWriter
+from thermal_fiducial.files.trajectory import tum_line
+from thermal_fiducial.replay.topics import Topics
+from thermal_fiducial.ros import convert
+from thermal_fiducial.ros.node import CountingNode
+
+
+class RunFiles:
+    """The files of a run folder that grow with the messages; a context manager.
+
+    Parameters
+    ----------
+    folder : the run folder; what an earlier run left there under these names is replaced
+    T_body_camera : (4, 4) extrinsics, to turn camera poses into body poses
+    topics : topics of ``output`` with their types
+    """
+
+    def __init__(self, folder: Path, T_body_camera: FloatArray, topics: Topics) -> None:
+        self.folder = folder
+        self._T_camera_body = inverse(T_body_camera)
+        self.counts: Counter[str] = Counter()
+        self.frames_with_markers = 0
+        self.warnings: Counter[str] = Counter()
+        self._last_figures: dict[str, dict[str, str]] = {}
+        self._fused = _opened(folder / 'fused.tum')
+        self._fiducial = _opened(folder / 'fiducial.tum')
+        self._detections = _opened(folder / 'detections.csv')
+        self._detections.write(','.join(['stamp_ns', 'id', *CORNER_FIELDS, 'sigma_px']) + '\n')
+        shutil.rmtree(folder / 'output', ignore_errors=True)
+        self._bag = BagWriter(folder / 'output')
+        self._types = {topic: _type_name(kind) for topic, (kind, _) in topics.items()}
+        self._readers: dict[str, tuple[type, Callable[[Any], None]]] = {
+            'pose': (PoseWithCovarianceStamped, self._on_pose),
+            'camera_pose': (PoseWithCovarianceStamped, self._on_camera_pose),
+            'markers': (PointCloud2, self._on_markers),
+            '/diagnostics': (DiagnosticArray, self._on_diagnostics),
+        }
+
+    def __enter__(self) -> Self:
+        self._bag.__enter__()
+        for topic, msgtype in self._types.items():
+            self._bag.add_topic(topic, msgtype)
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        for file in (self._fused, self._fiducial, self._detections):
+            file.close()
+        self._bag.__exit__(*exception)
+
+    def add(self, topic: str, time_ns: int, data: bytes) -> None:
+        """Take one published message, as CDR bytes, that came at ``time_ns`` of the bag's clock."""
+        self.counts[topic] += 1
+        self._bag.write(topic, time_ns, data, self._types[topic])
+        if topic in self._readers:
+            kind, read = self._readers[topic]
+            read(deserialize_message(data, kind))
+
+    @property
+    def figures(self) -> dict[str, dict[str, str]]:
+        """Node to the figures of its last diagnostics."""
+        return dict(sorted(self._last_figures.items()))
+
+    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        self._write_pose(self._fused, message, convert.transform_of(message.pose.pose))
+
+    def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
+        self._write_pose(self._fiducial, message, convert.transform_of(message.pose.pose) @ self._T_camera_body)
+
+    def _write_pose(self, file: TextIO, message: PoseWithCovarianceStamped, T_map_body: FloatArray) -> None:
+        q = quaternion_from_rotation(T_map_body[:3, :3])
+        file.write(tum_line(convert.stamp_ns(message.header.stamp), T_map_body[:3, 3], q) + '\n')
+
+    def _on_markers(self, message: PointCloud2) -> None:
+        stamp = convert.stamp_ns(message.header.stamp)
+        rows = convert.markers(message)
+        self.frames_with_markers += len(rows) > 0
+        for row in rows:
+            values = [f'{row[name]:.5f}' for name in (*CORNER_FIELDS, 'sigma_px')]
+            self._detections.write(f'{stamp},{row["id"]},{",".join(values)}\n')
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            self._last_figures[status.name] = {value.key: value.value for value in status.values}
+            if status.level != DiagnosticStatus.OK:
+                self.warnings[f'{status.name}: {status.message}'] += 1
+
+
+class Recorder(CountingNode):
+    """Subscribes to what the nodes publish and hands it on as (topic, bytes)."""
+
+    def __init__(self, take: Callable[[str, bytes], None], topics: Topics, **kwargs: Any) -> None:
+        super().__init__('recorder', **kwargs)
+        for topic, (kind, profile) in topics.items():
+            self.subscribe(kind, topic, partial(take, topic), profile, raw=True)
+
+
+def extrinsics(config: Any) -> FloatArray:
+    """T_body_camera (4, 4) of a config with ``camera_position`` and ``camera_orientation``."""
+    return transform_from_quaternion(config.camera_position, config.camera_orientation)
+
+
+def _opened(path: Path) -> TextIO:
+    return path.open('w', encoding='utf-8')
+
+
+def _type_name(kind: Any) -> str:
+    return f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'

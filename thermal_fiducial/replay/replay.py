@@ -1,0 +1,129 @@
+"""A replay from start to end: check what is given, play, leave the run folder of the contract."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+import json
+from pathlib import Path
+import shutil
+from typing import Any
+
+from thermal_fiducial.config import size_overrides
+from thermal_fiducial.core.geometry import transform_from_quaternion
+from thermal_fiducial.core.map_data import MarkerMap
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import BagReader
+from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.replay.lockstep import replay_lockstep
+from thermal_fiducial.replay.processes import replay_processes
+from thermal_fiducial.replay.recorder import RunFiles
+from thermal_fiducial.replay.settings import read_settings, Settings
+from thermal_fiducial.replay.topics import PLAYED, played_topics, recorded_topics
+
+MAP_FILE = 'marker_map.yaml'
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to replay and how."""
+
+    bag: Path
+    run: Path
+    params: Path | None = None
+    map_file: Path | None = None
+    mode: str | None = None
+    transport: str = 'lockstep'
+    rate: float = 1.0
+    images: bool = False
+    remaps: Mapping[str, str] = field(default_factory=dict)
+
+
+def replay(options: Options, progress: Callable[[float], None], warn: Callable[[str], None]) -> dict[str, Any]:
+    """Play a bag through the four nodes and write the run folder, all but the report.
+
+    Parameters
+    ----------
+    options : what and how
+    progress : called with the share done, 0 to 1
+    warn : called with a line about what is suspicious but can be used
+
+    Returns
+    -------
+    Content of ``summary.json``.
+
+    Raises
+    ------
+    InputError
+        An unusable bag, parameter or file; the message says which and why.
+    """
+    settings = _settings(options)
+    if settings.unknown:
+        warn(f'no node has parameter {", ".join(settings.unknown)}')
+    from_file = bool(settings.tau2_camera.calibration_file)
+    with BagReader(options.bag, options.remaps) as bag:
+        played = played_topics(calibration_from_file=from_file)
+        bag.require(played)
+        arguments = _prepare(options, settings, warn)
+        recorded = recorded_topics(calibration_from_file=from_file, images=options.images)
+        extrinsics = settings.pose_ekf.camera_position, settings.pose_ekf.camera_orientation
+        with RunFiles(options.run, transform_from_quaternion(*extrinsics), recorded) as files:
+            duration = max(bag.duration_ns, 1)
+            play = partial(replay_processes, rate=options.rate) if options.transport == 'processes' else replay_lockstep
+            timing = play(
+                bag, tuple(played), files, recorded, arguments, lambda time_ns: progress(min(1.0, time_ns / duration))
+            )
+        if not (options.run / MAP_FILE).exists():
+            save_map(options.run / MAP_FILE, MarkerMap())
+        summary = _summary(options, settings, bag, files) | timing
+    (options.run / 'summary.json').write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
+    return summary
+
+
+def _settings(options: Options) -> Settings:
+    overrides: dict[str, Any] = {}
+    if options.map_file is not None:
+        overrides['map_file'] = str(options.map_file)
+    if options.mode is not None:
+        overrides['mode'] = options.mode
+    return read_settings(options.params, overrides)
+
+
+def _prepare(options: Options, settings: Settings, warn: Callable[[str], None]) -> list[str]:
+    """Make the run folder, with parameters and a map of its own: the nodes never write to the user's."""
+    try:
+        options.run.mkdir(parents=True, exist_ok=True)
+        settings.write(options.run / 'parameters.yaml')
+        for name in ('latency.csv', 'report.html'):
+            (options.run / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(f'run folder {options.run}: {error.strerror}') from None
+    run_map, given = options.run / MAP_FILE, settings.marker_mapper.map_file
+    arguments = ['--params-file', str(options.run / 'parameters.yaml')]
+    if not given:
+        run_map.unlink(missing_ok=True)
+        warn('no map (--map): without one marker of known pose there is nothing to find the camera from')
+        return arguments
+    if Path(given).resolve() != run_map.resolve():
+        shutil.copyfile(given, run_map)
+    return [*arguments, '-p', f'map_file:={json.dumps(str(run_map))}']
+
+
+def _summary(options: Options, settings: Settings, bag: BagReader, files: RunFiles) -> dict[str, Any]:
+    """What can be said in numbers without a truth; nothing in it depends on the time that the replay took."""
+    mapper = settings.marker_mapper
+    marker_map = load_map(options.run / MAP_FILE, mapper.marker_size, size_overrides(mapper.marker_size_overrides))
+    return {
+        'format': 'thermal_fiducial/run',
+        'version': 1,
+        'bag': options.bag.resolve().name,
+        'transport': options.transport,
+        'mode': mapper.mode,
+        'start_ns': bag.start_ns,
+        'duration_s': bag.duration_ns * 1e-9,
+        'messages_in': {topic: bag.message_count([topic]) for topic in PLAYED if topic in bag.topics},
+        'messages_out': dict(sorted(files.counts.items())),
+        'frames_with_markers': files.frames_with_markers,
+        'markers_in_map': len(marker_map.markers),
+        'warnings': dict(files.warnings.most_common()),
+        'diagnostics': files.figures,
+    }

@@ -1,0 +1,122 @@
+"""Parameters of a replay: those of the nodes from a ROS parameter file, checked before anything starts."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from thermal_fiducial.config import (
+    ArucoDetectorConfig,
+    from_mapping,
+    MarkerMapperConfig,
+    parameters,
+    PoseEkfConfig,
+    size_overrides,
+    Tau2CameraConfig,
+)
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bad_pixels import load_bad_pixels
+from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.marker_map import load_map
+
+NODES: dict[str, type] = {
+    'tau2_camera': Tau2CameraConfig,
+    'aruco_detector': ArucoDetectorConfig,
+    'marker_mapper': MarkerMapperConfig,
+    'pose_ekf': PoseEkfConfig,
+}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the four nodes are started with, complete and checked."""
+
+    tau2_camera: Tau2CameraConfig
+    aruco_detector: ArucoDetectorConfig
+    marker_mapper: MarkerMapperConfig
+    pose_ekf: PoseEkfConfig
+    #: names in the parameter file that no node has
+    unknown: tuple[str, ...] = ()
+
+    def write(self, path: Path) -> None:
+        """Write all parameters as a ROS parameter file."""
+        document = {
+            f'/{node}': {'ros__parameters': {name: _plain(value) for name, _, value in parameters(getattr(self, node))}}
+            for node in NODES
+        }
+        path.write_text(yaml.safe_dump(document, sort_keys=False), encoding='utf-8')
+
+
+def read_settings(params: Path | None, overrides: Mapping[str, Any]) -> Settings:
+    """Settings from a ROS parameter file and ``overrides`` (name to value, for every node that has it).
+
+    Raises
+    ------
+    InputError
+        An unreadable file, a value of the wrong type or out of range, or a file named in a parameter that cannot be
+        used.
+    """
+    document = {} if params is None else _document(params)
+    configs: dict[str, Any] = {}
+    known: set[str] = set()
+    for node, kind in NODES.items():
+        names = {name for name, _, _ in parameters(kind)}
+        configs[node] = from_mapping(kind, _values_for(node, document) | dict(overrides))
+        known |= names
+    given = {name for section in document.values() for name in section}
+    settings = Settings(**configs, unknown=tuple(sorted(given - known - {'use_sim_time'})))
+    _check_files(settings)
+    return settings
+
+
+def _check_files(settings: Settings) -> None:
+    """Raise what a node would report as a fault."""
+    camera, mapper = settings.tau2_camera, settings.marker_mapper
+    load_dictionary(settings.aruco_detector.dictionary)
+    sizes = size_overrides(mapper.marker_size_overrides)
+    if camera.calibration_file:
+        load_camera(camera.calibration_file)
+    if camera.bad_pixel_file:
+        load_bad_pixels(camera.bad_pixel_file)
+    if mapper.map_file:
+        load_map(mapper.map_file, mapper.marker_size, sizes)
+
+
+def _document(path: Path) -> dict[str, dict[str, Any]]:
+    """Node pattern to its parameters, names joined by dots."""
+    try:
+        document = yaml.safe_load(path.read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else 'not a text file'
+        raise InputError(f'parameter file {path}: {reason}') from None
+    except yaml.YAMLError as error:
+        raise InputError(f'parameter file {path} is not YAML: {" ".join(str(error).split())}') from None
+    sections = document if isinstance(document, dict) else {}
+    if not sections or not all(
+        isinstance(s, dict) and isinstance(s.get('ros__parameters'), dict) for s in sections.values()
+    ):
+        raise InputError(f'parameter file {path}: not of the form NODE: {{ros__parameters: {{...}}}}')
+    return {str(node): dict(_flat(section['ros__parameters'], '')) for node, section in sections.items()}
+
+
+def _flat(section: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for name, value in section.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f'{prefix}{name}.')
+        else:
+            yield f'{prefix}{name}', value
+
+
+def _values_for(node: str, document: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for pattern, section in document.items():
+        if pattern.rsplit('/', 1)[-1] in ('**', '*', node):
+            values |= section
+    return values
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
