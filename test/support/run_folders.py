@@ -1,0 +1,125 @@
+"""A made-up run folder whose errors are known."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+from rosbags.typesys import get_typestore, Stores
+
+from thermal_fiducial.core.geometry import quaternion_from_rotation, so3_exp, transform
+from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.files.bags import BagWriter, TRUTH_TOPIC
+from thermal_fiducial.files.marker_map import save_map
+from thermal_fiducial.files.trajectory import save_tum
+
+START_NS = 1_700_000_000_000_000_000
+FUSED_SIGMA = np.array([2e-3, 2e-3, 2e-3, 3e-4, 3e-4, 3e-4])
+FIDUCIAL_SIGMA = 5.0 * FUSED_SIGMA
+
+
+def true_pose(t):
+    """T_map_body (N, 4, 4) at times (N,) [s]: a figure of eight that looks at the wall."""
+    p = np.stack([0.8 * np.sin(0.5 * t), 1.2 * np.sin(0.25 * t), 1.2 + 0.3 * np.cos(0.4 * t)], axis=-1)
+    phi = np.stack([0.06 * np.sin(1.1 * t), 0.05 * np.cos(0.9 * t), 0.4 * np.sin(0.3 * t)], axis=-1)
+    return transform(so3_exp(phi), p)
+
+
+def disturbed(T, sigma, rng):
+    """Poses whose errors, in the convention of the covariances, have standard deviations ``sigma`` (6,)."""
+    d = rng.normal(size=(len(T), 6)) * sigma
+    return transform(so3_exp(-d[:, 3:]) @ T[:, :3, :3], T[:, :3, 3] - d[:, :3])
+
+
+def write_poses(path, stamps, T):
+    save_tum(path, stamps.tolist(), T[:, :3, 3], quaternion_from_rotation(T[:, :3, :3]))
+
+
+def make_run(folder: Path, seconds=20.0, seed=0, gap=(8.0, 10.0), with_output=True, with_truth=True):
+    """Write a run folder; markers are out of view in ``gap`` [s]."""
+    rng = np.random.default_rng(seed)
+    folder.mkdir(parents=True)
+    stamps = START_NS + np.arange(0, int(seconds * 1e9), 5_000_000)
+    frames = START_NS + np.arange(0, int(seconds * 1e9), 33_333_333)
+    frames = frames[~((frames - START_NS > gap[0] * 1e9) & (frames - START_NS < gap[1] * 1e9))]
+    fused = disturbed(true_pose((stamps - START_NS) * 1e-9), FUSED_SIGMA, rng)
+    write_poses(folder / 'fused.tum', stamps, fused)
+    fiducial = disturbed(true_pose((frames - START_NS) * 1e-9), FIDUCIAL_SIGMA, rng)
+    write_poses(folder / 'fiducial.tum', frames, fiducial)
+    if with_truth:
+        known = START_NS + np.arange(0, int(seconds * 1e9) + 1, 10_000_000)
+        write_poses(folder / 'truth.tum', known, true_pose((known - START_NS) * 1e-9))
+    write_detections(folder / 'detections.csv', frames, rng)
+    save_map(folder / 'marker_map.yaml', wall())
+    (folder / 'summary.json').write_text(json.dumps({'bag': 'made_up', 'transport': 'processes'}))
+    if with_output:
+        write_output(folder / 'output', stamps, fused, rng)
+    return folder
+
+
+def wall():
+    R = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])  # faces -x, upright
+    places = [(3.0, 1.5 - i % 4, 0.9 + 0.7 * (i // 4)) for i in range(8)]
+    return MarkerMap(
+        {
+            i + 2: MapMarker(i + 2, 0.3, i == 0, transform(R, p), observations=0 if i == 7 else 9)
+            for i, p in enumerate(places)
+        }
+    )
+
+
+def write_detections(path, frames, rng):
+    names = [f'{axis}{corner}' for corner in range(4) for axis in 'uv']
+    with path.open('w', newline='') as file:
+        writer = csv.writer(file)
+        writer.writerow(['stamp_ns', 'id', *names, 'sigma_px'])
+        for k, stamp in enumerate(frames):
+            for marker in range(2, 9):
+                if (k // 60 + marker) % 3:
+                    writer.writerow([stamp, marker, *np.round(rng.uniform(0, 500, 8), 3), 0.03])
+
+
+def write_output(path, stamps, fused, rng):
+    """``pose`` with the right covariance, delayed by 3 to 5 ms, and diagnostics."""
+    types = get_typestore(Stores.ROS2_JAZZY).types
+    header, time = types['std_msgs/msg/Header'], types['builtin_interfaces/msg/Time']
+    covariance = np.diag(FUSED_SIGMA**2).ravel()
+    q = quaternion_from_rotation(fused[:, :3, :3])
+    with BagWriter(path) as bag:
+        for k, stamp in enumerate(stamps.tolist()):
+            head = header(stamp=time(*divmod(stamp, 1_000_000_000)), frame_id='map')
+            point = types['geometry_msgs/msg/Point'](*fused[k, :3, 3])
+            pose = types['geometry_msgs/msg/Pose'](point, types['geometry_msgs/msg/Quaternion'](*q[k]))
+            with_covariance = types['geometry_msgs/msg/PoseWithCovariance'](pose, covariance)
+            message = types['geometry_msgs/msg/PoseWithCovarianceStamped'](head, with_covariance)
+            bag.write('pose', stamp + int(rng.integers(3_000_000, 5_000_000)), message)
+            if k % 200 == 0:
+                status = types['diagnostic_msgs/msg/DiagnosticStatus']
+                items = [
+                    status(level=0, name='pose_ekf', message='running', hardware_id='', values=[]),
+                    status(level=1, name='tau2_camera', message='FFC', hardware_id='', values=[]),
+                ]
+                bag.write('/diagnostics', stamp, types['diagnostic_msgs/msg/DiagnosticArray'](head, items))
+
+
+def write_truth_bag(path, seconds=20.0):
+    """A bag with nothing but ground truth."""
+    types = get_typestore(Stores.ROS2_JAZZY).types
+    time, header = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
+    vector, zeros = types['geometry_msgs/msg/Vector3'], np.zeros(36)
+    with BagWriter(path) as bag:
+        for stamp in range(START_NS, START_NS + int(seconds * 1e9) + 1, 10_000_000):
+            T = true_pose(np.array([(stamp - START_NS) * 1e-9]))[0]
+            q = quaternion_from_rotation(T[:3, :3])
+            pose = types['geometry_msgs/msg/Pose'](
+                types['geometry_msgs/msg/Point'](*T[:3, 3]), types['geometry_msgs/msg/Quaternion'](*q)
+            )
+            twist = types['geometry_msgs/msg/Twist'](vector(0.0, 0.0, 0.0), vector(0.0, 0.0, 0.0))
+            message = types['nav_msgs/msg/Odometry'](
+                header(stamp=time(*divmod(stamp, 1_000_000_000)), frame_id='map'),
+                'base_link',
+                types['geometry_msgs/msg/PoseWithCovariance'](pose, zeros),
+                types['geometry_msgs/msg/TwistWithCovariance'](twist, zeros),
+            )
+            bag.write(TRUTH_TOPIC, stamp, message)
+    return path

@@ -1,0 +1,168 @@
+"""The filter as its users meet it: what comes out, when, and in what words."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.flights import config, errors, Flight, matched, Motion, rms, run, START_NS, timeline
+
+from thermal_fiducial.core.ekf import PoseEkf
+from thermal_fiducial.core.measurements import ImuSample
+
+
+@pytest.fixture(scope='module')
+def flight():
+    return Flight(seed=1, seconds=6.0)
+
+
+def test_noiseless_data_give_the_truth():
+    flight = Flight(seed=1, seconds=6.0, noiseless=True, imu_rate=400.0)
+    states, _ = run(PoseEkf(matched()), timeline(flight.samples(), flight.poses))
+    position, attitude = errors(flight, states, 2.0)
+    # what is left is the trapezoid: jerk-like 10 m/s^3 x (2.5 ms)^2 / 12 over the filter's memory, tens of micrometres
+    assert position.max() < 1e-4
+    assert attitude.max() < 1e-4
+
+
+def test_every_sample_has_its_odometry_once_initialised(flight):
+    ekf = PoseEkf(config())
+    states, _ = run(ekf, timeline(flight.samples(), flight.poses, 0.03))
+    stamps = np.array([state.stamp_ns for state in states])
+    expected = [sample.stamp_ns for sample in flight.samples()]
+    assert list(stamps) == expected[-len(stamps) :]
+    # three poses from 0.2 s on, the last with its delay and the sample after it
+    assert (stamps[0] - START_NS) * 1e-9 < 0.2 + 2 / 30 + 0.03 + 0.01
+    assert ekf.status == 'tracking'
+    assert not ekf.lost
+
+
+@pytest.mark.parametrize('delay', [0.05, 0.4, 'random'])
+def test_late_and_out_of_order_poses_equal_in_order_processing(flight, delay):
+    delays = np.random.default_rng(2).uniform(0.0, 0.2, len(flight.poses)) if delay == 'random' else delay
+    in_order, late = PoseEkf(config()), PoseEkf(config())
+    run(in_order, timeline(flight.samples(), flight.poses))
+    run(late, timeline(flight.samples(), flight.poses, delays))
+    late_now, now = late.state, in_order.state
+    # the last pose is 0.13 s old, so a delay of up to 0.4 s needs the poses that haven't arrived
+    if delay == 0.4:
+        for pose in flight.poses:
+            late.add_pose(pose)
+        late_now = late.state
+    for name in ('R_map_body', 'velocity', 'position', 'bias', 'time_offset', 'covariance'):
+        np.testing.assert_allclose(getattr(late_now, name), getattr(now, name), rtol=1e-9, atol=1e-12)
+
+
+def test_a_pose_ahead_of_the_imu_waits(flight):
+    ekf = PoseEkf(config())
+    samples = flight.samples()
+    for sample in samples[:100]:
+        ekf.add_imu(sample)
+    pose = next(pose for pose in flight.poses if pose.stamp_ns > samples[99].stamp_ns)
+    update = ekf.add_pose(pose)
+    assert update.pending
+    assert not update.accepted
+    assert 'waits' in update.reason
+    for sample in samples[100:110]:
+        ekf.add_imu(sample)
+    assert ekf.decided[pose.stamp_ns].reason == 'initialising'
+
+
+@pytest.mark.parametrize(
+    ('change', 'word'),
+    [
+        ({'angular_velocity': np.array([0.0, np.nan, 0.0])}, 'finite'),
+        ({'linear_acceleration': np.array([0.0, np.inf, 0.0])}, 'finite'),
+        ({'stamp_ns': -5_000_000}, 'repeated'),
+        ({'stamp_ns': -8_000_000}, 'back'),
+        ({'stamp_ns': 3_000_000_000}, 'ahead'),
+    ],
+)
+def test_a_bad_sample_is_refused_and_the_next_one_goes_on(flight, change, word):
+    ekf = PoseEkf(config())
+    samples = flight.samples()
+    run(ekf, timeline(samples[:400], [pose for pose in flight.poses if pose.stamp_ns < samples[390].stamp_ns]))
+    bad = samples[400]
+    change = {key: bad.stamp_ns + value if key == 'stamp_ns' else value for key, value in change.items()}
+    assert ekf.add_imu(replace(bad, **change)) is None
+    assert word in ekf.status
+    state = ekf.add_imu(samples[401])
+    assert state is not None
+    assert ekf.status == 'tracking'
+    truth = flight.motion.pose(flight.t[401])
+    # single-marker poses after 1.8 s: a few centimetres at the most
+    assert np.linalg.norm(state.T_map_body[:3, 3] - truth[:3, 3]) < 0.05
+
+
+@pytest.mark.parametrize('jump', [-5.0, -0.5, 30.0])
+def test_a_clock_that_jumps_starts_afresh(flight, jump):
+    ekf = PoseEkf(config())
+    run(ekf, timeline(flight.samples(), flight.poses))
+    shift = round((jump - 6.0 if jump < -1.0 else jump) * 1e9)
+    samples = [replace(sample, stamp_ns=sample.stamp_ns + 6_000_000_000 + shift) for sample in flight.samples()]
+    poses = [replace(pose, stamp_ns=pose.stamp_ns + 6_000_000_000 + shift) for pose in flight.poses]
+    statuses = set()
+    for item in timeline(samples, poses):
+        if isinstance(item, ImuSample):
+            ekf.add_imu(item)
+            statuses.add(ekf.status)
+        else:
+            ekf.add_pose(item)
+    assert any('started afresh' in status or 'waiting' in status for status in statuses)
+    assert ekf.status == 'tracking'
+    # a position that went on from the old clock would be off by the flight's extent, metres
+    error = np.linalg.norm(ekf.state.position - flight.motion.pose(flight.t[-1])[:3, 3])
+    assert error < 0.05
+
+
+def test_unusable_poses_are_refused_in_words(flight):
+    ekf = PoseEkf(config())
+    pose = flight.poses[0]
+    assert 'no IMU' in ekf.add_pose(pose).reason
+    run(ekf, timeline(flight.samples(), flight.poses))
+    assert 'too late' in ekf.add_pose(pose).reason
+    assert 'repeated' in ekf.add_pose(flight.poses[-1]).reason
+    assert 'ahead' in ekf.add_pose(replace(pose, stamp_ns=pose.stamp_ns + 60_000_000_000)).reason
+    assert 'finite' in ekf.add_pose(replace(flight.poses[-1], T_map_camera=np.full((4, 4), np.nan))).reason
+    shifted = flight.poses[-1].T_map_camera.copy()
+    shifted[0, 3] += 1.0
+    update = ekf.add_pose(replace(flight.poses[-1], stamp_ns=pose.stamp_ns + 5_650_000_000, T_map_camera=shifted))
+    assert not update.accepted
+    assert 'sigma' in update.reason
+    assert update.nis > 22.5
+
+
+def test_odometry_is_in_ros_frames():
+    """Twist in the body; the covariance's small axis follows the body into the map."""
+    flight = Flight(seed=3, seconds=6.0)
+    ekf = PoseEkf(config())
+    states, _ = run(ekf, timeline(flight.samples(), flight.poses))
+    last = states[-1]
+    T = flight.motion.pose(flight.t[-1])
+    # 0.1 m/s, 0.01 rad/s: far above the filter's error, far below a wrong frame's
+    np.testing.assert_allclose(last.velocity_body, T[:3, :3].T @ flight.motion.velocity(flight.t[-1]), atol=0.1)
+    np.testing.assert_allclose(last.angular_velocity_body, flight.motion.imu(flight.t[-1])[:3], atol=0.01)
+    P, R = ekf.state.covariance, ekf.state.R_map_body
+    np.testing.assert_allclose(last.pose_covariance[:3, :3], R @ P[6:9, 6:9] @ R.T, atol=1e-15)
+    np.testing.assert_allclose(last.pose_covariance[:3, 3:], R @ P[6:9, :3] @ R.T, atol=1e-15)
+    np.testing.assert_allclose(last.pose_covariance[3:, 3:], R @ P[:3, :3] @ R.T, atol=1e-15)
+    assert np.linalg.eigvalsh(last.twist_covariance).min() > 0.0
+
+
+def test_at_rest_the_gyroscope_bias_is_known_from_the_start():
+    flight = Flight(seed=4, seconds=2.0, motion=Motion.still(), bias_std=(0.02, 0.05))
+    ekf = PoseEkf(config())
+    run(ekf, timeline(flight.samples(), flight.poses[:3]))
+    # RATE_STD, three sigma
+    np.testing.assert_allclose(ekf.state.bias[:3], flight.bias[-1, :3], atol=0.015)
+    assert rms(np.sqrt(np.diag(ekf.state.covariance)[9:12])) < 0.006
+
+
+def test_reset_forgets(flight):
+    ekf = PoseEkf(config())
+    run(ekf, timeline(flight.samples(), flight.poses))
+    ekf.reset()
+    assert ekf.state is None
+    assert ekf.lost
+    assert ekf.status == 'waiting for IMU'
+    run(ekf, timeline(flight.samples(), flight.poses))
+    assert ekf.status == 'tracking'

@@ -1,0 +1,146 @@
+"""The error state's matrices against finite differences of the nominal state."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.flights import CAMERA_POSITION, config
+
+from thermal_fiducial.core.error_state import ErrorStateFilter, pose_innovation
+from thermal_fiducial.core.geometry import so3_exp, so3_left_jacobian, so3_log, transform
+from thermal_fiducial.core.imu import ImuStep
+from thermal_fiducial.core.initialisation import blank_state
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.navigation_state import inject, Layout
+
+FULL = config(estimate_extrinsics=True)
+LAYOUT = Layout.of(FULL)
+STEP = ImuStep(np.array([0.8, -1.5, 2.0, 3.0, -1.0, 9.0]), 0.005, 1.7e-4, 2.0e-3)
+
+
+@pytest.fixture
+def state():
+    rng = np.random.default_rng(5)
+    A = rng.normal(size=(LAYOUT.size, LAYOUT.size)) * 0.01
+    return replace(
+        blank_state(FULL, LAYOUT),
+        R_map_body=so3_exp([0.3, -0.2, 1.9]),
+        velocity=np.array([1.0, -0.5, 0.2]),
+        position=np.array([4.0, 2.0, -1.0]),
+        bias=0.01 * rng.normal(size=6),
+        covariance=A @ A.T,
+    )
+
+
+def difference(state, other):
+    """Error coordinates that carry ``state`` to ``other``."""
+    rotation = so3_log(state.R_map_body.T @ other.R_map_body)
+    J = np.linalg.inv(state.R_map_body @ so3_left_jacobian(rotation))
+    extrinsics = other.T_body_camera @ np.linalg.inv(state.T_body_camera)
+    phi = so3_log(extrinsics[:3, :3])
+    return np.concatenate(
+        (
+            rotation,
+            J @ (other.velocity - state.velocity),
+            J @ (other.position - state.position),
+            other.bias - state.bias,
+            other.gravity[:2] - state.gravity[:2],
+            [other.time_offset - state.time_offset],
+            phi,
+            np.linalg.inv(so3_left_jacobian(phi)) @ extrinsics[:3, 3],
+        )
+    )
+
+
+def test_inject_moves_the_state_by_the_error(state):
+    error = 0.1 * np.random.default_rng(1).normal(size=LAYOUT.size)
+    moved = inject(state, error, state.covariance, LAYOUT)
+    # 1e-9: double precision, but for the re-orthonormalisation, which is quadratic in rounding
+    np.testing.assert_allclose(difference(state, moved), error, atol=1e-9)
+
+
+def test_the_pose_error_propagates_exactly_linearly(state):
+    """The group error of two states under the same samples, not only for small errors."""
+    filter_ = ErrorStateFilter(FULL)
+    error = np.zeros(LAYOUT.size)
+    error[:9] = np.random.default_rng(2).normal(size=9)
+    other = inject(state, error, state.covariance, LAYOUT)
+    after = filter_.predict(state, STEP)
+    F = filter_._transition.F.copy()
+    # half a radian and a metre of error: exact to double precision is the left-invariant error's promise
+    np.testing.assert_allclose(difference(after, filter_.predict(other, STEP))[:9], (F @ error)[:9], atol=1e-12)
+
+
+def test_transition_is_the_derivative_of_the_propagation(state):
+    filter_ = ErrorStateFilter(FULL)
+    after = filter_.predict(state, STEP)
+    F = filter_._transition.F.copy()
+    columns = []
+    for error in 1e-6 * np.eye(LAYOUT.size):
+        other = filter_.predict(inject(state, error, state.covariance, LAYOUT), STEP)
+        columns.append(difference(after, other) / 1e-6)
+    # 1e-6: rounding of the differences; the gyroscope bias' second-order effect on v and p is within it at 5 ms
+    np.testing.assert_allclose(F, np.transpose(columns), atol=1e-6)
+
+
+def test_the_covariance_follows_the_error(state):
+    filter_ = ErrorStateFilter(FULL)
+    after = filter_.predict(state, STEP)
+    F, Q = filter_._transition.F, filter_._transition.Q
+    np.testing.assert_allclose(after.covariance, F @ state.covariance @ F.T + Q, atol=1e-15)
+
+
+def test_the_innovation_is_the_error_itself(state):
+    error = np.zeros(LAYOUT.size)
+    error[[0, 1, 2, 6, 7, 8]] = [0.4, -0.3, 0.8, 1.0, 2.0, -3.0]
+    truth = inject(state, error, state.covariance, LAYOUT)
+    np.testing.assert_allclose(pose_innovation(state, truth.T_map_body), error[[0, 1, 2, 6, 7, 8]], atol=1e-12)
+
+
+def test_covariance_of_the_body_pose_has_the_lever_arm():
+    """Samples of the camera pose in the ROS convention, carried to the body one by one."""
+    filter_ = ErrorStateFilter(FULL)
+    state = blank_state(FULL, LAYOUT)
+    rng = np.random.default_rng(4)
+    A = 1e-4 * rng.normal(size=(6, 6))
+    T = transform(so3_exp([0.5, 1.0, -2.0]), [1.0, 2.0, 3.0])
+    pose = filter_.body_pose(CameraPose(0, T, A @ A.T), state.T_body_camera)
+    columns = []
+    for d in 1e-6 * np.eye(6):
+        other = transform(so3_exp(d[3:]) @ T[:3, :3], T[:3, 3] + d[:3]) @ np.linalg.inv(state.T_body_camera)
+        inner = np.linalg.inv(pose.T_map_body) @ other
+        columns.append(np.concatenate((so3_log(inner[:3, :3]), inner[:3, 3])) / 1e-6)
+    J = np.transpose(columns)
+    assert np.linalg.norm(CAMERA_POSITION) > 0.1
+    # 1e-5 relative: finite differences of 1e-6
+    np.testing.assert_allclose(pose.covariance, J @ A @ A.T @ J.T, rtol=1e-4, atol=1e-5 * (A @ A.T).max())
+
+
+def test_time_offset_and_extrinsics_columns(state):
+    """A pose taken earlier, and one through other extrinsics, differ as the columns of H say."""
+    filter_ = ErrorStateFilter(FULL)
+    seen = {}
+    filter_._update = lambda state, innovation, H, noise: seen.update(y=innovation, H=H)
+    imu = np.concatenate((np.array([0.5, -1.0, 0.7]) + state.bias[:3], np.zeros(3)))
+    later = transform(state.R_map_body @ so3_exp([0.5e-6, -1e-6, 0.7e-6]), state.position + 1e-6 * state.velocity)
+    pose = CameraPose(0, later @ state.T_body_camera, np.eye(6))
+    filter_.correct(state, filter_.body_pose(pose, state.T_body_camera), imu)
+    np.testing.assert_allclose(seen['y'], 1e-6 * seen['H'][:, LAYOUT.time_offset], atol=1e-11)
+    for axis, error in enumerate(1e-6 * np.eye(6)):
+        T_true = transform(so3_exp(error[:3]), error[3:]) @ state.T_body_camera
+        pose = CameraPose(0, state.T_map_body @ T_true, np.eye(6))
+        filter_.correct(state, filter_.body_pose(pose, state.T_body_camera), imu)
+        np.testing.assert_allclose(seen['y'], 1e-6 * seen['H'][:, LAYOUT.extrinsics][:, axis], atol=1e-11)
+
+
+def test_alignment_column_of_tilt_bias_and_gravity(state):
+    filter_ = ErrorStateFilter(FULL)
+    seen = {}
+    filter_._update = lambda state, innovation, H, noise: seen.update(y=innovation, H=H)
+    for place in (0, 1, 2, 12, 13, 14, LAYOUT.gravity.start, LAYOUT.gravity.start + 1):
+        error = np.zeros(LAYOUT.size)
+        error[place] = 1e-6
+        truth = inject(state, error, state.covariance, LAYOUT)
+        filter_.align(state, truth.bias[3:] - truth.gravity @ truth.R_map_body, 0.1)
+        # 1e-10: second order of a tilt of 1e-6 under 10 m/s^2, with rounding
+        np.testing.assert_allclose(seen['y'], seen['H'] @ error, atol=1e-10)

@@ -1,0 +1,251 @@
+"""The filter: IMU samples and camera poses in, in any order of arrival; the robot's state at every IMU sample out.
+
+The belief at a sample is a function of the samples and poses up to it, ordered by time, never of the order in which
+they came: a pose that comes late goes where it belongs, and everything after it is computed again.
+"""
+
+from bisect import bisect_left, insort
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.gating import Belief, PoseGate, PoseUpdate, position_std
+from thermal_fiducial.core.imu import ImuStep, NoiseMonitor
+from thermal_fiducial.core.imu_input import ImuInput, Verdict
+from thermal_fiducial.core.initialisation import WINDOW_SECONDS
+from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
+from thermal_fiducial.core.navigation_state import NavigationState
+from thermal_fiducial.core.state_output import odometry
+from thermal_fiducial.core.types import FloatArray
+
+_SECOND_NS = 1_000_000_000
+#: Farther than this [ns] an estimated time offset never goes: the history is searched from there.
+_LARGEST_OFFSET_NS = 200_000_000
+
+
+@dataclass(slots=True)
+class _Node:
+    """An IMU sample, the noise densities of the step that ends with it, and the belief there."""
+
+    stamp_ns: int
+    imu: FloatArray
+    densities: tuple[float, float]
+    belief: Belief
+
+
+class PoseEkf:
+    """Left-invariant error-state Kalman filter with delayed, gated corrections.
+
+    ``status`` says in words how it is; ``diagnostics()`` in numbers; ``decided`` has the latest words on the poses.
+    """
+
+    def __init__(self, config: PoseEkfConfig) -> None:
+        self._config = config
+        self._offset_ns = round(config.camera_time_offset * _SECOND_NS)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        config = self._config
+        self._gate = PoseGate(config)
+        self._input = ImuInput(config.max_imu_gap)
+        self._begin()
+
+    def _begin(self) -> None:
+        self._noise = NoiseMonitor(self._config.imu)
+        self._nodes: list[_Node] = []
+        self._poses: list[CameraPose] = []
+        #: stamp of the camera to the latest word on its pose, for the poses in the buffer
+        self.decided: dict[int, PoseUpdate] = {}
+        self._accepted = self._refused = 0
+        self._imu_fault = ''
+        self._last_word = ''
+
+    # --- input ----------------------------------------------------------------------------------------
+
+    def add_imu(self, sample: ImuSample) -> Odometry | None:
+        """Propagate to an IMU sample.
+
+        Returns
+        -------
+        State at the sample's stamp; None before the filter is initialised and for a sample that it can't use
+        (``status`` says why).
+        """
+        verdict = self._input.judge(sample)
+        self._imu_fault = verdict.value
+        if verdict is Verdict.RESTART:
+            self._begin()
+            self._last_word = verdict.value
+        elif verdict is not Verdict.USE:
+            return None
+        imu = np.concatenate((sample.angular_velocity, sample.linear_acceleration))
+        if not self._nodes:
+            self._nodes.append(_Node(sample.stamp_ns, imu, (0.0, 0.0), Belief()))
+            return None
+        last = self._nodes[-1]
+        seconds = (sample.stamp_ns - last.stamp_ns) / _SECOND_NS
+        node = _Node(sample.stamp_ns, imu, self._noise.densities(imu, seconds), last.belief)
+        self._nodes.append(node)
+        self._advance(len(self._nodes) - 1)
+        self._prune()
+        return self._output(node)
+
+    def add_pose(self, pose: CameraPose) -> PoseUpdate:
+        """Correct by a camera pose at its own instant, now or as soon as the IMU samples of that instant are there.
+
+        ``pose.stamp_ns`` is the camera's stamp; ``camera_time_offset`` and the estimated rest are applied here.
+        """
+        update = self._unusable(pose)
+        if update is None:
+            insort(self._poses, pose, key=lambda item: item.stamp_ns)
+            first = self._first_node_after(pose)
+            for index in range(first, len(self._nodes)):
+                self._advance(index)
+            waiting = PoseUpdate(pose.stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
+            update = self.decided.get(pose.stamp_ns, waiting)
+        if not update.pending:
+            self._last_word = update.reason
+        return update
+
+    def _unusable(self, pose: CameraPose) -> PoseUpdate | None:
+        reason = ''
+        if not (np.isfinite(pose.T_map_camera).all() and np.isfinite(pose.covariance).all()):
+            reason = 'refused: not finite'
+        elif not self._nodes:
+            reason = 'refused: no IMU yet'
+        elif pose.stamp_ns + self._offset_ns - self._nodes[-1].stamp_ns > self._config.max_imu_gap * _SECOND_NS:
+            reason = 'refused: far ahead of the IMU'
+        elif self._due_ns(self._nodes[0].belief, pose) <= self._nodes[0].stamp_ns:
+            reason = 'refused: too late'
+        else:
+            place = bisect_left(self._poses, pose.stamp_ns, key=lambda item: item.stamp_ns)
+            if place < len(self._poses) and self._poses[place].stamp_ns == pose.stamp_ns:
+                reason = 'refused: stamp repeated'
+        return PoseUpdate(pose.stamp_ns, False, reason, np.nan) if reason else None
+
+    # --- the history ----------------------------------------------------------------------------------
+
+    def _due_ns(self, belief: Belief, pose: CameraPose) -> int:
+        """Instant of a pose in the clock of the IMU, as a belief sees it."""
+        estimated = belief.main.state.time_offset if belief.main else 0.0
+        return pose.stamp_ns + self._offset_ns + round(estimated * _SECOND_NS)
+
+    def _first_node_after(self, pose: CameraPose) -> int:
+        """First node with a belief that ``pose`` takes part in."""
+        earliest = pose.stamp_ns + self._offset_ns - _LARGEST_OFFSET_NS
+        index = max(bisect_left(self._nodes, earliest, key=lambda node: node.stamp_ns), 1)
+        while index < len(self._nodes):
+            if self._due_ns(self._nodes[index - 1].belief, pose) <= self._nodes[index].stamp_ns:
+                break
+            index += 1
+        return index
+
+    def _advance(self, index: int) -> None:
+        """Compute the belief of node ``index`` from the node before, with the poses that fall in between."""
+        before, node = self._nodes[index - 1], self._nodes[index]
+        belief, time_ns, imu = before.belief, before.stamp_ns, before.imu
+        place = bisect_left(self._poses, belief.pose_stamp_ns + 1, key=lambda item: item.stamp_ns)
+        for pose in self._poses[place:]:
+            due_ns = self._due_ns(belief, pose)
+            if due_ns > node.stamp_ns:
+                break
+            due_ns = max(due_ns, time_ns)
+            share = (due_ns - before.stamp_ns) / (node.stamp_ns - before.stamp_ns)
+            imu_there = before.imu + share * (node.imu - before.imu)
+            belief = self._propagate(belief, (imu, imu_there), due_ns - time_ns, node.densities)
+            time_ns, imu = due_ns, imu_there
+            belief, update = self._gate.weigh(belief, pose, due_ns, self._window(index, imu))
+            self._decide(update)
+        node.belief = self._propagate(belief, (imu, node.imu), node.stamp_ns - time_ns, node.densities)
+
+    def _propagate(
+        self, belief: Belief, ends: tuple[FloatArray, FloatArray], nanoseconds: int, densities: tuple[float, float]
+    ) -> Belief:
+        """Trapezoid: the mean of the samples at the ends holds over the step."""
+        if nanoseconds <= 0:
+            return belief
+        return self._gate.predict(belief, ImuStep(0.5 * (ends[0] + ends[1]), nanoseconds / _SECOND_NS, *densities))
+
+    def _window(self, index: int, imu: FloatArray) -> FloatArray:
+        """Samples (N, 6) of the last half second before node ``index``, then ``imu``."""
+        begin = self._nodes[index].stamp_ns - round(WINDOW_SECONDS * _SECOND_NS)
+        first = bisect_left(self._nodes, begin, key=lambda node: node.stamp_ns)
+        return np.array([*(node.imu for node in self._nodes[first:index]), imu])
+
+    def _decide(self, update: PoseUpdate) -> None:
+        if update.stamp_ns not in self.decided:
+            self._accepted += update.accepted
+            self._refused += not update.accepted
+        self.decided[update.stamp_ns] = update
+        self._last_word = update.reason
+
+    def _prune(self) -> None:
+        """Forget what no pose may reach any more; in blocks, as deleting from a list's head moves the rest."""
+        kept_ns = round((self._config.max_delay + WINDOW_SECONDS) * _SECOND_NS)
+        horizon = self._nodes[-1].stamp_ns - kept_ns
+        if self._nodes[len(self._nodes) // 2].stamp_ns >= horizon:
+            return
+        del self._nodes[: bisect_left(self._nodes, horizon, key=lambda node: node.stamp_ns)]
+        stale = bisect_left(self._poses, self._nodes[0].belief.pose_stamp_ns + 1, key=lambda item: item.stamp_ns)
+        for pose in self._poses[:stale]:
+            self.decided.pop(pose.stamp_ns, None)
+        del self._poses[:stale]
+
+    # --- output ---------------------------------------------------------------------------------------
+
+    def _output(self, node: _Node) -> Odometry | None:
+        if node.belief.main is None:
+            return None
+        return odometry(node.stamp_ns, node.belief.main.state, node.imu[:3], self._rate_variance(node))
+
+    def _rate_variance(self, node: _Node) -> float:
+        return node.densities[0] ** 2 * _SECOND_NS / (node.stamp_ns - self._nodes[-2].stamp_ns)
+
+    @property
+    def state(self) -> NavigationState | None:
+        """Estimate at the newest IMU sample."""
+        main = self._nodes[-1].belief.main if self._nodes else None
+        return main.state if main else None
+
+    @property
+    def status(self) -> str:
+        """How the filter is, in words."""
+        if self._imu_fault:
+            return self._imu_fault
+        if not self._nodes:
+            return 'waiting for IMU'
+        belief = self._nodes[-1].belief
+        if belief.main is None:
+            hits = belief.rival.hits if belief.rival else 0
+            return f'initialising: {hits} of {self._config.initial_poses} poses' if hits else 'waiting for markers'
+        uncertainty = position_std(belief.main.state)
+        if uncertainty > self._config.lost_position_std:
+            return f'lost: position known to {uncertainty:.2f} m'
+        coasting = (self._nodes[-1].stamp_ns - belief.main.accepted_ns) / _SECOND_NS
+        return f'coasting for {coasting:.1f} s' if coasting > 0.5 else 'tracking'
+
+    @property
+    def lost(self) -> bool:
+        """Whether there is no pose, or none as good as ``lost_position_std`` asks."""
+        return self.state is None or position_std(self.state) > self._config.lost_position_std
+
+    def diagnostics(self) -> dict[str, float]:
+        """How the filter is, in numbers (SI units)."""
+        rate, force = self._noise.vibration
+        numbers = {
+            'poses accepted': float(self._accepted),
+            'poses refused': float(self._refused),
+            'vibration rad/s': rate,
+            'vibration m/s^2': force,
+        }
+        if self.state is not None:
+            belief = self._nodes[-1].belief
+            assert belief.main
+            numbers |= {
+                'seconds since accepted pose': (self._nodes[-1].stamp_ns - belief.main.accepted_ns) / _SECOND_NS,
+                'starts afresh': float(belief.resets),
+                'position std': position_std(self.state),
+                'time offset': self._config.camera_time_offset + self.state.time_offset,
+            }
+        return numbers

@@ -1,0 +1,149 @@
+"""Prediction and correction of one estimate. Covariances are filterpy's work, the state on the group is ours."""
+
+from dataclasses import dataclass
+
+from filterpy.kalman import ExtendedKalmanFilter
+import numpy as np
+
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.geometry import inverse, skew, so3_left_jacobian_inverse, so3_log
+from thermal_fiducial.core.imu import ImuStep, Transition
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.navigation_state import (
+    ACCELEROMETER_BIAS,
+    GYROSCOPE_BIAS,
+    inject,
+    Layout,
+    NavigationState,
+    POSE,
+    POSITION,
+    ROTATION,
+    VELOCITY,
+)
+from thermal_fiducial.core.types import FloatArray
+
+#: Angular [rad/s^2] and linear [m/s^2] acceleration of ordinary flight. While the time offset is uncertain by s, a pose
+#: is known to second order only: half the acceleration times the square of the offset, of variance 3/4 a^2 s^4.
+_AGILITY_SQUARED = np.repeat((5.0**2, 3.0**2), 3)
+
+
+@dataclass(frozen=True, slots=True)
+class BodyPose:
+    """A measured pose of the robot.
+
+    ``covariance`` (6, 6): rotation, then position, of the error in the robot frame [rad, m].
+    """
+
+    T_map_body: FloatArray
+    covariance: FloatArray
+
+
+class ErrorStateFilter:
+    """Prediction by inertial steps, correction by poses, of :class:`NavigationState`."""
+
+    def __init__(self, config: PoseEkfConfig) -> None:
+        self.layout = Layout.of(config)
+        self._config = config
+        self._transition = Transition(self.layout.size, _random_walks(config, self.layout))
+        self._algebra = ExtendedKalmanFilter(dim_x=self.layout.size, dim_z=6)
+        self._floor = np.repeat((config.attitude_floor**2, config.position_floor**2), 3)
+        clock = 0.0 if config.estimate_time_offset else config.time_offset_std
+        self._clock_variance = config.stamp_jitter**2 + clock**2
+        self._H_pose = np.zeros((6, self.layout.size))
+        self._H_pose[np.arange(6), POSE] = 1.0
+        if self.layout.extrinsics:
+            self._H_pose[:, self.layout.extrinsics] = np.eye(6)
+
+    def predict(self, state: NavigationState, step: ImuStep) -> NavigationState:
+        """State after an inertial step."""
+        rotation, dv, dp = self._transition.compute(step, state.bias)
+        dt = step.seconds
+        R = state.R_map_body
+        R_next = R @ rotation
+        F = self._transition.F
+        if self.layout.gravity:
+            horizontal = R_next[:2].T
+            F[VELOCITY, self.layout.gravity] = horizontal * dt
+            F[POSITION, self.layout.gravity] = horizontal * (0.5 * dt * dt)
+        algebra = self._algebra
+        algebra.P, algebra.F, algebra.Q = state.covariance, F, self._transition.Q
+        algebra.predict()
+        fall = state.gravity * dt
+        return NavigationState(
+            R_next,
+            state.velocity + fall + R @ dv,
+            state.position + (state.velocity + 0.5 * fall) * dt + R @ dp,
+            state.bias,
+            state.gravity,
+            state.time_offset,
+            state.T_body_camera,
+            algebra.P,
+        )
+
+    def body_pose(self, pose: CameraPose, T_body_camera: FloatArray) -> BodyPose:
+        """Pose of the robot that a camera pose stands for, its covariance with the lever arm's cross terms."""
+        T_map_body = pose.T_map_camera @ inverse(T_body_camera)
+        R = T_map_body[:3, :3]
+        lever = T_map_body[:3, 3] - pose.T_map_camera[:3, 3]
+        # d p_body = d p_camera + d theta x lever, both in the map; then into the robot frame, rotation first.
+        J = np.zeros((6, 6))
+        J[:3, 3:] = R.T
+        J[3:, :3] = R.T
+        J[3:, 3:] = -R.T @ skew(lever)
+        return BodyPose(T_map_body, self._config.pose_noise_scale**2 * (J @ pose.covariance @ J.T))
+
+    def correct(self, state: NavigationState, pose: BodyPose, imu: FloatArray) -> tuple[NavigationState, float]:
+        """State corrected by a pose at its own instant, and the normalised innovation squared.
+
+        ``imu`` (6,): sample at that instant. A clock error moves the measured pose along the robot's motion; where
+        the offset isn't estimated this, and always the jitter of the stamps, enters the noise fully correlated.
+        """
+        motion = np.concatenate((imu[:3] - state.bias[:3], state.velocity_body))
+        H, floor, place = self._H_pose, self._floor, self.layout.time_offset
+        if place is not None:
+            H = H.copy()
+            H[:, place] = motion
+            floor = floor + 0.75 * state.covariance[place, place] ** 2 * _AGILITY_SQUARED
+        noise = pose.covariance + np.diag(floor) + self._clock_variance * np.outer(motion, motion)
+        return self._update(state, pose_innovation(state, pose.T_map_body), H, noise)
+
+    def align(self, state: NavigationState, force: FloatArray, std: float) -> tuple[NavigationState, float]:
+        """State corrected by the specific force (3,) of a robot at rest, known to ``std`` [m/s^2]."""
+        expected = -state.gravity @ state.R_map_body
+        H = np.zeros((3, self.layout.size))
+        H[:, ROTATION] = skew(expected)
+        H[:, ACCELEROMETER_BIAS] = np.eye(3)
+        if self.layout.gravity:
+            H[:, self.layout.gravity] = -state.R_map_body[:2].T
+        return self._update(state, force - state.bias[3:] - expected, H, std**2 * np.eye(3))
+
+    def settle(self, state: NavigationState, rate: FloatArray, std: float) -> tuple[NavigationState, float]:
+        """State corrected by the angular rate (3,) of a robot at rest, known to ``std`` [rad/s]."""
+        H = np.zeros((3, self.layout.size))
+        H[:, GYROSCOPE_BIAS] = np.eye(3)
+        return self._update(state, rate - state.bias[:3], H, std**2 * np.eye(3))
+
+    def _update(
+        self, state: NavigationState, innovation: FloatArray, H: FloatArray, noise: FloatArray
+    ) -> tuple[NavigationState, float]:
+        algebra = self._algebra
+        algebra.x, algebra.P = np.zeros(self.layout.size), state.covariance
+        algebra.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R=noise)
+        covariance = 0.5 * (algebra.P + algebra.P.T)
+        return inject(state, algebra.x, covariance, self.layout), float(algebra.mahalanobis**2)
+
+
+def pose_innovation(state: NavigationState, T_map_body: FloatArray) -> FloatArray:
+    """Rotation and position (6,) of Log(X^-1 Z) on SE(3): exactly the error of ``state`` if ``T_map_body`` is true."""
+    rotation = so3_log(state.R_map_body.T @ T_map_body[:3, :3])
+    offset = (T_map_body[:3, 3] - state.position) @ state.R_map_body
+    return np.concatenate((rotation, so3_left_jacobian_inverse(rotation) @ offset))
+
+
+def _random_walks(config: PoseEkfConfig, layout: Layout) -> FloatArray:
+    walks = np.zeros(layout.size)
+    walks[GYROSCOPE_BIAS] = config.imu.gyroscope_random_walk
+    walks[ACCELEROMETER_BIAS] = config.imu.accelerometer_random_walk
+    if layout.time_offset is not None:
+        walks[layout.time_offset] = config.time_offset_random_walk
+    return walks

@@ -1,0 +1,147 @@
+"""Which poses count: chi-square against the present belief, and recovery by evidence instead of lock-out.
+
+A pose that the belief refuses starts a rival, a second estimate that the following refused poses support or not.
+A rival that many poses agree with, while the belief accepts none, replaces it. The start of the filter is the
+same thing without a belief to replace.
+"""
+
+from dataclasses import dataclass, replace
+import math
+
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.error_state import ErrorStateFilter
+from thermal_fiducial.core.imu import ImuStep
+from thermal_fiducial.core.initialisation import blank_state, start
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.navigation_state import NavigationState
+from thermal_fiducial.core.types import FloatArray
+
+_SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class PoseUpdate:
+    """What became of a camera pose."""
+
+    #: stamp of the camera, as it came
+    stamp_ns: int
+    #: whether it moved the estimate
+    accepted: bool
+    #: in words; empty when accepted
+    reason: str
+    #: squared Mahalanobis distance (6 degrees of freedom), NaN where there was nothing to compare with
+    nis: float
+    #: whether the filter started afresh with it
+    reset: bool = False
+    #: whether it waits for the IMU samples of its instant; the final word is in ``PoseEkf.decided``
+    pending: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """An estimate and the poses that speak for it."""
+
+    state: NavigationState
+    #: instants of its first and of its last accepted pose, clock of the IMU
+    started_ns: int
+    accepted_ns: int
+    hits: int = 1
+    misses: int = 0
+
+    def supported(self, state: NavigationState, time_ns: int) -> 'Track':
+        """The track after a pose that it accepts."""
+        return Track(state, self.started_ns, time_ns, self.hits + 1, self.misses)
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """Everything that the filter knows at one instant."""
+
+    main: Track | None = None
+    rival: Track | None = None
+    #: stamp of the last camera pose in it
+    pose_stamp_ns: int = -(1 << 62)
+    #: times that it started afresh
+    resets: int = 0
+
+
+class PoseGate:
+    """Propagates beliefs and weighs poses against them."""
+
+    def __init__(self, config: PoseEkfConfig) -> None:
+        self._config = config
+        self._filter = ErrorStateFilter(config)
+        self.blank = blank_state(config, self._filter.layout)
+
+    def predict(self, belief: Belief, step: ImuStep) -> Belief:
+        """Belief after an inertial step."""
+        if belief.main is None and belief.rival is None:
+            return belief
+        main, rival = self._moved(belief.main, step), self._moved(belief.rival, step)
+        return Belief(main, rival, belief.pose_stamp_ns, belief.resets)
+
+    def _moved(self, track: Track | None, step: ImuStep) -> Track | None:
+        if track is None:
+            return None
+        state = self._filter.predict(track.state, step)
+        return Track(state, track.started_ns, track.accepted_ns, track.hits, track.misses)
+
+    def weigh(self, belief: Belief, pose: CameraPose, time_ns: int, imu: FloatArray) -> tuple[Belief, PoseUpdate]:
+        """Belief after a pose.
+
+        Parameters
+        ----------
+        time_ns : its instant in the clock of the IMU
+        imu : (N, 6) samples up to that instant, the last one interpolated at it
+        """
+        main = belief.main
+        if main and time_ns - main.accepted_ns > self._config.reinitialise_after * _SECOND_NS:
+            main = None
+        nis = math.nan
+        if main:
+            state, nis = self._correct(main.state, pose, imu)
+            if nis <= self._config.gate:
+                accepted = Belief(main.supported(state, time_ns), None, pose.stamp_ns, belief.resets)
+                return accepted, PoseUpdate(pose.stamp_ns, True, '', nis)
+        rival = self._challenge(belief.rival, main, pose, time_ns, imu)
+        if rival and self._convincing(rival, main, time_ns):
+            resets = belief.resets + (belief.main is not None)
+            reason = 'started afresh' if belief.main else 'initialised'
+            return Belief(rival, None, pose.stamp_ns, resets), PoseUpdate(pose.stamp_ns, True, reason, nis, True)
+        reason = f'refused: {math.sqrt(nis):.1f} sigma' if main else 'initialising'
+        if rival is None:
+            reason = 'refused: contradicts gravity'
+        refused = Belief(belief.main, rival, pose.stamp_ns, belief.resets)
+        return refused, PoseUpdate(pose.stamp_ns, False, reason, nis)
+
+    def _correct(self, state: NavigationState, pose: CameraPose, imu: FloatArray) -> tuple[NavigationState, float]:
+        return self._filter.correct(state, self._filter.body_pose(pose, state.T_body_camera), imu[-1])
+
+    def _challenge(
+        self, rival: Track | None, main: Track | None, pose: CameraPose, time_ns: int, imu: FloatArray
+    ) -> Track | None:
+        """The rival after a pose that the main estimate refused; one that fails too often gives way to the pose."""
+        if rival:
+            state, nis = self._correct(rival.state, pose, imu)
+            if nis <= self._config.gate:
+                return rival.supported(state, time_ns)
+            if rival.misses + 1 < rival.hits:
+                return replace(rival, misses=rival.misses + 1)
+        prior = main.state if main else self.blank
+        body = self._filter.body_pose(pose, prior.T_body_camera)
+        first = start(self._config, self._filter, body, prior, imu)
+        return Track(first, time_ns, time_ns) if first else None
+
+    def _convincing(self, rival: Track, main: Track | None, time_ns: int) -> bool:
+        if rival.hits < self._config.initial_poses:
+            return False
+        if main is None or position_std(main.state) > self._config.lost_position_std:
+            return True
+        since = max(rival.started_ns, main.accepted_ns)
+        return time_ns - since >= self._config.reset_after * _SECOND_NS and rival.hits >= 2 * rival.misses
+
+
+def position_std(state: NavigationState) -> float:
+    """Root of the sum of the position variances [m]."""
+    P = state.covariance
+    return math.sqrt(P[6, 6] + P[7, 7] + P[8, 8])

@@ -1,0 +1,57 @@
+"""What may enter the filter from the IMU: finite samples in the order of their stamps, on one clock."""
+
+from enum import Enum
+
+import numpy as np
+
+from thermal_fiducial.core.measurements import ImuSample
+
+#: So many samples in a row must agree with each other on a new clock before it is believed [samples].
+CLOCK_EVIDENCE = 10
+
+
+class Verdict(Enum):
+    """What to do with a sample."""
+
+    USE = ''
+    NOT_FINITE = 'IMU sample is not finite'
+    REPEATED = 'IMU stamp repeated'
+    BACKWARD = 'IMU stamp went back'
+    AHEAD = 'IMU stamp jumped ahead'
+    RESTART = 'IMU clock jumped: started afresh'
+
+
+class ImuInput:
+    """Judges samples one by one.
+
+    A stamp out of line is refused, as it may be a single bad one. When the stamps go on from there, the clock was
+    set, the bag restarted, or the IMU was away: then everything begins anew.
+    """
+
+    def __init__(self, max_gap: float) -> None:
+        """``max_gap``: longest step [s] that can be bridged."""
+        self._max_gap_ns = round(max_gap * 1e9)
+        self._last_ns: int | None = None
+        self._stray_ns = 0
+        self._strays = 0
+
+    def judge(self, sample: ImuSample) -> Verdict:
+        """Verdict on ``sample``; it is remembered."""
+        if not (np.isfinite(sample.angular_velocity).all() and np.isfinite(sample.linear_acceleration).all()):
+            return Verdict.NOT_FINITE
+        if self._last_ns is None or 0 < sample.stamp_ns - self._last_ns <= self._max_gap_ns:
+            self._last_ns, self._strays = sample.stamp_ns, 0
+            return Verdict.USE
+        if sample.stamp_ns == self._last_ns:
+            return Verdict.REPEATED
+        return self._stray(sample.stamp_ns)
+
+    def _stray(self, stamp_ns: int) -> Verdict:
+        assert self._last_ns is not None
+        follows = 0 < stamp_ns - self._stray_ns <= self._max_gap_ns
+        self._strays = self._strays + 1 if follows else 1
+        self._stray_ns = stamp_ns
+        if self._strays >= CLOCK_EVIDENCE:
+            self._last_ns, self._strays = stamp_ns, 0
+            return Verdict.RESTART
+        return Verdict.BACKWARD if stamp_ns < self._last_ns else Verdict.AHEAD

@@ -1,0 +1,121 @@
+"""The state at a first pose: the pose itself, gravity and gyroscope bias from stillness, the rest wide open.
+
+Nothing else is needed in motion: the pose error is linear in the error coordinates, thus the next two or three
+poses settle velocity and tilt whatever they were.
+"""
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.error_state import BodyPose, ErrorStateFilter
+from thermal_fiducial.core.geometry import transform_from_quaternion
+from thermal_fiducial.core.navigation_state import (
+    ACCELEROMETER_BIAS,
+    GYROSCOPE_BIAS,
+    Layout,
+    NavigationState,
+    POSE,
+    POSITION,
+    ROTATION,
+    VELOCITY,
+)
+from thermal_fiducial.core.types import FloatArray
+
+#: Seconds of samples that stillness is judged on, and the fewest of them.
+WINDOW_SECONDS, FEWEST_SAMPLES = 0.5, 20
+#: At rest the samples scatter less than this [rad/s, m/s^2] ...
+STILL_RATE_STD, STILL_FORCE_STD = 0.02, 0.3
+#: ... and their mean is a plausible gyroscope bias [rad/s] and gravity with accelerometer bias [m/s^2].
+STILL_RATE, STILL_FORCE = 0.1, 0.6
+#: What the mean of such a window is worth: a drone on its legs or in a hand still moves a little [rad/s, m/s^2].
+RATE_STD, FORCE_STD = 0.005, 0.05
+#: A first pose whose vertical is further than this [rad] from the specific force is of the wrong planar branch.
+LARGEST_TILT = math.radians(35.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """Mean rate (3,) [rad/s] and specific force (3,) [m/s^2] of a robot at rest."""
+
+    rate: FloatArray
+    force: FloatArray
+
+
+def rest(imu: FloatArray, gravity: float) -> Rest | None:
+    """What an IMU window (N, 6) says if the robot stood still in it."""
+    if len(imu) < FEWEST_SAMPLES:
+        return None
+    mean, std = imu.mean(axis=0), imu.std(axis=0)
+    quiet = std[:3].max() < STILL_RATE_STD and std[3:].max() < STILL_FORCE_STD
+    level = np.linalg.norm(mean[:3]) < STILL_RATE and abs(np.linalg.norm(mean[3:]) - gravity) < STILL_FORCE
+    return Rest(mean[:3], mean[3:]) if quiet and level else None
+
+
+def blank_state(config: PoseEkfConfig, layout: Layout) -> NavigationState:
+    """What is known before the first pose: the parameters."""
+    return NavigationState(
+        R_map_body=np.eye(3),
+        velocity=np.zeros(3),
+        position=np.zeros(3),
+        bias=np.zeros(6),
+        gravity=np.array([0.0, 0.0, -config.gravity]),
+        time_offset=0.0,
+        T_body_camera=transform_from_quaternion(config.camera_position, config.camera_orientation),
+        covariance=np.zeros((layout.size, layout.size)),
+    )
+
+
+def start(
+    config: PoseEkfConfig, filter_: ErrorStateFilter, pose: BodyPose, prior: NavigationState, imu: FloatArray
+) -> NavigationState | None:
+    """State at a first pose, or None where the pose contradicts gravity.
+
+    Parameters
+    ----------
+    prior : biases, gravity and offsets to begin with; its covariance doesn't count
+    imu : (N, 6) samples up to the pose's instant, the last one at that instant
+    """
+    up = pose.T_map_body[2, :3]
+    force = imu.mean(axis=0)[3:]
+    if up @ force < math.cos(LARGEST_TILT) * np.linalg.norm(force):
+        return None
+    state = _unaligned(config, filter_.layout, pose, prior, imu[-1])
+    still = rest(imu, config.gravity)
+    if still:
+        state, _ = filter_.align(state, still.force, FORCE_STD)
+        state, _ = filter_.settle(state, still.rate, RATE_STD)
+    return state
+
+
+def _unaligned(
+    config: PoseEkfConfig, layout: Layout, pose: BodyPose, prior: NavigationState, imu: FloatArray
+) -> NavigationState:
+    variances = np.zeros(layout.size)
+    variances[ROTATION], variances[POSITION] = config.attitude_floor**2, config.position_floor**2
+    variances[VELOCITY] = config.initial_velocity_std**2
+    variances[GYROSCOPE_BIAS] = config.initial_gyroscope_bias_std**2
+    variances[ACCELEROMETER_BIAS] = config.initial_accelerometer_bias_std**2
+    # The pose may be of another instant: the way that the robot, at a speed still unknown, makes meanwhile.
+    variances[POSITION] += (config.initial_velocity_std * config.time_offset_std) ** 2
+    if layout.gravity:
+        variances[layout.gravity] = (config.gravity * config.map_tilt_std) ** 2
+    if layout.extrinsics:
+        stds = (config.extrinsics_orientation_std, config.extrinsics_position_std)
+        variances[layout.extrinsics] = np.repeat(np.square(stds), 3)
+    P = np.diag(variances)
+    P[np.ix_(POSE, POSE)] += pose.covariance
+    turned = np.zeros(layout.size)
+    turned[ROTATION] = -imu[:3]
+    if layout.time_offset is not None:
+        turned[layout.time_offset] = 1.0
+    P += config.time_offset_std**2 * np.outer(turned, turned)
+    return replace(
+        prior,
+        R_map_body=pose.T_map_body[:3, :3],
+        position=pose.T_map_body[:3, 3],
+        velocity=np.zeros(3),
+        covariance=P,
+    )
