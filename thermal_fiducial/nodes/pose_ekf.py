@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.ekf import PoseEkf
 from thermal_fiducial.ros import convert, qos
-from thermal_fiducial.ros.node import OK, StageNode, WARN
+from thermal_fiducial.ros.node import ERROR, OK, StageNode, WARN
 from thermal_fiducial.ros.run import run
 
 _PATH_STEP_NS = 200_000_000
@@ -27,8 +27,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         super().__init__('pose_ekf', PoseEkfConfig, **kwargs)
         self.filter = PoseEkf(self.config)
         self._path: deque[tuple[int, Pose]] = deque(maxlen=_PATH_LENGTH)
-        self._refused_poses = 0
-        self._last_update = 'no camera_pose yet'
+        self._last_refusal = ''
         self._pose = self.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
         self._odometry = self.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
         self._path_output = self.advertise(Path, 'path')
@@ -48,8 +47,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
 
     def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
         update = self.filter.add_pose(convert.camera_pose(message))
-        self._refused_poses += not update.accepted
-        self._last_update = update.reason
+        self._last_refusal = '' if update.accepted or update.pending else update.reason
 
     def _extend_path(self, stamp: int, pose: Pose) -> None:
         if not self._path or not 0 <= stamp - self._path[-1][0] < _PATH_STEP_NS:
@@ -68,13 +66,16 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
             self._path_output.send(convert.path(self._path, convert.header(self._path[-1][0], self.config.map_frame)))
 
     def state(self) -> tuple[bytes, str]:
-        """What the filter says of itself, or why it refused the last pose."""
-        reason = self.filter.status or self._last_update
-        return (WARN, reason) if reason else (OK, 'ok')
+        """What the filter says of itself, and why it refused the last pose."""
+        status = self.filter.status
+        level = ERROR if self.filter.lost else OK if status == 'tracking' else WARN
+        if self._last_refusal and not self.filter.lost:
+            return WARN, f'{status}; {self._last_refusal}'
+        return level, status
 
     def figures(self) -> dict[str, object]:
-        """Refused poses."""
-        return {'refused camera poses': self._refused_poses}
+        """The filter in numbers."""
+        return {name: f'{value:.6g}' for name, value in self.filter.diagnostics().items()} | {'lost': self.filter.lost}
 
 
 def main() -> int:
