@@ -28,7 +28,7 @@ setup(
     extras_require={
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-common-interfaces==5.3.6'],
         'tools': ['scipy', 'rich', 'matplotlib', 'ezdxf', 'jinja2'],
-        'test': ['pytest', 'hypothesis', 'pytest-benchmark', 'pytest-xdist', 'evo'],
+        'test': ['pytest', 'shapely', 'hypothesis', 'pytest-benchmark', 'pytest-xdist', 'evo'],
         'lint': ['ruff', 'mypy', 'import-linter', 'types-PyYAML'],
         'colcon': ['colcon-core', 'colcon-ros', 'colcon-python-setup-py', 'colcon-bash'],
     },

@@ -1,0 +1,118 @@
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.fabrication.cuttability import examine
+from thermal_fiducial.fabrication.dictionary_search import distances, random_code, search
+from thermal_fiducial.fabrication.patterns import cuttable, pack, rotate, unpack, weight
+from thermal_fiducial.files.dictionary import load_dictionary, PACKAGED as FOLDER
+
+#: Packaged dictionary to bits along a side, least number of markers, distance.
+PACKAGED = {
+    'STENCIL_4X4_16': (4, 16, 6),
+    'STENCIL_4X4_100': (4, 80, 4),
+    'STENCIL_5X5_100': (5, 72, 8),
+    'STENCIL_6X6_100': (6, 50, 12),
+}
+
+
+def turned(rows):
+    """A marker as strings, turned by 90 degrees."""
+    return [''.join(row[column] for row in rows) for column in reversed(range(len(rows)))]
+
+
+def differing(a, b):
+    return sum(x != y for x, y in zip(''.join(a), ''.join(b), strict=True))
+
+
+def falls_apart(rows):
+    """Whether acrylic ('0') comes off, by following cells one by one: shares nothing with the code under test."""
+    n = len(rows)
+    acrylic = {(r, c) for r in range(-1, n + 1) for c in range(-1, n + 1) if not (0 <= r < n and 0 <= c < n)}
+    acrylic |= {(r, c) for r in range(n) for c in range(n) if rows[r][c] == '0'}
+    seen, waiting = {(-1, -1)}, [(-1, -1)]
+    while waiting:
+        r, c = waiting.pop()
+        for cell in {(r + 1, c), (r - 1, c), (r, c + 1), (r, c - 1)} & acrylic - seen:
+            seen.add(cell)
+            waiting.append(cell)
+    windows = (rows[r][c : c + 2] + rows[r + 1][c : c + 2] for r in range(n - 1) for c in range(n - 1))
+    return seen != acrylic or any(window in ('0110', '1001') for window in windows)
+
+
+@pytest.mark.parametrize('name', PACKAGED)
+def test_packaged_dictionary_keeps_its_promise(name):
+    size, least, distance = PACKAGED[name]
+    dictionary = load_dictionary(name)
+    markers = [[''.join(map(str, row)) for row in bits] for bits in marker_bits(dictionary).tolist()]
+    assert dictionary.markerSize == size
+    assert dictionary.maxCorrectionBits == (distance - 1) // 2
+    assert len(markers) >= least
+    assert not any(falls_apart(rows) for rows in markers)
+    all_turns = []
+    for rows in markers:
+        turns = [rows]
+        for _ in range(3):
+            turns.append(turned(turns[-1]))
+        assert min(differing(rows, other) for other in turns[1:]) >= distance
+        all_turns.append(turns)
+    assert min(differing(a[0], turn) for a, b in combinations(all_turns, 2) for turn in b) >= distance
+
+
+@pytest.mark.parametrize('name', ['STENCIL_4X4_16', 'STENCIL_4X4_100'])
+def test_packaged_dictionary_is_what_its_command_writes(name, tmp_path):
+    dictionary = load_dictionary(name)
+    packaged = (FOLDER / f'{name}.yaml').read_text()
+    arguments = packaged.splitlines()[0].split()[5:]
+    out = tmp_path / f'{name}.yaml'
+    assert main(['markers', 'dictionary', str(out), *arguments]) == 0
+    assert out.read_text() == packaged
+    assert len(dictionary.bytesList) == len(load_dictionary(out).bytesList)
+
+
+def test_opencv_reads_the_packaged_markers():
+    dictionary = load_dictionary('STENCIL_5X5_100')
+    for marker_id, bits in enumerate(marker_bits(dictionary)):
+        turned_bits = np.rot90(bits, marker_id % 4)
+        damaged = turned_bits.copy()
+        damaged[0, 0] ^= 1
+        found, identified, _ = dictionary.identify(damaged, 0.6)[:3]
+        assert found
+        assert identified == marker_id
+
+
+def test_code_is_invariant_and_far_apart():
+    code = random_code(4, 6, np.random.default_rng(3))
+    assert weight(code.words[1:]).min() >= 6
+    assert set(rotate(code.words, 4).tolist()) == set(code.words.tolist())
+
+
+def test_words_agree_with_bits():
+    rng = np.random.default_rng(5)
+    bits = rng.integers(0, 2, (200, 5, 5), dtype=np.uint8)
+    words = pack(bits)
+    assert np.array_equal(unpack(words, 5), bits)
+    assert np.array_equal(unpack(rotate(words, 5), 5), np.rot90(bits, axes=(1, 2)))
+    assert np.array_equal(weight(words), bits.sum(axis=(1, 2)))
+    # 5 x 5 random patterns are rarely cuttable; smoother ones are needed to see both answers.
+    smooth = np.repeat(np.repeat(rng.integers(0, 2, (200, 3, 3), dtype=np.uint8), 2, axis=1), 2, axis=2)
+    expected = [examine(marker).cuttable for marker in smooth]
+    assert 0 < sum(expected) < len(expected)
+    assert cuttable(pack(smooth), 6).tolist() == expected
+
+
+def test_search_depends_on_its_seed_only():
+    first, again, other = (search(4, 6, seed=seed, restarts=20) for seed in (1, 1, 2))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    assert min(distances(first)) >= 6
+
+
+@pytest.mark.parametrize(('bits', 'distance'), [(2, 4), (9, 4), (4, 0), (4, 17), (3, 9)])
+def test_search_refuses_what_cannot_be(bits, distance):
+    with pytest.raises(InputError):
+        search(bits, distance, seed=1, restarts=2)

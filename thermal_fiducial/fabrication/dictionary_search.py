@@ -1,0 +1,159 @@
+"""Search for dictionaries of markers that can be cut.
+
+A greedy search keeps whatever pattern is far enough from those kept before. Far more markers fit into a coset of a
+linear code: let C be a linear code of n x n bits with minimum distance d that turning the grid by 90 degrees maps
+onto itself, and v a pattern with v + R v in C. All words of v + C and all their rotations lie in v + C, so any two
+of them differ in at least d bits. What remains to be done is to keep the cuttable ones, one of each four rotations.
+
+Such codes are grown a dimension at a time: R acts unipotently on the patterns (R^4 = 1 in characteristic 2), so
+every invariant code can be reached by adding, each time, a g with g + R g already in the code. The g of one step
+form a space of at most a few hundred cosets, which are tried all; the choice among the fit ones is random.
+Background: F. MacWilliams, N. Sloane, "The Theory of Error-Correcting Codes", 1977.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from thermal_fiducial.core.types import Gray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.fabrication.cuttability import examine
+from thermal_fiducial.fabrication.patterns import cuttable, rotate, rotations, unpack, weight, Words
+
+
+@dataclass
+class LinearCode:
+    """A linear code of n x n bits, invariant under turning the grid."""
+
+    n: int
+    #: rows in reduced echelon form: highest bit to row
+    basis: dict[int, int] = field(default_factory=dict)
+    words: Words = field(default_factory=lambda: np.zeros(1, np.uint64))
+
+    def add(self, generator: int) -> None:
+        """Grow by one dimension."""
+        row = self.reduce(generator)
+        lead = row.bit_length() - 1
+        for other in self.basis:
+            if self.basis[other] >> lead & 1:
+                self.basis[other] ^= row
+        self.basis[lead] = row
+        self.words = np.concatenate([self.words, self.words ^ np.uint64(generator)])
+
+    def reduce(self, word: int) -> int:
+        """Representative of the coset of ``word``."""
+        for lead, row in self.basis.items():
+            if word >> lead & 1:
+                word ^= row
+        return word
+
+    def invariant_cosets(self) -> Words:
+        """A representative of each coset that turning the grid maps onto itself, the code's own (0) first."""
+        kernel: list[int] = []
+        images: dict[int, tuple[int, int]] = {}
+        units = [1 << bit for bit in range(self.n * self.n) if bit not in self.basis]
+        turned = rotate(np.array(units, dtype=np.uint64), self.n)
+        for unit, image in zip(units, turned, strict=True):
+            word, image = unit, self.reduce(unit ^ int(image))
+            while image and (image.bit_length() - 1) in images:
+                other_image, other_word = images[image.bit_length() - 1]
+                word, image = word ^ other_word, image ^ other_image
+            if image:
+                images[image.bit_length() - 1] = (image, word)
+            else:
+                kernel.append(word)
+        return span(kernel)
+
+
+def span(generators: Iterable[int]) -> Words:
+    """All sums of ``generators``."""
+    words = np.zeros(1, np.uint64)
+    for generator in generators:
+        words = np.concatenate([words, words ^ np.uint64(generator)])
+    return words
+
+
+def random_code(n: int, distance: int, rng: np.random.Generator) -> LinearCode:
+    """A code that no further dimension fits into, grown at random.
+
+    Every other one prefers generators that keep all weights divisible by 4: such codes (Golay's is one) are dense
+    at distances divisible by 4.
+    """
+    code = LinearCode(n)
+    doubly_even = bool(rng.integers(2))
+    cosets = code.invariant_cosets()[1:]
+    while True:
+        weights = weight(code.words ^ cosets[:, None])
+        fit = cosets[weights.min(axis=1) >= distance]
+        if not len(fit):
+            return code
+        preferred = cosets[(weights.min(axis=1) >= distance) & np.all(weights % 4 == 0, axis=1)]
+        choices = preferred if doubly_even and len(preferred) else fit
+        code.add(int(choices[rng.integers(len(choices))]))
+        cosets = code.invariant_cosets()[1:]
+
+
+def best_coset(code: LinearCode, distance: int) -> Words:
+    """The most markers, one word of each four rotations, that a coset of ``code`` holds."""
+    cosets = code.invariant_cosets()
+    words = code.words ^ cosets[:, None]
+    fit = cuttable(words.reshape(-1), code.n).reshape(words.shape)
+    most = words[np.argmax(np.sum(fit, axis=1))]
+    turned = rotations(most[cuttable(most, code.n)], code.n)
+    own = np.min(weight(turned[1:] ^ turned[0]), axis=0)
+    return np.unique(turned.min(axis=0)[own >= distance])
+
+
+def search(
+    n: int, distance: int, *, seed: int, restarts: int, progress: Callable[[int, int], None] | None = None
+) -> Gray:
+    """Markers of n x n bits that can be cut, any two (and any marker and itself turned) ``distance`` bits apart.
+
+    Parameters
+    ----------
+    n : bits along a side, 3 to 8
+    distance : least Hamming distance
+    seed, restarts : the same numbers give the same markers
+    progress : called with the number of restarts done and the most markers found so far
+
+    Returns
+    -------
+    (M, n, n) bits, 1 for white; the stiffest markers (shortest arms) first
+
+    Raises
+    ------
+    InputError
+        A size or distance out of range, or no marker found.
+    """
+    if not 3 <= n <= 8 or not 1 <= distance <= n * n:
+        raise InputError(f'no dictionary of {n} x {n} bits at distance {distance}: 3 to 8 bits, distance 1 to n * n')
+    rng = np.random.default_rng(seed)
+    best = np.zeros(0, np.uint64)
+    for done in range(1, restarts + 1):
+        markers = best_coset(random_code(n, distance, rng), distance)
+        best = markers if len(markers) > len(best) else best
+        if progress is not None:
+            progress(done, len(best))
+    if not len(best):
+        raise InputError(f'no cuttable marker of {n} x {n} bits at distance {distance} found; try more restarts')
+    bits = unpack(best, n)
+    arms = [examine(marker).longest_arm for marker in bits]
+    return np.asarray(bits[np.argsort(arms, kind='stable')])
+
+
+def distances(bits: Gray) -> tuple[int, int]:
+    """Least Hamming distance between two markers in any rotation, and of a marker to its own rotations.
+
+    Parameters
+    ----------
+    bits : (M, n, n)
+    """
+    between = own = bits.shape[-1] ** 2
+    for turns in range(4):
+        differing = np.sum(bits[:, None] != np.rot90(bits, turns, axes=(1, 2))[None], axis=(2, 3))
+        if turns:
+            own = min(own, int(np.min(np.diagonal(differing))))
+        if len(bits) > 1:
+            between = min(between, int(np.min(differing[~np.eye(len(bits), dtype=bool)])))
+    return between, own

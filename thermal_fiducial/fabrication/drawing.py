@@ -1,0 +1,110 @@
+"""What a laser cutter gets: closed contours of straight lines and arcs, circles, and engraved outlines.
+
+Millimetres, x to the right, y up, the origin at the lower left.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from thermal_fiducial.core.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Contour:
+    """A closed line.
+
+    Parameters
+    ----------
+    points : (N, 2) vertices [mm]; counter-clockwise round acrylic, clockwise round a hole
+    bulges : (N,) of the segment that leaves each vertex: tangent of a quarter of the arc's angle, positive when the
+        arc turns left, 0 for a straight line (as in DXF)
+    """
+
+    points: FloatArray
+    bulges: FloatArray
+
+    @property
+    def area(self) -> float:
+        """Area [mm^2], positive for a counter-clockwise contour."""
+        x, y = self.points.T
+        following = np.roll(self.points, -1, axis=0)
+        polygon = 0.5 * float(np.sum(x * following[:, 1] - following[:, 0] * y))
+        chord = np.linalg.norm(following - self.points, axis=1)
+        return polygon + float(np.sum(_segment_area(chord, self.bulges)))
+
+    def moved(self, dx: float, dy: float) -> 'Contour':
+        """The same contour elsewhere."""
+        return Contour(self.points + np.array([dx, dy]), self.bulges)
+
+    def flattened(self, points_per_arc: int = 8) -> FloatArray:
+        """Vertices (M, 2) [mm] of the polygon that replaces each arc by ``points_per_arc`` chords."""
+        pieces = []
+        following = np.roll(self.points, -1, axis=0)
+        for start, end, bulge in zip(self.points, following, self.bulges, strict=True):
+            pieces.append(start[None] if bulge == 0.0 else _arc(start, end, bulge, points_per_arc))
+        return np.concatenate(pieces)
+
+
+def _segment_area(chord: FloatArray, bulge: FloatArray) -> FloatArray:
+    """Signed area between an arc and its chord."""
+    angle = 4.0 * np.arctan(bulge)
+    sine = np.where(bulge == 0.0, 1.0, np.sin(angle / 2.0))
+    radius = chord / (2.0 * sine)
+    return np.asarray(np.where(bulge == 0.0, 0.0, 0.5 * radius**2 * (angle - np.sin(angle))))
+
+
+def _arc(start: FloatArray, end: FloatArray, bulge: float, count: int) -> FloatArray:
+    """``count`` points of an arc, its end left out."""
+    chord = end - start
+    middle = 0.5 * (start + end)
+    # The centre lies to the left of the chord by (1 - b^2) / (4 b) of its length.
+    centre = middle + np.array([-chord[1], chord[0]]) * (1.0 - bulge**2) / (4.0 * bulge)
+    turn = 4.0 * np.arctan(bulge) * np.arange(count) / count
+    radius = start - centre
+    cosine, sine = np.cos(turn), np.sin(turn)
+    return np.asarray(
+        centre + np.stack([cosine * radius[0] - sine * radius[1], sine * radius[0] + cosine * radius[1]], axis=1)
+    )
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A drilled or cut round hole [mm]."""
+
+    x: float
+    y: float
+    radius: float
+
+    def moved(self, dx: float, dy: float) -> 'Circle':
+        """The same hole elsewhere."""
+        return Circle(self.x + dx, self.y + dy, self.radius)
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """One drawing: what to cut, drill and engrave on a sheet of ``width`` times ``height`` [mm]."""
+
+    name: str
+    width: float
+    height: float
+    cuts: tuple[Contour, ...]
+    holes: tuple[Circle, ...] = ()
+    engraving: tuple[Contour, ...] = ()
+    #: number of separate pieces of acrylic that must come out
+    parts: int = 1
+    #: what the drawing shows, one line each, for the title of a preview and the notes of a PDF
+    notes: tuple[str, ...] = field(default=())
+
+    def moved(self, dx: float, dy: float) -> 'Drawing':
+        """The same drawing with everything on it shifted."""
+        return Drawing(
+            self.name,
+            self.width,
+            self.height,
+            tuple(contour.moved(dx, dy) for contour in self.cuts),
+            tuple(circle.moved(dx, dy) for circle in self.holes),
+            tuple(contour.moved(dx, dy) for contour in self.engraving),
+            self.parts,
+            self.notes,
+        )
