@@ -50,10 +50,20 @@ def make_run(folder: Path, seconds=20.0, seed=0, gap=(8.0, 10.0), with_output=Tr
         known = START_NS + np.arange(0, int(seconds * 1e9) + 1, 10_000_000)
         write_poses(folder / 'truth.tum', known, true_pose((known - START_NS) * 1e-9))
     write_detections(folder / 'detections.csv', frames, rng)
+    rows = [
+        f'imu_to_pose,{stamp},{value:.3f}' for stamp, value in zip(stamps, rng.uniform(1, 3, len(stamps)), strict=True)
+    ]
+    rows += [
+        f'image_to_camera_pose,{stamp},{value:.3f}'
+        for stamp, value in zip(frames, rng.uniform(8, 12, len(frames)), strict=True)
+    ]
+    (folder / 'latency.csv').write_text('\n'.join(['kind,stamp_ns,latency_ms', *rows]) + '\n')
     save_map(folder / 'marker_map.yaml', wall())
-    (folder / 'summary.json').write_text(json.dumps({'bag': 'made_up', 'transport': 'processes'}))
+    (folder / 'summary.json').write_text(
+        json.dumps({'bag': 'made_up', 'transport': 'processes', 'mode': 'mapping', 'duration_s': seconds})
+    )
     if with_output:
-        write_output(folder / 'output', stamps, fused, rng)
+        write_output(folder / 'output', stamps, fused)
     return folder
 
 
@@ -79,8 +89,8 @@ def write_detections(path, frames, rng):
                     writer.writerow([stamp, marker, *np.round(rng.uniform(0, 500, 8), 3), 0.03])
 
 
-def write_output(path, stamps, fused, rng):
-    """``pose`` with the right covariance, delayed by 3 to 5 ms, and diagnostics."""
+def write_output(path, stamps, fused):
+    """``pose`` with the right covariance, and diagnostics."""
     types = get_typestore(Stores.ROS2_JAZZY).types
     header, time = types['std_msgs/msg/Header'], types['builtin_interfaces/msg/Time']
     covariance = np.diag(FUSED_SIGMA**2).ravel()
@@ -92,7 +102,7 @@ def write_output(path, stamps, fused, rng):
             pose = types['geometry_msgs/msg/Pose'](point, types['geometry_msgs/msg/Quaternion'](*q[k]))
             with_covariance = types['geometry_msgs/msg/PoseWithCovariance'](pose, covariance)
             message = types['geometry_msgs/msg/PoseWithCovarianceStamped'](head, with_covariance)
-            bag.write('pose', stamp + int(rng.integers(3_000_000, 5_000_000)), message)
+            bag.write('pose', stamp, message)
             if k % 200 == 0:
                 status = types['diagnostic_msgs/msg/DiagnosticStatus']
                 items = [

@@ -1,0 +1,103 @@
+"""The measures of one run, as one nested dictionary: what ``summary.json`` and the tables show."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.report import metrics
+from thermal_fiducial.report.run_folder import Run
+
+#: NEES looks at one pose in this time: its errors change slowly, so more are no more evidence [ns].
+CONSISTENCY_NS = 100_000_000
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A run and how good it is; errors are None where there is no truth."""
+
+    run: Run
+    fused_errors: metrics.Errors | None
+    fiducial_errors: metrics.Errors | None
+    gaps: list[metrics.Gap]
+
+    @property
+    def start_ns(self) -> int:
+        """First stamp of anything: zero of the plots' time."""
+        run = self.run
+        firsts = [
+            stamps[0]
+            for stamps in (run.fiducial.stamps_ns, run.fused.stamps_ns, run.detections.stamps_ns)
+            if len(stamps)
+        ]
+        return int(min(firsts, default=0))
+
+    def seconds(self, stamps_ns: IntArray) -> FloatArray:
+        """Time of the plots [s]."""
+        return np.asarray((stamps_ns - self.start_ns) * 1e-9)
+
+    def seconds_at(self, stamp_ns: int) -> float:
+        """Time of the plots [s] of one stamp."""
+        return (stamp_ns - self.start_ns) * 1e-9
+
+    @property
+    def covariances(self) -> tuple[metrics.Errors, FloatArray] | None:
+        """Errors of the fused poses whose covariance was recorded, and these (N, 6, 6)."""
+        e, output = self.fused_errors, self.run.output
+        if e is None or not len(e) or not len(output.stamps_ns):
+            return None
+        at = np.clip(np.searchsorted(e.stamps_ns, output.stamps_ns), 0, len(e) - 1)
+        same = e.stamps_ns[at] == output.stamps_ns
+        at = at[same]
+        return metrics.Errors(e.stamps_ns[at], e.d[at], e.estimate[at], e.truth[at]), output.covariances[same]
+
+    def numbers(self) -> dict[str, Any]:
+        """All measures; what can't be known is left out."""
+        result: dict[str, Any] = {
+            'fused': metrics.output(self.run.fused),
+            'fiducial': {'poses': len(self.run.fiducial), 'way_m': metrics.way(self.run.fiducial)},
+            'markers': self._markers(),
+            'gaps': [_gap_numbers(gap) for gap in self.gaps],
+        }
+        if self.run.latencies:
+            result['latency'] = {kind: metrics.latency(ms) for kind, (_, ms) in self.run.latencies.items()}
+        for name, e in (('fused', self.fused_errors), ('fiducial', self.fiducial_errors)):
+            if e is not None and len(e):
+                result[name]['error'] = metrics.accuracy(e)
+                result[name]['jitter'] = metrics.jitter(e)
+                result[name]['relative_error'] = metrics.relative_pose_error(e)
+        if (known := self.covariances) is not None:
+            result['fused']['consistency'] = _consistency(*known)
+        return result
+
+    def _markers(self) -> dict[str, Any]:
+        detections, marker_map = self.run.detections, self.run.marker_map
+        frames, counts = np.unique(detections.stamps_ns, return_counts=True)
+        return {
+            'detections': len(detections.ids),
+            'frames_with_markers': len(frames),
+            'seen_in_a_frame': float(counts.mean()) if len(counts) else 0.0,
+            'different': len(np.unique(detections.ids)),
+            'corner_sigma_median_px': float(np.median(detections.sigma_px)) if len(detections.ids) else None,
+            'in_map': None if marker_map is None else len(marker_map.markers),
+        }
+
+
+def evaluate(run: Run) -> Evaluation:
+    """Measure a run."""
+    fused_errors = None if run.truth is None else metrics.errors(run.fused, run.truth)
+    fiducial_errors = None if run.truth is None else metrics.errors(run.fiducial, run.truth)
+    return Evaluation(run, fused_errors, fiducial_errors, metrics.gaps(run.fused, run.fiducial, fused_errors))
+
+
+def _gap_numbers(gap: metrics.Gap) -> dict[str, float]:
+    numbers = {key: value for key, value in asdict(gap).items() if value is not None}
+    return {'seconds': gap.seconds, **numbers}
+
+
+def _consistency(e: metrics.Errors, covariances: FloatArray) -> dict[str, float]:
+    wanted = np.arange(e.stamps_ns[0], e.stamps_ns[-1], CONSISTENCY_NS) if len(e) else np.zeros(0, np.int64)
+    picked = np.unique(np.searchsorted(e.stamps_ns, wanted))
+    chosen = metrics.Errors(e.stamps_ns[picked], e.d[picked], e.estimate[picked], e.truth[picked])
+    return metrics.consistency(chosen, covariances[picked])

@@ -1,0 +1,169 @@
+"""What a run folder holds, read into arrays."""
+
+from collections import Counter
+import csv
+from dataclasses import dataclass, field
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermal_fiducial.core.map_data import MarkerMap
+from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import BagReader
+from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
+
+FUSED, FIDUCIAL, TRUTH = 'fused.tum', 'fiducial.tum', 'truth.tum'
+DETECTIONS, LATENCY = 'detections.csv', 'latency.csv'
+MARKER_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'summary.json', 'output'
+#: Covariances are read from no more than so many messages, evenly over the run.
+MOST_COVARIANCES = 6000
+_LEVELS = ('ok', 'warning', 'error', 'stale')
+
+
+@dataclass(frozen=True)
+class Detections:
+    """Rows of detections.csv."""
+
+    stamps_ns: IntArray
+    ids: IntArray
+    sigma_px: FloatArray
+
+
+@dataclass(frozen=True)
+class Diagnostic:
+    """How often a node said something."""
+
+    node: str
+    level: str
+    message: str
+    count: int
+
+
+@dataclass(frozen=True)
+class Output:
+    """What the recorded messages of the nodes tell beyond the text files.
+
+    Parameters
+    ----------
+    stamps_ns, covariances : (N,), (N, 6, 6) of some of the ``pose`` messages
+    diagnostics : what the nodes said, most frequent first
+    """
+
+    stamps_ns: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    covariances: FloatArray = field(default_factory=lambda: np.zeros((0, 6, 6)))
+    diagnostics: tuple[Diagnostic, ...] = ()
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder."""
+
+    path: Path
+    fused: Trajectory
+    fiducial: Trajectory
+    detections: Detections
+    #: kind of latency to stamps (N,) [ns] and values (N,) [ms]; only a run in real time has any
+    latencies: dict[str, tuple[IntArray, FloatArray]]
+    output: Output
+    marker_map: MarkerMap | None
+    summary: dict[str, Any]
+    truth: Trajectory | None
+
+
+def read_run(path: Path, truth: Path | None = None) -> Run:
+    """Read a run folder.
+
+    Parameters
+    ----------
+    path : the folder
+    truth : a TUM file or a bag; default: the folder's own ``truth.tum``, where it has one
+
+    Raises
+    ------
+    InputError
+        No run folder, or a broken file in it.
+    """
+    if not path.is_dir():
+        raise InputError(f'{path}: no such run folder')
+    missing = [name for name in (FUSED, FIDUCIAL) if not (path / name).is_file()]
+    if missing:
+        raise InputError(f'{path} is no run folder: it has no {missing[0]}')
+    own_truth = path / TRUTH
+    if truth is None and own_truth.is_file():
+        truth = own_truth
+    return Run(
+        path=path,
+        fused=read_tum(path / FUSED),
+        fiducial=read_tum(path / FIDUCIAL),
+        detections=_detections(path / DETECTIONS),
+        latencies=_latencies(path / LATENCY),
+        output=_output(path / OUTPUT),
+        marker_map=load_map(path / MARKER_MAP) if (path / MARKER_MAP).is_file() else None,
+        summary=_summary(path / SUMMARY),
+        truth=None if truth is None else read_truth(truth),
+    )
+
+
+def _summary(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(path.read_text(encoding='utf-8'))
+    except (OSError, ValueError) as error:
+        raise InputError(f'{path}: {error}') from None
+    if not isinstance(content, dict):
+        raise InputError(f'{path}: not a JSON object')
+    return content
+
+
+def _rows(path: Path, kinds: dict[str, type]) -> list[list[Any]]:
+    """Columns ``kinds`` (name to type) of a CSV file, empty where there is no file."""
+    if not path.is_file():
+        return [[] for _ in kinds]
+    rows = []
+    with path.open(encoding='utf-8', newline='') as file:
+        for number, row in enumerate(csv.DictReader(file), 2):
+            try:
+                rows.append([kind(row[name]) for name, kind in kinds.items()])
+            except (KeyError, TypeError, ValueError):
+                raise InputError(f'{path}, line {number}: no {", ".join(kinds)}') from None
+    return [list(column) for column in zip(*rows, strict=True)] or [[] for _ in kinds]
+
+
+def _detections(path: Path) -> Detections:
+    stamps, ids, sigmas = _rows(path, {'stamp_ns': int, 'id': int, 'sigma_px': float})
+    return Detections(np.array(stamps, np.int64), np.array(ids, np.int64), np.array(sigmas, np.float64))
+
+
+def _latencies(path: Path) -> dict[str, tuple[IntArray, FloatArray]]:
+    kinds, stamps, values = _rows(path, {'kind': str, 'stamp_ns': int, 'latency_ms': float})
+    kind_of, stamp, value = np.array(kinds), np.array(stamps, np.int64), np.array(values, np.float64)
+    return {kind: (stamp[kind_of == kind], value[kind_of == kind]) for kind in dict.fromkeys(kinds)}
+
+
+def _output(path: Path) -> Output:
+    if not path.is_dir():
+        return Output()
+    with BagReader(path) as bag:
+        return Output(*_covariances(bag), _diagnostics(bag))
+
+
+def _covariances(bag: BagReader) -> tuple[IntArray, FloatArray]:
+    every = 1 + bag.message_count(['pose']) // MOST_COVARIANCES
+    messages = [item.message for index, item in enumerate(bag.messages(['pose'])) if index % every == 0]
+    stamps = [message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec for message in messages]
+    covariances = [message.pose.covariance for message in messages]
+    return np.array(stamps, np.int64), np.array(covariances, np.float64).reshape(-1, 6, 6)
+
+
+def _diagnostics(bag: BagReader) -> tuple[Diagnostic, ...]:
+    said: Counter[tuple[str, str, str]] = Counter()
+    for item in bag.messages(['diagnostics']):
+        for status in item.message.status:
+            level = status.level[0] if isinstance(status.level, (bytes, np.ndarray)) else status.level
+            said[status.name, _LEVELS[min(int(level), 3)], status.message] += 1
+    return tuple(Diagnostic(*key, count) for key, count in said.most_common())
