@@ -20,8 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     scenarios = '\n'.join(f'  {name:14}{item.description} ({item.seconds:g} s)' for name, item in SCENARIOS.items())
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = (
-        f'scenarios:\n{scenarios}\n\nOUT becomes a rosbag2 with ground_truth.tum, map_true.yaml, map_one.yaml (one fixed '
-        'marker)\nand params.yaml (the rig) in it. The same options and seed give the same bytes.'
+        f'scenarios:\n{scenarios}\n\nOUT becomes a rosbag2 with ground_truth.tum, map_true.yaml, map_one.yaml (one '
+        'fixed marker)\nand params.yaml (the rig) in it. The same options and seed give the same bytes.'
     )
     parser.add_argument('out', type=Path, metavar='OUT', help='folder to create')
     parser.add_argument('--scenario', default='fog', metavar='NAME', help='see below (default: fog)')

@@ -17,5 +17,5 @@ Frames with their truth, without any file::
 of it, ``noise=False`` switches noise, fixed pattern, bad pixels and shutter off. A scenario is a frozen dataclass:
 ``dataclasses.replace(named('wall'), sensor=replace(named('wall').sensor, lag=0.0), fog=Fog(0.3))``. It has ``.lens``
 (``.matrix``, ``.model``, ``.distortion``, ``.width``, ``.height``), ``.markers`` (``.id``, ``.size``,
-``.T_map_marker``, ``.corners_map``), ``.T_body_camera``, ``.dictionary``, ``.trajectory(seconds, seed)`` and its ``.sensor``.
+``.T_map_marker``, ``.corners_map``), ``.T_body_camera``, ``.dictionary``, ``.trajectory(seconds, seed)``, ``.sensor``.
 """

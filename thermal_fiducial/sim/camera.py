@@ -1,17 +1,17 @@
 """The camera's frames over a flight: rendering, sensor, shutter, truth."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.types import Counts, FloatArray
+from thermal_fiducial.core.types import BoolArray, Counts, FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.sim.imu import ImuRecord
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.render import Quality, Renderer
 from thermal_fiducial.sim.scenario import named, Scenario
-from thermal_fiducial.sim.scene import Marker
+from thermal_fiducial.sim.scene import Marker, Plate
 from thermal_fiducial.sim.sensor import IDEAL
 
 #: Stamp of the start of every flight.
@@ -32,8 +32,8 @@ class SimFrame:
     counts : (height, width) uint16
     shutter : whether the counts are no live view
     T_map_camera : (4, 4) at the stamp
-    corners_px : ID to true corners (4, 2) at the stamp, for each marker that lies wholly in the image and shows
-        its face, also when the shutter is closed
+    corners_px : ID to true corners (4, 2) at the stamp, for each marker that lies wholly in the image, shows
+        its face and isn't hidden, also when the shutter is closed
     """
 
     stamp_ns: int
@@ -82,12 +82,12 @@ class FlightPlan:
         """The camera's stamp of it."""
         return START_NS + round((self.frame_time(index) - self.scenario.camera_time_offset) * 1e9)
 
-    def imu_stamps(self) -> tuple[FloatArray, np.ndarray]:
+    def imu_stamps(self) -> tuple[FloatArray, IntArray]:
         """Times [s] and stamps [ns] of the IMU's samples."""
         rate = self.scenario.imu.rate
         ticks = np.arange(int(self.seconds * rate) + 1, dtype=np.int64)
         nanoseconds = np.round(ticks * (1e9 / rate)).astype(np.int64)
-        return nanoseconds * 1e-9, nanoseconds + START_NS
+        return np.asarray(nanoseconds * 1e-9), nanoseconds + START_NS
 
 
 def plan(
@@ -126,27 +126,31 @@ def simulate_imu(scenario: Scenario | str, seconds: float | None = None, seed: i
 
 
 def true_corners(
-    lens: Lens, markers: tuple[Marker, ...], T_map_camera: FloatArray, margin_px: float = 1.0
+    lens: Lens, markers: Sequence[Marker], plates: Sequence[Plate], T_map_camera: FloatArray, margin_px: float = 1.0
 ) -> dict[int, FloatArray]:
-    """ID to corners (4, 2) [px] of the markers wholly in the image that show their face."""
+    """ID to corners (4, 2) [px] of the markers that are wholly in the image, show their face and aren't hidden."""
     R, origin = T_map_camera[:3, :3], T_map_camera[:3, 3]
-    corners: dict[int, FloatArray] = {}
+    high = np.array([lens.width, lens.height]) - 1 - margin_px
+    seen: list[tuple[Marker, FloatArray]] = []
     for marker in markers:
-        T = marker.T_map_marker
         points = (marker.corners_map - origin) @ R
-        if (origin - T[:3, 3]) @ T[:3, 2] <= 0 or np.any(points[:, 2] < 0.05):
+        if (origin - marker.T_map_marker[:3, 3]) @ marker.T_map_marker[:3, 2] <= 0 or np.any(points[:, 2] < 0.05):
             continue
         pixels = lens.project(points)
-        high = np.array([lens.width, lens.height]) - 1 - margin_px
         if np.all((pixels >= margin_px) & (pixels <= high)) and np.all(_unfolded(lens, points, pixels)):
-            corners[marker.id] = pixels
-    return corners
+            seen.append((marker, pixels))
+    if not seen:
+        return {}
+    spread = np.array([marker.spread_map for marker, _ in seen])
+    hidden = np.any([plate.hides(origin, spread) for plate in plates], axis=(0, 2))
+    return {marker.id: pixels for (marker, pixels), covered in zip(seen, hidden, strict=True) if not covered}
 
 
-def _unfolded(lens: Lens, points: FloatArray, pixels: FloatArray) -> np.ndarray:
+def _unfolded(lens: Lens, points: FloatArray, pixels: FloatArray) -> BoolArray:
     """Whether the lens maps the pixels back to the points: beyond its field the distortion folds them into it."""
     slopes = points[:, :2] / points[:, 2:]
-    return np.linalg.norm(lens.slopes(pixels) - slopes, axis=1) < 1e-6 * (1.0 + np.linalg.norm(slopes, axis=1))
+    off = np.linalg.norm(lens.slopes(pixels) - slopes, axis=1)
+    return np.asarray(off < 1e-6 * (1.0 + np.linalg.norm(slopes, axis=1)))
 
 
 class ThermalCamera:
@@ -155,9 +159,10 @@ class ThermalCamera:
     def __init__(self, flight: FlightPlan) -> None:
         scenario = flight.sensor_scenario
         self._flight, self._scenario, self._sensor = flight, scenario, scenario.sensor
+        self._plates = scenario.plates
         self._renderer = Renderer(
             scenario.lens,
-            scenario.plates,
+            self._plates,
             scenario.room,
             scenario.fog,
             scenario.acrylic,
@@ -186,7 +191,7 @@ class ThermalCamera:
             return None
         counts = self._shutter_counts(index, t) if shutter else self._live_counts(index)
         T_map_camera = self._renderer.camera_poses(np.array([t]))[0]
-        corners = true_corners(self._scenario.lens, self._scenario.markers, T_map_camera)
+        corners = true_corners(self._scenario.lens, self._scenario.markers, self._plates, T_map_camera)
         return SimFrame(self._flight.stamp_ns(index), t, counts, shutter, T_map_camera, corners)
 
     def _live_counts(self, index: int) -> Counts:

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.sim.trajectory import GRAVITY, Trajectory
 
@@ -24,6 +23,16 @@ class ImuRecord:
 
 
 @dataclass(frozen=True)
+class ImuNoise:
+    """Continuous densities, under Kalibr's names: [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)], walks per second more."""
+
+    gyroscope_noise_density: float = 1.7e-4
+    accelerometer_noise_density: float = 2.0e-3
+    gyroscope_random_walk: float = 2.0e-5
+    accelerometer_random_walk: float = 3.0e-4
+
+
+@dataclass(frozen=True)
 class ImuModel:
     """Noise of the IMU.
 
@@ -34,7 +43,7 @@ class ImuModel:
     gyroscope_bias_sigma, accelerometer_bias_sigma : of the biases at switch-on [rad/s], [m/s^2]
     """
 
-    noise: ImuNoise = ImuNoise()  # noqa: RUF009
+    noise: ImuNoise = ImuNoise()
     rate: float = 200.0
     gyroscope_bias_sigma: float = 0.003
     accelerometer_bias_sigma: float = 0.04

@@ -4,6 +4,7 @@ Sources: OpenCV's documentation of ``calib3d`` (pinhole with radial, rational an
 ``fisheye`` (equidistant).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,8 +15,8 @@ from thermal_fiducial.errors import InputError
 
 COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 
-# Newton with a numerical Jacobian: the residual at the rim of the widest lens is below 1e-12 after eight steps.
-_STEPS = 12
+# Newton with a numerical Jacobian: four steps leave 1e-11 px at the rim of the worst lens, two more are spare.
+_STEPS = 6
 _DIFFERENCE = 1e-6
 
 
@@ -64,28 +65,35 @@ class Lens:
         target = (np.asarray(pixels, dtype=np.float64) - self.centre) / self.focal
         x = self._start(target)
         for _ in range(_STEPS):
-            J = _derivative(self._bend, x)
-            x = x - np.linalg.solve(J, (self._bend(x) - target)[..., None])[..., 0]
-        return np.asarray(x)
+            residual = self._bend(x) - target
+            x = x - np.sum(_inverse(_derivative(self._bend, x)) * residual[..., None, :], axis=-1)
+        return x
 
     def slopes_jacobian(self, slopes: npt.ArrayLike) -> FloatArray:
         """Derivative (..., 2, 2) of the rays by the pixel they belong to [1/px]."""
-        return np.asarray(np.linalg.inv(_derivative(self.project_slopes, np.asarray(slopes, dtype=np.float64))))
+        return _inverse(_derivative(self.project_slopes, np.asarray(slopes, dtype=np.float64)))
 
     def _start(self, target: FloatArray) -> FloatArray:
         if self.model != 'equidistant':
             return target
         theta = np.minimum(np.linalg.norm(target, axis=-1, keepdims=True), 1.4)
-        return target * np.tan(theta) / np.maximum(theta, 1e-9)
+        return np.asarray(target * np.tan(theta) / np.maximum(theta, 1e-9))
 
     def _bend(self, slopes: FloatArray) -> FloatArray:
         return _equidistant(slopes, self.distortion) if self.model == 'equidistant' else _brown(slopes, self.distortion)
 
 
-def _derivative(function: 'np._typing._ArrayLikeFloat_co | object', x: FloatArray) -> FloatArray:
+def _derivative(function: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
     steps = np.eye(2) * _DIFFERENCE
-    columns = [(function(x + d) - function(x - d)) / (2 * _DIFFERENCE) for d in steps]  # type: ignore[operator]
+    columns = [(function(x + d) - function(x - d)) / (2 * _DIFFERENCE) for d in steps]
     return np.stack(columns, axis=-1)
+
+
+def _inverse(J: FloatArray) -> FloatArray:
+    """Of matrices (..., 2, 2)."""
+    a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
+    adjugate = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
+    return np.asarray(adjugate / (a * d - b * c)[..., None, None])
 
 
 def _brown(slopes: FloatArray, distortion: tuple[float, ...]) -> FloatArray:

@@ -1,9 +1,9 @@
 """The scene as the focal plane sees it: sampled from the plates' own planes, in space and in time.
 
 A pixel wholly inside one cell of a plate at all times of a sub-frame needs one sample. Every other pixel gets the
-points of a rank-1 lattice over its area and the sub-frame: each point is back-projected through the lens with the camera pose
-of its own time and looked up in the plate. Its time is drawn from the exponential by which the bolometer forgets
-within the sub-frame, so that the sum over sub-frames y <- e y + (1 - e) x is the lag's true response,
+points of a rank-1 lattice over its area and the sub-frame: each point is back-projected through the lens with the
+camera pose of its own time and looked up in the plate. Its time is drawn from the exponential by which the bolometer
+forgets within the sub-frame, so that the sum over sub-frames y <- e y + (1 - e) x is the lag's true response,
 y(t) = integral of x(t - a) exp(-a / tau) / tau da, and a moving edge is smeared without steps.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.scene import Acrylic, Fog, Plate, Room
@@ -24,7 +24,7 @@ from thermal_fiducial.sim.trajectory import Trajectory
 LATTICES = {23: (1, 19, 10), 97: (1, 84, 79), 251: (1, 234, 148)}
 
 _NEAR = 0.05
-_COARSE = 8
+_COARSE = 4
 _KERNEL = np.ones((3, 3), np.uint8)
 
 
@@ -74,13 +74,17 @@ class Renderer:
         if quality.samples not in LATTICES:
             raise InputError(f'{quality.samples} samples a pixel: choose one of {", ".join(map(str, LATTICES))}')
         self._lens, self._plates, self._room, self._fog, self._acrylic = lens, list(plates), room, fog, acrylic
+        self._centres = np.array([plate.T_map_plate[:3, 3] for plate in plates]).reshape(-1, 3)
+        self._normals = np.array([plate.T_map_plate[:3, 2] for plate in plates]).reshape(-1, 3)
+        self._outlines = np.array([_outline(plate) for plate in plates]).reshape(-1, 32, 3)
         self._trajectory, self._T_body_camera = trajectory, T_body_camera
         self._interval, self._warm_up = interval, quality.warm_up
         self._sub_frames = quality.sub_frames if lag > 0 else 1
         self._dx, self._dy, self._ages, self._forget = _lattice(quality.samples, interval / self._sub_frames, lag)
         self._rays = _pixel_rays(lens)
-        self._norms = np.sqrt(1.0 + np.sum(self._rays[..., :2] ** 2, axis=-1))
-        self._coarse_rays = _coarse_rays(lens)
+        self._norms = np.sqrt(1.0 + np.sum(self._rays[:2] ** 2, axis=0))
+        self._coarse_rays = _coarse_rays(lens).astype(np.float32)
+        self._coarse_norms = np.linalg.norm(self._coarse_rays, axis=-1)
         self._max_slope = 1.2 * float(np.sqrt(self._norms.max() ** 2 - 1.0))
         self._previous: float | None = None
         self._state: Float32Array = np.zeros((lens.height, lens.width), np.float32)
@@ -118,40 +122,38 @@ class Renderer:
         middle = len(poses) // 2
         t_middle = t - float(self._ages[middle])
         image = self._background(poses[middle], t_middle)
-        distances = [float(np.linalg.norm(p.T_map_plate[:3, 3] - poses[middle, :3, 3])) for p in self._plates]
-        for index in np.argsort(distances)[::-1]:
-            self._draw(image, self._plates[index], poses, t_middle)
+        for plate, box in self._in_view(poses[[0, -1]]):
+            self._draw(image[box], plate, box, poses, t_middle)
         return image
 
     def _background(self, T_map_camera: FloatArray, t: float) -> Float32Array:
-        directions = self._coarse_rays @ T_map_camera[:3, :3].T
+        directions = self._coarse_rays @ T_map_camera[:3, :3].T.astype(np.float32)
         excess, distance = self._room.look(T_map_camera[:3, 3], directions)
-        through = np.exp(-self._fog.at(t) * distance * np.linalg.norm(directions, axis=-1))
-        coarse = (through * excess + (1.0 - through) * self._fog.excess).astype(np.float32)
+        through = np.exp(np.float32(-self._fog.at(t)) * distance * self._coarse_norms)
+        coarse = through * excess + (1.0 - through) * np.float32(self._fog.excess)
         height, width = coarse.shape[0] * _COARSE, coarse.shape[1] * _COARSE
         fine = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR)
         return np.ascontiguousarray(fine[: self._lens.height, : self._lens.width])
 
-    def _draw(self, image: Float32Array, plate: Plate, poses: FloatArray, t: float) -> None:
-        H, in_front = _homographies(plate, poses)
-        box = self._box(plate, poses[[0, -1]]) if in_front else None
-        if box is None:
-            return
-        rays, norms = self._rays[box], self._norms[box]
-        moments = [0, len(H) // 2, len(H) - 1]
-        u, v, inverse_depth = _look_up(rays[..., :3], H[moments], np.zeros((3, 2)))
-        column, row = _cells(u, v, plate)
-        level, cover = plate.levels[row[..., 1], column[..., 1]], plate.cover[row[..., 1], column[..., 1]]
-        cut = _cut_pixels(plate.regions[row, column])
-        level[cut], cover[cut] = self._supersample(plate, rays[cut], H)
-        self._blend(image[box], plate, level, cover, (u[..., 1], v[..., 1], inverse_depth[..., 1]), norms, t)
+    def _draw(self, image: Float32Array, plate: Plate, box: tuple[slice, slice], poses: FloatArray, t: float) -> None:
+        H = _homographies(plate, poses)
+        rays, norms = self._rays[:, *box], self._norms[box]
+        shape = norms.shape
+        u, v, inverse_depth = _look_up(rays[:3].reshape(3, -1), H[[0, len(H) // 2, -1]])
+        cells = _cells(u, v, plate)
+        level, cover = plate.levels.ravel()[cells[1]], plate.cover.ravel()[cells[1]]
+        cut = np.flatnonzero(_cut_pixels(plate.regions.ravel()[cells].reshape(3, *shape)))
+        if len(cut):
+            level[cut], cover[cut] = self._supersample(plate, rays.reshape(7, -1)[:, cut], H)
+        terms = (level, cover, u[1], v[1], inverse_depth[1])
+        level, cover, u, v, inverse_depth = (term.reshape(shape) for term in terms)
+        self._blend(image, plate, level, cover, (u, v, inverse_depth), norms, t)
 
     def _supersample(self, plate: Plate, rays: Float32Array, H: FloatArray) -> tuple[Float32Array, Float32Array]:
-        """Mean level and cover over the lattice of pixels ``rays`` (M, 7)."""
+        """Mean level and cover (M,) over the lattice of pixels ``rays`` (7, M)."""
         u, v, _ = _look_up(rays, H, np.stack([self._dx, self._dy], axis=1))
-        column, row = _cells(u, v, plate)
-        index = row * np.int32(plate.levels.shape[1]) + column
-        return plate.levels.ravel()[index].mean(axis=-1), plate.cover.ravel()[index].mean(axis=-1)
+        cells = _cells(u, v, plate)
+        return plate.levels.ravel()[cells].mean(axis=0), plate.cover.ravel()[cells].mean(axis=0)
 
     def _blend(
         self,
@@ -169,25 +171,43 @@ class Renderer:
         cold = self._acrylic.sheet(t) if plate.cold is None else plate.cold
         emitted = level * (plate.hot * slope) + (cover - level) * cold
         visible = inverse_depth > 0
-        depth = 1.0 / np.where(visible, inverse_depth, 1.0)
-        through = np.exp(-self._fog.at(t) * norms * depth)
+        depth = 1.0 / np.where(visible, inverse_depth, np.float32(1.0))
+        through = np.exp(np.float32(-self._fog.at(t)) * norms * depth)
         seen = through * emitted + (1.0 - through) * cover * self._fog.excess
         image += np.where(visible, seen - cover * image, 0.0)
 
-    def _box(self, plate: Plate, poses: FloatArray) -> tuple[slice, slice] | None:
-        """Rows and columns that the plate may touch during the sub-frame, or None."""
-        corners = plate.outline_map
-        outlines = [_clip(_outline((corners - T[:3, 3]) @ T[:3, :3])) for T in poses]
-        points = np.concatenate(outlines)
-        if len(points) == 0:
-            return None
-        slopes = points[:, :2] / points[:, 2:]
-        radius = np.linalg.norm(slopes, axis=1, keepdims=True)
-        pixels = self._lens.project_slopes(slopes * np.minimum(1.0, self._max_slope / np.maximum(radius, 1e-9)))
+    def _in_view(self, poses: FloatArray) -> list[tuple[Plate, tuple[slice, slice]]]:
+        """Plates that may be seen from ``poses`` (N, 4, 4), the farthest first, each with its rows and columns."""
+        centre = poses[:, :3, 3].mean(axis=0)
+        heights = np.sum((poses[:, None, :3, 3] - self._centres) * self._normals, axis=-1)
+        lows, highs, in_front = self._boxes(poses)
+        seen = np.all(heights > 1e-3, axis=0) & in_front & np.all(highs > lows, axis=1)
+        distance = np.linalg.norm(self._centres - centre, axis=1)
+        order = [index for index in np.argsort(-distance) if seen[index]]
+        return [(self._plates[n], (slice(lows[n, 1], highs[n, 1]), slice(lows[n, 0], highs[n, 0]))) for n in order]
+
+    def _boxes(self, poses: FloatArray) -> tuple[IntArray, IntArray, BoolArray]:
+        """Low and high corner (P, 2) [px] of what each plate may cover, and whether any of it is in front (P,)."""
+        points = (self._outlines - poses[:, None, None, :3, 3]) @ poses[:, None, :3, :3]
+        front = points[..., 2] > _NEAR
+        pixels = self._outline_pixels(points[..., :2] / np.where(front, points[..., 2], 1.0)[..., None])
+        low, high = pixels.min(axis=(0, 2)), pixels.max(axis=(0, 2))
+        some = np.any(front, axis=(0, 2))
+        for index in np.flatnonzero(some & ~np.all(front, axis=(0, 2))):
+            clipped = np.concatenate([_clip(outline) for outline in points[:, index]])
+            pixels = self._outline_pixels(clipped[:, :2] / clipped[:, 2:])
+            low[index], high[index] = pixels.min(axis=0), pixels.max(axis=0)
         size = np.array([self._lens.width, self._lens.height])
-        low = np.clip(np.floor(pixels.min(axis=0)) - 3, 0, size).astype(int)
-        high = np.clip(np.ceil(pixels.max(axis=0)) + 4, 0, size).astype(int)
-        return None if np.any(high <= low) else (slice(low[1], high[1]), slice(low[0], high[0]))
+        return (
+            np.clip(np.floor(low) - 3, 0, size).astype(np.int64),
+            np.clip(np.ceil(high) + 4, 0, size).astype(np.int64),
+            some,
+        )
+
+    def _outline_pixels(self, slopes: FloatArray) -> FloatArray:
+        """Pixels of rays; those that miss the image by far are drawn to a circle round it, where the lens is true."""
+        radius = np.linalg.norm(slopes, axis=-1, keepdims=True)
+        return self._lens.project_slopes(slopes * np.minimum(1.0, self._max_slope / np.maximum(radius, 1e-9)))
 
 
 def _lattice(samples: int, duration: float, lag: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -200,13 +220,13 @@ def _lattice(samples: int, duration: float, lag: float) -> tuple[FloatArray, Flo
 
 
 def _pixel_rays(lens: Lens) -> Float32Array:
-    """(height, width, 7): ray x y 1 of each pixel's centre, and dx/du dx/dv dy/du dy/dv."""
+    """(7, height, width): ray x y 1 of each pixel's centre, and dx/du dx/dv dy/du dy/dv."""
     v, u = np.mgrid[0 : lens.height, 0 : lens.width].astype(np.float64)
     slopes = lens.slopes(np.stack([u, v], axis=-1))
     J = lens.slopes_jacobian(slopes)
     ones = np.ones_like(u)
     terms = [slopes[..., 0], slopes[..., 1], ones, J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]]
-    return np.stack(terms, axis=-1).astype(np.float32)
+    return np.stack(terms).astype(np.float32)
 
 
 def _coarse_rays(lens: Lens) -> FloatArray:
@@ -217,61 +237,61 @@ def _coarse_rays(lens: Lens) -> FloatArray:
     return np.concatenate([slopes, np.ones((rows, columns, 1))], axis=-1)
 
 
-def _homographies(plate: Plate, poses: FloatArray) -> tuple[FloatArray, bool]:
-    """H (N, 3, 3) with H (x, y, 1) = (column, row, 1) / depth for the ray x y 1; and whether the face is seen."""
+def _homographies(plate: Plate, poses: FloatArray) -> FloatArray:
+    """H (N, 3, 3) with H (x, y, 1) = (column, row, 1) / depth for the ray x y 1, seen from ``poses`` (N, 4, 4)."""
     R_plate_map = plate.T_map_plate[:3, :3].T
     D = R_plate_map @ poses[:, :3, :3]
     o = (poses[:, :3, 3] - plate.T_map_plate[:3, 3]) @ R_plate_map.T
-    if not np.all(o[:, 2] > 1e-3):
-        return D, False
     metres = D - (o / o[:, 2:])[:, :, None] * D[:, 2:, :]
     metres[:, 2] = -D[:, 2] / o[:, 2:]
-    return plate.to_cells @ metres, True
+    return np.asarray(plate.to_cells @ metres)
 
 
-def _look_up(rays: Float32Array, H: FloatArray, offsets: FloatArray) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Column, row and inverse depth (..., N) where ``rays`` (..., 3 or 7), moved by ``offsets`` (N, 2) [px], hit."""
-    terms = [H[:, :, 0], H[:, :, 1], H[:, :, 2]]
-    if rays.shape[-1] == 7:
+def _look_up(
+    rays: Float32Array, H: FloatArray, offsets: FloatArray | None = None
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Column, row and inverse depth (N, M) where ``rays`` (3 or 7, M), moved by ``offsets`` (N, 2) [px], hit."""
+    terms = [H[..., 0], H[..., 1], H[..., 2]]
+    if offsets is not None:
         dx, dy = offsets[:, :1], offsets[:, 1:]
-        terms += [H[:, :, 0] * dx, H[:, :, 0] * dy, H[:, :, 1] * dx, H[:, :, 1] * dy]
-    matrix = np.stack(terms).transpose(0, 2, 1).reshape(len(terms), -1).astype(np.float32)
-    product = rays @ matrix
-    n = len(H)
-    u, v, inverse_depth = product[..., :n], product[..., n : 2 * n], product[..., 2 * n :]
-    safe = np.where(inverse_depth > 1e-6, inverse_depth, np.float32(np.inf))
-    outside = inverse_depth <= 1e-6
-    u, v = u / safe, v / safe
-    u[outside] = -1.0
+        terms += [H[..., 0] * dx, H[..., 0] * dy, H[..., 1] * dx, H[..., 1] * dy]
+    matrix = np.stack(terms, axis=-1).transpose(1, 0, 2).reshape(-1, len(terms)).astype(np.float32)
+    u, v, inverse_depth = (matrix @ rays).reshape(3, len(H), -1)
+    # Behind the camera this puts the point far off the plate.
+    depth = 1.0 / np.maximum(inverse_depth, np.float32(1e-6))
+    u *= depth
+    v *= depth
     return u, v, inverse_depth
 
 
-def _cells(u: Float32Array, v: Float32Array, plate: Plate) -> tuple[IntArray, IntArray]:
+def _cells(u: Float32Array, v: Float32Array, plate: Plate) -> IntArray:
+    """Index into the plate's flat grids; what is off the plate falls on their border."""
     rows, columns = plate.levels.shape
-    return (
-        np.clip(u, 0, columns - 0.5).astype(np.int32),  # type: ignore[return-value]
-        np.clip(v, 0, rows - 0.5).astype(np.int32),
-    )
+    row = np.clip(v, 0, rows - 0.5).astype(np.intp)
+    row *= columns
+    row += np.clip(u, 0, columns - 0.5).astype(np.intp)
+    return row
 
 
-def _cut_pixels(regions: np.ndarray) -> BoolArray:
-    """Pixels whose surroundings (3 x 3, at the three moments of ``regions`` (h, w, 3)) are not all of one region."""
-    highest = cv2.dilate(np.ascontiguousarray(regions.max(axis=-1)), _KERNEL)
-    lowest = cv2.erode(np.ascontiguousarray(regions.min(axis=-1)), _KERNEL)
+def _cut_pixels(regions: Gray) -> BoolArray:
+    """Pixels (h, w) whose surroundings (3 x 3, at the three moments of ``regions`` (3, h, w)) aren't all one region."""
+    highest = cv2.dilate(np.maximum(np.maximum(regions[0], regions[1]), regions[2]), _KERNEL)
+    lowest = cv2.erode(np.minimum(np.minimum(regions[0], regions[1]), regions[2]), _KERNEL)
     return np.asarray(highest != lowest)
 
 
-def _outline(corners_camera: FloatArray) -> FloatArray:
-    """Closed outline (33, 3) with eight points a side."""
+def _outline(plate: Plate) -> FloatArray:
+    """Outline (32, 3) in ``map`` with eight points a side."""
+    corners = plate.outline_map
     s = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None]
-    sides = [a + s * (b - a) for a, b in zip(corners_camera, np.roll(corners_camera, -1, axis=0), strict=True)]
-    return np.concatenate([*sides, corners_camera[:1]])
+    return np.concatenate([a + s * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
 
 
 def _clip(outline: FloatArray) -> FloatArray:
-    """The part of a closed outline in front of the camera, with the points where it crosses the near plane."""
-    a, b = outline[:-1], outline[1:]
-    crossing = (a[:, 2] > _NEAR) != (b[:, 2] > _NEAR)
+    """The points of a closed outline (N, 3) before the near plane, and those where it crosses that."""
+    a, b = outline, np.roll(outline, -1, axis=0)
+    front = outline[:, 2] > _NEAR
+    crossing = front != np.roll(front, -1)
     a, b = a[crossing], b[crossing]
     share = (_NEAR - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
-    return np.concatenate([outline[outline[:, 2] > _NEAR], a + share * (b - a)])
+    return np.concatenate([outline[front], a + share * (b - a)])

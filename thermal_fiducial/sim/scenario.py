@@ -44,7 +44,7 @@ class Scenario:
     markers: tuple[Marker, ...]
     lens: Lens = LENSES['13mm']
     camera_position: tuple[float, float, float] = (0.12, 0.02, -0.04)
-    camera_orientation: tuple[float, float, float, float] = (-0.49, 0.51, -0.495, 0.505)
+    camera_orientation: tuple[float, float, float, float] = (-0.49307, 0.489088, -0.497699, 0.519587)
     camera_time_offset: float = 0.0
     dictionary: str = 'DICT_4X4_50'
     flight: Flight | RecordedFlight = Flight()  # noqa: RUF009
@@ -104,7 +104,7 @@ def _wall() -> tuple[Marker, ...]:
 
 def _room() -> tuple[Marker, ...]:
     """Three rows of markers round the walls of the default room, every 0.9 m or so, at changing heights."""
-    markers = []
+    markers: list[Marker] = []
     walls = ((4.9, 180.0, 1), (3.9, -90.0, 0), (-3.9, 0.0, 1), (-3.9, 90.0, 0))
     for wall, (distance, yaw, axis) in enumerate(walls):
         for step in range(6):

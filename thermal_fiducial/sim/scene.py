@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
 from thermal_fiducial.sim.trajectory import pose_matrix
 
 
@@ -40,22 +40,29 @@ class Marker:
     roll_deg: float = 0.0
     size: float = 0.30
 
-    @property
+    @cached_property
     def rotation(self) -> Rotation:
         """R_map_marker."""
         return facing(self.yaw_deg, self.tilt_deg, self.roll_deg)
 
-    @property
+    @cached_property
     def T_map_marker(self) -> FloatArray:
         """(4, 4)."""
         return pose_matrix(self.rotation, self.position)
 
-    @property
+    @cached_property
     def corners_map(self) -> FloatArray:
         """(4, 3) in ``map`` [m], clockwise from the top-left."""
         s = self.size / 2
         local = np.array([[-s, s, 0, 1], [s, s, 0, 1], [s, -s, 0, 1], [-s, -s, 0, 1.0]])
         return np.asarray((local @ self.T_map_marker.T)[:, :3])
+
+    @cached_property
+    def spread_map(self) -> FloatArray:
+        """Points (25, 3) all over the square, in ``map`` [m]."""
+        a, b = np.meshgrid(np.linspace(0, 1, 5), np.linspace(0, 1, 5))
+        first, right, _, down = self.corners_map
+        return np.asarray(first + a.reshape(-1, 1) * (right - first) + b.reshape(-1, 1) * (down - first))
 
 
 @dataclass(frozen=True)
@@ -139,17 +146,18 @@ class Room:
     excess: tuple[float, ...] = (0.3, 0.0, -0.4, 0.2, -0.8, 0.9)
     texture: float = 0.25
 
-    def look(self, origin: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def look(self, origin: FloatArray, directions: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Excess [K] and distance (in units of the direction's length) along ``directions`` (..., 3) from inside."""
-        safe = np.where(np.abs(directions) < 1e-9, 1e-9, directions)
-        walls = np.where(safe > 0, np.array(self.high), np.array(self.low))
-        along = (walls - origin) / safe
+        safe = np.where(np.abs(directions) < 1e-9, np.float32(1e-9), directions)
+        inside = np.asarray(origin, dtype=safe.dtype)
+        walls = np.where(safe > 0, np.array(self.high, safe.dtype), np.array(self.low, safe.dtype))
+        along = (walls - inside) / safe
         axis = np.argmin(along, axis=-1)
         distance = np.take_along_axis(along, axis[..., None], axis=-1)[..., 0]
         side = np.take_along_axis(safe, axis[..., None], axis=-1)[..., 0] > 0
-        x, y, z = np.moveaxis(origin + distance[..., None] * directions, -1, 0)
+        x, y, z = np.moveaxis(inside + distance[..., None] * directions, -1, 0)
         wave = np.sin(1.3 * x + 0.7 * z) + np.sin(1.1 * y - 0.9 * z + 1.0) + np.sin(0.6 * (x + y) + 1.7 * z)
-        return np.array(self.excess)[2 * axis + side] + self.texture * wave, distance
+        return np.array(self.excess, safe.dtype)[2 * axis + side] + self.texture * wave, distance
 
 
 class Plate:
@@ -171,7 +179,7 @@ class Plate:
         T_map_plate: FloatArray,
         width: float,
         height: float,
-        levels: FloatArray,
+        levels: FloatArray | BoolArray,
         opaque: BoolArray,
         hot: float,
         cold: float | None,
@@ -185,18 +193,29 @@ class Plate:
         self.hot, self.cold, self.gradient = hot, cold, gradient
 
     @cached_property
-    def regions(self) -> np.ndarray:
+    def regions(self) -> Gray:
         """(rows + 2, columns + 2) uint8: cells of one number look alike."""
         _, region = np.unique(self.levels + 2 * self.cover, return_inverse=True)
-        return region.reshape(self.levels.shape).astype(np.uint8)
+        return np.asarray(region.reshape(self.levels.shape), dtype=np.uint8)
 
-    @property
+    @cached_property
     def to_cells(self) -> FloatArray:
         """(3, 3): from metres on the plate to column and row of the padded grids."""
         rows, columns = np.array(self.levels.shape) - 2
         return np.array(
             [[columns / self.width, 0, columns / 2 + 1], [0, -rows / self.height, rows / 2 + 1], [0, 0, 1.0]]
         )
+
+    def hides(self, origin: FloatArray, points: FloatArray) -> BoolArray:
+        """Whether each of ``points`` (..., 3) is behind the plate, seen from ``origin`` (3,), all in ``map``."""
+        R, centre = self.T_map_plate[:3, :3], self.T_map_plate[:3, 3]
+        o, p = (origin - centre) @ R, (points - centre) @ R
+        share = o[2] / np.maximum(o[2] - p[..., 2], 1e-9)
+        hit = o[:2] + share[..., None] * (p[..., :2] - o[:2])
+        column, row = np.moveaxis(hit @ self.to_cells[:2, :2].T + self.to_cells[:2, 2], -1, 0)
+        rows, columns = self.cover.shape
+        opaque = self.cover[np.clip(row, 0, rows - 1).astype(int), np.clip(column, 0, columns - 1).astype(int)] > 0
+        return np.asarray(opaque & (share < 1.0 - 1e-6) & (o[2] > 0))
 
     @property
     def outline_map(self) -> FloatArray:

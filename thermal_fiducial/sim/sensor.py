@@ -78,12 +78,13 @@ class Sensor:
         """14-bit counts (height, width) of the temperatures [K] that the bolometers reached at ``t`` [s]."""
         kelvin = cv2.GaussianBlur(temperature, (0, 0), self.psf_sigma_px) if self.psf_sigma_px > 0 else temperature
         rng = np.random.default_rng([seed, 4, frame])
-        kelvin = kelvin + self._pattern(t, kelvin.shape, seed)  # type: ignore[arg-type]
+        kelvin = kelvin + self._pattern(t, kelvin.shape, seed)
         if self.netd > 0:
             kelvin += rng.standard_normal(kelvin.shape, dtype=np.float32) * np.float32(self.netd)
         offset = self.offset_counts + self.drift_counts * float(np.sin(2 * np.pi * t / self.drift_period))
-        counts = np.clip(np.rint(kelvin * np.float32(self.counts_per_kelvin) + offset), 0, FULL_SCALE).astype(np.uint16)
-        where, stuck = _bad_pixels(kelvin.shape, self.bad_pixel_share, seed)  # type: ignore[arg-type]
+        levels = np.rint(kelvin * np.float32(self.counts_per_kelvin) + np.float32(offset))
+        counts: Counts = np.clip(levels, 0, FULL_SCALE).astype(np.uint16)
+        where, stuck = _bad_pixels(kelvin.shape, self.bad_pixel_share, seed)
         counts.reshape(-1)[where] = stuck
         return counts
 
@@ -91,7 +92,7 @@ class Sensor:
         index = self.ffc_index(t)
         growth = np.float32((max(0.0, t - self.ffc_start(index)) / _GROWTH_TIME) ** 0.8)
         after, growing = _patterns(self, shape, seed, index)
-        return after + growth * growing
+        return np.asarray(after + growth * growing, dtype=np.float32)
 
 
 @lru_cache(maxsize=2)
