@@ -72,7 +72,7 @@ def _figures(evaluation: Evaluation) -> list[Figure]:
             'Red dots: one frame of markers each. Blue: the filter, at IMU rate.',
             plots.pose_over_time(evaluation),
         ),
-        Figure('From above', 'The map with its markers and the flight.', plots.top_view(evaluation)),
+        Figure('Map', 'The markers of the map, red where they were seen, and the flight.', plots.map_views(evaluation)),
         Figure(
             'Error',
             'Estimate against truth, with three standard deviations as the filter states them (shaded).',

@@ -10,6 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
+from thermal_fiducial.core.geometry import apply
+from thermal_fiducial.core.pose import marker_corners
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.metrics import GAP_NS
@@ -158,61 +160,66 @@ def _legend(figure: Figure, axis: Axes) -> None:
                 handle.set_markersize(7)
 
 
-def top_view(evaluation: Evaluation) -> str:
-    """The flight from above, with the markers of the map: red seen, green not seen."""
+def map_views(evaluation: Evaluation) -> str:
+    """The flight from above and from the side, with the markers of the map: red seen, green not seen."""
     with styled():
-        figure = Figure(figsize=(6.4, 5.6))
-        draw_top_view(figure.subplots(), evaluation)
+        figure = Figure(figsize=(11.5, 5.0))
+        above, side = figure.subplots(1, 2)
+        draw_view(above, evaluation, (0, 1))
+        draw_view(side, evaluation, (0, 2))
+        above.set_title('From above')
+        side.set_title('From the side')
+        _legend(figure, above)
         return svg(figure)
 
 
-def draw_top_view(axis: Axes, evaluation: Evaluation) -> None:
-    """Draw it into ``axis``."""
-    run = evaluation.run
+def draw_view(axis: Axes, evaluation: Evaluation, shown: tuple[int, int] = (0, 1)) -> None:
+    """Draw two of the three coordinates of flight and markers into ``axis``."""
+    run, columns = evaluation.run, list(shown)
     if run.truth is not None:
-        _path(axis, run.truth, color=TRUTH, linewidth=4.0, alpha=0.3, label='ground truth')
-    _path(axis, run.fiducial, linestyle='', marker='.', markersize=2.0, color=FIDUCIAL, label='fiducial only')
-    _path(axis, run.fused, color=FUSED, linewidth=1.3, label='fused')
+        _path(axis, run.truth, columns, color=TRUTH, linewidth=4.0, alpha=0.3, label='ground truth')
+    _path(axis, run.fiducial, columns, linestyle='', marker='.', markersize=2.0, color=FIDUCIAL, label='fiducial only')
+    _path(axis, run.fused, columns, color=FUSED, linewidth=1.3, label='fused')
     if len(run.fused):
-        start = run.fused.positions[0]
-        axis.plot(start[0], start[1], 'o', color='white', markeredgecolor=FUSED, markeredgewidth=1.6, label='start')
-    _markers(axis, evaluation)
+        start = run.fused.positions[0, columns]
+        axis.plot(*start, 'o', color='white', markeredgecolor=FUSED, markeredgewidth=1.6, label='start')
+    _markers(axis, evaluation, columns)
     axis.set_aspect('equal', adjustable='datalim')
-    axis.set_xlabel('x [m]')
-    axis.set_ylabel('y [m]')
+    axis.set_xlabel(f'{"xyz"[shown[0]]} [m]')
+    axis.set_ylabel(f'{"xyz"[shown[1]]} [m]')
     axis.margins(0.06)
-    axis.legend(loc='upper center', bbox_to_anchor=(0.5, -0.12), ncols=3, handletextpad=0.5, columnspacing=1.4)
 
 
-def _path(axis: Axes, trajectory: Trajectory, **look: Any) -> None:
-    shown = trajectory.positions[thinned(len(trajectory), 2 * MOST_POINTS)]
-    axis.plot(shown[:, 0], shown[:, 1], **look)
+def _path(axis: Axes, trajectory: Trajectory, columns: list[int], **look: Any) -> None:
+    points = trajectory.positions[thinned(len(trajectory), 2 * MOST_POINTS)]
+    axis.plot(points[:, columns[0]], points[:, columns[1]], **look)
 
 
-def _markers(axis: Axes, evaluation: Evaluation) -> None:
+def _markers(axis: Axes, evaluation: Evaluation, columns: list[int]) -> None:
+    """Outlines of the markers; those that share a place in this view share a label."""
     if evaluation.run.marker_map is None:
         return
     seen = set(np.unique(evaluation.run.detections.ids).tolist())
+    labelled: dict[tuple[float, float], list[int]] = {}
     for kind, colour in (('seen', SEEN), ('not seen', UNSEEN)):
         chosen = [m for m in evaluation.run.marker_map.markers.values() if (m.id in seen) == (kind == 'seen')]
         for index, marker in enumerate(chosen):
-            centre, R, half = marker.T_map_marker[:2, 3], marker.T_map_marker[:3, :3], 0.5 * marker.size
-            ends = centre + np.outer([-half, half], R[:2, 0])
+            outline = apply(marker.T_map_marker, marker_corners(marker.size))[:, columns]
             label = None if index else f'marker {kind}'
-            axis.plot(*ends.T, color=colour, linewidth=4.0, solid_capstyle='butt', label=label)
-            # Behind the face, where no path runs.
-            normal = R[:2, 2] / max(float(np.linalg.norm(R[:2, 2])), 1e-6)
-            offset = (-9.0 * float(normal[0]), -9.0 * float(normal[1]))
-            axis.annotate(
-                str(marker.id),
-                (float(centre[0]), float(centre[1])),
-                offset,
-                textcoords='offset points',
-                ha='center',
-                va='center',
-                fontsize=7.5,
-                color=colour,
+            axis.fill(
+                *outline.T,
+                facecolor=colour,
+                edgecolor=colour,
+                linewidth=3.0,
+                alpha=0.85,
+                joinstyle='miter',
+                label=label,
             )
+            x, y = outline.mean(axis=0).round(1).tolist()
+            labelled.setdefault((x, y), []).append(marker.id)
+    for place, ids in labelled.items():
+        text = ' '.join(str(i) for i in sorted(ids))
+        axis.annotate(text, place, (8.0, 0.0), textcoords='offset points', va='center', fontsize=7.5, color=FAINT)
 
 
 def errors_over_time(evaluation: Evaluation) -> str | None:
