@@ -1,0 +1,50 @@
+"""Regenerates the tables of the README: ``python test/bench/readme.py`` (``make tables``).
+
+A table stands between ``<!-- NAME -->`` and ``<!-- end -->``. Parameters come from ``config.py``; measured tables
+from the Markdown files that the benchmarks leave in ``.doc/tables/``.
+"""
+
+from pathlib import Path
+import re
+
+from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, parameters, PoseEkfConfig, Tau2CameraConfig
+
+ROOT = Path(__file__).resolve().parents[2]
+NODES = {
+    'tau2_camera': Tau2CameraConfig,
+    'aruco_detector': ArucoDetectorConfig,
+    'marker_mapper': MarkerMapperConfig,
+    'pose_ekf': PoseEkfConfig,
+}
+
+
+def parameter_table(config: type) -> str:
+    """Markdown table of a node's parameters."""
+    rows = ['| parameter | default | meaning |', '|---|---|---|']
+    for name, item, default in parameters(config):
+        limits = item.metadata
+        extra = f' One of: {", ".join(limits["choices"])}.' if limits['choices'] else ''
+        live = ' Live.' if limits['live'] else ''
+        shown = list(default) if isinstance(default, tuple) else default
+        rows.append(f'| `{name}` | `{shown!r}` | {limits["description"]}{extra}{live} |'.replace("`''`", '`""`'))
+    return '\n'.join(rows)
+
+
+def tables() -> dict[str, str]:
+    """Name to Markdown of every table that can be made now."""
+    measured = {path.stem: path.read_text().strip() for path in sorted((ROOT / '.doc' / 'tables').glob('*.md'))}
+    return measured | {f'parameters {name}': parameter_table(config) for name, config in NODES.items()}
+
+
+def spliced(text: str, contents: dict[str, str]) -> str:
+    """``text`` with each named block replaced."""
+    for name, content in contents.items():
+        block = re.compile(rf'(<!-- {re.escape(name)} -->\n).*?(<!-- end -->)', re.DOTALL)
+        text = block.sub(lambda match, content=content: f'{match[1]}{content}\n{match[2]}', text)
+    return text
+
+
+if __name__ == '__main__':
+    readme = ROOT / 'README.md'
+    readme.write_text(spliced(readme.read_text(), tables()))
+    print(f'{readme.name}: {len(tables())} tables')

@@ -1,0 +1,139 @@
+"""The four stages composed: the offline twin of the node graph.
+
+Tests, benchmarks and tools run it without ROS. What passes from stage to stage is what the topics carry, in their
+precision, so a lock-step replay through the nodes gives the same numbers.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.config import (
+    ArucoDetectorConfig,
+    from_mapping,
+    MarkerMapperConfig,
+    PoseEkfConfig,
+    Tau2CameraConfig,
+)
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.ekf import PoseEkf, PoseUpdate
+from thermal_fiducial.core.geometry import quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.marker_map import MapperResult, MarkerMap, MarkerMapper
+from thermal_fiducial.core.measurements import CameraPose, ImuSample, Markers, Odometry
+from thermal_fiducial.core.thermal import FrameCleaner
+from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
+
+
+@dataclass(frozen=True)
+class PipelineConfig:
+    """The parameters of the four stages."""
+
+    tau2_camera: Tau2CameraConfig = field(default_factory=Tau2CameraConfig)
+    aruco_detector: ArucoDetectorConfig = field(default_factory=ArucoDetectorConfig)
+    marker_mapper: MarkerMapperConfig = field(default_factory=MarkerMapperConfig)
+    pose_ekf: PoseEkfConfig = field(default_factory=PoseEkfConfig)
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any]) -> 'PipelineConfig':
+        """One parameter file for all stages: ROS name to value.
+
+        Raises
+        ------
+        InputError
+            A value of the wrong type or out of range.
+        """
+        values = dict(values)
+        return cls(
+            from_mapping(Tau2CameraConfig, values),
+            from_mapping(ArucoDetectorConfig, values),
+            from_mapping(MarkerMapperConfig, values),
+            from_mapping(PoseEkfConfig, values),
+        )
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """What one thermal frame came to; a stage that was not reached is None."""
+
+    stamp_ns: int
+    #: why the frame was withheld; empty for a good one
+    withheld: str = ''
+    markers: Markers | None = None
+    mapping: MapperResult | None = None
+    update: PoseUpdate | None = None
+
+
+def as_published(T: FloatArray) -> FloatArray:
+    """A transform after the way through a message, which carries position and quaternion."""
+    return transform_from_quaternion(T[:3, 3], quaternion_from_rotation(T[:3, :3]))
+
+
+class Pipeline:
+    """Frames and IMU samples in, in the order of their arrival; odometry out.
+
+    Parameters
+    ----------
+    config : parameters of the stages
+    dictionary : ArUco dictionary of the markers
+    marker_map : the map to start from; at least one marker with a known pose
+    camera : intrinsics; may come later, frames before it give nothing
+    bad_pixels : (N, 2) column and row of dead pixels
+    """
+
+    def __init__(
+        self,
+        config: PipelineConfig,
+        dictionary: cv2.aruco.Dictionary,
+        marker_map: MarkerMap,
+        camera: Camera | None = None,
+        bad_pixels: IntArray | None = None,
+    ) -> None:
+        self.camera = camera
+        self.cleaner = FrameCleaner(config.tau2_camera, bad_pixels)
+        self.detector = MarkerDetector(config.aruco_detector, dictionary)
+        self.mapper = MarkerMapper(config.marker_mapper, marker_map)
+        self.filter = PoseEkf(config.pose_ekf)
+        self._odometry: Odometry | None = None
+        self._share_map()
+
+    def add_imu(self, sample: ImuSample) -> Odometry | None:
+        """Odometry at the stamp of an IMU sample; None before the filter is initialised."""
+        odometry = self.filter.add_imu(sample)
+        if odometry is not None:
+            self._odometry = replace(odometry, T_map_body=as_published(odometry.T_map_body))
+        return odometry
+
+    def add_image(self, stamp_ns: int, counts: Counts | Gray) -> FrameResult:
+        """Clean, detect, map and correct with one raw thermal frame (H, W) at its stamp."""
+        frame = self.cleaner.process(stamp_ns, counts)
+        if frame.counts is None or self.camera is None:
+            return FrameResult(stamp_ns, withheld=frame.reason or 'no camera_info')
+        markers = self.detector.detect(stamp_ns, frame.counts, self.camera, self._odometry)
+        mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry)
+        if mapping.map_changed:
+            self._share_map()
+        update = None if mapping.pose is None else self.filter.add_pose(_published_pose(mapping.pose))
+        return FrameResult(stamp_ns, markers=markers, mapping=mapping, update=update)
+
+    def _share_map(self) -> None:
+        """The detector looks for the markers of the map, as the ``marker_map`` topic gives them."""
+        rows = self.mapper.map.rows()
+        poses = transform_from_quaternion(
+            np.stack([rows[name] for name in 'xyz'], axis=-1),
+            np.stack([rows[name] for name in ('qx', 'qy', 'qz', 'qw')], axis=-1),
+        )
+        self.detector.set_map(
+            {
+                int(row['id']): (pose, float(row['size']))
+                for row, pose in zip(rows, poses, strict=True)
+                if row['trusted']
+            }
+        )
+
+
+def _published_pose(pose: CameraPose) -> CameraPose:
+    return replace(pose, T_map_camera=as_published(pose.T_map_camera), marker_ids=(), rms_px=0.0)
