@@ -56,7 +56,7 @@ class Motion:
         """(..., 6) true rate and specific force in the body."""
         phi, phi_dot = self._sum(self.rotation, t, 0), self._sum(self.rotation, t, 1)
         rate = so3_left_jacobian(-phi) @ phi_dot[..., None]
-        lift = self._sum(self.position, t, 2) + [0.0, 0.0, GRAVITY]
+        lift = self._sum(self.position, t, 2) + np.array([0.0, 0.0, GRAVITY])
         force = np.swapaxes(so3_exp(phi), -1, -2) @ lift[..., None]
         return np.concatenate((rate, force), axis=-2)[..., 0]
 
@@ -142,7 +142,7 @@ def matched(**changes) -> PoseEkfConfig:
 
 
 def timeline(samples: Iterable[ImuSample], poses: Iterable[CameraPose], delay=0.0):
-    """Samples and poses in the order of arrival; poses arrive ``delay`` (a number or one each) [s] after their stamp."""
+    """Samples and poses as they arrive, poses ``delay`` (a number or one each) [s] after their stamps."""
     poses = list(poses)
     delays = np.broadcast_to(delay, len(poses))
     arrivals = [(sample.stamp_ns, 0, sample) for sample in samples]

@@ -28,6 +28,7 @@ def state():
         velocity=np.array([1.0, -0.5, 0.2]),
         position=np.array([4.0, 2.0, -1.0]),
         bias=0.01 * rng.normal(size=6),
+        clock_open=True,
         covariance=A @ A.T,
     )
 
@@ -50,6 +51,18 @@ def difference(state, other):
             np.linalg.inv(so3_left_jacobian(phi)) @ extrinsics[:3, 3],
         )
     )
+
+
+def intercepted(filter_):
+    """Innovation and Jacobian of the next update, which isn't made."""
+    seen = {}
+
+    def update(state, innovation, H, noise):
+        seen.update(y=innovation, H=H)
+        return state, 0.0
+
+    filter_._update = update
+    return seen
 
 
 def test_inject_moves_the_state_by_the_error(state):
@@ -119,8 +132,7 @@ def test_covariance_of_the_body_pose_has_the_lever_arm():
 def test_time_offset_and_extrinsics_columns(state):
     """A pose taken earlier, and one through other extrinsics, differ as the columns of H say."""
     filter_ = ErrorStateFilter(FULL)
-    seen = {}
-    filter_._update = lambda state, innovation, H, noise: seen.update(y=innovation, H=H)
+    seen = intercepted(filter_)
     imu = np.concatenate((np.array([0.5, -1.0, 0.7]) + state.bias[:3], np.zeros(3)))
     later = transform(state.R_map_body @ so3_exp([0.5e-6, -1e-6, 0.7e-6]), state.position + 1e-6 * state.velocity)
     pose = CameraPose(0, later @ state.T_body_camera, np.eye(6))
@@ -135,8 +147,7 @@ def test_time_offset_and_extrinsics_columns(state):
 
 def test_alignment_column_of_tilt_bias_and_gravity(state):
     filter_ = ErrorStateFilter(FULL)
-    seen = {}
-    filter_._update = lambda state, innovation, H, noise: seen.update(y=innovation, H=H)
+    seen = intercepted(filter_)
     for place in (0, 1, 2, 12, 13, 14, LAYOUT.gravity.start, LAYOUT.gravity.start + 1):
         error = np.zeros(LAYOUT.size)
         error[place] = 1e-6

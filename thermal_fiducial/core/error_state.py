@@ -1,6 +1,6 @@
 """Prediction and correction of one estimate. Covariances are filterpy's work, the state on the group is ours."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from filterpy.kalman import ExtendedKalmanFilter
 import numpy as np
@@ -25,6 +25,10 @@ from thermal_fiducial.core.types import FloatArray
 #: Angular [rad/s^2] and linear [m/s^2] acceleration of ordinary flight. While the time offset is uncertain by s, a pose
 #: is known to second order only: half the acceleration times the square of the offset, of variance 3/4 a^2 s^4.
 _AGILITY_SQUARED = np.repeat((5.0**2, 3.0**2), 3)
+#: Root of the sum of the velocity variances [m/s] from which the time offset is estimated, and by how much the rate
+#: [rad/s] and the velocity [m/s] may have changed until then.
+_KNOWN_VELOCITY, _UNSEEN_CHANGE = 0.2, 0.5
+_SIX = np.arange(6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +80,7 @@ class ErrorStateFilter:
             state.bias,
             state.gravity,
             state.time_offset,
+            state.clock_open,
             state.T_body_camera,
             algebra.P,
         )
@@ -95,17 +100,52 @@ class ErrorStateFilter:
     def correct(self, state: NavigationState, pose: BodyPose, imu: FloatArray) -> tuple[NavigationState, float]:
         """State corrected by a pose at its own instant, and the normalised innovation squared.
 
-        ``imu`` (6,): sample at that instant. A clock error moves the measured pose along the robot's motion; where
-        the offset isn't estimated this, and always the jitter of the stamps, enters the noise fully correlated.
+        ``imu`` (6,): sample at that instant.
         """
         motion = np.concatenate((imu[:3] - state.bias[:3], state.velocity_body))
-        H, floor, place = self._H_pose, self._floor, self.layout.time_offset
-        if place is not None:
+        H = self._H_pose
+        if state.clock_open:
             H = H.copy()
-            H[:, place] = motion
-            floor = floor + 0.75 * state.covariance[place, place] ** 2 * _AGILITY_SQUARED
-        noise = pose.covariance + np.diag(floor) + self._clock_variance * np.outer(motion, motion)
-        return self._update(state, pose_innovation(state, pose.T_map_body), H, noise)
+            H[:, self.layout.time_offset] = motion
+        noise = pose.covariance + self._clock_noise(state, motion)
+        noise[_SIX, _SIX] += self._floor
+        corrected, nis = self._update(state, pose_innovation(state, pose.T_map_body), H, noise)
+        return self._open_clock(corrected, imu), nis
+
+    def _clock_noise(self, state: NavigationState, motion: FloatArray) -> FloatArray:
+        """What a clock error that isn't in the state, or is there to first order only, makes of a pose (6, 6).
+
+        A clock error moves a pose along the motion: the jitter of the stamps, and the offset where it isn't estimated,
+        are noise correlated over all axes.
+        """
+        noise = self._clock_variance * np.outer(motion, motion)
+        place = self.layout.time_offset
+        if place is None:
+            return noise
+        if not state.clock_open:
+            noise[_SIX, _SIX] += (self._config.time_offset_std * _UNSEEN_CHANGE) ** 2
+            return noise
+        variance = state.covariance[place, place]
+        noise[_SIX, _SIX] += 0.75 * variance**2 * _AGILITY_SQUARED
+        noise[3:, 3:] += variance * state.covariance[VELOCITY, VELOCITY]
+        return noise
+
+    def _open_clock(self, state: NavigationState, imu: FloatArray) -> NavigationState:
+        """Begin to estimate the time offset once the velocity is known.
+
+        Before, it would multiply an unknown velocity. Until then the state follows the clock of the camera, thus the
+        offset starts fully correlated with it: X(t + s) = X(t) Exp((rate, acceleration, velocity) s).
+        """
+        place = self.layout.time_offset
+        if place is None or state.clock_open or state.covariance[VELOCITY, VELOCITY].trace() > _KNOWN_VELOCITY**2:
+            return state
+        slide = np.zeros(self.layout.size)
+        slide[ROTATION] = state.bias[:3] - imu[:3]
+        slide[VELOCITY] = state.bias[3:] - imu[3:] - state.gravity @ state.R_map_body
+        slide[POSITION] = -state.velocity_body
+        slide[place] = 1.0
+        covariance = state.covariance + self._config.time_offset_std**2 * np.outer(slide, slide)
+        return replace(state, clock_open=True, covariance=covariance)
 
     def align(self, state: NavigationState, force: FloatArray, std: float) -> tuple[NavigationState, float]:
         """State corrected by the specific force (3,) of a robot at rest, known to ``std`` [m/s^2]."""

@@ -63,6 +63,7 @@ def blank_state(config: PoseEkfConfig, layout: Layout) -> NavigationState:
         bias=np.zeros(6),
         gravity=np.array([0.0, 0.0, -config.gravity]),
         time_offset=0.0,
+        clock_open=False,
         T_body_camera=transform_from_quaternion(config.camera_position, config.camera_orientation),
         covariance=np.zeros((layout.size, layout.size)),
     )
@@ -82,7 +83,7 @@ def start(
     force = imu.mean(axis=0)[3:]
     if up @ force < math.cos(LARGEST_TILT) * np.linalg.norm(force):
         return None
-    state = _unaligned(config, filter_.layout, pose, prior, imu[-1])
+    state = _unaligned(config, filter_.layout, pose, prior)
     still = rest(imu, config.gravity)
     if still:
         state, _ = filter_.align(state, still.force, FORCE_STD)
@@ -90,16 +91,12 @@ def start(
     return state
 
 
-def _unaligned(
-    config: PoseEkfConfig, layout: Layout, pose: BodyPose, prior: NavigationState, imu: FloatArray
-) -> NavigationState:
+def _unaligned(config: PoseEkfConfig, layout: Layout, pose: BodyPose, prior: NavigationState) -> NavigationState:
     variances = np.zeros(layout.size)
     variances[ROTATION], variances[POSITION] = config.attitude_floor**2, config.position_floor**2
     variances[VELOCITY] = config.initial_velocity_std**2
     variances[GYROSCOPE_BIAS] = config.initial_gyroscope_bias_std**2
     variances[ACCELEROMETER_BIAS] = config.initial_accelerometer_bias_std**2
-    # The pose may be of another instant: the way that the robot, at a speed still unknown, makes meanwhile.
-    variances[POSITION] += (config.initial_velocity_std * config.time_offset_std) ** 2
     if layout.gravity:
         variances[layout.gravity] = (config.gravity * config.map_tilt_std) ** 2
     if layout.extrinsics:
@@ -107,15 +104,11 @@ def _unaligned(
         variances[layout.extrinsics] = np.repeat(np.square(stds), 3)
     P = np.diag(variances)
     P[np.ix_(POSE, POSE)] += pose.covariance
-    turned = np.zeros(layout.size)
-    turned[ROTATION] = -imu[:3]
-    if layout.time_offset is not None:
-        turned[layout.time_offset] = 1.0
-    P += config.time_offset_std**2 * np.outer(turned, turned)
     return replace(
         prior,
         R_map_body=pose.T_map_body[:3, :3],
         position=pose.T_map_body[:3, 3],
         velocity=np.zeros(3),
+        clock_open=False,
         covariance=P,
     )

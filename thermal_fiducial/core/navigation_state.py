@@ -67,6 +67,8 @@ class NavigationState:
     gravity: FloatArray
     #: [s], t_imu = t_camera + camera_time_offset + time_offset
     time_offset: float
+    #: whether the time offset is being estimated: it is once the velocity is known
+    clock_open: bool
     #: (4, 4)
     T_body_camera: FloatArray
     #: (n, n) of the error coordinates of :class:`Layout`
