@@ -87,29 +87,28 @@ class Scenario:
 
 
 def _wall() -> tuple[Marker, ...]:
-    """Eight markers between 2.5 and 4.5 m in front of home, at different depths and angles."""
+    """Eight markers between 2.5 and 4.5 m in front of home, at various depths and angles; the first is seen from it."""
     depth = (3.2, 2.9, 3.5, 4.4, 3.0, 3.8, 2.8, 4.1)
     yaw = (180, 165, 190, 172, 200, 183, 160, 195)
     tilt = (0, 8, -6, 4, -10, 5, 12, -3)
     markers = []
     for index in range(8):
-        column, row = index % 4, index // 4
+        column, row = (index + 2) % 4, index // 4
         y = (1.5 - column) * 0.52 * depth[index] / 3.2
-        z = 1.25 + (0.5 - row) * 0.62 * depth[index] / 3.2
-        markers.append(
-            Marker(index + 2, (depth[index], round(y, 3), round(z, 3)), yaw[index], tilt[index], 3.0 * index - 8)
-        )
+        z = 1.25 + (row - 0.5) * 0.62 * depth[index] / 3.2
+        position = (depth[index], round(y, 3), round(z, 3))
+        markers.append(Marker(index + 2, position, yaw[index], tilt[index], 3.0 * index - 8.0))
     return tuple(markers)
 
 
 def _room() -> tuple[Marker, ...]:
-    """Three rows of markers round the walls of the default room, every 0.9 m or so, at changing heights."""
+    """Six markers on each wall of the default room at changing heights; the first is in front of home."""
     markers: list[Marker] = []
     walls = ((4.9, 180.0, 1), (3.9, -90.0, 0), (-3.9, 0.0, 1), (-3.9, 90.0, 0))
     for wall, (distance, yaw, axis) in enumerate(walls):
-        for step in range(6):
+        for step in (2, 3, 1, 4, 0, 5):
             along = (-2.5 + step) * (1.05 if axis else 1.25) + (0.0 if axis else 0.5)
-            height = (1.0, 1.75, 1.3)[(step + wall) % 3]
+            height = (1.3, 1.0, 1.75)[(step + wall) % 3]
             x, y = (distance, along) if axis else (along, distance)
             turn = ((7 * step + 5 * wall) % 5 - 2) * 6.0
             markers.append(Marker(len(markers) + 2, (x, y, height), yaw + turn, 3.0 * (step % 3 - 1), 0.0, 0.40))

@@ -111,8 +111,8 @@ class Flight:
     ground_time, climb_time, hover_time : [s]
     """
 
-    home: tuple[float, float, float] = (0.0, 0.0, 0.15)
-    height: float = 1.1
+    home: tuple[float, float, float] = (0.0, 0.0, 0.40)
+    height: float = 0.9
     amplitude: tuple[float, float, float] = (0.5, 0.6, 0.25)
     period: tuple[float, float, float] = (9.0, 7.0, 5.0)
     sway_deg: float = 8.0
