@@ -9,6 +9,7 @@ y(t) = integral of x(t - a) exp(-a / tau) / tau da, and a moving edge is smeared
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -219,6 +220,7 @@ def _lattice(samples: int, duration: float, lag: float) -> tuple[FloatArray, Flo
     return columns[order] - 0.5, rows[order] - 0.5, ages[order], forget
 
 
+@lru_cache(maxsize=2)
 def _pixel_rays(lens: Lens) -> Float32Array:
     """(7, height, width): ray x y 1 of each pixel's centre, and dx/du dx/dv dy/du dy/dv."""
     v, u = np.mgrid[0 : lens.height, 0 : lens.width].astype(np.float64)
@@ -229,6 +231,7 @@ def _pixel_rays(lens: Lens) -> Float32Array:
     return np.stack(terms).astype(np.float32)
 
 
+@lru_cache(maxsize=2)
 def _coarse_rays(lens: Lens) -> FloatArray:
     """Rays (rows, columns, 3) through the centres of blocks of pixels, as ``cv2.resize`` takes them."""
     rows, columns = -(-lens.height // _COARSE), -(-lens.width // _COARSE)
