@@ -51,8 +51,8 @@ def print_tables(shown: list[Table]) -> None:
     for entry in shown:
         table = rich.table.Table(title=entry.title, title_justify='left', box=box.SIMPLE_HEAD, title_style='bold')
         for index, head in enumerate(entry.heads):
-            style = {'fused': 'blue', 'fiducial': 'red'}.get(head)
-            table.add_column(Text(head), justify='left' if index == 0 or entry.textual else 'right', header_style=style or '')
+            style = {'fused': 'blue', 'fiducial': 'red'}.get(head, '')
+            table.add_column(Text(head), justify='left' if index == 0 or entry.textual else 'right', header_style=style)
         for row in entry.rows:
             table.add_row(*map(Text, row))
         console.print(table)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from thermal_fiducial.core.map_data import MarkerMap
+from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
@@ -26,10 +27,11 @@ _LEVELS = ('ok', 'warning', 'error', 'stale')
 
 @dataclass(frozen=True)
 class Detections:
-    """Rows of detections.csv."""
+    """Rows (N,) of detections.csv, and their corners (N, 4, 2) [px]."""
 
     stamps_ns: IntArray
     ids: IntArray
+    corners_px: FloatArray
     sigma_px: FloatArray
 
 
@@ -135,8 +137,10 @@ def _rows(path: Path, kinds: dict[str, type]) -> list[list[Any]]:
 
 
 def _detections(path: Path) -> Detections:
-    stamps, ids, sigmas = _rows(path, {'stamp_ns': int, 'id': int, 'sigma_px': float})
-    return Detections(np.array(stamps, np.int64), np.array(ids, np.int64), np.array(sigmas, np.float64))
+    kinds = {'stamp_ns': int, 'id': int, 'sigma_px': float} | dict.fromkeys(CORNER_FIELDS, float)
+    stamps, ids, sigmas, *corners = _rows(path, kinds)
+    corners_px = np.array(corners, np.float64).T.reshape(-1, 4, 2)
+    return Detections(np.array(stamps, np.int64), np.array(ids, np.int64), corners_px, np.array(sigmas, np.float64))
 
 
 def _latencies(path: Path) -> dict[str, tuple[IntArray, FloatArray]]:

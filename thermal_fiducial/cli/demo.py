@@ -1,0 +1,98 @@
+"""``demo``: a flight through fog, from the simulated camera to the report."""
+
+import argparse
+import os
+from pathlib import Path
+import shutil
+import sys
+import time
+from typing import Any
+
+from thermal_fiducial.cli.evaluate import print_tables
+from thermal_fiducial.cli.replay import progress_bar
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.report import evaluate_run, Evaluation, write_page
+from thermal_fiducial.report.tables import tables
+
+SCENARIO = 'fog'
+#: Stands in the folder of a demo: only such a folder is ever replaced.
+MARK = '.thermal_fiducial_demo'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument(
+        '--out', type=Path, default=Path('runs/demo'), metavar='RUN', help='folder (default: runs/demo)'
+    )
+    parser.add_argument('--seconds', type=float, default=30.0, help='length of the flight [s] (default: 30)')
+    parser.add_argument('--seed', type=int, default=0, help='of path and noise (default: 0)')
+    parser.add_argument('--picture', type=Path, metavar='PNG', help='also draw frame, map and error into one picture')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Simulate, replay, score, report."""
+    started = time.monotonic()
+    _make_room(args.out)
+    bag = args.out / 'bag'
+    _simulate(bag, args.seconds, args.seed)
+    _replay(bag, args.out)
+    evaluation, numbers = evaluate_run(args.out, bag)
+    page = write_page(evaluation, numbers)
+    if args.picture is not None:
+        from thermal_fiducial.report.picture import draw_picture
+
+        draw_picture(evaluation, bag, args.picture)
+    _say(evaluation, numbers)
+    print(f'\n{time.monotonic() - started:.0f} s from start to end. The report, with all pictures: {page}')
+    return 0
+
+
+def _make_room(out: Path) -> None:
+    """An empty folder ``out``, in the place of an earlier demo if there is one."""
+    if out.exists() and not (out / MARK).is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f'{out} exists and is no earlier demo: choose another folder with --out')
+    try:
+        if out.exists():
+            shutil.rmtree(out)
+        out.mkdir(parents=True)
+        (out / MARK).touch()
+    except OSError as error:
+        raise InputError(f'{out}: {error.strerror}') from None
+
+
+def _simulate(bag: Path, seconds: float, seed: int) -> None:
+    from thermal_fiducial.sim.camera import plan
+    from thermal_fiducial.sim.writer import write_flight
+
+    flight = plan(SCENARIO, seconds, seed)
+    with _step(f'1/3 simulating {flight.seconds:g} s of flight') as share:
+        done = 0
+
+        def advance(frames: int) -> None:
+            nonlocal done
+            done += frames
+            share(min(1.0, done / flight.frame_count))
+
+        write_flight(bag, flight, workers=len(os.sched_getaffinity(0)), progress=advance)
+
+
+def _replay(bag: Path, out: Path) -> None:
+    try:
+        from thermal_fiducial.replay.replay import Options, replay
+    except ImportError as error:
+        raise InputError(f'the demo runs the ROS 2 nodes and finds no {error.name}: install the extra "ros"') from None
+    options = Options(bag=bag, run=out, params=bag / 'params.yaml', map_file=bag / 'map_one.yaml')
+    with _step('2/3 replaying it through the four nodes') as share:
+        replay(options, share, lambda line: print(f'warning: {line}', file=sys.stderr))
+    print('3/3 scoring', file=sys.stderr)
+
+
+def _step(title: str) -> Any:
+    if not sys.stderr.isatty():
+        print(title, file=sys.stderr)
+    return progress_bar(title)
+
+
+def _say(evaluation: Evaluation, numbers: dict[str, Any]) -> None:
+    wanted = ('Accuracy', 'Output', 'Drop-outs')
+    print_tables([table for table in tables(evaluation, numbers) if table.title.startswith(wanted)])
