@@ -8,11 +8,11 @@ import shutil
 from typing import Any, Self, TextIO
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
-from thermal_fiducial.core.geometry import inverse, quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.geometry import inverse, transform_from_quaternion
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagWriter
@@ -78,14 +78,11 @@ class RunFiles:
         return dict(sorted(self._last_figures.items()))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._write_pose(self._fused, message, convert.transform_of(message.pose.pose))
+        _write_pose(self._fused, message, message.pose.pose)
 
     def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._write_pose(self._fiducial, message, convert.transform_of(message.pose.pose) @ self._T_camera_body)
-
-    def _write_pose(self, file: TextIO, message: PoseWithCovarianceStamped, T_map_body: FloatArray) -> None:
-        q = quaternion_from_rotation(T_map_body[:3, :3])
-        file.write(tum_line(convert.stamp_ns(message.header.stamp), T_map_body[:3, 3], q) + '\n')
+        T_map_body = convert.transform_of(message.pose.pose) @ self._T_camera_body
+        _write_pose(self._fiducial, message, convert.pose(T_map_body))
 
     def _on_markers(self, message: PointCloud2) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
@@ -118,6 +115,11 @@ def extrinsics(config: Any) -> FloatArray:
 
 def _opened(path: Path) -> TextIO:
     return path.open('w', encoding='utf-8')
+
+
+def _write_pose(file: TextIO, message: PoseWithCovarianceStamped, pose: Pose) -> None:
+    p, q = pose.position, pose.orientation
+    file.write(tum_line(convert.stamp_ns(message.header.stamp), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)) + '\n')
 
 
 def _type_name(kind: Any) -> str:

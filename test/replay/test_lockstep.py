@@ -1,0 +1,128 @@
+"""Replay in lock-step: complete, deterministic, equal to the offline pipeline, robust against bad bags."""
+
+import json
+
+import numpy as np
+import pytest
+from support import small_bag
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.geometry import inverse, rotation_angle, transform_from_quaternion
+from thermal_fiducial.core.measurements import CORNER_FIELDS
+from thermal_fiducial.core.pipeline import Pipeline, PipelineConfig
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.files.trajectory import load_tum, tum_line
+from thermal_fiducial.ros import convert
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    """A bag with its parameters and a map of one marker."""
+    folder = tmp_path_factory.mktemp('small')
+    small_bag.recording().write(folder / 'bag')
+    small_bag.side_files(folder)
+    return folder
+
+
+def replay(bag, out, folder, *extra):
+    """Exit status of the command."""
+    return main(
+        ['replay', str(bag), '--out', str(out), '--params', str(folder / 'params.yaml')]
+        + ['--map', str(folder / 'map.yaml'), '--no-report', *map(str, extra)]
+    )
+
+
+@pytest.fixture(scope='module')
+def run(folder):
+    assert replay(folder / 'bag', folder / 'run', folder) == 0
+    return folder / 'run'
+
+
+def test_every_imu_message_after_the_start_has_its_pose(run):
+    stamps, _, _ = load_tum(run / 'fused.tum')
+    imu_ns = small_bag.START_NS + 5_000_000 * np.arange(600)
+    expected = imu_ns[imu_ns >= stamps[0]]
+    np.testing.assert_array_equal(stamps, expected)
+    # The filter starts with its third pose, a tenth of a second in.
+    assert stamps[0] - small_bag.START_NS < 300_000_000
+
+
+def test_poses_are_those_of_the_flight(run):
+    # The flat pictures are good to a few tenths of a pixel, which is about a centimetre at 2.5 m.
+    for name, tolerance in (('fused.tum', 0.03), ('fiducial.tum', 0.05)):
+        stamps, positions, quaternions = load_tum(run / name)
+        t = (stamps - small_bag.START_NS) * 1e-9
+        error = inverse(small_bag.true_pose(t)) @ transform_from_quaternion(positions, quaternions)
+        assert np.sqrt(np.mean(np.sum(error[:, :3, 3] ** 2, axis=1))) < tolerance
+        assert np.sqrt(np.mean(rotation_angle(error[:, :3, :3]) ** 2)) < 0.02
+
+
+def test_unknown_markers_enter_the_map(run):
+    found, true = load_map(run / 'marker_map.yaml').markers, small_bag.map_of(range(4)).markers
+    assert sorted(found) == [0, 1, 2, 3]
+    for key, marker in found.items():
+        # As above: flat pictures, a centimetre or two.
+        assert np.linalg.norm(marker.T_map_marker[:3, 3] - true[key].T_map_marker[:3, 3]) < 0.05
+
+
+def test_the_run_folder_is_complete(run):
+    summary = json.loads((run / 'summary.json').read_text())
+    assert summary['messages_in'] == {IMAGE_TOPIC: 90, CAMERA_INFO_TOPIC: 90, IMU_TOPIC: 600}
+    assert summary['messages_out']['markers'] == 90
+    assert summary['frames_with_markers'] == 90
+    lines = (run / 'detections.csv').read_text().splitlines()
+    assert lines[0] == 'stamp_ns,id,u0,v0,u1,v1,u2,v2,u3,v3,sigma_px'
+    assert len(lines) == 1 + 4 * 90
+    with BagReader(run / 'output') as bag:
+        assert bag.message_count(['pose']) == len((run / 'fused.tum').read_text().splitlines())
+        assert bag.message_count(['diagnostics']) == 4 * 3  # four nodes; two whole seconds and the end
+
+
+def test_two_replays_give_the_same_bytes(run, folder):
+    assert replay(folder / 'bag', folder / 'again', folder) == 0
+    files = sorted(path.relative_to(run) for path in run.rglob('*') if path.is_file())
+    assert len(files) >= 8
+    assert files == sorted(
+        path.relative_to(folder / 'again') for path in (folder / 'again').rglob('*') if path.is_file()
+    )
+    for file in files:
+        assert (run / file).read_bytes() == (folder / 'again' / file).read_bytes(), file
+
+
+def test_lockstep_equals_the_pipeline(run, folder):
+    pipeline = Pipeline(
+        PipelineConfig.from_mapping(small_bag.PARAMETERS),
+        load_dictionary('DICT_4X4_50'),
+        load_map(folder / 'map.yaml'),
+        small_bag.CAMERA,
+    )
+    fused, corners = [], []
+    with BagReader(folder / 'bag') as bag:
+        for recorded in bag.messages([IMAGE_TOPIC, IMU_TOPIC]):
+            message = recorded.message
+            stamp = convert.stamp_ns(message.header.stamp)
+            if recorded.topic == IMU_TOPIC:
+                odometry = pipeline.add_imu(convert.imu_sample(message))
+                fused += [] if odometry is None else [(odometry.stamp_ns, odometry.T_map_body)]
+            else:
+                counts = message.data.view('<u2').reshape(message.height, message.width)
+                corners += [_cells(stamp, row) for row in pipeline.add_image(stamp, counts).markers]
+    assert [_line(*pose) for pose in fused] == (run / 'fused.tum').read_text().splitlines()
+    rows = [line.split(',')[:10] for line in (run / 'detections.csv').read_text().splitlines()[1:]]
+    assert corners == rows
+    save_map(folder / 'pipeline.yaml', pipeline.mapper.map)
+    assert (folder / 'pipeline.yaml').read_bytes() == (run / 'marker_map.yaml').read_bytes()
+
+
+def _line(stamp, T):
+    pose = convert.pose(T)
+    p, q = pose.position, pose.orientation
+    return tum_line(stamp, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+
+
+def _cells(stamp, row):
+    return [str(stamp), str(row['id']), *(f'{row[name]:.5f}' for name in CORNER_FIELDS)]

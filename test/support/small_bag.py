@@ -1,0 +1,165 @@
+"""A bag that is made in a second: four markers on a wall, warped flat pictures, a robot that sways in front of it.
+
+Good enough to run everything that handles bags; no measure of accuracy, which is the simulator's matter.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import cv2
+import numpy as np
+from rosbags.typesys import get_typestore, Stores
+import yaml
+
+from support.flights import Motion
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry import apply, inverse, transform
+from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.pose import marker_corners
+from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.marker_map import save_map
+
+START_NS = 1_700_000_000_000_000_000
+CAMERA = Camera(640, 512, np.array([[745.0, 0.0, 319.5], [0.0, 745.0, 255.5], [0.0, 0.0, 1.0]]))
+T_BODY_CAMERA = transform([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], [0.1, 0.0, 0.0])
+R_MAP_MARKER = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+SIZE = 0.3
+#: ID to its centre in the map
+CENTRES = {0: (2.5, 0.32, 0.26), 1: (2.5, -0.28, 0.3), 2: (2.5, 0.28, -0.3), 3: (2.5, -0.32, -0.26)}
+PARAMETERS = {'marker_size': SIZE, 'camera_position': [0.1, 0.0, 0.0], 'camera_orientation': [-0.5, 0.5, -0.5, 0.5]}
+_COLD, _HOT, _NOISE = 7000, 7600, 4.0
+_PIXELS_PER_BIT = 40
+
+_TYPES = get_typestore(Stores.ROS2_JAZZY).types
+
+
+@dataclass
+class Recording:
+    """What is to be written: (bag stamp, topic, message), and the truth."""
+
+    events: list[tuple[int, str, Any]] = field(default_factory=list)
+
+    def of(self, topic):
+        """The messages on a topic."""
+        return [message for _, name, message in self.events if name == topic]
+
+    def without(self, topic):
+        return Recording([event for event in self.events if event[1] != topic])
+
+    def renamed(self, rename):
+        return Recording([(stamp, rename(topic), message) for stamp, topic, message in self.events])
+
+    def write(self, path, storage='mcap'):
+        with BagWriter(path, storage) as bag:
+            for stamp, topic, message in sorted(self.events, key=lambda event: event[0]):
+                bag.write(topic, stamp, message)
+        return path
+
+
+def true_pose(t):
+    """T_map_body (4, 4) at ``t`` [s]."""
+    return _motion().pose(t)
+
+
+def _motion():
+    # Small and slow, so that the markers stay in view whatever the seed.
+    return Motion.random(np.random.default_rng(7), speed=0.12, turn=0.05)
+
+
+def map_of(ids):
+    """The true map of markers ``ids``, all fixed."""
+    markers = {i: MapMarker(i, SIZE, True, transform(R_MAP_MARKER, CENTRES[i])) for i in ids}
+    return MarkerMap(markers)
+
+
+def recording(seconds=3.0, seed=0):
+    """Frames at 30 Hz, camera_info with each, IMU at 200 Hz."""
+    rng = np.random.default_rng(seed)
+    result = Recording()
+    for k in range(round(200 * seconds)):
+        stamp = START_NS + k * 5_000_000
+        result.events.append((stamp + 1_000_000, IMU_TOPIC, imu(stamp, _motion().imu(k * 0.005))))
+    for k in range(round(30 * seconds)):
+        stamp = START_NS + 2_000_000 + k * 33_333_333
+        counts = frame(_motion().pose((stamp - START_NS) * 1e-9), rng)
+        result.events.append((stamp + 20_000_000, CAMERA_INFO_TOPIC, camera_info(stamp)))
+        result.events.append((stamp + 20_000_001, IMAGE_TOPIC, image(stamp, counts)))
+    return result
+
+
+def side_files(folder, ids=(0,)):
+    """``map.yaml`` with markers ``ids`` and ``params.yaml``, in ``folder``; their paths."""
+    save_map(folder / 'map.yaml', map_of(ids))
+    (folder / 'params.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': PARAMETERS}}))
+    return folder / 'map.yaml', folder / 'params.yaml'
+
+
+def frame(T_map_body, rng):
+    """Counts (512, 640): hot stencils on a cold wall, flat pictures warped into place."""
+    T_camera_map = inverse(T_map_body @ T_BODY_CAMERA)
+    picture = np.full((CAMERA.height, CAMERA.width), _COLD, np.float32)
+    for marker_id, centre in CENTRES.items():
+        T_camera_marker = T_camera_map @ transform(R_MAP_MARKER, centre)
+        # The plate is one bit wider all round than the black square of six bits.
+        side = marker_corners(SIZE * 8 / 6)
+        uv = CAMERA.project(apply(T_camera_marker, side)).astype(np.float32)
+        plate = np.full((8, 8), 255, np.uint8)
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+        plate[1:7, 1:7] = cv2.aruco.generateImageMarker(dictionary, marker_id, 6)
+        texture = np.kron(plate, np.ones((_PIXELS_PER_BIT, _PIXELS_PER_BIT), np.uint8)).astype(np.float32)
+        n = texture.shape[0] - 0.5
+        corners = np.array([[-0.5, -0.5], [n, -0.5], [n, n], [-0.5, n]], np.float32)
+        H = cv2.getPerspectiveTransform(corners, uv)
+        warped = cv2.warpPerspective(texture, H, (CAMERA.width, CAMERA.height), flags=cv2.INTER_AREA)
+        picture += warped / 255.0 * (_HOT - _COLD)
+    picture = cv2.GaussianBlur(picture, (0, 0), 0.7) + rng.normal(0.0, _NOISE, picture.shape)
+    return np.rint(picture).astype(np.uint16)
+
+
+def header(stamp_ns, frame_id):
+    seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    stamp = _TYPES['builtin_interfaces/msg/Time'](sec=seconds, nanosec=nanoseconds)
+    return _TYPES['std_msgs/msg/Header'](stamp=stamp, frame_id=frame_id)
+
+
+def image(stamp_ns, counts):
+    height, width = counts.shape
+    return _TYPES['sensor_msgs/msg/Image'](
+        header=header(stamp_ns, 'thermal_camera_optical'),
+        height=height,
+        width=width,
+        encoding='mono16',
+        is_bigendian=0,
+        step=2 * width,
+        data=counts.astype('<u2').view(np.uint8).ravel(),
+    )
+
+
+def camera_info(stamp_ns, camera=CAMERA):
+    region = _TYPES['sensor_msgs/msg/RegionOfInterest'](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    return _TYPES['sensor_msgs/msg/CameraInfo'](
+        header=header(stamp_ns, 'thermal_camera_optical'),
+        height=camera.height,
+        width=camera.width,
+        distortion_model=camera.model,
+        d=camera.D,
+        k=camera.K.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.hstack([camera.K, np.zeros((3, 1))]).ravel(),
+        binning_x=0,
+        binning_y=0,
+        roi=region,
+    )
+
+
+def imu(stamp_ns, values):
+    vector, covariance = _TYPES['geometry_msgs/msg/Vector3'], np.zeros(9)
+    return _TYPES['sensor_msgs/msg/Imu'](
+        header=header(stamp_ns, 'base_link'),
+        orientation=_TYPES['geometry_msgs/msg/Quaternion'](x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=np.array([-1.0, *covariance[1:]]),
+        angular_velocity=vector(*(float(value) for value in values[:3])),
+        angular_velocity_covariance=covariance,
+        linear_acceleration=vector(*(float(value) for value in values[3:])),
+        linear_acceleration_covariance=covariance,
+    )

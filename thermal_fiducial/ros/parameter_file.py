@@ -1,0 +1,80 @@
+"""The parameter file with every parameter, its default and its meaning, written out of the config dataclasses.
+
+``python -m thermal_fiducial.ros.parameter_file > config/thermal_fiducial.yaml``
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import Field
+import textwrap
+from typing import Any
+
+import yaml
+
+from thermal_fiducial.config import (
+    ArucoDetectorConfig,
+    MarkerMapperConfig,
+    parameters,
+    PoseEkfConfig,
+    Tau2CameraConfig,
+)
+
+NODES: dict[str, type] = {
+    'tau2_camera': Tau2CameraConfig,
+    'aruco_detector': ArucoDetectorConfig,
+    'marker_mapper': MarkerMapperConfig,
+    'pose_ekf': PoseEkfConfig,
+}
+_WIDTH = 118
+_END_OF_SCALAR = '...\n'
+_HEAD = """\
+# Every parameter of the four nodes with its default. One file serves them all: a node takes the names it knows.
+#   ros2 run thermal_fiducial pose_ekf --ros-args --params-file thermal_fiducial.yaml
+/**:
+  ros__parameters:
+"""
+
+
+def parameter_file() -> str:
+    """Text of the file: what several nodes share first, then node by node."""
+    uses = Counter(name for kind in NODES.values() for name, _, _ in parameters(kind))
+    shared: dict[str, str] = {}
+    own: dict[str, list[str]] = {node: [] for node in NODES}
+    for node, kind in NODES.items():
+        for name, item, default in parameters(kind):
+            entry = ''.join(_entry(name, item, default))
+            if uses[name] > 1:
+                shared.setdefault(name, entry)
+            else:
+                own[node].append(entry)
+    sections = {'shared by several nodes': list(shared.values()), **own}
+    return _HEAD + '\n'.join(f'    # --- {title}\n{"".join(entries)}' for title, entries in sections.items())
+
+
+def _entry(name: str, item: 'Field[Any]', default: Any) -> Iterator[str]:
+    limits = item.metadata
+    text = (
+        limits['description'] + ''.join(f' {part}' for part in _limits(limits)) + (' Live.' if limits['live'] else '')
+    )
+    yield textwrap.indent(textwrap.fill(text, _WIDTH - 6), '    # ') + '\n'
+    value = yaml.safe_dump(list(default) if isinstance(default, tuple) else default, default_flow_style=True)
+    # Dotted names are as good as nested ones to ROS, and keep each entry whole.
+    yield f'    {name}: {value.removesuffix(_END_OF_SCALAR).strip()}\n'
+
+
+def _limits(limits: Any) -> Iterator[str]:
+    if limits['choices']:
+        yield f'One of: {", ".join(limits["choices"])}.'
+    low, high = limits['minimum'], limits['maximum']
+    if low is not None and high is not None:
+        yield f'From {low:g} to {high:g}.'
+    elif low is not None:
+        yield f'At least {low:g}.'
+    elif high is not None:
+        yield f'At most {high:g}.'
+    if limits['live']:
+        yield 'Live.'
+
+
+if __name__ == '__main__':
+    print(parameter_file(), end='')
