@@ -1,0 +1,276 @@
+"""The renderer against OpenCV's projection and against what a first-order lag does in closed form."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.ndimage import map_coordinates
+from scipy.spatial.transform import Rotation
+from support.tiny import LENS, TINY
+
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.sim.camera import CHUNK, render_frames
+from thermal_fiducial.sim.lens import Lens
+from thermal_fiducial.sim.render import LATTICES, Quality, Renderer
+from thermal_fiducial.sim.scene import Acrylic, Clutter, clutter_plate, facing, Fog, Marker, marker_plate, Plate, Room
+from thermal_fiducial.sim.trajectory import Motion, pose_matrix
+
+EMPTY_ROOM = Room(excess=(0.0,) * 6, texture=0.0)
+ACRYLIC = Acrylic(contrast=1.0, gradient=0.0, steady=0.0)
+LENSES = {
+    'plumb_bob': LENS,
+    'rational_polynomial': Lens(
+        (150.0, 151.0), (78.2, 65.1), 'rational_polynomial', (0.31, 0.05, 3e-4, -2e-4, 0.01, 0.64, 0.12, 0.02), 160, 128
+    ),
+    'equidistant': Lens((110.0, 111.0), (80.4, 61.7), 'equidistant', (0.0143, -0.0218, 0.0312, -0.0174), 160, 128),
+}
+# The camera looks along +x of the body, slightly askew.
+T_BODY_CAMERA = pose_matrix(
+    Rotation.from_quat([-0.5, 0.5, -0.5, 0.5]) * Rotation.from_euler('xyz', [3, -4, 7], True), 0
+)
+_S, _HALF = np.linspace(-0.5, 0.5, 200, endpoint=False), np.full(200, 0.5)
+# Of a unit square, 200 points a side.
+OUTLINE = np.concatenate([np.stack(xy, 1) for xy in ((_S, -_HALF), (_HALF, _S), (-_S, _HALF), (-_HALF, -_S))])
+
+
+class Straight:
+    """A body that glides at constant velocity without turning."""
+
+    def __init__(self, position=(0.0, 0.0, 1.2), velocity=(0.0, 0.0, 0.0)):
+        self.position, self.velocity = np.array(position), np.array(velocity)
+
+    def __call__(self, t):
+        t = np.atleast_1d(t)
+        zero = np.zeros((len(t), 3))
+        still = Rotation.identity(len(t))
+        return Motion(self.position + t[:, None] * self.velocity, still, zero + self.velocity, zero, zero)
+
+
+def renderer(plates, lens=LENS, body=None, lag=0.0, samples=251, fog=Fog(), room=EMPTY_ROOM):  # noqa: B008
+    body = body or Straight()
+    return Renderer(lens, plates, room, fog, ACRYLIC, body, T_BODY_CAMERA, 1 / 30, lag, Quality(samples))
+
+
+def opencv_pixels(lens, points_map, T_map_camera):
+    T, points_map = np.linalg.inv(T_map_camera), np.ascontiguousarray(points_map)
+    rotation, translation = cv2.Rodrigues(T[:3, :3])[0], T[:3, 3]
+    D = np.array(lens.distortion)
+    if lens.model == 'equidistant':
+        return cv2.fisheye.projectPoints(points_map[:, None], rotation, translation, lens.matrix, D)[0][:, 0]
+    return cv2.projectPoints(points_map, rotation, translation, lens.matrix, D)[0][:, 0]
+
+
+def on_plate(plate, points):
+    """Points (N, 2) [m] on a plate, in map (N, 3)."""
+    return np.column_stack([points, np.zeros(len(points)), np.ones(len(points))]) @ plate.T_map_plate.T[:, :3]
+
+
+def polygon_moments(p):
+    """Area and centroid of a polygon (N, 2), Green's theorem."""
+    q = np.roll(p, -1, axis=0)
+    cross = p[:, 0] * q[:, 1] - q[:, 0] * p[:, 1]
+    area = cross.sum() / 2
+    return abs(area), ((p + q) * cross[:, None]).sum(axis=0) / (6 * area)
+
+
+def hole(yaw=180.0, tilt=20.0, roll=25.0, position=(2.0, 0.1, 1.3), size=0.3):
+    """A single warm square."""
+    T = pose_matrix(facing(yaw, tilt, roll), position)
+    return Plate(T, size, size, np.ones((1, 1)), np.ones((1, 1), bool), 1.0, 0.0)
+
+
+def image_moments(image):
+    v, u = np.mgrid[0 : image.shape[0], 0 : image.shape[1]]
+    total = float(image.sum(dtype=np.float64))
+    return total, np.array([float((u * image).sum(dtype=np.float64)), float((v * image).sum(dtype=np.float64))]) / total
+
+
+@pytest.mark.parametrize('model', LENSES)
+@pytest.mark.parametrize('y', [-0.3, 0.0, 0.4])
+def test_centroid_and_area_of_a_hole_are_opencvs(model, y):
+    lens, plate = LENSES[model], hole(position=(1.8, y, 1.2 + 0.5 * y))
+    image = renderer([plate], lens).frame(0.0)
+    pixels = opencv_pixels(lens, on_plate(plate, OUTLINE * 0.3), renderer([plate], lens).camera_poses(np.zeros(1))[0])
+    area, centroid = polygon_moments(pixels)
+    total, mean = image_moments(image)
+    # 251 points a pixel on an outline of 100 pixels: the lattice's error is far below the 0.01 px that is asked for.
+    np.testing.assert_allclose(mean, centroid, atol=0.003)
+    assert total == pytest.approx(area, abs=0.003 * np.sqrt(area) * 4)
+
+
+def edge_offsets(image, outline, normals):
+    """Signed distance [px] from the points of an edge to where the image is 0.5, along the normals."""
+    reach = np.linspace(-5, 5, 201)
+    offsets = []
+    for point, normal in zip(outline, normals, strict=True):
+        line = point + reach[:, None] * normal
+        values = map_coordinates(image, [line[:, 1], line[:, 0]], order=3)
+        crossing = np.flatnonzero((values[:-1] - 0.5) * (values[1:] - 0.5) <= 0)[0]
+        part = (0.5 - values[crossing]) / (values[crossing + 1] - values[crossing])
+        offsets.append(reach[crossing] + part * (reach[1] - reach[0]))
+    return np.array(offsets)
+
+
+@pytest.mark.parametrize('samples', LATTICES)
+@pytest.mark.parametrize('model', LENSES)
+def test_edges_of_the_black_square_are_opencvs(model, samples):
+    lens = LENSES[model]
+    marker = Marker(5, (1.5, 0.05, 1.25), 175.0, 12.0, 9.0, 0.5)
+    plate = marker_plate(marker, TINY.aruco_dictionary, ACRYLIC)
+    view = renderer([plate], lens, samples=samples)
+    image = cv2.GaussianBlur(view.frame(0.0).astype(np.float64), (0, 0), 0.7)
+    pose = view.camera_poses(np.zeros(1))[0]
+    for start, end in zip(marker.corners_map, np.roll(marker.corners_map, -1, axis=0), strict=True):
+        s = np.linspace(0.15, 0.85, 60)[:, None]
+        outline = opencv_pixels(lens, start + s * (end - start), pose)
+        tangent = np.gradient(outline, axis=0)
+        normals = np.stack([-tangent[:, 1], tangent[:, 0]], 1) / np.linalg.norm(tangent, axis=1)[:, None]
+        # The mean over an edge, so that the phase of the pixels cancels; 0.01 px is the requirement.
+        assert abs(edge_offsets(image, outline, normals).mean()) < 0.01
+
+
+def test_true_corners_are_opencvs():
+    frame = next(render_frames(TINY, noise=False, start=40))
+    assert set(frame.corners_px) == {5, 7}
+    for marker in TINY.markers:
+        expected = opencv_pixels(TINY.lens, marker.corners_map, frame.T_map_camera)
+        np.testing.assert_allclose(frame.corners_px[marker.id], expected, atol=1e-6)
+
+
+def test_corners_are_clockwise_from_the_top_left_and_the_code_reads():
+    frame = next(render_frames(TINY, noise=False, start=40))
+    low, high = np.percentile(frame.counts, [1, 99])
+    gray = np.clip((frame.counts - low) / (high - low) * 255, 0, 255).astype(np.uint8)
+    gray = cv2.resize(gray, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+    corners, ids, _ = cv2.aruco.ArucoDetector(TINY.aruco_dictionary).detectMarkers(gray)
+    assert sorted(ids.ravel().tolist()) == [5, 7]
+    for found, marker_id in zip(corners, ids.ravel().tolist(), strict=True):
+        # Unrefined corners in an enlarged picture: a pixel is enough to tell the order.
+        np.testing.assert_allclose((found[0] - 1.5) / 4, frame.corners_px[marker_id], atol=1.0)
+
+
+# --- lag ----------------------------------------------------------------------------------------------
+
+
+def moving(speed, lag):
+    """Image at t = 0 of a hole in front of a camera that glides sideways, and the pose then."""
+    plate = hole(180.0, 0.0, 0.0, (2.0, 0.0, 1.2), 0.45)
+    view = renderer([plate], body=Straight(velocity=(0.0, speed, 0.0)), lag=lag, samples=97)
+    return plate, view.frame(0.0), view.camera_poses(np.array([-1e-3, 0.0]))
+
+
+def test_lag_shifts_the_centroid_by_tau():
+    tau, speed = 0.010, 1.5
+    plate, still, poses = moving(speed, 0.0)
+    _, lagged, _ = moving(speed, tau)
+    _, before = image_moments(still)
+    total, after = image_moments(lagged)
+    earlier, later = (polygon_moments(opencv_pixels(LENS, on_plate(plate, OUTLINE * 0.45), pose))[1] for pose in poses)
+    velocity = (later - earlier) / 1e-3
+    # 140 px/s. What is forgotten of the frames before the warm-up is e^-13; the lens' distortion bends the path of
+    # 1.4 px by some thousandths.
+    np.testing.assert_allclose(before - after, velocity * tau, atol=0.01)
+    assert np.linalg.norm(velocity) > 100
+    assert total == pytest.approx(still.sum(), rel=2e-3)
+
+
+@pytest.mark.parametrize('tau', [0.008, 0.012])
+def test_lag_shifts_the_half_height_of_an_edge_by_tau_ln_2(tau):
+    speed = 3.0
+    plate, lagged, poses = moving(speed, tau)
+    side = np.array([[-0.225, y] for y in np.linspace(-0.1, 0.1, 30)])
+    earlier, outline = (opencv_pixels(LENS, on_plate(plate, side), pose) for pose in poses)
+    velocity = (outline - earlier) / 1e-3
+    tangent = np.gradient(outline, axis=0)
+    normals = np.stack([-tangent[:, 1], tangent[:, 0]], 1) / np.linalg.norm(tangent, axis=1)[:, None]
+    normal_speed = np.sum(velocity * normals, axis=1)
+    length = abs(normal_speed) * tau
+    # The response 1 - exp(-x/L), averaged over the pixel's width, crosses 1/2 at L ln 2 + 1/(24 L) to second order.
+    expected = -np.sign(normal_speed) * (length * np.log(2) + 1 / (24 * length))
+    offsets = edge_offsets(lagged.astype(np.float64), outline, normals)
+    assert length.mean() > 2.0
+    # The mean over the edge; cubic interpolation of the unblurred picture and the lattice leave some hundredths.
+    assert abs((offsets - expected).mean()) < 0.03
+
+
+def test_a_moving_edge_is_smeared_without_steps():
+    _, lagged, _ = moving(3.0, 0.010)
+    # Along a row the response rises and decays monotonically: no ghost edge at the seams of the sub-frames.
+    row = cv2.GaussianBlur(lagged, (0, 0), 0.5)[60]
+    peak = int(np.argmax(row))
+    assert np.all(np.diff(row[: peak - 2]) > -0.005)
+    assert np.all(np.diff(row[peak + 2 :]) < 0.005)
+
+
+# --- scene --------------------------------------------------------------------------------------------
+
+
+def test_fog_attenuates_and_glows():
+    plate = hole(180.0, 0.0, 0.0, (3.0, 0.0, 1.2), 2.0)
+    image = renderer([plate], fog=Fog(0.4, 0.3, 0.0)).frame(0.0)
+    u, v = 80, 64
+    ray = np.append(LENS.slopes(np.array([u, v])), 1.0)
+    direction = T_BODY_CAMERA[:3, :3] @ ray
+    distance = np.linalg.norm(ray) * 3.0 / direction[0]
+    through = np.exp(-0.4 * distance)
+    # Single precision.
+    assert image[v, u] == pytest.approx(through * 1.0 + (1 - through) * 0.3, abs=1e-4)
+
+
+def test_nearer_things_hide_farther_ones():
+    far, near = hole(position=(3.0, 0.0, 1.2), size=1.0), hole(position=(2.0, 0.0, 1.2), size=0.3)
+    near.hot = 5.0
+    for plates in ([far, near], [near, far]):
+        image = renderer(plates).frame(0.0)
+        assert image.max() == pytest.approx(5.0, abs=1e-5)
+    assert near.hides(
+        np.array([0.0, 0.0, 1.2]), np.array([[3.0, 0.0, 1.2], [3.0, 1.0, 1.2], [1.0, 0.0, 1.2]])
+    ).tolist() == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_a_face_is_seen_from_its_front_only():
+    image = renderer([hole(0.0)]).frame(0.0)
+    assert image.max() == 0.0
+
+
+def test_a_plate_that_reaches_behind_the_camera_is_drawn():
+    pipe = clutter_plate(Clutter('pipe', (0.0, 1.5, 1.25), -90.0, 40.0, 0.4, 10.0))
+    whole = renderer([pipe], LENSES['equidistant'], samples=23).frame(0.0)
+    short = clutter_plate(Clutter('pipe', (10.25, 1.5, 1.25), -90.0, 19.5, 0.4, 10.0))
+    front = renderer([short], LENSES['equidistant'], samples=23).frame(0.0)
+    assert (whole > 1.0).sum() > 200
+    # Beside their gradients the two are the same pixels.
+    assert ((whole > 1.0) != (front > 1.0)).mean() < 1e-3
+
+
+def test_inverted_polarity_swaps_the_cells():
+    marker = TINY.markers[0]
+    normal = marker_plate(marker, TINY.aruco_dictionary, ACRYLIC)
+    inverted = marker_plate(marker, TINY.aruco_dictionary, replace(ACRYLIC, inverted=True))
+    np.testing.assert_array_equal(normal.levels[1:-1, 1:-1], 1.0 - inverted.levels[1:-1, 1:-1])
+
+
+def test_acrylic_warms_up():
+    acrylic = Acrylic(contrast=20.0, steady=0.5, warm_up_time=100.0, age=0.0)
+    assert acrylic.sheet(0.0) == 0.0
+    assert acrylic.sheet(100.0) == pytest.approx(10.0 * (1 - np.exp(-1)))
+    assert acrylic.sheet(1e4) == pytest.approx(10.0)
+
+
+def test_same_seed_same_frames_whatever_was_rendered_before():
+    whole = {frame.stamp_ns: frame.counts for frame in render_frames(TINY, seed=3)}
+    chunk = list(render_frames(TINY, seed=3, start=CHUNK, stop=CHUNK + 4))
+    assert len(chunk) == 4
+    assert all(np.array_equal(frame.counts, whole[frame.stamp_ns]) for frame in chunk)
+    other = next(render_frames(TINY, seed=4, start=CHUNK))
+    assert np.any(other.counts != chunk[0].counts)
+
+
+def test_refuses_an_unknown_lattice():
+    with pytest.raises(InputError, match='samples'):
+        renderer([], samples=7)

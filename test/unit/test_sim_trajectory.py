@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.trajectory import save_tum
+from thermal_fiducial.sim.camera import plan, true_corners
+from thermal_fiducial.sim.recorded import RecordedFlight
+from thermal_fiducial.sim.scenario import SCENARIOS
+from thermal_fiducial.sim.trajectory import Trajectory
+
+STEP = 1e-4
+
+
+@pytest.mark.parametrize('name', SCENARIOS)
+def test_derivatives_are_those_of_the_motion(name):
+    trajectory = SCENARIOS[name].trajectory(24.0, seed=4)
+    t = np.linspace(1.0, 23.0, 57)
+    before, here, after = trajectory(t - STEP), trajectory(t), trajectory(t + STEP)
+    turn = (before.rotation.inv() * after.rotation).as_rotvec() / (2 * STEP)
+    # Central differences over 0.1 ms: the error is step^2/6 times a third derivative of at most 100.
+    np.testing.assert_allclose(here.velocity, (after.position - before.position) / (2 * STEP), atol=1e-6)
+    np.testing.assert_allclose(here.acceleration, (after.velocity - before.velocity) / (2 * STEP), atol=1e-5)
+    np.testing.assert_allclose(here.angular_velocity_body, turn, atol=1e-5)
+
+
+@pytest.mark.parametrize('name', SCENARIOS)
+def test_takes_off_and_lands_at_the_same_point(name):
+    trajectory = SCENARIOS[name].trajectory(30.0, seed=1)
+    start, high, end = trajectory([0.0]), trajectory([6.0]), trajectory([30.0])
+    # The splines' ripple from where the motion begins; it has decayed below a micrometre.
+    np.testing.assert_allclose(start.position, end.position, atol=1e-6)
+    np.testing.assert_allclose(start.velocity, 0.0, atol=1e-5)
+    assert high.position[0, 2] > start.position[0, 2] + 0.5
+    assert (start.rotation.inv() * end.rotation).magnitude()[0] < 1e-5
+
+
+def test_seeds_fly_differently():
+    positions = [SCENARIOS['wall'].trajectory(20.0, seed)([9.0]).position for seed in (0, 1)]
+    assert np.linalg.norm(positions[0] - positions[1]) > 0.02
+
+
+def test_fast_flight_is_fast():
+    flight = plan('fast')
+    motion = flight.scenario.trajectory(flight.seconds, flight.seed)(np.linspace(0, flight.seconds, 600))
+    rate = np.degrees(np.linalg.norm(motion.angular_velocity_body, axis=1).max())
+    assert 120 < rate < 150
+    assert 1.5 < np.linalg.norm(motion.velocity, axis=1).max() < 3.0
+
+
+def test_dropout_hides_all_markers_twice_for_two_seconds():
+    flight = plan('dropout', seed=5)
+    scenario = flight.scenario
+    plates = scenario.plates
+    t = np.arange(0.0, flight.seconds, 0.1)
+    poses = scenario.trajectory(flight.seconds, flight.seed)(t).T_map_body @ scenario.T_body_camera
+    visible = [true_corners(scenario.lens, scenario.markers, plates, pose) for pose in poses]
+    seen = ''.join('x' if corners else ' ' for corners in visible)
+    assert [len(gap) >= 20 for gap in seen.split('x') if gap] == [True, True]
+
+
+def test_too_short_a_flight_is_refused():
+    with pytest.raises(InputError, match='too short'):
+        SCENARIOS['wall'].trajectory(5.0, 0)
+
+
+def test_follows_recorded_poses(tmp_path):
+    t = np.arange(0.0, 6.0, 0.02)
+    positions = np.stack([np.sin(t), 0.5 * np.cos(t), 1.0 + 0.1 * t], axis=1)
+    rotations = Rotation.from_euler('ZYX', np.stack([t, 0.2 * np.sin(t), 0.1 * np.cos(t)], axis=1))
+    # The sign of a quaternion in a file is arbitrary.
+    signs = np.where(np.arange(len(t)) % 7 < 3, -1.0, 1.0)[:, None]
+    save_tum(tmp_path / 'a.tum', (1e9 * (t + 50)).round().astype(int), positions, rotations.as_quat() * signs)
+    flight = RecordedFlight.load(tmp_path / 'a.tum')
+    motion = flight.trajectory(flight.seconds, 0)(t)
+    # Ten knots a second of a curve with unit derivatives: interpolation between the poses adds (0.01)^2/8.
+    np.testing.assert_allclose(motion.position, positions, atol=1e-4)
+    assert np.max((motion.rotation.inv() * rotations).magnitude()) < 1e-4
+    assert flight.seconds == pytest.approx(5.98)
+
+
+def test_refuses_too_few_poses(tmp_path):
+    save_tum(tmp_path / 'a.tum', [0, 10**9], np.zeros((2, 3)), np.tile([0, 0, 0, 1.0], (2, 1)))
+    with pytest.raises(InputError, match='too few'):
+        RecordedFlight.load(tmp_path / 'a.tum')
+    with pytest.raises(InputError, match='more than'):
+        Trajectory(np.arange(3.0), np.zeros((3, 3)), Rotation.identity(3))
+    with pytest.raises(InputError, match='increasing'):
+        Trajectory(np.zeros(8), np.zeros((8, 3)), Rotation.identity(8))
