@@ -1,0 +1,49 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.images import image_to_array, stamp_to_ns
+
+PIXELS = np.array([[1, 2, 300], [4, 16383, 6]], np.uint16)
+
+
+def message(data, encoding='mono16', step=6, big=0, width=3, height=2):
+    return SimpleNamespace(height=height, width=width, encoding=encoding, step=step, is_bigendian=big, data=data)
+
+
+@pytest.mark.parametrize('big', [0, 1])
+@pytest.mark.parametrize('padding', [0, 1, 5])
+@pytest.mark.parametrize('encoding', ['mono16', '16UC1'])
+def test_any_byte_order_and_row_step(big, padding, encoding):
+    rows = PIXELS.astype('>u2' if big else '<u2').view(np.uint8).reshape(2, 6)
+    data = np.pad(rows, ((0, 0), (0, padding)), constant_values=99).ravel()
+    pixels = image_to_array(message(data, encoding, 6 + padding, big))
+    np.testing.assert_array_equal(pixels, PIXELS)
+    assert pixels.dtype == np.uint16
+
+
+def test_eight_bits_and_a_last_row_without_padding():
+    pixels = image_to_array(message(np.arange(8, dtype=np.uint8), 'mono8', 5))
+    np.testing.assert_array_equal(pixels, [[0, 1, 2], [5, 6, 7]])
+    assert pixels.dtype == np.uint8
+
+
+@pytest.mark.parametrize(
+    'broken',
+    [
+        message(np.zeros(11, np.uint8)),
+        message(np.zeros(12, np.uint8), step=5),
+        message(np.zeros(12, np.uint8), width=0),
+        message(np.zeros(12, np.uint8), height=0),
+        message(np.zeros(36, np.uint8), encoding='rgb8'),
+    ],
+)
+def test_refuses_what_does_not_fit(broken):
+    with pytest.raises(InputError, match='image'):
+        image_to_array(broken)
+
+
+def test_stamps_are_exact():
+    assert stamp_to_ns(SimpleNamespace(sec=1_700_000_000, nanosec=123_456_789)) == 1_700_000_000_123_456_789
