@@ -6,7 +6,8 @@ marker's pose is fitted to views from several directions from either start, and 
 two fits is refuted.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.fitting import fit_pose
 from thermal_fiducial.core.geometry import rotation_angle
 from thermal_fiducial.core.reprojection import linearise, shared_covariances, whitening
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, IntArray
 
 #: Views closer in direction than this tell nothing new of the ambiguity [rad].
 MIN_SEPARATION = np.deg2rad(1.0)
@@ -29,15 +30,18 @@ SYSTEMATIC_PX = 0.1
 INCONSISTENT = 200.0
 # Fits that end nearer to each other than this are one fit [rad].
 _SAME_FIT = np.deg2rad(2.0)
+# How often a fit may change its mind about the cameras' poses.
+_CHOICES = 4
 
 
 @dataclass(frozen=True)
 class View:
-    """A marker seen from a known camera pose."""
+    """A marker seen from a camera whose pose is known, or known to be one of two."""
 
+    #: (2, 4, 4) twice the same where there is no doubt
     T_map_camera: FloatArray
-    #: (6, 6) of the camera pose, ROS convention
-    covariance: FloatArray
+    #: (2, 6, 6) of either, ROS convention
+    covariances: FloatArray
     #: (4, 2) [px]
     corners: FloatArray
     #: (4, 2, 2) [px^2]
@@ -63,24 +67,33 @@ class Candidate:
     size: float
     views: list[View] = field(default_factory=list)
     #: what it waits for, in words
-    reason: str = ''
+    reason: str = 'not judged yet'
+    #: views since it was last judged
+    untried: int = 0
     _directions: list[FloatArray] = field(default_factory=list)
 
     def add(self, view: View) -> bool:
         """Keep ``view`` if it shows the marker from a new direction; whether it did."""
         # Both branches put the centre at the same place: the direction doesn't depend on the ambiguity.
-        arm = view.T_map_camera[:3, :3] @ view.branches[0, :3, 3]
+        arm = view.T_map_camera[0, :3, :3] @ view.branches[0, :3, 3]
         direction = -arm / np.linalg.norm(arm)
         if self._directions and np.max(np.stack(self._directions) @ direction) > np.cos(MIN_SEPARATION):
             return False
         self.views.append(view)
         self._directions.append(direction)
+        self.untried += 1
         if len(self.views) > MAX_VIEWS:
             self._drop_most_redundant()
         return True
 
+    def move(self, T_new_old: FloatArray) -> None:
+        """The map moved: the views' camera poses move with it."""
+        self.views = [replace(view, T_map_camera=T_new_old @ view.T_map_camera) for view in self.views]
+        self._directions = [T_new_old[:3, :3] @ direction for direction in self._directions]
+
     def place(self, camera: Camera) -> Placement:
         """Pose in the map if the views settle it."""
+        self.untried = 0
         nothing = np.zeros((6, 6))
         if len(self.views) < MIN_VIEWS:
             return Placement(None, nothing, f'marker {self.id} needs views from more directions')
@@ -102,10 +115,11 @@ class Candidate:
         del self.views[index], self._directions[index]
 
     def _fits(self, camera: Camera) -> list['_Fit']:
-        """Fits from both branches of two views far apart, the best first."""
-        starts = [view.T_map_camera @ branch for view in (self.views[0], self.views[-1]) for branch in view.branches]
-        finite = [start for start in starts if np.all(np.isfinite(start))]
-        return sorted((_fit(start, self.size, self.views, camera) for start in finite), key=lambda fit: fit.chi2)
+        """Fits from every branch of two views far apart, the best first."""
+        pairs = [view.T_map_camera[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
+        starts = np.concatenate(pairs).reshape(-1, 4, 4)
+        starts = starts[np.all(np.isfinite(starts), axis=(1, 2))]
+        return sorted((_fit(start, self.size, self.views, camera) for start in starts), key=lambda fit: fit.chi2)
 
 
 @dataclass(frozen=True)
@@ -117,15 +131,36 @@ class _Fit:
 
 
 def _fit(start: FloatArray, size: float, views: list[View], camera: Camera) -> _Fit:
-    """Fit of one marker to views from known camera poses."""
+    """Fit of one marker to views; of a camera's two poses the one that suits the marker better is taken."""
+    chosen = _choose(start, size, views, camera)
+    fit = _fit_chosen(start, size, views, chosen, camera)
+    for _ in range(_CHOICES):
+        previous, chosen = chosen, _choose(fit.T, size, views, camera)
+        if np.array_equal(previous, chosen):
+            break
+        fit = _fit_chosen(fit.T, size, views, chosen, camera)
+    return fit
+
+
+def _choose(T: FloatArray, size: float, views: list[View], camera: Camera) -> IntArray:
+    """Which of its two camera poses suits each of n views, (n,), for a marker at T."""
     n = len(views)
-    T_map_camera = np.stack([view.T_map_camera for view in views])
+    T_map_camera = np.concatenate([view.T_map_camera for view in views])
+    uv, J, _ = linearise(camera, T_map_camera, np.broadcast_to(T, (2 * n, 4, 4)), np.full(2 * n, size))
+    W = _weighting([view for view in views for _ in range(2)], J, np.concatenate([view.covariances for view in views]))
+    r = W @ (np.repeat([view.corners for view in views], 2, axis=0) - uv)[..., None]
+    cost = np.sum(r**2, axis=(1, 2, 3)).reshape(n, 2)
+    return np.asarray(np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=1), dtype=np.int64)
+
+
+def _fit_chosen(start: FloatArray, size: float, views: list[View], chosen: IntArray, camera: Camera) -> _Fit:
+    n = len(views)
+    T_map_camera = np.stack([view.T_map_camera[i] for view, i in zip(views, chosen, strict=True)])
+    camera_covariances = np.stack([view.covariances[i] for view, i in zip(views, chosen, strict=True)])
     corners = np.stack([view.corners for view in views])
-    camera_covariances = np.stack([view.covariance for view in views])
     sizes = np.full(n, size)
     _, J, _ = linearise(camera, T_map_camera, np.broadcast_to(start, (n, 4, 4)), sizes)
-    noise = np.stack([view.corner_covariances for view in views]) + SYSTEMATIC_PX**2 * np.eye(2)
-    W = whitening(noise + np.nan_to_num(shared_covariances(J, camera_covariances)))
+    W = _weighting(views, J, camera_covariances)
 
     def evaluate(T: FloatArray) -> tuple[FloatArray, FloatArray]:
         uv, _, J = linearise(camera, T_map_camera, np.broadcast_to(T, (n, 4, 4)), sizes)
@@ -139,6 +174,12 @@ def _fit(start: FloatArray, size: float, views: list[View], camera: Camera) -> _
     noise = np.linalg.inv(np.einsum('vri,vrj->ij', J_marker, J_marker))
     gains = -noise @ np.einsum('vri,vrj->vij', J_marker, J_camera)
     return _Fit(T, chi2, noise, correlated_sum(gains, camera_covariances))
+
+
+def _weighting(views: Sequence[View], J_camera: FloatArray, camera_covariances: FloatArray) -> FloatArray:
+    """Whitening (n, 4, 2, 2) by the corners' noise, the systematic part, and the camera's own uncertainty."""
+    noise = np.stack([view.corner_covariances for view in views]) + SYSTEMATIC_PX**2 * np.eye(2)
+    return whitening(noise + np.nan_to_num(shared_covariances(J_camera, camera_covariances)))
 
 
 def _whitened(W: FloatArray, J: FloatArray) -> FloatArray:

@@ -83,7 +83,17 @@ class Location:
     rms_px: float
 
 
-def locate(sight: Sight, running_errors: FloatArray, camera: Camera, prior: FloatArray | None) -> Location | str:
+@dataclass(frozen=True)
+class Refusal:
+    """Why nobody knows where the camera is, in words."""
+
+    reason: str
+    #: (2, 4, 4) the two poses of an unsettled ambiguity, where it is that, and (2, 6, 6) their covariances
+    rivals: FloatArray | None = None
+    covariances: FloatArray | None = None
+
+
+def locate(sight: Sight, running_errors: FloatArray, camera: Camera, prior: FloatArray | None) -> Location | Refusal:
     """Camera pose from N known markers.
 
     Parameters
@@ -94,18 +104,18 @@ def locate(sight: Sight, running_errors: FloatArray, camera: Camera, prior: Floa
 
     Returns
     -------
-    The location, or in words why there is none.
+    The location, or why there is none.
     """
     points = corners_in_map(sight.T_map_marker, sight.sizes)
     hypotheses = _hypotheses(sight, points, camera, prior)
     if not len(hypotheses):
-        return 'no usable pose of any known marker'
+        return Refusal('no usable pose of any known marker')
     # Step 3: the pose from all known markers jointly; step 4: the error of each; step 5: weights; step 6: refinement.
     covariances = _with_map_uncertainty(sight, hypotheses[0], camera)
     try:
         first = solve_camera_pose(sight.corners, covariances, points, camera, hypotheses[0])
     except InputError:
-        return f'no camera pose explains {_names(sight)}'
+        return Refusal(f'no camera pose explains {_names(sight)}')
     errors = _errors_px(first.residuals_px)
     weights = marker_weights(errors, running_errors)
     best = first
@@ -119,12 +129,14 @@ def locate(sight: Sight, running_errors: FloatArray, camera: Camera, prior: Floa
             apart = difference(rival, T)
             spread = np.outer(apart, apart)
         elif prior is None:
-            return f'planar ambiguity of {_names(sight)} unsettled'
+            rivals = np.stack([T, rival])
+            spreads = np.stack([pose_covariance(sight, covariances, weights, camera, pose) for pose in rivals])
+            return Refusal(f'planar ambiguity of {_names(sight)} unsettled', rivals, spreads)
         elif _distance(rival, prior) < _distance(T, prior):
             T = rival
     covariance = pose_covariance(sight, covariances, weights, camera, T) + spread
     if not np.all(np.isfinite(covariance)):
-        return f'the pose from {_names(sight)} is not determined'
+        return Refusal(f'the pose from {_names(sight)} is not determined')
     residuals = sight.corners - reproject(camera, T, points)
     return Location(T, covariance, weights, float(np.sqrt(np.mean(np.sum(residuals**2, axis=-1)))))
 
@@ -166,7 +178,7 @@ def pose_covariance(
     )
     noise *= max(1.0, chi2 / max(8 * n - 6, 1))
     map_gains = -np.einsum('ncir,ncrj->nij', gains, J_marker.reshape(n, 4, 2, 6))
-    return noise + correlated_sum(map_gains, sight.map_covariances)
+    return np.asarray(noise + correlated_sum(map_gains, sight.map_covariances), dtype=np.float64)
 
 
 def _hypotheses(sight: Sight, points: FloatArray, camera: Camera, prior: FloatArray | None) -> FloatArray:
@@ -189,7 +201,8 @@ def _with_map_uncertainty(sight: Sight, T_map_camera: FloatArray, camera: Camera
         return sight.covariances
     T = np.broadcast_to(T_map_camera, (len(sight.markers), 4, 4))
     _, _, J = linearise(camera, T, sight.T_map_marker, sight.sizes)
-    return sight.covariances + np.nan_to_num(shared_covariances(J, sight.map_covariances))
+    shared = np.nan_to_num(shared_covariances(J, sight.map_covariances))
+    return np.asarray(sight.covariances + shared, dtype=np.float64)
 
 
 def _rival(

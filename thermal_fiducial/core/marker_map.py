@@ -14,20 +14,26 @@ import numpy as np
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.candidates import Candidate, View
-from thermal_fiducial.core.geometry import so3_exp, transform, transform_from_quaternion
-from thermal_fiducial.core.localization import locate, Location, Sight
+from thermal_fiducial.core.geometry import inverse, skew, so3_exp, transform, transform_from_quaternion
+from thermal_fiducial.core.keyframes import Keyframe, KeyframeStore, Link, Rig
+from thermal_fiducial.core.localization import locate, Location, Refusal, Sight
 from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.map_refinement import prior_poses, Refinement, Snapshot
 from thermal_fiducial.core.measurements import CameraPose, columns, corner_covariances, corners_px, Markers, Odometry
 from thermal_fiducial.core.reprojection import corners_in_map, linearise, reproject
 from thermal_fiducial.core.trust import culprits, DISAGREEMENT, Trust
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
-__all__ = ['MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
+__all__ = ['MapJump', 'MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
 
 #: A pose of the past tells rival poses apart for this long [ns].
 CONTINUITY_NS = 300_000_000
 #: Corner errors to allow for before a marker is said to disagree with the others [px].
 TOLERANCE_PX = 0.3
+#: Candidates that are judged in one frame: bounds its time when many are new.
+TRIALS = 3
+# A refinement is worth its time when there are these many keyframes more than at the last one.
+_GROWTH, _FEW = 1.2, 15
 
 
 @dataclass(frozen=True)
@@ -47,11 +53,24 @@ class MapperResult:
     #: all markers in quarantine
     quarantined: tuple[int, ...] = ()
     map_version: int = 0
+    #: how often a refinement has moved the map
+    map_resets: int = 0
 
     @property
     def in_view(self) -> frozenset[int]:
         """IDs of the known markers in view."""
         return frozenset(self.residuals_px)
+
+
+@dataclass(frozen=True)
+class MapJump:
+    """A refinement moved the map: poses told before and after don't compare as they are."""
+
+    map_version: int
+    #: how often this has happened
+    resets: int
+    #: (4, 4) moves poses near the robot from the old map to the new: T_new = T_new_old @ T_old
+    T_new_old: FloatArray
 
 
 class MarkerMapper:
@@ -75,10 +94,14 @@ class MarkerMapper:
     def reset(self) -> None:
         """Back to the map that it was started with."""
         self.map = self._initial.copy()
+        self.resets = 0
         self._candidates: dict[int, Candidate] = {}
         self._trust = Trust()
         self._quarantined = {key for key, marker in self.map.markers.items() if not marker.trusted}
         self._last: CameraPose | None = None
+        self._camera: Camera | None = None
+        self._keyframes = KeyframeStore(self.config.keyframe_budget)
+        self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(self.map.markers)
 
     def process(
         self, stamp_ns: int, markers: Markers, camera: Camera, odometry: Odometry | None = None
@@ -98,25 +121,27 @@ class MarkerMapper:
         trusted = np.array([marker.trusted for marker in known.markers], dtype=bool)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
         location = self._locate(stamp_ns, known.select(trusted), camera, odometry)
-        if isinstance(location, str):
-            return self._result(stamp_ns, None, location)
+        if isinstance(location, Refusal):
+            changed, waiting = self._without_pose(stamp_ns, markers[~is_known], camera, odometry, location)
+            return self._result(stamp_ns, None, location.reason, changed, waiting=waiting)
         ids = tuple(marker.id for marker, used in zip(known.markers, trusted, strict=True) if used)
         self._last = CameraPose(stamp_ns, location.T_map_camera, location.covariance, ids, location.rms_px)
         # Step 7: errors updated.
         errors = self._update_errors(stamp_ns, known, location, camera)
         changed = self._judge(known, trusted, errors, location, camera)
         # Step 8: new markers placed relative to the camera.
-        waiting: dict[int, str] = {}
+        waiting = {}
         if not self.frozen:
-            placed, waiting = self._place_new(stamp_ns, markers[~is_known], camera, self._last)
-            self.map.version += placed
+            self._keep(markers, camera, self._last)
+            cameras = np.stack([location.T_map_camera] * 2), np.stack([location.covariance] * 2)
+            placed, waiting = self._place_new(stamp_ns, markers[~is_known], camera, *cameras)
             changed |= placed
         residuals = {marker.id: float(error) for marker, error in zip(known.markers, errors, strict=True)}
         return self._result(stamp_ns, self._last, '', changed, residuals, waiting)
 
-    def _locate(self, stamp_ns: int, sight: Sight, camera: Camera, odometry: Odometry | None) -> Location | str:
+    def _locate(self, stamp_ns: int, sight: Sight, camera: Camera, odometry: Odometry | None) -> Location | Refusal:
         if not sight.markers:
-            return self._nothing_known()
+            return Refusal(self._nothing_known())
         errors = self._trust.running_errors(sight.markers)
         return locate(sight, errors, camera, self._prior(stamp_ns, odometry))
 
@@ -168,25 +193,129 @@ class MarkerMapper:
             (self._quarantined.discard if trusted_now else self._quarantined.add)(marker_id)
         return bool(changes)
 
-    def _place_new(self, stamp_ns: int, rows: Markers, camera: Camera, pose: CameraPose) -> tuple[bool, dict[int, str]]:
-        """Show new markers to their candidates; whether any entered the map, and what the others wait for."""
-        waiting: dict[int, str] = {}
-        placed = False
+    def _place_new(
+        self, stamp_ns: int, rows: Markers, camera: Camera, T_map_camera: FloatArray, pose_covariances: FloatArray
+    ) -> tuple[bool, dict[int, str]]:
+        """Show new markers to their candidates; whether any entered the map, and what the others wait for.
+
+        ``T_map_camera`` (2, 4, 4) are the poses that the camera may have, ``pose_covariances`` (2, 6, 6) theirs.
+        """
         branches = np.stack([_poses(rows, ''), _poses(rows, 'a')], axis=1)
         corners, covariances = corners_px(rows), corner_covariances(rows)
+        shown = []
         for i, marker_id in enumerate(int(key) for key in rows['id']):
             size = self._sizes.get(marker_id, self.config.marker_size)
             candidate = self._candidates.setdefault(marker_id, Candidate(marker_id, size))
-            view = View(pose.T_map_camera, pose.covariance, corners[i], covariances[i], branches[i])
-            if candidate.add(view):
-                placement = candidate.place(camera)
-                candidate.reason = placement.reason
-                if placement.T_map_marker is not None:
-                    self._enter(stamp_ns, candidate, placement.T_map_marker, placement.covariance)
-                    placed = True
-                    continue
-            waiting[marker_id] = candidate.reason
-        return placed, waiting
+            candidate.add(View(T_map_camera, pose_covariances, corners[i], covariances[i], branches[i]))
+            shown.append(candidate)
+        placed = False
+        for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:
+            if not candidate.untried:
+                continue
+            placement = candidate.place(camera)
+            candidate.reason = placement.reason
+            if placement.T_map_marker is not None:
+                self._enter(stamp_ns, candidate, placement.T_map_marker, placement.covariance)
+                placed = True
+        self.map.version += placed
+        return placed, {candidate.id: candidate.reason for candidate in shown if candidate.id in self._candidates}
+
+    def _keep(self, rows: Markers, camera: Camera, pose: CameraPose) -> None:
+        """Keep the frame for the refinement; of one marker alone nothing can be learned."""
+        if self._camera is None or not camera.matches(self._camera):
+            self._camera = camera
+            self._keyframes = KeyframeStore(self.config.keyframe_budget)
+        self._last_frame = _keyframe(rows, pose)
+        if len(rows) >= 2:
+            self._keyframes.add(self._last_frame)
+
+    def _without_pose(
+        self, stamp_ns: int, rows: Markers, camera: Camera, odometry: Odometry | None, refusal: Refusal
+    ) -> tuple[bool, dict[int, str]]:
+        """What a frame without a pose may still teach of new markers."""
+        if self.frozen or not len(rows):
+            return False, {}
+        if refusal.rivals is not None and refusal.covariances is not None:
+            return self._place_new(stamp_ns, rows, camera, refusal.rivals, refusal.covariances)
+        if odometry is None or self._last is None:
+            return False, {}
+        if not 0 <= stamp_ns - self._last.stamp_ns <= self.config.bridge_duration * 1e9:
+            return False, {}
+        return self._bridge(stamp_ns, rows, camera, odometry)
+
+    def _bridge(self, stamp_ns: int, rows: Markers, camera: Camera, odometry: Odometry) -> tuple[bool, dict[int, str]]:
+        """Place new markers from the odometry while no known one is in view."""
+        pose = self._from_odometry(stamp_ns, odometry)
+        frame = _keyframe(rows, pose)
+        if not any(int(key) in self._candidates for key in rows['id']):
+            # Nothing but the odometry joins these markers to the map. Once is enough: its error is the same for all
+            # that follow, which hang together through the markers themselves.
+            self._keyframes.add(self._last_frame)
+            self._keyframes.links.append(_link(self._last_frame, frame, pose.covariance))
+            self._keyframes.add(frame)
+        elif len(rows) >= 2:
+            self._keyframes.add(frame)
+        cameras = np.stack([pose.T_map_camera] * 2), np.stack([pose.covariance] * 2)
+        return self._place_new(stamp_ns, rows, camera, *cameras)
+
+    def _from_odometry(self, stamp_ns: int, odometry: Odometry) -> CameraPose:
+        T_map_body = predict(odometry, stamp_ns)
+        A = np.eye(6)
+        A[:3, 3:] = -skew(T_map_body[:3, :3] @ self._T_body_camera[:3, 3])
+        return CameraPose(stamp_ns, T_map_body @ self._T_body_camera, A @ odometry.pose_covariance @ A.T)
+
+    def refinement_due(self, stamp_ns: int) -> bool:
+        """Whether enough has been seen since the last joint refinement for another to be worth its time."""
+        period = self.config.refinement_period
+        if self.frozen or not self._keyframes.frames or period == 0.0 or stamp_ns - self._refined_ns < period * 1e9:
+            return False
+        enough = len(self._keyframes.frames) >= _GROWTH * self._refined_frames + _FEW
+        return enough or len(self.map.markers) > self._refined_markers
+
+    def snapshot(self) -> Snapshot | None:
+        """What a refinement works on, for :func:`~thermal_fiducial.core.map_refinement.refine`; None: nothing yet.
+
+        The snapshot is immutable: the refinement may run elsewhere while frames are processed.
+        """
+        if self._camera is None:
+            return None
+        frames = tuple(self._keyframes.frames.values())
+        if frames:
+            self._refined_ns = frames[-1].stamp_ns
+        self._refined_frames, self._refined_markers = len(frames), len(self.map.markers)
+        return Snapshot(
+            {key: marker for key, marker in self.map.markers.items() if marker.trusted},
+            frames,
+            Rig.single(self._camera),
+            tuple(self._keyframes.links),
+            prior_poses(self._initial.markers),
+            self.map.version,
+        )
+
+    def apply(self, refinement: Refinement) -> MapJump | None:
+        """Take over a refinement: markers, keyframes, candidates and the last pose move together.
+
+        Returns
+        -------
+        The jump, to be told to whoever holds poses in the map; None where the map is frozen.
+        """
+        if self.frozen:
+            return None
+        for marker_id, adjusted in refinement.markers.items():
+            marker = self.map.markers.get(marker_id)
+            if marker is not None and marker.trusted:
+                self.map.markers[marker_id] = replace(
+                    marker, T_map_marker=adjusted.T_map_marker, covariance=adjusted.covariance
+                )
+        T_new_old = self._keyframes.move(refinement.keyframes)
+        for candidate in self._candidates.values():
+            candidate.move(T_new_old)
+        if self._last is not None:
+            self._last = replace(self._last, T_map_camera=T_new_old @ self._last.T_map_camera)
+            self._last_frame = replace(self._last_frame, T_map_rig=T_new_old @ self._last_frame.T_map_rig)
+        self.map.version += 1
+        self.resets += 1
+        return MapJump(self.map.version, self.resets, T_new_old)
 
     def _enter(self, stamp_ns: int, candidate: Candidate, T_map_marker: FloatArray, covariance: FloatArray) -> None:
         del self._candidates[candidate.id]
@@ -206,7 +335,7 @@ class MarkerMapper:
     ) -> MapperResult:
         quarantined = tuple(sorted(self._quarantined))
         return MapperResult(
-            stamp_ns, pose, reason, changed, residuals or {}, waiting or {}, quarantined, self.map.version
+            stamp_ns, pose, reason, changed, residuals or {}, waiting or {}, quarantined, self.map.version, self.resets
         )
 
 
@@ -214,7 +343,24 @@ def predict(odometry: Odometry, stamp_ns: int) -> FloatArray:
     """T_map_body (4, 4) at ``stamp_ns``, velocities constant since the odometry."""
     dt = (stamp_ns - odometry.stamp_ns) * 1e-9
     step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
-    return odometry.T_map_body @ step
+    return np.asarray(odometry.T_map_body @ step, dtype=np.float64)
+
+
+def _keyframe(rows: Markers, pose: CameraPose) -> Keyframe:
+    return Keyframe(
+        pose.stamp_ns,
+        pose.T_map_camera,
+        rows['id'].astype(np.int64),
+        corners_px(rows),
+        corner_covariances(rows),
+        np.zeros(len(rows), dtype=np.int64),
+    )
+
+
+def _link(a: Keyframe, b: Keyframe, covariance: FloatArray) -> Link:
+    """Odometry from ``a``, whose pose is known, to ``b``, whose pose in the map has ``covariance``."""
+    rotation = np.kron(np.eye(2), a.T_map_rig[:3, :3].T)
+    return Link(a.stamp_ns, b.stamp_ns, inverse(a.T_map_rig) @ b.T_map_rig, rotation @ covariance @ rotation.T)
 
 
 def _usable(markers: Markers) -> Markers:
@@ -223,7 +369,7 @@ def _usable(markers: Markers) -> Markers:
     twice = np.isin(markers['id'], ids[counts > 1])
     finite = np.all(np.isfinite(corners_px(markers)), axis=(1, 2))
     sound = np.all(np.linalg.eigvalsh(np.nan_to_num(corner_covariances(markers))) > 0.0, axis=(1, 2))
-    return markers[~twice & finite & sound]
+    return np.asarray(markers[~twice & finite & sound])
 
 
 def _poses(rows: Markers, prefix: str) -> FloatArray:

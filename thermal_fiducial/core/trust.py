@@ -92,7 +92,7 @@ def culprits(disagrees: np.ndarray, trusted: np.ndarray, markers: list[MapMarker
     preference = _preference(markers[a], markers[b])
     if preference:
         blamed[b if preference > 0 else a] = True
-    return blamed
+    return np.asarray(blamed)
 
 
 def _preference(a: MapMarker, b: MapMarker) -> int:

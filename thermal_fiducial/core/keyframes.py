@@ -1,0 +1,120 @@
+"""Frames kept for the joint refinement: few enough for hours, different enough to hold the map together."""
+
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry import inverse
+from thermal_fiducial.core.types import FloatArray, IntArray
+
+# Side of a cell of camera positions [m] and of viewing directions [components of a unit vector] to begin with.
+_CELL_M = 0.25
+_CELL_DIRECTION = 0.25
+# Share of the budget to which the store is thinned, so that it is thinned seldom.
+_THINNED = 0.85
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Cameras that move as one; a single camera is its own rig."""
+
+    cameras: tuple[Camera, ...]
+    #: (C, 4, 4) T_rig_camera of each
+    T_rig_camera: FloatArray
+
+    @classmethod
+    def single(cls, camera: Camera) -> 'Rig':
+        """A rig of one camera."""
+        return cls((camera,), np.eye(4)[None])
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """What one frame showed, all markers of it, known or not."""
+
+    stamp_ns: int
+    T_map_rig: FloatArray
+    #: (k,)
+    ids: IntArray
+    #: (k, 4, 2) [px]
+    corners: FloatArray
+    #: (k, 4, 2, 2) [px^2]
+    covariances: FloatArray
+    #: (k,) index of the camera of the rig that saw each
+    cameras: IntArray
+
+
+@dataclass(frozen=True)
+class Link:
+    """Odometry between two keyframes that no marker connects."""
+
+    stamp_a_ns: int
+    stamp_b_ns: int
+    #: (4, 4)
+    T_a_b: FloatArray
+    #: (6, 6) of T_a_b, ROS convention, in frame a
+    covariance: FloatArray
+
+
+@dataclass
+class KeyframeStore:
+    """At most ``budget`` keyframes; of many alike (camera near, direction alike) only as many as there is room for."""
+
+    budget: int
+    frames: dict[int, Keyframe] = field(default_factory=dict)
+    links: list[Link] = field(default_factory=list)
+
+    def add(self, frame: Keyframe) -> None:
+        """Keep ``frame``; thin out when there are too many."""
+        self.frames[frame.stamp_ns] = frame
+        if len(self.frames) > self.budget:
+            self._thin(int(_THINNED * self.budget))
+
+    def move(self, adjusted: Mapping[int, FloatArray]) -> FloatArray:
+        """Take over adjusted poses by stamp; frames newer than these move like the last of them.
+
+        Returns
+        -------
+        (4, 4) T_new_old of that last one; the identity when there is none.
+        """
+        last = max((stamp for stamp in adjusted if stamp in self.frames), default=None)
+        if last is None:
+            return np.eye(4)
+        T_new_old = adjusted[last] @ inverse(self.frames[last].T_map_rig)
+        self.frames = {
+            stamp: replace(frame, T_map_rig=adjusted.get(stamp, T_new_old @ frame.T_map_rig))
+            for stamp, frame in self.frames.items()
+        }
+        return T_new_old
+
+    def _thin(self, room: int) -> None:
+        linked = {stamp for link in self.links for stamp in (link.stamp_a_ns, link.stamp_b_ns)}
+        coarseness = 1.0
+        while len(cells := self._cells(coarseness)) > room:
+            coarseness *= 2.0
+        share = _fair_share([len(stamps) for stamps in cells.values()], room)
+        kept = linked & self.frames.keys()
+        for stamps in cells.values():
+            chosen = np.linspace(0, len(stamps) - 1, min(share, len(stamps))).round().astype(int)
+            kept.update(stamps[i] for i in chosen)
+        self.frames = {stamp: frame for stamp, frame in self.frames.items() if stamp in kept}
+
+    def _cells(self, coarseness: float) -> dict[tuple[int, ...], list[int]]:
+        """Stamps of the keyframes by cell of camera position and viewing direction."""
+        T = np.stack([frame.T_map_rig for frame in self.frames.values()])
+        scaled = np.concatenate([T[:, :3, 3] / _CELL_M, T[:, :3, 2] / _CELL_DIRECTION], axis=-1) / coarseness
+        cells: dict[tuple[int, ...], list[int]] = defaultdict(list)
+        for stamp, key in zip(self.frames, np.floor(scaled).astype(int).tolist(), strict=True):
+            cells[tuple(key)].append(stamp)
+        return cells
+
+
+def _fair_share(counts: list[int], room: int) -> int:
+    """The largest number that each cell may keep so that all together fit into ``room``; at least one."""
+    share = 1
+    while sum(min(count, share + 1) for count in counts) <= room and share < max(counts):
+        share += 1
+    return share
