@@ -12,7 +12,7 @@ import numpy as np
 
 from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.bad_pixels import BadPixelFiller, BadPixelFinder, pixel_noise
-from thermal_fiducial.core.types import BoolArray, Counts, Gray, IntArray
+from thermal_fiducial.core.types import Counts, Gray, IntArray
 from thermal_fiducial.errors import InputError
 
 FROZEN = 'frozen'
@@ -85,7 +85,7 @@ class FrameCleaner:
         if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
             return CleanFrame(None, STALE_STAMP)
         self._stamp_ns = stamp_ns
-        reason = self._stale(stamp_ns, image)
+        reason = self._stale(stamp_ns, image, coarse=counts.dtype == np.uint8)
         if reason:
             return CleanFrame(None, reason)
         self._live_ns = stamp_ns
@@ -105,8 +105,8 @@ class FrameCleaner:
         """Whether the clock was set back or a recording starts anew, rather than a frame coming out of order."""
         return self._stamp_ns is not None and stamp_ns < self._stamp_ns - 1_000_000_000
 
-    def _stale(self, stamp_ns: int, image: Counts) -> str:
-        if self._freeze.repeats(image):
+    def _stale(self, stamp_ns: int, image: Counts, *, coarse: bool) -> str:
+        if self._freeze.repeats(image, coarse=coarse):
             reason = FROZEN
         elif self._shutter.closed(stamp_ns, image):
             reason = SHUTTER
@@ -156,32 +156,31 @@ class _FreezeDetector:
     """Recognises repeated counts: noise never lets two frames of a living bolometer array agree."""
 
     ROW_STEP = 8
-    # A pixel in 300 may flicker; a quarter of the rows repeated is a frame torn between old and new.
-    FLICKER = 1 / 300
+    # So many rows repeated are a frame torn between old and new. Eight bits may be too coarse to show the noise, so
+    # there a row may repeat without being old, but not all of them.
     TORN = 0.25
+    TORN_8_BIT = 0.999
 
     def __init__(self) -> None:
         # Two, because a double-buffered driver that gets nothing new may send its two frames in turn.
         self._recent: deque[Counts] = deque(maxlen=2)
 
-    def repeats(self, image: Counts) -> bool:
+    def repeats(self, image: Counts, *, coarse: bool) -> bool:
         sample = image[:: self.ROW_STEP].copy()
-        repeated = any(self._agree(sample, earlier) for earlier in self._recent)
+        torn = self.TORN_8_BIT if coarse else self.TORN
+        repeated = any(_repeated_rows(sample, earlier) > torn for earlier in self._recent)
         if not repeated:
             self._recent.append(sample)
         return repeated
 
-    def _agree(self, sample: Counts, earlier: Counts) -> bool:
-        changed = np.mean(sample != earlier, axis=1) <= self.FLICKER
-        if not changed.any():
-            return False
-        clipped = sample.max(axis=1) == sample.min(axis=1)
-        return bool(np.mean(_without(changed, clipped)) > self.TORN)
 
-
-def _without(rows: BoolArray, clipped: BoolArray) -> BoolArray:
-    """``rows`` that are not ``clipped``: a row at the end of the scale repeats without being stale."""
-    return rows if clipped.all() else rows[~clipped]
+def _repeated_rows(sample: Counts, earlier: Counts) -> float:
+    """Share of the rows that repeat, of those that could change: clipped ones at the end of the scale can't."""
+    same = np.all(sample == earlier, axis=1)
+    if not same.any():
+        return 0.0
+    clipped = sample.max(axis=1) == sample.min(axis=1)
+    return float(np.mean(same if clipped.all() else same[~clipped]))
 
 
 class _ShutterDetector:

@@ -85,7 +85,14 @@ def _draw_frame(axis: Axes, picture: Gray, evaluation: Evaluation, stamp_ns: int
     for marker, corners in zip(detections.ids[here], detections.corners_px[here], strict=True):
         axis.fill(*corners.T, fill=False, edgecolor='#22d3ee', linewidth=1.4)
         axis.text(
-            *corners.min(axis=0), f'{marker} ', color='#22d3ee', fontsize=9, weight='bold', ha='right', va='bottom'
+            corners[:, 0].min(),
+            corners[:, 1].min(),
+            f'{marker} ',
+            color='#22d3ee',
+            fontsize=9,
+            weight='bold',
+            ha='right',
+            va='bottom',
         )
     axis.set_axis_off()
     axis.set_title(f'What the thermal camera sees: {int(here.sum())} markers found', color=INK)

@@ -1,0 +1,334 @@
+"""Cleaning of raw frames: rows, flags, bad pixels, frozen and shutter frames, the 8-bit view."""
+
+import cv2
+import numpy as np
+import pytest
+
+from thermal_fiducial.config import Tau2CameraConfig
+from thermal_fiducial.core.thermal import EightBitView, FrameCleaner, FROZEN, SETTLING, SHUTTER, STALE_STAMP
+from thermal_fiducial.errors import InputError
+
+PERIOD_NS = 33_333_333
+NOISE = 1.3  # counts: NETD 50 mK at 0.04 K a count
+
+
+def soft_step(x):
+    """An edge at 0 through a lens with a point spread of 0.6 px."""
+    return 0.5 * (1.0 + np.tanh(0.85 * x / 0.6))
+
+
+def scene(shift=0.0, contrast=150.0, shape=(512, 640)):
+    """Warm squares on a colder wall, edges as soft as a lens makes them, moved to the right by ``shift`` px."""
+    rows, columns = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
+
+    def box(u0, v0, side):
+        across = soft_step(columns - shift - u0) - soft_step(columns - shift - u0 - side)
+        return across * (soft_step(rows - v0) - soft_step(rows - v0 - side))
+
+    return (
+        7000.0 + 0.05 * rows + contrast * (box(150.3, 120.6, 60.0) + box(330.7, 260.2, 45.0) + box(60.4, 350.1, 30.0))
+    )
+
+
+def noisy(image, rng, sigma=NOISE):
+    return (image + rng.normal(0.0, sigma, image.shape)).round().clip(0, 16383).astype(np.uint16)
+
+
+class Camera:
+    """Feeds a cleaner with frames, a period apart."""
+
+    def __init__(self, bad_pixels=None, **config):
+        self.cleaner = FrameCleaner(Tau2CameraConfig(**config), bad_pixels)
+        self.stamp_ns = 1_700_000_000_000_000_000
+
+    def __call__(self, counts, periods=1):
+        self.stamp_ns += periods * PERIOD_NS
+        return self.cleaner.process(self.stamp_ns, counts)
+
+
+def test_a_clean_frame_passes_untouched():
+    frame = noisy(scene(), np.random.default_rng(0))
+    result = Camera()(frame)
+    assert result.reason == ''
+    assert np.array_equal(result.counts, frame)
+    assert not np.shares_memory(result.counts, frame)
+
+
+def test_8_bit_frames_become_counts():
+    frame = (noisy(scene(), np.random.default_rng(0)) // 64).astype(np.uint8)
+    result = Camera()(frame)
+    assert result.counts.dtype == np.uint16
+    assert np.array_equal(result.counts, frame)
+
+
+def test_flags_above_14_bits_are_masked():
+    frame = noisy(scene(), np.random.default_rng(0))
+    flagged = frame | np.uint16(0x8000)
+    flagged[::7] |= 0x4000
+    assert np.array_equal(Camera()(flagged).counts, frame)
+    assert np.array_equal(Camera(bits=16)(flagged).counts, flagged)
+
+
+@pytest.mark.parametrize('rows', [1, 2])
+@pytest.mark.parametrize('top', [False, True])
+def test_telemetry_rows_are_cut_from_either_side(rows, top):
+    rng = np.random.default_rng(1)
+    camera = Camera()
+    for _ in range(3):
+        frame = noisy(scene(), rng)
+        telemetry = rng.integers(0, 1 << 14, (rows, 640)).astype(np.uint16)
+        telemetry[:, 200:] = 0
+        result = camera(np.vstack([telemetry, frame] if top else [frame, telemetry]))
+        assert np.array_equal(result.counts, frame)
+
+
+def test_frames_of_other_heights_are_left_whole():
+    frame = noisy(scene(shape=(300, 400)), np.random.default_rng(1))
+    assert Camera()(frame).counts.shape == (300, 400)
+
+
+@pytest.mark.parametrize(
+    'frame',
+    [
+        np.zeros((512, 640, 3), np.uint16),
+        np.zeros((512, 640), np.float32),
+        np.zeros((8, 640), np.uint16),
+        np.zeros(9, 'u1'),
+    ],
+)
+def test_what_is_no_frame_is_refused(frame):
+    with pytest.raises(InputError):
+        Camera()(frame)
+
+
+# --- frozen frames -------------------------------------------------------------------------------------
+
+
+def test_repeated_counts_are_frozen_and_the_first_frame_after_a_freeze_settles():
+    rng = np.random.default_rng(2)
+    camera = Camera()
+    last = noisy(scene(), rng)
+    assert camera(last).reason == ''
+    assert [camera(last.copy()).reason for _ in range(12)] == [FROZEN] * 12
+    assert camera(noisy(scene(20.0), rng)).reason == SETTLING
+    assert camera(noisy(scene(21.0), rng)).reason == ''
+
+
+def test_a_frozen_frame_with_living_telemetry_is_frozen():
+    rng = np.random.default_rng(3)
+    camera = Camera()
+    frame = noisy(scene(), rng)
+
+    def with_telemetry():
+        return np.vstack([frame, rng.integers(0, 9000, (1, 640)).astype(np.uint16)])
+
+    assert camera(with_telemetry()).reason == ''
+    assert camera(with_telemetry()).reason == FROZEN
+
+
+def test_two_buffers_sent_in_turn_are_frozen():
+    rng = np.random.default_rng(4)
+    camera = Camera()
+    buffers = [noisy(scene(), rng), noisy(scene(1.0), rng)]
+    assert [camera(buffers[i % 2]).reason for i in range(6)] == ['', '', *[FROZEN] * 4]
+
+
+def test_a_frame_torn_between_old_and_new_is_withheld():
+    rng = np.random.default_rng(5)
+    camera = Camera()
+    old, new = noisy(scene(), rng), noisy(scene(5.0), rng)
+    assert camera(old).reason == ''
+    assert camera(np.vstack([new[:256], old[256:]])).reason == FROZEN
+
+
+def test_a_driver_that_sends_each_frame_twice_keeps_half_of_them():
+    rng = np.random.default_rng(6)
+    camera = Camera()
+    reasons = []
+    for k in range(6):
+        frame = noisy(scene(k), rng)
+        reasons += [camera(frame).reason, camera(frame).reason]
+    assert reasons == ['', FROZEN] * 6
+
+
+@pytest.mark.parametrize('sigma', [0.15, 1.3])
+def test_a_robot_that_stands_still_is_not_frozen(sigma):
+    """Also in the low-gain mode, where the noise is a fraction of a count."""
+    rng = np.random.default_rng(7)
+    camera = Camera()
+    assert all(camera(noisy(scene(), rng, sigma)).reason == '' for _ in range(20))
+
+
+def test_a_clipped_sky_is_not_frozen():
+    rng = np.random.default_rng(8)
+    camera = Camera()
+    for _ in range(4):
+        frame = (noisy(scene(), rng) // 64).astype(np.uint8)
+        frame[:250] = 0
+        assert camera(frame).reason == ''
+
+
+# --- shutter -------------------------------------------------------------------------------------------
+
+
+def shutter(rng):
+    """The shutter's inside: shading, fixed pattern and noise, no scene."""
+    rows, columns = np.mgrid[:512, :640]
+    shading = 12.0 * ((rows - 256) / 256) ** 2 + 6.0 * columns / 640
+    pattern = np.random.default_rng(99).normal(0.0, 2.0, (512, 640))
+    return noisy(7100.0 + shading + pattern, rng)
+
+
+@pytest.mark.parametrize('contrast', [25.0, 150.0, 1500.0])
+def test_the_shutter_is_recognised(contrast):
+    rng = np.random.default_rng(10)
+    camera = Camera()
+    assert all(camera(noisy(scene(k, contrast), rng)).reason == '' for k in range(8))
+    assert [camera(shutter(rng)).reason for _ in range(10)] == [SHUTTER] * 10
+    assert camera(noisy(scene(9.0, contrast), rng)).reason == SETTLING
+    assert all(camera(noisy(scene(10.0 + k, contrast), rng)).reason == '' for k in range(5))
+
+
+def test_a_flat_scene_is_not_withheld_for_long():
+    rng = np.random.default_rng(11)
+    camera = Camera()
+    for k in range(5):
+        camera(noisy(scene(k), rng))
+    reasons = [camera(shutter(rng)).reason for _ in range(60)]
+    assert reasons[:30] == [SHUTTER] * 30
+    assert reasons[48:] == [''] * 12
+
+
+def test_a_hot_object_that_leaves_does_not_hide_cooler_markers():
+    rng = np.random.default_rng(12)
+    camera = Camera()
+    hot = scene(contrast=25.0)
+    hot[400:500, 540:640] += 2500.0
+    assert all(camera(noisy(hot, rng)).reason == '' for _ in range(5))
+    assert all(camera(noisy(scene(contrast=25.0), rng)).reason == '' for _ in range(5))
+
+
+# --- stamps --------------------------------------------------------------------------------------------
+
+
+def test_stamps_that_do_not_increase_are_refused_and_a_restart_is_taken():
+    rng = np.random.default_rng(13)
+    camera = Camera()
+    camera(noisy(scene(), rng))
+    assert camera(noisy(scene(), rng), periods=0).reason == STALE_STAMP
+    assert camera(noisy(scene(), rng), periods=-3).reason == STALE_STAMP
+    assert camera(noisy(scene(), rng), periods=4).reason == ''
+    assert camera(noisy(scene(), rng), periods=-900).reason == ''
+
+
+# --- bad pixels ----------------------------------------------------------------------------------------
+
+
+def test_listed_pixels_are_filled_from_the_first_frame_on():
+    rng = np.random.default_rng(14)
+    frame = noisy(scene(), rng)
+    broken = frame.copy()
+    broken[40, 100], broken[0, 0], broken[511, 639], broken[60, 300:302] = 0, 16383, 0, 16383
+    listed = np.array([[100, 40], [0, 0], [639, 511], [300, 60], [301, 60]])
+    clean = Camera(listed)(broken).counts
+    difference = clean.astype(int) - frame
+    assert np.count_nonzero(difference) <= len(listed)
+    # On a flat wall a neighbour or a mean of two differs by no more than noise.
+    assert np.abs(difference).max() < 6 * NOISE
+
+
+def test_a_listed_pixel_outside_the_frame_is_refused():
+    with pytest.raises(InputError, match='640 10'):
+        Camera(np.array([[640, 10]]))(noisy(scene(), np.random.default_rng(0)))
+
+
+def test_bad_pixels_are_found_and_nothing_else():
+    """Dead, stuck within the scene's range, and a pair side by side; in a scene that moves."""
+    rng = np.random.default_rng(15)
+    bad = rng.choice(512 * 640, 300, replace=False)
+    stuck = np.where(rng.random(300) < 0.5, np.where(rng.random(300) < 0.5, 0, 16383), rng.integers(6800, 7400, 300))
+    bad, stuck = np.append(bad, [700, 701]), np.append(stuck, [16383, 16383])
+    camera = Camera()
+    for k in range(170):
+        frame = noisy(scene(60.0 * np.sin(0.05 * k)), rng)
+        frame.reshape(-1)[bad] = stuck
+        result = camera(frame)
+    found = {int(row * 640 + column) for column, row in camera.cleaner.bad_pixels}
+    assert found <= set(bad.tolist())
+    visible = np.abs(stuck - 7012.0) > 60.0  # the others do not stand out of this wall, so they do no harm either
+    assert len(found & set(bad[visible].tolist())) >= 0.98 * visible.sum()
+    assert np.abs(result.counts.reshape(-1)[bad[visible]].astype(int) - 7012).max() < 200
+
+
+@pytest.mark.parametrize('contrast', [25.0, 400.0])
+@pytest.mark.parametrize('polarity', [1, -1])
+def test_markers_are_never_taken_for_bad_pixels(contrast, polarity):
+    """Neither their corners nor bits of two pixels, while the robot stands still for ten seconds."""
+    rng = np.random.default_rng(16)
+    bits = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 6)
+    image = np.full((128, 160), 0.0)
+    for scale, at in ((2.0, (20, 20)), (3.3, (20, 60)), (8.0, (60, 20))):
+        fine = cv2.resize(bits, None, fx=8, fy=8, interpolation=cv2.INTER_NEAREST).astype(np.float64) / 255.0
+        side = round(6 * scale)
+        image[at[0] : at[0] + side, at[1] : at[1] + side] = cv2.resize(fine, (side, side), interpolation=cv2.INTER_AREA)
+    image = 7000.0 + polarity * contrast * cv2.GaussianBlur(image, None, 0.5)
+    camera = Camera()
+    for _ in range(300):
+        frame = noisy(image, rng)
+        assert np.array_equal(camera(frame).counts, frame)
+    assert len(camera.cleaner.bad_pixels) == 0
+
+
+def test_filling_keeps_an_edge_in_its_place():
+    """Bad pixels on a slanted edge: the line fitted to it moves by far less than a hundredth of a pixel."""
+    rng = np.random.default_rng(17)
+    rows, columns = np.mgrid[:128, :160].astype(np.float64)
+    edge = 80.3 + 0.25 * (rows - 64)
+    image = 7000.0 + 200.0 * soft_step(columns - edge)
+    on_edge = np.array([(round(80.3 + 0.25 * (row - 64)), row) for row in range(10, 120, 11)])
+    shifts = []
+    for _ in range(40):
+        frame = noisy(image, rng)
+        broken = frame.copy()
+        broken[on_edge[:, 1], on_edge[:, 0]] = 16383
+        shifts.append(_edge_offset(Camera(on_edge)(broken).counts, edge) - _edge_offset(frame, edge))
+    # One pixel in eleven was lost at the very edge; what it carried is interpolated along the edge.
+    assert abs(np.mean(shifts)) < 0.01
+    assert np.std(shifts) < 0.01
+
+
+def _edge_offset(counts, edge):
+    """Mean displacement of the edge [px], from the area under its profile in each row."""
+    window = slice(60, 104)
+    area = ((counts[20:110, window].astype(np.float64) - 7000.0) / 200.0).sum(axis=1)
+    return float(np.mean((window.stop - 0.5 - area) - edge[20:110, 0]))
+
+
+# --- 8-bit view ----------------------------------------------------------------------------------------
+
+
+def test_the_view_spans_the_scene():
+    picture = EightBitView(Tau2CameraConfig())(noisy(scene(), np.random.default_rng(18)))
+    assert picture.dtype == np.uint8
+    assert picture.shape == (512, 640)
+    assert picture[150, 180] > 200 > 60 > picture[300, 550]
+
+
+def test_a_hot_object_does_not_make_the_view_pump():
+    rng = np.random.default_rng(19)
+    view = EightBitView(Tau2CameraConfig())
+    for _ in range(30):
+        before = view(noisy(scene(), rng))[150, 180]
+    hot = scene()
+    hot[400:, 500:] += 3000.0
+    steps = [int(view(noisy(hot, rng))[150, 180]) for _ in range(60)]
+    changes = np.abs(np.diff([int(before), *steps]))
+    # The scale follows within seconds; one frame changes it by a twentieth of what there is to change.
+    assert changes.max() < 130
+    assert steps[-1] < before
+    assert steps[0] > 0.3 * before
+
+
+def test_a_flat_scene_is_not_stretched_to_noise():
+    picture = EightBitView(Tau2CameraConfig())(noisy(np.full((512, 640), 7000.0), np.random.default_rng(20)))
+    assert picture.std() < 12.0  # 1.3 counts of 40
