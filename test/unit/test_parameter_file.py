@@ -1,0 +1,36 @@
+"""The parameter file of the package is the one that the config dataclasses make."""
+
+from pathlib import Path
+
+import yaml
+
+from thermal_fiducial.config import from_mapping, parameters
+from thermal_fiducial.replay.settings import read_settings
+from thermal_fiducial.ros.parameter_file import NODES, parameter_file
+
+FILE = Path(__file__).resolve().parents[2] / 'config' / 'thermal_fiducial.yaml'
+
+
+def test_the_file_is_up_to_date():
+    # python -m thermal_fiducial.ros.parameter_file > config/thermal_fiducial.yaml
+    assert FILE.read_text() == parameter_file()
+
+
+def test_the_file_holds_every_default():
+    values = yaml.safe_load(FILE.read_text())['/**']['ros__parameters']
+    for kind in NODES.values():
+        assert from_mapping(kind, values) == kind()
+        assert {name for name, _, _ in parameters(kind)} <= set(values)
+
+
+def test_a_parameter_of_several_nodes_has_one_default():
+    seen = {}
+    for kind in NODES.values():
+        for name, _, default in parameters(kind):
+            assert seen.setdefault(name, default) == default
+
+
+def test_a_replay_takes_the_file():
+    settings = read_settings(FILE, {'mode': 'localization'})
+    assert settings.unknown == ()
+    assert settings.marker_mapper.mode == 'localization'
