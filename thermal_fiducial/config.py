@@ -221,6 +221,16 @@ class ArucoDetectorConfig:
     marker_size_overrides: tuple[str, ...] = _marker_size_overrides()
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
+    bolometer_lag: float = param(
+        0.010,
+        'Thermal time constant of the bolometers; 0: none, or a camera of another kind.',
+        unit='s',
+        minimum=0.0,
+        maximum=0.05,
+    )
+    blur_px: float = param(
+        0.66, 'Standard deviation of the blur by optics and pixel.', unit='px', minimum=0.3, maximum=3.0
+    )
     min_side_px: float = param(12.0, 'Shortest side of a marker.', unit='px', minimum=8.0, maximum=400.0)
     error_correction_rate: float = param(
         0.6, 'Share of the bit errors that the dictionary can correct that are accepted.', minimum=0.0, maximum=1.0
@@ -265,7 +275,7 @@ class ImuNoise:
     gyroscope_range: float = param(34.9, 'Readings beyond this are saturated.', unit='rad/s', minimum=0.1)
     accelerometer_range: float = param(156.0, 'Readings beyond this are saturated.', unit='m/s^2', minimum=10.0)
     vibration: float = param(
-        0.5,
+        1.0,
         'Share of the sample-to-sample noise that counts as white noise where it exceeds the densities; 0: none.',
         minimum=0.0,
         maximum=1.0,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.types import Counts, Float32Array, Gray
+from thermal_fiducial.core.types import Float32Array, Gray
 
 # Mean and spread are taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
 _SHRINK = 4
@@ -26,8 +26,6 @@ class NormalisedView:
 
     #: (height, width)
     gray: Gray
-    #: (height, width) the counts as float32
-    counts: Float32Array
     #: standard deviation of the noise of a pixel [counts]
     noise: float
 
@@ -46,16 +44,15 @@ def noise_of(counts: Float32Array) -> float:
     return max(float(np.partition(difference, middle)[middle]) * _MAD_OF_DIFFERENCE, 0.3)
 
 
-def normalise(image: Counts | Gray, smoothing_px: float, floor: float) -> NormalisedView:
-    """8-bit view of ``image``.
+def normalise(counts: Float32Array, smoothing_px: float, floor: float) -> NormalisedView:
+    """8-bit view of ``counts``.
 
     Parameters
     ----------
-    image : (height, width) counts or gray levels
+    counts : (height, width) counts or gray levels
     smoothing_px : standard deviation of the Gaussian before the search, 0 for none
     floor : smallest spread that is divided by, in standard deviations of the noise of a pixel
     """
-    counts = image.astype(np.float32)
     noise = noise_of(counts)
     smooth = cv2.GaussianBlur(counts, (0, 0), smoothing_px) if smoothing_px > 0 else counts
     height, width = counts.shape
@@ -69,4 +66,4 @@ def normalise(image: Counts | Gray, smoothing_px: float, floor: float) -> Normal
     full_offset = cv2.resize(offset, (width, height), interpolation=cv2.INTER_LINEAR)
     np.multiply(smooth, full_gain, out=full_gain)
     gray = cv2.add(full_gain, full_offset, dtype=cv2.CV_8U)
-    return NormalisedView(gray, counts, noise)
+    return NormalisedView(gray, noise)
