@@ -8,11 +8,22 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import STORAGES
 from thermal_fiducial.sim.camera import FlightPlan, plan
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.scenario import LENSES, named, Scenario, SCENARIOS, with_contrast, with_lens
 from thermal_fiducial.sim.writer import write_flight
+
+#: Inclusive ranges of the numbers.
+_RANGES = {
+    'seconds': (1.0, 3600.0),
+    'seed': (0, 2**32 - 1),
+    'contrast': (0.01, 400.0),
+    'fog': (0.0, 100.0),
+    'time_offset': (-1.0, 1.0),
+    'workers': (1, 64),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -40,12 +51,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate and say how to replay."""
+    for name, (low, high) in _RANGES.items():
+        value = getattr(args, name)
+        if value is not None and not low <= value <= high:
+            raise InputError(f'--{name.replace("_", "-")} {value} is outside {low} .. {high}')
     scenario = _scenario(args)
     flight = plan(scenario, args.seconds, args.seed)
     console = Console(stderr=True)
     with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console) as progress:
         task = progress.add_task(f'{scenario.name}, {flight.seconds:g} s', total=flight.frame_count)
         write_flight(args.out, flight, args.storage, args.workers, lambda n: progress.advance(task, n))
+        progress.update(task, completed=flight.frame_count)
     print(_summary(args.out, flight))
     return 0
 

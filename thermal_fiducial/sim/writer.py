@@ -1,43 +1,31 @@
 """A simulated flight as a rosbag2 with everything that a replay of it needs beside it."""
 
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
 from dataclasses import dataclass, fields
+import heapq
 import multiprocessing
 import os
 from pathlib import Path
 import shutil
+import signal
 import tempfile
 from typing import Any
 
 import cv2
-import numpy as np
-from rosbags.typesys import get_typestore, Stores
 import yaml
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, TRUTH_TOPIC
 from thermal_fiducial.files.trajectory import save_tum
-from thermal_fiducial.sim.camera import CHUNK, FlightPlan, SimFrame, ThermalCamera
+from thermal_fiducial.sim import messages
+from thermal_fiducial.sim.camera import CHUNK, FlightPlan, SimFrame, START_NS, ThermalCamera
 from thermal_fiducial.sim.scenario import Scenario
 from thermal_fiducial.sim.scene import Marker
 
-#: A frame reaches the recorder this long after its stamp, an IMU sample and the truth sooner [ns].
+#: A frame reaches the recorder this long after its read-out, an IMU sample and the truth sooner [ns].
 IMAGE_DELAY_NS = 25_000_000
 IMU_DELAY_NS = 1_000_000
-
-_TYPES = get_typestore(Stores.ROS2_JAZZY).types
-_Time, _Header = _TYPES['builtin_interfaces/msg/Time'], _TYPES['std_msgs/msg/Header']
-_Vector3, _Point = _TYPES['geometry_msgs/msg/Vector3'], _TYPES['geometry_msgs/msg/Point']
-_Quaternion, _Pose = _TYPES['geometry_msgs/msg/Quaternion'], _TYPES['geometry_msgs/msg/Pose']
-_Twist = _TYPES['geometry_msgs/msg/Twist']
-_PoseWithCovariance = _TYPES['geometry_msgs/msg/PoseWithCovariance']
-_TwistWithCovariance = _TYPES['geometry_msgs/msg/TwistWithCovariance']
-_Image, _CameraInfo = _TYPES['sensor_msgs/msg/Image'], _TYPES['sensor_msgs/msg/CameraInfo']
-_Region, _Imu = _TYPES['sensor_msgs/msg/RegionOfInterest'], _TYPES['sensor_msgs/msg/Imu']
-_Odometry = _TYPES['nav_msgs/msg/Odometry']
-
-CAMERA_FRAME, BODY_FRAME, MAP_FRAME = 'thermal_camera_optical', 'base_link', 'map'
 
 
 @dataclass(frozen=True)
@@ -64,7 +52,7 @@ def write_flight(
         fixed marker, the start of a map) and ``params.yaml`` (the rig) in it
     storage : mcap or sqlite3
     workers : processes that render; the bytes don't depend on it
-    progress : called with the number of frames that are done, chunk by chunk
+    progress : called with the number of frames written since the last call
 
     Raises
     ------
@@ -82,158 +70,82 @@ def write_flight(
         _write_bag(folder / out.name, flight, storage, workers, progress or (lambda _: None))
         _write_side_files(folder / out.name, flight)
         (folder / out.name).rename(out)
+    except OSError as error:
+        raise InputError(f'{out}: {error.strerror}') from None
+    except BrokenExecutor:
+        raise InputError(f'{out}: a rendering process died, for want of memory perhaps') from None
     finally:
         shutil.rmtree(folder)
 
 
 def _write_bag(folder: Path, flight: FlightPlan, storage: str, workers: int, progress: Callable[[int], None]) -> None:
     corners = ['stamp_ns,id,u0,v0,u1,v1,u2,v2,u3,v3\n']
-    body = _body_events(flight)
+    frames = _noting_corners(_frames(flight, workers), corners)
+    events = heapq.merge(_body_events(flight), _camera_events(frames, flight), key=lambda event: event.arrival_ns)
     with BagWriter(folder, storage) as bag:
-        pending = next(body, None)
-        for frames in _chunks(flight, workers):
-            for frame in frames:
-                arrival = frame.stamp_ns + IMAGE_DELAY_NS
-                while pending is not None and pending.arrival_ns <= arrival:
-                    bag.write(pending.topic, pending.arrival_ns, pending.message)
-                    pending = next(body, None)
-                bag.write(CAMERA_INFO_TOPIC, arrival, _camera_info(flight.scenario, frame.stamp_ns))
-                bag.write(IMAGE_TOPIC, arrival, _image(frame))
-                corners += [_corner_line(frame, marker_id) for marker_id in frame.corners_px]
-            progress(CHUNK)
-        while pending is not None:
-            bag.write(pending.topic, pending.arrival_ns, pending.message)
-            pending = next(body, None)
+        for event in events:
+            bag.write(event.topic, event.arrival_ns, event.message)
+            if event.topic == IMAGE_TOPIC:
+                progress(1)
     (folder / 'ground_truth_corners.csv').write_text(''.join(corners), encoding='ascii')
 
 
-def _corner_line(frame: SimFrame, marker_id: int) -> str:
-    numbers = ','.join(f'{value:.4f}' for value in frame.corners_px[marker_id].ravel())
-    return f'{frame.stamp_ns},{marker_id},{numbers}\n'
+def _noting_corners(frames: Iterable[SimFrame], lines: list[str]) -> Iterator[SimFrame]:
+    for frame in frames:
+        for marker_id, corners in frame.corners_px.items():
+            numbers = ','.join(f'{value:.4f}' for value in corners.ravel())
+            lines.append(f'{frame.stamp_ns},{marker_id},{numbers}\n')
+        yield frame
 
 
-# --- rendering in chunks ------------------------------------------------------------------------------
-
-_worker_flight: list[FlightPlan] = []
-
-
-def _start_worker(flight: FlightPlan) -> None:
-    cv2.setNumThreads(1)
-    _worker_flight[:] = [flight]
-
-
-def _render_chunk(start: int) -> list[SimFrame]:
-    flight = _worker_flight[0]
-    return list(_camera(flight).frames(start, min(start + CHUNK, flight.frame_count)))
-
-
-_cameras: dict[int, ThermalCamera] = {}
-
-
-def _camera(flight: FlightPlan) -> ThermalCamera:
-    """The process' one camera: its tables of rays take a second to make."""
-    if id(flight) not in _cameras:
-        _cameras.clear()
-        _cameras[id(flight)] = ThermalCamera(flight)
-    return _cameras[id(flight)]
-
-
-def _chunks(flight: FlightPlan, workers: int) -> Iterator[list[SimFrame]]:
-    starts = range(0, flight.frame_count, CHUNK)
-    if workers <= 1:
-        camera = ThermalCamera(flight)
-        for start in starts:
-            yield list(camera.frames(start, min(start + CHUNK, flight.frame_count)))
-        return
-    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-    context = multiprocessing.get_context('spawn')
-    with ProcessPoolExecutor(workers, context, _start_worker, (flight,)) as pool:
-        yield from pool.map(_render_chunk, starts)
-
-
-# --- messages -----------------------------------------------------------------------------------------
-
-
-def _header(stamp_ns: int, frame_id: str) -> Any:
-    seconds, nanoseconds = divmod(int(stamp_ns), 1_000_000_000)
-    return _Header(stamp=_Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
-
-
-def _image(frame: SimFrame) -> Any:
-    height, width = frame.counts.shape
-    return _Image(
-        header=_header(frame.stamp_ns, CAMERA_FRAME),
-        height=height,
-        width=width,
-        encoding='mono16',
-        is_bigendian=0,
-        step=2 * width,
-        data=np.ascontiguousarray(frame.counts, dtype='<u2').view(np.uint8).ravel(),
-    )
-
-
-def _camera_info(scenario: Scenario, stamp_ns: int) -> Any:
-    lens = scenario.lens
-    return _CameraInfo(
-        header=_header(stamp_ns, CAMERA_FRAME),
-        height=lens.height,
-        width=lens.width,
-        distortion_model=lens.model,
-        d=np.array(lens.distortion),
-        k=lens.matrix.ravel(),
-        r=np.eye(3).ravel(),
-        p=np.hstack([lens.matrix, np.zeros((3, 1))]).ravel(),
-        binning_x=0,
-        binning_y=0,
-        roi=_Region(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
-    )
+def _camera_events(frames: Iterable[SimFrame], flight: FlightPlan) -> Iterator[_Event]:
+    for frame in frames:
+        arrival = START_NS + round(frame.seconds * 1e9) + IMAGE_DELAY_NS
+        yield _Event(arrival, CAMERA_INFO_TOPIC, messages.camera_info(flight.scenario.lens, frame.stamp_ns))
+        yield _Event(arrival, IMAGE_TOPIC, messages.image(frame))
 
 
 def _body_events(flight: FlightPlan) -> Iterator[_Event]:
-    """IMU samples and true odometry."""
+    """IMU samples and the truth at their stamps."""
     scenario = flight.scenario
     times, stamps = flight.imu_stamps()
     trajectory = scenario.trajectory(flight.seconds, flight.seed)
     record, motion = scenario.imu.sample(trajectory, times, stamps, flight.seed), trajectory(times)
-    noise, rate = scenario.imu.noise, scenario.imu.rate
-    rate_covariance = np.eye(3).ravel() * noise.gyroscope_noise_density**2 * rate
-    force_covariance = np.eye(3).ravel() * noise.accelerometer_noise_density**2 * rate
-    unknown = np.array([-1.0] + [0.0] * 8)
-    no_rotation = _Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
-    quaternions = motion.rotation.as_quat()
-    velocities = motion.rotation.inv().apply(motion.velocity)
-    for n, stamp in enumerate(stamps):
-        imu = _Imu(
-            header=_header(stamp, BODY_FRAME),
-            orientation=no_rotation,
-            orientation_covariance=unknown,
-            angular_velocity=_vector(record.angular_velocity[n]),
-            angular_velocity_covariance=rate_covariance,
-            linear_acceleration=_vector(record.linear_acceleration[n]),
-            linear_acceleration_covariance=force_covariance,
-        )
-        yield _Event(int(stamp) + IMU_DELAY_NS, IMU_TOPIC, imu)
-        pose = _Pose(position=_point(motion.position[n]), orientation=_quaternion(quaternions[n]))
-        twist = _Twist(linear=_vector(velocities[n]), angular=_vector(motion.angular_velocity_body[n]))
-        odometry = _Odometry(
-            header=_header(stamp, MAP_FRAME),
-            child_frame_id=BODY_FRAME,
-            pose=_PoseWithCovariance(pose=pose, covariance=np.zeros(36)),
-            twist=_TwistWithCovariance(twist=twist, covariance=np.zeros(36)),
-        )
-        yield _Event(int(stamp) + IMU_DELAY_NS, TRUTH_TOPIC, odometry)
+    quaternions, velocities = motion.rotation.as_quat(), motion.rotation.inv().apply(motion.velocity)
+    truth = zip(motion.position, quaternions, velocities, motion.angular_velocity_body, strict=True)
+    samples = zip(record.angular_velocity, record.linear_acceleration, strict=True)
+    for stamp, sample, state in zip(stamps.tolist(), samples, truth, strict=True):
+        yield _Event(stamp + IMU_DELAY_NS, IMU_TOPIC, messages.imu(stamp, *sample, scenario.imu))
+        yield _Event(stamp + IMU_DELAY_NS, TRUTH_TOPIC, messages.odometry(stamp, *state))
 
 
-def _vector(v: np.ndarray) -> Any:
-    return _Vector3(x=float(v[0]), y=float(v[1]), z=float(v[2]))
+# --- rendering in chunks ------------------------------------------------------------------------------
+
+#: The camera of a worker process, made once: its tables of rays take a second.
+_worker_camera: list[ThermalCamera] = []
 
 
-def _point(v: np.ndarray) -> Any:
-    return _Point(x=float(v[0]), y=float(v[1]), z=float(v[2]))
+def _start_worker(flight: FlightPlan) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process ends us
+    cv2.setNumThreads(1)
+    _worker_camera[:] = [ThermalCamera(flight)]
 
 
-def _quaternion(q: np.ndarray) -> Any:
-    return _Quaternion(x=float(q[0]), y=float(q[1]), z=float(q[2]), w=float(q[3]))
+def _render_chunk(start: int, stop: int) -> list[SimFrame]:
+    return list(_worker_camera[0].frames(start, stop))
+
+
+def _frames(flight: FlightPlan, workers: int) -> Iterator[SimFrame]:
+    if workers <= 1:
+        yield from ThermalCamera(flight).frames(0, flight.frame_count)
+        return
+    starts = list(range(0, flight.frame_count, CHUNK))
+    stops = [min(start + CHUNK, flight.frame_count) for start in starts]
+    os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')  # a worker is to use one core
+    context = multiprocessing.get_context('spawn')  # a fork of a process that runs ROS deadlocks
+    with ProcessPoolExecutor(min(workers, len(starts)), context, _start_worker, (flight,)) as pool:
+        for chunk in pool.map(_render_chunk, starts, stops):
+            yield from chunk
 
 
 # --- what a replay needs beside the bag ---------------------------------------------------------------
@@ -264,7 +176,7 @@ def _marker_map(scenario: Scenario, markers: tuple[Marker, ...]) -> dict[str, An
         }
         for marker in markers
     ]
-    head = {'format': 'thermal_fiducial/marker_map', 'version': 1, 'frame_id': MAP_FRAME}
+    head = {'format': 'thermal_fiducial/marker_map', 'version': 1, 'frame_id': messages.MAP_FRAME}
     return {**head, 'dictionary': scenario.dictionary, 'markers': entries}
 
 

@@ -1,0 +1,191 @@
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+from support.tiny import TINY
+import yaml
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.config import from_mapping, PoseEkfConfig
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import BagReader
+from thermal_fiducial.files.images import image_to_array, stamp_to_ns
+from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.trajectory import load_tum
+from thermal_fiducial.sim.camera import plan, render_frames, simulate_imu
+from thermal_fiducial.sim.scenario import LENSES, SCENARIOS
+from thermal_fiducial.sim.writer import IMAGE_DELAY_NS, write_flight
+
+SECONDS = 2.0
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('bags') / 'tiny'
+    write_flight(folder, plan(replace(TINY, camera_time_offset=-0.02), SECONDS, 3), workers=2)
+    return folder
+
+
+@pytest.fixture(scope='module')
+def messages(bag):
+    with BagReader(bag) as reader:
+        return list(reader.messages())
+
+
+def of(messages, topic):
+    return [message.message for message in messages if message.topic == topic]
+
+
+def test_topics_of_the_contract(bag):
+    with BagReader(bag) as reader:
+        assert reader.topics == {
+            'thermal/image_raw': 'sensor_msgs/msg/Image',
+            'thermal/camera_info': 'sensor_msgs/msg/CameraInfo',
+            'imu/data': 'sensor_msgs/msg/Imu',
+            'ground_truth/odometry': 'nav_msgs/msg/Odometry',
+        }
+        counts = [reader.message_count([topic]) for topic in reader.topics]
+    assert sorted(counts) == [60, 60, 401, 401]
+
+
+def test_frames_are_those_of_the_renderer(messages):
+    scenario = replace(TINY, camera_time_offset=-0.02)
+    for frame, message in zip(render_frames(scenario, SECONDS, 3), of(messages, 'thermal/image_raw'), strict=True):
+        assert stamp_to_ns(message.header.stamp) == frame.stamp_ns
+        np.testing.assert_array_equal(image_to_array(message), frame.counts)
+
+
+def test_the_cameras_clock_is_off_by_the_offset(messages):
+    arrivals = {m.stamp_ns: stamp_to_ns(m.message.header.stamp) for m in messages if m.topic == 'thermal/image_raw'}
+    # t_imu = t_camera - 20 ms, and the bag's stamps are the IMU's clock; integers, rounded once.
+    assert all(abs((arrived - IMAGE_DELAY_NS) - (stamp - 20_000_000)) <= 1 for arrived, stamp in arrivals.items())
+    stamps = [message.stamp_ns for message in messages]
+    assert stamps == sorted(stamps)
+
+
+def test_imu_and_truth(messages):
+    imu, record = of(messages, 'imu/data'), simulate_imu(TINY, SECONDS, 3)
+    assert [stamp_to_ns(m.header.stamp) for m in imu] == record.stamps_ns.tolist()
+    rates = [[m.angular_velocity.x, m.angular_velocity.y, m.angular_velocity.z] for m in imu]
+    np.testing.assert_array_equal(rates, record.angular_velocity)
+    truth = of(messages, 'ground_truth/odometry')
+    assert [stamp_to_ns(m.header.stamp) for m in truth] == record.stamps_ns.tolist()
+    motion = TINY.trajectory(SECONDS, 3)([1.0])
+    position = truth[200].pose.pose.position
+    np.testing.assert_allclose([position.x, position.y, position.z], motion.position[0], atol=1e-12)
+    twist = truth[200].twist.twist.linear
+    velocity = motion.rotation[0].inv().apply(motion.velocity[0])
+    np.testing.assert_allclose([twist.x, twist.y, twist.z], velocity, atol=1e-12)
+
+
+def test_camera_info_is_the_lens(messages):
+    info = of(messages, 'thermal/camera_info')[0]
+    assert (info.width, info.height, info.distortion_model) == (160, 128, 'plumb_bob')
+    np.testing.assert_array_equal(info.k.reshape(3, 3), TINY.lens.matrix)
+    np.testing.assert_array_equal(info.d, TINY.lens.distortion)
+    assert info.header.frame_id == 'thermal_camera_optical'
+
+
+def test_maps_truth_and_rig_beside_it(bag):
+    true, one = load_map(bag / 'map_true.yaml'), load_map(bag / 'map_one.yaml')
+    assert (set(true.markers), set(one.markers)) == ({5, 7}, {5})
+    for marker in TINY.markers:
+        np.testing.assert_allclose(true.markers[marker.id].T_map_marker, marker.T_map_marker, atol=1e-9)
+        assert true.markers[marker.id].size == marker.size
+    stamps, positions, _ = load_tum(bag / 'ground_truth.tum')
+    assert len(stamps) == 401
+    np.testing.assert_allclose(positions[0], positions[-1], atol=1e-5)
+    parameters = yaml.safe_load((bag / 'params.yaml').read_text())['/**']['ros__parameters']
+    assert parameters['marker_size_overrides'] == ['7:0.25'] or parameters['marker_size_overrides'] == ['5:0.3']
+    flat = {f'imu.{name}': value for name, value in parameters['imu'].items()} | parameters
+    config = from_mapping(PoseEkfConfig, {name: value for name, value in flat.items() if name != 'imu'})
+    assert config.camera_position == TINY.camera_position
+    assert config.camera_time_offset == -0.02
+    assert math.isclose(config.imu.gyroscope_noise_density, 1.7e-4)
+
+
+def test_true_corners_beside_it(bag):
+    rows = np.loadtxt(bag / 'ground_truth_corners.csv', delimiter=',', skiprows=1, dtype=str)
+    frame = next(render_frames(replace(TINY, camera_time_offset=-0.02), SECONDS, 3))
+    assert int(rows[0, 0]) == frame.stamp_ns
+    corners = rows[0, 2:].astype(float).reshape(4, 2)
+    # Four decimals are written.
+    np.testing.assert_allclose(corners, frame.corners_px[int(rows[0, 1])], atol=1e-4)
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_same_seed_same_bytes_with_any_number_of_workers(tmp_path, storage):
+    for name, workers in (('one', 1), ('two', 2)):
+        (tmp_path / name).mkdir()
+        write_flight(tmp_path / name / 'bag', plan(TINY, SECONDS, 1), storage, workers)
+    files = sorted(path.name for path in (tmp_path / 'one' / 'bag').iterdir())
+    assert len(files) == 7
+    for file in files:
+        assert (tmp_path / 'one' / 'bag' / file).read_bytes() == (tmp_path / 'two' / 'bag' / file).read_bytes()
+
+
+def test_nothing_is_left_of_a_failed_flight(tmp_path):
+    with pytest.raises(InputError, match='dictionary'):
+        write_flight(tmp_path / 'bag', plan(replace(TINY, dictionary='DICT_9X9'), SECONDS))
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- the command --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def tiny_scenario(monkeypatch):
+    monkeypatch.setitem(SCENARIOS, 'tiny', TINY)
+
+
+def test_command_writes_a_bag_and_says_how_to_replay_it(tiny_scenario, tmp_path, capsys):
+    out = tmp_path / 'new' / 'bag'
+    options = ['--scenario', 'tiny', '--seconds', '2', '--contrast', '6', '--fog', '0.2', '--ffc', 'never']
+    assert main(['simulate', str(out), *options, '--storage', 'sqlite3', '--inverted', '--workers', '1']) == 0
+    assert f'replay {out}' in capsys.readouterr().out
+    with BagReader(out) as reader:
+        assert reader.message_count(['thermal/image_raw']) == 60
+    assert list(out.glob('*.db3'))
+
+
+def test_command_follows_a_trajectory(tiny_scenario, tmp_path):
+    lines = [f'{n / 10} {0.01 * n} 0 0.7 0 0 0 1\n' for n in range(31)]
+    (tmp_path / 'path.tum').write_text(''.join(lines))
+    command = ['simulate', str(tmp_path / 'bag'), '--scenario', 'tiny', '--workers', '1']
+    assert main([*command, '--trajectory', str(tmp_path / 'path.tum')]) == 0
+    stamps, positions, _ = load_tum(tmp_path / 'bag' / 'ground_truth.tum')
+    assert (stamps[-1] - stamps[0]) == 3_000_000_000
+    # The spline goes through the poses; nine decimals are written.
+    np.testing.assert_allclose(positions[-1], [0.3, 0.0, 0.7], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ('options', 'says'),
+    [
+        (['--scenario', 'moon'], 'moon'),
+        (['--lens', '3mm'], '3mm'),
+        (['--seconds', '1'], 'too short'),
+        (['--seconds', 'nan'], '--seconds nan is outside'),
+        (['--seed', '-1'], '--seed -1'),
+        (['--time-offset', '2'], '--time-offset 2.0'),
+        (['--trajectory', 'nowhere.tum'], 'nowhere.tum'),
+    ],
+)
+def test_command_refuses_in_one_line(tmp_path, capsys, options, says):
+    assert main(['simulate', str(tmp_path / 'bag'), '--workers', '1', *options]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert says in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_command_keeps_what_exists(tmp_path, capsys):
+    assert main(['simulate', str(tmp_path)]) == 2
+    assert 'exists already' in capsys.readouterr().err
+
+
+def test_help_lists_scenarios_and_lenses(capsys):
+    with pytest.raises(SystemExit):
+        main(['simulate', '--help'])
+    text = capsys.readouterr().out
+    assert all(name in text for name in (*SCENARIOS, *LENSES))

@@ -1,0 +1,96 @@
+"""The simulated messages, as objects of rosbags."""
+
+from typing import Any
+
+import numpy as np
+from rosbags.typesys import get_typestore, Stores
+
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.sim.camera import SimFrame
+from thermal_fiducial.sim.imu import ImuModel
+from thermal_fiducial.sim.lens import Lens
+
+CAMERA_FRAME, BODY_FRAME, MAP_FRAME = 'thermal_camera_optical', 'base_link', 'map'
+
+_TYPES = get_typestore(Stores.ROS2_JAZZY).types
+
+
+def _make(kind: str, *args: Any, **fields: Any) -> Any:
+    return _TYPES[kind](*args, **fields)
+
+
+def _header(stamp_ns: int, frame_id: str) -> Any:
+    time = _make('builtin_interfaces/msg/Time', *divmod(int(stamp_ns), 1_000_000_000))
+    return _make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)
+
+
+def _vector(values: FloatArray, kind: str = 'Vector3') -> Any:
+    return _make(f'geometry_msgs/msg/{kind}', *values.tolist())
+
+
+def image(frame: SimFrame) -> Any:
+    """A frame as little-endian mono16."""
+    height, width = frame.counts.shape
+    return _make(
+        'sensor_msgs/msg/Image',
+        header=_header(frame.stamp_ns, CAMERA_FRAME),
+        height=height,
+        width=width,
+        encoding='mono16',
+        is_bigendian=0,
+        step=2 * width,
+        data=np.ascontiguousarray(frame.counts, dtype='<u2').view(np.uint8).ravel(),
+    )
+
+
+def camera_info(lens: Lens, stamp_ns: int) -> Any:
+    """Calibration of the lens."""
+    return _make(
+        'sensor_msgs/msg/CameraInfo',
+        header=_header(stamp_ns, CAMERA_FRAME),
+        height=lens.height,
+        width=lens.width,
+        distortion_model=lens.model,
+        d=np.array(lens.distortion),
+        k=lens.matrix.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.hstack([lens.matrix, np.zeros((3, 1))]).ravel(),
+        binning_x=0,
+        binning_y=0,
+        roi=_make('sensor_msgs/msg/RegionOfInterest', 0, 0, 0, 0, do_rectify=False),
+    )
+
+
+def imu(stamp_ns: int, angular_velocity: FloatArray, linear_acceleration: FloatArray, model: ImuModel) -> Any:
+    """An IMU sample, without orientation, with the variances of its noise."""
+    deviations = np.array([model.noise.gyroscope_noise_density, model.noise.accelerometer_noise_density])
+    gyroscope, accelerometer = (np.eye(3).ravel() * variance for variance in deviations**2 * model.rate)
+    return _make(
+        'sensor_msgs/msg/Imu',
+        header=_header(stamp_ns, BODY_FRAME),
+        orientation=_make('geometry_msgs/msg/Quaternion', 0.0, 0.0, 0.0, 1.0),
+        orientation_covariance=np.array([-1.0] + [0.0] * 8),
+        angular_velocity=_vector(angular_velocity),
+        angular_velocity_covariance=gyroscope,
+        linear_acceleration=_vector(linear_acceleration),
+        linear_acceleration_covariance=accelerometer,
+    )
+
+
+def odometry(
+    stamp_ns: int,
+    position: FloatArray,
+    quaternion: FloatArray,
+    velocity_body: FloatArray,
+    angular_velocity_body: FloatArray,
+) -> Any:
+    """The truth: pose of the body in ``map``, twist in the body's frame."""
+    pose = _make('geometry_msgs/msg/Pose', _vector(position, 'Point'), _vector(quaternion, 'Quaternion'))
+    twist = _make('geometry_msgs/msg/Twist', _vector(velocity_body), _vector(angular_velocity_body))
+    return _make(
+        'nav_msgs/msg/Odometry',
+        header=_header(stamp_ns, MAP_FRAME),
+        child_frame_id=BODY_FRAME,
+        pose=_make('geometry_msgs/msg/PoseWithCovariance', pose, np.zeros(36)),
+        twist=_make('geometry_msgs/msg/TwistWithCovariance', twist, np.zeros(36)),
+    )
