@@ -1,0 +1,91 @@
+"""Real nodes in a context of their own, with a tester that publishes and listens."""
+
+from contextlib import contextmanager
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+
+from thermal_fiducial.ros import qos
+from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.run import make_executor
+
+
+class Graph:
+    """The nodes of a test; :meth:`spin_until` runs them."""
+
+    def __init__(self, context):
+        self.context = context
+        self.executor = make_executor(context)
+        self.nodes = []
+        self.tester = self._added(CountingNode('tester', context=context))
+        self._outputs = {}
+        self.heard = {}
+        self.listen(DiagnosticArray, '/diagnostics')
+
+    def _added(self, node):
+        self.executor.add_node(node)
+        self.nodes.append(node)
+        return node
+
+    def add(self, kind, live=False, **parameters):
+        overrides = [Parameter(name.replace('__', '.'), value=value) for name, value in parameters.items()]
+        return self._added(kind(live=live, context=self.context, parameter_overrides=overrides))
+
+    def listen(self, kind, topic, profile=qos.RESULT):
+        """Collect the messages of a topic in ``heard``."""
+        messages = self.heard[topic] = []
+        self.tester.subscribe(kind, topic, messages.append, profile)
+
+    def send(self, topic, *messages, profile=qos.RESULT):
+        """Publish, and wait until every subscription in the graph has it."""
+        if topic not in self._outputs:
+            self._outputs[topic] = self.tester.advertise(type(messages[0]), topic, profile)
+        output = self._outputs[topic]
+        readers = [source for node in self.nodes for source in node.inputs if source.topic == output.topic]
+        self.spin_until(lambda: output.listeners == len(readers) and all(reader.publishers for reader in readers))
+        for message in messages:
+            before = [reader.count for reader in readers]
+            output.send(message)
+            self.spin_until(lambda before=before: all(r.count > n for r, n in zip(readers, before, strict=True)))
+
+    def diagnose(self, node):
+        """The node's next diagnostic status: (level, message, figures)."""
+        heard = self.heard['/diagnostics']
+        count = len(heard)
+        self.spin_until(lambda: node._diagnostics.listeners == 1 and self.tester.inputs[0].publishers)
+        node.diagnose(0)
+        self.spin_until(lambda: len(heard) > count)
+        (status,) = heard[-1].status
+        return status.level, status.message, {item.key: item.value for item in status.values}
+
+    def spin_until(self, condition, seconds=10.0):
+        deadline = time.monotonic() + seconds
+        while not condition():
+            self.executor.spin_once(timeout_sec=0.05)
+            assert time.monotonic() < deadline, 'waited in vain'
+
+    def call(self, kind, name, request):
+        """Response of a service."""
+        client = self.tester.create_client(kind, name)
+        self.spin_until(client.service_is_ready)
+        future = client.call_async(request)
+        self.spin_until(future.done)
+        self.tester.destroy_client(client)
+        return future.result()
+
+
+@contextmanager
+def ros_graph(*arguments):
+    """A graph; ``arguments`` as after ``--ros-args``."""
+    context = Context()
+    context.init(args=['--ros-args', *arguments])
+    graph = Graph(context)
+    try:
+        yield graph
+    finally:
+        graph.executor.shutdown()
+        for node in graph.nodes:
+            node.destroy_node()
+        context.try_shutdown()

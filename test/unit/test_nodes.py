@@ -1,0 +1,394 @@
+"""The four nodes one by one: what they publish, say and survive."""
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+from rcl_interfaces.srv import DescribeParameters
+from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2
+from std_srvs.srv import SetBool, Trigger
+from support import small_bag
+from support.ros_graph import ros_graph
+
+from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.camera_info import save_camera
+from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.nodes.aruco_detector import ArucoDetector
+from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
+from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
+from thermal_fiducial.nodes.tau2_camera import Tau2Camera
+from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.node import ERROR, OK, WARN
+
+pytestmark = pytest.mark.ros
+START = small_bag.START_NS
+FRAME_NS = 33_333_333
+
+
+@pytest.fixture
+def graph():
+    with ros_graph() as graph:
+        yield graph
+
+
+def frames(count):
+    rng = np.random.default_rng(3)
+    pictures = [small_bag.frame(small_bag.true_pose(k / 30), rng) for k in range(count)]
+    return [convert.image(p, convert.header(START + k * FRAME_NS, 'camera')) for k, p in enumerate(pictures)]
+
+
+def info(camera=small_bag.CAMERA):
+    return convert.camera_info(camera, convert.header(START, 'camera'))
+
+
+def imu(k, rate=(0.0, 0.0, 0.0), force=(0.0, 0.0, 9.80665)):
+    message = Imu(header=convert.header(START + k * 5_000_000, 'base_link'))
+    message.angular_velocity = convert.vector(np.array(rate))
+    message.linear_acceleration = convert.vector(np.array(force))
+    return message
+
+
+def pose(k, T=None):
+    head = convert.header(START + k * 5_000_000, 'map')
+    T_map_camera = small_bag.T_BODY_CAMERA if T is None else T
+    return convert.pose_with_covariance(T_map_camera, np.diag([1e-6] * 3 + [1e-7] * 3), head)
+
+
+# --- tau2_camera --------------------------------------------------------------------------------------
+
+
+def test_clean_frames_go_out_with_their_stamp_and_frozen_ones_do_not(graph):
+    node = graph.add(Tau2Camera)
+    graph.listen(Image, 'thermal/image')
+    first, second = frames(2)
+    frozen = convert.image(convert.image_array(first), convert.header(START + 2, 'camera'))
+    graph.send('thermal/image_raw', first, frozen)
+    level, reason, figures = graph.diagnose(node)
+    assert (level, reason, figures['withheld: frozen']) == (WARN, 'frozen', '1')
+    graph.send('thermal/image_raw', second)
+    graph.spin_until(lambda: len(graph.heard['thermal/image']) == 2)
+    assert [message.header.stamp for message in graph.heard['thermal/image']] == [
+        first.header.stamp,
+        second.header.stamp,
+    ]
+    assert graph.heard['thermal/image'][0].header.frame_id == 'thermal_camera_optical'
+    assert graph.diagnose(node)[:2] == (OK, 'ok')
+
+
+def test_the_8_bit_view_is_made_only_for_somebody(graph):
+    node = graph.add(Tau2Camera)
+    first, second = frames(2)
+    graph.send('thermal/image_raw', first)
+    assert graph.diagnose(node)[2]['published /thermal/image_mono8'] == '0'
+    graph.listen(Image, 'thermal/image_mono8')
+    graph.spin_until(lambda: node._image_mono8.listeners == 1)
+    graph.send('thermal/image_raw', second)
+    graph.spin_until(lambda: graph.heard['thermal/image_mono8'])
+    assert graph.heard['thermal/image_mono8'][0].encoding == 'mono8'
+
+
+def test_a_truncated_image_is_refused_and_the_next_one_taken(graph):
+    node = graph.add(Tau2Camera)
+    good, broken = frames(2)
+    broken.data = broken.data[:1000]
+    graph.send('thermal/image_raw', broken)
+    level, reason, figures = graph.diagnose(node)
+    assert level == WARN
+    assert '640x512' in reason
+    assert '1000' in reason
+    assert figures['refused messages'] == '1'
+    graph.send('thermal/image_raw', good)
+    level, _, figures = graph.diagnose(node)
+    assert (level, figures['published /thermal/image']) == (OK, '1')
+
+
+def test_a_calibration_file_is_published_with_each_image(graph, tmp_path):
+    save_camera(tmp_path / 'tau2.yaml', small_bag.CAMERA)
+    graph.add(Tau2Camera, calibration_file=str(tmp_path / 'tau2.yaml'))
+    graph.listen(CameraInfo, 'thermal/camera_info')
+    graph.send('thermal/image_raw', *frames(1))
+    graph.spin_until(lambda: graph.heard['thermal/camera_info'])
+    message = graph.heard['thermal/camera_info'][0]
+    assert convert.camera(message).matches(small_bag.CAMERA)
+    assert convert.stamp_ns(message.header.stamp) == START
+
+
+@pytest.mark.parametrize('parameter', ['calibration_file', 'bad_pixel_file'])
+def test_a_file_that_is_not_there_is_a_fault_and_the_node_lives(graph, parameter):
+    node = graph.add(Tau2Camera, **{parameter: '/nowhere/file'})
+    graph.send('thermal/image_raw', *frames(1))
+    level, reason, figures = graph.diagnose(node)
+    assert level == ERROR
+    assert '/nowhere/file' in reason
+    assert figures['published /thermal/image'] == '1'
+
+
+# --- aruco_detector -----------------------------------------------------------------------------------
+
+
+def test_markers_come_as_rows_of_the_contract(graph):
+    graph.add(ArucoDetector, marker_size=small_bag.SIZE)
+    graph.listen(PointCloud2, 'markers')
+    graph.send('thermal/camera_info', info())
+    empty = convert.image(np.full((512, 640), 7000, np.uint16), convert.header(START + 1, 'camera'))
+    graph.send('thermal/image', *frames(1), empty)
+    graph.spin_until(lambda: len(graph.heard['markers']) == 2)
+    full, none = graph.heard['markers']
+    assert [field.name for field in full.fields[:4]] == ['x', 'y', 'z', 'id']
+    assert full.point_step == MARKER_DTYPE.itemsize
+    rows = convert.markers(full)
+    assert rows['id'].tolist() == [0, 1, 2, 3]
+    # Flat pictures at 2.4 m: a few centimetres.
+    np.testing.assert_allclose(rows['z'], 2.4, atol=0.1)
+    assert (none.width, len(none.data)) == (0, 0)
+
+
+def test_no_camera_info_is_said_and_then_forgotten(graph):
+    node = graph.add(ArucoDetector)
+    first, second = frames(2)
+    graph.send('thermal/image', first)
+    assert graph.diagnose(node)[:2] == (WARN, 'no camera_info')
+    graph.send('thermal/camera_info', info())
+    graph.send('thermal/image', second)
+    level, _, figures = graph.diagnose(node)
+    assert (level, figures['published /markers']) == (OK, '1')
+
+
+def test_an_uncalibrated_camera_info_does_not_replace_a_good_one(graph):
+    node = graph.add(ArucoDetector)
+    graph.send('thermal/camera_info', info(), CameraInfo(width=640, height=512))
+    assert 'not calibrated' in graph.diagnose(node)[2]['last refusal']
+    graph.send('thermal/image', *frames(1))
+    assert graph.diagnose(node)[2]['published /markers'] == '1'
+
+
+def test_an_image_of_another_size_than_the_calibration_is_refused(graph):
+    node = graph.add(ArucoDetector)
+    graph.send('thermal/camera_info', info())
+    graph.send('thermal/image', convert.image(np.zeros((256, 320), np.uint16), convert.header(START, 'camera')))
+    assert graph.diagnose(node)[:2] == (WARN, 'image of 320x256, camera_info of 640x512 pixels')
+
+
+def test_an_unknown_dictionary_is_a_fault_and_the_node_lives(graph):
+    node = graph.add(ArucoDetector, dictionary='DICT_9X9_9')
+    graph.send('thermal/camera_info', info())
+    graph.send('thermal/image', *frames(1))
+    level, reason, figures = graph.diagnose(node)
+    assert level == ERROR
+    assert 'DICT_9X9_9' in reason
+    assert figures['published /markers'] == '0'
+
+
+def test_the_annotated_image_is_made_for_a_listener(graph):
+    node = graph.add(ArucoDetector, marker_size=small_bag.SIZE)
+    graph.listen(Image, 'thermal/image_markers')
+    graph.spin_until(lambda: node._annotated.listeners == 1)
+    graph.send('thermal/camera_info', info())
+    graph.send('thermal/image', *frames(1))
+    graph.spin_until(lambda: graph.heard['thermal/image_markers'])
+    message = graph.heard['thermal/image_markers'][0]
+    picture = np.frombuffer(message.data, np.uint8).reshape(512, 640, 3)
+    assert message.encoding == 'bgr8'
+    # Four outlines in red are some thousand pixels that are not grey.
+    assert np.count_nonzero(picture[..., 2] != picture[..., 0]) > 1000
+
+
+# --- marker_mapper ------------------------------------------------------------------------------------
+
+
+def markers(k=0):
+    """The detector's answer to a frame."""
+    with ros_graph() as graph:
+        graph.add(ArucoDetector, marker_size=small_bag.SIZE)
+        graph.listen(PointCloud2, 'markers')
+        graph.send('thermal/camera_info', info())
+        graph.send('thermal/image', frames(k + 1)[k])
+        graph.spin_until(lambda: graph.heard['markers'])
+        return graph.heard['markers'][0]
+
+
+@pytest.fixture
+def map_file(tmp_path):
+    return small_bag.side_files(tmp_path)[0]
+
+
+def test_the_map_is_latched_and_the_camera_found(graph, map_file):
+    node = graph.add(MarkerMapperNode, map_file=str(map_file))
+    graph.listen(PointCloud2, 'marker_map', qos.LATCHED)
+    graph.spin_until(lambda: graph.heard['marker_map'])
+    rows = convert.cloud_rows(graph.heard['marker_map'][0], MAP_DTYPE)
+    assert (rows['id'].tolist(), rows['fixed'].tolist()) == ([0], [1])
+    graph.listen(PoseWithCovarianceStamped, 'camera_pose')
+    graph.send('thermal/camera_info', info())
+    graph.send('markers', markers())
+    graph.spin_until(lambda: graph.heard['camera_pose'])
+    found = convert.camera_pose(graph.heard['camera_pose'][0])
+    true = small_bag.true_pose(0.0) @ small_bag.T_BODY_CAMERA
+    # One flat picture of a marker at 2.4 m: a decimetre.
+    assert np.linalg.norm(found.T_map_camera[:3, 3] - true[:3, 3]) < 0.1
+    assert np.all(np.linalg.eigvalsh(found.covariance) > 0.0)
+    assert graph.diagnose(node)[2]['markers in map'] == '1'
+
+
+def test_services_save_freeze_and_reset(graph, map_file):
+    node = graph.add(MarkerMapperNode, map_file=str(map_file))
+    before = map_file.read_bytes()
+    map_file.unlink()
+    saved = graph.call(Trigger, 'marker_mapper/save', Trigger.Request())
+    assert saved.success
+    assert load_map(map_file).markers.keys() == {0}
+    assert map_file.read_bytes() == before
+    assert graph.call(SetBool, 'marker_mapper/freeze', SetBool.Request(data=True)).message == 'map frozen'
+    assert node.mapper.frozen
+    assert graph.call(SetBool, 'marker_mapper/freeze', SetBool.Request(data=False)).success
+    assert not node.mapper.frozen
+    assert graph.call(Trigger, 'marker_mapper/reset', Trigger.Request()).success
+
+
+def test_a_broken_map_file_is_a_fault_and_never_overwritten(graph, map_file):
+    map_file.write_text('format: thermal_fiducial/marker_map\nmarkers: [{id: 1, posi')
+    node = graph.add(MarkerMapperNode, map_file=str(map_file))
+    level, reason, _ = graph.diagnose(node)
+    assert level == ERROR
+    assert str(map_file) in reason
+    broken = map_file.read_bytes()
+    assert graph.call(Trigger, 'marker_mapper/save', Trigger.Request()).success
+    node.close()
+    assert map_file.read_bytes() == broken
+    assert load_map(map_file.with_name('map.new.yaml')).markers == {}
+
+
+def test_saving_nowhere_is_refused(graph):
+    graph.add(MarkerMapperNode)
+    response = graph.call(Trigger, 'marker_mapper/save', Trigger.Request())
+    assert not response.success
+    assert 'map_file' in response.message
+
+
+def test_mapping_saves_on_shutdown_and_localization_does_not(graph, map_file):
+    for mode, expected in (('localization', False), ('mapping', True)):
+        node = graph.add(MarkerMapperNode, map_file=str(map_file), mode=mode)
+        content = map_file.read_bytes()
+        map_file.unlink()
+        node.close()
+        assert map_file.exists() == expected
+        map_file.write_bytes(content)
+
+
+def test_a_cloud_that_is_no_markers_is_refused(graph, map_file):
+    node = graph.add(MarkerMapperNode, map_file=str(map_file))
+    graph.send('thermal/camera_info', info())
+    graph.send('markers', PointCloud2(point_step=16, height=1))
+    assert 'cloud without field' in graph.diagnose(node)[1]
+
+
+# --- pose_ekf -----------------------------------------------------------------------------------------
+
+
+def fly(graph, messages):
+    for message in messages:
+        graph.send('imu/data' if isinstance(message, Imu) else 'camera_pose', message)
+
+
+def test_one_pose_and_one_odometry_for_each_imu_message(graph):
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
+    for kind, topic in ((PoseWithCovarianceStamped, 'pose'), (Odometry, 'odometry')):
+        graph.listen(kind, topic)
+    fly(graph, [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
+    started = node._pose.count
+    assert 30 < started < 60
+    fly(graph, [imu(k) for k in range(60, 80)])
+    assert node._pose.count == node._odometry.count == started + 20
+    graph.spin_until(lambda: len(graph.heard['pose']) == len(graph.heard['odometry']) == started + 20)
+    message = graph.heard['odometry'][-1]
+    assert convert.stamp_ns(message.header.stamp) == START + 79 * 5_000_000
+    assert (message.header.frame_id, message.child_frame_id) == ('map', 'base_link')
+    # At rest at the origin: what is left is noise of the made-up poses' floor.
+    np.testing.assert_allclose(convert.odometry(message).T_map_body, np.eye(4), atol=0.01)
+    level, reason, figures = graph.diagnose(node)
+    assert (level, reason, figures['lost']) == (OK, 'tracking', 'False')
+
+
+def test_nan_in_the_imu_is_refused_and_the_next_sample_taken(graph):
+    node = graph.add(PoseEkfNode)
+    fly(graph, [imu(0), imu(1, force=(np.nan, 0.0, 9.8))])
+    level, _, figures = graph.diagnose(node)
+    assert (figures['refused messages'], 'not finite' in figures['last refusal']) == ('1', True)
+    assert level != OK
+    fly(graph, [imu(2)])
+    assert graph.diagnose(node)[2]['refused messages'] == '1'
+
+
+def test_stamps_that_go_back_are_said_and_survived(graph):
+    node = graph.add(PoseEkfNode)
+    fly(graph, [imu(10), imu(11), imu(9)])
+    level, reason, _ = graph.diagnose(node)
+    assert level != OK
+    assert reason
+    fly(graph, [imu(12)])
+    assert graph.diagnose(node)[1] == 'waiting for markers'
+
+
+def test_a_camera_pose_that_is_none_is_refused(graph):
+    node = graph.add(PoseEkfNode)
+    broken = pose(0)
+    broken.pose.pose.orientation.w = broken.pose.pose.orientation.x = 0.0
+    broken.pose.pose.orientation.y = broken.pose.pose.orientation.z = 0.0
+    fly(graph, [imu(0), broken])
+    assert 'unit quaternion' in graph.diagnose(node)[1]
+
+
+def test_reset_starts_afresh(graph):
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
+    fly(graph, [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
+    assert graph.diagnose(node)[1] == 'tracking'
+    assert graph.call(Trigger, 'pose_ekf/reset', Trigger.Request()).success
+    fly(graph, [imu(60)])
+    assert graph.diagnose(node)[1] == 'waiting for markers'
+
+
+# --- parameters ---------------------------------------------------------------------------------------
+
+
+def test_silence_is_said(graph):
+    node = graph.add(PoseEkfNode)
+    assert graph.diagnose(node)[:2] == (WARN, 'no imu/data')
+
+
+@pytest.mark.parametrize(
+    ('rule', 'reason'),
+    [
+        ('marker_size:=-1.0', 'marker_size'),
+        ('marker_size:=big', 'marker_size'),
+        ('camera_position:=[1.0, 2.0]', 'camera_position: 2 values, not 3'),
+        ('marker_size_overrides:=["7"]', '"ID:SIZE"'),
+    ],
+)
+def test_an_unusable_parameter_is_one_line(rule, reason):
+    with ros_graph('-p', rule) as graph:
+        try:
+            said = graph.add(ArucoDetector).faults
+        except InputError as error:
+            said = [str(error)]
+    assert len(said) == 1
+    assert reason in said[0]
+
+
+def test_parameters_are_described(graph):
+    graph.add(PoseEkfNode)
+    request = DescribeParameters.Request(names=['imu.gyroscope_noise_density', 'gravity', 'map_frame'])
+    noise, gravity, frame = graph.call(DescribeParameters, 'pose_ekf/describe_parameters', request).descriptors
+    assert 'rad/s/sqrt(Hz)' in noise.description
+    assert noise.floating_point_range[0].from_value == 0.0
+    assert (gravity.floating_point_range[0].from_value, gravity.floating_point_range[0].to_value) == (9.7, 9.9)
+    assert frame.read_only
+
+
+def test_names_are_relative(graph):
+    with ros_graph('-r', '__ns:=/drone', '-r', 'pose:=vision/pose') as other:
+        node = other.add(PoseEkfNode)
+        topics = {output.topic for output in node.outputs} | {source.topic for source in node.inputs}
+    assert topics == {
+        '/diagnostics', '/drone/vision/pose', '/drone/odometry', '/drone/path', '/drone/imu/data', '/drone/camera_pose'
+    }  # fmt: skip
