@@ -38,7 +38,7 @@ def load_camera(path: str | Path) -> Camera:
 
 
 def _camera(content: dict[str, Any]) -> Camera:
-    model = content.get('distortion_model', 'plumb_bob')
+    model = str(content.get('distortion_model', 'plumb_bob'))
     return Camera(
         width=_integer(content, 'image_width'),
         height=_integer(content, 'image_height'),

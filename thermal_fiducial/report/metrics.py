@@ -120,14 +120,14 @@ def aligned_residuals(e: Errors) -> FloatArray:
 
 
 def pairs_apart(stamps_ns: IntArray, interval_ns: int) -> tuple[IntArray, IntArray]:
-    """Indices i and j of samples that lie ``interval_ns`` apart, within a fifth of it."""
+    """Indices i and j of samples that lie ``interval_ns`` apart, within a fifth of it and 20 ms."""
     if len(stamps_ns) < 2:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     wanted = stamps_ns + interval_ns
     right = np.clip(np.searchsorted(stamps_ns, wanted), 1, len(stamps_ns) - 1)
     j = np.where(wanted - stamps_ns[right - 1] < stamps_ns[right] - wanted, right - 1, right)
     i = np.arange(len(stamps_ns))
-    close = (np.abs(stamps_ns[j] - wanted) <= interval_ns // 5) & (j > i)
+    close = (np.abs(stamps_ns[j] - wanted) <= min(interval_ns // 5, 20_000_000)) & (j > i)
     return i[close], j[close]
 
 
