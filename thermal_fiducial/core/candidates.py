@@ -38,6 +38,7 @@ _CHOICES = 4
 class View:
     """A marker seen from a camera whose pose is known, or known to be one of two."""
 
+    stamp_ns: int
     #: (2, 4, 4) twice the same where there is no doubt
     T_map_camera: FloatArray
     #: (2, 6, 6) of either, ROS convention
@@ -77,6 +78,13 @@ class Candidate:
         # Both branches put the centre at the same place: the direction doesn't depend on the ambiguity.
         arm = view.T_map_camera[0, :3, :3] @ view.branches[0, :3, 3]
         direction = -arm / np.linalg.norm(arm)
+        stamps = [kept.stamp_ns for kept in self.views]
+        if view.stamp_ns in stamps:
+            # The same frame again, its camera's pose known better by now.
+            index = stamps.index(view.stamp_ns)
+            self.views[index], self._directions[index] = view, direction
+            self.untried += 1
+            return True
         if self._directions and np.max(np.stack(self._directions) @ direction) > np.cos(MIN_SEPARATION):
             return False
         self.views.append(view)
@@ -106,6 +114,14 @@ class Candidate:
         if rivals and rivals[0].chi2 - best.chi2 < DECISIVE * scale:
             return Placement(None, nothing, f'planar ambiguity of marker {self.id} unsettled')
         return Placement(best.T, scale * best.noise + best.from_cameras)
+
+    def solutions(self, camera: Camera) -> list[FloatArray]:
+        """All poses (4, 4) that a fit to the views ends in, the best first."""
+        poses: list[FloatArray] = []
+        for fit in self._fits(camera):
+            if all(rotation_angle(fit.T[:3, :3].T @ T[:3, :3]) > _SAME_FIT for T in poses) and np.isfinite(fit.chi2):
+                poses.append(fit.T)
+        return poses
 
     def _drop_most_redundant(self) -> None:
         """Drop the view whose nearest neighbour is the nearest of all."""

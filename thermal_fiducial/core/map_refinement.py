@@ -58,6 +58,8 @@ class Refinement:
     #: rms re-projection error [px] before and after
     rms_before_px: float
     rms_px: float
+    #: robust sum of squared whitened residuals, in units of their actual variance
+    cost: float
     #: ratio of the residuals' variance to what the corner covariances promise
     variance_factor: float
     #: marker ID to the share of its views that are outliers
@@ -247,6 +249,7 @@ class _Problem:
             dict(zip(self.stamps, state.T_map_rig, strict=True)),
             float(np.sqrt(np.sum(before.squared_px) / (4 * n))),
             float(np.sqrt(np.sum(after.squared_px) / (4 * n))),
+            after.cost / max(factor, 1.0),
             factor,
             dict(zip(self.ids, outlying.tolist(), strict=True)),
             iterations,

@@ -18,7 +18,7 @@ from thermal_fiducial.core.geometry import inverse, skew, so3_exp, transform, tr
 from thermal_fiducial.core.keyframes import Keyframe, KeyframeStore, Link, Rig
 from thermal_fiducial.core.localization import locate, Location, Refusal, Sight
 from thermal_fiducial.core.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.map_refinement import prior_poses, Refinement, Snapshot
+from thermal_fiducial.core.map_refinement import prior_poses, refine, Refinement, Snapshot
 from thermal_fiducial.core.measurements import CameraPose, columns, corner_covariances, corners_px, Markers, Odometry
 from thermal_fiducial.core.reprojection import corners_in_map, linearise, reproject
 from thermal_fiducial.core.trust import culprits, DISAGREEMENT, Trust
@@ -99,7 +99,7 @@ class MarkerMapper:
         self._trust = Trust()
         self._quarantined = {key for key, marker in self.map.markers.items() if not marker.trusted}
         self._last: CameraPose | None = None
-        self._camera: Camera | None = None
+        self._cameras: list[Camera] = []
         self._keyframes = KeyframeStore(self.config.keyframe_budget)
         self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(self.map.markers)
 
@@ -206,7 +206,7 @@ class MarkerMapper:
         for i, marker_id in enumerate(int(key) for key in rows['id']):
             size = self._sizes.get(marker_id, self.config.marker_size)
             candidate = self._candidates.setdefault(marker_id, Candidate(marker_id, size))
-            candidate.add(View(T_map_camera, pose_covariances, corners[i], covariances[i], branches[i]))
+            candidate.add(View(stamp_ns, T_map_camera, pose_covariances, corners[i], covariances[i], branches[i]))
             shown.append(candidate)
         placed = False
         for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:
@@ -215,19 +215,24 @@ class MarkerMapper:
             placement = candidate.place(camera)
             candidate.reason = placement.reason
             if placement.T_map_marker is not None:
-                self._enter(stamp_ns, candidate, placement.T_map_marker, placement.covariance)
+                self.enter(stamp_ns, candidate, placement.T_map_marker, placement.covariance)
                 placed = True
         self.map.version += placed
         return placed, {candidate.id: candidate.reason for candidate in shown if candidate.id in self._candidates}
 
     def _keep(self, rows: Markers, camera: Camera, pose: CameraPose) -> None:
         """Keep the frame for the refinement; of one marker alone nothing can be learned."""
-        if self._camera is None or not camera.matches(self._camera):
-            self._camera = camera
-            self._keyframes = KeyframeStore(self.config.keyframe_budget)
-        self._last_frame = _keyframe(rows, pose)
+        self._last_frame = _keyframe(rows, pose, self._camera_index(camera))
         if len(rows) >= 2:
             self._keyframes.add(self._last_frame)
+
+    def _camera_index(self, camera: Camera) -> int:
+        """Index of ``camera`` among those seen so far: a calibration may change, or frames of several cameras come."""
+        for index, known in enumerate(self._cameras):
+            if camera is known or camera.matches(known):
+                return index
+        self._cameras.append(camera)
+        return len(self._cameras) - 1
 
     def _without_pose(
         self, stamp_ns: int, rows: Markers, camera: Camera, odometry: Odometry | None, refusal: Refusal
@@ -246,7 +251,7 @@ class MarkerMapper:
     def _bridge(self, stamp_ns: int, rows: Markers, camera: Camera, odometry: Odometry) -> tuple[bool, dict[int, str]]:
         """Place new markers from the odometry while no known one is in view."""
         pose = self._from_odometry(stamp_ns, odometry)
-        frame = _keyframe(rows, pose)
+        frame = _keyframe(rows, pose, self._camera_index(camera))
         if not any(int(key) in self._candidates for key in rows['id']):
             # Nothing but the odometry joins these markers to the map. Once is enough: its error is the same for all
             # that follow, which hang together through the markers themselves.
@@ -277,20 +282,27 @@ class MarkerMapper:
 
         The snapshot is immutable: the refinement may run elsewhere while frames are processed.
         """
-        if self._camera is None:
+        if not self._keyframes.frames:
             return None
         frames = tuple(self._keyframes.frames.values())
-        if frames:
-            self._refined_ns = frames[-1].stamp_ns
+        self._refined_ns = frames[-1].stamp_ns
         self._refined_frames, self._refined_markers = len(frames), len(self.map.markers)
         return Snapshot(
             {key: marker for key, marker in self.map.markers.items() if marker.trusted},
             frames,
-            Rig.single(self._camera),
+            Rig(tuple(self._cameras), np.broadcast_to(np.eye(4), (len(self._cameras), 4, 4))),
             tuple(self._keyframes.links),
             prior_poses(self._initial.markers),
             self.map.version,
         )
+
+    def refine(self) -> Refinement | None:
+        """Refine here and now, and take it over: for tools, and wherever time doesn't press."""
+        snapshot = self.snapshot()
+        refinement = refine(snapshot) if snapshot is not None else None
+        if refinement is not None:
+            self.apply(refinement)
+        return refinement
 
     def apply(self, refinement: Refinement) -> MapJump | None:
         """Take over a refinement: markers, keyframes, candidates and the last pose move together.
@@ -317,8 +329,14 @@ class MarkerMapper:
         self.resets += 1
         return MapJump(self.map.version, self.resets, T_new_old)
 
-    def _enter(self, stamp_ns: int, candidate: Candidate, T_map_marker: FloatArray, covariance: FloatArray) -> None:
-        del self._candidates[candidate.id]
+    @property
+    def candidates(self) -> dict[int, Candidate]:
+        """Markers on trial."""
+        return dict(self._candidates)
+
+    def enter(self, stamp_ns: int, candidate: Candidate, T_map_marker: FloatArray, covariance: FloatArray) -> None:
+        """Take a candidate into the map."""
+        self._candidates.pop(candidate.id, None)
         self._trust.forget([candidate.id])
         self.map.markers[candidate.id] = MapMarker(
             candidate.id, candidate.size, False, T_map_marker, covariance, first_seen_ns=stamp_ns, last_seen_ns=stamp_ns
@@ -346,14 +364,14 @@ def predict(odometry: Odometry, stamp_ns: int) -> FloatArray:
     return np.asarray(odometry.T_map_body @ step, dtype=np.float64)
 
 
-def _keyframe(rows: Markers, pose: CameraPose) -> Keyframe:
+def _keyframe(rows: Markers, pose: CameraPose, camera: int) -> Keyframe:
     return Keyframe(
         pose.stamp_ns,
         pose.T_map_camera,
         rows['id'].astype(np.int64),
         corners_px(rows),
         corner_covariances(rows),
-        np.zeros(len(rows), dtype=np.int64),
+        np.full(len(rows), camera),
     )
 
 

@@ -1,0 +1,119 @@
+"""A map from frames in any order: photos of a place, or the detections of a whole run at once."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.candidates import Candidate, DECISIVE
+from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.map_refinement import refine, Refinement
+from thermal_fiducial.core.marker_map import MarkerMapper
+from thermal_fiducial.core.measurements import Markers
+from thermal_fiducial.core.types import FloatArray
+
+# Passes over all frames: more than any chain of markers needs of which each is seen with the last alone.
+_MAX_PASSES = 50
+# What a rival pose starts its joint adjustment with: as good as unknown.
+_UNKNOWN = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
+
+
+@dataclass(frozen=True)
+class Built:
+    """A map from frames, and how it came out."""
+
+    map: MarkerMap
+    #: the last joint adjustment; None: there was nothing to adjust
+    refinement: Refinement | None
+    #: markers that were seen but could not be placed, with the reason in words
+    unplaced: dict[int, str]
+    #: frames that gave a camera pose in the end
+    frames_used: int
+
+
+def build_map(
+    frames: Sequence[Markers],
+    camera: Camera,
+    marker_map: MarkerMap,
+    config: MarkerMapperConfig,
+    progress: Callable[[int], None] = lambda markers: None,
+) -> Built:
+    """Grow ``marker_map`` by all markers that hang together with it, and adjust all jointly.
+
+    The frames are shown to the mapper again and again, for as long as any brings a new marker: a frame in which
+    nothing is known yet may be the link to the rest later. Where views alone leave two poses of a marker, the joint
+    adjustment of either decides.
+
+    Parameters
+    ----------
+    frames : rows of MARKER_DTYPE of each frame
+    progress : is told the number of markers in the map after each pass
+    """
+    config = replace(config, mode='mapping', keyframe_budget=max(len(frames), config.keyframe_budget))
+    mapper = MarkerMapper(config, marker_map)
+    used, waiting, refinement = 0, {}, None
+    for _ in range(_MAX_PASSES):
+        before = len(mapper.map.markers)
+        used = 0
+        for k, rows in enumerate(frames):
+            result = mapper.process(_stamp(k), rows, camera)
+            waiting |= result.candidates
+            used += result.pose is not None
+        refinement = mapper.refine() or refinement
+        progress(len(mapper.map.markers))
+        if len(mapper.map.markers) == before and not _settle(mapper, camera):
+            break
+    unplaced = {key: why for key, why in waiting.items() if key not in mapper.map.markers}
+    return Built(_with_statistics(mapper.map, frames, marker_map), refinement, unplaced, used)
+
+
+def _stamp(k: int) -> int:
+    """Stamp of frame k, in every pass the same; seconds apart, since unordered frames have no continuity."""
+    return (k + 1) * 1_000_000_000
+
+
+def _settle(mapper: MarkerMapper, camera: Camera) -> bool:
+    """Decide between the rival poses of a candidate by adjusting the map jointly with either; whether one was."""
+    for candidate in mapper.candidates.values():
+        winner = _winner(mapper, candidate, candidate.solutions(camera)[:2])
+        if winner is not None:
+            mapper.enter(candidate.views[-1].stamp_ns, candidate, *winner)
+            mapper.map.version += 1
+            return True
+    return False
+
+
+def _winner(
+    mapper: MarkerMapper, candidate: Candidate, rivals: list[FloatArray]
+) -> tuple[FloatArray, FloatArray] | None:
+    """Pose and covariance of the rival that the joint adjustment prefers decisively."""
+    snapshot = mapper.snapshot()
+    if snapshot is None or not rivals:
+        return None
+    outcomes = []
+    for T in rivals:
+        trial = MapMarker(candidate.id, candidate.size, False, T, _UNKNOWN)
+        refinement = refine(replace(snapshot, markers={**snapshot.markers, candidate.id: trial}))
+        if refinement is not None and candidate.id in refinement.markers:
+            outcomes.append((refinement.cost, refinement.markers[candidate.id]))
+    outcomes.sort(key=lambda outcome: outcome[0])
+    if not outcomes or (len(outcomes) == 2 and outcomes[1][0] - outcomes[0][0] < DECISIVE):
+        return None
+    return outcomes[0][1].T_map_marker, outcomes[0][1].covariance
+
+
+def _with_statistics(built: MarkerMap, frames: Sequence[Markers], start: MarkerMap) -> MarkerMap:
+    """Observations counted once, however often the frames were shown; stamps of made-up times left out."""
+    ids, counts = np.unique(np.concatenate([rows['id'] for rows in frames]), return_counts=True)
+    seen = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+    for key, marker in built.markers.items():
+        earlier = start.markers.get(key)
+        built.markers[key] = replace(
+            marker,
+            observations=seen.get(key, 0) + (earlier.observations if earlier else 0),
+            first_seen_ns=earlier.first_seen_ns if earlier else 0,
+            last_seen_ns=earlier.last_seen_ns if earlier else 0,
+        )
+    return built
