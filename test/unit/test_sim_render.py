@@ -194,6 +194,22 @@ def test_lag_shifts_the_half_height_of_an_edge_by_tau_ln_2(tau):
     assert abs((offsets - expected).mean()) < 0.03
 
 
+def test_stepwise_lag_is_what_its_sum_says():
+    tau, speed, step = 0.010, 1.5, 1 / 120
+    plate = hole(180.0, 0.0, 0.0, (2.0, 0.0, 1.2), 0.45)
+    body = Straight(velocity=(0.0, speed, 0.0))
+    view = Renderer(
+        LENS, [plate], EMPTY_ROOM, Fog(), ACRYLIC, body, T_BODY_CAMERA, 1 / 30, tau, Quality(97, stepwise=True)
+    )
+    _, after = image_moments(view.frame(0.0))
+    poses = view.camera_poses(np.array([-1e-3, 0.0]))
+    earlier, before = (polygon_moments(opencv_pixels(LENS, on_plate(plate, OUTLINE * 0.45), p))[1] for p in poses)
+    forget = np.exp(-step / tau)
+    # Weights (1 - e) e^k at ages k steps: their mean is e / (1 - e) steps. Distortion bends the path a little.
+    shift = (before - earlier) / 1e-3 * step * forget / (1 - forget)
+    np.testing.assert_allclose(before - after, shift, atol=0.01)
+
+
 def test_a_moving_edge_is_smeared_without_steps():
     _, lagged, _ = moving(3.0, 0.010)
     # Along a row the response rises and decays monotonically: no ghost edge at the seams of the sub-frames.

@@ -21,6 +21,7 @@ _RANGES = {
     'seed': (0, 2**32 - 1),
     'contrast': (0.01, 400.0),
     'fog': (0.0, 100.0),
+    'lag': (0.0, 0.1),
     'time_offset': (-1.0, 1.0),
     'workers': (1, 64),
 }
@@ -43,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--contrast', type=float, metavar='K', help='warm plates over cold acrylic [K]')
     parser.add_argument('--inverted', action='store_true', help='warm code on a cold ground')
     parser.add_argument('--fog', type=float, metavar='E', help='extinction in the long-wave infrared [1/m]')
+    parser.add_argument('--lag', type=float, metavar='S', help='thermal time constant of the bolometers [s]')
     parser.add_argument('--ffc', choices=('frozen', 'dropped', 'shutter', 'never'), help='what a shutter event sends')
     parser.add_argument('--time-offset', type=float, metavar='S', help="camera's clock: t_imu = t_camera + S [s]")
     parser.add_argument('--trajectory', type=Path, metavar='TUM', help='fly these poses of base_link in map instead')
@@ -76,6 +78,8 @@ def _scenario(args: argparse.Namespace) -> Scenario:
         scenario = replace(scenario, acrylic=replace(scenario.acrylic, inverted=True))
     if args.fog is not None:
         scenario = replace(scenario, fog=replace(scenario.fog, extinction=args.fog))
+    if args.lag is not None:
+        scenario = replace(scenario, sensor=replace(scenario.sensor, lag=args.lag))
     if args.ffc == 'never':
         scenario = replace(scenario, sensor=replace(scenario.sensor, ffc_period=0.0))
     elif args.ffc is not None:

@@ -14,7 +14,8 @@ Frames with their truth, without any file::
     imu = simulate_imu('wall', seconds=12, seed=3)   # imu.stamps_ns, imu.angular_velocity, imu.linear_acceleration
 
 ``seconds`` is the length of the whole flight (take-off to landing, 11 s at least); ``start`` and ``stop`` pick frames
-of it, ``noise=False`` switches noise, fixed pattern, bad pixels and shutter off. A scenario is a frozen dataclass:
+of it, ``noise=False`` switches noise, fixed pattern, bad pixels and shutter off,
+``quality=Quality(samples=97)`` (of :mod:`.render`) samples finer. A scenario is a frozen dataclass:
 ``dataclasses.replace(named('wall'), sensor=replace(named('wall').sensor, lag=0.0), fog=Fog(0.3))``. It has ``.lens``
 (``.matrix``, ``.model``, ``.distortion``, ``.width``, ``.height``), ``.markers`` (``.id``, ``.size``,
 ``.T_map_marker``, ``.corners_map``), ``.T_body_camera``, ``.dictionary``, ``.trajectory(seconds, seed)``, ``.sensor``.

@@ -20,6 +20,8 @@ START_NS = 1_700_000_000_000_000_000
 #: on the number of workers.
 CHUNK = 30
 
+_DEFAULT_QUALITY = Quality()
+
 
 @dataclass(frozen=True)
 class SimFrame:
@@ -58,7 +60,7 @@ class FlightPlan:
     seconds: float
     seed: int
     noise: bool = True
-    quality: Quality = Quality()  # noqa: RUF009
+    quality: Quality = _DEFAULT_QUALITY
 
     @property
     def sensor_scenario(self) -> Scenario:
@@ -91,11 +93,16 @@ class FlightPlan:
 
 
 def plan(
-    scenario: Scenario | str, seconds: float | None = None, seed: int = 0, *, noise: bool = True, samples: int = 23
+    scenario: Scenario | str,
+    seconds: float | None = None,
+    seed: int = 0,
+    *,
+    noise: bool = True,
+    quality: Quality = _DEFAULT_QUALITY,
 ) -> FlightPlan:
     """A flight of ``scenario`` (an object or a name), by default of its own length."""
     chosen = named(scenario) if isinstance(scenario, str) else scenario
-    return FlightPlan(chosen, seconds or chosen.seconds, seed, noise, Quality(samples=samples))
+    return FlightPlan(chosen, seconds or chosen.seconds, seed, noise, quality)
 
 
 def render_frames(
@@ -104,7 +111,7 @@ def render_frames(
     seed: int = 0,
     *,
     noise: bool = True,
-    samples: int = 23,
+    quality: Quality = _DEFAULT_QUALITY,
     start: int = 0,
     stop: int | None = None,
 ) -> Iterator[SimFrame]:
@@ -112,7 +119,7 @@ def render_frames(
 
     With ``ffc_behaviour`` ``dropped`` those of the closed shutter are missing.
     """
-    flight = plan(scenario, seconds, seed, noise=noise, samples=samples)
+    flight = plan(scenario, seconds, seed, noise=noise, quality=quality)
     camera = ThermalCamera(flight)
     yield from camera.frames(start, flight.frame_count if stop is None else min(stop, flight.frame_count))
 

@@ -38,11 +38,14 @@ class Quality:
     samples : points of a pixel in a sub-frame, a key of :data:`LATTICES`
     sub_frames : of a frame interval
     warm_up : frames before the first one that fill the bolometers' memory
+    stepwise : whether the lag is integrated in steps, the scene taken at the end of each sub-frame, as simpler
+        renderers do: an edge leaves a staircase, and less lag than the time constant says
     """
 
     samples: int = 23
     sub_frames: int = 4
     warm_up: int = 3
+    stepwise: bool = False
 
 
 class Renderer:
@@ -81,7 +84,7 @@ class Renderer:
         self._trajectory, self._T_body_camera = trajectory, T_body_camera
         self._interval, self._warm_up = interval, quality.warm_up
         self._sub_frames = quality.sub_frames if lag > 0 else 1
-        self._dx, self._dy, self._ages, self._forget = _lattice(quality.samples, interval / self._sub_frames, lag)
+        self._dx, self._dy, self._ages, self._forget = _lattice(quality, interval / self._sub_frames, lag)
         self._rays = _pixel_rays(lens)
         self._norms = np.sqrt(1.0 + np.sum(self._rays[:2] ** 2, axis=0))
         self._coarse_rays = _coarse_rays(lens).astype(np.float32)
@@ -211,11 +214,13 @@ class Renderer:
         return self._lens.project_slopes(slopes * np.minimum(1.0, self._max_slope / np.maximum(radius, 1e-9)))
 
 
-def _lattice(samples: int, duration: float, lag: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+def _lattice(quality: Quality, duration: float, lag: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Offsets in the pixel [px], ages before the end of the sub-frame [s] in rising order, and the share forgotten."""
-    columns, rows, times = (((np.arange(samples) * g) % samples + 0.5) / samples for g in LATTICES[samples])
+    n = quality.samples
+    columns, rows, times = (((np.arange(n) * g) % n + 0.5) / n for g in LATTICES[n])
     forget = float(np.exp(-duration / lag)) if lag > 0 else 0.0
-    ages = -lag * np.log(1.0 - times * (1.0 - forget)) if lag > 0 else np.zeros(samples)
+    continuous = lag > 0 and not quality.stepwise
+    ages = -lag * np.log(1.0 - times * (1.0 - forget)) if continuous else np.zeros(n)
     order = np.argsort(ages, kind='stable')
     return columns[order] - 0.5, rows[order] - 0.5, ages[order], forget
 
