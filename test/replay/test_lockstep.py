@@ -30,10 +30,8 @@ def folder(tmp_path_factory):
 
 def replay(bag, out, folder, *extra):
     """Exit status of the command."""
-    return main(
-        ['replay', str(bag), '--out', str(out), '--params', str(folder / 'params.yaml')]
-        + ['--map', str(folder / 'map.yaml'), '--no-report', *map(str, extra)]
-    )
+    given = ['--params', folder / 'params.yaml', '--map', folder / 'map.yaml', '--no-report']
+    return main([str(word) for word in ('replay', bag, '--out', out, *given, *extra)])
 
 
 @pytest.fixture(scope='module')

@@ -3,6 +3,7 @@
 Good enough to run everything that handles bags; no measure of accuracy, which is the simulator's matter.
 """
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,6 +34,28 @@ _PIXELS_PER_BIT = 40
 _TYPES = get_typestore(Stores.ROS2_JAZZY).types
 
 
+@dataclass(frozen=True)
+class Raw:
+    """Bytes that are said to be a message."""
+
+    msgtype: str
+    data: bytes
+
+
+def replaced(message, **fields):
+    """A copy of a message with other fields."""
+    return type(message)(
+        **{
+            **{
+                item.name: getattr(message, item.name)
+                for item in dataclasses.fields(message)
+                if item.name != '__msgtype__'
+            },
+            **fields,
+        }
+    )
+
+
 @dataclass
 class Recording:
     """What is to be written: (bag stamp, topic, message), and the truth."""
@@ -52,7 +75,10 @@ class Recording:
     def write(self, path, storage='mcap'):
         with BagWriter(path, storage) as bag:
             for stamp, topic, message in sorted(self.events, key=lambda event: event[0]):
-                bag.write(topic, stamp, message)
+                if isinstance(message, Raw):
+                    bag.write(topic, stamp, message.data, message.msgtype)
+                else:
+                    bag.write(topic, stamp, message)
         return path
 
 

@@ -67,7 +67,8 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             head = convert.header(stamp, self.config.map_frame)
             pose = convert.pose_with_covariance(result.pose.T_map_camera, result.pose.covariance, head)
             self._camera_pose.send(pose)
-        if result.map_changed:
+        refined = self.mapper.refinement_due(stamp) and self.mapper.refine() is not None
+        if result.map_changed or refined:
             self._publish_map()
 
     def _publish_map(self) -> None:

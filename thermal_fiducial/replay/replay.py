@@ -8,11 +8,11 @@ from pathlib import Path
 import shutil
 from typing import Any
 
-from thermal_fiducial.config import size_overrides
+from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.geometry import transform_from_quaternion
 from thermal_fiducial.core.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader
+from thermal_fiducial.files.bags import BagReader, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
@@ -72,9 +72,9 @@ def replay(options: Options, progress: Callable[[float], None], warn: Callable[[
             timing = play(
                 bag, tuple(played), files, recorded, arguments, lambda time_ns: progress(min(1.0, time_ns / duration))
             )
-        if not (options.run / MAP_FILE).exists():
-            save_map(options.run / MAP_FILE, MarkerMap())
-        summary = _summary(options, settings, bag, files) | timing
+        _report_refusals(files, warn)
+        marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)
+        summary = _summary(options, settings, bag, files) | {'markers_in_map': len(marker_map.markers)} | timing
     (options.run / 'summary.json').write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
     return summary
 
@@ -108,22 +108,53 @@ def _prepare(options: Options, settings: Settings, warn: Callable[[str], None]) 
     return [*arguments, '-p', f'map_file:={json.dumps(str(run_map))}']
 
 
+def _final_map(path: Path, config: MarkerMapperConfig) -> MarkerMap:
+    """The map at the end, whole in its file: also one that no node saved, and with the sizes that it left out."""
+    if not path.exists():
+        marker_map = MarkerMap(frame_id=config.map_frame, dictionary=config.dictionary)
+    else:
+        marker_map = load_map(path, config.marker_size, size_overrides(config.marker_size_overrides))
+        if config.mode == 'mapping':
+            return marker_map
+    save_map(path, marker_map)
+    return marker_map
+
+
+def _report_refusals(files: RunFiles, warn: Callable[[str], None]) -> None:
+    """Say which nodes refused messages.
+
+    Raises
+    ------
+    InputError
+        Not one of the images or of the IMU messages could be used.
+    """
+    for node, topic in (
+        ('tau2_camera', IMAGE_TOPIC),
+        ('aruco_detector', ''),
+        ('marker_mapper', ''),
+        ('pose_ekf', IMU_TOPIC),
+    ):
+        figures = files.figures.get(node, {})
+        refused, reason = int(figures.get('refused messages', 0)), figures.get('last refusal', '')
+        if topic and refused and refused >= int(figures[f'received /{topic}']):
+            raise InputError(f'not one message on {topic} could be used: {reason}')
+        if refused:
+            warn(f'{node}: {refused} messages refused, the last one: {reason}')
+
+
 def _summary(options: Options, settings: Settings, bag: BagReader, files: RunFiles) -> dict[str, Any]:
     """What can be said in numbers without a truth; nothing in it depends on the time that the replay took."""
-    mapper = settings.marker_mapper
-    marker_map = load_map(options.run / MAP_FILE, mapper.marker_size, size_overrides(mapper.marker_size_overrides))
     return {
         'format': 'thermal_fiducial/run',
         'version': 1,
         'bag': options.bag.resolve().name,
         'transport': options.transport,
-        'mode': mapper.mode,
+        'mode': settings.marker_mapper.mode,
         'start_ns': bag.start_ns,
         'duration_s': bag.duration_ns * 1e-9,
         'messages_in': {topic: bag.message_count([topic]) for topic in PLAYED if topic in bag.topics},
         'messages_out': dict(sorted(files.counts.items())),
         'frames_with_markers': files.frames_with_markers,
-        'markers_in_map': len(marker_map.markers),
         'warnings': dict(files.warnings.most_common()),
         'diagnostics': files.figures,
     }

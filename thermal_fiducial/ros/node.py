@@ -179,7 +179,7 @@ class StageNode(CountingNode, Generic[Config]):
             f'published {output.topic}': output.count for output in self.outputs if output.topic != '/diagnostics'
         }
         values = {**self.figures(), 'refused messages': self._refused, 'last refusal': self._refusal, **counts}
-        name = f'{self.get_fully_qualified_name()}: {type(self).__name__}'.lstrip('/')
+        name = self.get_fully_qualified_name().lstrip('/')
         self._diagnostics.send(convert.diagnostics(name, level, reason, values, stamp_ns))
         self._diagnosed_inputs = {source.topic: source.count for source in self.inputs}
         self._diagnosed_refused = self._refused

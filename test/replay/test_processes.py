@@ -1,0 +1,73 @@
+"""Replay with one process a node: what comes out, what is measured, how it ends."""
+
+import json
+
+import numpy as np
+import pytest
+from support import small_bag
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.trajectory import load_tum
+from thermal_fiducial.replay.latency import header_stamp_ns, IMAGE_TO_CORRECTED_POSE, IMU_TO_POSE, LatencyMeter
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+
+@pytest.fixture(scope='module')
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('processes')
+    bag = small_bag.recording(seconds=3.0).write(folder / 'bag')
+    map_file, params = small_bag.side_files(folder)
+    # Half speed: the machine that runs the tests may be busy with others.
+    arguments = ['replay', bag, '--out', folder / 'run', '--params', params, '--map', map_file, '--no-report']
+    assert main([str(word) for word in (*arguments, '--transport', 'processes', '--rate', '0.5')]) == 0
+    return folder / 'run'
+
+
+def test_the_run_folder_is_that_of_lockstep_with_times(run):
+    summary = json.loads((run / 'summary.json').read_text())
+    assert summary['transport'] == 'processes'
+    assert set(summary['cpu_percent']) == {'tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf'}
+    assert all(0.0 < percent < 100.0 for percent in summary['cpu_percent'].values())
+    for kind in (IMU_TO_POSE, IMAGE_TO_CORRECTED_POSE):
+        assert 0.0 < summary['latency_ms'][kind]['median'] < 1000.0
+    kinds = [line.split(',')[0] for line in (run / 'latency.csv').read_text().splitlines()]
+    assert kinds.count(IMU_TO_POSE) == summary['messages_out']['pose']
+
+
+def test_no_imu_message_is_lost(run):
+    stamps, _, _ = load_tum(run / 'fused.tum')
+    np.testing.assert_array_equal(np.diff(stamps), 5_000_000)
+    assert stamps[-1] == small_bag.START_NS + 599 * 5_000_000
+
+
+def test_the_map_is_saved_on_shutdown(run):
+    assert sorted(load_map(run / 'marker_map.yaml').markers) == [0, 1, 2, 3]
+
+
+def test_a_node_that_refuses_its_parameters_ends_the_replay(tmp_path, capfd):
+    bag = small_bag.recording(seconds=0.2).write(tmp_path / 'bag')
+    (tmp_path / 'params.yaml').write_text('/**: {ros__parameters: {marker_size: -1.0}}')
+    arguments = ['replay', bag, '--out', tmp_path / 'run', '--params', tmp_path / 'params.yaml']
+    assert main([str(word) for word in (*arguments, '--transport', 'processes')]) == 2
+    assert 'marker_size' in capfd.readouterr().err
+
+
+def test_latencies_are_paired_by_stamp():
+    meter = LatencyMeter()
+    meter.sent('image', 100, now_ns=1_000_000)
+    meter.sent('imu', 110, now_ns=3_000_000)
+    meter.camera_pose(100, now_ns=5_000_000)
+    meter.pose(110, now_ns=7_000_000)
+    meter.pose(999, now_ns=9_000_000)
+    summary = meter.summary()
+    assert {kind: values['max'] for kind, values in summary.items()} == {
+        'imu_to_pose': 4.0, 'image_to_camera_pose': 4.0, 'image_to_corrected_pose': 6.0
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(('order', 'flag'), [('little', 1), ('big', 0)])
+def test_the_stamp_of_serialised_bytes(order, flag):
+    data = bytes([0, flag, 0, 0]) + (1_700_000_000).to_bytes(4, order) + (123_456_789).to_bytes(4, order)
+    assert header_stamp_ns(data) == 1_700_000_000_123_456_789
