@@ -38,7 +38,7 @@ def draw_picture(evaluation: Evaluation, bag: Path, path: Path) -> None:
     stamp_ns = _frame_to_show(evaluation)
     picture = _view(bag, stamp_ns)
     with styled():
-        figure = Figure(figsize=(14.0, 4.7), dpi=110)
+        figure = Figure(figsize=(14.0, 4.3), dpi=110)
         frame, above, error = figure.subplots(1, 3, width_ratios=(1.32, 1.0, 1.0))
         _draw_frame(frame, picture, evaluation, stamp_ns)
         draw_view(above, evaluation)
