@@ -114,7 +114,8 @@ class Pipeline:
             return FrameResult(stamp_ns, withheld=frame.reason or 'no camera_info')
         markers = self.detector.detect(stamp_ns, frame.counts, self.camera, self._odometry)
         mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry)
-        if mapping.map_changed:
+        refined = self.mapper.refinement_due(stamp_ns) and self.mapper.refine() is not None
+        if mapping.map_changed or refined:
             self._share_map()
         update = None if mapping.pose is None else self.filter.add_pose(_published_pose(mapping.pose))
         return FrameResult(stamp_ns, markers=markers, mapping=mapping, update=update)
