@@ -1,0 +1,123 @@
+"""``colcon build`` makes the four executables that ``ros2 run`` starts, and they run."""
+
+import os
+from pathlib import Path
+import shutil
+import signal
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf')
+SOURCES = ('package.xml', 'setup.py', 'setup.cfg', 'resource', 'config', 'launch', 'thermal_fiducial')
+
+COLCON = Path(sys.executable).with_name('colcon')
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.ros,
+    pytest.mark.skipif(not COLCON.exists(), reason="colcon is not installed: pip install '.[colcon]'"),
+]
+
+
+@pytest.fixture(scope='module')
+def workspace(tmp_path_factory):
+    """A workspace with a copy of the package, built."""
+    workspace = tmp_path_factory.mktemp('workspace')
+    package = workspace / 'src' / 'thermal_fiducial'
+    package.mkdir(parents=True)
+    for name in SOURCES:
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, package / name, ignore=shutil.ignore_patterns('__pycache__'))
+        else:
+            shutil.copy(source, package / name)
+    colcon(workspace, 'build')
+    return workspace
+
+
+def executable(workspace, node, *arguments):
+    """The command of ``ros2 run``, in a shell that has sourced the workspace."""
+    file = workspace / 'install' / 'thermal_fiducial' / 'lib' / 'thermal_fiducial' / node
+    return ['bash', '-c', '. install/setup.bash && exec "$0" "$@"', file, *arguments]
+
+
+def colcon(workspace, *arguments):
+    # The folder of this python first, so that colcon's scripts get this interpreter.
+    environment = {
+        **os.environ,
+        'PATH': f'{COLCON.parent}{os.pathsep}{os.environ["PATH"]}',
+        'COLCON_HOME': str(workspace),
+    }
+    done = subprocess.run(
+        [COLCON, *arguments], cwd=workspace, env=environment, capture_output=True, text=True, timeout=120, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_colcon_takes_it_for_an_ament_package(workspace):
+    # An invalid package.xml would only downgrade it to a plain Python one, which ros2 run does not find.
+    hooks = workspace / 'install' / 'thermal_fiducial' / 'share' / 'thermal_fiducial' / 'hook'
+    assert (hooks / 'ament_prefix_path.sh').is_file()
+
+
+def test_what_is_installed(workspace):
+    prefix = workspace / 'install' / 'thermal_fiducial'
+    assert {path.name for path in (prefix / 'lib' / 'thermal_fiducial').iterdir()} == {*NODES, 'thermal-fiducial'}
+    share = prefix / 'share'
+    assert (share / 'ament_index' / 'resource_index' / 'packages' / 'thermal_fiducial').is_file()
+    package = share / 'thermal_fiducial'
+    for file in ('package.xml', 'config/thermal_fiducial.yaml', 'config/thermal_fiducial.rviz'):
+        assert (package / file).is_file()
+    assert {path.name for path in (ROOT / 'launch').glob('*.py')} == {p.name for p in (package / 'launch').iterdir()}
+    (code,) = prefix.glob('lib/python3*/site-packages/thermal_fiducial')
+    for data in ('ros/fastdds.xml', 'py.typed'):
+        assert (code / data).is_file()
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_an_executable_runs_until_it_is_told_to_stop(workspace, node):
+    process = subprocess.Popen(
+        executable(workspace, node),
+        env={**os.environ, 'ROS_LOG_DIR': str(workspace / 'log')},
+        cwd=workspace,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    try:
+        process.wait(3.0)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=20.0)
+    assert process.returncode == 0, output
+
+
+def test_an_executable_refuses_a_parameter_in_one_line(workspace):
+    done = subprocess.run(
+        executable(workspace, 'pose_ekf', '--ros-args', '-p', 'gravity:=1.6'),
+        cwd=workspace,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith('pose_ekf: parameter gravity')
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_the_manifest_names_each_module_that_the_nodes_import():
+    manifest = ElementTree.parse(ROOT / 'package.xml').getroot()
+    named = {element.text for element in manifest.iter('exec_depend')}
+    imported = {
+        line.split()[1].split('.')[0]
+        for folder in ('ros', 'nodes')
+        for file in (ROOT / 'thermal_fiducial' / folder).glob('*.py')
+        for line in file.read_text().splitlines()
+        if line.startswith('from ') and '.msg' in line
+    }
+    assert imported
+    assert imported <= named
