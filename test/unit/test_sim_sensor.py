@@ -73,6 +73,7 @@ def test_frozen_shutter_repeats_counts_under_new_stamps():
     assert len(frozen) == 9
     assert len(frames) == 75
     before = frames[[frame.shutter for frame in frames].index(True) - 1]
+    # The freeze goes over the end of a chunk of frames.
     assert all(np.array_equal(frame.counts, before.counts) for frame in frozen)
     assert np.all(np.diff([frame.stamp_ns for frame in frames]) > 33_000_000)
     live = [frame.counts for frame in frames if not frame.shutter]
@@ -97,7 +98,7 @@ def test_without_noise_there_is_no_shutter():
 
 
 def test_refuses_an_unknown_behaviour():
-    with pytest.raises(InputError, match='not frozen'):
+    with pytest.raises(InputError, match='not one of frozen'):
         frames_of('blinking')
 
 

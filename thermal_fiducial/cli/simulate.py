@@ -13,6 +13,7 @@ from thermal_fiducial.files.bags import STORAGES
 from thermal_fiducial.sim.camera import FlightPlan, plan
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.scenario import LENSES, named, Scenario, SCENARIOS, with_contrast, with_lens
+from thermal_fiducial.sim.sensor import FFC_BEHAVIOURS
 from thermal_fiducial.sim.writer import write_flight
 
 #: Inclusive ranges of the numbers.
@@ -45,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--inverted', action='store_true', help='warm code on a cold ground')
     parser.add_argument('--fog', type=float, metavar='E', help='extinction in the long-wave infrared [1/m]')
     parser.add_argument('--lag', type=float, metavar='S', help='thermal time constant of the bolometers [s]')
-    parser.add_argument('--ffc', choices=('frozen', 'dropped', 'shutter', 'never'), help='what a shutter event sends')
+    parser.add_argument('--ffc', choices=(*FFC_BEHAVIOURS, 'never'), help='what a shutter event sends')
     parser.add_argument('--time-offset', type=float, metavar='S', help="camera's clock: t_imu = t_camera + S [s]")
     parser.add_argument('--trajectory', type=Path, metavar='TUM', help='fly these poses of base_link in map instead')
     parser.add_argument('--workers', type=int, default=_cores(), help='processes (default: one a core)')

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.core.types import BoolArray, Counts, FloatArray, IntArray
-from thermal_fiducial.errors import InputError
 from thermal_fiducial.sim.imu import ImuRecord
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.render import Quality, Renderer
@@ -193,7 +192,7 @@ class ThermalCamera:
 
     def _frame(self, index: int) -> SimFrame | None:
         t = self._flight.frame_time(index)
-        shutter = self._sensor.in_ffc(t)
+        shutter = self._closed(index)
         if shutter and self._sensor.ffc_behaviour == 'dropped':
             return None
         counts = self._shutter_counts(index, t) if shutter else self._live_counts(index)
@@ -208,15 +207,24 @@ class ThermalCamera:
         return counts
 
     def _shutter_counts(self, index: int, t: float) -> Counts:
-        if self._sensor.ffc_behaviour == 'shutter':
-            lens = self._scenario.lens
-            flat = np.full((lens.height, lens.width), self._sensor.shutter_excess, np.float32)
-            return self._sensor.counts(flat, t, index, self._flight.seed)
-        if self._sensor.ffc_behaviour != 'frozen':
-            raise InputError(f'driver behaviour {self._sensor.ffc_behaviour!r}: not frozen, dropped or shutter')
+        if self._sensor.ffc_behaviour == 'frozen':
+            return self._frozen_counts(index)
+        flat = np.full((self._scenario.lens.height, self._scenario.lens.width), self._sensor.shutter_excess, np.float32)
+        return self._sensor.counts(flat, t, index, self._flight.seed)
+
+    def _frozen_counts(self, index: int) -> Counts:
+        """Counts of the last frame before the shutter closed."""
         last = index
-        while last > 0 and self._sensor.in_ffc(self._flight.frame_time(last)):
+        while last > 0 and self._closed(last):
             last -= 1
-        if self._last is None or self._last[0] != last:
-            return self._live_counts(last)
-        return self._last[1]
+        if self._last is not None and self._last[0] == last:
+            return self._last[1]
+        # It was in another chunk: the same steps as there give the same counts to the last bit.
+        self._renderer.forget()
+        for earlier in range(last - last % CHUNK, last):
+            if not self._closed(earlier):
+                self._renderer.frame(self._flight.frame_time(earlier))
+        return self._live_counts(last)
+
+    def _closed(self, index: int) -> bool:
+        return self._sensor.in_ffc(self._flight.frame_time(index))

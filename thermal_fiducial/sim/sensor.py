@@ -11,8 +11,10 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.types import Counts, Float32Array
+from thermal_fiducial.errors import InputError
 
 FULL_SCALE = 16383
+FFC_BEHAVIOURS = ('frozen', 'dropped', 'shutter')
 _SHADING_GRID = 4
 _GROWTH_TIME = 180.0
 
@@ -58,6 +60,10 @@ class Sensor:
     ffc_behaviour: str = 'frozen'
     shutter_excess: float = 4.0
     frame_rate: float = 30.0
+
+    def __post_init__(self) -> None:
+        if self.ffc_behaviour not in FFC_BEHAVIOURS:
+            raise InputError(f'driver behaviour {self.ffc_behaviour!r} is not one of {", ".join(FFC_BEHAVIOURS)}')
 
     def ffc_index(self, t: float) -> int:
         """Number of shutter events that have begun until ``t`` [s]."""
