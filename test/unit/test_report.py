@@ -1,0 +1,253 @@
+"""The report on a run folder: what it reads, what it refuses, what it shows."""
+
+import json
+import re
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+from support.run_folders import FIDUCIAL_SIGMA, FUSED_SIGMA, make_run, write_truth_bag
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.report import evaluate_run, write_report
+from thermal_fiducial.report.evaluation import evaluate
+from thermal_fiducial.report.plots import euler_deg, near, svg, thinned, visible_spans
+from thermal_fiducial.report.run_folder import read_run
+from thermal_fiducial.report.tables import cards, number, tables
+
+
+@pytest.fixture(scope='module')
+def run_folder(tmp_path_factory):
+    return make_run(tmp_path_factory.mktemp('runs') / 'run')
+
+
+@pytest.fixture
+def small_run(tmp_path):
+    return make_run(tmp_path / 'run', seconds=3.0, gap=(1.0, 1.5), with_output=False)
+
+
+def test_the_measures_are_those_of_the_noise_that_was_put_in(run_folder):
+    numbers = evaluate_run(run_folder)[1]
+    for name, sigma, tolerance in (('fused', FUSED_SIGMA, 0.04), ('fiducial', FIDUCIAL_SIGMA, 0.1)):
+        # rms of three axes of white noise from 4000 and 541 poses: the tolerances are four sigma of that estimate.
+        error = numbers[name]['error']
+        assert error['position_rms_mm'] == pytest.approx(1e3 * np.sqrt(3) * sigma[0], rel=tolerance)
+        assert error['attitude_rms_deg'] == pytest.approx(np.rad2deg(np.sqrt(3) * sigma[3]), rel=tolerance)
+        assert numbers[name]['jitter']['position_mm'] == pytest.approx(1e3 * np.sqrt(6) * sigma[0], rel=1.2 * tolerance)
+    # 200 samples of six degrees of freedom: the mean's sigma is sqrt(2 / 1200) = 4 %.
+    assert numbers['fused']['consistency']['pose_nees_per_dof'] == pytest.approx(1.0, abs=0.16)
+    assert numbers['latency']['imu_to_pose']['p50_ms'] == pytest.approx(2.0, abs=0.1)
+    assert numbers['markers'] == {
+        'detections': 2525,
+        'frames_with_markers': 541,
+        'seen_in_a_frame': pytest.approx(2525 / 541),
+        'different': 7,
+        'corner_sigma_median_px': 0.03,
+        'in_map': 8,
+    }
+    (gap,) = numbers['gaps']
+    assert gap['seconds'] == pytest.approx(2.0, abs=0.07)
+
+
+def test_the_summary_keeps_what_it_had_and_gains_the_measures(run_folder):
+    evaluate_run(run_folder)
+    evaluate_run(run_folder)
+    summary = json.loads((run_folder / 'summary.json').read_text())
+    assert summary['bag'] == 'made_up'
+    assert summary['evaluation']['fused']['error']['position_rms_mm'] > 0.0
+
+
+def test_truth_from_a_bag_is_the_truth_from_a_file(tmp_path, small_run):
+    from_file = evaluate_run(small_run)[1]
+    (small_run / 'truth.tum').unlink()
+    without = evaluate_run(small_run)[1]
+    from_bag = evaluate_run(small_run, write_truth_bag(tmp_path / 'bag', 3.0))[1]
+    assert 'error' not in without['fused']
+    # The file rounds to a nanometre.
+    assert from_bag['fused']['error'] == pytest.approx(from_file['fused']['error'], rel=1e-5)
+
+
+def test_the_page_is_one_file_of_sound_pictures(run_folder):
+    page = write_report(run_folder).read_text()
+    assert not re.search(r'(src|href)="(?!#)', page)
+    assert 'http' not in re.sub(
+        r'http://www\.w3\.org/\S+|http://purl\.org/\S+|http://creativecommons\.org/\S+', '', page
+    )
+    pictures = re.findall(r'<svg.*?</svg>', page, re.DOTALL)
+    assert len(pictures) == 5
+    for picture in pictures:
+        ET.fromstring(picture)
+    for words in ('Position error', 'markers alone', 'NEES', 'Drop-outs', 'FFC', 'image to camera pose'):
+        assert words in page
+    assert 'nan' not in re.sub(r'<svg.*?</svg>', '', page, flags=re.DOTALL).lower()
+
+
+def test_the_same_run_gives_the_same_page(small_run):
+    assert write_report(small_run).read_bytes() == write_report(small_run).read_bytes()
+
+
+def test_without_truth_there_are_no_errors_rather_than_false_ones(tmp_path):
+    run = make_run(tmp_path / 'run', seconds=3.0, gap=(1.0, 1.5), with_output=False, with_truth=False)
+    (run / 'latency.csv').unlink()
+    page = write_report(run).read_text()
+    assert 'without ground truth' in page
+    assert len(re.findall('<svg', page)) == 3
+    assert 'Position error' not in page
+    assert 'Accuracy' not in page
+
+
+def test_words_of_others_are_escaped(small_run):
+    (small_run / 'summary.json').write_text(json.dumps({'bag': '<script>alert(1)</script>'}))
+    assert '<script>' not in write_report(small_run).read_text()
+
+
+@pytest.mark.parametrize('kept', [('fused.tum', 'fiducial.tum'), ('fused.tum', 'fiducial.tum', 'detections.csv')])
+def test_a_bare_run_has_a_report(small_run, kept):
+    for path in small_run.iterdir():
+        if path.name not in kept:
+            path.unlink()
+    assert 'Detections' in write_report(small_run).read_text()
+
+
+def test_a_run_in_which_nothing_came_out_has_a_report(tmp_path):
+    for name in ('fused.tum', 'fiducial.tum'):
+        (tmp_path / name).touch()
+    (tmp_path / 'detections.csv').write_text('stamp_ns,id,u0,v0,u1,v1,u2,v2,u3,v3,sigma_px\n')
+    evaluation, numbers = evaluate_run(tmp_path)
+    assert numbers['fused'] == {'poses': 0}
+    assert [card.name for card in cards(evaluation, numbers)] == ['Output', 'Markers', 'Without markers']
+    assert write_report(tmp_path).is_file()
+
+
+def test_a_fused_path_without_any_fiducial_pose(small_run):
+    (small_run / 'fiducial.tum').write_text('')
+    numbers = evaluate_run(small_run)[1]
+    assert numbers['fiducial'] == {'poses': 0, 'way_m': 0.0}
+    assert write_report(small_run).is_file()
+
+
+# --- bad input -----------------------------------------------------------------------------------------
+
+BROKEN = [
+    ('fused.tum', '1.0 2.0 3.0\n', 'fused.tum'),
+    ('fiducial.tum', 'a b c d e f g h\n', 'fiducial.tum'),
+    ('fused.tum', '2.0 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n', 'goes back'),
+    ('fused.tum', '2.0 0 0 0 0 0 0 nan\n', 'fused.tum'),
+    ('detections.csv', 'stamp_ns,id\n1,2\n', 'detections.csv, line 2'),
+    ('latency.csv', 'kind,stamp_ns,latency_ms\nimu_to_pose,1,slow\n', 'latency.csv, line 2'),
+    ('summary.json', '{"bag": ', 'summary.json'),
+    ('summary.json', '[1]', 'not a JSON object'),
+    ('marker_map.yaml', 'markers: 3\n', 'marker_map.yaml'),
+    ('truth.tum', '1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n', 'no time in common'),
+]
+
+
+@pytest.mark.parametrize(('name', 'text', 'words'), BROKEN, ids=lambda value: None)
+def test_a_broken_file_gives_one_line_and_status_2(small_run, capsys, name, text, words):
+    (small_run / name).write_text(text)
+    assert main(['evaluate', str(small_run)]) == 2
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count('\n') == 1
+
+
+def test_a_damaged_output_bag_gives_one_line(small_run, capsys):
+    (small_run / 'output').mkdir()
+    (small_run / 'output' / 'metadata.yaml').write_text('rosbag2_bagfile_information: 7\n')
+    assert main(['evaluate', str(small_run)]) == 2
+    assert capsys.readouterr().err.count('\n') == 1
+
+
+@pytest.mark.parametrize('make', [lambda path: None, lambda path: path.mkdir(), lambda path: path.touch()])
+def test_what_is_no_run_folder_is_refused(tmp_path, capsys, make):
+    make(tmp_path / 'run')
+    assert main(['evaluate', str(tmp_path / 'run')]) == 2
+    assert capsys.readouterr().err.count('\n') == 1
+
+
+@pytest.mark.parametrize('truth', ['none.tum', 'empty.tum', 'folder', 'text.mcap'])
+def test_unusable_truth_is_refused(tmp_path, small_run, capsys, truth):
+    (tmp_path / 'empty.tum').touch()
+    (tmp_path / 'folder').mkdir()
+    (tmp_path / 'text.mcap').write_text('no bag')
+    assert main(['evaluate', str(small_run), '--truth', str(tmp_path / truth)]) == 2
+    error = capsys.readouterr().err
+    assert truth in error
+    assert error.count('\n') == 1
+
+
+def test_a_bag_without_truth_is_refused_by_the_name_of_the_topic(run_folder, capsys):
+    assert main(['evaluate', str(run_folder), '--truth', str(run_folder / 'output')]) == 2
+    assert 'ground_truth/odometry' in capsys.readouterr().err
+
+
+def test_a_report_that_cannot_be_written_is_an_input_error(small_run):
+    (small_run / 'report.html').mkdir()
+    with pytest.raises(InputError, match=r'report\.html'):
+        write_report(small_run)
+
+
+# --- command -------------------------------------------------------------------------------------------
+
+
+def test_evaluate_prints_tables_with_their_units(small_run, capsys):
+    assert main(['evaluate', str(small_run)]) == 0
+    printed = capsys.readouterr().out
+    for words in ('position error, rms [mm]', 'fiducial', 'Drop-outs', 'report.html'):
+        assert words in printed
+
+
+def test_evaluate_prints_json(small_run, capsys):
+    assert main(['evaluate', str(small_run), '--json', '--no-report']) == 0
+    assert json.loads(capsys.readouterr().out)['fused']['poses'] == 600
+    assert not (small_run / 'report.html').exists()
+
+
+# --- parts ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ('value', 'text'),
+    [(0.0, '0'), (None, '–'), (1234.5, '1234'), (0.05604, '0.056'), (3.14159, '3.14'), (12345678.0, '12345678'),
+     (1.2e-5, '0.000012'), (-2.5, '-2.5'), (1e-9, '0')],
+)  # fmt: skip
+def test_numbers_are_written_plainly(value, text):
+    assert number(value) == text
+
+
+def test_angles_do_not_jump():
+    yaw = np.deg2rad(np.linspace(0.0, 720.0, 100))
+    T = np.tile(np.eye(4), (100, 1, 1))
+    T[:, 0, 0] = T[:, 1, 1] = np.cos(yaw)
+    T[:, 1, 0], T[:, 0, 1] = np.sin(yaw), -np.sin(yaw)
+    assert np.allclose(euler_deg(T)[:, 2], np.rad2deg(yaw))
+    assert np.allclose(near(np.array([[0.0, 0.0, -359.0]]), np.array([0.0, 0.0, 2.0])), [[0.0, 0.0, 1.0]])
+
+
+def test_thinning_keeps_both_ends():
+    assert thinned(0).tolist() == []
+    assert thinned(3).tolist() == [0, 1, 2]
+    index = thinned(100_000, 100)
+    assert (len(index), index[0], index[-1]) == (100, 0, 99_999)
+
+
+def test_visible_spans_break_at_gaps():
+    stamps = np.array([0, 33, 66, 1000, 1033]) * 1_000_000
+    assert visible_spans(stamps) == [(0, 66_000_000), (1_000_000_000, 1_033_000_000)]
+    assert visible_spans(stamps[:0]) == []
+
+
+def test_tables_leave_out_what_is_not_known(small_run):
+    evaluation = evaluate(read_run(small_run))
+    titles = [table.title for table in tables(evaluation, evaluation.numbers())]
+    assert 'Accuracy' in titles
+    assert not any('nodes' in title or 'covariance' in title for title in titles)
+
+
+def test_a_picture_has_no_date_and_no_path():
+    from matplotlib.figure import Figure
+
+    text = svg(Figure(figsize=(1, 1)))
+    assert text.startswith('<svg')
+    assert 'date' not in text
