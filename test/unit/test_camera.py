@@ -1,0 +1,142 @@
+"""Camera models against OpenCV, and their inverses."""
+
+import cv2
+import numpy as np
+import pytest
+
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.errors import InputError
+
+K = np.array([[441.2, 0.0, 322.1], [0.0, 439.8, 251.3], [0.0, 0.0, 1.0]])
+CAMERAS = {
+    'pinhole': Camera(640, 512, K),
+    'plumb_bob': Camera(640, 512, K, 'plumb_bob', [-0.29, 0.11, 1e-3, -5e-4, -0.02]),
+    'rational_polynomial': Camera(640, 512, K, 'rational_polynomial', [0.3, 0.05, 1e-3, -5e-4, 0.01, 0.6, 0.12, 0.02]),
+    'equidistant': Camera(640, 512, K, 'equidistant', [-0.125, -0.0158, 0.0055, 0.0019]),
+}
+every_model = pytest.mark.parametrize('name', CAMERAS)
+
+
+def view_points(camera, count=400, seed=0):
+    """Points all over the image, 0.5 to 10 m away."""
+    rng = np.random.default_rng(seed)
+    uv = rng.uniform([0, 0], [camera.width - 1, camera.height - 1], (count, 2))
+    return camera.rays(uv) * rng.uniform(0.5, 10.0, (count, 1)), uv
+
+
+def opencv(camera, points):
+    zero = np.zeros(3)
+    if camera.model == 'equidistant':
+        return cv2.fisheye.projectPoints(points[:, None], zero, zero, camera.K, camera.D)[0][:, 0]
+    return cv2.projectPoints(points, zero, zero, camera.K, camera.D)[0][:, 0]
+
+
+@every_model
+def test_projection_is_opencv_s(name):
+    points, _ = view_points(CAMERAS[name])
+    assert np.allclose(CAMERAS[name].project(points), opencv(CAMERAS[name], points), atol=1e-9)
+
+
+@every_model
+def test_a_ray_projects_onto_its_pixel(name):
+    points, uv = view_points(CAMERAS[name])
+    # Newton's iteration stops at rounding: 1e-14 of a focal length, a little more at the rim.
+    assert np.allclose(CAMERAS[name].project(points), uv, atol=1e-9)
+    assert np.allclose(np.linalg.norm(CAMERAS[name].rays(uv), axis=1), 1.0)
+
+
+@every_model
+def test_normalise_inverts_distort(name):
+    _, uv = view_points(CAMERAS[name], seed=1)
+    assert np.allclose(CAMERAS[name].distort(CAMERAS[name].normalise(uv)), uv, atol=1e-9)
+
+
+@every_model
+def test_projection_jacobian_is_the_difference_quotient(name):
+    camera, h = CAMERAS[name], 1e-6
+    points, _ = view_points(camera, 60, seed=2)
+    points = np.vstack([points, [[0.0, 0.0, 2.0], [1e-8, 0.0, 1.0]]])
+    uv, J = camera.project_jacobian(points)
+    assert np.allclose(uv, camera.project(points))
+    for k in range(3):
+        d = h * np.eye(3)[k]
+        numeric = (camera.project(points + d) - camera.project(points - d)) / (2 * h)
+        # Points from 0.5 m: third derivatives up to 1e4 px/m^3 times h^2, and 1e-13 px / h of rounding.
+        assert np.allclose(J[..., k], numeric, rtol=1e-7, atol=2e-6)
+
+
+@every_model
+def test_distortion_jacobian_is_the_difference_quotient(name):
+    camera, h = CAMERAS[name], 1e-6
+    x = np.vstack([np.random.default_rng(3).uniform(-0.6, 0.6, (50, 2)), [[0.0, 0.0], [1e-9, 0.0]]])
+    J = camera.distort_jacobian(x)
+    for k in range(2):
+        d = h * np.eye(2)[k]
+        assert np.allclose(J[..., k], (camera.distort(x + d) - camera.distort(x - d)) / (2 * h), rtol=1e-7, atol=1e-6)
+
+
+@every_model
+def test_what_lies_behind_is_not_seen(name):
+    points = np.array([[0.1, 0.1, -1.0], [0.0, 0.0, 0.0], [0.1, 0.2, 1.0]])
+    assert np.isnan(CAMERAS[name].project(points)).all(axis=1).tolist() == [True, True, False]
+
+
+def test_points_beyond_the_fold_are_not_seen():
+    """A strong barrel polynomial folds back: a point far outside would land in the image."""
+    camera = Camera(640, 512, K, 'plumb_bob', [-0.3, 0.0, 0.0, 0.0, 0.0])
+    fold = 1.0 / np.sqrt(0.9)
+    outside, inside = np.array([1.7 * fold, 0.0, 1.0]), np.array([0.97 * fold, 0.0, 1.0])
+    assert camera.contains(opencv(camera, outside[None])[0])
+    assert np.isnan(camera.project(outside)).all()
+    assert np.isfinite(camera.project(inside)).all()
+
+
+def test_a_wide_fisheye_is_inverted_to_its_rim():
+    camera = Camera(640, 512, np.array([[240.0, 0, 320], [0, 240.0, 256], [0, 0, 1]]), 'equidistant', [0.0] * 4)
+    uv = np.array([[0.0, 256.0], [639.0, 256.0], [320.0, 0.0], [20.0, 100.0]])
+    assert np.allclose(camera.distort(camera.normalise(uv)), uv, atol=1e-8)
+
+
+def test_single_points_and_batches():
+    camera = CAMERAS['equidistant']
+    points, uv = view_points(camera, 12)
+    assert np.allclose(camera.project(points.reshape(3, 4, 3)), uv.reshape(3, 4, 2))
+    assert np.allclose(camera.project(points[0]), uv[0])
+    assert camera.project_jacobian(points.reshape(3, 4, 3))[1].shape == (3, 4, 2, 3)
+
+
+def test_contains_and_its_margin():
+    camera = CAMERAS['pinhole']
+    uv = np.array([[0.0, 0.0], [639.0, 511.0], [639.1, 10.0], [-0.1, 10.0], [5.0, 5.0], [np.nan, 3.0]])
+    assert camera.contains(uv).tolist() == [True, True, False, False, True, False]
+    assert camera.contains(uv, 5.0).tolist() == [False, False, False, False, True, False]
+
+
+def test_matches_is_equality_of_all():
+    camera = CAMERAS['plumb_bob']
+    assert camera.matches(Camera(640, 512, K.copy(), 'plumb_bob', camera.D.tolist()))
+    assert camera.matches(Camera(640, 512, K.ravel(), 'plumb_bob', camera.D))
+    for other in (Camera(640, 480, K, 'plumb_bob', camera.D), Camera(640, 512, K), CAMERAS['equidistant']):
+        assert not camera.matches(other)
+
+
+def test_short_coefficients_are_filled_up():
+    assert Camera(640, 512, K, 'plumb_bob', [-0.3, 0.1, 0.0, 0.0]).D.tolist() == [-0.3, 0.1, 0.0, 0.0, 0.0]
+    assert Camera(640, 512, K, 'plumb_bob', [0.0] * 14).D.tolist() == [0.0] * 5
+    assert Camera(640, 512, K).focal_px == pytest.approx(np.sqrt(441.2 * 439.8))
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        ((640, 512, K, 'tangent'), "'tangent' is not one of"),
+        ((640, 512, K, 'equidistant', [0.1] * 5), 'takes 4 coefficients, not 5'),
+        ((640, 512, np.zeros((3, 3))), 'not calibrated'),
+        ((640, 512, np.full((3, 3), np.nan)), 'not calibrated'),
+        ((640, 512, K, 'plumb_bob', [np.inf, 0, 0, 0, 0]), 'not calibrated'),
+        ((0, 512, K), 'image size 0x512'),
+    ],
+)
+def test_what_is_no_calibration_is_refused(arguments, words):
+    with pytest.raises(InputError, match=words):
+        Camera(*arguments)

@@ -1,0 +1,103 @@
+"""Parameters: complete metadata, and refusal of what doesn't fit."""
+
+from dataclasses import dataclass
+
+import pytest
+
+from thermal_fiducial import config
+from thermal_fiducial.config import (
+    ArucoDetectorConfig,
+    from_mapping,
+    group,
+    MarkerMapperConfig,
+    param,
+    parameters,
+    PoseEkfConfig,
+    size_overrides,
+    Tau2CameraConfig,
+)
+from thermal_fiducial.errors import InputError
+
+NODES = (Tau2CameraConfig, ArucoDetectorConfig, MarkerMapperConfig, PoseEkfConfig)
+
+
+@dataclass(frozen=True)
+class Inner:
+    gain: float = param(1.0, 'Gain.', unit='1', minimum=0.0, maximum=2.0)
+
+
+@dataclass(frozen=True)
+class Example:
+    name: str = param('a', 'Name.', choices=('a', 'b'))
+    count: int = param(3, 'Count.', minimum=1)
+    flag: bool = param(False, 'Flag.')
+    place: tuple[float, ...] = param((0.0, 0.0), 'Place.', unit='m', length=2, minimum=-5.0)
+    words: tuple[str, ...] = param((), 'Words.')
+    inner: Inner = group(Inner)  # noqa: RUF009
+
+
+@pytest.mark.parametrize('kind', NODES)
+def test_defaults_pass_their_own_checks_and_are_described(kind):
+    for name, item, default in parameters(kind):
+        assert config.checked(name, item, default) == default
+        assert item.metadata['description'].split(' [')[0].endswith('.'), name
+    assert from_mapping(kind, {}) == kind()
+
+
+def test_names_shared_by_nodes_have_one_meaning():
+    seen = {}
+    for kind in NODES:
+        for name, item, default in parameters(kind):
+            meaning = default, *(item.metadata[key] for key in ('minimum', 'maximum', 'choices', 'length'))
+            assert seen.setdefault(name, meaning) == meaning, name
+
+
+def test_parameters_of_a_class_and_of_an_instance():
+    assert [name for name, _, _ in parameters(Example)] == ['name', 'count', 'flag', 'place', 'words', 'inner.gain']
+    changed = from_mapping(Example, {'inner.gain': 0.5})
+    assert {name: value for name, _, value in parameters(changed)}['inner.gain'] == 0.5
+
+
+def test_values_take_the_place_of_defaults_and_strangers_are_left_alone():
+    made = from_mapping(Example, {'name': 'b', 'place': [1, 2.5], 'words': ['x'], 'inner.gain': 2, 'other': object()})
+    assert made == Example(name='b', place=(1.0, 2.5), words=('x',), inner=Inner(2.0))
+    assert isinstance(made.inner.gain, float)
+
+
+@pytest.mark.parametrize(
+    ('values', 'words'),
+    [
+        ({'name': 'c'}, "parameter name: 'c' is not one of a, b"),
+        ({'name': 3}, 'not of type str'),
+        ({'count': 0}, 'outside 1 .. None'),
+        ({'count': 2.0}, 'not of type int'),
+        ({'count': True}, 'not of type int'),
+        ({'flag': 1}, 'not of type bool'),
+        ({'place': [1.0]}, '1 values, not 2'),
+        ({'place': [1.0, 'x']}, "'x' is not a number"),
+        ({'place': [1.0, -6.0]}, '-6.0 is outside'),
+        ({'place': [1.0, float('nan')]}, 'nan is outside'),
+        ({'place': 'ab'}, "'ab' is not a list"),
+        ({'words': 'ab'}, "'ab' is not a list"),
+        ({'words': 7}, '7 is not a list'),
+        ({'inner.gain': 2.1}, 'parameter inner.gain: 2.1 is outside 0.0 .. 2.0'),
+        ({'inner.gain': float('nan')}, 'outside'),
+        ({'inner.gain': False}, 'not a number'),
+    ],
+)
+def test_what_does_not_fit_is_refused_by_name(values, words):
+    with pytest.raises(InputError) as error:
+        from_mapping(Example, values)
+    assert words in str(error.value)
+    assert str(error.value).startswith(f'parameter {next(iter(values))}')
+
+
+def test_size_overrides():
+    assert size_overrides(()) == {}
+    assert size_overrides(('7:0.5', '12:0.125')) == {7: 0.5, 12: 0.125}
+
+
+@pytest.mark.parametrize('entry', ['7', '7:', ':0.5', 'a:0.5', '7:b', '7:0', '7:-1', '7:nan', '7:inf'])
+def test_a_broken_override_is_refused(entry):
+    with pytest.raises(InputError, match='marker_size_overrides'):
+        size_overrides((entry,))
