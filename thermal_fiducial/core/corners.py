@@ -1,27 +1,33 @@
-"""Sub-pixel corners: the outer edges of the black squares located on raw counts.
+"""Sub-pixel corners: the grid lines of the markers located on raw counts.
 
-Every side is a straight line in normalised image coordinates, a gentle curve in the raw image. Along it, columns (or
-rows, whichever cross it more squarely) of whole pixels are compared with the profile of a blurred, lagging step
-between the local levels of both sides (:mod:`.edge_profile`), the known bits next to a narrow border included. The
-columns are grouped in segments, each of which measures one displacement with its own levels and its variance from its
-own residuals; a robust line through the segments of a side, and the intersections of the lines, are the corners.
-Clutter, dead pixels and hidden stretches cost the segments that they touch. No pixel is interpolated, so noise stays
-white and covariances honest.
+The sides of a marker, and where it helps the lines between its bits, are straight in normalised image coordinates,
+gentle curves in the raw image. Across a line, columns (or rows, whichever cross it more squarely) of whole pixels are
+compared with the known pattern blurred by the optics. One segment, a bit long, measures the displacement of its line
+with levels of its own and a variance from its own residuals; a robust adjustment of the four corners to all segments
+of the marker follows. Clutter, dead pixels and hidden stretches cost the segments that they touch. No pixel is
+interpolated, so noise stays white and covariances honest.
 """
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.edge_profile import EdgeProfiles
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import Float32Array, FloatArray, Gray, IntArray
 
-_SEGMENTS = 8
-_COLUMNS = 4
-_NODES = 5
-# Columns this many blurs (and the lag's tail) away from a corner see one edge only.
-_CORNER_BLURS = 2.0
+# A curved line is a quartic through five of its points.
+_T_NODES = np.linspace(0.0, 1.0, 5)
+_QUARTIC = np.linalg.inv(np.vander(_T_NODES, increasing=True))
+# Cells narrower than this many blurs show their neighbours' edges in every profile.
+_NARROW = 5.0
+_NEIGHBOURS = (-2, -1, 1, 2)
+# Weight of a pixel or segment falls off beyond this many standard deviations.
+_PIXEL_OUTLIER = 4.5
+_SEGMENT_OUTLIER = 2.5
+# Standard deviation of what is known of the corners beforehand [px].
+_PRIOR_PX = 3.0
+_HOPELESS = 1e6
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,261 +39,341 @@ class RefinedCorners:
     corners_px : (N, 4, 2)
     covariances : (N, 4, 2, 2) [px^2]
     contrast : (N,) white minus black [counts]
+    noise : (N,) standard deviation of a pixel about the model [counts]
     """
 
     corners_px: FloatArray
     covariances: FloatArray
     contrast: FloatArray
+    noise: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
-class _Columns:
-    """Pixels across the E = 4 N sides: K columns of M pixels each."""
+class GridPattern:
+    """What lies on both sides of the grid lines of all markers of a dictionary with m x m cells, border included.
 
-    #: (E, K) share of the side at which a column crosses it
+    Parameters
+    ----------
+    before : (M, 2, m + 1, m) value, 0 black and 1 white, before each of the lines; the first index says along columns
+        (lines from left to right, counted from the top) or along rows (lines from the top down, counted from the left)
+    step : the same of the change of value across the line
+    """
+
+    before: Float32Array
+    step: Float32Array
+
+    @property
+    def cells(self) -> int:
+        """Number of cells along a side, the border included."""
+        return self.step.shape[-1]
+
+
+def grid_pattern(bits: Gray) -> GridPattern:
+    """Pattern of markers with ``bits`` (M, n, n), white round the black border."""
+    grid = np.pad(bits.astype(np.float32), ((0, 0), (1, 1), (1, 1)))
+    surrounded = np.pad(grid, ((0, 0), (1, 1), (0, 0)), constant_values=1.0)
+    turned = np.pad(np.swapaxes(grid, 1, 2), ((0, 0), (1, 1), (0, 0)), constant_values=1.0)
+    both = np.stack([surrounded, turned], axis=1)
+    return GridPattern(both[:, :, :-1], np.diff(both, axis=2))
+
+
+@dataclass(frozen=True, slots=True)
+class _Lines:
+    """Pixels across E grid lines, K columns of M pixels each."""
+
+    #: (E, K) share of the line at which a column crosses it
     t: FloatArray
-    #: (E, K, M) outward distance of each pixel [px]
+    #: (E, K) which columns repeat no other
+    fresh: FloatArray
+    #: (E, K, M) distance of each pixel [px]: downward for lines from left to right, rightward for those from the top
     distance: Float32Array
     #: (E, K, M) place of each pixel in the flat image
     pixel: IntArray
-    #: (E, K, M) 1 for a pixel in the image, in a column that repeats no other
-    weight: Float32Array
-    #: (E, 2) outward normal in the image, at the middle
+    #: (E, K, M) whether it lies in the image
+    inside: np.ndarray
+    #: (E, K, 2) unit normal, along which distances grow
     normal: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
 class _Shifts:
-    """Outward displacements that the segments (E, S) measured."""
+    """Displacements of their lines (E, S) that segments measured, (E, S) variances, contrasts, noise variances."""
 
-    t: FloatArray
     shift: FloatArray
     variance: FloatArray
     contrast: FloatArray
-
-
-def edge_bits(bits: Gray) -> Gray:
-    """The two rows of bits next to each side (M, 4, 2, n) of patterns (M, n, n), in the direction of the sides."""
-    turned = np.stack([np.rot90(bits, turn, axes=(1, 2)) for turn in range(4)], axis=1)
-    return turned[:, :, :2]
+    noise: FloatArray
 
 
 def refine_corners(
     image: Float32Array,
     corners_px: FloatArray,
     camera: Camera,
-    border_bits: Gray,
+    before: Float32Array,
+    step: Float32Array,
     blur_px: float,
-    lag_px: FloatArray,
-    passes: tuple[float, ...] = (2.0, 1.0, 1.0),
+    *,
+    inner: bool = False,
+    columns: int = 6,
+    passes: tuple[float, ...] = (1.3, 1.0),
 ) -> RefinedCorners:
     """Corners of N markers, refined.
 
     Parameters
     ----------
     image : (height, width) counts
-    corners_px : (N, 4, 2) to within two pixels, or a third of a bit
-    border_bits : (N, 4, 2, n) of :func:`edge_bits`
+    corners_px : (N, 4, 2) to within two pixels, or a third of a cell
+    before, step : (N, 2, m + 1, m) of :class:`GridPattern`
     blur_px : standard deviation of optics and pixel
-    lag_px : (N, 2) image motion within the bolometers' time constant, against the motion
+    inner : whether the lines between the bits are used besides the sides
+    columns : of pixels, in a segment
     passes : factor on the blur, for each pass: a wide one catches, narrow ones measure
     """
-    count = len(corners_px)
-    x = camera.normalise(corners_px)
-    lag = np.repeat(lag_px, 4, axis=0)
-    bits = border_bits.reshape(4 * count, 2, -1)
+    cells = step.shape[-1]
+    numbers = np.arange(cells + 1) if inner else np.array([0, cells])
+    corners = corners_px
     for factor in passes:
         blur = factor * blur_px
-        half = int(np.clip(np.ceil(2.5 * blur + 1.5 * np.abs(lag_px).max(initial=0.0) + 1.0), 4, 10))
-        columns, cell = _columns(x, camera, image.shape, bits.shape[-1] + 2, half, blur, lag)
-        shifts = _measure(image, columns, cell, bits, blur, np.sum(lag * columns.normal, axis=-1))
-        x, covariances = _intersect(x, camera, shifts)
-    J = camera.distort_jacobian(x)
+        lines, extent = _lines(corners, camera, image.shape, numbers / cells, cells * columns, blur)
+        shifts = _measure(image, lines, before, step, numbers, extent, blur)
+        corners, covariances = _adjust(corners, lines, shifts, numbers / cells, cells)
+    count = len(corners)
+    good = shifts.variance.reshape(count, -1) < _HOPELESS
     return RefinedCorners(
-        camera.distort(x),
-        J @ covariances @ np.swapaxes(J, -1, -2),
-        np.median(shifts.contrast.reshape(count, -1), axis=1),
+        corners,
+        covariances,
+        _mean_where(shifts.contrast.reshape(count, -1), good),
+        np.sqrt(_mean_where(shifts.noise.reshape(count, -1), good)),
     )
 
 
-_T_NODES = np.linspace(0.0, 1.0, _NODES)
-_POLYNOMIAL = np.linalg.inv(np.vander(_T_NODES, increasing=True))
+def _mean_where(values: FloatArray, good: np.ndarray) -> FloatArray:
+    return np.asarray(np.sum(values * good, axis=1) / np.maximum(good.sum(axis=1), 1))
 
 
-def _columns(
-    x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, half: int, blur: float, lag: FloatArray
-) -> tuple[_Columns, FloatArray]:
-    """Columns across the sides of quadrilaterals (N, 4, 2), and the size (E,) of a bit across each side [px]."""
+def _lines(
+    corners: FloatArray, camera: Camera, shape: tuple[int, ...], levels: FloatArray, count: int, blur: float
+) -> tuple[_Lines, tuple[FloatArray, FloatArray]]:
+    """Pixels across the grid lines at ``levels`` (L,) of both directions, and the marker's extent there."""
     height, width = shape
-    start = x.reshape(-1, 2)
-    chord = (np.roll(x, -1, axis=1) - x).reshape(-1, 2)
-    nodes = camera.distort(start[:, None] + _T_NODES[:, None] * chord[:, None])
+    nodes = _nodes(corners, camera, levels).reshape(-1, len(_T_NODES), 2)
     span = nodes[:, -1] - nodes[:, 0]
-    length = np.linalg.norm(span, axis=-1)
-    tangent = span / length[:, None]
-    normal = np.stack([tangent[:, 1], -tangent[:, 0]], axis=-1)
-    inward = (np.roll(x, 1, axis=1) - x).reshape(-1, 2)
-    corners = nodes[:, 0].reshape(x.shape)
-    neighbour = (np.roll(corners, 1, axis=1) - corners).reshape(-1, 2)
-    opposite = (np.roll(corners, -2, axis=1) - np.roll(corners, -1, axis=1)).reshape(-1, 2)
-    cell = -0.5 * np.sum((neighbour + opposite) * normal, axis=-1) / cells
-    del inward
     steep = np.abs(span[:, 1]) > np.abs(span[:, 0])
-    curve = np.einsum('ij,ejk->eik', _POLYNOMIAL, nodes)
-    along = np.where(steep[:, None], curve[..., 1], curve[..., 0])
-    across = np.where(steep[:, None], curve[..., 0], curve[..., 1])
-    margin_px = _CORNER_BLURS * blur + 1.0 + 1.5 * np.abs(np.sum(lag * tangent, axis=-1))
-    margin = np.minimum(margin_px / length, 0.2)[:, None]
-    count = _SEGMENTS * _COLUMNS
-    share = (np.arange(count) + 0.5) / count
-    t = margin + (1.0 - 2.0 * margin) * share
+    curve = _QUARTIC @ np.where(steep[:, None, None], nodes[..., ::-1], nodes)
+    along, across = curve[..., 0], curve[..., 1]
+    t = np.broadcast_to((np.arange(count) + 0.5) / count, (len(nodes), count))
     whole = np.rint(_value(along, t))
-    repeated = np.zeros(whole.shape, dtype=bool)
-    repeated[:, 1:] = whole[:, 1:] == whole[:, :-1]
+    fresh = np.ones(whole.shape)
+    fresh[:, 1:] = whole[:, 1:] != whole[:, :-1]
     for _ in range(2):
         t = t - (_value(along, t) - whole) / _slope(along, t)
-    centre = _value(across, t)
-    d_along, d_across = _slope(along, t), _slope(across, t)
-    # Outward is (dv, -du) of a clockwise tangent (du, dv); what counts is its component across the columns.
-    sign = np.where(steep, 1.0, -1.0)[:, None]
-    pitch = sign * d_along / np.hypot(d_along, d_across)
+    centre, slope = _value(across, t), _slope(across, t) / _slope(along, t)
+    # Distances grow downward across lines from left to right, and rightward across those from the top down.
+    first = np.arange(len(nodes)) // len(levels) % 2 == 0
+    sign = np.where(steep, -np.sign(span[:, 1]), np.sign(span[:, 0])) * np.where(first, 1.0, -1.0)
+    pitch = sign[:, None] / np.sqrt(1.0 + slope**2)
+    half = int(np.clip(np.ceil(2.5 * blur + 1.0), 4, 10))
     base = np.rint(centre)
     offsets = np.arange(-half, half + 1)
     distance = (((base - centre)[..., None] + offsets) * pitch[..., None]).astype(np.float32)
-    place = base[..., None].astype(np.int64) + offsets
-    extent_across = np.where(steep, width, height)[:, None, None]
-    extent_along = np.where(steep, height, width)[:, None]
-    inside = (place >= 0) & (place < extent_across) & ((whole >= 0) & (whole < extent_along) & ~repeated)[..., None]
-    stride_across = np.where(steep, 1, width)[:, None, None]
-    stride_along = np.where(steep, width, 1)[:, None]
-    pixel = np.where(inside, place * stride_across + (whole.astype(np.int64) * stride_along)[..., None], 0)
-    inner = np.where(cell >= 5.0 * blur, cell - 2.0 * blur, 2.0 * cell - 1.5 * blur)[:, None, None]
-    outer = np.maximum(cell, 2.5)[:, None, None]
-    inside &= (distance >= -inner) & (distance <= outer)
-    return _Columns(t, distance, pixel, inside.astype(np.float32), normal), cell
+    place = base.astype(np.int64)[..., None] + offsets
+    far, end = np.where(steep, width, height)[:, None, None], np.where(steep, height, width)[:, None]
+    fresh = fresh * ((whole >= 0) & (whole < end))
+    inside = (place >= 0) & (place < far)
+    across_stride, along_stride = np.where(steep, 1, width)[:, None, None], np.where(steep, width, 1)[:, None]
+    pixel = place * across_stride + (whole.astype(np.int64) * along_stride)[..., None]
+    normal = np.stack([-slope * pitch, pitch], axis=-1)
+    normal = np.where(steep[:, None, None], normal[..., ::-1], normal)
+    return _Lines(t, fresh, distance, pixel, inside, normal), _cell_sizes(nodes, len(levels), normal[:, count // 2])
 
 
-def _value(polynomial: FloatArray, t: FloatArray) -> FloatArray:
-    result = polynomial[:, -1:] * t
-    for order in range(_NODES - 2, 0, -1):
-        result = (result + polynomial[:, order : order + 1]) * t
-    return np.asarray(result + polynomial[:, :1])
+def _cell_sizes(nodes: FloatArray, levels: int, normal: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Extent of the marker across and along each of its E lines [px]."""
+    middle = nodes[:, 2].reshape(-1, levels, 2)
+    across = np.repeat(middle[:, -1] - middle[:, 0], levels, axis=0)
+    return np.abs(np.sum(across * normal, axis=-1)), np.linalg.norm(nodes[:, -1] - nodes[:, 0], axis=-1)
 
 
-def _slope(polynomial: FloatArray, t: FloatArray) -> FloatArray:
-    result = (_NODES - 1.0) * polynomial[:, -1:] * t
-    for order in range(_NODES - 2, 1, -1):
-        result = (result + order * polynomial[:, order : order + 1]) * t
-    return np.asarray(result + polynomial[:, 1:2])
+def _nodes(corners: FloatArray, camera: Camera, levels: FloatArray) -> FloatArray:
+    """Pixels (N, 2, L, 5, 2) of five points on every grid line of quadrilaterals (N, 4, 2) [px]."""
+    c = camera.normalise(corners)
+    # Projective map of the unit square (P. Heckbert, "Fundamentals of texture mapping", 1989, section 2.2.3).
+    d1, d2, d3 = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2], c[:, 0] - c[:, 1] + c[:, 2] - c[:, 3]
+    determinant = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+    g = ((d3[:, 0] * d2[:, 1] - d3[:, 1] * d2[:, 0]) / determinant)[:, None]
+    h = ((d1[:, 0] * d3[:, 1] - d1[:, 1] * d3[:, 0]) / determinant)[:, None]
+    right, down = c[:, 1] - c[:, 0] + g * c[:, 1], c[:, 3] - c[:, 0] + h * c[:, 3]
+    level, t = np.meshgrid(levels, _T_NODES, indexing='ij')
+    a, b = np.stack([t, level]).ravel(), np.stack([level, t]).ravel()
+    x = (c[:, None, 0] + a[:, None] * right[:, None] + b[:, None] * down[:, None]) / (1.0 + a * g + b * h)[..., None]
+    return camera.distort(x).reshape(len(corners), 2, len(levels), len(_T_NODES), 2)
+
+
+def _value(quartic: FloatArray, t: FloatArray) -> FloatArray:
+    c = quartic[:, :, None]
+    return np.asarray((((c[:, 4] * t + c[:, 3]) * t + c[:, 2]) * t + c[:, 1]) * t + c[:, 0])
+
+
+def _slope(quartic: FloatArray, t: FloatArray) -> FloatArray:
+    c = quartic[:, :, None]
+    return np.asarray(((4.0 * c[:, 4] * t + 3.0 * c[:, 3]) * t + 2.0 * c[:, 2]) * t + c[:, 1])
+
+
+# The normal distribution and its density, over +-_REACH standard deviations.
+_REACH, _FINENESS = 6.0, 64
+_NORMAL = np.array(
+    [0.5 * math.erfc(-z / math.sqrt(2.0)) for z in np.arange(-_REACH * _FINENESS, _REACH * _FINENESS + 1) / _FINENESS],
+    dtype=np.float32,
+)
+_DENSITY = np.gradient(_NORMAL, 1.0 / _FINENESS).astype(np.float32)
+
+
+def _blurred_step(distance: Float32Array, blur: float) -> tuple[Float32Array, Float32Array]:
+    """A step from 0 to 1 at zero, and its derivative [1/px]."""
+    limit = np.float32(_REACH * _FINENESS)
+    index = (np.clip(distance * np.float32(_FINENESS / blur), -limit, limit) + (limit + np.float32(0.5))).astype(
+        np.intp
+    )
+    return _NORMAL.take(index), _DENSITY.take(index) * np.float32(1.0 / blur)
+
+
+def _along(values: Float32Array, t: FloatArray, extent: FloatArray, blur: float) -> Float32Array:
+    """Values (E, m, V) of the cells along the lines, 0 beyond, as blurred columns at t (E, K) see them: (E, K, V)."""
+    cells = values.shape[1]
+    z = (t[..., None] * cells - np.arange(cells + 1)) * (extent / (cells * blur))[:, None, None]
+    step = 0.5 + 0.5 * np.tanh(0.7988 * z * (1.0 + 0.04417 * z * z))
+    return np.asarray((step[..., :-1] - step[..., 1:]).astype(np.float32) @ values)
+
+
+def _model(
+    lines: _Lines,
+    before: Float32Array,
+    step: Float32Array,
+    numbers: IntArray,
+    extent: tuple[FloatArray, FloatArray],
+    blur: float,
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """White's share of every pixel, its derivative by distance, and the weight of the pixel, each (E, K, M)."""
+    cells = step.shape[-1]
+    cell, along = extent[0] / cells, extent[1]
+    # Black is what the cells take away from the white around: nothing beyond the ends of a line.
+    near = np.stack([1.0 - before[:, :, numbers], step[:, :, numbers]], axis=-1).reshape(-1, cells, 2)
+    black, own = np.split(_along(near, lines.t, along, blur), 2, axis=-1)
+    value, slope = _blurred_step(lines.distance, blur)
+    value, slope = own * value - black, own * slope
+    narrow = np.flatnonzero(cell < _NARROW * blur)
+    if len(narrow):
+        t, distance = lines.t[narrow], lines.distance[narrow]
+        width = cell[narrow].astype(np.float32)[:, None, None]
+        padded = np.pad(step, ((0, 0), (0, 0), (2, 2), (0, 0)))
+        beyond = np.stack([padded[:, :, numbers + 2 + offset] for offset in _NEIGHBOURS], axis=-1)
+        amounts = _along(beyond.reshape(-1, cells, len(_NEIGHBOURS))[narrow], t, along[narrow], blur)
+        for index, offset in enumerate(_NEIGHBOURS):
+            share, rise = _blurred_step(distance - offset * width, blur)
+            amount = amounts[..., index : index + 1]
+            value[narrow] += amount * (share if offset > 0 else share - 1.0)
+            slope[narrow] += amount * rise
+    reach = np.where(cell < _NARROW * blur, 1.6 * cell, cell - 2.0 * blur)
+    quiet = np.minimum(reach, np.maximum(cell, 2.5))
+    number = np.tile(numbers, len(cell) // len(numbers))
+    low = np.where(number == 0, quiet, reach)[:, None, None]
+    high = np.where(number == cells, quiet, reach)[:, None, None]
+    weight = lines.inside & (lines.distance >= -low) & (lines.distance <= high)
+    weight = weight & ((np.abs(own[..., 0]) > 0.7) & (lines.fresh > 0.0))[..., None]
+    return value, slope, weight.astype(np.float32)
 
 
 def _measure(
-    image: Float32Array, columns: _Columns, cell: FloatArray, bits: Gray, blur: float, lag: FloatArray
+    image: Float32Array,
+    lines: _Lines,
+    before: Float32Array,
+    step: Float32Array,
+    numbers: IntArray,
+    extent: tuple[FloatArray, FloatArray],
+    blur: float,
 ) -> _Shifts:
-    profiles = EdgeProfiles(blur, lag)
-    index = profiles.index(columns.distance)
-    model, slope = profiles.value(index), profiles.slope(index)
-    narrow = np.flatnonzero(cell < 5.0 * blur)
-    if len(narrow):
-        subset = EdgeProfiles(blur, lag[narrow])
-        w = cell[narrow].astype(np.float32)[:, None, None]
-        b1, b2 = _blurred_bits(bits[narrow], columns.t[narrow], cell[narrow], blur)
-        for step, amount in ((1.0, b1), (2.0, b2 - b1)):
-            index = subset.index(columns.distance[narrow] + step * w)
-            model[narrow] += amount * (1.0 - subset.value(index))
-            slope[narrow] -= amount * subset.slope(index)
-    edges = len(cell)
-    shape = (edges * _SEGMENTS, -1)
-    counts = image.ravel().take(columns.pixel).reshape(shape)
-    weight = columns.weight.reshape(shape)
-    X = np.stack([np.ones_like(counts), model.reshape(shape), slope.reshape(shape), counts - counts[:, :1]], axis=1)
+    """Displacement of each segment, one a cell long, by least squares over level, contrast and displacement."""
+    value, slope, weight = _model(lines, before, step, numbers, extent, blur)
+    cells = step.shape[-1]
+    shape = (value.shape[0] * cells, -1)
+    counts = image.ravel().take(lines.pixel, mode='clip').reshape(shape)
+    middle = counts[:, counts.shape[1] // 2][:, None]
+    X = np.stack([np.ones_like(counts), value.reshape(shape), slope.reshape(shape), counts - middle], axis=1)
+    weight = weight.reshape(shape)
+    shifts, coefficients = _solve(X, weight, len(step))
+    residual = X[:, 3] - (coefficients[:, None] @ X[:, :3])[:, 0]
+    outlier = np.abs(residual) > _PIXEL_OUTLIER * np.sqrt(shifts.noise).reshape(-1, 1)
+    if np.any(outlier & (weight > 0.0)):
+        shifts, _ = _solve(X, weight * ~outlier, len(step))
+    return shifts
+
+
+def _solve(X: Float32Array, weight: Float32Array, count: int) -> tuple[_Shifts, Float32Array]:
+    """Least squares of the last of four columns X (segments, 4, pixels) on the others: (1, model, derivative)."""
     gram = ((X * weight[:, None]) @ np.swapaxes(X, -1, -2)).astype(np.float64)
-    shift, variance, contrast, coefficients, noise = _solve(gram, edges)
-    residual = X[:, 3] - np.einsum('sip,si->sp', X[:, :3], coefficients.astype(np.float32))
-    outlier = np.abs(residual) > 4.5 * np.sqrt(noise)[:, None].astype(np.float32)
-    if np.any(outlier & (weight > 0)):
-        weight = weight * ~outlier
-        gram = ((X * weight[:, None]) @ np.swapaxes(X, -1, -2)).astype(np.float64)
-        shift, variance, contrast, coefficients, noise = _solve(gram, edges)
-    column_weight = columns.weight.max(axis=-1)
-    t = columns.t.reshape(edges, _SEGMENTS, _COLUMNS)
-    used = column_weight.reshape(edges, _SEGMENTS, _COLUMNS)
-    t = np.sum(t * used, axis=-1) / np.maximum(used.sum(axis=-1), 1.0)
-    return _Shifts(
-        t,
-        shift.reshape(edges, _SEGMENTS),
-        variance.reshape(edges, _SEGMENTS),
-        contrast.reshape(edges, _SEGMENTS),
-    )
-
-
-def _solve(gram, edges):
-    """Least squares of level, contrast and displacement per segment."""
     number = gram[:, 0, 0]
-    A = gram[:, :3, :3] + 1e-6 * np.maximum(number, 1.0)[:, None, None] * np.eye(3)
-    inverse = np.linalg.inv(A)
+    inverse = np.linalg.inv(gram[:, :3, :3] + (1e-6 * number + 1e-6)[:, None, None] * np.eye(3))
     right = gram[:, :3, 3]
     coefficients = (inverse @ right[..., None])[..., 0]
     square = np.maximum(gram[:, 3, 3] - np.sum(coefficients * right, axis=-1), 0.0)
-    freedom = number - 3.0
-    own = np.where(freedom > 0.5, square / np.maximum(freedom, 1.0), np.inf)
-    own = own.reshape(-1, 4 * _SEGMENTS)
-    level = np.nanmedian(np.where(np.isfinite(own), own, np.nan), axis=1, keepdims=True)
-    noise = np.where(own > 2.5 * level, own, level).reshape(-1)
-    contrast = coefficients[:, 1]
-    safe = np.where(np.abs(contrast) > 1e-3, contrast, 1e-3)
-    shift = -coefficients[:, 2] / safe
-    variance = np.where(freedom > 0.5, noise * inverse[:, 2, 2] / safe**2, np.inf)
-    variance = np.where(np.isfinite(variance), variance, 1e6)
-    typical = np.median(contrast.reshape(-1, 4 * _SEGMENTS), axis=1).repeat(4 * _SEGMENTS)
-    variance = np.where(contrast * np.sign(typical) > 0.3 * np.abs(typical), variance, 1e6)
-    return np.clip(shift, -2.0, 2.0), variance, contrast, coefficients, noise
+    free = number - 3.0
+    usable = (free > 1.5).reshape(count, -1)
+    noise = (square / np.maximum(free, 1.0)).reshape(count, -1)
+    contrast = coefficients[:, 1].reshape(count, -1)
+    typical_noise = _median_where(noise, usable)
+    typical = _median_where(contrast, usable)
+    noise = np.where(noise > 2.5 * typical_noise, noise, typical_noise) + 1e-3
+    usable &= contrast * np.sign(typical) > 0.3 * np.abs(typical)
+    safe = np.where(usable, contrast, 1.0)
+    shift = np.where(usable, np.clip(-coefficients[:, 2].reshape(count, -1) / safe, -2.0, 2.0), 0.0)
+    variance = np.where(usable, noise * inverse[:, 2, 2].reshape(count, -1) / safe**2, _HOPELESS)
+    return _Shifts(shift, variance, contrast, noise), coefficients.astype(np.float32)
 
 
-def _blurred_bits(bits: Gray, t: FloatArray, cell: FloatArray, blur: float) -> tuple[Float32Array, Float32Array]:
-    n = bits.shape[-1]
-    position = t[..., None] * (n + 2) - np.arange(1, n + 2)
-    step = 0.5 + 0.5 * np.tanh(0.8 * position * (cell / blur)[:, None, None])
-    window = step[..., :-1] - step[..., 1:]
-    first = np.einsum('ekn,en->ek', window, bits[:, 0].astype(np.float64))
-    second = np.einsum('ekn,en->ek', window, bits[:, 1].astype(np.float64))
-    return first[..., None].astype(np.float32), second[..., None].astype(np.float32)
+def _median_where(values: FloatArray, good: np.ndarray) -> FloatArray:
+    """Medians (N, 1) of the good ones of values (N, S), 0 where there is none."""
+    order = np.sort(np.where(good, values, np.inf), axis=1)
+    middle = np.maximum(good.sum(axis=1) - 1, 0) // 2
+    median = np.take_along_axis(order, middle[:, None], axis=1)
+    return np.where(np.isfinite(median), median, 0.0)
 
 
-def _intersect(x: FloatArray, camera: Camera, shifts: _Shifts) -> tuple[FloatArray, FloatArray]:
-    """Corners (N, 4, 2) of the moved lines, normalised, and their covariances (N, 4, 2, 2)."""
-    start = x.reshape(-1, 2)
-    chord = (np.roll(x, -1, axis=1) - x).reshape(-1, 2)
-    n = np.stack([chord[:, 1], -chord[:, 0]], axis=-1) / np.linalg.norm(chord, axis=-1, keepdims=True)
-    J = camera.distort_jacobian(start[:, None] + shifts.t[..., None] * chord[:, None])
-    image_tangent = (J @ chord[:, None, :, None])[..., 0]
-    image_normal = np.stack([image_tangent[..., 1], -image_tangent[..., 0]], axis=-1)
-    image_normal /= np.linalg.norm(image_normal, axis=-1, keepdims=True)
-    gain = np.einsum('esi,esij,ej->es', image_normal, J, n)
-    moved, deviation = shifts.shift / gain, np.sqrt(shifts.variance) / gain
-    basis = np.stack([1.0 - shifts.t, shifts.t], axis=-1)
-    weight = 1.0 / deviation**2
-    prior = np.eye(2) / (3.0 / gain.mean(axis=1))[:, None, None] ** 2
-    robust = np.ones_like(weight)
+def _adjust(
+    corners: FloatArray, lines: _Lines, shifts: _Shifts, levels: FloatArray, cells: int
+) -> tuple[FloatArray, FloatArray]:
+    """Corners (N, 4, 2) moved to explain the shifts of all segments, and their covariances (N, 4, 2, 2)."""
+    count = len(corners)
+    A = _design(lines, levels, cells, count)
+    deviation = np.sqrt(shifts.variance)
+    robust = np.ones_like(deviation)
+    prior = np.eye(8) / _PRIOR_PX**2
     for _ in range(3):
-        total = weight * robust
-        information = np.einsum('es,esi,esj->eij', total, basis, basis) + prior
+        weighted = A * (robust / shifts.variance)[..., None]
+        information = np.swapaxes(weighted, -1, -2) @ A + prior
         covariance = np.linalg.inv(information)
-        ends = np.einsum('eij,es,esj->ei', covariance, total * moved, basis)
-        normalised = (moved - np.einsum('esi,ei->es', basis, ends)) / deviation
-        scale = np.maximum(1.4826 * np.median(np.abs(normalised), axis=1, keepdims=True), 1.0)
-        robust = 1.0 / np.maximum(np.abs(normalised) / (2.5 * scale), 1.0) ** 2
-    kept = robust > 0.99
-    chi2 = np.sum(np.where(kept, normalised**2, 0.0).reshape(len(x), -1), axis=1)
-    freedom = np.maximum(np.sum((kept & (shifts.variance < 1e5)).reshape(len(x), -1), axis=1) - 8.0, 0.0)
-    factor = (chi2 + 24.0) / (freedom + 24.0)
-    covariance = covariance * np.repeat(factor, 4)[:, None, None]
-    ends = ends.reshape(-1, 4, 2)
-    variance = np.einsum('eii->ei', covariance).reshape(-1, 4, 2)
-    n = n.reshape(-1, 4, 2)
-    N = np.stack([np.roll(n, 1, axis=1), n], axis=-2)
-    offsets = np.stack([np.roll(ends[..., 1], 1, axis=1), ends[..., 0]], axis=-1)
-    spread = np.stack([np.roll(variance[..., 1], 1, axis=1), variance[..., 0]], axis=-1)
-    inverse = np.linalg.inv(N)
-    delta = (inverse @ offsets[..., None])[..., 0]
-    return x + delta, (inverse * spread[..., None, :]) @ np.swapaxes(inverse, -1, -2)
+        moved = (covariance @ (np.swapaxes(weighted, -1, -2) @ shifts.shift[..., None]))[..., 0]
+        normalised = (shifts.shift - (A @ moved[..., None])[..., 0]) / deviation
+        used = shifts.variance < _HOPELESS
+        scale = np.maximum(1.4826 * _median_where(np.abs(normalised), used), 1.0)
+        robust = 1.0 / np.maximum(np.abs(normalised) / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
+    kept = used & (robust > 0.99)
+    chi2 = np.sum(np.where(kept, normalised**2, 0.0), axis=1)
+    free = np.maximum(kept.sum(axis=1) - 8.0, 0.0)
+    # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
+    covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None]
+    blocks = np.einsum('nikil->nikl', covariance.reshape(count, 4, 2, 4, 2))
+    return corners + moved.reshape(count, 4, 2), blocks
+
+
+def _design(lines: _Lines, levels: FloatArray, cells: int, count: int) -> FloatArray:
+    """Derivative (N, segments, 8) of the segments' displacements along their normals by the corners'."""
+    edges = len(lines.t)
+    fresh = lines.fresh.reshape(edges, cells, -1)
+    t = np.sum(lines.t.reshape(fresh.shape) * fresh, axis=-1) / np.maximum(fresh.sum(axis=-1), 1.0)
+    t = t.reshape(count, 2, len(levels), cells)
+    level = np.broadcast_to(levels[:, None], t.shape[1:])
+    a = np.stack([t[:, 0], np.broadcast_to(level[0], t[:, 0].shape)], axis=1)
+    b = np.stack([np.broadcast_to(level[0], t[:, 0].shape), t[:, 1]], axis=1)
+    share = np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), a * b, (1.0 - a) * b], axis=-1)
+    normal = lines.normal.reshape(edges, cells, -1, 2)[:, :, fresh.shape[-1] // 2].reshape(*t.shape, 1, 2)
+    return np.asarray((share[..., None] * normal).reshape(count, -1, 8))

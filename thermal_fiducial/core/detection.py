@@ -10,7 +10,7 @@ from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.contrast import normalise
-from thermal_fiducial.core.corners import edge_bits, refine_corners, RefinedCorners
+from thermal_fiducial.core.corners import grid_pattern, refine_corners, RefinedCorners
 from thermal_fiducial.core.lag import markers_without_lag, MotionTracker, smear, SmearField, Twist, without_lag
 from thermal_fiducial.core.measurements import (
     CORNER_COVARIANCE_FIELDS,
@@ -43,7 +43,7 @@ class MarkerDetector:
         self.config = config
         self._sizes = size_overrides(config.marker_size_overrides)
         self._search = ArucoSearch(dictionary, 23, 7.0, config.min_side_px, config.error_correction_rate)
-        self._border_bits = edge_bits(marker_bits(dictionary))
+        self._pattern = grid_pattern(marker_bits(dictionary))
         T_body_camera = geometry.transform(
             geometry.rotation_from_quaternion(config.camera_orientation), config.camera_position
         )
@@ -99,7 +99,7 @@ class MarkerDetector:
     ) -> RefinedCorners:
         """Corners at the stamp: refined on the image freed of lag, by the twist that they themselves improve."""
         sizes = self._sizes_of(ids)
-        bits = self._border_bits[ids]
+        before, step = self._pattern.before[ids], self._pattern.step[ids]
         tau = self.config.bolometer_lag
         x = camera.normalise(corners)
         depth = _corner_depths(x, sizes)
@@ -110,7 +110,7 @@ class MarkerDetector:
             if twist is not None:
                 used, _ = smear(camera, x, depth, twist, tau)
                 scene = markers_without_lag(image, corners, used, _WINDOW_MARGIN_PX)
-            refined = refine_corners(scene, corners, camera, bits, self.config.blur_px, np.zeros((len(ids), 2)))
+            refined = refine_corners(scene, corners, camera, before, step, self.config.blur_px)
             x = camera.normalise(refined.corners_px)
             noise = np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1).mean(axis=-1)) / camera.focal_px
             twist = self._motion.correct(stamp_ns, predicted, ids, x, depth, noise)

@@ -10,7 +10,7 @@ from thermal_fiducial.core.types import FloatArray, Gray, IntArray
 
 
 class ArucoSearch:
-    """Blind search for the markers of a dictionary in an 8-bit view, without sub-pixel refinement.
+    """Blind search for the markers of a dictionary in an 8-bit view.
 
     Parameters
     ----------
@@ -33,7 +33,8 @@ class ArucoSearch:
         parameters.adaptiveThreshWinSizeMin = window_px
         parameters.adaptiveThreshWinSizeMax = window_px
         parameters.adaptiveThreshConstant = threshold
-        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+        parameters.cornerRefinementMaxIterations = 5
         parameters.detectInvertedMarker = True
         parameters.errorCorrectionRate = error_rate
         parameters.minDistanceToBorder = 1
