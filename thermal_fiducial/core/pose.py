@@ -21,8 +21,8 @@ from thermal_fiducial.errors import InputError
 _MAX_STEPS = 20
 # A step below this [m and rad, relative to unit scene] changes no published digit.
 _CONVERGED = 1e-9
-# Nor does a cost that falls by less than this share of itself: quadratic convergence has squared the error by then.
-_GAIN = 1e-9
+# A cost that falls by less than this share of itself is at its minimum to a thousandth of a standard deviation.
+_GAIN = 1e-6
 # Damping at which Levenberg-Marquardt finds no better pose at all.
 _HOPELESS = 1e6
 # Stands in for a start that does not exist; the square it shows is in front of the camera.
