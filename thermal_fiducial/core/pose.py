@@ -22,7 +22,7 @@ _MAX_STEPS = 20
 # A step below this [m and rad, relative to unit scene] changes no published digit.
 _CONVERGED = 1e-9
 # A cost that falls by less than this share of itself is at its minimum to a thousandth of a standard deviation.
-_GAIN = 1e-6
+_GAIN = 1e-7
 # Damping at which Levenberg-Marquardt finds no better pose at all.
 _HOPELESS = 1e6
 # Stands in for a start that does not exist; the square it shows is in front of the camera.
@@ -328,7 +328,8 @@ def _minimise(evaluate: Callable[[FloatArray], _Evaluation], T: FloatArray) -> _
         T = np.where(better[:, None, None], trial, T)
         gradient = np.where(better[:, None], new[1], gradient)
         information = np.where(better[:, None, None], new[2], information)
-        still = (np.abs(step).max(axis=-1) < _CONVERGED) | (better & (new[0] >= (1.0 - _GAIN) * cost))
+        unchanged = (new[0] >= (1.0 - _GAIN) * cost) & (new[0] <= (1.0 + _GAIN) * cost)
+        still = (np.abs(step).max(axis=-1) < _CONVERGED) | unchanged
         cost = np.where(better, new[0], cost)
         damping = np.where(better, 0.1 * damping, 10.0 * damping)
         if np.all(still | (damping > _HOPELESS)):
