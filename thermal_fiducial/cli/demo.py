@@ -15,6 +15,8 @@ from thermal_fiducial.report import evaluate_run, Evaluation, write_page
 from thermal_fiducial.report.tables import tables
 
 SCENARIO = 'fog'
+BAG = 'flight_through_fog'
+LONGEST_S = 3600.0
 #: Stands in the folder of a demo: only such a folder is ever replaced.
 MARK = '.thermal_fiducial_demo'
 
@@ -31,9 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, replay, score, report."""
+    if not 0.0 < args.seconds <= LONGEST_S:
+        raise InputError(f'--seconds {args.seconds:g} is not between 0 and {LONGEST_S:g}')
     started = time.monotonic()
     _make_room(args.out)
-    bag = args.out / 'bag'
+    bag = args.out / BAG
     _simulate(bag, args.seconds, args.seed)
     _replay(bag, args.out)
     evaluation, numbers = evaluate_run(args.out, bag)

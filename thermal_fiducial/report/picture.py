@@ -39,7 +39,7 @@ def draw_picture(evaluation: Evaluation, bag: Path, path: Path) -> None:
     picture = _view(bag, stamp_ns)
     with styled():
         figure = Figure(figsize=(14.0, 4.3), dpi=110)
-        frame, above, error = figure.subplots(1, 3, width_ratios=(1.32, 1.0, 1.0))
+        frame, above, error = figure.subplots(1, 3, width_ratios=(1.2, 1.0, 1.0))
         _draw_frame(frame, picture, evaluation, stamp_ns)
         draw_view(above, evaluation)
         above.set_title('The map from above')
@@ -116,6 +116,7 @@ def _draw_error(axis: Axes, evaluation: Evaluation) -> None:
                 label=f'{name}: {rms:.1f} mm rms',
             )
     axis.set_yscale('log')
+    axis.set_ylim(bottom=0.1)
     axis.set_xlabel('time [s]')
     axis.set_ylabel('position error [mm]')
     axis.set_title('Error against ground truth')

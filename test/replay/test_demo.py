@@ -1,0 +1,53 @@
+"""The demo from start to end, and the folders that it refuses."""
+
+import json
+
+import numpy as np
+from PIL import Image
+import pytest
+
+from thermal_fiducial.cli.demo import MARK
+from thermal_fiducial.cli.main import main
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+def test_a_short_demo(tmp_path, capfd):
+    out, picture = tmp_path / 'demo', tmp_path / 'picture.png'
+    out.mkdir()
+    for name in (MARK, 'old'):
+        (out / name).touch()
+    assert main(['demo', '--out', str(out), '--seconds', '11', '--seed', '1', '--picture', str(picture)]) == 0
+    assert not (out / 'old').exists()
+    printed = capfd.readouterr().out
+    assert 'position error, rms [mm]' in printed
+    assert str(out / 'report.html') in printed
+    numbers = json.loads((out / 'summary.json').read_text())['evaluation']
+    assert numbers['fused']['poses'] > 1000
+    # Far from what the algorithms reach: this is about the chain being whole, frames and signs included.
+    assert numbers['fused']['error']['position_rms_mm'] < 30.0
+    assert 'Error' in (out / 'report.html').read_text()
+    image = np.asarray(Image.open(picture).convert('RGB'))
+    assert image.shape[1] > 1200
+    assert image.std() > 20.0
+    assert picture.stat().st_size < 400_000
+
+
+def test_a_folder_of_somebody_else_is_never_replaced(tmp_path, capsys):
+    (tmp_path / 'thesis.tex').write_text('years of work')
+    assert main(['demo', '--out', str(tmp_path)]) == 2
+    assert 'no earlier demo' in capsys.readouterr().err
+    assert (tmp_path / 'thesis.tex').read_text() == 'years of work'
+
+
+def test_a_file_in_the_way_is_refused(tmp_path, capsys):
+    (tmp_path / 'file').touch()
+    assert main(['demo', '--out', str(tmp_path / 'file')]) == 2
+    assert main(['demo', '--out', str(tmp_path / 'file' / 'demo')]) == 2
+    assert capsys.readouterr().err.count('\n') == 2
+
+
+@pytest.mark.parametrize('seconds', ['-3', '0', 'nan', 'inf', '1.5'])
+def test_an_impossible_length_is_refused(tmp_path, capsys, seconds):
+    assert main(['demo', '--out', str(tmp_path / 'demo'), f'--seconds={seconds}']) == 2
+    assert f'{seconds} ' in capsys.readouterr().err
