@@ -1,0 +1,117 @@
+"""The run loop: transport profile, arguments, parameters that change while a node runs."""
+
+from dataclasses import dataclass
+import os
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import Imu
+from support.ros_graph import ros_graph
+
+from thermal_fiducial.config import group, param
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros import qos, run
+from thermal_fiducial.ros.node import StageNode
+
+pytestmark = pytest.mark.ros
+
+
+@dataclass(frozen=True)
+class Inner:
+    gain: float = param(1.0, 'Gain.', unit='1/s', minimum=0.0, maximum=5.0, live=True)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """One of every kind."""
+
+    name: str = param('a', 'Name.', choices=('a', 'b'), live=True)
+    count: int = param(3, 'Count.', minimum=1)
+    sizes: tuple[str, ...] = param((), 'Sizes.')
+    weights: tuple[float, ...] = param((), 'Weights.', live=True)
+    inner: Inner = group(Inner)  # noqa: RUF009
+
+
+class Stage(StageNode[Parameters]):
+    def __init__(self, **kwargs):
+        super().__init__('stage', Parameters, **kwargs)
+        self.subscribe(Imu, 'imu/data', lambda message: None, qos.IMU_INPUT)
+
+
+def test_parameters_of_every_kind_come_from_the_command_line():
+    with ros_graph('-p', 'sizes:=["7:0.5"]', '-p', 'weights:=[1.0, 2.0]', '-p', 'inner.gain:=2.0') as graph:
+        node = graph.add(Stage)
+        assert node.config == Parameters(sizes=('7:0.5',), weights=(1.0, 2.0), inner=Inner(2.0))
+
+
+def test_parameters_come_from_a_file(tmp_path):
+    file = tmp_path / 'params.yaml'
+    file.write_text('/**: {ros__parameters: {name: b, sizes: [], inner: {gain: 0.5}, foreign: 1}}')
+    with ros_graph('--params-file', str(file)) as graph:
+        assert graph.add(Stage).config == Parameters(name='b', inner=Inner(0.5))
+
+
+@pytest.mark.parametrize(
+    ('rule', 'words'),
+    [
+        ('count:=0', 'count'),
+        ('count:=1.5', 'count'),
+        ('name:=c', "'c' is not one of a, b"),
+        ('inner.gain:=9.0', 'inner.gain'),
+        ('sizes:=[1, 2]', 'sizes'),
+    ],
+)
+def test_a_refused_parameter_is_an_input_error(rule, words):
+    with ros_graph('-p', rule) as graph, pytest.raises(InputError, match=f'parameter .*{words}'):
+        graph.add(Stage)
+
+
+def set_parameter(graph, name, value):
+    request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
+    (result,) = graph.call(SetParameters, 'stage/set_parameters', request).results
+    return result.successful, result.reason
+
+
+def test_live_parameters_can_be_set_and_others_not():
+    with ros_graph() as graph:
+        node = graph.add(Stage)
+        assert set_parameter(graph, 'inner.gain', 3.0) == (True, '')
+        assert set_parameter(graph, 'name', 'b') == (True, '')
+        assert node.config == Parameters(name='b', inner=Inner(3.0))
+        assert set_parameter(graph, 'name', 'c')[0] is False
+        assert set_parameter(graph, 'inner.gain', 7.0)[0] is False
+        assert set_parameter(graph, 'count', 4)[0] is False
+        assert node.config == Parameters(name='b', inner=Inner(3.0))
+        (value,) = graph.call(GetParameters, 'stage/get_parameters', GetParameters.Request(names=['inner.gain'])).values
+        assert value.double_value == 3.0
+
+
+def test_the_profile_is_used_unless_the_user_has_one(monkeypatch):
+    for name in ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE'):
+        monkeypatch.delenv(name, raising=False)
+    run.use_transport_profile()
+    assert os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] == str(run.PROFILE)
+    monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', '/my/profile.xml')
+    run.use_transport_profile()
+    assert os.environ['FASTRTPS_DEFAULT_PROFILES_FILE'] == '/my/profile.xml'
+
+
+def test_the_profile_takes_an_image_whole():
+    root = ElementTree.parse(run.PROFILE).getroot()
+    sizes = {
+        element.tag.rpartition('}')[2]: int(element.text) for element in root.iter() if (element.text or '').isdigit()
+    }
+    # A 640x514 frame of 16 bits and its header; a segment smaller than a message loses messages silently.
+    assert sizes['maxMessageSize'] > 640 * 514 * 2 + 1000
+    assert sizes['segment_size'] >= 4 * sizes['maxMessageSize']
+
+
+@pytest.mark.parametrize('arguments', [['--params-file', '/nowhere.yaml'], ['-p', 'x'], ['-r', 'bad']])
+def test_arguments_that_ros_cannot_read_are_an_input_error(arguments):
+    with pytest.raises(InputError) as caught:
+        run.initialise(['--ros-args', *arguments], Context())
+    assert '\n' not in str(caught.value)
+    assert arguments[1] in str(caught.value)
