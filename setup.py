@@ -27,6 +27,7 @@ setup(
     install_requires=['numpy>=1.26', 'opencv-python-headless>=4.10', 'filterpy>=2.0.0', 'pyyaml', 'rosbags>=0.11'],
     extras_require={
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-common-interfaces==5.3.6'],
+        'cloud': ['small_gicp', 'plyfile', 'pypcd4', 'scipy', 'rich', 'matplotlib'],
         'tools': ['scipy', 'rich', 'matplotlib', 'ezdxf', 'jinja2'],
         'test': ['pytest', 'shapely', 'hypothesis', 'pytest-benchmark', 'pytest-xdist', 'evo'],
         'lint': ['ruff', 'mypy', 'import-linter', 'types-PyYAML'],

@@ -8,11 +8,13 @@ import numpy as np
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.candidates import Candidate, DECISIVE
+from thermal_fiducial.core.geometry import quaternion_from_rotation
 from thermal_fiducial.core.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.map_refinement import refine, Refinement
 from thermal_fiducial.core.marker_map import MarkerMapper
-from thermal_fiducial.core.measurements import Markers
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.measurements import CORNER_COVARIANCE_FIELDS, CORNER_FIELDS, MARKER_DTYPE, Markers
+from thermal_fiducial.core.pose import solve_marker_poses
+from thermal_fiducial.core.types import FloatArray, IntArray
 
 # Passes over all frames: more than any chain of markers needs of which each is seen with the last alone.
 _MAX_PASSES = 50
@@ -53,7 +55,8 @@ def build_map(
     """
     config = replace(config, mode='mapping', keyframe_budget=max(len(frames), config.keyframe_budget))
     mapper = MarkerMapper(config, marker_map)
-    used, waiting, refinement = 0, {}, None
+    used, refinement = 0, None
+    waiting: dict[int, str] = {}
     for _ in range(_MAX_PASSES):
         before = len(mapper.map.markers)
         used = 0
@@ -67,6 +70,40 @@ def build_map(
             break
     unplaced = {key: why for key, why in waiting.items() if key not in mapper.map.markers}
     return Built(_with_statistics(mapper.map, frames, marker_map), refinement, unplaced, used)
+
+
+def rows_from_corners(
+    ids: IntArray, corners: FloatArray, covariances: FloatArray, sizes: FloatArray, camera: Camera
+) -> Markers:
+    """Rows (N,) of MARKER_DTYPE of markers known by their corners alone, as a file of detections holds them.
+
+    Parameters
+    ----------
+    ids, sizes : (N,), (N,) [m]
+    corners, covariances : (N, 4, 2) [px], (N, 4, 2, 2) [px^2]
+    """
+    rows = np.zeros(len(ids), MARKER_DTYPE)
+    if not len(ids):
+        return rows
+    poses = solve_marker_poses(corners, covariances, sizes, camera)
+    rows['id'] = ids
+    _fill(rows, CORNER_FIELDS, corners.reshape(-1, 8))
+    _fill(rows, CORNER_COVARIANCE_FIELDS, covariances.reshape(-1, 4, 4)[..., [0, 1, 3]].reshape(-1, 12))
+    rows['sigma_px'] = np.sqrt(np.trace(covariances, axis1=-2, axis2=-1).mean(axis=-1) / 2.0)
+    rows['rms_px'] = [pose.rms_px for pose in poses]
+    rows['arms_px'] = [pose.alternative_rms_px for pose in poses]
+    for prefix, T in (
+        ('', np.stack([pose.T_camera_marker for pose in poses])),
+        ('a', np.stack([pose.T_alternative for pose in poses])),
+    ):
+        _fill(rows, tuple(prefix + axis for axis in 'xyz'), T[:, :3, 3])
+        _fill(rows, tuple(f'{prefix}q{axis}' for axis in 'xyzw'), quaternion_from_rotation(T[:, :3, :3]))
+    return np.asarray(rows[np.isfinite(rows['rms_px'])])
+
+
+def _fill(rows: Markers, names: tuple[str, ...], values: FloatArray) -> None:
+    for name, column in zip(names, values.T, strict=True):
+        rows[name] = column
 
 
 def _stamp(k: int) -> int:

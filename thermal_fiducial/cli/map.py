@@ -1,0 +1,220 @@
+"""``map``: show, check, edit, merge, build, refine and align marker maps."""
+
+import argparse
+from collections.abc import Callable
+import csv
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from thermal_fiducial.cli import map_cloud, map_sources
+from thermal_fiducial.config import size_overrides
+from thermal_fiducial.core import map_editing
+from thermal_fiducial.core.geometry import transform_from_quaternion
+from thermal_fiducial.core.map_data import MarkerMap
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files import map_history
+from thermal_fiducial.files.marker_map import load_map, save_map
+
+Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Sub-commands of ``map``."""
+    parser.add_argument('--marker-size', type=float, metavar='M', help='side of markers whose entry has none [m]')
+    parser.add_argument(
+        '--marker-size-override', action='append', default=[], metavar='ID:M', help='side of one marker [m]'
+    )
+    commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
+    show = _command(commands, 'show', 'table of the markers, and a plot', _show)
+    show.add_argument('--plot', type=Path, metavar='PNG', help='top and side view with uncertainties')
+    _command(commands, 'check', 'what is doubtful about a map; exit status 1 if anything is', _check)
+    for name, fixed in (('fix', True), ('unfix', False)):
+        action = _command(commands, name, f'declare markers {"fixed: they never move" if fixed else "free"}', _fix)
+        action.add_argument('ids', type=int, nargs='+', metavar='ID')
+        action.set_defaults(fixed=fixed)
+    _add_editing(commands)
+    _command(commands, 'history', 'earlier versions of a map', _history)
+    _command(commands, 'undo', 'put the latest earlier version back', _undo)
+    map_sources.add_build(commands.add_parser('build', help='a map from a folder of photos in any order'))
+    map_sources.add_refine(commands.add_parser('refine', help='adjust a map to the detections of a run'))
+    map_cloud.add_align(commands.add_parser('align', help='hold a map against a point cloud of the place'))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the chosen action."""
+    return int(args.do(args))
+
+
+def _command(
+    commands: Commands, name: str, text: str, do: Callable[[argparse.Namespace], int]
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:])
+    parser.add_argument('map', type=Path, metavar='MAP', help='map file (YAML)')
+    parser.set_defaults(do=do)
+    return parser
+
+
+def _add_editing(commands: Commands) -> None:
+    move = _command(commands, 'move', 'put a marker somewhere else', _move)
+    move.add_argument('id', type=int, metavar='ID')
+    move.add_argument('--position', type=float, nargs=3, required=True, metavar=('X', 'Y', 'Z'))
+    move.add_argument('--orientation', type=float, nargs=4, metavar=('QX', 'QY', 'QZ', 'QW'), help='default: as it is')
+    move.add_argument('--sigma', type=float, default=0.005, metavar='M', help='how well that is known (0.005 m)')
+    move.add_argument('--sigma-deg', type=float, default=1.0, metavar='DEG', help='and its orientation (1 deg)')
+    rename = _command(commands, 'rename', 'give a marker another ID', _rename)
+    rename.add_argument('old', type=int, metavar='OLD')
+    rename.add_argument('new', type=int, metavar='NEW')
+    delete = _command(commands, 'delete', 'take markers out', _delete)
+    delete.add_argument('ids', type=int, nargs='+', metavar='ID')
+    merge = _command(commands, 'merge', 'take over the markers of another map, by the ones in common', _merge)
+    merge.add_argument('other', type=Path, metavar='OTHER')
+    merge.add_argument('--out', type=Path, metavar='FILE', help='default: MAP itself')
+    anchor = _command(commands, 'anchor', 'move the whole map onto surveyed markers', _anchor)
+    anchor.add_argument(
+        'survey', type=Path, metavar='CSV', help='lines "id,x,y,z": centres of three markers or more [m]'
+    )
+    anchor.add_argument('--fix', action='store_true', help='and declare those markers fixed')
+
+
+def _load(args: argparse.Namespace, path: Path | None = None) -> MarkerMap:
+    return load_map(path or args.map, args.marker_size, size_overrides(tuple(args.marker_size_override)))
+
+
+def _save(args: argparse.Namespace, edited: MarkerMap, action: str) -> int:
+    map_history.save_with_history(args.map, edited, action)
+    print(f'{args.map}: {action}; version {edited.version}, {len(edited.markers)} markers')
+    return 0
+
+
+def _show(args: argparse.Namespace) -> int:
+    marker_map = _load(args)
+    table = Table(
+        title=f'{args.map}: {marker_map.dictionary}, frame {marker_map.frame_id}, version {marker_map.version}'
+    )
+    for name in ('ID', 'size m', 'x m', 'y m', 'z m', 'faces', 'sigma mm', 'deg', 'error px', 'seen', 'standing'):
+        table.add_column(name, justify='right' if name not in ('faces', 'standing') else 'left')
+    for key in sorted(marker_map.markers):
+        m = marker_map.markers[key]
+        x, y, z = m.T_map_marker[:3, 3]
+        sigma = [float(np.sqrt(max(np.trace(block), 0.0))) for block in (m.covariance[:3, :3], m.covariance[3:, 3:])]
+        standing = 'quarantine' if not m.trusted else 'fixed' if m.fixed else ''
+        table.add_row(
+            str(key), f'{m.size:g}', f'{x:.4f}', f'{y:.4f}', f'{z:.4f}', _facing(m.T_map_marker[:3, 2]),
+            f'{1e3 * sigma[0]:.2f}', f'{np.rad2deg(sigma[1]):.3f}', f'{m.reprojection_error_px:.3f}',
+            str(m.observations), standing,
+        )  # fmt: skip
+    # Eleven columns: in a narrower window lines wrap, but no number is cut.
+    console = Console()
+    console.width = max(console.width, 110)
+    console.print(table)
+    if args.plot:
+        from thermal_fiducial.cli.map_plot import plot_map
+
+        plot_map(marker_map, args.plot)
+        print(f'{args.plot} written')
+    return 0
+
+
+def _facing(normal: FloatArray) -> str:
+    """Where a marker looks, in words: the nearest axis, and how far off it is."""
+    axis = int(np.argmax(np.abs(normal)))
+    off = np.rad2deg(np.arccos(np.clip(abs(normal[axis]), -1.0, 1.0)))
+    return f'{"-" if normal[axis] < 0 else "+"}{"xyz"[axis]}' + (f' {off:.0f} deg off' if off >= 0.5 else '')
+
+
+def _check(args: argparse.Namespace) -> int:
+    found = map_editing.problems(_load(args))
+    for line in found:
+        print(line)
+    print(f'{args.map}: {len(found)} doubts' if found else f'{args.map}: sound')
+    return 1 if found else 0
+
+
+def _fix(args: argparse.Namespace) -> int:
+    names = ' '.join(str(key) for key in args.ids)
+    return _save(
+        args,
+        map_editing.set_fixed(_load(args), args.ids, args.fixed),
+        f'{"fix" if args.fixed else "unfix"} {names}',
+    )
+
+
+def _move(args: argparse.Namespace) -> int:
+    marker_map = _load(args)
+    if args.id not in marker_map.markers:
+        raise InputError(f'{args.map}: marker {args.id} is not in the map')
+    T = marker_map.markers[args.id].T_map_marker.copy()
+    if args.orientation:
+        if not 0.9 < float(np.linalg.norm(args.orientation)) < 1.1:
+            raise InputError('--orientation is no unit quaternion x y z w')
+        T = transform_from_quaternion(args.position, args.orientation)
+    T[:3, 3] = args.position
+    covariance = np.diag([args.sigma**2 / 3.0] * 3 + [np.deg2rad(args.sigma_deg) ** 2 / 3.0] * 3)
+    return _save(args, map_editing.move(marker_map, args.id, T, covariance), f'move {args.id}')
+
+
+def _rename(args: argparse.Namespace) -> int:
+    return _save(args, map_editing.rename(_load(args), args.old, args.new), f'rename {args.old} to {args.new}')
+
+
+def _delete(args: argparse.Namespace) -> int:
+    names = ' '.join(str(key) for key in args.ids)
+    return _save(args, map_editing.delete(_load(args), args.ids), f'delete {names}')
+
+
+def _merge(args: argparse.Namespace) -> int:
+    merged, alignment = map_editing.merge(_load(args), _load(args, args.other))
+    for key, residual in alignment.residuals_m.items():
+        note = '  left out: it disagrees with the others' if key in alignment.outliers else ''
+        print(f'marker {key}: {1e3 * residual:.1f} mm{note}')
+    if args.out:
+        save_map(args.out, merged)
+        print(f'{args.out}: {len(merged.markers)} markers')
+        return 0
+    return _save(args, merged, f'merge {args.other.name}')
+
+
+def _anchor(args: argparse.Namespace) -> int:
+    surveyed = _survey(args.survey)
+    anchored, distances = map_editing.anchor(_load(args), surveyed)
+    for key, distance in distances.items():
+        print(f'marker {key}: {1e3 * distance:.1f} mm from its surveyed place')
+    if args.fix:
+        anchored = map_editing.set_fixed(anchored, distances, True)
+    return _save(args, anchored, f'anchor to {args.survey.name}')
+
+
+def _survey(path: Path) -> dict[int, FloatArray]:
+    surveyed: dict[int, FloatArray] = {}
+    try:
+        with path.open(newline='', encoding='utf-8') as file:
+            for number, row in enumerate(csv.reader(file), start=1):
+                if not row or row[0].strip().lower() in ('id', '') or row[0].startswith('#'):
+                    continue
+                try:
+                    surveyed[int(row[0])] = np.array([float(value) for value in row[1:4]]).reshape(3)
+                except ValueError:
+                    raise InputError(f'{path}: line {number} is not "id,x,y,z"') from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f'{path}: cannot read the survey') from error
+    return surveyed
+
+
+def _history(args: argparse.Namespace) -> int:
+    earlier = map_history.entries(args.map)
+    for entry in earlier:
+        print(f'{entry.number:6d}  version {entry.version}, {entry.markers} markers, before: {entry.action}')
+    current = _load(args)
+    print(f'   now  version {current.version}, {len(current.markers)} markers')
+    return 0
+
+
+def _undo(args: argparse.Namespace) -> int:
+    entry = map_history.undo(args.map)
+    print(f'{args.map}: undone: {entry.action}; version {entry.version}, {entry.markers} markers')
+    return 0

@@ -1,0 +1,92 @@
+"""``map align``: a marker map against a point cloud of the place."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+import yaml
+
+from thermal_fiducial.config import size_overrides
+from thermal_fiducial.core.cloud_alignment import align_to_cloud, CloudAlignment
+from thermal_fiducial.core.geometry import apply, inverse, quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.marker_map import load_map, write_atomically
+from thermal_fiducial.files.point_cloud import load_cloud
+
+# Points of the cloud in the picture: more make it no clearer.
+_DRAWN = 200_000
+
+
+def add_align(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``map align``."""
+    parser.add_argument('map', type=Path, metavar='MAP', help='map file (YAML)')
+    parser.add_argument('--cloud', type=Path, required=True, metavar='FILE', help='point cloud, .ply or .pcd')
+    parser.add_argument(
+        '--initial',
+        type=float,
+        nargs=7,
+        default=[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+        metavar=('X', 'Y', 'Z', 'QX', 'QY', 'QZ', 'QW'),
+        help='rough pose of the map in the cloud (default: the same frame)',
+    )
+    parser.add_argument('--reach', type=float, default=0.5, metavar='M', help='how rough that may be (0.5 m)')
+    parser.add_argument('--out', type=Path, metavar='YAML', help='write the transform here')
+    parser.add_argument('--plot', type=Path, metavar='PNG', help='draw map and cloud together')
+    parser.set_defaults(do=_align)
+
+
+def _align(args: argparse.Namespace) -> int:
+    marker_map = load_map(args.map, args.marker_size, size_overrides(tuple(args.marker_size_override)))
+    if not marker_map.markers:
+        raise InputError(f'{args.map}: the map has no marker')
+    cloud = load_cloud(args.cloud)
+    initial = transform_from_quaternion(args.initial[:3], args.initial[3:])
+    try:
+        alignment = align_to_cloud(marker_map.markers.values(), cloud, initial, args.reach)
+    except ImportError as error:
+        raise InputError("map align needs the extra 'cloud': pip install thermal_fiducial[cloud]") from error
+    _tell(alignment)
+    if args.out:
+        _write(args.out, alignment.T, marker_map.frame_id, args.cloud)
+    if args.plot:
+        from thermal_fiducial.cli.map_plot import plot_map
+
+        shown = cloud[:: max(1, len(cloud) // _DRAWN)]
+        plot_map(marker_map, args.plot, apply(inverse(alignment.T), shown))
+        print(f'{args.plot} written')
+    return 0
+
+
+def _tell(alignment: CloudAlignment) -> None:
+    table = Table(title='surface under each marker')
+    for name in ('ID', 'distance mm', 'angle deg', 'points'):
+        table.add_column(name, justify='right')
+    for fit in sorted(alignment.fits, key=lambda fit: fit.id):
+        row = (str(fit.id), f'{1e3 * fit.distance_m:.1f}', f'{np.rad2deg(fit.angle):.2f}', str(fit.points))
+        table.add_row(*row)
+    Console().print(table)
+    distances = np.array([fit.distance_m for fit in alignment.fits])
+    print(f'{len(distances)} markers, {1e3 * np.sqrt(np.mean(distances**2)):.1f} mm rms from their surfaces')
+    if alignment.without_surface:
+        print(f'no surface near markers {", ".join(map(str, alignment.without_surface))}')
+    if alignment.open_directions:
+        print(f'the surfaces leave {alignment.open_directions} of 6 directions open: there the initial pose stands')
+    position, q = alignment.T[:3, 3], quaternion_from_rotation(alignment.T[:3, :3])
+    print('map in cloud: position', *(f'{v:.4f}' for v in position), 'orientation', *(f'{v:.6f}' for v in q))
+
+
+def _write(path: Path, T: FloatArray, frame_id: str, cloud: Path) -> None:
+    document = {
+        'parent': cloud.name,
+        'child': frame_id,
+        'position': [round(float(v), 9) for v in T[:3, 3]],
+        'orientation': [round(float(v), 9) for v in quaternion_from_rotation(T[:3, :3])],
+    }
+    try:
+        write_atomically(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
+    except OSError as error:
+        raise InputError(f'{path}: cannot write the transform: {error.strerror}') from error
+    print(f'{path} written')

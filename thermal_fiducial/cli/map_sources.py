@@ -1,0 +1,187 @@
+"""``map build`` and ``map refine``: maps from photos and from the detections of a run."""
+
+import argparse
+import csv
+from pathlib import Path
+
+import cv2
+import numpy as np
+from rich.progress import Progress
+
+from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, size_overrides
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.map_building import build_map, Built, rows_from_corners
+from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.measurements import CORNER_FIELDS, Markers
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.map_history import save_with_history
+from thermal_fiducial.files.marker_map import load_map
+
+_IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
+
+
+def add_build(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``map build``."""
+    parser.add_argument('images', type=Path, metavar='FOLDER', help='photos of the markers, in any order')
+    parser.add_argument(
+        '--calibration', type=Path, required=True, metavar='FILE', help='camera_info YAML of the camera'
+    )
+    parser.add_argument('--dictionary', default='DICT_4X4_50', help='dictionary or dictionary file (DICT_4X4_50)')
+    start = parser.add_mutually_exclusive_group(required=True)
+    start.add_argument('--origin', type=int, metavar='ID', help='marker that becomes the origin of the map')
+    start.add_argument('--map', type=Path, metavar='MAP', help='map with known markers to start from')
+    parser.add_argument('--out', type=Path, required=True, metavar='MAP', help='the map to write')
+    parser.set_defaults(do=_build)
+
+
+def add_refine(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``map refine``."""
+    parser.add_argument('map', type=Path, metavar='MAP', help='the map to adjust; its fixed markers stay')
+    parser.add_argument('run_folder', type=Path, metavar='RUN', help='run folder with detections.csv, or such a file')
+    parser.add_argument(
+        '--calibration', type=Path, required=True, metavar='FILE', help='camera_info YAML of the camera'
+    )
+    parser.add_argument('--max-frames', type=int, default=1500, metavar='N', help='frames used, evenly chosen (1500)')
+    parser.add_argument('--out', type=Path, metavar='FILE', help='default: MAP itself')
+    parser.set_defaults(do=_refine)
+
+
+def _build(args: argparse.Namespace) -> int:
+    camera = load_camera(args.calibration)
+    start = _start(args)
+    frames = _detect(_photos(args.images), camera, _detector(args))
+    if args.origin is not None and not any(args.origin in rows['id'] for rows in frames):
+        raise InputError(f'{args.images}: marker {args.origin}, the origin, is in none of the {len(frames)} photos')
+    return _grow(args, frames, camera, start, args.out, f'build from {args.images.name}')
+
+
+def _refine(args: argparse.Namespace) -> int:
+    camera = load_camera(args.calibration)
+    start = load_map(args.map, args.marker_size, size_overrides(tuple(args.marker_size_override)))
+    file = args.run_folder / 'detections.csv' if args.run_folder.is_dir() else args.run_folder
+    frames = _read_detections(file, start, _mapper_config(args, start.dictionary), camera)
+    if len(frames) > args.max_frames:
+        frames = [frames[i] for i in np.linspace(0, len(frames) - 1, args.max_frames).astype(int)]
+    return _grow(args, frames, camera, start, args.out or args.map, f'refine from {args.run_folder.name}')
+
+
+def _grow(
+    args: argparse.Namespace, frames: list[Markers], camera: Camera, start: MarkerMap, out: Path, action: str
+) -> int:
+    with Progress(transient=True) as progress:
+        task = progress.add_task('mapping', total=None)
+        built = build_map(
+            frames,
+            camera,
+            start,
+            _mapper_config(args, start.dictionary),
+            lambda markers: progress.update(task, description=f'mapping: {markers} markers'),
+        )
+    _tell(built, len(frames))
+    save_with_history(out, built.map, action)
+    print(f'{out}: {len(built.map.markers)} markers')
+    return 0
+
+
+def _tell(built: Built, frames: int) -> None:
+    print(f'{built.frames_used} of {frames} frames used')
+    if built.refinement is not None:
+        print(f're-projection error {built.refinement.rms_px:.3f} px rms')
+        for key, share in built.refinement.outliers.items():
+            if share > 0.3:
+                print(f'marker {key}: {100 * share:.0f} % of its views disagree with the others; has it been moved?')
+    for key, why in sorted(built.unplaced.items()):
+        print(f'marker {key} is not in the map: {why}')
+
+
+def _mapper_config(args: argparse.Namespace, dictionary: str) -> MarkerMapperConfig:
+    defaults = MarkerMapperConfig()
+    return MarkerMapperConfig(
+        dictionary=dictionary,
+        marker_size=args.marker_size or defaults.marker_size,
+        marker_size_overrides=tuple(args.marker_size_override),
+    )
+
+
+def _start(args: argparse.Namespace) -> MarkerMap:
+    sizes = size_overrides(tuple(args.marker_size_override))
+    if args.map is not None:
+        return load_map(args.map, args.marker_size, sizes)
+    size = sizes.get(args.origin, args.marker_size)
+    if size is None:
+        raise InputError('map build --origin needs --marker-size')
+    origin = MapMarker(args.origin, size, True, np.eye(4))
+    return MarkerMap({args.origin: origin}, dictionary=args.dictionary)
+
+
+def _detector(args: argparse.Namespace) -> MarkerDetector:
+    defaults = ArucoDetectorConfig()
+    config = ArucoDetectorConfig(
+        dictionary=args.dictionary,
+        marker_size=args.marker_size or defaults.marker_size,
+        marker_size_overrides=tuple(args.marker_size_override),
+    )
+    return MarkerDetector(config, load_dictionary(args.dictionary))
+
+
+def _photos(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise InputError(f'{folder}: no such folder')
+    photos = sorted(file for file in folder.iterdir() if file.suffix.lower() in _IMAGES)
+    if not photos:
+        raise InputError(f'{folder}: no photos ({", ".join(sorted(_IMAGES))})')
+    return photos
+
+
+def _detect(photos: list[Path], camera: Camera, detector: MarkerDetector) -> list[Markers]:
+    frames = []
+    with Progress(transient=True) as progress:
+        for k, photo in enumerate(progress.track(photos, description='detecting')):
+            counts = cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+            if counts is None:
+                raise InputError(f'{photo}: not a readable picture')
+            if counts.shape != (camera.height, camera.width):
+                raise InputError(
+                    f'{photo}: {counts.shape[1]}x{counts.shape[0]}, '
+                    f'but the calibration is for {camera.width}x{camera.height}'
+                )
+            deep = counts.dtype == np.uint16
+            frames.append(detector.detect(k, counts.astype(np.uint16) if deep else counts.astype(np.uint8), camera))
+    return frames
+
+
+def _read_detections(path: Path, start: MarkerMap, config: MarkerMapperConfig, camera: Camera) -> list[Markers]:
+    """Rows of each frame of a ``detections.csv``."""
+    try:
+        with path.open(newline='', encoding='utf-8') as file:
+            table = np.array(
+                [
+                    [float(row[name]) for name in ('stamp_ns', 'id', 'sigma_px', *CORNER_FIELDS)]
+                    for row in csv.DictReader(file)
+                ]
+            )
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f'{path}: cannot read the detections') from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f'{path}: not a table of detections: {error}') from error
+    if not len(table):
+        raise InputError(f'{path}: no detections')
+    stamps, firsts = np.unique(table[:, 0], return_index=True)
+    overrides = size_overrides(config.marker_size_overrides)
+    sizes = {key: marker.size for key, marker in start.markers.items()}
+    frames = []
+    for first, last in zip(firsts, [*firsts[1:], len(table)], strict=True):
+        rows = table[first:last]
+        ids = rows[:, 1].astype(np.int64)
+        size = np.array([sizes.get(int(key), overrides.get(int(key), config.marker_size)) for key in ids])
+        frames.append(rows_from_corners(ids, rows[:, 3:].reshape(-1, 4, 2), _isotropic(rows[:, 2]), size, camera))
+    assert len(frames) == len(stamps)
+    return frames
+
+
+def _isotropic(sigma_px: FloatArray) -> FloatArray:
+    return np.asarray(np.maximum(sigma_px, 1e-3)[:, None, None, None] ** 2 * np.tile(np.eye(2), (4, 1, 1)))
