@@ -9,7 +9,8 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.cuttability import examine
 from thermal_fiducial.fabrication.dictionary_search import distances, random_code, search
 from thermal_fiducial.fabrication.patterns import cuttable, pack, rotate, unpack, weight
-from thermal_fiducial.files.dictionary import load_dictionary, PACKAGED as FOLDER
+from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.dictionary import PACKAGED as FOLDER
 
 #: Packaged dictionary to bits along a side, least number of markers, distance.
 PACKAGED = {

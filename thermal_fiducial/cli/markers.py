@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from thermal_fiducial.cli import marker_planning
 from thermal_fiducial.core.patterns import marker_bits
 from thermal_fiducial.core.types import Gray
 from thermal_fiducial.errors import InputError
@@ -45,6 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_bridge(commands.add_parser('bridge', help='where bridges go in markers of a standard dictionary'))
     _add_board(commands.add_parser('board', help='drawings of thermal calibration boards'))
     _add_dictionary(commands.add_parser('dictionary', help='search a dictionary of markers that can be cut'))
+    marker_planning.add_plan(
+        commands.add_parser('plan', help='will it be seen, how good is the pose, how long is it warm')
+    )
+    marker_planning.add_measure(
+        commands.add_parser('measure', help='measure the tables that plan reads, in simulation')
+    )
 
 
 def run(args: argparse.Namespace) -> int:

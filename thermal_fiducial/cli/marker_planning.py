@@ -1,0 +1,189 @@
+"""``markers plan`` and ``markers measure``: choose side, thickness and stand-off before cutting."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.fabrication.contrast import Mounting, remaining_contrast
+from thermal_fiducial.fabrication.planning import (
+    expect,
+    Expectation,
+    load_measurements,
+    Measurements,
+    PACKAGED,
+    save_measurements,
+)
+from thermal_fiducial.files.camera_info import load_camera
+
+# Pitch of a Tau 2's pixels [mm].
+_PITCH_MM = 0.017
+_FADE_SECONDS = (0.0, 30.0, 60.0, 120.0, 300.0, 900.0, 3600.0)
+_STAND_OFFS_MM = (0.0, 0.5, 2.0, 5.0, 10.0, 20.0)
+# Sides [px] from the least that any detector reads to a marker that fills the image; contrasts in NETD.
+_SIDES_PX = (10.0, 14.0, 20.0, 28.0, 40.0, 60.0, 100.0, 160.0)
+_CONTRASTS = (1.0, 2.0, 3.0, 4.0, 8.0, 20.0, 80.0, 300.0)
+_TILTS_DEG = (0.0, 30.0, 50.0, 65.0, 75.0)
+
+
+def add_plan(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``markers plan``."""
+    parser.set_defaults(do=_plan)
+    camera = parser.add_argument_group('camera')
+    camera.add_argument('--calibration', type=Path, help='camera_info YAML')
+    camera.add_argument('--lens', type=float, default=13.0, metavar='MM', help='focal length, without a calibration')
+    camera.add_argument('--netd', type=float, default=0.05, metavar='K', help='temporal noise of the camera')
+    marker = parser.add_argument_group('marker')
+    marker.add_argument('--size', type=float, default=300.0, metavar='MM', help='side of the black square')
+    marker.add_argument('--bits', type=int, default=4, help='bits along a side of the dictionary')
+    marker.add_argument('--thickness', type=float, default=3.0, metavar='MM', help='of the acrylic')
+    marker.add_argument(
+        '--stand-off', type=float, default=10.0, metavar='MM', help='air between warm surface and sheet'
+    )
+    scene = parser.add_argument_group('scene')
+    scene.add_argument('--contrast', type=float, default=15.0, metavar='K', help='warm surface above the room')
+    scene.add_argument('--after', type=float, default=300.0, metavar='S', help='time since the surface is warm')
+    scene.add_argument('--loss', type=float, default=10.0, metavar='W/m2/K', help='10 in still air, 25 under rotors')
+    scene.add_argument('--fog', type=float, default=0.0, metavar='1/M', help='extinction in the long-wave infrared')
+    scene.add_argument('--tilt', type=float, default=30.0, metavar='DEG', help='between normal and line of sight')
+    scene.add_argument('--distances', default='1,1.5,2,3,4,6,8,12', metavar='LIST', help='metres')
+    parser.add_argument('--plot', type=Path, metavar='FILE', help='picture of both tables (PNG, PDF, SVG)')
+    parser.add_argument('--tables', type=Path, default=PACKAGED, help='measurements (default: those of the package)')
+
+
+def _plan(args: argparse.Namespace) -> int:
+    distances = _numbers(args.distances)
+    mounting = Mounting(1e-3 * args.thickness, 1e-3 * args.stand_off, args.loss)
+    share = float(remaining_contrast(mounting, args.after))
+    contrast = args.contrast * share
+    measurements = load_measurements(args.tables)
+    views = [_expectation(args, measurements, distance, contrast) for distance in distances]
+    console = Console()
+    console.print(
+        f'{args.contrast:g} K in front of the room; {100 * share:.0f} % of it, {contrast:.2g} K, left after '
+        f'{args.after:g} s with {args.thickness:g} mm of acrylic and {args.stand_off:g} mm of stand-off.'
+    )
+    console.print(_view_table(distances, views))
+    console.print(_fade_table(args))
+    if args.plot is not None:
+        _draw(args, measurements, distances, views)
+        console.print(f'{args.plot}')
+    return 0
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(',')]
+    except ValueError:
+        raise InputError(f'--distances {text!r} is not a list of numbers') from None
+    if min(values) <= 0.0:
+        raise InputError(f'--distances {text!r}: all must be positive')
+    return sorted(values)
+
+
+def _camera(args: argparse.Namespace) -> Camera:
+    if args.calibration is not None:
+        return load_camera(args.calibration)
+    if not args.lens > 0.0:
+        raise InputError(f'--lens {args.lens:g} mm is no focal length')
+    focal = args.lens / _PITCH_MM
+    return Camera(640, 512, np.array([[focal, 0.0, 319.5], [0.0, focal, 255.5], [0.0, 0.0, 1.0]]))
+
+
+def _expectation(args: argparse.Namespace, measurements: Measurements, distance: float, contrast: float) -> Expectation:
+    if not (args.netd > 0.0 and contrast > 0.0 and args.fog >= 0.0):
+        raise InputError('--netd and --contrast must be positive, --fog must not be negative')
+    seen = contrast * float(np.exp(-args.fog * distance)) / args.netd
+    return expect(
+        measurements,
+        _camera(args),
+        size=1e-3 * args.size,
+        distance=distance,
+        tilt_deg=args.tilt,
+        contrast=seen,
+        bits=args.bits,
+    )
+
+
+def _view_table(distances: list[float], views: list[Expectation]) -> Table:
+    table = Table(
+        'distance m', 'side px', 'detected', 'corner px', 'position mm', 'distance mm', 'rotation deg', 'flips'
+    )
+    for distance, view in zip(distances, views, strict=True):
+        verdict = f'{"yes" if view.detected else "no"} ({100 * view.found:.0f} %)'
+        numbers = ['-'] * 5
+        if view.found > 0.0 and np.isfinite(view.position):
+            errors = f'{1e3 * view.position:.2g}', f'{1e3 * view.distance:.2g}', f'{view.rotation_deg:.2g}'
+            numbers = [f'{view.sigma_px:.3f}', *errors, f'{100 * view.wrong_branch:.0f} %']
+        table.add_row(f'{distance:g}', f'{view.side_px:.0f}', verdict, *numbers)
+    table.title = 'One view of one marker (median errors; position: of the camera as seen from the marker)'
+    return table
+
+
+def _fade(args: argparse.Namespace, stand_off_mm: float, seconds: FloatArray) -> FloatArray:
+    return remaining_contrast(Mounting(1e-3 * args.thickness, 1e-3 * stand_off_mm, args.loss), seconds)
+
+
+def _fade_table(args: argparse.Namespace) -> Table:
+    table = Table('stand-off mm', *(f'{seconds:g} s' for seconds in _FADE_SECONDS))
+    for stand_off in sorted({*_STAND_OFFS_MM, args.stand_off}):
+        shares = _fade(args, stand_off, np.array(_FADE_SECONDS))
+        label = 'in contact' if stand_off == 0.0 else f'{stand_off:g}'
+        table.add_row(label, *(f'{100 * share:.0f} %' for share in shares))
+    table.title = f'Contrast left with {args.thickness:g} mm of acrylic'
+    return table
+
+
+def _draw(
+    args: argparse.Namespace, measurements: Measurements, distances: list[float], views: list[Expectation]
+) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4.2), layout='constrained')
+    FigureCanvasAgg(figure)
+    fade, pose = figure.subplots(1, 2)
+    seconds = np.linspace(0.0, 900.0, 181)
+    for stand_off in sorted({*_STAND_OFFS_MM, args.stand_off}):
+        label = 'in contact' if stand_off == 0.0 else f'{stand_off:g} mm stand-off'
+        fade.plot(seconds, 100.0 * _fade(args, stand_off, seconds), label=label)
+    fade.set(xlabel='time [s]', ylabel='contrast left [%]', ylim=(0, 100), title=f'{args.thickness:g} mm of acrylic')
+    fade.legend(fontsize='small')
+    pose.semilogy(distances, [1e3 * view.position for view in views], 'o-', label='camera position [mm]')
+    pose.semilogy(distances, [view.rotation_deg for view in views], 's-', label='rotation [deg]')
+    pose.set(xlabel='distance [m]', title=f'marker of {args.size:g} mm, tilted {args.tilt:g} deg: median error')
+    found = pose.twinx()
+    found.fill_between(distances, [100.0 * view.found for view in views], alpha=0.15)
+    found.set(ylabel='found [%]', ylim=(0, 100))
+    pose.legend(fontsize='small')
+    try:
+        figure.savefig(args.plot, dpi=130)
+    except (OSError, ValueError) as error:
+        raise InputError(f'{args.plot}: {error}') from None
+
+
+def add_measure(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``markers measure``."""
+    parser.set_defaults(do=_measure)
+    parser.add_argument('out', type=Path, help='file to write (YAML)')
+    parser.add_argument('--markers', type=int, default=24, help='markers to show for every side, contrast and tilt')
+    parser.add_argument('--seed', type=int, default=1, help='of the rendering')
+
+
+def _measure(args: argparse.Namespace) -> int:
+    from thermal_fiducial.cli.marker_measurement import DICTIONARY, LENS, measure
+
+    axes = np.array(_SIDES_PX), np.array(_CONTRASTS), np.array(_TILTS_DEG)
+    with Progress(transient=True) as bar:
+        task = bar.add_task('showing markers', total=int(np.prod([len(axis) for axis in axes])))
+        measurements = measure(*axes, markers=args.markers, seed=args.seed, progress=lambda: bar.advance(task))
+    notes = {'dictionary': DICTIONARY, 'lens': LENS, 'markers': args.markers, 'seed': args.seed}
+    save_measurements(args.out, measurements, notes)
+    print(f'{args.out}: {int(np.sum(measurements.found >= 0.9))} of {measurements.found.size} kinds of view detected')
+    return 0

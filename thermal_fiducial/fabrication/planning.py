@@ -1,0 +1,233 @@
+"""What a camera will make of a marker: whether it is found, and how good its pose is.
+
+Nothing is guessed: ``measured.yaml`` holds what the detector of this package did with rendered frames over marker
+side in pixels, contrast and tilt (``thermal-fiducial markers measure`` makes it anew). The share of markers found and
+the noise of the corners are read from it; the pose error follows by running the pose solver on corners with that
+noise, both planar branches included, because near front-parallel views no linear propagation holds.
+"""
+
+from dataclasses import dataclass
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.pose import marker_corners, PlanarPose, solve_marker_poses
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+
+FORMAT = 'thermal_fiducial/marker_measurements'
+#: What the package ships.
+PACKAGED = Path(__file__).resolve().parent / 'measured.yaml'
+#: A marker is planned as detected when so many of the measured ones were.
+DETECTED = 0.9
+
+_TABLES = ('side_px', 'contrast', 'tilt_deg', 'found', 'sigma_px')
+_SAMPLES = 200
+# Bits along a side of the markers that were measured: what counts for reading them is the size of a cell.
+_MEASURED_BITS = 4
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What the detector did.
+
+    Parameters
+    ----------
+    side_px : (S,) side of the black square as a front view would show it
+    contrast : (C,) in standard deviations of the camera's temporal noise (NETD)
+    tilt_deg : (T,) between the marker's normal and the line of sight
+    found : (S, C, T) share of the markers that were found
+    sigma_px : (S, C, T) noise of a corner coordinate; NaN where nothing was found
+    """
+
+    side_px: FloatArray
+    contrast: FloatArray
+    tilt_deg: FloatArray
+    found: FloatArray
+    sigma_px: FloatArray
+
+    def look_up(self, side_px: float, contrast: float, tilt_deg: float, bits: int = 4) -> tuple[float, float]:
+        """Share found and corner noise [px], linear between the measured points (logarithmic in side and contrast).
+
+        Beyond the measured range the nearest end counts, except that nothing smaller or fainter than measured is
+        found.
+        """
+        if contrast < self.contrast[0]:
+            return 0.0, np.nan
+        faint = _position(np.log(self.contrast), np.log(contrast))
+        tilted = _position(self.tilt_deg, tilt_deg)
+        readable = side_px * (_MEASURED_BITS + 2) / (bits + 2)
+        found = 0.0
+        if readable >= self.side_px[0]:
+            found = _interpolate(self.found, (_position(np.log(self.side_px), np.log(readable)), faint, tilted))
+        large = _position(np.log(self.side_px), np.log(max(side_px, self.side_px[0])))
+        return found, _interpolate(self.sigma_px, (large, faint, tilted))
+
+
+def _position(axis: FloatArray, value: float) -> tuple[int, float]:
+    """Interval of a grid axis that ``value`` falls into, and where in it (0 to 1)."""
+    index = int(np.clip(np.searchsorted(axis, value) - 1, 0, len(axis) - 2))
+    return index, float(np.clip((value - axis[index]) / (axis[index + 1] - axis[index]), 0.0, 1.0))
+
+
+def _interpolate(table: FloatArray, positions: tuple[tuple[int, float], ...]) -> float:
+    """Linear between the corners of a cell; corners without a value are left out."""
+    total, weights = 0.0, 0.0
+    for corner in np.ndindex(2, 2, 2):
+        weight = float(
+            np.prod([share if side else 1.0 - share for side, (_, share) in zip(corner, positions, strict=True)])
+        )
+        value = table[tuple(index + side for side, (index, _) in zip(corner, positions, strict=True))]
+        if weight > 0.0 and np.isfinite(value):
+            total, weights = total + weight * float(value), weights + weight
+    return total / weights if weights > 0.0 else np.nan
+
+
+def load_measurements(path: str | os.PathLike[str] = PACKAGED) -> Measurements:
+    """Measurements from a file.
+
+    Raises
+    ------
+    InputError
+        Not a file of measurements.
+    """
+    try:
+        document: Any = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f'{path}: not a readable YAML file: {" ".join(str(error).split())}') from None
+    if not isinstance(document, dict) or document.get('format') != FORMAT:
+        raise InputError(f'{path}: not of format {FORMAT}')
+    try:
+        tables = [np.array(document[name], dtype=np.float64) for name in _TABLES]
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f'{path}: {error} is missing or no table') from None
+    side, contrast, tilt, found, sigma = tables
+    shape = len(side), len(contrast), len(tilt)
+    if found.shape != shape or sigma.shape != shape or min(shape) < 2:
+        raise InputError(f'{path}: tables of {found.shape} and {sigma.shape} do not fit axes of {shape}')
+    return Measurements(side, contrast, tilt, found, sigma)
+
+
+def save_measurements(path: str | os.PathLike[str], measurements: Measurements, notes: dict[str, Any]) -> None:
+    """Write ``measurements``, with ``notes`` on how they were made."""
+    document: dict[str, Any] = {'format': FORMAT, **notes}
+    for name in _TABLES:
+        document[name] = np.round(getattr(measurements, name), 4).tolist()
+    Path(path).write_text(
+        yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120), encoding='utf-8'
+    )
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What to expect of one marker in one view.
+
+    Parameters
+    ----------
+    side_px : of the black square as a front view would show it
+    found : share of such markers that is found
+    sigma_px : noise of a corner coordinate
+    position : median error of the camera's position in the marker's frame [m]
+    distance : median error of the distance [m]
+    rotation_deg : median error of the rotation
+    wrong_branch : share of poses on the wrong branch of the planar ambiguity; the errors are those of the others
+    """
+
+    side_px: float
+    found: float
+    sigma_px: float
+    position: float = np.nan
+    distance: float = np.nan
+    rotation_deg: float = np.nan
+    wrong_branch: float = np.nan
+
+    @property
+    def detected(self) -> bool:
+        """Whether one may count on it."""
+        return self.found >= DETECTED
+
+
+def expect(
+    measurements: Measurements,
+    camera: Camera,
+    *,
+    size: float,
+    distance: float,
+    tilt_deg: float,
+    contrast: float,
+    bits: int = 4,
+    seed: int = 1,
+) -> Expectation:
+    """What ``camera`` makes of a marker in the middle of its image.
+
+    Parameters
+    ----------
+    size : side of the black square [m]
+    distance : [m]
+    tilt_deg : between the marker's normal and the line of sight
+    contrast : in standard deviations of the camera's temporal noise
+    bits : along a side of the marker
+    """
+    if not (size > 0.0 and distance > size and 0.0 <= tilt_deg < 85.0 and contrast > 0.0):
+        raise InputError(f'side {size:g} m, distance {distance:g} m, tilt {tilt_deg:g} deg cannot be planned')
+    side_px = camera.focal_px * size / distance
+    found, sigma = measurements.look_up(side_px, contrast, tilt_deg, bits)
+    if not np.isfinite(sigma):
+        return Expectation(side_px, found, sigma)
+    rng = np.random.default_rng(seed)
+    turned = rng.uniform(0.0, 2.0 * np.pi, _SAMPLES)
+    T = viewed_at(distance, np.radians(tilt_deg), turned, camera)
+    corners = camera.project(geometry.apply(T, marker_corners(size)))
+    noisy = corners + rng.normal(0.0, sigma, corners.shape)
+    covariances = np.broadcast_to(sigma**2 * np.eye(2), (*corners.shape, 2))
+    poses = solve_marker_poses(noisy, covariances, np.full(_SAMPLES, size), camera)
+    return Expectation(side_px, found, sigma, *pose_errors(poses, T))
+
+
+def viewed_at(distance: float, tilt: float, turned: npt.ArrayLike, camera: Camera) -> FloatArray:
+    """T_camera_marker (N, 4, 4) of a marker in the middle of the image.
+
+    Parameters
+    ----------
+    tilt : of its normal against the line of sight [rad]
+    turned : (N,) direction of the tilt axis, and of the marker about its own normal [rad]
+    """
+    turned = np.asarray(turned, dtype=np.float64)
+    middle = camera.rays(np.array([0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]))
+    zero = np.zeros_like(turned)
+    axis = np.stack([np.cos(turned), np.sin(turned), zero], axis=-1)
+    own = geometry.so3_exp(np.stack([zero, zero, 2.3 * turned], axis=-1))
+    R = geometry.so3_exp(tilt * axis) @ np.diag([1.0, -1.0, -1.0]) @ own
+    return geometry.transform(R, distance * middle)
+
+
+def pose_errors(poses: list[PlanarPose], T_true: FloatArray) -> tuple[float, float, float, float]:
+    """Median errors of position [m], distance [m] and rotation [deg], and the share on the wrong branch.
+
+    Parameters
+    ----------
+    poses : N poses of a marker in the camera
+    T_true : (N, 4, 4)
+    """
+    best = np.stack([pose.T_camera_marker for pose in poses])
+    other = np.stack([pose.T_alternative for pose in poses])
+    angle, other_angle = (
+        geometry.rotation_angle(T[:, :3, :3] @ np.swapaxes(T_true[:, :3, :3], 1, 2)) for T in (best, other)
+    )
+    wrong = other_angle < angle
+    if np.all(wrong):
+        return np.nan, np.nan, np.nan, 1.0
+    seen_from = geometry.inverse(best)[:, :3, 3] - geometry.inverse(T_true)[:, :3, 3]
+    along = np.linalg.norm(best[:, :3, 3], axis=1) - np.linalg.norm(T_true[:, :3, 3], axis=1)
+    return (
+        float(np.median(np.linalg.norm(seen_from, axis=1)[~wrong])),
+        float(np.median(np.abs(along)[~wrong])),
+        float(np.degrees(np.median(angle[~wrong]))),
+        float(np.mean(wrong)),
+    )
