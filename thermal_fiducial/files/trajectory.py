@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from decimal import Decimal, InvalidOperation
+import math
 from pathlib import Path
 
 import numpy as np
@@ -68,8 +69,8 @@ def _row(path: str | Path, number: int, line: str) -> tuple[int, list[float]]:
         values = [float(word) for word in words[1:]]
     except (InvalidOperation, ValueError, OverflowError):
         raise InputError(f'{path} line {number}: not numbers') from None
-    if len(values) != 7 or not np.all(np.isfinite(values)):
+    if len(values) != 7 or not all(map(math.isfinite, values)):
         raise InputError(f'{path} line {number}: {len(words)} values, or not finite ones; a pose has 8')
-    if np.linalg.norm(values[3:]) < 1e-6:
+    if math.hypot(*values[3:]) < 1e-6:
         raise InputError(f'{path} line {number}: a quaternion of no length')
     return stamp, values
