@@ -18,6 +18,7 @@ from thermal_fiducial.fabrication.boards import asymmetric_circles
 
 # Share of a grid's circles that must be wholly in the image.
 _LEAST_SHARE = 0.6
+_APART_NS = 10_000_000_000
 # Images up to this width [px] are enlarged for the search.
 _SMALL = 400
 _GRID = cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
@@ -143,10 +144,13 @@ class MarkerBoard:
 
     def __init__(self, board: MarkerMap, detector: Detector) -> None:
         self._board, self._detector = board, detector
+        self._stamp_ns = 0
 
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting | None:
         """See :class:`Target`."""
-        rows = self._detector.detect(0, counts, camera)
+        # Views have nothing to do with each other: far apart in time none hints at motion to the next.
+        self._stamp_ns += _APART_NS
+        rows = self._detector.detect(self._stamp_ns, counts, camera)
         rows = rows[np.isin(rows['id'], list(self._board.markers))]
         if len(rows) < 2:
             return None

@@ -1,0 +1,108 @@
+"""IMU samples between camera frames, summed up once: rotation, velocity and position increments with covariances.
+
+C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza, "On-manifold preintegration for real-time visual-inertial
+odometry", 2017, section VI, for all intervals at once.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.config import ImuNoise
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.types import FloatArray
+
+# Longest step of the integration [s]: the sampling interval of a 200 Hz IMU.
+_STEP = 0.005
+
+
+@dataclass(frozen=True)
+class ImuTrack:
+    """Samples (N,) in the IMU's clock.
+
+    Parameters
+    ----------
+    seconds : (N,) increasing
+    rate : (N, 3) angular velocity [rad/s]
+    force : (N, 3) specific force [m/s^2]
+    """
+
+    seconds: FloatArray
+    rate: FloatArray
+    force: FloatArray
+
+    def at(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Rate and force (..., 3) at times ``t``, linear between samples."""
+        flat = t.reshape(-1)
+        rate, force = (
+            np.stack([np.interp(flat, self.seconds, signal[:, axis]) for axis in range(3)], axis=-1)
+            for signal in (self.rate, self.force)
+        )
+        return rate.reshape(*t.shape, 3), force.reshape(*t.shape, 3)
+
+
+@dataclass(frozen=True)
+class Increments:
+    """Between consecutive frames; leading dimension (K,).
+
+    Parameters
+    ----------
+    dt : [s]
+    R, v, p : rotation (3, 3), velocity and position increments in the body frame at the interval's start
+    by_bias : (9, 6) derivative of (rotation, velocity, position) by gyroscope and accelerometer bias
+    covariance : (9, 9) of the same
+    """
+
+    dt: FloatArray
+    R: FloatArray
+    v: FloatArray
+    p: FloatArray
+    by_bias: FloatArray
+    covariance: FloatArray
+
+
+def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: ImuNoise) -> Increments:
+    """Increments between ``times`` (K + 1,) [s, IMU's clock].
+
+    Parameters
+    ----------
+    bias : (K, 6) gyroscope and accelerometer bias of each interval, about which the derivatives are taken
+    """
+    dt = np.diff(times)
+    count = len(dt)
+    steps = max(1, int(np.ceil(dt.max() / _STEP)))
+    h = (dt / steps)[:, None]
+    R, v, p = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros((count, 3))
+    by_bias, covariance = np.zeros((count, 9, 6)), np.zeros((count, 9, 9))
+    density = np.array([noise.gyroscope_noise_density] * 3 + [noise.accelerometer_noise_density] * 3) ** 2
+    for step in range(steps):
+        rate, force = imu.at(times[:-1] + (step + 0.5) * h[:, 0])
+        rate, force = rate - bias[:, :3], force - bias[:, 3:]
+        turn = geometry.so3_exp(rate * h)
+        transition, inputs = _linearised(R, force, turn, h[:, :, None])
+        # Noise and bias enter in the same way; a bias takes away from the sample.
+        by_bias = transition @ by_bias - inputs
+        covariance = transition @ covariance @ np.swapaxes(transition, 1, 2)
+        covariance += inputs @ ((density / h)[:, :, None] * np.swapaxes(inputs, 1, 2))
+        middle = R @ geometry.so3_exp(0.5 * rate * h)
+        a = (middle @ force[:, :, None])[:, :, 0]
+        p = p + v * h + 0.5 * a * h**2
+        v = v + a * h
+        R = R @ turn
+    return Increments(dt, R, v, p, by_bias, covariance)
+
+
+def _linearised(R: FloatArray, force: FloatArray, turn: FloatArray, h: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Transition (K, 9, 9) of the errors (rotation, velocity, position), and how samples enter (K, 9, 6)."""
+    count = len(R)
+    transition = np.tile(np.eye(9), (count, 1, 1))
+    by_turn = -R @ geometry.skew(force)
+    transition[:, :3, :3] = np.swapaxes(turn, 1, 2)
+    transition[:, 3:6, :3] = by_turn * h
+    transition[:, 6:, :3] = 0.5 * by_turn * h**2
+    transition[:, 6:, 3:6] = np.eye(3) * h
+    inputs = np.zeros((count, 9, 6))
+    inputs[:, :3, :3] = np.eye(3) * h
+    inputs[:, 3:6, 3:] = R * h
+    inputs[:, 6:, 3:] = 0.5 * R * h**2
+    return transition, inputs
