@@ -38,12 +38,14 @@ class View:
 
     Parameters
     ----------
+    stamp_ns : random, so that no view hints at motion to the next
     counts : (height, width)
     ids : (N,)
     T_camera_marker : (N, 4, 4)
     corners_px : (N, 4, 2) true ones
     """
 
+    stamp_ns: int
     counts: Counts
     ids: list[int]
     T_camera_marker: FloatArray
@@ -70,7 +72,7 @@ def render_view(side_px: float, contrast: float, tilt_deg: float, rng: np.random
     counts = _SENSOR.counts(renderer.frame(_TIME), _TIME, 0, int(rng.integers(1 << 31)))
     s = 0.5 * _SIZE
     corners = np.array([[-s, s, 0.0], [s, s, 0.0], [s, -s, 0.0], [-s, -s, 0.0]])
-    return View(counts, ids, T, lens.project(geometry.apply(T, corners)))
+    return View(int(rng.integers(1 << 60)), counts, ids, T, lens.project(geometry.apply(T, corners)))
 
 
 def _places(lens: Lens, side_px: float, rng: np.random.Generator) -> Iterator[FloatArray]:
@@ -105,7 +107,7 @@ def _plate(T: FloatArray, bits: np.ndarray, contrast: float) -> Plate:
 
 def detect(view: View, detector: MarkerDetector, camera: Camera) -> tuple[Markers, FloatArray]:
     """Rows of the markers of ``view`` that were found, and for each its index among the true ones."""
-    rows = detector.detect(0, view.counts, camera)
+    rows = detector.detect(view.stamp_ns, view.counts, camera)
     order = {marker_id: index for index, marker_id in enumerate(view.ids)}
     known = np.array([marker_id in order for marker_id in rows['id'].tolist()], dtype=np.bool_)
     rows = rows[known]

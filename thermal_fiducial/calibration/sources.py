@@ -1,0 +1,119 @@
+"""Raw frames, IMU samples and intrinsics from a folder of pictures or a bag."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.calibration.preintegration import ImuTrack
+from thermal_fiducial.config import Tau2CameraConfig
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.thermal import FrameCleaner
+from thermal_fiducial.core.types import Counts, Gray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.images import image_to_array, stamp_to_ns
+
+PICTURES = ('.png', '.tif', '.tiff', '.pgm', '.jpg', '.jpeg', '.bmp')
+_IMAGE_TYPE, _IMU_TYPE, _INFO_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/CameraInfo'
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One raw frame.
+
+    Parameters
+    ----------
+    name : of its file, or its number in the bag
+    stamp_ns : of the bag's frames; of pictures their number, ten seconds apart
+    counts : (height, width)
+    """
+
+    name: str
+    stamp_ns: int
+    counts: Counts | Gray
+
+
+def is_folder_of_pictures(source: Path) -> bool:
+    """Whether ``source`` is a folder that holds no bag."""
+    return source.is_dir() and not (source / 'metadata.yaml').exists()
+
+
+def pictures(folder: Path) -> list[Path]:
+    """Picture files of a folder in the order of their names.
+
+    Raises
+    ------
+    InputError
+        There are none.
+    """
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
+    if not paths:
+        raise InputError(f'{folder}: no pictures ({", ".join(PICTURES)}) and no bag')
+    return paths
+
+
+def read_picture(path: Path) -> Counts | Gray:
+    """Pixels (height, width) of 8 or 16 bit; colours become grey.
+
+    Raises
+    ------
+    InputError
+        Not a picture of 8 or 16 bit.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise InputError(f'{path}: not a picture')
+    if image.ndim == 3:
+        image = cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY)
+    if image.dtype not in (np.uint8, np.uint16) or min(image.shape) < 32:
+        raise InputError(f'{path}: a picture of {image.shape[1]}x{image.shape[0]} {image.dtype}, not 8 or 16 bit grey')
+    return image.astype(np.uint8) if image.dtype == np.uint8 else image.astype(np.uint16)
+
+
+def clean_frames(bag: BagReader) -> Iterator[Frame]:
+    """Frames of a bag as the detector gets them: without those that the shutter or the driver froze."""
+    bag.require({IMAGE_TOPIC: _IMAGE_TYPE})
+    cleaner = FrameCleaner(Tau2CameraConfig())
+    for index, entry in enumerate(bag.messages([IMAGE_TOPIC])):
+        stamp_ns = stamp_to_ns(entry.message.header.stamp)
+        frame = cleaner.process(stamp_ns, image_to_array(entry.message))
+        if frame.counts is not None:
+            yield Frame(str(index), stamp_ns, frame.counts)
+
+
+def recorded_camera(bag: BagReader) -> Camera:
+    """Intrinsics that the bag recorded.
+
+    Raises
+    ------
+    InputError
+        There are none, or none that a camera can have.
+    """
+    bag.require({CAMERA_INFO_TOPIC: _INFO_TYPE})
+    info = next(bag.messages([CAMERA_INFO_TOPIC])).message
+    return Camera(int(info.width), int(info.height), np.array(info.k), str(info.distortion_model), np.array(info.d))
+
+
+def imu_track(bag: BagReader) -> tuple[ImuTrack, int]:
+    """IMU samples in order, in seconds since the stamp that is returned with them.
+
+    Raises
+    ------
+    InputError
+        No topic of IMU samples, or samples that are no numbers.
+    """
+    bag.require({IMU_TOPIC: _IMU_TYPE})
+    stamps, values = [], []
+    for entry in bag.messages([IMU_TOPIC]):
+        message = entry.message
+        stamps.append(stamp_to_ns(message.header.stamp))
+        rate, force = message.angular_velocity, message.linear_acceleration
+        values.append((rate.x, rate.y, rate.z, force.x, force.y, force.z))
+    order, first = np.unique(np.array(stamps, dtype=np.int64), return_index=True)
+    table = np.array(values, dtype=np.float64)[first]
+    if len(order) < 2 or not np.all(np.isfinite(table)):
+        raise InputError(f'{bag.path}: the IMU samples are not finite numbers at increasing stamps')
+    return ImuTrack((order - order[0]) * 1e-9, table[:, :3], table[:, 3:]), int(order[0])
