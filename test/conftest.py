@@ -1,4 +1,4 @@
-"""Settings of all tests: checked message fields, one DDS domain a worker, hypothesis profiles."""
+"""Settings of all tests: checked message fields, a DDS domain for each test process, hypothesis profiles."""
 
 import os
 from pathlib import Path
@@ -7,14 +7,16 @@ from pathlib import Path
 os.environ['ROS_PYTHON_CHECK_FIELDS'] = '1'
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
-_WORKER = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
-os.environ['ROS_DOMAIN_ID'] = str(90 + _WORKER % 11)
 
-import cv2  # noqa: E402
-import hypothesis  # noqa: E402
-import pytest  # noqa: E402
+import cv2
+import hypothesis
+import pytest
+
+from thermal_fiducial.replay.domain import own_domain
 
 cv2.setNumThreads(1)
+_domain = own_domain()
+os.environ['ROS_DOMAIN_ID'] = str(_domain.__enter__())
 hypothesis.settings.register_profile('default', derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile('default')
 

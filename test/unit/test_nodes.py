@@ -1,6 +1,6 @@
 """The four nodes one by one: what they publish, say and survive."""
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ from std_srvs.srv import SetBool, Trigger
 from support import small_bag
 from support.ros_graph import ros_graph
 
+from thermal_fiducial.core.geometry import so3_exp, transform
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import save_camera
@@ -199,7 +200,7 @@ def test_the_annotated_image_is_made_for_a_listener(graph):
 
 def markers(k=0):
     """The detector's answer to a frame."""
-    with ros_graph() as graph:
+    with ros_graph('-r', '__ns:=/aside') as graph:
         graph.add(ArucoDetector, marker_size=small_bag.SIZE)
         graph.listen(PointCloud2, 'markers')
         graph.send('thermal/camera_info', info())
@@ -390,5 +391,52 @@ def test_names_are_relative(graph):
         node = other.add(PoseEkfNode)
         topics = {output.topic for output in node.outputs} | {source.topic for source in node.inputs}
     assert topics == {
-        '/diagnostics', '/drone/vision/pose', '/drone/odometry', '/drone/path', '/drone/imu/data', '/drone/camera_pose'
+        '/diagnostics', '/drone/vision/pose', '/drone/odometry', '/drone/path', '/drone/imu/data', '/drone/camera_pose',
+        '/drone/map_correction',
     }  # fmt: skip
+
+
+# --- the map moves ------------------------------------------------------------------------------------
+
+
+def correction(k, T_new_old):
+    return convert.map_correction(T_new_old, START + k * 5_000_000, 'map')
+
+
+def test_the_estimate_moves_with_the_map(graph):
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
+    fly(graph, [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
+    T_new_old = transform(so3_exp([0.0, 0.0, 0.3]), [1.0, 2.0, 0.0])
+    graph.send('map_correction', correction(57, T_new_old))
+    # The pose of an earlier frame that comes after the word of the correction is still one of the old map.
+    fly(graph, [pose(56), imu(60), pose(59, T_new_old @ small_bag.T_BODY_CAMERA), imu(61)])
+    np.testing.assert_allclose(node.filter.state.T_map_body, T_new_old, atol=0.01)
+    assert graph.diagnose(node)[:2] == (OK, 'tracking')
+
+
+def test_a_live_mapper_refines_in_the_background_and_tells_the_correction(graph, map_file):
+    graph.listen(TransformStamped, 'map_correction')
+    graph.listen(PoseWithCovarianceStamped, 'camera_pose')
+    node = graph.add(MarkerMapperNode, live=True, map_file=str(map_file), refinement_period=0.1)
+    try:
+        with ros_graph('-r', '__ns:=/aside') as other:
+            other.add(ArucoDetector, marker_size=small_bag.SIZE)
+            other.listen(PointCloud2, 'markers')
+            other.send('thermal/camera_info', info())
+            other.send('thermal/image', *frames(40))
+            other.spin_until(lambda: len(other.heard['markers']) == 40)
+        graph.send('thermal/camera_info', info())
+        graph.send('markers', *other.heard['markers'][:30])
+        graph.spin_until(lambda: node._refiner.take() is None and not node._refiner.busy)
+        assert graph.call(Trigger, 'marker_mapper/refine', Trigger.Request()).message == 'refinement started'
+        graph.spin_until(lambda: node._refiner._connection.poll())
+        graph.send('markers', other.heard['markers'][30])
+        graph.spin_until(lambda: graph.heard['map_correction'])
+    finally:
+        node.close()
+    assert node.mapper.resets >= 1
+    stamp, T_new_old = convert.correction_of(graph.heard['map_correction'][0])
+    assert stamp >= START
+    # The first marker is held, so the map stays where it is; flat pictures leave some centimetres to correct.
+    assert np.linalg.norm(T_new_old[:3, 3]) < 0.2
+    assert len(graph.heard['camera_pose']) == 31

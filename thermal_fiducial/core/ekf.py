@@ -14,7 +14,7 @@ from thermal_fiducial.core.gating import Belief, PoseGate, PoseUpdate, position_
 from thermal_fiducial.core.imu import ImuStep, NoiseMonitor
 from thermal_fiducial.core.imu_input import ImuInput, Verdict
 from thermal_fiducial.core.initialisation import WINDOW_SECONDS
-from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
+from thermal_fiducial.core.measurements import CameraPose, ImuSample, in_moved_map, Odometry
 from thermal_fiducial.core.navigation_state import NavigationState
 from thermal_fiducial.core.state_output import odometry
 from thermal_fiducial.core.types import FloatArray
@@ -107,6 +107,12 @@ class PoseEkf:
         if not update.pending:
             self._last_word = update.reason
         return update
+
+    def move_map(self, T_new_old: FloatArray) -> None:
+        """Follow a correction of the map: estimates and buffered poses move with it, T_new = T_new_old @ T_old."""
+        for node in self._nodes:
+            node.belief = self._gate.in_moved_map(node.belief, T_new_old)
+        self._poses = [in_moved_map(pose, T_new_old) for pose in self._poses]
 
     def _unusable(self, pose: CameraPose) -> PoseUpdate | None:
         reason = ''

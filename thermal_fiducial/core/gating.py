@@ -13,7 +13,7 @@ from thermal_fiducial.core.error_state import ErrorStateFilter
 from thermal_fiducial.core.imu import ImuStep
 from thermal_fiducial.core.initialisation import blank_state, start
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.navigation_state import NavigationState
+from thermal_fiducial.core.navigation_state import in_moved_map, NavigationState
 from thermal_fiducial.core.types import FloatArray
 
 _SECOND_NS = 1_000_000_000
@@ -85,6 +85,14 @@ class PoseGate:
             return None
         state = self._filter.predict(track.state, step)
         return Track(state, track.started_ns, track.accepted_ns, track.hits, track.misses)
+
+    def in_moved_map(self, belief: Belief, T_new_old: FloatArray) -> Belief:
+        """``belief`` in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
+
+        def move(track: Track | None) -> Track | None:
+            return track and replace(track, state=in_moved_map(track.state, T_new_old, self._filter.layout))
+
+        return replace(belief, main=move(belief.main), rival=move(belief.rival))
 
     def weigh(self, belief: Belief, pose: CameraPose, time_ns: int, imu: FloatArray) -> tuple[Belief, PoseUpdate]:
         """Belief after a pose.

@@ -5,7 +5,7 @@ about x, y, z), both expressed in the parent frame ``a`` of ``T_a_b``, so that t
 ``p = p_hat + d[:3]`` and ``R = exp(d[3:]) @ R_hat``.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -79,6 +79,12 @@ class CameraPose:
     marker_ids: tuple[int, ...] = field(default=())
     #: re-projection error, rms over their corners [px]
     rms_px: float = 0.0
+
+
+def in_moved_map(pose: CameraPose, T_new_old: FloatArray) -> CameraPose:
+    """``pose`` in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
+    turn = np.kron(np.eye(2), T_new_old[:3, :3])
+    return replace(pose, T_map_camera=T_new_old @ pose.T_map_camera, covariance=turn @ pose.covariance @ turn.T)
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,6 +107,26 @@ def inject(state: NavigationState, error: FloatArray, covariance: FloatArray, la
     return moved
 
 
+def in_moved_map(state: NavigationState, T_new_old: FloatArray, layout: Layout) -> NavigationState:
+    """``state`` in a map whose coordinates are moved by ``T_new_old`` (4, 4).
+
+    The error is one of the robot frame, so only the horizontal gravity's coordinates turn.
+    """
+    R = T_new_old[:3, :3]
+    moved = replace(
+        state,
+        R_map_body=orthonormal(R @ state.R_map_body),
+        velocity=R @ state.velocity,
+        position=R @ state.position + T_new_old[:3, 3],
+        gravity=R @ state.gravity,
+    )
+    if layout.gravity:
+        turn = np.eye(layout.size)
+        turn[layout.gravity, layout.gravity] = R[:2, :2]
+        moved.covariance = turn @ state.covariance @ turn.T
+    return moved
+
+
 def with_horizontal(gravity: FloatArray, horizontal: FloatArray) -> FloatArray:
     """Downward vector as long as ``gravity`` (3,) with the given horizontal components (2,) [m/s^2]."""
     down = math.sqrt(max(float(gravity @ gravity - horizontal @ horizontal), 0.0))

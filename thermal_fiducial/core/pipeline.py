@@ -20,9 +20,11 @@ from thermal_fiducial.config import (
 )
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
-from thermal_fiducial.core.ekf import PoseEkf, PoseUpdate
+from thermal_fiducial.core.ekf import PoseEkf
+from thermal_fiducial.core.gating import PoseUpdate
 from thermal_fiducial.core.geometry import quaternion_from_rotation, transform_from_quaternion
-from thermal_fiducial.core.marker_map import MapperResult, MarkerMap, MarkerMapper
+from thermal_fiducial.core.map_refinement import refine
+from thermal_fiducial.core.marker_map import MapJump, MapperResult, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Markers, Odometry
 from thermal_fiducial.core.thermal import FrameCleaner
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
@@ -114,11 +116,18 @@ class Pipeline:
             return FrameResult(stamp_ns, withheld=frame.reason or 'no camera_info')
         markers = self.detector.detect(stamp_ns, frame.counts, self.camera, self._odometry)
         mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry)
-        refined = self.mapper.refinement_due(stamp_ns) and self.mapper.refine() is not None
-        if mapping.map_changed or refined:
-            self._share_map()
         update = None if mapping.pose is None else self.filter.add_pose(_published_pose(mapping.pose))
+        jump = self._refine(stamp_ns)
+        if jump is not None:
+            self.filter.move_map(as_published(jump.T_new_old))
+        if mapping.map_changed or jump is not None:
+            self._share_map()
         return FrameResult(stamp_ns, markers=markers, mapping=mapping, update=update)
+
+    def _refine(self, stamp_ns: int) -> MapJump | None:
+        snapshot = self.mapper.snapshot() if self.mapper.refinement_due(stamp_ns) else None
+        refinement = None if snapshot is None else refine(snapshot)
+        return None if refinement is None else self.mapper.apply(refinement)
 
     def _share_map(self) -> None:
         """The detector looks for the markers of the map, as the ``marker_map`` topic gives them."""

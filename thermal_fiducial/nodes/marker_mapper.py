@@ -1,22 +1,27 @@
 """Node ``marker_mapper``: markers to the camera's pose in the map, and the map itself."""
 
+from collections.abc import Iterable
 from pathlib import Path
 import sys
 from typing import Any
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+import numpy as np
 from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
-from thermal_fiducial.core.marker_map import MarkerMap, MarkerMapper
+from thermal_fiducial.core.map_refinement import refine, Refinement, Snapshot
+from thermal_fiducial.core.marker_map import MapJump, MapperResult, MarkerMap, MarkerMapper
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.ros import convert, display, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
 from thermal_fiducial.ros.node import OK, WARN
 from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.worker import Background, Foreground
 
 
 class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
@@ -28,15 +33,18 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         marker_map = self.attempt(self._load_map, empty)
         self.mapper = MarkerMapper(self.config, marker_map)
         self._save_path = self._choose_save_path()
-        self._reason = 'no markers yet'
-        self._stamp = 0
+        self._refiner = self._make_refiner()
+        self._result = MapperResult(0, None, 'no markers yet')
+        self._shown_in_view: frozenset[int] = frozenset()
         self._camera_pose = self.advertise(PoseWithCovarianceStamped, 'camera_pose')
         self._marker_map = self.advertise(PointCloud2, 'marker_map', qos.LATCHED)
         self._map_markers = self.advertise(MarkerArray, 'marker_map/markers', qos.LATCHED)
+        self._map_correction = self.advertise(TransformStamped, 'map_correction')
         self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT)
         self.follow_hints()
         self.create_service(Trigger, '~/save', self._on_save)
         self.create_service(Trigger, '~/reset', self._on_reset)
+        self.create_service(Trigger, '~/refine', self._on_refine)
         self.create_service(SetBool, '~/freeze', self._on_freeze)
         self._publish_map()
 
@@ -54,6 +62,9 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         path = Path(self.config.map_file)
         return path.with_name(f'{path.stem}.new{path.suffix}') if self.faults and path.exists() else path
 
+    def _make_refiner(self) -> Foreground[Snapshot, Refinement | None] | Background[Snapshot, Refinement | None]:
+        return Background(refine) if self.live and self.config.mode == 'mapping' else Foreground(refine)
+
     def configure(self, config: MarkerMapperConfig) -> None:
         """Take over live parameters."""
         super().configure(config)
@@ -62,20 +73,46 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     def _on_markers(self, message: PointCloud2) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
         result = self.mapper.process(stamp, convert.markers(message), self.camera(), self.odometry())
-        self._reason, self._stamp = result.reason, stamp
+        self._result = result
         if result.pose is not None:
             head = convert.header(stamp, self.config.map_frame)
             pose = convert.pose_with_covariance(result.pose.T_map_camera, result.pose.covariance, head)
             self._camera_pose.send(pose)
-        refined = self.mapper.refinement_due(stamp) and self.mapper.refine() is not None
-        if result.map_changed or refined:
+        jump = self._refine(stamp)
+        if jump is not None:
+            self._map_correction.send(convert.map_correction(jump.T_new_old, stamp, self.config.map_frame))
+        if result.map_changed or jump is not None:
             self._publish_map()
 
+    def _refine(self, stamp: int) -> MapJump | None:
+        """Start a joint refinement where one is due, take over one that is done."""
+        if not self._refiner.busy and self.mapper.refinement_due(stamp):
+            self._start_refinement()
+        refinement = self._refiner.take()
+        return None if refinement is None else self.mapper.apply(refinement)
+
+    def _start_refinement(self) -> bool:
+        snapshot = self.mapper.snapshot()
+        if snapshot is not None:
+            self._refiner.start(snapshot)
+        return snapshot is not None
+
     def _publish_map(self) -> None:
-        rows = self.mapper.map.rows()
-        head = convert.header(self._stamp, self.config.map_frame)
+        rows = self.mapper.map.rows(self._result.in_view)
+        head = convert.header(self._result.stamp_ns, self.config.map_frame)
         self._marker_map.send(convert.cloud(rows, head))
+        self._show_map(rows, head)
+
+    def _show_map(self, rows: np.ndarray, head: Header) -> None:
         self._map_markers.send(display.map_markers(rows, head))
+        self._shown_in_view = self._result.in_view
+
+    def diagnose(self, stamp_ns: int) -> None:
+        """Publish the diagnostics; colour the markers anew where others are in view."""
+        super().diagnose(stamp_ns)
+        if self._result.in_view != self._shown_in_view:
+            head = convert.header(self._result.stamp_ns, self.config.map_frame)
+            self._show_map(self.mapper.map.rows(self._result.in_view), head)
 
     def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         try:
@@ -97,13 +134,22 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         response.success, response.message = True, f'{len(self.mapper.map.markers)} markers left'
         return response
 
+    def _on_refine(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if self._refiner.busy:
+            response.message = 'a refinement is under way'
+        else:
+            response.success = self._start_refinement()
+            response.message = 'refinement started' if response.success else 'nothing to refine yet'
+        return response
+
     def _on_freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self.mapper.frozen = bool(request.data)
         response.success, response.message = True, 'map frozen' if request.data else 'map free'
         return response
 
     def close(self) -> None:
-        """Save what was mapped."""
+        """End the refinement; save what was mapped."""
+        self._refiner.close()
         if self.config.mode != 'mapping' or self._save_path is None or not self.mapper.map.markers:
             return
         try:
@@ -112,17 +158,29 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             self.get_logger().error(str(error))
 
     def state(self) -> tuple[bytes, str]:
-        """Why the last frame gave no pose."""
-        if self._reason:
-            return WARN, self._reason
+        """Why the last frame gave no pose, and which markers are not trusted."""
+        if self._result.reason:
+            return WARN, self._result.reason
+        if self._result.quarantined:
+            return WARN, f'quarantined: {_listed(self._result.quarantined)}'
         return OK, 'map frozen' if self.mapper.frozen else 'ok'
 
     def figures(self) -> dict[str, object]:
-        """Size and version of the map."""
+        """The map in numbers, and what waits to enter it."""
+        result = self._result
+        waiting = '; '.join(f'{key}: {reason}' for key, reason in result.candidates.items())
         return super().figures() | {
             'markers in map': len(self.mapper.map.markers),
             'map version': self.mapper.map.version,
+            'map corrections': self.mapper.resets,
+            'in view': _listed(sorted(result.in_view)),
+            'quarantined': _listed(result.quarantined),
+            'candidates': waiting,
         }
+
+
+def _listed(ids: Iterable[int]) -> str:
+    return ', '.join(str(key) for key in ids)
 
 
 def main() -> int:

@@ -4,7 +4,7 @@ from collections import deque
 import sys
 from typing import Any
 
-from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
 from sensor_msgs.msg import Imu
@@ -12,12 +12,16 @@ from std_srvs.srv import Trigger
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.ekf import PoseEkf
+from thermal_fiducial.core.measurements import CameraPose, in_moved_map
+from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.node import ERROR, OK, StageNode, WARN
 from thermal_fiducial.ros.run import run
 
 _PATH_STEP_NS = 200_000_000
 _PATH_LENGTH = 3000
+#: Corrections of the map that a late pose may have to follow.
+_CORRECTIONS = 10
 
 
 class PoseEkfNode(StageNode[PoseEkfConfig]):
@@ -28,11 +32,13 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.filter = PoseEkf(self.config)
         self._path: deque[tuple[int, Pose]] = deque(maxlen=_PATH_LENGTH)
         self._last_refusal = ''
+        self._corrections: deque[tuple[int, FloatArray]] = deque(maxlen=_CORRECTIONS)
         self._pose = self.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
         self._odometry = self.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
         self._path_output = self.advertise(Path, 'path')
         self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
+        self.subscribe(TransformStamped, 'map_correction', self._on_map_correction, qos.RESULT)
         self.create_service(Trigger, '~/reset', self._on_reset)
 
     def _on_imu(self, message: Imu) -> None:
@@ -46,8 +52,21 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._extend_path(odometry.stamp_ns, result.pose.pose)
 
     def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
-        update = self.filter.add_pose(convert.camera_pose(message))
+        update = self.filter.add_pose(self._in_present_map(convert.camera_pose(message)))
         self._last_refusal = '' if update.accepted or update.pending else update.reason
+
+    def _on_map_correction(self, message: TransformStamped) -> None:
+        correction = convert.correction_of(message)
+        self._corrections.append(correction)
+        self.filter.move_map(correction[1])
+        self.get_logger().info('the map was corrected: the estimate moves with it')
+
+    def _in_present_map(self, pose: CameraPose) -> CameraPose:
+        """A pose that a correction overtook, moved like the map."""
+        for stamp_ns, T_new_old in self._corrections:
+            if pose.stamp_ns <= stamp_ns:
+                pose = in_moved_map(pose, T_new_old)
+        return pose
 
     def _extend_path(self, stamp: int, pose: Pose) -> None:
         if not self._path or not 0 <= stamp - self._path[-1][0] < _PATH_STEP_NS:
@@ -70,7 +89,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         status = self.filter.status
         level = ERROR if self.filter.lost else OK if status == 'tracking' else WARN
         if self._last_refusal and not self.filter.lost:
-            return WARN, f'{status}; {self._last_refusal}'
+            return WARN, f'{status}; pose {self._last_refusal}'
         return level, status
 
     def figures(self) -> dict[str, object]:

@@ -3,7 +3,7 @@
 from typing import Any, TypeAlias
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2
 from visualization_msgs.msg import MarkerArray
@@ -23,6 +23,7 @@ _RESULTS: Topics = {
     'marker_poses': (PoseArray, qos.RESULT),
     'camera_pose': (PoseWithCovarianceStamped, qos.RESULT),
     'marker_map': (PointCloud2, qos.LATCHED),
+    'map_correction': (TransformStamped, qos.RESULT),
     'marker_map/markers': (MarkerArray, qos.LATCHED),
     'pose': (PoseWithCovarianceStamped, qos.IMU_RATE_RESULT),
     'odometry': (Odometry, qos.IMU_RATE_RESULT),

@@ -10,7 +10,16 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Point, Pose, PoseArray, PoseStamped, PoseWithCovarianceStamped, Quaternion, Vector3
+from geometry_msgs.msg import (
+    Point,
+    Pose,
+    PoseArray,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Quaternion,
+    TransformStamped,
+    Vector3,
+)
 from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
 import numpy as np
@@ -347,6 +356,28 @@ def vector(v: FloatArray) -> Vector3:
     """Vector3 of (3,)."""
     x, y, z = v.tolist()
     return Vector3(x=x, y=y, z=z)
+
+
+def map_correction(T_new_old: FloatArray, stamp: int, map_frame: str) -> TransformStamped:
+    """A correction of the map: moves coordinates of the map up to ``stamp`` [ns] to those from there on."""
+    place = pose(T_new_old)
+    message = TransformStamped(header=header(stamp, map_frame), child_frame_id=f'{map_frame}_before')
+    message.transform.translation = vector(T_new_old[:3, 3])
+    message.transform.rotation = place.orientation
+    return message
+
+
+def correction_of(message: TransformStamped) -> tuple[int, FloatArray]:
+    """Stamp [ns] and T_new_old (4, 4) of a correction of the map.
+
+    Raises
+    ------
+    InputError
+        A value that is not finite, or a quaternion that is none.
+    """
+    p = message.transform.translation
+    place = Pose(position=Point(x=p.x, y=p.y, z=p.z), orientation=message.transform.rotation)
+    return stamp_ns(message.header.stamp), transform_of(place)
 
 
 def path(poses: Iterable[tuple[int, Pose]], head: Header) -> Path:

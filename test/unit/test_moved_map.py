@@ -1,0 +1,73 @@
+"""A correction of the map moves the estimate with it: nothing else changes."""
+
+import numpy as np
+import pytest
+from support.flights import config, Flight
+
+from thermal_fiducial.core.ekf import PoseEkf
+from thermal_fiducial.core.geometry import so3_exp, transform
+from thermal_fiducial.core.measurements import in_moved_map
+
+CORRECTIONS = {
+    'turned about the vertical': transform(so3_exp([0.0, 0.0, 0.7]), [1.0, -2.0, 0.3]),
+    'small': transform(so3_exp([0.002, -0.003, 0.01]), [0.05, -0.02, 0.01]),
+}
+
+
+def events(flight, delay_ns=40_000_000):
+    """IMU samples and poses in the order of their arrival."""
+    everything = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
+    everything += [(pose.stamp_ns + delay_ns, 1, pose) for pose in flight.poses]
+    return [(kind, item) for _, kind, item in sorted(everything, key=lambda event: event[:2])]
+
+
+def run(flight, T_new_old, jump_ns):
+    """Outputs of a filter that is told of the jump, with poses in the new map from then on."""
+    ekf, outputs, jumped = PoseEkf(config()), [], False
+    for kind, item in events(flight):
+        if not jumped and kind == 0 and item.stamp_ns >= jump_ns:
+            ekf.move_map(T_new_old)
+            jumped = True
+        if kind == 0:
+            outputs.append(ekf.add_imu(item))
+        else:
+            ekf.add_pose(in_moved_map(item, T_new_old) if jumped else item)
+    return outputs
+
+
+@pytest.mark.parametrize('T_new_old', CORRECTIONS.values(), ids=CORRECTIONS)
+def test_the_estimate_goes_on_in_the_new_map(T_new_old):
+    flight = Flight(seconds=3.0)
+    jump_ns = flight.samples()[400].stamp_ns
+    reference = run(flight, np.eye(4), jump_ns)
+    moved = run(flight, T_new_old, jump_ns)
+    turn = np.kron(np.eye(2), T_new_old[:3, :3])
+    for sample, before, after in zip(flight.samples(), reference, moved, strict=True):
+        if before is None:
+            assert after is None
+            continue
+        T, turned = (T_new_old, turn) if sample.stamp_ns >= jump_ns else (np.eye(4), np.eye(6))
+        # A tilted map turns the horizontal gravity's prior a little; a map turned about the vertical is exact.
+        tolerance = 1e-9 if T_new_old is CORRECTIONS['turned about the vertical'] else 2e-4
+        np.testing.assert_allclose(after.T_map_body, T @ before.T_map_body, atol=tolerance)
+        np.testing.assert_allclose(after.velocity_body, before.velocity_body, atol=10 * tolerance)
+        np.testing.assert_allclose(
+            after.pose_covariance, turned @ before.pose_covariance @ turned.T, atol=1e-6, rtol=0.05
+        )
+
+
+def test_without_the_word_the_jump_is_refused_at_first():
+    # The negative control: poses in a map that moved by 1.4 m contradict the estimate.
+    flight = Flight(seconds=4.0)
+    jump_ns = flight.samples()[500].stamp_ns
+    T_new_old = transform(np.eye(3), [1.0, 1.0, 0.0])
+    ekf, accepted = PoseEkf(config()), []
+    for kind, item in events(flight):
+        late = item.stamp_ns >= jump_ns
+        if kind == 0:
+            ekf.add_imu(item)
+        else:
+            update = ekf.add_pose(in_moved_map(item, T_new_old) if late else item)
+            accepted.append((late, update.accepted))
+    assert not next(was_accepted for late, was_accepted in accepted if late)
+    assert [was_accepted for late, was_accepted in accepted if not late][-1]

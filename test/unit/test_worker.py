@@ -1,0 +1,88 @@
+"""Long work beside the callbacks: done elsewhere, told once, survived when it fails."""
+
+import os
+import time
+
+import pytest
+from support.tasks import work
+
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.worker import Background, Foreground
+
+
+def until(condition, seconds=20.0):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        time.sleep(0.005)
+        assert time.monotonic() < deadline, 'waited in vain'
+
+
+@pytest.fixture
+def worker():
+    worker = Background(work)
+    until(lambda: worker.take() is None and not worker.busy)
+    yield worker
+    worker.close()
+
+
+def result_of(worker):
+    outcome = []
+    until(lambda: (outcome.append(worker.take()) or outcome[-1]) is not None)
+    return outcome[-1]
+
+
+def test_work_is_done_in_another_process_without_waiting_for_it(worker):
+    began = time.monotonic()
+    worker.start(0.5)
+    assert worker.busy
+    assert worker.take() is None
+    # Far less than the work takes; on a busy machine a pipe may take its time.
+    assert time.monotonic() - began < 0.25
+    process, task = result_of(worker)
+    assert task == 0.5
+    assert process != os.getpid()
+    assert not worker.busy
+    assert worker.take() is None
+
+
+def test_one_task_after_the_other(worker):
+    for task in (0.0, 0.01):
+        worker.start(task)
+        assert result_of(worker)[1] == task
+
+
+def failure(worker):
+    """What is raised while a task is awaited."""
+    with pytest.raises(InputError) as caught:
+        result_of(worker)
+    return str(caught.value)
+
+
+def test_work_that_fails_is_told_and_the_next_is_done(worker):
+    worker.start('fail')
+    assert 'no answer' in failure(worker)
+    worker.start(0.0)
+    assert result_of(worker)[1] == 0.0
+
+
+def test_a_process_that_dies_is_told_once_and_never_used_again(worker):
+    worker.start('die')
+    assert 'ended' in failure(worker)
+    assert worker.take() is None
+    until(lambda: worker.busy)
+
+
+def test_closing_does_not_wait_for_the_work(worker):
+    worker.start(60.0)
+    began = time.monotonic()
+    worker.close()
+    assert time.monotonic() - began < 5.0
+
+
+def test_in_the_foreground_the_result_is_there_at_once():
+    worker = Foreground(work)
+    assert worker.take() is None
+    worker.start(0.0)
+    assert worker.take() == (os.getpid(), 0.0)
+    assert worker.take() is None
+    assert not worker.busy
