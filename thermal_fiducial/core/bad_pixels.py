@@ -16,7 +16,7 @@ from thermal_fiducial.errors import InputError
 # a fine line (roofs, masts in real frames) stands out from seven of its neighbours up to 5 times, so where one is
 # excepted more is asked.
 SPREADS_ALONE = 2
-SPREADS_OF_TWO = 8
+SPREADS_OF_TWO = 12
 
 # Opposite neighbours (row, column), near ones first: the pixel lies in the middle of each pair.
 _PAIRS = np.array([(0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (2, 2), (2, -2), (1, 2), (2, 1), (1, -2), (2, -1)])
@@ -40,6 +40,7 @@ class BadPixelFinder:
     def __init__(self, shape: tuple[int, int], interval: int = 10, sigmas: float = 8.0) -> None:
         self._votes = np.zeros(shape, np.uint8)
         self._stuck = np.zeros(shape, np.bool_)
+        self._bad = np.zeros(shape, np.bool_)
         self._interval = interval
         self._sigmas = sigmas
         self._frames = 0
@@ -52,22 +53,25 @@ class BadPixelFinder:
         if self._frames > self.ENOUGH // self.VOTE + 1 and self._frames % self._interval:
             return None
         noise = pixel_noise(counts)
-        outlying = _stands_out(counts, self._sigmas * noise)
-        self._votes = cv2.subtract(self._votes, np.ones_like(self._votes))  # type: ignore[assignment]
+        surroundings = np.asarray(cv2.medianBlur(counts, 3), np.uint16)
+        outlying = _stands_out(counts, surroundings, self._sigmas * noise)
+        self._votes -= self._votes > 0
         votes = self._votes.reshape(-1)
         votes[outlying] = np.minimum(votes[outlying] + self.VOTE + 1, 4 * self.ENOUGH)
-        self._watch(counts, self._sigmas * noise)
-        rows, columns = np.divmod(np.flatnonzero((self._votes >= self.ENOUGH) | self._stuck), counts.shape[1])
+        self._watch(counts, surroundings, self._sigmas * noise)
+        # Once bad, a pixel stays so until its last vote has faded.
+        self._bad = (self._votes >= self.ENOUGH) | (self._bad & (self._votes > 0)) | self._stuck
+        rows, columns = np.divmod(np.flatnonzero(self._bad), counts.shape[1])
         return np.stack([columns, rows], axis=-1)
 
-    def _watch(self, counts: Counts, moved_counts: float) -> None:
+    def _watch(self, counts: Counts, surroundings: Counts, moved_counts: float) -> None:
         """Mark pixels that kept one value over a window in which the median of their surroundings moved."""
-        surroundings = cv2.medianBlur(counts, 3)
         if self._watched == 0:
-            self._first, self._lowest, self._highest = counts.copy(), surroundings, surroundings
+            self._first, self._lowest, self._highest = counts.copy(), surroundings.copy(), surroundings.copy()
             self._constant = np.ones(counts.shape, np.bool_)
         self._constant &= counts == self._first
-        self._lowest, self._highest = cv2.min(self._lowest, surroundings), cv2.max(self._highest, surroundings)
+        np.minimum(self._lowest, surroundings, out=self._lowest)
+        np.maximum(self._highest, surroundings, out=self._highest)
         self._watched += 1
         if self._watched == self.WINDOW:
             moved = cv2.subtract(self._highest, self._lowest) > moved_counts
@@ -82,13 +86,13 @@ def pixel_noise(counts: Counts) -> float:
     return max(0.5, 1.4826 * float(np.median(difference)) / float(np.sqrt(2.0)))
 
 
-def _stands_out(counts: Counts, margin_counts: float) -> IntArray:
+def _stands_out(counts: Counts, surroundings: Counts, margin_counts: float) -> IntArray:
     """Flat indices of the pixels outside the range of their neighbours by the margin and by their spread.
 
-    The median, cheap for the whole frame, leaves few pixels to look at.
+    ``surroundings``, the median of each pixel's neighbourhood, leaves few pixels to look at.
     """
     width = counts.shape[1]
-    candidates = np.flatnonzero(cv2.absdiff(counts, cv2.medianBlur(counts, 3)) > margin_counts)
+    candidates = np.flatnonzero(cv2.absdiff(counts, surroundings) > margin_counts)
     rows, columns = np.divmod(candidates, width)
     # Mirrored at the rim, so that no pixel is its own neighbour.
     padded = cv2.copyMakeBorder(counts, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)
@@ -98,7 +102,7 @@ def _stands_out(counts: Counts, margin_counts: float) -> IntArray:
     outlying = np.zeros(len(candidates), np.bool_)
     for excepted, spreads in ((0, SPREADS_ALONE), (1, SPREADS_OF_TWO)):
         for sign, ordered in ((1, beside), (-1, -beside[:, ::-1])):
-            highest, lowest = ordered[:, 7 - excepted], ordered[:, 0]
+            highest, lowest = ordered[:, 7 - excepted], ordered[:, excepted]
             outlying |= sign * value - highest > np.maximum(margin_counts, spreads * (highest - lowest))
     return np.asarray(candidates[outlying])
 
@@ -165,19 +169,20 @@ def _sound_pairs(rows: IntArray, columns: IntArray, bad: BoolArray) -> tuple[Int
         ends.append(r * width + c)
     penalty = np.where(usable, 0, unsound)
     penalty[:, _NEAR_PAIRS:] += _FAR_PENALTY_COUNTS
-    # At the rim and inside clusters no pair may be whole: the nearest sound pixel stands in.
-    nearest = _nearest_sound(bad)[rows, columns][:, None]
-    fallback = np.full_like(nearest, unsound - 1)
-    first, second = (np.concatenate([end, nearest], axis=1) for end in ends)
-    return first, second, np.concatenate([penalty, fallback], axis=1)
+    # At the rim and inside clusters no pair may be whole: the nearest sound pixel stands in for both ends.
+    lone = ~usable.any(axis=1)
+    if lone.any():
+        ends[0][lone, 0] = ends[1][lone, 0] = _nearest_sound(bad, rows[lone], columns[lone])
+        penalty[lone, 0] = 0
+    return ends[0], ends[1], penalty
 
 
-def _nearest_sound(bad: BoolArray) -> IntArray:
-    """Flat index of the sound pixel nearest to each pixel."""
+def _nearest_sound(bad: BoolArray, rows: IntArray, columns: IntArray) -> IntArray:
+    """Flat indices of the sound pixels nearest to those at ``rows`` and ``columns``."""
     _, labels = cv2.distanceTransformWithLabels(
         bad.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
     )
     index = np.zeros(int(labels.max()) + 1, np.int64)
     sound = np.flatnonzero(~bad)
     index[labels.reshape(-1)[sound]] = sound
-    return np.asarray(index[labels])
+    return np.asarray(index[labels[rows, columns]])
