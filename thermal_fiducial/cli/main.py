@@ -10,6 +10,7 @@ from thermal_fiducial import __version__
 from thermal_fiducial.errors import InputError
 
 PROGRAM = 'thermal-fiducial'
+INSTALL_HINT = "pip install '.[tools,ros]' in the package's folder, or apt on the robot"
 
 #: Command to what it does. Module ``cli/<command>.py`` has ``add_arguments(parser)`` and ``run(args) -> int``; it is
 #: imported only when its command is called, so that each starts fast and needs only its own extras.
@@ -37,26 +38,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     Exit status: 0 done, 2 wrong usage or unusable input, 130 interrupted.
     """
     argv = sys.argv[1:] if argv is None else list(argv)
-    command = argv[0] if argv else None
+    command = argv[0] if argv else ''
     parser = argparse.ArgumentParser(
         prog=PROGRAM, description='Thermal-inertial localization from acrylic markers, for drones in smoke and fog.'
     )
     parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')
     subparsers = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
-    for name, description in COMMANDS.items():
-        subparser = subparsers.add_parser(name, help=description, description=description[0].upper() + description[1:])
-        if name == command:
-            module = import_module(f'thermal_fiducial.cli.{name.replace("-", "_")}')
-            module.add_arguments(subparser)
-            subparser.set_defaults(run=module.run)
-    args = parser.parse_args(argv)
+    choices = {name: subparsers.add_parser(name, help=text, description=text) for name, text in COMMANDS.items()}
     try:
-        return int(args.run(args))
+        if command in choices:
+            module = import_module(f'thermal_fiducial.cli.{command.replace("-", "_")}')
+            module.add_arguments(choices[command])
+        args = parser.parse_args(argv)
+        return int(module.run(args))
     except InputError as error:
-        print(f'{PROGRAM} {args.command}: {error}', file=sys.stderr)
+        print(f'{PROGRAM} {command}: {error}', file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition('.')[0] == 'thermal_fiducial':
+            raise
+        print(f'{PROGRAM} {command}: needs the Python package {error.name}: {INSTALL_HINT}', file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f'{PROGRAM} {args.command}: interrupted', file=sys.stderr)
+        print(f'{PROGRAM} {command}: interrupted', file=sys.stderr)
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
