@@ -243,21 +243,23 @@ def test_a_listed_pixel_outside_the_frame_is_refused():
 
 
 def test_bad_pixels_are_found_and_nothing_else():
-    """Dead, stuck within the scene's range, and a pair side by side; in a scene that moves."""
+    """Dead, stuck within the scene's range, and pairs of the same and of opposite polarity; in a scene that moves."""
     rng = np.random.default_rng(15)
-    bad = rng.choice(512 * 640, 300, replace=False)
-    stuck = np.where(rng.random(300) < 0.5, np.where(rng.random(300) < 0.5, 0, 16383), rng.integers(6800, 7400, 300))
-    bad, stuck = np.append(bad, [700, 701]), np.append(stuck, [16383, 16383])
+    height, width = 320, 400
+    bad = rng.choice(height * width, 150, replace=False)
+    stuck = np.where(rng.random(150) < 0.5, np.where(rng.random(150) < 0.5, 0, 16383), rng.integers(6800, 7400, 150))
+    bad, stuck = np.append(bad, [700, 701, 9000, 9001]), np.append(stuck, [16383, 16383, 16383, 100])
     camera = Camera()
     for k in range(170):
-        frame = noisy(scene(60.0 * np.sin(0.05 * k)), rng)
+        frame = noisy(scene(60.0 * np.sin(0.05 * k), shape=(height, width)), rng)
         frame.reshape(-1)[bad] = stuck
         result = camera(frame)
-    found = {int(row * 640 + column) for column, row in camera.cleaner.bad_pixels}
+    found = {int(row * width + column) for column, row in camera.cleaner.bad_pixels}
     assert found <= set(bad.tolist())
-    visible = np.abs(stuck - 7012.0) > 60.0  # the others do not stand out of this wall, so they do no harm either
+    visible = np.abs(stuck - 7008.0) > 60.0  # the others do not stand out of this wall, so they do no harm either
     assert len(found & set(bad[visible].tolist())) >= 0.98 * visible.sum()
-    assert np.abs(result.counts.reshape(-1)[bad[visible]].astype(int) - 7012).max() < 200
+    assert {700, 701, 9000, 9001} <= found
+    assert np.abs(result.counts.reshape(-1)[bad[visible]].astype(int) - 7008).max() < 200
 
 
 @pytest.mark.parametrize('contrast', [25.0, 400.0])
@@ -276,6 +278,17 @@ def test_markers_are_never_taken_for_bad_pixels(contrast, polarity):
     for _ in range(300):
         frame = noisy(image, rng)
         assert np.array_equal(camera(frame).counts, frame)
+    assert len(camera.cleaner.bad_pixels) == 0
+
+
+def test_corners_of_clipped_markers_are_not_stuck():
+    """A hovering robot, a camera with automatic gain that clips the warm parts at 255."""
+    rng = np.random.default_rng(21)
+    camera = Camera()
+    for _ in range(200):
+        image = scene(0.7 * rng.standard_normal(), 250.0, (512, 200))
+        frame = ((image + rng.normal(0.0, NOISE, image.shape)) - 6980.0).clip(0, 200).round() * 1.275
+        assert camera(frame.astype(np.uint8)).reason == ''
     assert len(camera.cleaner.bad_pixels) == 0
 
 

@@ -68,7 +68,8 @@ class BadPixelFinder:
         """Mark pixels that kept one value over a window in which the median of their surroundings moved."""
         if self._watched == 0:
             self._first, self._lowest, self._highest = counts.copy(), surroundings.copy(), surroundings.copy()
-            self._constant = np.ones(counts.shape, np.bool_)
+            # At the ends of the scale a sound pixel keeps its value too: the corner of a clipped marker, say.
+            self._constant = (counts > counts.min()) & (counts < counts.max())
         self._constant &= counts == self._first
         np.minimum(self._lowest, surroundings, out=self._lowest)
         np.maximum(self._highest, surroundings, out=self._highest)
