@@ -100,3 +100,17 @@ def test_batches_are_single_calls_side_by_side():
 def test_skew_is_the_cross_product():
     v, w = np.random.default_rng(3).normal(size=(2, 10, 3))
     assert np.allclose((geometry.skew(v) @ w[..., None])[..., 0], np.cross(v, w))
+
+
+def test_one_rotation_gives_the_quaternion_that_a_batch_gives():
+    rng = np.random.default_rng(5)
+    phi = rng.normal(size=(300, 3))
+    phi[::3] *= np.pi / np.linalg.norm(phi[::3], axis=1, keepdims=True)
+    phi[1::7] *= 1e-9
+    R = geometry.so3_exp(phi)
+    batch = geometry.quaternion_from_rotation(R)
+    single = np.array([geometry.quaternion_from_rotation(one) for one in R])
+    assert np.all(single[:, 3] >= 0.0)
+    # The same formulas in doubles; at half a turn the sign is free.
+    sign = np.where(np.sum(batch * single, axis=1, keepdims=True) < 0.0, -1.0, 1.0)
+    np.testing.assert_allclose(sign * single, batch, atol=1e-15)
