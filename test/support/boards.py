@@ -24,7 +24,7 @@ def chessboard_levels(columns, rows):
 
 
 def circle_levels(columns, rows, spacing, diameter, cell):
-    """Round holes on a grid of cells of side ``cell`` [m], with a rim of one spacing, and the board's width and height."""
+    """Round holes on a grid of cells of side ``cell`` [m], rim one spacing; and width and height."""
     height, width = (rows + 1) * spacing, (2 * columns + 1) * spacing
     v, u = (np.mgrid[0 : round(height / cell), 0 : round(width / cell)] + 0.5) * cell - spacing
     row = np.clip(np.rint(v / spacing), 0, rows - 1)

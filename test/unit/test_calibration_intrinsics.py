@@ -1,0 +1,115 @@
+"""Intrinsics from points: what the least squares do, apart from how points are found in images."""
+
+import numpy as np
+import pytest
+from support.boards import random_view
+
+from thermal_fiducial.calibration.intrinsics import _Fit, calibrate, choose_model
+from thermal_fiducial.calibration.targets import Sighting
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.sim.scenario import LENSES
+
+ROW, COLUMN = np.divmod(np.arange(48), 8)
+POINTS = np.stack([0.05 * COLUMN, 0.05 * ROW, 0.0 * ROW], axis=1)
+
+
+def sightings(lens, count, sigma, seed):
+    rng = np.random.default_rng(seed)
+    views = []
+    for _ in range(count):
+        pixels = lens.project(geometry.apply(random_view(lens, POINTS, rng), POINTS))
+        views.append(Sighting(POINTS, pixels + rng.normal(0.0, sigma, pixels.shape)))
+    return views
+
+
+def true_parameters(lens):
+    return np.array([*lens.focal, *lens.centre, *lens.distortion])
+
+
+def parameters(camera):
+    return np.array([camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2], *camera.D])
+
+
+@pytest.mark.parametrize('name', ['7.5mm', '13mm', '19mm'])
+def test_noiseless_points_give_the_lens_back(name):
+    lens = LENSES[name]
+    found = calibrate(sightings(lens, 12, 0.0, 1), 640, 512, lens.model)
+    # What is left is the convergence of the iteration: a thousandth of what noise does.
+    assert found.rms_px < 1e-4
+    assert parameters(found.camera)[:4] == pytest.approx(true_parameters(lens)[:4], abs=2e-2)
+
+
+@pytest.mark.parametrize('name', ['7.5mm', '13mm'])
+def test_covariance_is_what_the_errors_are(name):
+    lens = LENSES[name]
+    squared = []
+    for seed in range(12):
+        found = calibrate(sightings(lens, 15, 0.03, seed), 640, 512, lens.model)
+        error = (parameters(found.camera) - true_parameters(lens))[:4]
+        squared.append(error @ np.linalg.solve(found.covariance[:4, :4], error))
+    # Mean of 12 values of chi-square with 4 degrees of freedom: 4, with a deviation of 0.82; five of them.
+    assert 1.5 < np.mean(squared) < 8.0
+
+
+@pytest.mark.parametrize(('name', 'model'), [('7.5mm', 'equidistant'), ('13mm', 'plumb_bob')])
+def test_held_out_error_chooses_the_lens_model(name, model):
+    best, errors = choose_model(sightings(LENSES[name], 24, 0.02, 3), 640, 512)
+    assert best.camera.model == model
+    # Noise of 0.02 px a coordinate is 0.028 px in the plane.
+    assert errors[model] == pytest.approx(0.028, abs=0.003)
+
+
+def test_views_that_do_not_belong_are_dropped():
+    views = sightings(LENSES['13mm'], 16, 0.02, 4)
+    views[5] = Sighting(views[5].points, views[5].pixels + np.random.default_rng(1).normal(0.0, 1.0, (48, 2)))
+    views[11] = Sighting(views[11].points, views[11].pixels[::-1] * (1.0, 0.98))
+    found = calibrate(views, 640, 512, 'plumb_bob')
+    assert {5, 11} <= set(found.dropped)
+    assert found.rms_px < 0.04
+
+
+def test_centroids_of_circles_are_not_their_centres():
+    # 24 mm discs 0.4 m away: seen obliquely their centroids lie up to a few tenths of a pixel off their centres.
+    lens = LENSES['13mm']
+    rng = np.random.default_rng(2)
+    angle = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
+    rim = 0.012 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    views = []
+    for _ in range(14):
+        T = random_view(lens, POINTS, rng)
+        outlines = lens.project(geometry.apply(T, (POINTS[:, None] + rim).reshape(-1, 3))).reshape(48, 400, 2)
+        a, b = outlines - outlines.mean(1, keepdims=True), np.roll(outlines, -1, 1) - outlines.mean(1, keepdims=True)
+        cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+        middle = np.sum((a + b) * cross[..., None], axis=1) / (3.0 * cross.sum(1)[:, None])
+        views.append(Sighting(POINTS, outlines.mean(1) + middle))
+    aware = calibrate(views, 640, 512, 'plumb_bob', radius=0.012)
+    blind = calibrate(views, 640, 512, 'plumb_bob')
+    # 24 chords in place of a circle leave 0.003 px.
+    assert aware.rms_px < 0.005
+    assert blind.rms_px > 5.0 * aware.rms_px
+    assert aware.camera.K[0, 0] == pytest.approx(lens.focal[0], rel=1e-4)
+
+
+@pytest.mark.parametrize('model', ['plumb_bob', 'rational_polynomial', 'equidistant'])
+def test_derivatives_against_differences(model):
+    D = {'plumb_bob': [-0.3, 0.1, 1e-3, -1e-3, 0.01], 'equidistant': [0.01, -0.02, 0.03, -0.01]}
+    D['rational_polynomial'] = [0.3, 0.05, 3e-4, -2e-4, 0.01, 0.6, 0.1, 0.02]
+    camera = Camera(640, 512, np.array([[600.0, 0, 320], [0, 610.0, 250], [0, 0, 1]]), model, np.array(D[model]))
+    T = geometry.transform(geometry.so3_exp([0.2, -0.3, 0.1]), [-0.15, -0.1, 0.6])[None]
+    fit = _Fit([Sighting(POINTS, np.zeros((48, 2)))], camera, 0.0)
+    by_intrinsics, by_pose = fit._jacobian(camera, T)
+    J = np.concatenate([by_intrinsics, by_pose], axis=2)
+    h = 1e-6
+    for column in range(J.shape[2]):
+        step = np.zeros(J.shape[2])
+        step[column] = h
+        ahead, behind = (fit._error(*fit._moved(camera, T, sign * step)) for sign in (1.0, -1.0))
+        # Second-order terms of h^2 times a third derivative of the order of 1e3 px.
+        assert J[:, :, column] == pytest.approx((ahead - behind) / (2 * h), rel=1e-5, abs=1e-4)
+
+
+def test_too_few_views():
+    with pytest.raises(InputError, match='needs 5'):
+        calibrate(sightings(LENSES['13mm'], 4, 0.0, 1), 640, 512, 'plumb_bob')
