@@ -231,9 +231,53 @@ class ArucoDetectorConfig:
     blur_px: float = param(
         0.66, 'Standard deviation of the blur by optics and pixel.', unit='px', minimum=0.3, maximum=3.0
     )
-    min_side_px: float = param(12.0, 'Shortest side of a marker.', unit='px', minimum=8.0, maximum=400.0)
-    error_correction_rate: float = param(
-        0.6, 'Share of the bit errors that the dictionary can correct that are accepted.', minimum=0.0, maximum=1.0
+    whitelist: tuple[int, ...] = param((), 'IDs that may be found. Empty: all of the dictionary.')
+    whitelist_from_map: bool = param(False, 'Find only the markers of the map, where there is one.')
+    min_side_px: float = param(12.0, 'Shortest side of a marker.', unit='px', minimum=8.0, maximum=400.0, live=True)
+    min_contrast: float = param(
+        0.7,
+        'Smallest contrast of white over black, in standard deviations of the noise of a pixel.',
+        minimum=0.0,
+        maximum=1000.0,
+        live=True,
+    )
+    min_correlation: float = param(
+        0.8, 'Smallest correlation of the cells with the pattern of a marker.', minimum=0.5, maximum=1.0, live=True
+    )
+    min_margin: float = param(
+        0.12,
+        'By how much the pattern must correlate better than that of any other marker.',
+        minimum=0.0,
+        maximum=0.5,
+        live=True,
+    )
+    max_bit_errors: int = param(
+        1, 'Bits on the wrong side of the middle between black and white.', minimum=0, maximum=10, live=True
+    )
+    max_border_errors: int = param(2, 'The same for the cells of the black border.', minimum=0, maximum=20, live=True)
+    guided: bool = param(True, 'With a map and odometry: look for known markers where they should be.', live=True)
+    blind_interval: int = param(
+        5,
+        'A blind search follows every so many frames, and whenever an expected marker is not seen.',
+        minimum=1,
+        maximum=1000,
+        live=True,
+    )
+    max_odometry_age: float = param(
+        0.1, 'Oldest odometry that predicts where markers are.', unit='s', minimum=0.0, maximum=1.0, live=True
+    )
+    guided_min_contrast: float = param(
+        0.35, 'min_contrast of an expected marker.', minimum=0.0, maximum=1000.0, live=True
+    )
+    guided_min_correlation: float = param(
+        0.6, 'min_correlation of an expected marker.', minimum=0.3, maximum=1.0, live=True
+    )
+    guided_min_margin: float = param(0.05, 'min_margin of an expected marker.', minimum=0.0, maximum=0.5, live=True)
+    duplicates: str = param(
+        'drop',
+        'An ID at two places of a frame, as in a reflection. drop: neither counts; best: the clearer one does.',
+        choices=('drop', 'best'),
+        live=True,
     )
 
 
@@ -322,7 +366,9 @@ class PoseEkfConfig:
     initial_accelerometer_bias_std: float = param(0.2, 'Accelerometer bias at the start.', unit='m/s^2', minimum=0.0)
     initial_poses: int = param(3, 'Poses that must agree before the filter starts.', minimum=1, maximum=100)
     pose_noise_scale: float = param(
-        1.0, 'Factor on the standard deviation of the camera poses, for errors that last over many frames.', minimum=0.1
+        3.0,
+        'Factor on the standard deviation of the camera poses: their errors last for about ten frames, not one.',
+        minimum=0.1,
     )
     position_floor: float = param(0.001, 'Least standard deviation of a camera pose, position.', unit='m', minimum=0.0)
     attitude_floor: float = param(
