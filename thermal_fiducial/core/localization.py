@@ -113,14 +113,14 @@ def locate(sight: Sight, running_errors: FloatArray, camera: Camera, prior: Floa
     # Step 3: the pose from all known markers jointly; step 4: the error of each; step 5: weights; step 6: refinement.
     covariances = _with_map_uncertainty(sight, hypotheses[0], camera)
     try:
-        first = solve_camera_pose(sight.corners, covariances, points, camera, hypotheses[0])
+        first = solve_camera_pose(sight.corners, covariances, points, camera, hypotheses[0], compete=False)
     except InputError:
         return Refusal(f'no camera pose explains {_names(sight)}')
     errors = _errors_px(first.residuals_px)
     weights = marker_weights(errors, running_errors)
     best = first
     if np.any(weights < 1.0):
-        best = solve_camera_pose(sight.corners, covariances, points, camera, first.T_map_camera, weights=weights)
+        best = solve_camera_pose(sight.corners, covariances, points, camera, first.T_map_camera, weights, compete=False)
     T = best.T_map_camera
     spread = np.zeros((6, 6))
     rival = _rival(sight, covariances, weights, camera, T, hypotheses)

@@ -168,6 +168,7 @@ def solve_camera_pose(
     camera: Camera,
     initial: FloatArray | None = None,
     weights: npt.ArrayLike | None = None,
+    compete: bool = True,
 ) -> JointPose:
     """Pose of the camera from N markers of known pose jointly.
 
@@ -182,6 +183,7 @@ def solve_camera_pose(
     corners_in_map : (N, 4, 3) [m] squares, in the order of :func:`marker_corners`
     initial : (4, 4) predicted T_map_camera
     weights : (N,) factors on the information of each marker; default 1
+    compete : False: ``initial`` is good, nothing else need be tried
 
     Raises
     ------
@@ -201,11 +203,11 @@ def solve_camera_pose(
     def evaluate(T: FloatArray) -> _Evaluation:
         return _camera_evaluation(T, points, measured, whitening, camera)
 
-    starts = _camera_starts(corners, squares, camera)
-    cost = evaluate(starts)[0]
-    starts = starts[np.argsort(cost)[:2]]
-    if initial is not None:
-        starts = np.concatenate([np.asarray(initial, dtype=np.float64)[None], starts])
+    starts = np.empty((0, 4, 4)) if initial is None else np.asarray(initial, dtype=np.float64)[None]
+    if compete or initial is None:
+        others = _camera_starts(corners, squares, camera)
+        cost = evaluate(others)[0]
+        starts = np.concatenate([starts, others[np.argsort(cost)[:2]]])
     T, chi2, information = _minimise(evaluate, starts)
     best = int(np.argmin(chi2))
     if not np.isfinite(chi2[best]):
