@@ -4,8 +4,6 @@ The local mean is taken out and the local spread divided by, down to a floor of 
 structures little is amplified, on flat walls a marker of twice the noise fills the range.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
@@ -18,16 +16,6 @@ _LOCAL = 17
 _GAIN = 60.0
 # 1 / (sqrt(2) * 0.6745): standard deviation from the median absolute difference of two pixels.
 _MAD_OF_DIFFERENCE = 1.0484
-
-
-@dataclass(frozen=True, slots=True)
-class NormalisedView:
-    """What the candidate search looks at."""
-
-    #: (height, width)
-    gray: Gray
-    #: standard deviation of the noise of a pixel [counts]
-    noise: float
 
 
 def noise_of(counts: Float32Array) -> float:
@@ -44,19 +32,26 @@ def noise_of(counts: Float32Array) -> float:
     return max(float(np.partition(difference, middle)[middle]) * _MAD_OF_DIFFERENCE, 0.3)
 
 
-def normalise(counts: Float32Array, smoothing_px: float, floor: float) -> NormalisedView:
+def halved(counts: Float32Array) -> Float32Array:
+    """Half the resolution: means of 2 x 2 pixels, with half the noise."""
+    height, width = counts.shape
+    return np.asarray(cv2.resize(counts, (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+
+
+def normalise(counts: Float32Array, noise: float, smoothing_px: float, floor: float, shrink: int = _SHRINK) -> Gray:
     """8-bit view of ``counts``.
 
     Parameters
     ----------
     counts : (height, width) counts or gray levels
+    noise : standard deviation of the noise of a pixel [counts]
     smoothing_px : standard deviation of the Gaussian before the search, 0 for none
     floor : smallest spread that is divided by, in standard deviations of the noise of a pixel
+    shrink : by which mean and spread are taken at a lower resolution
     """
-    noise = noise_of(counts)
     smooth = cv2.GaussianBlur(counts, (0, 0), smoothing_px) if smoothing_px > 0 else counts
     height, width = counts.shape
-    small = cv2.resize(counts, (width // _SHRINK, height // _SHRINK), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(counts, (width // shrink, height // shrink), interpolation=cv2.INTER_AREA)
     mean = cv2.blur(small, (_LOCAL, _LOCAL))
     deviation = small - mean
     variance = cv2.blur(deviation * deviation, (_LOCAL, _LOCAL))
@@ -65,5 +60,4 @@ def normalise(counts: Float32Array, smoothing_px: float, floor: float) -> Normal
     full_gain = cv2.resize(gain, (width, height), interpolation=cv2.INTER_LINEAR)
     full_offset = cv2.resize(offset, (width, height), interpolation=cv2.INTER_LINEAR)
     np.multiply(smooth, full_gain, out=full_gain)
-    gray = cv2.add(full_gain, full_offset, dtype=cv2.CV_8U)
-    return NormalisedView(gray, noise)
+    return np.asarray(cv2.add(full_gain, full_offset, dtype=cv2.CV_8U))

@@ -1,6 +1,7 @@
 """Markers of a frame: found, identified, their corners refined, both poses of each."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 
 import cv2
@@ -9,25 +10,37 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.contrast import normalise
+from thermal_fiducial.core.contrast import noise_of
 from thermal_fiducial.core.corners import grid_pattern, refine_corners, RefinedCorners
+from thermal_fiducial.core.decoding import Decoder
+from thermal_fiducial.core.guided import camera_in_map, expected_markers, look
 from thermal_fiducial.core.lag import markers_without_lag, MotionTracker, smear, SmearField, Twist, without_lag
-from thermal_fiducial.core.measurements import (
-    CORNER_COVARIANCE_FIELDS,
-    CORNER_FIELDS,
-    MARKER_DTYPE,
-    Markers,
-    Odometry,
-)
-from thermal_fiducial.core.opencv_aruco import ArucoSearch
+from thermal_fiducial.core.marker_rows import marker_rows
+from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers, Odometry
 from thermal_fiducial.core.patterns import marker_bits
-from thermal_fiducial.core.pose import ippe_square, marker_corners, PlanarPose, solve_marker_poses
-from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.pose import choose_branch, ippe_square, marker_corners, solve_marker_poses
+from thermal_fiducial.core.search import blind_search, Found, merged
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 
 # Smear by lag below which neither the search nor the shape of an edge changes [px].
 _SMEAR_THAT_MATTERS_PX = 0.4
+# Contrast over noise from which smeared edges cost more than the noise of sharpening them.
+_CLEAR = 20.0
 # Pixels round a marker that the refinement may look at.
 _WINDOW_MARGIN_PX = 16
+# Depth of the scene while no marker has told it [m].
+_TYPICAL_DEPTH = 3.0
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """OpenCV on one thread inside: at this image size threads cost more than they give."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
 
 
 class MarkerDetector:
@@ -35,26 +48,29 @@ class MarkerDetector:
 
     Parameters
     ----------
-    config : parameters
+    config : parameters; may be replaced while running
     dictionary : of the markers
     """
 
     def __init__(self, config: ArucoDetectorConfig, dictionary: cv2.aruco.Dictionary) -> None:
         self.config = config
         self._sizes = size_overrides(config.marker_size_overrides)
-        self._search = ArucoSearch(dictionary, 23, 7.0, config.min_side_px, config.error_correction_rate)
-        self._pattern = grid_pattern(marker_bits(dictionary))
-        T_body_camera = geometry.transform(
+        bits = marker_bits(dictionary)
+        self._decoder = Decoder(bits)
+        self._pattern = grid_pattern(bits)
+        self._T_body_camera = geometry.transform(
             geometry.rotation_from_quaternion(config.camera_orientation), config.camera_position
         )
-        self._motion = MotionTracker(T_body_camera)
+        self._motion = MotionTracker(self._T_body_camera)
         self._field: SmearField | None = None
-        self._depth = 3.0
+        self._depth = _TYPICAL_DEPTH
         self._map: dict[int, tuple[FloatArray, float]] = {}
+        self._since_blind = 0
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
         """Markers that are known: ID to (T_map_marker, side [m])."""
-        self._map = dict(marker_map)
+        count = self._decoder.count
+        self._map = {marker_id: entry for marker_id, entry in marker_map.items() if 0 <= marker_id < count}
 
     def detect(self, stamp_ns: int, counts: Counts | Gray, camera: Camera, odometry: Odometry | None = None) -> Markers:
         """Markers of one frame, sorted by ID; an empty array when there are none.
@@ -66,15 +82,68 @@ class MarkerDetector:
         camera : its intrinsics
         odometry : the filter's latest state, where there is one
         """
-        predicted = self._motion.predict(stamp_ns, odometry)
-        image = counts.astype(np.float32)
-        view = normalise(self._scene(image, camera, predicted), 1.5, 3.0)
-        ids, corners = _unique(*self._search.find(view.gray))
+        with one_thread():
+            twist = self._motion.predict(stamp_ns, odometry)
+            image = counts.astype(np.float32)
+            T_camera_map = self._predicted_pose(stamp_ns, odometry, twist)
+            found = self._find(image, camera, twist, T_camera_map)
+            if len(found.ids) == 0:
+                self._motion.remember(stamp_ns, twist, found.ids, found.corners_px)
+                return np.zeros(0, dtype=MARKER_DTYPE)
+            refined = self._refined(stamp_ns, image, found, camera, twist)
+            return self._rows(found.ids, refined, camera, T_camera_map)
+
+    def size(self, marker_id: int) -> float:
+        """Side of a marker [m]: of the map, or of the overrides, or the common one."""
+        if marker_id in self._map:
+            return self._map[marker_id][1]
+        return self._sizes.get(marker_id, self.config.marker_size)
+
+    def _predicted_pose(self, stamp_ns: int, odometry: Odometry | None, twist: Twist | None) -> FloatArray | None:
+        """T_camera_map at the frame, where odometry that is fresh enough tells it."""
+        if odometry is None or twist is None or not self._map:
+            return None
+        if abs(stamp_ns - odometry.stamp_ns) * 1e-9 > self.config.max_odometry_age:
+            return None
+        return geometry.inverse(camera_in_map(stamp_ns, odometry, self._T_body_camera, twist))
+
+    def _find(self, image: Float32Array, camera: Camera, twist: Twist | None, T_camera_map: FloatArray | None) -> Found:
+        """The expected markers where they should be, and whatever a blind search shows, when that is due."""
+        expected, complete = Found.none(), False
+        if T_camera_map is not None and twist is not None and self.config.guided:
+            expected, complete = self._guided(image, camera, twist, T_camera_map)
+        self._since_blind += 1
+        if complete and self._since_blind < self.config.blind_interval:
+            return expected
+        self._since_blind = 0
+        scene = self._scene(image, camera, twist)
+        return merged(expected, blind_search(image, scene, self._decoder, self._allowed(), self.config))
+
+    def _guided(
+        self, image: Float32Array, camera: Camera, twist: Twist, T_camera_map: FloatArray
+    ) -> tuple[Found, bool]:
+        """Known markers that are seen where they should be, and whether these are all that should be."""
+        ids, corners, depth = expected_markers(self._map, T_camera_map, camera, self.config.min_side_px)
         if len(ids) == 0:
-            self._motion.remember(stamp_ns, predicted, ids, corners)
-            return np.zeros(0, dtype=MARKER_DTYPE)
-        refined = self._refined(stamp_ns, image, ids, corners, camera, predicted)
-        return self._rows(ids, refined, camera)
+            return Found.none(), False
+        noise = noise_of(image)
+        shift, _ = smear(camera, camera.normalise(corners), depth, twist, self.config.bolometer_lag)
+        found, seen = look(image, ids, corners + shift, self._decoder, noise, self.config)
+        found = replace(found, corners_px=found.corners_px - shift[seen])
+        blurred = ~seen & (np.abs(shift).max(axis=(1, 2)) > _SMEAR_THAT_MATTERS_PX)
+        if blurred.any():
+            scene = markers_without_lag(image, corners[blurred], shift[blurred], _WINDOW_MARGIN_PX)
+            sharp, also = look(scene, ids[blurred], corners[blurred], self._decoder, noise, self.config)
+            found = merged(found, sharp)
+            seen[np.flatnonzero(blurred)[also]] = True
+        return found, bool(seen.all())
+
+    def _allowed(self) -> BoolArray:
+        """Which IDs of the dictionary may be found."""
+        wanted = list(self._map) if self._map and self.config.whitelist_from_map else list(self.config.whitelist)
+        if not wanted:
+            return np.ones(self._decoder.count, dtype=bool)
+        return np.asarray(np.isin(np.arange(self._decoder.count), wanted))
 
     def _scene(self, image: Float32Array, camera: Camera, twist: Twist | None) -> Float32Array:
         """The frame as the search sees it, freed of lag where motion is fast enough to matter there."""
@@ -89,27 +158,23 @@ class MarkerDetector:
         return without_lag(image, field[..., 0], field[..., 1])
 
     def _refined(
-        self,
-        stamp_ns: int,
-        image: Float32Array,
-        ids: IntArray,
-        corners: FloatArray,
-        camera: Camera,
-        predicted: Twist | None,
+        self, stamp_ns: int, image: Float32Array, found: Found, camera: Camera, predicted: Twist | None
     ) -> RefinedCorners:
         """Corners at the stamp: refined on the image freed of lag, by the twist that they themselves improve."""
-        sizes = self._sizes_of(ids)
+        ids, corners = found.ids, found.corners_px
+        # Freeing an image of lag costs noise: of faint markers only the delay is taken out.
+        clear = np.abs(found.clarity) > _CLEAR
         before, step = self._pattern.before[ids], self._pattern.step[ids]
         tau = self.config.bolometer_lag
         x = camera.normalise(corners)
-        depth = _corner_depths(x, sizes)
+        depth = _corner_depths(x, self._sizes_of(ids))
         self._depth = float(np.median(depth))
         twist = predicted
         for _ in range(2):
             scene, used = image, np.zeros_like(corners)
             if twist is not None:
-                used, _ = smear(camera, x, depth, twist, tau)
-                scene = markers_without_lag(image, corners, used, _WINDOW_MARGIN_PX)
+                used = smear(camera, x, depth, twist, tau)[0] * clear[:, None, None]
+                scene = markers_without_lag(image, corners[clear], used[clear], _WINDOW_MARGIN_PX)
             refined = refine_corners(scene, corners, camera, before, step, self.config.blur_px)
             x = camera.normalise(refined.corners_px)
             noise = np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1).mean(axis=-1)) / camera.focal_px
@@ -120,26 +185,22 @@ class MarkerDetector:
             change = better - used
             corners = refined.corners_px - change
             refined = replace(refined, corners_px=corners, covariances=refined.covariances + spread)
-            if np.abs(change).max() < _SMEAR_THAT_MATTERS_PX:
+            if np.abs(change[clear]).max(initial=0.0) < _SMEAR_THAT_MATTERS_PX:
                 break
         self._motion.remember(stamp_ns, twist, ids, camera.normalise(refined.corners_px))
         return refined
 
-    def _rows(self, ids: IntArray, refined: RefinedCorners, camera: Camera) -> Markers:
-        sizes = self._sizes_of(ids)
-        poses = solve_marker_poses(refined.corners_px, refined.covariances, sizes, camera)
-        seen = np.array([np.isfinite(pose.rms_px) for pose in poses])
-        rows: Markers = _marker_rows(ids, refined, poses)[seen]
-        return np.sort(rows, order='id')
+    def _rows(self, ids: IntArray, refined: RefinedCorners, camera: Camera, T_camera_map: FloatArray | None) -> Markers:
+        poses = solve_marker_poses(refined.corners_px, refined.covariances, self._sizes_of(ids), camera)
+        if T_camera_map is not None:
+            poses = [
+                choose_branch(pose, T_camera_map @ self._map[marker_id][0]) if marker_id in self._map else pose
+                for marker_id, pose in zip(ids.tolist(), poses, strict=True)
+            ]
+        return marker_rows(ids, refined, poses)
 
     def _sizes_of(self, ids: IntArray) -> FloatArray:
         return np.array([self.size(marker_id) for marker_id in ids.tolist()])
-
-    def size(self, marker_id: int) -> float:
-        """Side of a marker [m]: of the map, or of the overrides, or the common one."""
-        if marker_id in self._map:
-            return self._map[marker_id][1]
-        return self._sizes.get(marker_id, self.config.marker_size)
 
 
 def _corner_depths(x: FloatArray, sizes: FloatArray) -> FloatArray:
@@ -147,37 +208,3 @@ def _corner_depths(x: FloatArray, sizes: FloatArray) -> FloatArray:
     T = ippe_square(x, sizes)[:, 0]
     corners = geometry.apply(T, sizes[:, None, None] * marker_corners(1.0))
     return np.maximum(np.nan_to_num(corners[..., 2], nan=1.0), 0.1)
-
-
-def _unique(ids: IntArray, corners: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Without the IDs that appear more than once: one of them is a reflection, and nothing says which."""
-    values, counts = np.unique(ids, return_counts=True)
-    keep = np.isin(ids, values[counts == 1])
-    return ids[keep], corners[keep]
-
-
-def _marker_rows(ids: IntArray, refined: RefinedCorners, poses: list[PlanarPose]) -> Markers:
-    rows = np.zeros(len(ids), dtype=MARKER_DTYPE)
-    rows['id'] = ids
-    _fill(rows, CORNER_FIELDS, refined.corners_px.reshape(-1, 8))
-    covariances = refined.covariances
-    terms = np.stack([covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]], axis=-1)
-    _fill(rows, CORNER_COVARIANCE_FIELDS, terms.reshape(-1, 12))
-    rows['sigma_px'] = np.sqrt(0.5 * np.trace(covariances, axis1=-2, axis2=-1).mean(axis=-1))
-    rows['contrast_counts'] = refined.contrast
-    best = np.stack([pose.T_camera_marker for pose in poses])
-    other = np.stack([pose.T_alternative for pose in poses])
-    _fill(rows, ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'), _pose_fields(best))
-    _fill(rows, ('ax', 'ay', 'az', 'aqx', 'aqy', 'aqz', 'aqw'), _pose_fields(other))
-    rows['rms_px'] = [pose.rms_px for pose in poses]
-    rows['arms_px'] = [pose.alternative_rms_px for pose in poses]
-    return rows
-
-
-def _pose_fields(T: FloatArray) -> FloatArray:
-    return np.concatenate([T[:, :3, 3], geometry.quaternion_from_rotation(T[:, :3, :3])], axis=-1)
-
-
-def _fill(rows: Markers, names: tuple[str, ...], values: FloatArray) -> None:
-    for column, name in enumerate(names):
-        rows[name] = values[:, column]

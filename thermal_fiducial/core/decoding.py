@@ -1,0 +1,118 @@
+"""Which marker a quadrilateral shows: correlation of its cells with every pattern of the dictionary.
+
+All cells count, the black border as well as the bits, each the mean of several pixels, so that a pattern stands out
+from noise at contrasts where no single bit could be thresholded.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
+
+# Samples along a cell, in its middle, away from blurred edges.
+_SAMPLES = np.array([0.3, 0.5, 0.7])
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What Q quadrilaterals look most like."""
+
+    #: (Q,) most similar ID
+    ids: IntArray
+    #: (Q,) quarter turns that make the first corner the marker's top-left
+    turns: IntArray
+    #: (Q,) its correlation, negative where black and white are swapped
+    correlation: FloatArray
+    #: (Q,) correlation of the most similar other ID
+    runner_up: FloatArray
+    #: (Q,) white minus black [counts]
+    contrast: FloatArray
+    #: (Q,) bits on the wrong side of the middle between black and white
+    bit_errors: IntArray
+    #: (Q,) the same of border cells
+    border_errors: IntArray
+
+
+class Decoder:
+    """Patterns of a dictionary, ready for correlation.
+
+    Parameters
+    ----------
+    bits : (M, n, n)
+    """
+
+    def __init__(self, bits: Gray) -> None:
+        grid = np.pad(bits.astype(np.float64), ((0, 0), (1, 1), (1, 1)))
+        self.count, self.cells = len(grid), grid.shape[-1]
+        self._border = np.pad(np.zeros(bits.shape[1:], dtype=bool), 1, constant_values=True).ravel()
+        # Pattern k after `turn` steps: as it looks in a quadrilateral whose first corner is the marker's corner `turn`.
+        self._grids = np.stack([np.rot90(grid, turn, axes=(1, 2)) for turn in range(4)], axis=1)
+        flat = self._grids.reshape(-1, self.cells**2)
+        x, y = np.meshgrid(np.linspace(-1.0, 1.0, self.cells), np.linspace(-1.0, 1.0, self.cells))
+        plane = np.linalg.qr(np.stack([np.ones(x.size), x.ravel(), y.ravel()], axis=1))[0]
+        # A background that rises across the marker is no pattern: planes are projected out of both.
+        self._detrend = np.eye(x.size) - plane @ plane.T
+        detrended = flat @ self._detrend
+        self._patterns = detrended / np.maximum(np.linalg.norm(detrended, axis=1, keepdims=True), 1e-9)
+        share = ((np.arange(self.cells)[:, None] + _SAMPLES) / self.cells).ravel()
+        self._a, self._b = (axis.ravel() for axis in np.meshgrid(share, share))
+
+    def read(self, image: Float32Array, quads: FloatArray, allowed: BoolArray) -> Reading:
+        """Most similar pattern of each quadrilateral (Q, 4, 2) among those ``allowed`` (M,)."""
+        values = self._cell_means(image, quads)
+        values = values @ self._detrend
+        spread = np.linalg.norm(values, axis=1, keepdims=True)
+        similar = (values / np.maximum(spread, 1e-9)) @ self._patterns.T
+        similar = np.where(np.repeat(allowed, 4), similar, 0.0)
+        best = np.abs(similar).argmax(axis=1)
+        rows = np.arange(len(quads))
+        correlation = similar[rows, best]
+        ids = best // 4
+        others = np.abs(similar).reshape(len(quads), -1, 4).max(axis=-1)
+        others[rows, ids] = 0.0
+        return self._judged(values, best, correlation, others.max(axis=1))
+
+    def _judged(self, values: FloatArray, best: IntArray, correlation: FloatArray, runner_up: FloatArray) -> Reading:
+        expected = self._grids.reshape(-1, self.cells**2)[best]
+        shape = expected @ self._detrend
+        contrast = np.sum(values * shape, axis=1) / np.maximum(np.sum(shape * shape, axis=1), 1e-9)
+        safe = np.where(np.abs(contrast) < 1e-6, 1e-6, contrast)[:, None]
+        # What is left of the pattern, back on the scale from 0 for black to 1 for white.
+        seen = expected + (values - contrast[:, None] * shape) / safe
+        wrong = (seen > 0.5) != (expected > 0.5)
+        return Reading(
+            best // 4,
+            best % 4,
+            correlation,
+            runner_up,
+            contrast,
+            np.sum(wrong & ~self._border, axis=1),
+            np.sum(wrong & self._border, axis=1),
+        )
+
+    def _cell_means(self, image: Float32Array, quads: FloatArray) -> FloatArray:
+        """Mean counts (Q, m * m) of the cells."""
+        uv = _inside(quads, self._a, self._b).astype(np.float32)
+        sampled = cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        blocks = sampled.reshape(len(quads), self.cells, len(_SAMPLES), self.cells, len(_SAMPLES))
+        return np.asarray(blocks.mean(axis=(2, 4)).reshape(len(quads), -1), dtype=np.float64)
+
+
+def shrunk(quads: FloatArray, cells: int) -> FloatArray:
+    """The markers (Q, 4, 2) in plates (Q, 4, 2) that surround them with a white margin of one cell."""
+    low, high = 1.0 / (cells + 2), (cells + 1.0) / (cells + 2)
+    return _inside(quads, np.array([low, high, high, low]), np.array([low, low, high, high]))
+
+
+def _inside(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """Points (Q, P, 2) at shares a, b (P,) of quadrilaterals (Q, 4, 2), by the projective map of the unit square."""
+    d1, d2, d3 = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2], c[:, 0] - c[:, 1] + c[:, 2] - c[:, 3]
+    determinant = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+    determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+    g = ((d3[:, 0] * d2[:, 1] - d3[:, 1] * d2[:, 0]) / determinant)[:, None]
+    h = ((d1[:, 0] * d3[:, 1] - d1[:, 1] * d3[:, 0]) / determinant)[:, None]
+    right, down = c[:, 1] - c[:, 0] + g * c[:, 1], c[:, 3] - c[:, 0] + h * c[:, 3]
+    top = c[:, None, 0] + a[:, None] * right[:, None] + b[:, None] * down[:, None]
+    return np.asarray(top / (1.0 + a * g + b * h)[..., None])

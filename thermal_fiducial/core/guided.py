@@ -1,0 +1,106 @@
+"""Prediction-guided detection: known markers are looked for where they must be.
+
+A marker is accepted by its own evidence alone: its pattern, in its expected place and attitude, must correlate with
+the image clearly, and better than the pattern of any other marker or any other turn of its own.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.contrast import halved
+from thermal_fiducial.core.decoding import Decoder, Reading
+from thermal_fiducial.core.lag import Twist
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.pose import marker_corners
+from thermal_fiducial.core.search import Found
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+
+# Cells at least this wide are read at half the resolution, where a pixel has half the noise.
+_WIDE_CELL_PX = 8.0
+# A marker turned further from the camera than this shows too little to be expected.
+_MAX_TILT_COSINE = 0.2
+# Places round the prediction that are tried when nothing is found at it, in shares of a cell.
+_OFFSETS = np.stack(np.meshgrid([-1.0, -0.5, 0.0, 0.5, 1.0], [-1.0, -0.5, 0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
+
+
+def expected_markers(
+    marker_map: Mapping[int, tuple[FloatArray, float]], T_camera_map: FloatArray, camera: Camera, min_side_px: float
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """IDs (N,), corners (N, 4, 2) [px] and their depths (N, 4) [m] of the markers wholly in view that show a face."""
+    ids = np.array(sorted(marker_map), dtype=np.int64)
+    if len(ids) == 0:
+        return ids, np.zeros((0, 4, 2)), np.zeros((0, 4))
+    T_map_marker = np.stack([marker_map[marker_id][0] for marker_id in ids.tolist()])
+    sizes = np.array([marker_map[marker_id][1] for marker_id in ids.tolist()])
+    T = T_camera_map @ T_map_marker
+    points = geometry.apply(T, sizes[:, None, None] * marker_corners(1.0))
+    corners = camera.project(points)
+    distance = np.maximum(np.linalg.norm(T[:, :3, 3], axis=-1), 1e-6)
+    facing = -np.sum(T[:, :3, 2] * T[:, :3, 3], axis=-1) / distance > _MAX_TILT_COSINE
+    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
+    inside = camera.contains(corners, 2.0).all(axis=1)
+    seen = inside & facing & (np.min(np.nan_to_num(sides), axis=1) >= min_side_px)
+    return ids[seen], corners[seen], points[seen][..., 2]
+
+
+def camera_in_map(stamp_ns: int, odometry: Odometry, T_body_camera: FloatArray, twist: Twist) -> FloatArray:
+    """T_map_camera (4, 4) at a frame, from the odometry before it carried on with the camera's twist."""
+    dt = (stamp_ns - odometry.stamp_ns) * 1e-9
+    moved = geometry.transform(geometry.so3_exp(twist.value[3:] * dt), twist.value[:3] * dt)
+    return np.asarray(odometry.T_map_body @ T_body_camera @ moved)
+
+
+def look(
+    image: Float32Array,
+    ids: IntArray,
+    corners: FloatArray,
+    decoder: Decoder,
+    noise: float,
+    config: ArucoDetectorConfig,
+) -> tuple[Found, BoolArray]:
+    """The expected markers (N,), (N, 4, 2) that the image shows, and which (N,) of them these are."""
+    corners = corners.copy()
+    reading = _read(image, corners, decoder)
+    good = _confirmed(reading, ids, noise, config)
+    missing = np.flatnonzero(~good)
+    if len(missing):
+        cell = np.linalg.norm(corners[missing, 2] - corners[missing, 0], axis=-1) / (1.4 * decoder.cells)
+        tried = corners[missing, None] + (cell[:, None, None] * _OFFSETS)[:, :, None]
+        places = len(_OFFSETS)
+        around = _read(image, tried.reshape(-1, 4, 2), decoder)
+        confirmed = _confirmed(around, np.repeat(ids[missing], places), noise, config)
+        score = np.where(confirmed, np.abs(around.correlation), 0.0).reshape(-1, places)
+        best = score.argmax(axis=1)
+        rows = np.arange(len(missing))
+        hit = score[rows, best] > 0.0
+        corners[missing[hit]] = tried[rows, best][hit]
+        good[missing] = hit
+        contrast = reading.contrast.copy()
+        contrast[missing] = around.contrast.reshape(-1, places)[rows, best]
+    else:
+        contrast = reading.contrast
+    return Found(ids[good], corners[good], contrast[good] / noise), good
+
+
+def _read(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
+    """Readings of (Q, 4, 2), at half the resolution when all are large enough for it."""
+    everything = np.ones(decoder.count, dtype=bool)
+    sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
+    if sides.min(initial=np.inf) >= _WIDE_CELL_PX * decoder.cells:
+        return decoder.read(halved(image), 0.5 * (quads - 0.5), everything)
+    return decoder.read(image, quads, everything)
+
+
+def _confirmed(reading: Reading, ids: IntArray, noise: float, config: ArucoDetectorConfig) -> BoolArray:
+    similarity = np.abs(reading.correlation)
+    return np.asarray(
+        (reading.ids == ids)
+        & (reading.turns == 0)
+        & (similarity >= config.guided_min_correlation)
+        & (similarity - reading.runner_up >= config.guided_min_margin)
+        & (np.abs(reading.contrast) >= config.guided_min_contrast * noise)
+    )

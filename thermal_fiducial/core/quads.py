@@ -1,0 +1,45 @@
+"""Quadrilaterals in the outlines of a thresholded view: where markers may be."""
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.core.types import FloatArray, Gray
+
+# The hull of an outline is simplified to within this share of its length: more than noise bends it, less than a side.
+_STRAIGHT = 0.05
+
+
+def find_quads(gray: Gray, window_px: int, threshold: float, min_side_px: float) -> FloatArray:
+    """Convex quadrilaterals (Q, 4, 2) [px], clockwise, of what is darker or brighter than its surroundings.
+
+    Parameters
+    ----------
+    gray : (height, width)
+    window_px : odd width of the surroundings
+    threshold : levels below the mean of the surroundings
+    min_side_px : shortest side
+    """
+    mask = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window_px, threshold)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    shortest, longest = 3.2 * min_side_px, 2.0 * sum(gray.shape)
+    quads = []
+    for outline in outlines:
+        if not shortest <= len(outline) <= longest:
+            continue
+        hull = cv2.convexHull(outline)
+        simple = cv2.approxPolyDP(hull, _STRAIGHT * cv2.arcLength(hull, True), True)
+        if len(simple) == 4:
+            quads.append(simple[:, 0].astype(np.float64))
+    if not quads:
+        return np.zeros((0, 4, 2))
+    found = np.stack(quads)
+    sides = np.linalg.norm(np.roll(found, -1, axis=1) - found, axis=-1)
+    found = found[np.isfinite(sides).all(axis=1) & (sides.min(axis=1) >= min_side_px)]
+    return _clockwise(found)
+
+
+def _clockwise(quads: FloatArray) -> FloatArray:
+    """Quadrilaterals in the order in which a clock's hand passes their corners, seen with v downward."""
+    diagonal, other = quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1]
+    turned = diagonal[:, 0] * other[:, 1] - diagonal[:, 1] * other[:, 0] < 0.0
+    return np.where(turned[:, None, None], quads[:, ::-1], quads)
