@@ -81,7 +81,9 @@ def tables(evaluation: Evaluation, numbers: dict[str, Any]) -> list[Table]:
         _latency(numbers),
         Table('Markers', ('', ''), _pick(numbers['markers'], _MARKERS)),
         _gaps(evaluation),
+        _load(evaluation),
         _diagnostics(evaluation),
+        _figures(evaluation),
     ]
     return [table for table in made if table.rows]
 
@@ -143,6 +145,23 @@ def _gaps(evaluation: Evaluation) -> Table:
 def _diagnostics(evaluation: Evaluation) -> Table:
     rows = [(said.node, said.level, said.message, f'{said.count} x') for said in evaluation.run.output.diagnostics]
     return Table('What the nodes said, once a second', ('node', 'level', 'message', 'times'), rows, textual=True)
+
+
+def _load(evaluation: Evaluation) -> Table:
+    used = evaluation.run.summary.get('cpu_percent', {})
+    return Table('Processor load', ('', 'of one core [%]'), [(node, number(value)) for node, value in used.items()])
+
+
+def _figures(evaluation: Evaluation) -> Table:
+    """What the nodes counted, but for the traffic on their topics."""
+    said = evaluation.run.summary.get('diagnostics', {})
+    rows = [
+        (node, name, str(value))
+        for node, figures in said.items()
+        for name, value in figures.items()
+        if value and not name.startswith(('received ', 'published '))
+    ]
+    return Table('What the nodes counted, at the end', ('node', 'figure', 'value'), rows, textual=True)
 
 
 def cards(evaluation: Evaluation, numbers: dict[str, Any]) -> list[Card]:
