@@ -78,31 +78,39 @@ def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: ImuN
     for step in range(steps):
         rate, force = imu.at(times[:-1] + (step + 0.5) * h[:, 0])
         rate, force = rate - bias[:, :3], force - bias[:, 3:]
-        turn = geometry.so3_exp(rate * h)
-        transition, inputs = _linearised(R, force, turn, h[:, :, None])
+        half = geometry.so3_exp(0.5 * rate * h)
+        middle = R @ half
+        transition, inputs = _linearised(middle, force, half, h[:, :, None])
         # Noise and bias enter in the same way; a bias takes away from the sample.
         by_bias = transition @ by_bias - inputs
         covariance = transition @ covariance @ np.swapaxes(transition, 1, 2)
         covariance += inputs @ ((density / h)[:, :, None] * np.swapaxes(inputs, 1, 2))
-        middle = R @ geometry.so3_exp(0.5 * rate * h)
         a = (middle @ force[:, :, None])[:, :, 0]
         p = p + v * h + 0.5 * a * h**2
         v = v + a * h
-        R = R @ turn
+        R = middle @ half
     return Increments(dt, R, v, p, by_bias, covariance)
 
 
-def _linearised(R: FloatArray, force: FloatArray, turn: FloatArray, h: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Transition (K, 9, 9) of the errors (rotation, velocity, position), and how samples enter (K, 9, 6)."""
-    count = len(R)
+def _linearised(
+    middle: FloatArray, force: FloatArray, half: FloatArray, h: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Transition (K, 9, 9) of the errors (rotation, velocity, position), and how samples enter (K, 9, 6).
+
+    All is taken at the ``middle`` of the step, ``half`` a step's turn after its start.
+    """
+    count = len(middle)
+    back = np.swapaxes(half, 1, 2)
+    by_turn = -middle @ geometry.skew(force)
     transition = np.tile(np.eye(9), (count, 1, 1))
-    by_turn = -R @ geometry.skew(force)
-    transition[:, :3, :3] = np.swapaxes(turn, 1, 2)
-    transition[:, 3:6, :3] = by_turn * h
-    transition[:, 6:, :3] = 0.5 * by_turn * h**2
+    transition[:, :3, :3] = back @ back
+    transition[:, 3:6, :3] = by_turn @ back * h
+    transition[:, 6:, :3] = 0.5 * by_turn @ back * h**2
     transition[:, 6:, 3:6] = np.eye(3) * h
     inputs = np.zeros((count, 9, 6))
-    inputs[:, :3, :3] = np.eye(3) * h
-    inputs[:, 3:6, 3:] = R * h
-    inputs[:, 6:, 3:] = 0.5 * R * h**2
+    inputs[:, :3, :3] = back * h
+    inputs[:, 3:6, :3] = 0.5 * by_turn * h**2
+    inputs[:, 6:, :3] = 0.25 * by_turn * h**3
+    inputs[:, 3:6, 3:] = middle * h
+    inputs[:, 6:, 3:] = 0.5 * middle * h**2
     return transition, inputs

@@ -1,0 +1,163 @@
+"""Camera against IMU from poses and samples of simulated flights."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.calibration.camera_imu import _first_state, _imu_errors, _Problem, calibrate_camera_imu
+from thermal_fiducial.calibration.preintegration import ImuTrack, preintegrate
+from thermal_fiducial.config import ImuNoise
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.sim.camera import plan, simulate_imu, START_NS
+from thermal_fiducial.sim.imu import ImuModel
+from thermal_fiducial.sim.imu import ImuNoise as SimulatedNoise
+from thermal_fiducial.sim.scenario import named
+from thermal_fiducial.sim.trajectory import GRAVITY
+
+OFFSET = 0.024
+SCENARIO = replace(named('fast'), camera_time_offset=OFFSET)
+NO_NOISE = ImuModel(SimulatedNoise(0.0, 0.0, 0.0, 0.0), gyroscope_bias_sigma=0.0, accelerometer_bias_sigma=0.0)
+
+
+def recording(scenario, seconds, seed, sigma_m=0.002, sigma_rad=0.0006):
+    """Camera poses as from markers at a few metres, and IMU samples."""
+    flight = plan(scenario, seconds, seed)
+    trajectory = scenario.trajectory(seconds, seed)
+    record = simulate_imu(scenario, seconds, seed)
+    rng = np.random.default_rng([seed, 77])
+    sigma = np.repeat([sigma_m, sigma_rad], 3)
+    covariance = np.diag(np.maximum(sigma, 1e-5) ** 2)
+    T = trajectory(np.array([flight.frame_time(k) for k in range(flight.frame_count)])).T_map_body
+    T = T @ scenario.T_body_camera
+    noise = rng.normal(0.0, 1.0, (len(T), 6)) * sigma
+    T = geometry.transform(geometry.so3_exp(noise[:, 3:]) @ T[:, :3, :3], T[:, :3, 3] + noise[:, :3])
+    poses = [CameraPose(flight.stamp_ns(k), pose, covariance) for k, pose in enumerate(T)]
+    imu = ImuTrack((record.stamps_ns - START_NS) * 1e-9, record.angular_velocity, record.linear_acceleration)
+    return poses, imu
+
+
+def error_of(result, scenario):
+    """Rotation about the camera's axes, position, offset: in the order of the covariance."""
+    difference = geometry.inverse(result.T_body_camera) @ scenario.T_body_camera
+    position = scenario.T_body_camera[:3, 3] - result.T_body_camera[:3, 3]
+    return np.array(
+        [*geometry.so3_log(difference[:3, :3]), *position, scenario.camera_time_offset - result.time_offset]
+    )
+
+
+def test_increments_are_those_of_the_flight():
+    scenario = replace(SCENARIO, imu=NO_NOISE)
+    _, imu = recording(scenario, 20.0, 1)
+    times = np.arange(5.0, 12.0, 1 / 30)
+    motion = scenario.trajectory(20.0, 1)(times)
+    R, dt = motion.rotation.as_matrix(), np.diff(times)[:, None]
+    g = np.array([0.0, 0.0, -GRAVITY])
+    found = preintegrate(imu, times, np.zeros((len(dt), 6)), ImuNoise())
+    R0t = np.swapaxes(R[:-1], 1, 2)
+    dv = np.einsum('nij,nj->ni', R0t, np.diff(motion.velocity, axis=0) - g * dt)
+    dp = np.einsum('nij,nj->ni', R0t, np.diff(motion.position, axis=0) - motion.velocity[:-1] * dt - 0.5 * g * dt**2)
+    # Samples of 200 Hz interpolated linearly: the error is their second derivative times (5 ms)^2 / 12.
+    assert np.abs(geometry.so3_log(np.swapaxes(found.R, 1, 2) @ R0t @ R[1:])).max() < 2e-5
+    assert np.abs(found.v - dv).max() < 2e-4
+    assert np.abs(found.p - dp).max() < 5e-6
+
+
+def test_bias_derivatives_against_differences():
+    _, imu = recording(SCENARIO, 20.0, 1)
+    times = np.arange(5.0, 6.0, 1 / 30)
+    zero = np.zeros((len(times) - 1, 6))
+    base = preintegrate(imu, times, zero, ImuNoise())
+    h = 1e-5
+    for column in range(6):
+        step = np.zeros(6)
+        step[column] = h
+        moved = preintegrate(imu, times, zero + step, ImuNoise())
+        turn = geometry.so3_log(np.swapaxes(base.R, 1, 2) @ moved.R)
+        difference = np.concatenate([turn, moved.v - base.v, moved.p - base.p], axis=1) / h
+        # Second order in the turn of a step, 0.01 rad at most, and in h.
+        assert base.by_bias[:, :, column] == pytest.approx(difference, rel=2e-3, abs=2e-6)
+
+
+def test_derivatives_of_the_batch_against_differences():
+    poses, imu = recording(SCENARIO, 20.0, 3)
+    chosen = poses[150:162]
+    stamps = np.array([(pose.stamp_ns - START_NS) * 1e-9 for pose in chosen])
+    measured = np.stack([pose.T_map_camera for pose in chosen])
+    root = np.tile(np.eye(6), (len(chosen), 1, 1))
+    problem = _Problem(stamps, measured, root, imu, ImuNoise())
+    state = _first_state(stamps, measured, imu, GRAVITY)
+    state = replace(state, p_body_camera=np.array([0.1, 0.0, -0.05]))
+    increments = preintegrate(imu, stamps + state.offset, state.bias[:-1], ImuNoise())
+    _, pose_own, pose_shared = problem._pose_errors(state)
+    _, first, second, imu_shared = _imu_errors(state, increments, ImuNoise())
+    count, h = len(chosen), 1e-6
+
+    def both(moved):
+        return problem._pose_errors(moved)[0], _imu_errors(moved, increments, ImuNoise())[0]
+
+    def derivative(own, shared):
+        ahead, behind = (both(problem._moved(state, sign * own, sign * shared)) for sign in (1.0, -1.0))
+        return [(a - b) / (2.0 * h) for a, b in zip(ahead, behind, strict=True)]
+
+    for column in range(15):
+        own = np.zeros((count, 15))
+        own[:, column] = h
+        by_pose, by_imu = derivative(own, np.zeros(9))
+        # Rotation errors of noisy poses are up to 0.01 rad: their right and left derivatives differ by half of that.
+        assert by_pose == pytest.approx(pose_own[:, :, column], abs=2e-2)
+        if column < 9:
+            expected = first[:, :, column] + second[:, :, column]
+            assert by_imu == pytest.approx(expected, rel=1e-3, abs=1e-3 * np.abs(expected).max() + 1e-3)
+    for column in (0, 1, 2, 3, 4, 5, 7, 8):
+        shared = np.zeros(9)
+        shared[column] = h
+        by_pose, by_imu = derivative(np.zeros((count, 15)), shared)
+        assert by_pose == pytest.approx(pose_shared[:, :, column], abs=2e-2)
+        assert by_imu == pytest.approx(imu_shared[:, :, column], rel=1e-3, abs=1e-3 * np.abs(imu_shared).max())
+
+
+def test_noiseless_recording_gives_the_extrinsics_back():
+    scenario = replace(SCENARIO, imu=NO_NOISE)
+    poses, imu = recording(scenario, 20.0, 2, sigma_m=0.0, sigma_rad=0.0)
+    result = calibrate_camera_imu(poses, imu, START_NS, ImuNoise())
+    error = np.abs(error_of(result, scenario))
+    # Samples between frames are interpolated: 1e-5 rad, a few hundredths of a millimetre, some microseconds.
+    assert np.all(error[:3] < 2e-5)
+    assert np.all(error[3:6] < 1e-4)
+    assert error[6] < 2e-5
+
+
+@pytest.mark.parametrize('seed', [1, 2, 3])
+def test_a_minute_is_enough(seed):
+    poses, imu = recording(SCENARIO, 60.0, seed)
+    result = calibrate_camera_imu(poses, imu, START_NS, ImuNoise())
+    error = error_of(result, SCENARIO)
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.05
+    assert np.linalg.norm(error[3:6]) < 0.002
+    assert abs(error[6]) < 0.0005
+    # Chi-square of seven degrees of freedom, 99.9 %.
+    assert error @ np.linalg.solve(result.covariance, error) < 24.3
+    assert result.gravity_map == pytest.approx([0.0, 0.0, -GRAVITY], abs=0.02)
+
+
+def test_wrong_poses_hardly_matter():
+    poses, imu = recording(SCENARIO, 30.0, 4)
+    rng = np.random.default_rng(5)
+    for index in rng.choice(len(poses), 20, replace=False).tolist():
+        T = poses[index].T_map_camera @ geometry.transform(geometry.so3_exp([0.0, 0.3, 0.0]), [0.3, 0.0, 0.1])
+        poses[index] = replace(poses[index], T_map_camera=T)
+    error = error_of(calibrate_camera_imu(poses, imu, START_NS, ImuNoise()), SCENARIO)
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.1
+    assert np.linalg.norm(error[3:6]) < 0.004
+
+
+def test_refuses_what_it_cannot_answer():
+    poses, imu = recording(SCENARIO, 20.0, 1)
+    with pytest.raises(InputError, match='camera poses'):
+        calibrate_camera_imu(poses[:50], imu, START_NS, ImuNoise())
+    still = [replace(pose, T_map_camera=poses[0].T_map_camera) for pose in poses]
+    with pytest.raises(InputError, match='three axes'):
+        calibrate_camera_imu(still, imu, START_NS, ImuNoise())
