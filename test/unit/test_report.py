@@ -45,6 +45,7 @@ def test_the_measures_are_those_of_the_noise_that_was_put_in(run_folder):
         'different': 7,
         'corner_sigma_median_px': 0.03,
         'in_map': 8,
+        'detections_not_in_map': 0,
     }
     (gap,) = numbers['gaps']
     assert gap['seconds'] == pytest.approx(2.0, abs=0.07)

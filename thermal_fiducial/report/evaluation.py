@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.report import metrics
 from thermal_fiducial.report.run_folder import Run
 
@@ -52,6 +52,13 @@ class Evaluation:
         at = at[same]
         return metrics.Errors(e.stamps_ns[at], e.d[at], e.estimate[at], e.truth[at]), output.covariances[same]
 
+    @property
+    def strangers(self) -> BoolArray:
+        """Which detections are of markers that never entered the map: false ones, or seen too seldom."""
+        known = self.run.marker_map
+        ids = self.run.detections.ids
+        return np.zeros(len(ids), np.bool_) if known is None else ~np.isin(ids, list(known.markers))
+
     def numbers(self) -> dict[str, Any]:
         """All measures; what can't be known is left out."""
         result: dict[str, Any] = {
@@ -81,6 +88,7 @@ class Evaluation:
             'different': len(np.unique(detections.ids)),
             'corner_sigma_median_px': float(np.median(detections.sigma_px)) if len(detections.ids) else None,
             'in_map': None if marker_map is None else len(marker_map.markers),
+            'detections_not_in_map': int(np.sum(self.strangers)),
         }
 
 

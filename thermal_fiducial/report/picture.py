@@ -54,12 +54,13 @@ def draw_picture(evaluation: Evaluation, bag: Path, path: Path) -> None:
 
 
 def _frame_to_show(evaluation: Evaluation) -> int:
-    """Stamp of the frame with most markers; of several, one in the middle of the flight."""
-    frames, counts = np.unique(evaluation.run.detections.stamps_ns, return_counts=True)
+    """Stamp of the frame with most markers of the map; of several, one in the middle of the flight."""
+    frames, counts = np.unique(evaluation.run.detections.stamps_ns[~evaluation.strangers], return_counts=True)
     if not len(frames):
         raise InputError(f'{evaluation.run.path}: no marker was detected, so there is nothing to draw')
     best = frames[counts == counts.max()]
-    return int(best[len(best) // 2])
+    best = best[~np.isin(best, evaluation.run.detections.stamps_ns[evaluation.strangers])]
+    return int(best[len(best) // 2] if len(best) else frames[np.argmax(counts)])
 
 
 def _view(bag: Path, stamp_ns: int) -> Gray:

@@ -69,6 +69,7 @@ _MARKERS = (
     ('different markers', 'different'),
     ('corner sigma, median [px]', 'corner_sigma_median_px'),
     ('markers in the map', 'in_map'),
+    ('detections of markers that are not in it', 'detections_not_in_map'),
 )
 
 
