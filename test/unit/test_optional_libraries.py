@@ -1,0 +1,67 @@
+"""What may be missing on a robot: the core runs without ROS, the commands without the tools they don't need."""
+
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+from support.run_folders import make_run
+
+import thermal_fiducial.core
+
+WITHOUT_ROS = ('rclpy', 'sensor_msgs', 'geometry_msgs', 'rosbags', 'yaml')
+TOOLS = ('matplotlib', 'jinja2', 'rich', 'scipy', 'ezdxf', 'PIL')
+
+# filterpy itself imports scipy and matplotlib, so in the core only ROS and files are hidden.
+BLOCK = """
+import sys
+class Hidden:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition('.')[0] in {names!r}:
+            raise ModuleNotFoundError(f'No module named {{name!r}}', name=name)
+sys.meta_path.insert(0, Hidden())
+"""
+
+
+def python(code, hidden, *arguments):
+    return subprocess.run(
+        [sys.executable, '-c', BLOCK.format(names=hidden) + code, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_the_core_imports_without_ros_and_files():
+    folder = Path(thermal_fiducial.core.__file__).parent
+    names = [f'thermal_fiducial.core.{path.stem}' for path in folder.glob('*.py') if path.stem != '__init__']
+    result = python('import importlib\nfor name in sys.argv[1:]: importlib.import_module(name)', WITHOUT_ROS, *names)
+    assert result.returncode == 0, result.stderr
+
+
+COMMAND = 'from thermal_fiducial.cli.main import main\nsys.exit(main(sys.argv[1:]))'
+
+
+@pytest.fixture(scope='module')
+def run_folder(tmp_path_factory):
+    return str(make_run(tmp_path_factory.mktemp('runs') / 'run', seconds=2.0, gap=(1.0, 1.4), with_output=False))
+
+
+def test_measures_need_no_tools(run_folder):
+    result = python(COMMAND, TOOLS, 'evaluate', run_folder, '--json', '--no-report')
+    assert result.returncode == 0, result.stderr
+    assert '"position_rms_mm"' in result.stdout
+
+
+@pytest.mark.parametrize('options', [(), ('--no-report',)])
+def test_a_missing_tool_is_named_in_one_line(run_folder, options):
+    result = python(COMMAND, TOOLS, 'evaluate', run_folder, *options)
+    assert result.returncode == 2
+    assert 'install the extra "tools"' in result.stderr
+    assert result.stderr.count('\n') == 1
+
+
+def test_the_demo_without_ros_says_what_is_missing(tmp_path):
+    code = 'from pathlib import Path\nfrom thermal_fiducial.cli.demo import _replay\n_replay(Path(), Path())'
+    result = python(code, ('rclpy', 'sensor_msgs', 'diagnostic_msgs', 'geometry_msgs'))
+    assert 'install the extra "ros"' in result.stderr
