@@ -195,19 +195,36 @@ class Tau2CameraConfig:
 
     calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
     bad_pixel_file: str = param('', 'List of dead pixels: a text file, "column row" a line. Empty: none.')
-    find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.')
+    find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.', live=True)
     bits: int = param(14, 'Significant bits of a 16-bit pixel; flags above them are masked.', minimum=8, maximum=16)
     settle_frames: int = param(
-        1, 'Frames withheld after a shutter event, while they may still hold old counts.', minimum=0, maximum=30
+        1,
+        'Frames withheld after a shutter event, while they may still hold old counts.',
+        minimum=0,
+        maximum=30,
+        live=True,
     )
     view_tail_percent: float = param(
-        0.5, '8-bit view: share of the pixels beyond either end of the scale.', unit='%', minimum=0.0, maximum=25.0
+        0.5,
+        '8-bit view: share of the pixels beyond either end of the scale.',
+        unit='%',
+        minimum=0.0,
+        maximum=25.0,
+        live=True,
     )
     view_smoothing: float = param(
-        0.05, '8-bit view: share of a new frame in the scale; small values follow slowly.', minimum=0.001, maximum=1.0
+        0.05,
+        '8-bit view: share of a new frame in the scale; small values follow slowly.',
+        minimum=0.001,
+        maximum=1.0,
+        live=True,
     )
     view_minimum_span: float = param(
-        40.0, '8-bit view: narrowest scale, so that noise alone does not fill it.', unit='counts', minimum=1.0
+        40.0,
+        '8-bit view: narrowest scale, so that noise alone does not fill it.',
+        unit='counts',
+        minimum=1.0,
+        live=True,
     )
     frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
 
@@ -299,10 +316,11 @@ class MarkerMapperConfig:
         unit='s',
         minimum=0.0,
         maximum=60.0,
+        live=True,
     )
     keyframe_budget: int = param(800, 'Frames kept for the joint refinement.', minimum=10, maximum=20000)
     refinement_period: float = param(
-        2.0, 'Shortest time between two joint refinements; 0: never.', unit='s', minimum=0.0, maximum=3600.0
+        2.0, 'Shortest time between two joint refinements; 0: never.', unit='s', minimum=0.0, maximum=3600.0, live=True
     )
 
 
@@ -395,3 +413,14 @@ class PoseEkfConfig:
     )
     map_frame: str = param('map', 'Frame of the pose.')
     base_frame: str = param('base_link', 'Frame of the robot: that of the IMU.')
+    camera_frame: str = param('thermal_camera_optical', 'Frame of the camera, for publish_tf.')
+    publish_tf: bool = param(False, 'Publish map to base_frame and base_frame to camera_frame on /tf (needs tf2_ros).')
+    bridge_rate: float = param(
+        0.0,
+        'Rate of bridge/odometry and bridge/pose for a flight controller, silent while lost, smooth with '
+        'smoothing_time; 0: none.',
+        unit='Hz',
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    px4: bool = param(False, 'Publish fmu/in/vehicle_visual_odometry at bridge_rate too (needs px4_msgs).')

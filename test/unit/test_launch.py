@@ -8,6 +8,9 @@ from types import ModuleType, SimpleNamespace
 import pytest
 import yaml
 
+from thermal_fiducial import config
+from thermal_fiducial.ros.parameter_file import NODES as PARAMETERS
+
 ROOT = Path(__file__).resolve().parents[2]
 NODES = ['tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf']
 
@@ -86,6 +89,24 @@ def test_arguments_reach_the_nodes(launched):
         assert node.parameters[1] == {'mode': 'localization', 'use_sim_time': True, 'map_file': 'hall.yaml'}
     view = Path(nodes[4].arguments[1])
     assert (ROOT / view.relative_to('/share/thermal_fiducial')).is_file()
+
+
+@pytest.mark.parametrize(
+    ('file', 'parameters', 'remappings'),
+    [
+        ('mavros', {'bridge_rate': 30.0}, [('bridge/odometry', 'mavros/odometry/out')]),
+        ('ardupilot', {'bridge_rate': 20.0}, [('bridge/odometry', 'mavros/odometry/out')]),
+        ('px4', {'bridge_rate': 50.0, 'px4': True}, []),
+    ],
+)
+def test_flight_controllers_get_their_output(launched, file, parameters, remappings):
+    _, nodes = launched(f'{file}.launch.py')
+    known = {name: item for kind in PARAMETERS.values() for name, item, _ in config.parameters(kind)}
+    for node in nodes:
+        assert node.remappings == remappings
+        assert node.parameters[1] == {'mode': 'localization', 'use_sim_time': False, **parameters}
+    for name, value in parameters.items():
+        assert config.checked(name, known[name], value) == value
 
 
 def test_the_view_shows_what_the_nodes_publish():

@@ -4,7 +4,8 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
-from rcl_interfaces.srv import DescribeParameters
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 from support import small_bag
@@ -386,6 +387,15 @@ def test_parameters_are_described(graph):
     assert frame.read_only
 
 
+def test_live_parameters_take_effect(graph):
+    node = graph.add(Tau2Camera)
+    parameter = Parameter('settle_frames', value=7).to_parameter_msg()
+    request = SetParameters.Request(parameters=[parameter])
+    (result,) = graph.call(SetParameters, 'tau2_camera/set_parameters', request).results
+    assert result.successful
+    assert node.cleaner.config.settle_frames == node.view.config.settle_frames == 7
+
+
 def test_names_are_relative(graph):
     with ros_graph('-r', '__ns:=/drone', '-r', 'pose:=vision/pose') as other:
         node = other.add(PoseEkfNode)
@@ -400,7 +410,7 @@ def test_names_are_relative(graph):
 
 
 def correction(k, T_new_old):
-    return convert.map_correction(T_new_old, START + k * 5_000_000, 'map')
+    return convert.transform_message(T_new_old, START + k * 5_000_000, 'map', 'map_before')
 
 
 def test_the_estimate_moves_with_the_map(graph):

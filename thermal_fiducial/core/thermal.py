@@ -45,7 +45,7 @@ class FrameCleaner:
     """
 
     def __init__(self, config: Tau2CameraConfig, bad_pixels: IntArray | None = None) -> None:
-        self._config = config
+        self.config = config
         self._known_bad: IntArray = np.reshape([] if bad_pixels is None else bad_pixels, (-1, 2)).astype(np.int64)
         self._telemetry = _TelemetryRows()
         self._restart((0, 0))
@@ -99,7 +99,7 @@ class FrameCleaner:
         image = self._telemetry.cut(counts)
         if min(image.shape) < 16:
             raise InputError(f'frame of {image.shape[1]}x{image.shape[0]} pixels is too small')
-        return image.astype(np.uint16) & np.uint16((1 << self._config.bits) - 1)
+        return image.astype(np.uint16) & np.uint16((1 << self.config.bits) - 1)
 
     def _jumped_back(self, stamp_ns: int) -> bool:
         """Whether the clock was set back or a recording starts anew, rather than a frame coming out of order."""
@@ -118,12 +118,12 @@ class FrameCleaner:
         # A single repeated frame is a driver that runs faster than the camera. After a longer stop the first new
         # frame may still hold old counts: in the bolometers, which lag, and in the driver's buffers.
         if self._live_ns is not None and stamp_ns - self._live_ns > 90_000_000:
-            self._settling = self._config.settle_frames
+            self._settling = self.config.settle_frames
         return reason
 
     def _replace_bad_pixels(self, image: Counts) -> None:
         assert self._filler is not None
-        if self._config.find_bad_pixels:
+        if self.config.find_bad_pixels:
             found = self._finder.add(image)
             if found is not None and not np.array_equal(found, self._found) and 100 * len(found) < image.size:
                 self._found = found
@@ -231,13 +231,13 @@ class EightBitView:
     STEP = 8
 
     def __init__(self, config: Tau2CameraConfig) -> None:
-        self._config = config
+        self.config = config
         self._range: tuple[float, float] | None = None
 
     def __call__(self, counts: Counts) -> Gray:
         """Picture (height, width) uint8 of ``counts`` (height, width)."""
         low, high = self._follow(counts)
-        span = max(high - low, self._config.view_minimum_span)
+        span = max(high - low, self.config.view_minimum_span)
         # What falls below the scale saturates at zero in the unsigned difference, what exceeds it in the conversion.
         start = max(0.0, 0.5 * (low + high - span))
         above = cv2.subtract(counts, np.array([start]))
@@ -245,12 +245,12 @@ class EightBitView:
 
     def _follow(self, counts: Counts) -> tuple[float, float]:
         sample = counts[:: self.STEP, :: self.STEP].ravel()
-        share = self._config.view_tail_percent / 100.0
+        share = self.config.view_tail_percent / 100.0
         ranks = (int(share * (sample.size - 1)), int((1.0 - share) * (sample.size - 1)))
         part = np.partition(sample, ranks)
         now = float(part[ranks[0]]), float(part[ranks[1]])
         if self._range is not None:
-            a = self._config.view_smoothing
+            a = self.config.view_smoothing
             now = tuple((1.0 - a) * old + a * new for old, new in zip(self._range, now, strict=True))  # type: ignore[assignment]
         self._range = now
         return now

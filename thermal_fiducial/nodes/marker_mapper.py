@@ -80,7 +80,8 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             self._camera_pose.send(pose)
         jump = self._refine(stamp)
         if jump is not None:
-            self._map_correction.send(convert.map_correction(jump.T_new_old, stamp, self.config.map_frame))
+            frame = self.config.map_frame
+            self._map_correction.send(convert.transform_message(jump.T_new_old, stamp, frame, f'{frame}_before'))
         if result.map_changed or jump is not None:
             self._publish_map()
 

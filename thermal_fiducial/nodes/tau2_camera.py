@@ -37,6 +37,11 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
         self._reason = ''
         self.subscribe(Image, 'thermal/image_raw', self._on_image, qos.CAMERA_INPUT)
 
+    def configure(self, config: Tau2CameraConfig) -> None:
+        """Take over live parameters."""
+        super().configure(config)
+        self.cleaner.config = self.view.config = config
+
     def _on_image(self, message: Image) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
         frame = self.cleaner.process(stamp, convert.image_array(message))

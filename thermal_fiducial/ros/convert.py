@@ -358,17 +358,18 @@ def vector(v: FloatArray) -> Vector3:
     return Vector3(x=x, y=y, z=z)
 
 
-def map_correction(T_new_old: FloatArray, stamp: int, map_frame: str) -> TransformStamped:
-    """A correction of the map: moves coordinates of the map up to ``stamp`` [ns] to those from there on."""
-    place = pose(T_new_old)
-    message = TransformStamped(header=header(stamp, map_frame), child_frame_id=f'{map_frame}_before')
-    message.transform.translation = vector(T_new_old[:3, 3])
-    message.transform.rotation = place.orientation
+def transform_message(T_a_b: FloatArray, stamp: int, a: str, b: str) -> TransformStamped:
+    """Transform message of T_a_b (4, 4)."""
+    message = TransformStamped(header=header(stamp, a), child_frame_id=b)
+    message.transform.translation = vector(T_a_b[:3, 3])
+    message.transform.rotation = pose(T_a_b).orientation
     return message
 
 
 def correction_of(message: TransformStamped) -> tuple[int, FloatArray]:
-    """Stamp [ns] and T_new_old (4, 4) of a correction of the map.
+    """Stamp [ns] and T_new_old (4, 4) of a ``map_correction``.
+
+    It moves coordinates of the map as poses up to the stamp have them to those of poses after it.
 
     Raises
     ------

@@ -1,0 +1,103 @@
+"""What leaves for a flight controller: odometry at its rate, only while it may be used, as each autopilot wants it.
+
+The autopilots: mavros takes nav_msgs/Odometry (``odometry/out``) or PoseWithCovarianceStamped
+(``vision_pose/pose_cov``) in ENU and FLU and converts; PX4 over uXRCE-DDS takes px4_msgs/VehicleOdometry in FRD.
+"""
+
+from collections.abc import Callable
+import importlib
+from typing import Any
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry as OdometryMessage
+import numpy as np
+
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.node import CountingNode
+
+#: Turns forward-left-up axes into forward-right-down ones, and back.
+FLU_TO_FRD = np.array([1.0, -1.0, -1.0])
+PX4_TOPIC = 'fmu/in/vehicle_visual_odometry'
+
+
+class FlightControllerBridge:
+    """Outputs for a flight controller, every ``1 / bridge_rate``; none where ``bridge_rate`` is 0.
+
+    Parameters
+    ----------
+    node : whose outputs they are
+    config : frames, rate
+    fault : told in words what was asked for and cannot be had
+    """
+
+    def __init__(self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None]) -> None:
+        self._config = config
+        self._period_ns = round(1e9 / config.bridge_rate) if config.bridge_rate > 0.0 else 0
+        self._due_ns = 0
+        self._px4: Any = None
+        if not self._period_ns:
+            return
+        self._odometry = node.advertise(OdometryMessage, 'bridge/odometry')
+        self._pose = node.advertise(PoseWithCovarianceStamped, 'bridge/pose')
+        if config.px4:
+            try:
+                self._px4 = importlib.import_module('px4_msgs.msg').VehicleOdometry
+            except ImportError:
+                fault('parameter px4: px4_msgs is not installed')
+            else:
+                self._px4_odometry = node.advertise(self._px4, PX4_TOPIC, qos.RESULT)
+
+    def send(self, odometry: Odometry, resets: int) -> None:
+        """Publish ``odometry`` if its turn has come.
+
+        Parameters
+        ----------
+        resets : how often the pose has jumped; autopilots that know of a counter take the jump over with it
+        """
+        stamp = odometry.stamp_ns
+        if not self._period_ns or self._due_ns - self._period_ns < stamp < self._due_ns:
+            return
+        # In step with the IMU, however its period divides ours; afresh after a gap or a clock that was set back.
+        on_time = abs(stamp - self._due_ns) < self._period_ns
+        self._due_ns = (self._due_ns if on_time else stamp) + self._period_ns
+        head = convert.header(stamp, self._config.map_frame)
+        message = convert.odometry_message(odometry, head, self._config.base_frame)
+        self._odometry.send(message)
+        self._pose.send(PoseWithCovarianceStamped(header=head, pose=message.pose))
+        if self._px4 is not None:
+            self._px4_odometry.send(px4_odometry(self._px4, odometry, resets))
+
+
+def px4_odometry(kind: Any, odometry: Odometry, resets: int) -> Any:
+    """px4_msgs/VehicleOdometry (``kind``) of the robot's state.
+
+    The map's axes become forward-right-down with an arbitrary heading (pose_frame FRD), velocities those of the
+    body; quaternions are w x y z, variances the three diagonals, the orientation's in the body.
+    """
+    message = kind()
+    # PX4 fills in the time of arrival for 0 and takes the other, in its microseconds, for that of the measurement.
+    message.timestamp = 0
+    message.timestamp_sample = odometry.stamp_ns // 1000
+    place = convert.pose(odometry.T_map_body)
+    q = place.orientation
+    R = odometry.T_map_body[:3, :3]
+    message.pose_frame = kind.POSE_FRAME_FRD
+    message.position = _float32(FLU_TO_FRD * odometry.T_map_body[:3, 3])
+    message.q = _float32(np.array([q.w, q.x, -q.y, -q.z]))
+    message.velocity_frame = kind.VELOCITY_FRAME_BODY_FRD
+    message.velocity = _float32(FLU_TO_FRD * odometry.velocity_body)
+    message.angular_velocity = _float32(FLU_TO_FRD * odometry.angular_velocity_body)
+    covariance = odometry.pose_covariance
+    message.position_variance = _float32(np.diag(covariance)[:3])
+    message.orientation_variance = _float32(np.diag(R.T @ covariance[3:, 3:] @ R))
+    message.velocity_variance = _float32(np.diag(odometry.twist_covariance)[:3])
+    message.reset_counter = resets % 256
+    message.quality = 100
+    return message
+
+
+def _float32(values: FloatArray) -> 'np.ndarray[Any, np.dtype[np.float32]]':
+    return np.asarray(values, dtype=np.float32)
