@@ -106,7 +106,7 @@ def write_output(path, stamps, fused):
             if k % 200 == 0:
                 status = types['diagnostic_msgs/msg/DiagnosticStatus']
                 items = [
-                    status(level=0, name='pose_ekf', message='running', hardware_id='', values=[]),
+                    status(level=0, name='pose_ekf', message=f'running for {k / 200:.1f} s', hardware_id='', values=[]),
                     status(level=1, name='tau2_camera', message='FFC', hardware_id='', values=[]),
                 ]
                 bag.write('/diagnostics', stamp, types['diagnostic_msgs/msg/DiagnosticArray'](head, items))

@@ -246,6 +246,25 @@ def test_tables_leave_out_what_is_not_known(small_run):
     assert not any('nodes' in title or 'covariance' in title for title in titles)
 
 
+def test_what_the_nodes_said_is_counted_whatever_its_numbers(run_folder):
+    said = {(entry.node, entry.level, entry.message): entry.count for entry in read_run(run_folder).output.diagnostics}
+    assert said == {
+        ('pose_ekf', 'ok', 'running for … s'): 20,
+        ('tau2_camera', 'warning', 'FFC'): 20,
+    }
+
+
+def test_figures_and_load_of_the_nodes(small_run):
+    diagnostics = {'tau2_camera': {'withheld: FFC': '12', 'refused messages': '0', 'received /thermal/image_raw': '9'}}
+    (small_run / 'summary.json').write_text(
+        json.dumps({'diagnostics': diagnostics, 'cpu_percent': {'pose_ekf': 24.04}})
+    )
+    evaluation = evaluate(read_run(small_run))
+    rows = {table.title: table.rows for table in tables(evaluation, evaluation.numbers())}
+    assert rows['What the nodes counted, at the end'] == [('tau2_camera', 'withheld: FFC', '12')]
+    assert rows['Processor load'] == [('pose_ekf', '24')]
+
+
 def test_a_picture_has_no_date_and_no_path():
     from matplotlib.figure import Figure
 

@@ -5,6 +5,7 @@ import csv
 from dataclasses import dataclass, field
 import json
 from pathlib import Path
+import re
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ DETECTIONS, LATENCY = 'detections.csv', 'latency.csv'
 MARKER_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'summary.json', 'output'
 #: Covariances are read from no more than so many messages, evenly over the run.
 MOST_COVARIANCES = 6000
+# "coasting for 0.6 s" and "coasting for 0.8 s" are one thing to say.
+_NUMBER = re.compile(r'\d+(\.\d+)?')
 _LEVELS = ('ok', 'warning', 'error', 'stale')
 
 
@@ -169,5 +172,5 @@ def _diagnostics(bag: BagReader) -> tuple[Diagnostic, ...]:
     for item in bag.messages(['diagnostics']):
         for status in item.message.status:
             level = status.level[0] if isinstance(status.level, (bytes, np.ndarray)) else status.level
-            said[status.name, _LEVELS[min(int(level), 3)], status.message] += 1
+            said[status.name, _LEVELS[min(int(level), 3)], _NUMBER.sub('…', status.message)] += 1
     return tuple(Diagnostic(*key, count) for key, count in said.most_common())

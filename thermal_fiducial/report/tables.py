@@ -160,7 +160,7 @@ def _figures(evaluation: Evaluation) -> Table:
         (node, name, str(value))
         for node, figures in said.items()
         for name, value in figures.items()
-        if value and not name.startswith(('received ', 'published '))
+        if value not in ('', '0') and not name.startswith(('received ', 'published '))
     ]
     return Table('What the nodes counted, at the end', ('node', 'figure', 'value'), rows, textual=True)
 
