@@ -33,7 +33,7 @@ _OPTION_HELP = {
     'corner_radius': 'radius of re-entrant corners',
     'bridge_width': 'webs that hold islands of standard dictionaries',
     'frame_width': 'width of the frame (--mount frame)',
-    'tie_width': 'ties between pattern and frame (--mount frame)',
+    'tie_width': 'necks of the ears, or ties to the frame',
 }
 
 

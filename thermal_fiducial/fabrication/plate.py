@@ -1,7 +1,7 @@
 """Drawings of one marker plate: the pattern and what holds it.
 
-Three mounts. ``ears``: the black square with a small ear at each side, outside the corners; the warm surface behind
-must reach a cell beyond the square. ``frame``: a ring of hot background one cell wide, then a frame of acrylic, held
+Three mounts. ``ears``: the black square with a tab at the middle of each side, on a neck so narrow that the edges
+which the camera measures stay free; the warm surface behind must reach a cell beyond the square. ``frame``: a ring of hot background one cell wide, then a frame of acrylic, held
 together by ties; the ties break the outline of the black square where the camera resolves them. ``none``: the black
 square alone.
 """
@@ -21,8 +21,10 @@ MOUNTS = ('ears', 'frame', 'none')
 
 # Acrylic left around a mounting hole [mm]: the thickness of usual sheets, the least that a bolt may clamp.
 _WALL_MM = 3.0
-# Width of an ear in sides of the marker: room for the engraving, and four fifths of each edge stay free to measure.
-_EAR_WIDTH = 0.15
+# Width of a tab and length of its neck in sides of the marker: room for the engraving, and warm background between
+# tab and edge that the camera resolves. Together they stay below the 12 % of a side that OpenCV smooths away when it
+# looks for squares.
+_TAB_WIDTH, _NECK = 0.15, 0.04
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class PlateOptions:
     quiet_cells: float = 1.0
     #: width of the frame
     frame_width: float = 15.0
-    #: width of the ties between pattern and frame
+    #: width of the necks of the ears, and of the ties between pattern and frame
     tie_width: float = 4.0
 
     def __post_init__(self) -> None:
@@ -119,7 +121,7 @@ def mounting_points(options: PlateOptions, cells: int) -> tuple[FloatArray, floa
     if options.mount == 'none':
         return np.zeros((0, 2)), side
     if options.mount == 'ears':
-        reach = 0.5 * (options.size + _ear_length(options))
+        reach = 0.5 * (side - _tab_length(options))
         return reach * np.array([(0.0, -1.0), (0.0, 1.0), (-1.0, 0.0), (1.0, 0.0)]), side
     reach = 0.5 * (side - options.frame_width)
     return reach * np.array([(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)]), side
@@ -139,26 +141,33 @@ def _moved(r: Rectangle, offset: FloatArray) -> Rectangle:
 Mounted = tuple[list[Rectangle], list[Contour]]
 
 
-def _ear_length(options: PlateOptions) -> float:
+def _tab_length(options: PlateOptions) -> float:
     return options.hole_diameter + 2.0 * _WALL_MM
 
 
+def _ear_length(options: PlateOptions) -> float:
+    return _NECK * options.size + _tab_length(options)
+
+
 def _ears(label: str, options: PlateOptions, length: float) -> Mounted:
-    """Four ears; the upper one carries the label to the left of its hole and the arrow to the right."""
-    half = 0.5 * max(length, _EAR_WIDTH * options.size)
-    middle, far = length + 0.5 * options.size, length + options.size
+    """Four tabs on necks; the upper one carries the label to the left of its hole and the arrow to the right."""
+    tab, total = _tab_length(options), 2.0 * length + options.size
+    half, neck = 0.5 * max(tab, _TAB_WIDTH * options.size), 0.5 * options.tie_width
+    middle, far = 0.5 * total, total - tab
     ears = [
-        Rectangle(middle - half, 0.0, middle + half, length),
-        Rectangle(middle - half, far, middle + half, far + length),
-        Rectangle(0.0, middle - half, length, middle + half),
-        Rectangle(far, middle - half, far + length, middle + half),
+        Rectangle(middle - neck, 0.0, middle + neck, total),
+        Rectangle(0.0, middle - neck, total, middle + neck),
+        Rectangle(middle - half, 0.0, middle + half, tab),
+        Rectangle(middle - half, far, middle + half, total),
+        Rectangle(0.0, middle - half, tab, middle + half),
+        Rectangle(far, middle - half, total, middle + half),
     ]
     room = half - 0.5 * options.hole_diameter - 2.0
     beside = 0.5 * options.hole_diameter + 1.0 + 0.5 * room
-    height = far + 0.5 * length
+    height = total - 0.5 * tab
     engraving = [
-        *text(label, middle - beside, height, room, 0.6 * length),
-        *arrow(middle + beside, height, room, 0.6 * length),
+        *text(label, middle - beside, height, room, 0.6 * tab),
+        *arrow(middle + beside, height, room, 0.6 * tab),
     ]
     return ears, engraving
 
