@@ -35,14 +35,28 @@ _CHOICES = 4
 
 
 @dataclass(frozen=True)
-class View:
-    """A marker seen from a camera whose pose is known, or known to be one of two."""
+class Viewpoint:
+    """Where a camera is, or the two places where it may be."""
 
-    stamp_ns: int
     #: (2, 4, 4) twice the same where there is no doubt
     T_map_camera: FloatArray
-    #: (2, 6, 6) of either, ROS convention
+    #: (2, 6, 6) of either, ROS convention: by how much views may differ from each other
     covariances: FloatArray
+    #: (6, 6) error that all views share (of odometry over a gap): it moves the marker, but no view against another
+    common: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @classmethod
+    def known(cls, T_map_camera: FloatArray, covariance: FloatArray) -> 'Viewpoint':
+        """A camera pose (4, 4) without doubt, and its covariance (6, 6)."""
+        return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2))
+
+
+@dataclass(frozen=True)
+class View:
+    """A marker in one frame."""
+
+    stamp_ns: int
+    viewpoint: Viewpoint
     #: (4, 2) [px]
     corners: FloatArray
     #: (4, 2, 2) [px^2]
@@ -76,7 +90,7 @@ class Candidate:
     def add(self, view: View) -> bool:
         """Keep ``view`` if it shows the marker from a new direction; whether it did."""
         # Both branches put the centre at the same place: the direction doesn't depend on the ambiguity.
-        arm = view.T_map_camera[0, :3, :3] @ view.branches[0, :3, 3]
+        arm = view.viewpoint.T_map_camera[0, :3, :3] @ view.branches[0, :3, 3]
         direction = -arm / np.linalg.norm(arm)
         stamps = [kept.stamp_ns for kept in self.views]
         if view.stamp_ns in stamps:
@@ -96,7 +110,10 @@ class Candidate:
 
     def move(self, T_new_old: FloatArray) -> None:
         """The map moved: the views' camera poses move with it."""
-        self.views = [replace(view, T_map_camera=T_new_old @ view.T_map_camera) for view in self.views]
+        self.views = [
+            replace(view, viewpoint=replace(view.viewpoint, T_map_camera=T_new_old @ view.viewpoint.T_map_camera))
+            for view in self.views
+        ]
         self._directions = [T_new_old[:3, :3] @ direction for direction in self._directions]
 
     def place(self, camera: Camera) -> Placement:
@@ -132,7 +149,7 @@ class Candidate:
 
     def _fits(self, camera: Camera) -> list['_Fit']:
         """Fits from every branch of two views far apart, the best first."""
-        pairs = [view.T_map_camera[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
+        pairs = [view.viewpoint.T_map_camera[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
         starts = np.concatenate(pairs).reshape(-1, 4, 4)
         starts = starts[np.all(np.isfinite(starts), axis=(1, 2))]
         return sorted((_fit(start, self.size, self.views, camera) for start in starts), key=lambda fit: fit.chi2)
@@ -161,9 +178,11 @@ def _fit(start: FloatArray, size: float, views: list[View], camera: Camera) -> _
 def _choose(T: FloatArray, size: float, views: list[View], camera: Camera) -> IntArray:
     """Which of its two camera poses suits each of n views, (n,), for a marker at T."""
     n = len(views)
-    T_map_camera = np.concatenate([view.T_map_camera for view in views])
+    T_map_camera = np.concatenate([view.viewpoint.T_map_camera for view in views])
     uv, J, _ = linearise(camera, T_map_camera, np.broadcast_to(T, (2 * n, 4, 4)), np.full(2 * n, size))
-    W = _weighting([view for view in views for _ in range(2)], J, np.concatenate([view.covariances for view in views]))
+    W = _weighting(
+        [view for view in views for _ in range(2)], J, np.concatenate([view.viewpoint.covariances for view in views])
+    )
     r = W @ (np.repeat([view.corners for view in views], 2, axis=0) - uv)[..., None]
     cost = np.sum(r**2, axis=(1, 2, 3)).reshape(n, 2)
     return np.asarray(np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=1), dtype=np.int64)
@@ -171,8 +190,8 @@ def _choose(T: FloatArray, size: float, views: list[View], camera: Camera) -> In
 
 def _fit_chosen(start: FloatArray, size: float, views: list[View], chosen: IntArray, camera: Camera) -> _Fit:
     n = len(views)
-    T_map_camera = np.stack([view.T_map_camera[i] for view, i in zip(views, chosen, strict=True)])
-    camera_covariances = np.stack([view.covariances[i] for view, i in zip(views, chosen, strict=True)])
+    T_map_camera = np.stack([view.viewpoint.T_map_camera[i] for view, i in zip(views, chosen, strict=True)])
+    camera_covariances = np.stack([view.viewpoint.covariances[i] for view, i in zip(views, chosen, strict=True)])
     corners = np.stack([view.corners for view in views])
     sizes = np.full(n, size)
     _, J, _ = linearise(camera, T_map_camera, np.broadcast_to(start, (n, 4, 4)), sizes)
@@ -189,7 +208,9 @@ def _fit_chosen(start: FloatArray, size: float, views: list[View], chosen: IntAr
     J_camera, J_marker = _whitened(W, J_camera), _whitened(W, J_marker)
     noise = np.linalg.inv(np.einsum('vri,vrj->ij', J_marker, J_marker))
     gains = -noise @ np.einsum('vri,vrj->vij', J_marker, J_camera)
-    return _Fit(T, chi2, noise, correlated_sum(gains, camera_covariances))
+    common = np.stack([view.viewpoint.common for view in views])
+    from_cameras = correlated_sum(gains, camera_covariances) + correlated_sum(gains, common)
+    return _Fit(T, chi2, noise, from_cameras)
 
 
 def _weighting(views: Sequence[View], J_camera: FloatArray, camera_covariances: FloatArray) -> FloatArray:

@@ -78,6 +78,8 @@ class Location:
     T_map_camera: FloatArray
     #: (6, 6), ROS convention, of the corners' noise and of the map
     covariance: FloatArray
+    #: (6, 6) the same without the error that all markers in view share: how well it is placed among them
+    relative_covariance: FloatArray
     #: (N,) weights of the markers, 1 for one as good as the rest
     weights: FloatArray
     rms_px: float
@@ -130,15 +132,17 @@ def locate(sight: Sight, running_errors: FloatArray, camera: Camera, prior: Floa
             spread = np.outer(apart, apart)
         elif prior is None:
             rivals = np.stack([T, rival])
-            spreads = np.stack([pose_covariance(sight, covariances, weights, camera, pose) for pose in rivals])
+            spreads = np.stack([pose_covariances(sight, covariances, weights, camera, pose)[0] for pose in rivals])
             return Refusal(f'planar ambiguity of {_names(sight)} unsettled', rivals, spreads)
         elif _distance(rival, prior) < _distance(T, prior):
             T = rival
-    covariance = pose_covariance(sight, covariances, weights, camera, T) + spread
+    covariance, relative = pose_covariances(sight, covariances, weights, camera, T)
     if not np.all(np.isfinite(covariance)):
         return Refusal(f'the pose from {_names(sight)} is not determined')
     residuals = sight.corners - reproject(camera, T, points)
-    return Location(T, covariance, weights, float(np.sqrt(np.mean(np.sum(residuals**2, axis=-1)))))
+    return Location(
+        T, covariance + spread, relative + spread, weights, float(np.sqrt(np.mean(np.sum(residuals**2, axis=-1))))
+    )
 
 
 def marker_weights(errors: FloatArray, running_errors: FloatArray) -> FloatArray:
@@ -152,13 +156,14 @@ def marker_weights(errors: FloatArray, running_errors: FloatArray) -> FloatArray
     return np.asarray(np.minimum(1.0, reference / np.maximum(combined, 1e-12)))
 
 
-def pose_covariance(
+def pose_covariances(
     sight: Sight, covariances: FloatArray, weights: FloatArray, camera: Camera, T_map_camera: FloatArray
-) -> FloatArray:
+) -> tuple[FloatArray, FloatArray]:
     """Covariance (6, 6) of a camera pose that was estimated with ``weights`` and corner ``covariances`` (N, 4, 2, 2).
 
     The estimate is linear in the corners and in the map near its optimum: noise of the corners goes in as white, at
-    least as large as the residuals say; errors of the map's markers go in with unknown correlations.
+    least as large as the residuals say; errors of the map's markers go in with unknown correlations. The second
+    covariance leaves out what the best-known marker in view is uncertain by, as the error that all of them share.
     """
     n = len(sight.markers)
     T = np.broadcast_to(T_map_camera, (n, 4, 4))
@@ -169,7 +174,7 @@ def pose_covariance(
     try:
         A_inverse = np.linalg.inv(A)
     except np.linalg.LinAlgError:
-        return np.full((6, 6), np.nan)
+        return np.full((6, 6), np.nan), np.full((6, 6), np.nan)
     gains = A_inverse @ np.moveaxis(weighted, -1, -2)
     noise = np.einsum('ncir,ncrs,ncjs->ij', gains, sight.covariances, gains)
     residuals = (sight.corners - uv)[..., None]
@@ -178,7 +183,15 @@ def pose_covariance(
     )
     noise *= max(1.0, chi2 / max(8 * n - 6, 1))
     map_gains = -np.einsum('ncir,ncrj->nij', gains, J_marker.reshape(n, 4, 2, 6))
-    return np.asarray(noise + correlated_sum(map_gains, sight.map_covariances), dtype=np.float64)
+    shared = sight.map_covariances[np.argmin(np.trace(sight.map_covariances, axis1=1, axis2=2))]
+    own = positive(sight.map_covariances - shared)
+    return noise + correlated_sum(map_gains, sight.map_covariances), noise + correlated_sum(map_gains, own)
+
+
+def positive(covariances: FloatArray) -> FloatArray:
+    """The nearest covariances (..., 6, 6): negative variances become none."""
+    values, vectors = np.linalg.eigh(0.5 * (covariances + np.swapaxes(covariances, -1, -2)))
+    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2))
 
 
 def _hypotheses(sight: Sight, points: FloatArray, camera: Camera, prior: FloatArray | None) -> FloatArray:

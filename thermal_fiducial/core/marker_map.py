@@ -13,10 +13,10 @@ import numpy as np
 
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.candidates import Candidate, View
+from thermal_fiducial.core.candidates import Candidate, View, Viewpoint
 from thermal_fiducial.core.geometry import inverse, skew, so3_exp, transform, transform_from_quaternion
 from thermal_fiducial.core.keyframes import Keyframe, KeyframeStore, Link, Rig
-from thermal_fiducial.core.localization import locate, Location, Refusal, Sight
+from thermal_fiducial.core.localization import locate, Location, positive, Refusal, Sight
 from thermal_fiducial.core.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.map_refinement import prior_poses, refine, Refinement, Snapshot
 from thermal_fiducial.core.measurements import CameraPose, columns, corner_covariances, corners_px, Markers, Odometry
@@ -100,6 +100,7 @@ class MarkerMapper:
         self._quarantined = {key for key, marker in self.map.markers.items() if not marker.trusted}
         self._last: CameraPose | None = None
         self._cameras: list[Camera] = []
+        self._gap: FloatArray | None = None
         self._keyframes = KeyframeStore(self.config.keyframe_budget)
         self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(self.map.markers)
 
@@ -126,6 +127,7 @@ class MarkerMapper:
             return self._result(stamp_ns, None, location.reason, changed, waiting=waiting)
         ids = tuple(marker.id for marker, used in zip(known.markers, trusted, strict=True) if used)
         self._last = CameraPose(stamp_ns, location.T_map_camera, location.covariance, ids, location.rms_px)
+        self._gap = None
         # Step 7: errors updated.
         errors = self._update_errors(stamp_ns, known, location, camera)
         changed = self._judge(known, trusted, errors, location, camera)
@@ -133,8 +135,8 @@ class MarkerMapper:
         waiting = {}
         if not self.frozen:
             self._keep(markers, camera, self._last)
-            cameras = np.stack([location.T_map_camera] * 2), np.stack([location.covariance] * 2)
-            placed, waiting = self._place_new(stamp_ns, markers[~is_known], camera, *cameras)
+            viewpoint = _viewpoint(location)
+            placed, waiting = self._place_new(stamp_ns, markers[~is_known], camera, viewpoint)
             changed |= placed
         residuals = {marker.id: float(error) for marker, error in zip(known.markers, errors, strict=True)}
         return self._result(stamp_ns, self._last, '', changed, residuals, waiting)
@@ -194,19 +196,16 @@ class MarkerMapper:
         return bool(changes)
 
     def _place_new(
-        self, stamp_ns: int, rows: Markers, camera: Camera, T_map_camera: FloatArray, pose_covariances: FloatArray
+        self, stamp_ns: int, rows: Markers, camera: Camera, viewpoint: Viewpoint
     ) -> tuple[bool, dict[int, str]]:
-        """Show new markers to their candidates; whether any entered the map, and what the others wait for.
-
-        ``T_map_camera`` (2, 4, 4) are the poses that the camera may have, ``pose_covariances`` (2, 6, 6) theirs.
-        """
+        """Show new markers to their candidates; whether any entered the map, and what the others wait for."""
         branches = np.stack([_poses(rows, ''), _poses(rows, 'a')], axis=1)
         corners, covariances = corners_px(rows), corner_covariances(rows)
         shown = []
         for i, marker_id in enumerate(int(key) for key in rows['id']):
             size = self._sizes.get(marker_id, self.config.marker_size)
             candidate = self._candidates.setdefault(marker_id, Candidate(marker_id, size))
-            candidate.add(View(stamp_ns, T_map_camera, pose_covariances, corners[i], covariances[i], branches[i]))
+            candidate.add(View(stamp_ns, viewpoint, corners[i], covariances[i], branches[i]))
             shown.append(candidate)
         placed = False
         for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:
@@ -241,7 +240,7 @@ class MarkerMapper:
         if self.frozen or not len(rows):
             return False, {}
         if refusal.rivals is not None and refusal.covariances is not None:
-            return self._place_new(stamp_ns, rows, camera, refusal.rivals, refusal.covariances)
+            return self._place_new(stamp_ns, rows, camera, Viewpoint(refusal.rivals, refusal.covariances))
         if odometry is None or self._last is None:
             return False, {}
         if not 0 <= stamp_ns - self._last.stamp_ns <= self.config.bridge_duration * 1e9:
@@ -260,8 +259,11 @@ class MarkerMapper:
             self._keyframes.add(frame)
         elif len(rows) >= 2:
             self._keyframes.add(frame)
-        cameras = np.stack([pose.T_map_camera] * 2), np.stack([pose.covariance] * 2)
-        return self._place_new(stamp_ns, rows, camera, *cameras)
+        if self._gap is None:
+            self._gap = pose.covariance
+        # What the odometry had gathered when the gap's first marker came is the same for all its views.
+        growth = Viewpoint.known(pose.T_map_camera, positive(pose.covariance - self._gap))
+        return self._place_new(stamp_ns, rows, camera, replace(growth, common=self._gap))
 
     def _from_odometry(self, stamp_ns: int, odometry: Odometry) -> CameraPose:
         T_map_body = predict(odometry, stamp_ns)
@@ -362,6 +364,11 @@ def predict(odometry: Odometry, stamp_ns: int) -> FloatArray:
     dt = (stamp_ns - odometry.stamp_ns) * 1e-9
     step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
     return np.asarray(odometry.T_map_body @ step, dtype=np.float64)
+
+
+def _viewpoint(location: Location) -> Viewpoint:
+    known = Viewpoint.known(location.T_map_camera, location.relative_covariance)
+    return replace(known, common=positive(location.covariance - location.relative_covariance))
 
 
 def _keyframe(rows: Markers, pose: CameraPose, camera: int) -> Keyframe:

@@ -1,0 +1,50 @@
+"""The store of keyframes: bounded, spread out, moved as one."""
+
+import numpy as np
+
+from test.support.walls import flight
+from thermal_fiducial.core.geometry import so3_exp, transform
+from thermal_fiducial.core.keyframes import Keyframe, KeyframeStore, Link
+
+
+def frame(stamp, T):
+    return Keyframe(
+        stamp, T, np.array([1, 2]), np.zeros((2, 4, 2)), np.zeros((2, 4, 2, 2)), np.zeros(2, dtype=np.int64)
+    )
+
+
+def test_the_budget_is_kept_however_long_the_flight():
+    store = KeyframeStore(100)
+    for k in range(5000):
+        store.add(frame(k, flight(k / 30)))
+        assert len(store.frames) <= 100
+    assert len(store.frames) > 60
+
+
+def test_rare_views_outlive_common_ones():
+    store = KeyframeStore(50)
+    rare = transform(np.eye(3), [10.0, 0.0, 0.0])
+    store.add(frame(0, rare))
+    for k in range(1, 2000):
+        store.add(frame(k, transform(np.eye(3), [0.0, 0.0, 1e-4 * (k % 7)])))
+    assert 0 in store.frames
+
+
+def test_linked_frames_are_never_dropped():
+    store = KeyframeStore(20)
+    store.links.append(Link(3, 5, np.eye(4), np.eye(6)))
+    for k in range(500):
+        store.add(frame(k, np.eye(4)))
+    assert {3, 5} <= store.frames.keys()
+
+
+def test_frames_newer_than_the_adjustment_move_with_its_last():
+    store = KeyframeStore(10)
+    for k in range(4):
+        store.add(frame(k, transform(np.eye(3), [k, 0.0, 0.0])))
+    T = transform(so3_exp([0.0, 0.0, 0.1]), [0.5, 0.0, 0.0])
+    moved = store.move({k: T @ store.frames[k].T_map_rig for k in range(3)})
+    np.testing.assert_allclose(moved, T, atol=1e-12)
+    for k in range(4):
+        np.testing.assert_allclose(store.frames[k].T_map_rig, T @ transform(np.eye(3), [k, 0.0, 0.0]), atol=1e-12)
+    np.testing.assert_array_equal(store.move({99: T}), np.eye(4))

@@ -1,0 +1,238 @@
+"""Joint adjustment: exactness, the Schur complement, robustness, gauge, links, priors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from test.support.walls import CAMERA, flight, see, SIZE, wall
+from thermal_fiducial.core import map_refinement
+from thermal_fiducial.core.geometry import inverse, so3_exp, transform
+from thermal_fiducial.core.keyframes import Keyframe, Link, Rig
+from thermal_fiducial.core.map_data import MapMarker
+from thermal_fiducial.core.map_refinement import prior_poses, refine, Snapshot
+from thermal_fiducial.core.measurements import corner_covariances, corners_px
+from thermal_fiducial.core.reprojection import difference, retract
+
+
+def keyframe(stamp, T_map_rig, rows, camera=0):
+    ids = rows['id'].astype(np.int64)
+    return Keyframe(stamp, T_map_rig, ids, corners_px(rows), corner_covariances(rows), np.full(len(ids), camera))
+
+
+def snapshot(rng, poses, sigma=0.02, count=30, disturbance=0.01, fixed=(0,)):
+    """A flight past markers, everything but the fixed ones disturbed."""
+    frames = []
+    for k in range(count):
+        T = flight(20.0 * k / count)
+        rows = see(T, poses, sigma, rng)
+        frames.append(keyframe(k + 1, retract(T, disturbance * rng.normal(size=6)), rows))
+    markers = {
+        i: MapMarker(i, SIZE, True, T)
+        if i in fixed
+        else MapMarker(i, SIZE, False, retract(T, disturbance * rng.normal(size=6)), 1e-2 * np.eye(6))
+        for i, T in poses.items()
+    }
+    return Snapshot(markers, tuple(frames), Rig.single(CAMERA))
+
+
+def errors(refinement, poses):
+    return np.stack([difference(marker.T_map_marker, poses[i]) for i, marker in refinement.markers.items()])
+
+
+def test_noiseless_corners_give_the_exact_map():
+    poses = wall(np.random.default_rng(0))
+    refinement = refine(snapshot(np.random.default_rng(1), poses, sigma=0.0))
+    assert refinement is not None
+    assert sorted(refinement.markers) == list(range(1, 8))
+    # The rows carry corners as float32, 3e-5 px: micrometres.
+    assert np.max(np.abs(errors(refinement, poses))) < 2e-5
+    assert refinement.rms_px < 1e-4 < refinement.rms_before_px
+    for k, T in refinement.keyframes.items():
+        assert np.max(np.abs(difference(T, flight(20.0 * (k - 1) / 30)))) < 2e-5
+
+
+def test_the_schur_complement_answers_like_the_whole_system():
+    """One step, and the covariances, against the dense normal equations of all unknowns."""
+    rng = np.random.default_rng(2)
+    poses = wall(rng, 4)
+    s = snapshot(rng, poses, count=6, disturbance=1e-3)
+    s = replace(s, links=(Link(2, 5, inverse(flight(20 / 6)) @ flight(80 / 6), np.diag([1e-4] * 3 + [1e-5] * 3)),))
+    s = replace(s, priors=prior_poses({1: s.markers[1]}))
+    problem = map_refinement._Problem.build(s)
+    assert problem is not None
+    e = problem.evaluate(problem.start, 1.0)
+    F, M = len(problem.stamps), len(problem.ids)
+    H, g = np.zeros((6 * (F + M),) * 2), np.zeros(6 * (F + M))
+
+    def add(terms, r):
+        for i, J_i in terms:
+            g[6 * i : 6 * i + 6] += J_i.T @ r
+            for j, J_j in terms:
+                H[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] += J_i.T @ J_j
+
+    for v in range(len(problem.frame)):
+        w = np.sqrt(e.weights[v])
+        terms = [(problem.frame[v], w * e.J_rig[v]), (F + problem.marker[v], w * e.J_marker[v])]
+        add(terms, w * e.r[v])
+    for a, b, r, J_a, J_b in problem._linked(problem.start):
+        add([(a, J_a), (b, J_b)], r)
+    for m, r, J in problem._prior_terms(problem.start):
+        add([(F + m, J)], r)
+    free = np.repeat(np.concatenate([np.ones(F, dtype=bool), ~problem.held]), 6)
+    expected = np.zeros(6 * (F + M))
+    expected[free] = np.linalg.solve(H[np.ix_(free, free)], g[free])
+    blocks = problem._blocks(problem.start, e)
+    frames, markers = problem.equations.solve(blocks, 0.0)
+    # Two ways of solving one system of condition 1e8.
+    np.testing.assert_allclose(np.concatenate([frames.ravel(), markers.ravel()]), expected, rtol=1e-5, atol=1e-9)
+    inverse_H = np.linalg.inv(H[np.ix_(free, free)])
+    covariances = problem.equations.covariances(blocks, 1.0, np.zeros((M, 6, 6)))
+    for k, m in enumerate(np.flatnonzero(~problem.held)):
+        own = slice(6 * (F + k), 6 * (F + k) + 6)
+        np.testing.assert_allclose(covariances[m], inverse_H[own, own], rtol=1e-4, atol=1e-15)
+
+
+def test_derivatives_of_a_link_are_those_of_its_residual():
+    rng = np.random.default_rng(3)
+    poses = wall(rng, 3)
+    s = snapshot(rng, poses, count=4, disturbance=0.0)
+    T = [frame.T_map_rig for frame in s.keyframes]
+    s = replace(s, links=(Link(1, 3, inverse(T[0]) @ T[2], np.eye(6)),))
+    problem = map_refinement._Problem.build(s)
+    assert problem is not None
+    h = 1e-6
+    ((a, b, _, J_a, J_b),) = problem._linked(problem.start)
+    for index, J in ((a, J_a), (b, J_b)):
+        for axis in range(6):
+            d = np.zeros((len(T), 6))
+            d[index, axis] = h
+            e = [
+                problem._linked(replace(problem.start, T_map_rig=retract(problem.start.T_map_rig, sign * d)))[0][2]
+                for sign in (1.0, -1.0)
+            ]
+            # The residual is measured minus predicted; central differences of step 1e-6.
+            np.testing.assert_allclose(-(e[0] - e[1]) / (2 * h), J[:, axis], atol=1e-8)
+
+
+def test_outliers_do_not_move_the_map_and_are_told():
+    rng = np.random.default_rng(4)
+    poses = wall(rng)
+    s = snapshot(rng, poses)
+    frames = []
+    for k, frame in enumerate(s.keyframes):
+        corners = frame.corners.copy()
+        corners[frame.ids == 3] += 5.0 * (k % 2)
+        frames.append(replace(frame, corners=corners))
+    refinement = refine(replace(s, keyframes=tuple(frames)))
+    assert refinement is not None
+    clean = refine(s)
+    assert clean is not None
+    # Without half the views of one marker, the error grows a little; outliers of 250 sigma would be centimetres.
+    assert np.max(np.abs(errors(refinement, poses))) < 5.0 * np.max(np.abs(errors(clean, poses))) + 1e-4
+    assert refinement.outliers[3] == pytest.approx(0.5, abs=0.1)
+    assert max(share for key, share in refinement.outliers.items() if key != 3) < 0.05
+
+
+def test_optimistic_corner_covariances_are_found_out():
+    rng = np.random.default_rng(5)
+    poses = wall(rng)
+    s = snapshot(rng, poses, sigma=0.1, count=60)
+    optimistic = tuple(replace(frame, covariances=frame.covariances / 25.0) for frame in s.keyframes)
+    honest, corrected = refine(s), refine(replace(s, keyframes=optimistic))
+    assert honest is not None
+    assert corrected is not None
+    # A variance from a thousand residuals, and the views beyond 99.9 % that it leaves out.
+    assert corrected.variance_factor == pytest.approx(25.0, rel=0.1)
+    for key in honest.markers:
+        np.testing.assert_allclose(
+            np.diag(corrected.markers[key].covariance), np.diag(honest.markers[key].covariance), rtol=0.2
+        )
+
+
+def test_the_covariance_of_a_fixed_marker_enters_that_of_the_others():
+    rng = np.random.default_rng(6)
+    poses = wall(rng)
+    s = snapshot(rng, poses)
+    survey = np.diag([1e-4, 2e-4, 3e-4, 0.0, 0.0, 0.0])
+    unsure = replace(s, markers={**s.markers, 0: replace(s.markers[0], covariance=survey)})
+    sharp, blurred = refine(s), refine(unsure)
+    assert sharp is not None
+    assert blurred is not None
+    for key, marker in blurred.markers.items():
+        # A fixed marker off by some way takes the whole map along by as much.
+        np.testing.assert_allclose(marker.covariance - sharp.markers[key].covariance, survey, atol=1e-8)
+        np.testing.assert_allclose(marker.T_map_marker, sharp.markers[key].T_map_marker, atol=1e-9)
+
+
+def test_a_link_carries_the_map_over_a_gap():
+    """Two groups of markers that no frame shows together: only odometry joins them."""
+    rng = np.random.default_rng(7)
+    poses = wall(rng)
+    s = snapshot(rng, poses, count=20)
+    frames = []
+    for frame in s.keyframes:
+        group = frame.ids < 4 if frame.stamp_ns <= 10 else frame.ids >= 4
+        frames.append(replace(frame, ids=frame.ids[group], corners=frame.corners[group],
+                              covariances=frame.covariances[group], cameras=frame.cameras[group]))  # fmt: skip
+    drift = np.array([0.01, -0.02, 0.005, 0.002, -0.001, 0.003])
+    T_a, T_b = (flight(20.0 * (k - 1) / 20) for k in (10, 11))
+    covariance = np.diag([4e-4] * 3 + [1e-5] * 3)
+    link = Link(10, 11, retract(inverse(T_a) @ T_b, drift), covariance)
+    refinement = refine(replace(s, keyframes=tuple(frames), links=(link,)))
+    assert refinement is not None
+    near = [difference(refinement.markers[i].T_map_marker, poses[i]) for i in (1, 2, 3)]
+    # Ten frames of 0.02 px; the gap is no concern of theirs.
+    assert np.max(np.abs(near)) < 5e-3
+    for i in range(4, 8):
+        d = difference(refinement.markers[i].T_map_marker, poses[i])
+        # As far off as the odometry, and knowing it.
+        assert 0.005 < np.linalg.norm(d[:3]) < 0.05
+        assert d @ np.linalg.solve(refinement.markers[i].covariance, d) < 12.6
+        assert np.trace(refinement.markers[i].covariance[:3, :3]) > np.trace(covariance[:3, :3])
+
+
+def test_without_a_link_the_other_side_of_a_gap_is_left_alone():
+    rng = np.random.default_rng(8)
+    poses = wall(rng, 2)
+    s = snapshot(rng, poses, count=5)
+    lonely = [replace(f, ids=f.ids[:1], corners=f.corners[:1], covariances=f.covariances[:1], cameras=f.cameras[:1])
+              for f in s.keyframes]  # fmt: skip
+    assert refine(replace(s, keyframes=tuple(lonely))) is None
+    assert refine(replace(s, keyframes=())) is None
+
+
+def test_two_cameras_of_a_rig_are_one():
+    rng = np.random.default_rng(9)
+    poses = wall(rng)
+    T_rig_camera = np.stack([np.eye(4), transform(so3_exp([0.0, 0.1, 0.02]), [0.2, 0.01, -0.02])])
+    frames = []
+    for k in range(15):
+        T = flight(k)
+        both = [keyframe(k + 1, T, see(T @ T_rig_camera[c], poses, 0.0, rng), c) for c in range(2)]
+        frames.append(
+            Keyframe(
+                k + 1,
+                retract(T, 0.01 * rng.normal(size=6)),
+                *(
+                    np.concatenate([getattr(f, name) for f in both])
+                    for name in ('ids', 'corners', 'covariances', 'cameras')
+                ),
+            )
+        )
+    s = snapshot(rng, poses, count=1)
+    refinement = refine(replace(s, keyframes=tuple(frames), rig=Rig((CAMERA, CAMERA), T_rig_camera)))
+    assert refinement is not None
+    assert np.max(np.abs(errors(refinement, poses))) < 2e-5
+
+
+def test_known_markers_hold_on_to_what_was_known_of_them():
+    rng = np.random.default_rng(10)
+    poses = wall(rng, 3)
+    s = snapshot(rng, poses, sigma=2.0, count=3)
+    sharp = np.diag([1e-8] * 6)
+    before = {**s.markers, 1: replace(s.markers[1], T_map_marker=poses[1], covariance=sharp)}
+    held = refine(replace(s, markers=before, priors=prior_poses(before)))
+    assert held is not None
+    # Two markers are known from before: each counts half.
+    assert np.max(np.abs(difference(held.markers[1].T_map_marker, poses[1]))) < 5 * np.sqrt(2e-8)

@@ -1,0 +1,96 @@
+"""Re-projection and its derivatives; bounds of correlated errors."""
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.candidates import correlated_sum
+from thermal_fiducial.core.geometry import so3_exp, transform
+from thermal_fiducial.core.reprojection import difference, linearise, retract, shared_covariances, whitening
+
+CAMERAS = [
+    Camera(640, 512, np.array([[440.0, 0.0, 320.0], [0.0, 442.0, 250.0], [0.0, 0.0, 1.0]]), model, D)
+    for model, D in (
+        ('plumb_bob', np.array([-0.3, 0.1, 1e-3, -2e-3, 0.01])),
+        ('equidistant', np.array([-0.02, 0.016, -0.01, 0.002])),
+    )
+]
+
+
+def some_views(rng, n=5):
+    T_map_camera = transform(so3_exp(0.2 * rng.normal(size=(n, 3))), 0.3 * rng.normal(size=(n, 3)))
+    away = transform(so3_exp(np.array([np.pi, 0.0, 0.0]) + 0.4 * rng.normal(size=(n, 3))), [0.0, 0.0, 2.0])
+    return T_map_camera, T_map_camera @ away, rng.uniform(0.1, 0.4, n)
+
+
+@pytest.mark.parametrize('camera', CAMERAS, ids=lambda camera: camera.model)
+def test_derivatives_are_those_of_the_pixels(camera):
+    rng = np.random.default_rng(0)
+    T_map_camera, T_map_marker, sizes = some_views(rng)
+    _, J_camera, J_marker = linearise(camera, T_map_camera, T_map_marker, sizes)
+    h = 1e-6
+    for axis in range(6):
+        d = np.zeros(6)
+        d[axis] = h
+        for which, J in ((0, J_camera), (1, J_marker)):
+            plus, minus = (
+                linearise(
+                    camera,
+                    retract(T_map_camera, sign * d) if which == 0 else T_map_camera,
+                    retract(T_map_marker, sign * d) if which == 1 else T_map_marker,
+                    sizes,
+                )[0]
+                for sign in (1.0, -1.0)
+            )
+            numeric = ((plus - minus) / (2 * h)).reshape(-1, 8)
+            # Central differences of step 1e-6 of values of hundreds: round-off 1e-4 px per unit, curvature below it.
+            np.testing.assert_allclose(J[..., axis], numeric, rtol=1e-5, atol=2e-3)
+
+
+def test_difference_undoes_retract():
+    rng = np.random.default_rng(1)
+    T = transform(so3_exp(rng.normal(size=(20, 3))), rng.normal(size=(20, 3)))
+    d = np.clip(rng.normal(size=(20, 6)), -1.7, 1.7)  # rotations below pi
+    np.testing.assert_allclose(difference(retract(T, d), T), d, atol=1e-12)
+
+
+def test_whitening_makes_the_covariance_a_unit():
+    rng = np.random.default_rng(2)
+    A = rng.normal(size=(7, 4, 2, 2))
+    C = A @ np.swapaxes(A, -1, -2) + 0.1 * np.eye(2)
+    W = whitening(C)
+    np.testing.assert_allclose(W @ C @ np.swapaxes(W, -1, -2), np.broadcast_to(np.eye(2), C.shape), atol=1e-12)
+
+
+def test_shared_errors_count_once_however_many_corners_show_them():
+    """The information of the four corners together is no more than what the shared error leaves."""
+    J = np.tile(np.eye(2, 6), (1, 4, 1)).reshape(1, 8, 6)
+    C = np.diag([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])[None]
+    shared = shared_covariances(J, C)
+    information = np.sum(np.linalg.inv(shared[0]), axis=0)
+    np.testing.assert_allclose(np.linalg.inv(information), np.eye(2), atol=1e-12)
+
+
+@pytest.mark.parametrize('correlation', [-0.9, 0.0, 0.5, 1.0])
+def test_the_bound_holds_for_any_correlation(correlation):
+    rng = np.random.default_rng(3)
+    gains = rng.normal(size=(3, 6, 6))
+    A = rng.normal(size=(3, 6, 6))
+    C = A @ np.swapaxes(A, -1, -2)
+    roots = np.linalg.cholesky(C)
+    bound = correlated_sum(gains, C)
+    joint = np.zeros((6, 6))
+    for i in range(3):
+        for j in range(3):
+            # Cross-covariances of this correlation; three errors of -0.9 to each other cannot be, -0.45 can.
+            rho = 1.0 if i == j else max(correlation, -0.45)
+            joint += rho * gains[i] @ roots[i] @ roots[j].T @ gains[j].T
+    assert np.linalg.eigvalsh(bound - joint)[0] > -1e-9 * np.trace(bound)
+
+
+def test_the_bound_of_one_error_is_its_covariance():
+    rng = np.random.default_rng(4)
+    G, A = rng.normal(size=(2, 1, 6, 6))
+    C = A @ np.swapaxes(A, -1, -2)
+    np.testing.assert_allclose(correlated_sum(G, C), G[0] @ C[0] @ G[0].T)
+    assert not np.any(correlated_sum(G, 0 * C))
