@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from rclpy.executors import SingleThreadedExecutor
 from support import small_bag
 
 from thermal_fiducial.cli.main import main
@@ -14,6 +15,7 @@ from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPI
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.trajectory import load_tum, tum_line
+from thermal_fiducial.replay import lockstep
 from thermal_fiducial.ros import convert
 
 pytestmark = pytest.mark.ros
@@ -74,21 +76,31 @@ def test_the_run_folder_is_complete(run):
     assert summary['frames_with_markers'] == 90
     lines = (run / 'detections.csv').read_text().splitlines()
     assert lines[0] == 'stamp_ns,id,u0,v0,u1,v1,u2,v2,u3,v3,sigma_px'
-    assert len(lines) == 1 + 4 * 90
+    # All four, but where a guided search looked only for what was in the map as yet.
+    assert 0.9 * 4 * 90 < len(lines) - 1 <= 4 * 90
     with BagReader(run / 'output') as bag:
         assert bag.message_count(['pose']) == len((run / 'fused.tum').read_text().splitlines())
         assert bag.message_count(['diagnostics']) == 4 * 3  # four nodes; two whole seconds and the end
 
 
+def assert_same_files(one, other):
+    files = sorted(path.relative_to(one) for path in one.rglob('*') if path.is_file())
+    assert len(files) >= 8
+    assert files == sorted(path.relative_to(other) for path in other.rglob('*') if path.is_file())
+    for file in files:
+        assert (one / file).read_bytes() == (other / file).read_bytes(), file
+
+
 def test_two_replays_give_the_same_bytes(run, folder):
     assert replay(folder / 'bag', folder / 'again', folder) == 0
-    files = sorted(path.relative_to(run) for path in run.rglob('*') if path.is_file())
-    assert len(files) >= 8
-    assert files == sorted(
-        path.relative_to(folder / 'again') for path in (folder / 'again').rglob('*') if path.is_file()
-    )
-    for file in files:
-        assert (run / file).read_bytes() == (folder / 'again' / file).read_bytes(), file
+    assert_same_files(run, folder / 'again')
+
+
+def test_the_executor_does_not_matter(run, folder, monkeypatch):
+    # Where rclpy has no EventsExecutor: another order of callbacks, the same results.
+    monkeypatch.setattr(lockstep, 'make_executor', lambda context: SingleThreadedExecutor(context=context))
+    assert replay(folder / 'bag', folder / 'single', folder) == 0
+    assert_same_files(run, folder / 'single')
 
 
 def test_lockstep_equals_the_pipeline(run, folder):
