@@ -121,7 +121,8 @@ class Flight:
 
 def config(**changes) -> PoseEkfConfig:
     """The shipped parameters with the camera of these flights."""
-    return PoseEkfConfig(camera_position=CAMERA_POSITION, camera_orientation=CAMERA_ORIENTATION, **changes)
+    camera = {'camera_position': CAMERA_POSITION, 'camera_orientation': CAMERA_ORIENTATION}
+    return PoseEkfConfig(**(camera | changes))
 
 
 def matched(**changes) -> PoseEkfConfig:

@@ -13,7 +13,7 @@ from thermal_fiducial.core.initialisation import blank_state
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.navigation_state import inject, Layout
 
-FULL = config(estimate_extrinsics=True)
+FULL = config(estimate_extrinsics=True, pose_noise_scale=1.0)
 LAYOUT = Layout.of(FULL)
 STEP = ImuStep(np.array([0.8, -1.5, 2.0, 3.0, -1.0, 9.0]), 0.005, 1.7e-4, 2.0e-3)
 

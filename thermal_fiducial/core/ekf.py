@@ -6,16 +6,19 @@ they came: a pose that comes late goes where it belongs, and everything after it
 
 from bisect import bisect_left, insort
 from dataclasses import dataclass
+import math
 
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.gating import Belief, PoseGate, PoseUpdate, position_std
+from thermal_fiducial.core.coasting import usable_seconds
+from thermal_fiducial.core.gating import Belief, PoseGate, PoseUpdate, position_std, Track
 from thermal_fiducial.core.imu import ImuStep, NoiseMonitor
 from thermal_fiducial.core.imu_input import ImuInput, Verdict
 from thermal_fiducial.core.initialisation import WINDOW_SECONDS
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, in_moved_map, Odometry
 from thermal_fiducial.core.navigation_state import NavigationState
+from thermal_fiducial.core.smoothing import SmoothOutput
 from thermal_fiducial.core.state_output import odometry
 from thermal_fiducial.core.types import FloatArray
 
@@ -60,7 +63,10 @@ class PoseEkf:
         self.decided: dict[int, PoseUpdate] = {}
         self._accepted = self._refused = 0
         self._imu_fault = ''
-        self._last_word = ''
+        seconds = self._config.smoothing_time
+        self._smoother = SmoothOutput(seconds) if seconds > 0.0 else None
+        #: the latest odometry without steps; None unless ``smoothing_time`` asks for it
+        self.smooth: Odometry | None = None
 
     # --- input ----------------------------------------------------------------------------------------
 
@@ -76,7 +82,7 @@ class PoseEkf:
         self._imu_fault = verdict.value
         if verdict is Verdict.RESTART:
             self._begin()
-            self._last_word = verdict.value
+            self._imu_fault = verdict.value
         elif verdict is not Verdict.USE:
             return None
         imu = np.concatenate((sample.angular_velocity, sample.linear_acceleration))
@@ -89,7 +95,9 @@ class PoseEkf:
         self._nodes.append(node)
         self._advance(len(self._nodes) - 1)
         self._prune()
-        return self._output(node)
+        output = self._output(node)
+        self.smooth = self._smoother.follow(output) if self._smoother and output else None
+        return output
 
     def add_pose(self, pose: CameraPose) -> PoseUpdate:
         """Correct by a camera pose at its own instant, now or as soon as the IMU samples of that instant are there.
@@ -104,8 +112,6 @@ class PoseEkf:
                 self._advance(index)
             waiting = PoseUpdate(pose.stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
             update = self.decided.get(pose.stamp_ns, waiting)
-        if not update.pending:
-            self._last_word = update.reason
         return update
 
     def move_map(self, T_new_old: FloatArray) -> None:
@@ -184,7 +190,6 @@ class PoseEkf:
             self._accepted += update.accepted
             self._refused += not update.accepted
         self.decided[update.stamp_ns] = update
-        self._last_word = update.reason
 
     def _prune(self) -> None:
         """Forget what no pose may reach any more; in blocks, as deleting from a list's head moves the rest."""
@@ -228,13 +233,30 @@ class PoseEkf:
         uncertainty = position_std(belief.main.state)
         if uncertainty > self._config.lost_position_std:
             return f'lost: position known to {uncertainty:.2f} m'
-        coasting = (self._nodes[-1].stamp_ns - belief.main.accepted_ns) / _SECOND_NS
+        coasting = self._coasting(belief.main)
         return f'coasting for {coasting:.1f} s' if coasting > 0.5 else 'tracking'
+
+    def _coasting(self, track: Track) -> float:
+        return (self._nodes[-1].stamp_ns - track.accepted_ns) / _SECOND_NS
+
+    def _time_offset_std(self, state: NavigationState) -> float:
+        """Of the estimate; before it is begun, and where there is none, what the parameter says [s]."""
+        place = self._gate.layout.time_offset
+        if place is None or not state.clock_open:
+            return self._config.time_offset_std
+        return math.sqrt(state.covariance[place, place])
 
     @property
     def lost(self) -> bool:
         """Whether there is no pose, or none as good as ``lost_position_std`` asks."""
         return self.state is None or position_std(self.state) > self._config.lost_position_std
+
+    @property
+    def usable_for(self) -> float:
+        """Seconds [s] for which the pose stays as good as ``lost_position_std`` asks, if no marker comes any more."""
+        if self.state is None:
+            return 0.0
+        return usable_seconds(self.state, self._gate.layout, self._config.imu, self._config.lost_position_std)
 
     def diagnostics(self) -> dict[str, float]:
         """How the filter is, in numbers (SI units)."""
@@ -249,9 +271,14 @@ class PoseEkf:
             belief = self._nodes[-1].belief
             assert belief.main
             numbers |= {
-                'seconds since accepted pose': (self._nodes[-1].stamp_ns - belief.main.accepted_ns) / _SECOND_NS,
+                'seconds since accepted pose': self._coasting(belief.main),
                 'starts afresh': float(belief.resets),
                 'position std': position_std(self.state),
+                'usable for': self.usable_for,
                 'time offset': self._config.camera_time_offset + self.state.time_offset,
+                'time offset std': self._time_offset_std(self.state),
+                'gyroscope bias': float(np.linalg.norm(self.state.bias[:3])),
+                'accelerometer bias': float(np.linalg.norm(self.state.bias[3:])),
+                'map tilt': math.asin(float(np.hypot(*self.state.gravity[:2])) / self._config.gravity),
             }
         return numbers

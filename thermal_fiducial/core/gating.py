@@ -71,7 +71,8 @@ class PoseGate:
     def __init__(self, config: PoseEkfConfig) -> None:
         self._config = config
         self._filter = ErrorStateFilter(config)
-        self.blank = blank_state(config, self._filter.layout)
+        self.layout = self._filter.layout
+        self.blank = blank_state(config, self.layout)
 
     def predict(self, belief: Belief, step: ImuStep) -> Belief:
         """Belief after an inertial step."""

@@ -12,8 +12,8 @@ from thermal_fiducial.core.types import FloatArray
 SMALL_ANGLE = 1e-2
 #: A step longer than this [s] is a gap: what happened in it isn't known from the samples at its ends.
 GAP = 0.03
-#: Standard deviation of rate [rad/s] and specific force [m/s^2] in a gap or under saturation.
-UNKNOWN_RATE, UNKNOWN_FORCE = 0.5, 3.0
+#: Standard deviation of rate [rad/s] and specific force [m/s^2] in a gap; of a saturated sample, hit or fault.
+UNKNOWN_RATE, UNKNOWN_FORCE, SATURATED_FORCE = 0.5, 3.0, 150.0
 #: Time constant of the running vibration level [s].
 VIBRATION_TIME = 0.3
 
@@ -85,7 +85,8 @@ class Transition:
         self.F = np.eye(size)
         self.Q = np.zeros((size, size))
         self._walk = random_walks**2
-        self._diagonal = np.arange(size)
+        self._walk_part = np.einsum('ii->i', self.Q)[9:]
+        self._white = np.zeros(6)
         self._local = np.zeros((9, 15))
         self._local[:9, :9] = np.eye(9)
 
@@ -120,9 +121,9 @@ class Transition:
     def _fill_noise(self, jacobian: FloatArray, step: ImuStep) -> None:
         """White noise of a sample acts like a bias over the step; its variance is density^2 / dt."""
         dt = step.seconds
-        scaled = jacobian * np.repeat((step.gyroscope_density**2 / dt, step.accelerometer_density**2 / dt), 3)
-        self.Q[:9, :9] = scaled @ jacobian.T
-        self.Q[self._diagonal[9:], self._diagonal[9:]] = self._walk[9:] * dt
+        self._white[:3], self._white[3:] = step.gyroscope_density**2 / dt, step.accelerometer_density**2 / dt
+        self.Q[:9, :9] = (jacobian * self._white) @ jacobian.T
+        self._walk_part[:] = self._walk[9:] * dt
 
 
 def _skews(a: list[float], dv: list[float], dp: list[float]) -> FloatArray:
@@ -154,12 +155,13 @@ class NoiseMonitor:
         self._noise = noise
         self._recent: list[FloatArray] = []
         self._variance = np.zeros(2)
+        self._beyond = (False, False)
 
     @property
     def vibration(self) -> tuple[float, float]:
         """Running sample-to-sample standard deviations [rad/s, m/s^2], rms over the axes."""
-        rate, force = np.sqrt(self._variance)
-        return float(rate), float(force)
+        rate, force = self._variance.tolist()
+        return math.sqrt(rate), math.sqrt(force)
 
     def densities(self, imu: FloatArray, seconds: float) -> tuple[float, float]:
         """Gyroscope and accelerometer density for the step of ``seconds`` that ends with sample ``imu`` (6,)."""
@@ -167,14 +169,26 @@ class NoiseMonitor:
         rate, force = self._noise.gyroscope_noise_density, self._noise.accelerometer_noise_density
         if self._noise.vibration > 0.0:
             share = self._noise.vibration * math.sqrt(min(seconds, GAP))
-            rate, force = max(rate, share * self.vibration[0]), max(force, share * self.vibration[1])
+            shaken_rate, shaken_force = self.vibration
+            rate, force = max(rate, share * shaken_rate), max(force, share * shaken_force)
         unknown = math.sqrt(seconds)
-        peak = np.abs(imu)
-        if seconds > GAP or peak[:3].max() >= self._noise.gyroscope_range:
+        rate_lost, force_lost = self._saturated(imu.tolist())
+        if seconds > GAP or rate_lost:
             rate = max(rate, UNKNOWN_RATE * unknown)
-        if seconds > GAP or peak[3:].max() >= self._noise.accelerometer_range:
-            force = max(force, UNKNOWN_FORCE * unknown * (1.0 if seconds > GAP else 10.0))
+        if seconds > GAP:
+            force = max(force, UNKNOWN_FORCE * unknown)
+        if force_lost:
+            force = max(force, SATURATED_FORCE * unknown)
         return rate, force
+
+    def _saturated(self, imu: list[float]) -> tuple[bool, bool]:
+        """Whether rate and force are beyond their ranges at either end of the step."""
+        before = self._beyond
+        self._beyond = (
+            max(map(abs, imu[:3])) >= self._noise.gyroscope_range,
+            max(map(abs, imu[3:])) >= self._noise.accelerometer_range,
+        )
+        return before[0] or self._beyond[0], before[1] or self._beyond[1]
 
     def _watch(self, imu: FloatArray, seconds: float) -> None:
         if seconds > GAP:
@@ -185,6 +199,6 @@ class NoiseMonitor:
         first, second, third = self._recent
         difference = first - 2.0 * second + third
         # White noise of variance s^2 has second differences of variance 6 s^2.
-        variance = (difference * difference).reshape(2, 3).mean(axis=1) / 6.0
+        variance = (difference * difference).reshape(2, 3).sum(axis=1) / 18.0
         self._variance += min(seconds / VIBRATION_TIME, 1.0) * (variance - self._variance)
         del self._recent[0]

@@ -1,0 +1,92 @@
+"""Whether the filter's covariance is the truth about its errors, and that a fault in it shows.
+
+The mean of N chi-square variables lies in a known band at each instant over the runs. The instants of a run are
+correlated, so that a sound filter may well be outside of a 95 % band for a second: the band here is that of 99 %.
+"""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from support.flights import config, Flight, matched, state_error, timeline
+
+from thermal_fiducial.core.ekf import PoseEkf
+from thermal_fiducial.core.measurements import ImuSample
+
+RUNS = 50
+SECONDS = 4.0
+#: Every so many IMU samples the error is weighed, after the first second.
+STRIDE, FIRST = 20, 200
+
+
+def consistency(configuration, runs):
+    """Normalised squared errors (runs, instants) of state and innovations."""
+    nees, nis = [], []
+    for seed in range(runs):
+        data = Flight(seed=seed, seconds=SECONDS)
+        ekf, row, count = PoseEkf(configuration), [], 0
+        for item in timeline(data.samples(), data.poses):
+            if not isinstance(item, ImuSample):
+                ekf.add_pose(item)
+                continue
+            ekf.add_imu(item)
+            if count % STRIDE == 0 and count >= FIRST:
+                row.append(squared_error(data, ekf.state, count))
+            count += 1
+        nees.append(row)
+        last = [ekf.decided[pose.stamp_ns].nis for pose in data.poses if pose.stamp_ns in ekf.decided]
+        nis.append(last[-60:])
+    return np.array(nees), np.array(nis)
+
+
+def squared_error(data, state, index):
+    if state is None:
+        return np.inf
+    error = state_error(data, state, data.t[index], index)
+    return error @ np.linalg.solve(state.covariance[:15, :15], error)
+
+
+def band(freedom, runs):
+    return chi2.ppf([0.005, 0.995], freedom * runs) / runs
+
+
+def share_inside(values, freedom):
+    low, high = band(freedom, len(values))
+    mean = values.mean(axis=0)
+    return float(np.mean((low < mean) & (mean < high)))
+
+
+@pytest.fixture(scope='module')
+def exact():
+    return consistency(matched(), RUNS)
+
+
+@pytest.mark.slow
+def test_errors_are_what_the_covariance_says(exact):
+    nees, _ = exact
+    assert share_inside(nees, 15) >= 0.9
+
+
+@pytest.mark.slow
+def test_innovations_are_what_the_covariance_says(exact):
+    _, nis = exact
+    assert share_inside(nis, 6) >= 0.9
+
+
+@pytest.mark.slow
+def test_shipped_parameters_are_conservative():
+    nees, nis = consistency(config(), 8)
+    assert nees.mean() <= band(15, 8)[1]
+    assert nis.mean() <= band(6, 8)[1]
+
+
+FAULTS = {
+    'extrinsics transposed': {'camera_orientation': (0.5, -0.5, 0.5, 0.5)},
+    'gravity upward': {'gravity': -9.80665},
+}
+
+
+@pytest.mark.parametrize('fault', FAULTS)
+def test_a_fault_shows_in_the_consistency(fault):
+    """Negative control: the very bound that the sound filter keeps is broken, if it starts at all."""
+    nees, _ = consistency(matched(**FAULTS[fault]), 2)
+    assert np.median(nees) > band(15, 2)[1]

@@ -1,0 +1,49 @@
+"""Fifty simulated maps: the errors of the markers are what their covariances say."""
+
+import numpy as np
+import pytest
+
+from test.support.walls import CAMERA, flight, see, SIZE, wall
+from thermal_fiducial.core.keyframes import Keyframe, Rig
+from thermal_fiducial.core.map_data import MapMarker
+from thermal_fiducial.core.map_refinement import refine, Snapshot
+from thermal_fiducial.core.measurements import corner_covariances, corners_px
+from thermal_fiducial.core.reprojection import difference, retract
+
+RUNS = 50
+
+
+def one_map(seed):
+    """NEES of each of the seven free markers of one simulated map."""
+    rng = np.random.default_rng(seed)
+    poses = wall(rng)
+    sigma, phase = rng.choice([0.02, 0.1]), rng.uniform(0.0, 20.0)
+    frames = []
+    for k in range(25):
+        T = flight(phase + 0.8 * k)
+        rows = see(T, poses, sigma, rng)
+        ids = rows['id'].astype(np.int64)
+        start = retract(T, 0.01 * rng.normal(size=6))
+        frames.append(
+            Keyframe(k, start, ids, corners_px(rows), corner_covariances(rows), np.zeros(len(ids), dtype=np.int64))
+        )
+    markers = {
+        i: MapMarker(i, SIZE, i == 0, T if i == 0 else retract(T, 0.01 * rng.normal(size=6)), (i > 0) * np.eye(6))
+        for i, T in poses.items()
+    }
+    refinement = refine(Snapshot(markers, tuple(frames), Rig.single(CAMERA)))
+    nees = []
+    for i in range(1, 8):
+        d = difference(poses[i], refinement.markers[i].T_map_marker)
+        nees.append(d @ np.linalg.solve(refinement.markers[i].covariance, d))
+    return nees
+
+
+@pytest.mark.slow
+def test_nees_of_marker_poses_is_inside_the_95_percent_band():
+    nees = np.array([one_map(seed) for seed in range(RUNS)])
+    # Mean of 50 chi squares of six degrees of freedom: 95 % between 5.1 and 7.0 (C. Bar-Shalom et al., 2001, section
+    # 5.4). The seven markers of a map share most of their error, so they are judged as one.
+    assert 5.1 < nees.mean() < 7.0
+    # And each marker by itself at 99.9 %.
+    assert np.all((nees.mean(axis=0) > 4.5) & (nees.mean(axis=0) < 7.7))

@@ -1,0 +1,51 @@
+"""For how long the pose may be used when no marker comes any more."""
+
+import numpy as np
+from numpy.polynomial import polynomial
+
+from thermal_fiducial.config import ImuNoise
+from thermal_fiducial.core.geometry import skew
+from thermal_fiducial.core.navigation_state import (
+    ACCELEROMETER_BIAS,
+    GYROSCOPE_BIAS,
+    Layout,
+    NavigationState,
+    POSITION,
+    ROTATION,
+    VELOCITY,
+)
+from thermal_fiducial.core.types import FloatArray
+
+#: Farther than this [s] nobody needs to look ahead, and in this grid.
+HORIZON, STEP = 60.0, 0.05
+
+
+def usable_seconds(state: NavigationState, layout: Layout, noise: ImuNoise, position_std: float) -> float:
+    """Seconds [s] on the IMU alone until the position is worse than ``position_std`` [m]; at most ``HORIZON``."""
+    times = np.arange(0.0, HORIZON + STEP, STEP)
+    beyond = polynomial.polyval(times, coasting_variance(state, layout, noise)) > position_std**2
+    return float(times[np.argmax(beyond)]) if beyond.any() else HORIZON
+
+
+def coasting_variance(state: NavigationState, layout: Layout, noise: ImuNoise) -> FloatArray:
+    """Sum of the position variances [m^2] after t seconds of hover, coefficients of t^0 .. t^6.
+
+    The error is rho + nu t + alpha t^2 / 2 + beta t^3 / 6 + noise, with alpha the acceleration that tilt and
+    accelerometer bias feign, and beta its growth by the gyroscope bias that is left.
+    """
+    lift = skew(-state.gravity @ state.R_map_body)
+    n = layout.size
+    rho, nu, alpha, beta = (np.zeros((3, n)) for _ in range(4))
+    rho[:, POSITION] = nu[:, VELOCITY] = np.eye(3)
+    alpha[:, ROTATION], alpha[:, ACCELEROMETER_BIAS], beta[:, GYROSCOPE_BIAS] = -lift, -np.eye(3), lift
+    if layout.gravity:
+        alpha[:, layout.gravity] = state.R_map_body[:2].T
+    terms = (rho, nu, alpha / 2.0, beta / 6.0)
+    coefficients = np.zeros(7)
+    for i, left in enumerate(terms):
+        for j, right in enumerate(terms):
+            coefficients[i + j] += np.einsum('ik,kl,il', left, state.covariance, right)
+    # White accelerations on three axes, each sigma^2 t^3 / 3, and the tilt that white rates make of two.
+    coefficients[3] += noise.accelerometer_noise_density**2
+    coefficients[5] += 2.0 * noise.gyroscope_noise_density**2 * float(state.gravity @ state.gravity) / 20.0
+    return coefficients
