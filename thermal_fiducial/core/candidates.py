@@ -45,6 +45,11 @@ class Viewpoint:
     #: (6, 6) error that all views share (of odometry over a gap): it moves the marker, but no view against another
     common: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
+    @property
+    def poses(self) -> FloatArray:
+        """The one or two (k, 4, 4) different poses."""
+        return self.T_map_camera if np.any(self.T_map_camera[0] != self.T_map_camera[1]) else self.T_map_camera[:1]
+
     @classmethod
     def known(cls, T_map_camera: FloatArray, covariance: FloatArray) -> 'Viewpoint':
         """A camera pose (4, 4) without doubt, and its covariance (6, 6)."""
@@ -149,8 +154,8 @@ class Candidate:
 
     def _fits(self, camera: Camera) -> list['_Fit']:
         """Fits from every branch of two views far apart, the best first."""
-        pairs = [view.viewpoint.T_map_camera[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
-        starts = np.concatenate(pairs).reshape(-1, 4, 4)
+        pairs = [view.viewpoint.poses[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
+        starts = np.concatenate([pair.reshape(-1, 4, 4) for pair in pairs])
         starts = starts[np.all(np.isfinite(starts), axis=(1, 2))]
         return sorted((_fit(start, self.size, self.views, camera) for start in starts), key=lambda fit: fit.chi2)
 
@@ -178,6 +183,8 @@ def _fit(start: FloatArray, size: float, views: list[View], camera: Camera) -> _
 def _choose(T: FloatArray, size: float, views: list[View], camera: Camera) -> IntArray:
     """Which of its two camera poses suits each of n views, (n,), for a marker at T."""
     n = len(views)
+    if all(len(view.viewpoint.poses) == 1 for view in views):
+        return np.zeros(n, dtype=np.int64)
     T_map_camera = np.concatenate([view.viewpoint.T_map_camera for view in views])
     uv, J, _ = linearise(camera, T_map_camera, np.broadcast_to(T, (2 * n, 4, 4)), np.full(2 * n, size))
     W = _weighting(

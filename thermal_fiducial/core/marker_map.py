@@ -32,6 +32,8 @@ CONTINUITY_NS = 300_000_000
 TOLERANCE_PX = 0.3
 #: Candidates that are judged in one frame: bounds its time when many are new.
 TRIALS = 3
+# A candidate is judged again when its views have grown by one in so many.
+_PATIENCE = 6
 # A refinement is worth its time when there are these many keyframes more than at the last one.
 _GROWTH, _FEW = 1.2, 15
 
@@ -209,7 +211,7 @@ class MarkerMapper:
             shown.append(candidate)
         placed = False
         for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:
-            if not candidate.untried:
+            if candidate.untried <= len(candidate.views) // _PATIENCE:
                 continue
             placement = candidate.place(camera)
             candidate.reason = placement.reason
