@@ -12,7 +12,7 @@ import numpy as np
 
 from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.bad_pixels import BadPixelFiller, BadPixelFinder, pixel_noise
-from thermal_fiducial.core.types import Counts, Gray, IntArray
+from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 from thermal_fiducial.errors import InputError
 
 FROZEN = 'frozen'
@@ -162,8 +162,8 @@ class _FreezeDetector:
     TORN_8_BIT = 0.999
 
     def __init__(self) -> None:
-        # Two, because a double-buffered driver that gets nothing new may send its two frames in turn.
-        self._recent: deque[Counts] = deque(maxlen=2)
+        # As many as a driver has buffers: one that gets nothing new may send them in turn.
+        self._recent: deque[Counts] = deque(maxlen=4)
 
     def repeats(self, image: Counts, *, coarse: bool) -> bool:
         sample = image[:: self.ROW_STEP].copy()
@@ -224,15 +224,16 @@ def _structure(image: Counts) -> float:
 class EightBitView:
     """Counts as an 8-bit picture whose scale follows the scene slowly.
 
-    The scale runs between two percentiles of a sub-sample, smoothed over frames: an object that enters or leaves
-    doesn't make the rest of the picture pump.
+    The scale runs between two percentiles of a sub-sample, smoothed over frames, and in a frame moves by no more than a
+    small share of its span: an object that enters or leaves doesn't make the rest of the picture pump. Only when
+    nothing of the scene is on the scale any more does it jump there.
     """
 
     STEP = 8
 
     def __init__(self, config: Tau2CameraConfig) -> None:
         self.config = config
-        self._range: tuple[float, float] | None = None
+        self._range: FloatArray | None = None
 
     def __call__(self, counts: Counts) -> Gray:
         """Picture (height, width) uint8 of ``counts`` (height, width)."""
@@ -248,9 +249,11 @@ class EightBitView:
         share = self.config.view_tail_percent / 100.0
         ranks = (int(share * (sample.size - 1)), int((1.0 - share) * (sample.size - 1)))
         part = np.partition(sample, ranks)
-        now = float(part[ranks[0]]), float(part[ranks[1]])
-        if self._range is not None:
-            a = self.config.view_smoothing
-            now = tuple((1.0 - a) * old + a * new for old, new in zip(self._range, now, strict=True))  # type: ignore[assignment]
-        self._range = now
-        return now
+        now = np.array([part[ranks[0]], part[ranks[1]]], np.float64)
+        if self._range is None or now[0] > self._range[1] or now[1] < self._range[0]:
+            self._range = now
+        else:
+            # Relative to the span, or an object a hundred times hotter than the markers would black them out at once.
+            most = max(float(self._range[1] - self._range[0]), self.config.view_minimum_span)
+            self._range = self._range + self.config.view_smoothing * np.clip(now - self._range, -most, most)
+        return float(self._range[0]), float(self._range[1])
