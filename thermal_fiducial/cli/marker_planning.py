@@ -28,7 +28,7 @@ _FADE_SECONDS = (0.0, 30.0, 60.0, 120.0, 300.0, 900.0, 3600.0)
 _STAND_OFFS_MM = (0.0, 0.5, 2.0, 5.0, 10.0, 20.0)
 # Sides [px] from the least that any detector reads to a marker that fills the image; contrasts in NETD.
 _SIDES_PX = (10.0, 14.0, 20.0, 28.0, 40.0, 60.0, 100.0, 160.0)
-_CONTRASTS = (1.0, 2.0, 3.0, 4.0, 8.0, 20.0, 80.0, 300.0)
+_CONTRASTS = (1.0, 2.0, 4.0, 8.0, 20.0, 80.0, 300.0)
 _TILTS_DEG = (0.0, 30.0, 50.0, 65.0, 75.0)
 
 
@@ -172,7 +172,7 @@ def add_measure(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``markers measure``."""
     parser.set_defaults(do=_measure)
     parser.add_argument('out', type=Path, help='file to write (YAML)')
-    parser.add_argument('--markers', type=int, default=24, help='markers to show for every side, contrast and tilt')
+    parser.add_argument('--markers', type=int, default=16, help='markers to show for every side, contrast and tilt')
     parser.add_argument('--seed', type=int, default=1, help='of the rendering')
 
 
