@@ -12,11 +12,14 @@ from std_srvs.srv import Trigger
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.ekf import PoseEkf
+from thermal_fiducial.core.geometry import transform_from_quaternion
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.bridge import FlightControllerBridge
 from thermal_fiducial.ros.node import ERROR, OK, StageNode, WARN
 from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.transforms import TransformBroadcaster
 
 _PATH_STEP_NS = 200_000_000
 _PATH_LENGTH = 3000
@@ -32,14 +35,25 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.filter = PoseEkf(self.config)
         self._path: deque[tuple[int, Pose]] = deque(maxlen=_PATH_LENGTH)
         self._last_refusal = ''
+        #: how often the pose has jumped: fresh starts and corrections of the map
+        self._jumps = 0
         self._corrections: deque[tuple[int, FloatArray]] = deque(maxlen=_CORRECTIONS)
         self._pose = self.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
         self._odometry = self.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
         self._path_output = self.advertise(Path, 'path')
+        if self.config.smoothing_time > 0.0:
+            self._smooth_odometry = self.advertise(OdometryMessage, 'odometry_smooth', qos.IMU_RATE_RESULT)
+        self._bridge = FlightControllerBridge(self, self.config, self.fault)
+        self._transforms = self._make_transforms() if self.config.publish_tf else None
         self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
         self.subscribe(TransformStamped, 'map_correction', self._on_map_correction, qos.RESULT)
         self.create_service(Trigger, '~/reset', self._on_reset)
+
+    def _make_transforms(self) -> TransformBroadcaster:
+        config = self.config
+        T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
+        return TransformBroadcaster(self, config.base_frame, config.camera_frame, T_body_camera, self.fault)
 
     def _on_imu(self, message: Imu) -> None:
         odometry = self.filter.add_imu(convert.imu_sample(message))
@@ -47,18 +61,28 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
             return
         head = convert.header(odometry.stamp_ns, self.config.map_frame)
         result = convert.odometry_message(odometry, head, self.config.base_frame)
+        pose = PoseWithCovarianceStamped(header=head, pose=result.pose)
         self._odometry.send(result)
-        self._pose.send(PoseWithCovarianceStamped(header=head, pose=result.pose))
+        self._pose.send(pose)
+        smooth = self.filter.smooth
+        if smooth is not None:
+            self._smooth_odometry.send(convert.odometry_message(smooth, head, self.config.base_frame))
+        if not self.filter.lost:
+            self._bridge.send(smooth or odometry, self._jumps)
+        if self._transforms is not None:
+            self._transforms.send(pose)
         self._extend_path(odometry.stamp_ns, result.pose.pose)
 
     def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
         update = self.filter.add_pose(self._in_present_map(convert.camera_pose(message)))
         self._last_refusal = '' if update.accepted or update.pending else update.reason
+        self._jumps += update.reset
 
     def _on_map_correction(self, message: TransformStamped) -> None:
         correction = convert.correction_of(message)
         self._corrections.append(correction)
         self.filter.move_map(correction[1])
+        self._jumps += 1
         self.get_logger().info('the map was corrected: the estimate moves with it')
 
     def _in_present_map(self, pose: CameraPose) -> CameraPose:
@@ -94,7 +118,8 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
 
     def figures(self) -> dict[str, object]:
         """The filter in numbers."""
-        return {name: f'{value:.6g}' for name, value in self.filter.diagnostics().items()} | {'lost': self.filter.lost}
+        numbers: dict[str, object] = {name: f'{value:.6g}' for name, value in self.filter.diagnostics().items()}
+        return numbers | {'lost': self.filter.lost, 'jumps': self._jumps}
 
 
 def main() -> int:
