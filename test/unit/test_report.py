@@ -1,5 +1,6 @@
 """The report on a run folder: what it reads, what it refuses, what it shows."""
 
+from decimal import Decimal
 import json
 import re
 import xml.etree.ElementTree as ET
@@ -7,6 +8,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 from support.run_folders import FIDUCIAL_SIGMA, FUSED_SIGMA, make_run, write_truth_bag
+import yaml
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.errors import InputError
@@ -57,6 +59,19 @@ def test_the_summary_keeps_what_it_had_and_gains_the_measures(run_folder):
     summary = json.loads((run_folder / 'summary.json').read_text())
     assert summary['bag'] == 'made_up'
     assert summary['evaluation']['fused']['error']['position_rms_mm'] > 0.0
+
+
+def test_the_camera_s_clock_is_no_error_of_the_fiducial_poses(small_run):
+    """Stamps 25 ms early, and the filter was told so: the same errors as with right stamps."""
+    right = evaluate_run(small_run)[1]['fiducial']['error']['position_rms_mm']
+    lines = [line.split(' ', 1) for line in (small_run / 'fiducial.tum').read_text().splitlines()]
+    early = [f'{Decimal(stamp) - Decimal("0.025")} {rest}\n' for stamp, rest in lines]
+    (small_run / 'fiducial.tum').write_text(''.join(early))
+    wrong = evaluate_run(small_run)[1]['fiducial']['error']['position_rms_mm']
+    parameters = {'/pose_ekf': {'ros__parameters': {'camera_time_offset': 0.025}}}
+    (small_run / 'parameters.yaml').write_text(yaml.safe_dump(parameters))
+    assert evaluate_run(small_run)[1]['fiducial']['error']['position_rms_mm'] == pytest.approx(right)
+    assert wrong > right + 1.0
 
 
 def test_truth_from_a_bag_is_the_truth_from_a_file(tmp_path, small_run):
@@ -139,6 +154,7 @@ BROKEN = [
     ('latency.csv', 'kind,stamp_ns,latency_ms\nimu_to_pose,1,slow\n', 'latency.csv, line 2'),
     ('summary.json', '{"bag": ', 'summary.json'),
     ('summary.json', '[1]', 'not a JSON object'),
+    ('parameters.yaml', '/pose_ekf: 3\n', 'parameters.yaml'),
     ('marker_map.yaml', 'markers: 3\n', 'marker_map.yaml'),
     ('truth.tum', '1.0 0 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n', 'no time in common'),
 ]

@@ -9,6 +9,7 @@ import re
 from typing import Any
 
 import numpy as np
+import yaml
 
 from thermal_fiducial.core.map_data import MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
@@ -19,7 +20,7 @@ from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
 
 FUSED, FIDUCIAL, TRUTH = 'fused.tum', 'fiducial.tum', 'truth.tum'
-DETECTIONS, LATENCY = 'detections.csv', 'latency.csv'
+DETECTIONS, LATENCY, PARAMETERS = 'detections.csv', 'latency.csv', 'parameters.yaml'
 MARKER_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'summary.json', 'output'
 #: Covariances are read from no more than so many messages, evenly over the run.
 MOST_COVARIANCES = 6000
@@ -65,7 +66,10 @@ class Output:
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder."""
+    """A run folder.
+
+    The fiducial poses are stamped by the camera's clock; here they have the IMU's stamps, as the filter takes them.
+    """
 
     path: Path
     fused: Trajectory
@@ -103,7 +107,7 @@ def read_run(path: Path, truth: Path | None = None) -> Run:
     return Run(
         path=path,
         fused=read_tum(path / FUSED),
-        fiducial=read_tum(path / FIDUCIAL),
+        fiducial=read_tum(path / FIDUCIAL).delayed(_camera_time_offset_ns(path / PARAMETERS)),
         detections=_detections(path / DETECTIONS),
         latencies=_latencies(path / LATENCY),
         output=_output(path / OUTPUT),
@@ -111,6 +115,17 @@ def read_run(path: Path, truth: Path | None = None) -> Run:
         summary=_summary(path / SUMMARY),
         truth=None if truth is None else read_truth(truth),
     )
+
+
+def _camera_time_offset_ns(path: Path) -> int:
+    """t_imu - t_camera that the filter was told."""
+    if not path.is_file():
+        return 0
+    try:
+        nodes = yaml.safe_load(path.read_text(encoding='utf-8'))
+        return round(float(nodes['/pose_ekf']['ros__parameters']['camera_time_offset']) * 1e9)
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError):
+        raise InputError(f'{path}: no camera_time_offset of pose_ekf in it') from None
 
 
 def _summary(path: Path) -> dict[str, Any]:

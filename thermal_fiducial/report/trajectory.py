@@ -37,6 +37,10 @@ class Trajectory:
         """The poses at ``index``."""
         return Trajectory(self.stamps_ns[index], self.T_map_body[index])
 
+    def delayed(self, delay_ns: int) -> 'Trajectory':
+        """The same poses at later stamps."""
+        return Trajectory(self.stamps_ns + delay_ns, self.T_map_body)
+
 
 def ordered(stamps_ns: IntArray, positions: FloatArray, quaternions: FloatArray) -> Trajectory:
     """Trajectory of poses whose stamps do not go back; of several poses at one stamp, the first."""

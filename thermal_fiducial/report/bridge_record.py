@@ -1,0 +1,116 @@
+"""What leaves for a flight controller, and the IMU beside it, as arrays: live or from a bag."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from thermal_fiducial.core.geometry import rotation_from_quaternion
+from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import BagReader, IMU_TOPIC
+from thermal_fiducial.files.images import stamp_to_ns
+
+#: Topics that a bridge is looked for on, the first one that there is.
+ODOMETRY_TOPICS = ('bridge/odometry', 'odometry')
+
+
+@dataclass(frozen=True)
+class BridgeRecord:
+    """Odometry messages (N of them) and IMU samples (M).
+
+    ``arrivals_ns`` and ``imu_stamps_ns`` are compared with ``stamps_ns``; velocities are as the messages have them,
+    which should be the robot's frame.
+    """
+
+    stamps_ns: IntArray
+    arrivals_ns: IntArray
+    positions: FloatArray
+    quaternions: FloatArray
+    velocities: FloatArray
+    rates: FloatArray
+    covariances: FloatArray
+    frames: tuple[tuple[str, str], ...]
+    imu_stamps_ns: IntArray
+    imu: FloatArray
+    #: whether arrivals are of the clock that stamps are of
+    live: bool = False
+
+    @property
+    def rotations(self) -> FloatArray:
+        """(N, 3, 3) R_map_body; identity for a quaternion that is none."""
+        valid = np.linalg.norm(self.quaternions, axis=1, keepdims=True) > 1e-6
+        return rotation_from_quaternion(np.where(valid, self.quaternions, (0.0, 0.0, 0.0, 1.0)))
+
+
+@dataclass
+class Recorder:
+    """Collects messages of rclpy or of a bag."""
+
+    live: bool = False
+    _odometry: list[tuple[Any, ...]] = field(default_factory=list)
+    _imu: list[tuple[Any, ...]] = field(default_factory=list)
+    _frames: set[tuple[str, str]] = field(default_factory=set)
+
+    def odometry(self, message: Any, arrival_ns: int) -> None:
+        """Take a nav_msgs/Odometry."""
+        p, q = message.pose.pose.position, message.pose.pose.orientation
+        v, w = message.twist.twist.linear, message.twist.twist.angular
+        row = (p.x, p.y, p.z, q.x, q.y, q.z, q.w, v.x, v.y, v.z, w.x, w.y, w.z)
+        self._odometry.append((stamp_to_ns(message.header.stamp), arrival_ns, row, tuple(message.pose.covariance)))
+        self._frames.add((message.header.frame_id, message.child_frame_id))
+
+    def imu(self, message: Any) -> None:
+        """Take a sensor_msgs/Imu."""
+        w, a = message.angular_velocity, message.linear_acceleration
+        self._imu.append((stamp_to_ns(message.header.stamp), (w.x, w.y, w.z, a.x, a.y, a.z)))
+
+    def record(self) -> BridgeRecord:
+        """What was collected."""
+        rows = np.array([entry[2] for entry in self._odometry], dtype=np.float64).reshape(-1, 13)
+        return BridgeRecord(
+            stamps_ns=np.array([entry[0] for entry in self._odometry], dtype=np.int64),
+            arrivals_ns=np.array([entry[1] for entry in self._odometry], dtype=np.int64),
+            positions=rows[:, :3],
+            quaternions=rows[:, 3:7],
+            velocities=rows[:, 7:10],
+            rates=rows[:, 10:],
+            covariances=np.array([entry[3] for entry in self._odometry], dtype=np.float64).reshape(-1, 6, 6),
+            frames=tuple(sorted(self._frames)),
+            imu_stamps_ns=np.array([entry[0] for entry in self._imu], dtype=np.int64),
+            imu=np.array([entry[1] for entry in self._imu], dtype=np.float64).reshape(-1, 6),
+            live=self.live,
+        )
+
+
+def read_bridge(path: Path, topic: str = '', imu_bag: Path | None = None) -> BridgeRecord:
+    """Record of a bag, or of the ``output`` of a run folder.
+
+    Parameters
+    ----------
+    topic : of the odometry; empty: the first of ``ODOMETRY_TOPICS`` that there is
+    imu_bag : bag with the IMU, where the first one has none
+
+    Raises
+    ------
+    InputError
+        Unreadable, or no such topic.
+    """
+    recorder = Recorder()
+    with BagReader(path / 'output' if (path / 'output').is_dir() else path) as bag:
+        wanted = [name for name in ([topic] if topic else ODOMETRY_TOPICS) if name in bag.topics]
+        if not wanted:
+            raise InputError(f'{path}: no topic {topic or " or ".join(ODOMETRY_TOPICS)}')
+        bag.require({wanted[0]: 'nav_msgs/msg/Odometry'})
+        for message in bag.messages([wanted[0], IMU_TOPIC]):
+            if message.topic == IMU_TOPIC:
+                recorder.imu(message.message)
+            else:
+                recorder.odometry(message.message, message.stamp_ns)
+    if imu_bag is not None:
+        with BagReader(imu_bag) as bag:
+            bag.require({IMU_TOPIC: 'sensor_msgs/msg/Imu'})
+            for message in bag.messages([IMU_TOPIC]):
+                recorder.imu(message.message)
+    return recorder.record()
