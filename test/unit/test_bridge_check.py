@@ -1,0 +1,170 @@
+"""Each fault that a bridge may have is found and named; a sound one passes."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support.flights import Motion
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.geometry import quaternion_from_rotation, so3_exp
+from thermal_fiducial.report.bridge_check import check_bridge, Level
+from thermal_fiducial.report.bridge_record import BridgeRecord, Recorder
+
+RATE = 40.0
+
+
+def record_of(motion, seconds=8.0, live=True):
+    """A perfect bridge at 40 Hz with the 200 Hz IMU beside it."""
+    t, imu_t = np.arange(seconds * RATE) / RATE, np.arange(seconds * 200.0) / 200.0
+    T, imu = motion.pose(t), motion.imu(imu_t)
+    stamps = np.round(t * 1e9).astype(np.int64)
+    return BridgeRecord(
+        stamps_ns=stamps,
+        arrivals_ns=stamps + 4_000_000,
+        positions=T[:, :3, 3],
+        quaternions=quaternion_from_rotation(T[:, :3, :3]),
+        velocities=(motion.velocity(t)[:, None] @ T[:, :3, :3])[:, 0],
+        rates=motion.imu(t)[:, :3],
+        covariances=np.tile(np.diag([1e-6] * 3 + [1e-8] * 3), (len(t), 1, 1)),
+        frames=(('map', 'base_link'),),
+        imu_stamps_ns=np.round(imu_t * 1e9).astype(np.int64),
+        imu=imu,
+        live=live,
+    )
+
+
+@pytest.fixture(scope='module')
+def flying():
+    return record_of(Motion.random(np.random.default_rng(3)))
+
+
+@pytest.fixture(scope='module')
+def resting():
+    return record_of(Motion.still())
+
+
+def level_of(record, check):
+    (finding,) = [finding for finding in check_bridge(record) if finding.check == check]
+    assert finding.consequence or finding.level is Level.OK
+    return finding.level
+
+
+def test_a_sound_bridge_has_no_fault(flying, resting):
+    assert {finding.level for finding in check_bridge(flying)} <= {Level.OK, Level.UNTESTED}
+    assert level_of(flying, 'yaw') is Level.OK
+    assert level_of(flying, 'velocity') is Level.OK
+    assert level_of(resting, 'gravity') is Level.OK
+    assert level_of(resting, 'yaw') is Level.UNTESTED
+    assert level_of(resting, 'velocity') is Level.UNTESTED
+
+
+def frd(record):
+    """The same in NED and FRD: somebody has already converted."""
+    flip = np.array([1.0, -1.0, -1.0])
+    return replace(
+        record,
+        positions=record.positions * flip,
+        quaternions=record.quaternions * np.array([1.0, -1.0, -1.0, 1.0]),
+        velocities=record.velocities * flip,
+    )
+
+
+def upside_down(record):
+    turned = record.rotations @ np.diag([1.0, -1.0, -1.0])
+    return replace(record, quaternions=quaternion_from_rotation(turned))
+
+
+def tilted(record):
+    return replace(record, quaternions=quaternion_from_rotation(so3_exp([0.2, 0.0, 0.0]) @ record.rotations))
+
+
+def velocity_in_map(record):
+    return replace(record, velocities=(record.rotations @ record.velocities[..., None])[..., 0])
+
+
+def thinned(record, keep):
+    arrays = ('stamps_ns', 'arrivals_ns', 'positions', 'quaternions', 'velocities', 'rates', 'covariances')
+    return replace(record, **{name: getattr(record, name)[keep] for name in arrays})
+
+
+def jumping(record):
+    positions = record.positions.copy()
+    positions[100:] += [1.0, 0.0, 0.0]
+    return replace(record, positions=positions)
+
+
+def with_stamps(record, change):
+    stamps = record.stamps_ns.copy()
+    stamps[50] += change
+    return replace(record, stamps_ns=stamps)
+
+
+FAULTS = {
+    'values': lambda record: replace(record, positions=record.positions * np.nan),
+    'rate': lambda record: thinned(record, slice(None, None, 20)),
+    'stamps': lambda record: with_stamps(record, -100_000_000),
+    'age': lambda record: replace(record, arrivals_ns=record.stamps_ns + 400_000_000),
+    'frame names': lambda record: replace(record, frames=(('world', 'base_link'),)),
+    'yaw': frd,
+    'velocity': velocity_in_map,
+    'covariance': lambda record: replace(record, covariances=0.0 * record.covariances),
+    'jumps': jumping,
+}
+
+
+@pytest.mark.parametrize('check', FAULTS)
+def test_each_fault_is_found(flying, check):
+    assert level_of(FAULTS[check](flying), check) is Level.FAULT
+
+
+@pytest.mark.parametrize('fault', [upside_down, tilted])
+def test_a_wrong_vertical_is_found(resting, fault):
+    assert level_of(fault(resting), 'gravity') is Level.FAULT
+
+
+def test_smaller_flaws_are_warnings(flying):
+    gap = np.delete(np.arange(len(flying.stamps_ns)), np.arange(100, 110))
+    assert level_of(thinned(flying, gap), 'rate') is Level.WARNING
+    assert level_of(thinned(flying, slice(None, None, 2)), 'rate') is Level.WARNING
+    repeated = with_stamps(flying, -round(1e9 / RATE))
+    assert level_of(repeated, 'stamps') is Level.WARNING
+    assert level_of(replace(flying, covariances=1e-10 * flying.covariances), 'covariance') is Level.WARNING
+    assert level_of(replace(flying, arrivals_ns=flying.stamps_ns - 50_000_000), 'age') is Level.FAULT
+    assert level_of(replace(flying, live=False), 'age') is Level.UNTESTED
+
+
+def test_silence_is_a_fault():
+    (finding,) = check_bridge(Recorder().record())
+    assert finding.level is Level.FAULT
+    assert 'nothing' in finding.consequence
+
+
+def message(record, index):
+    vector = lambda v: SimpleNamespace(**dict(zip('xyzw', map(float, v), strict=False)))  # noqa: E731
+    stamp = SimpleNamespace(sec=int(record.stamps_ns[index]) // 10**9, nanosec=int(record.stamps_ns[index]) % 10**9)
+    pose = SimpleNamespace(position=vector(record.positions[index]), orientation=vector(record.quaternions[index]))
+    twist = SimpleNamespace(linear=vector(record.velocities[index]), angular=vector(record.rates[index]))
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id='map'),
+        child_frame_id='base_link',
+        pose=SimpleNamespace(pose=pose, covariance=record.covariances[index].ravel()),
+        twist=SimpleNamespace(twist=twist),
+    )
+
+
+def test_messages_become_the_record(flying):
+    recorder = Recorder(live=True)
+    for index in range(len(flying.stamps_ns)):
+        recorder.odometry(message(flying, index), int(flying.arrivals_ns[index]))
+    record = recorder.record()
+    for name in ('stamps_ns', 'arrivals_ns', 'positions', 'quaternions', 'velocities', 'rates', 'covariances'):
+        np.testing.assert_array_equal(getattr(record, name), getattr(flying, name))
+    assert record.frames == flying.frames
+
+
+def test_the_command_wants_something_to_check(tmp_path, capsys):
+    assert main(['check-bridge', str(tmp_path / 'nothing')]) == 2
+    assert 'no such bag' in capsys.readouterr().err
+    assert main(['check-bridge', '--seconds', '-1']) == 2

@@ -1,0 +1,64 @@
+"""``check-bridge``: verify what a flight controller would receive, live or from a recording."""
+
+import argparse
+import json
+from pathlib import Path
+
+from thermal_fiducial.cli.evaluate import print_tables
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.report.bridge_check import check_bridge, Finding, Level
+from thermal_fiducial.report.bridge_record import BridgeRecord, ODOMETRY_TOPICS, read_bridge, Recorder
+from thermal_fiducial.report.tables import Table
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.description = (
+        'Verify rate, stamps, frames (gravity of a still drone, a yaw turn), velocity and covariance of what a flight '
+        'controller would receive, and say what it would do with it. Without RECORDING it listens: keep the drone '
+        'still for some seconds, then turn it by hand to the left and back. Exit status 1 if there is a fault.'
+    )
+    parser.add_argument('recording', nargs='?', type=Path, metavar='RECORDING', help='bag or run folder; none: listen')
+    parser.add_argument('--topic', default='', help='odometry to check (default: bridge/odometry, else odometry)')
+    parser.add_argument('--imu', type=Path, metavar='BAG', help='bag with imu/data, where RECORDING has none')
+    parser.add_argument('--seconds', type=float, default=15.0, help='how long to listen (default: 15)')
+    parser.add_argument('--json', action='store_true', help='print the findings as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check and print. 0: no fault; 1: an autopilot would not fly on it."""
+    if args.recording is not None:
+        record = read_bridge(args.recording, args.topic, args.imu)
+    else:
+        record = _listen(args.topic or ODOMETRY_TOPICS[0], args.seconds)
+    findings = check_bridge(record)
+    if args.json:
+        print(json.dumps([_as_json(finding) for finding in findings], indent=2))
+    else:
+        rows = [(finding.check, finding.level.value, finding.seen, finding.consequence) for finding in findings]
+        print_tables(
+            [Table('what a flight controller would receive', ('check', '', 'seen', 'what it does'), rows, textual=True)]
+        )
+    return int(any(finding.level is Level.FAULT for finding in findings))
+
+
+def _listen(topic: str, seconds: float) -> BridgeRecord:
+    if not 0.0 < seconds < 3600.0:
+        raise InputError(f'--seconds {seconds:g}: between 0 and 3600')
+    try:
+        from thermal_fiducial.ros.bridge_listener import listen
+    except ImportError as error:
+        raise InputError(f'listening needs ROS 2 ({error.name} is missing); name a recording instead') from None
+    recorder = Recorder(live=True)
+    print(f'Listening to {topic} and imu/data for {seconds:g} s: keep still, then turn left and back by hand.')
+    listen(topic, seconds, recorder.odometry, recorder.imu)
+    return recorder.record()
+
+
+def _as_json(finding: Finding) -> dict[str, str]:
+    return {
+        'check': finding.check,
+        'level': finding.level.value,
+        'seen': finding.seen,
+        'consequence': finding.consequence,
+    }
