@@ -259,13 +259,20 @@ class ArucoDetectorConfig:
         live=True,
     )
     min_correlation: float = param(
-        0.8, 'Smallest correlation of the cells with the pattern of a marker.', minimum=0.5, maximum=1.0, live=True
+        0.7, 'Smallest correlation of the cells with the pattern of a marker.', minimum=0.5, maximum=1.0, live=True
     )
     min_margin: float = param(
-        0.12,
+        0.07,
         'By how much the pattern must correlate better than that of any other marker.',
         minimum=0.0,
         maximum=0.5,
+        live=True,
+    )
+    min_surround: float = param(
+        0.3,
+        'Smallest step from the border to its white surroundings, as a share of the contrast, on three sides.',
+        minimum=0.0,
+        maximum=1.0,
         live=True,
     )
     max_bit_errors: int = param(

@@ -14,7 +14,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.types import Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # A curved line is a quartic through five of its points.
 _T_NODES = np.linspace(0.0, 1.0, 5)
@@ -25,6 +25,9 @@ _NEIGHBOURS = (-2, -1, 1, 2)
 # Weight of a pixel or segment falls off beyond this many standard deviations.
 _PIXEL_OUTLIER = 4.5
 _SEGMENT_OUTLIER = 2.5
+# Factors on the blur, pass by pass: a wide one catches, narrow ones measure, until the corners no longer move.
+_PASSES = (1.4, 1.0, 1.0, 1.0, 1.0)
+_SETTLED_PX = 0.3
 # Standard deviation of what is known of the corners beforehand [px].
 _PRIOR_PX = 3.0
 _HOPELESS = 1e6
@@ -46,6 +49,10 @@ class RefinedCorners:
     covariances: FloatArray
     contrast: FloatArray
     noise: FloatArray
+
+    def only(self, keep: BoolArray) -> 'RefinedCorners':
+        """Those of the markers ``keep`` (N,)."""
+        return RefinedCorners(self.corners_px[keep], self.covariances[keep], self.contrast[keep], self.noise[keep])
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +122,6 @@ def refine_corners(
     *,
     inner: bool = False,
     columns: int = 6,
-    passes: tuple[float, ...] = (1.3, 1.0),
 ) -> RefinedCorners:
     """Corners of N markers, refined.
 
@@ -127,24 +133,43 @@ def refine_corners(
     blur_px : standard deviation of optics and pixel
     inner : whether the lines between the bits are used besides the sides
     columns : of pixels, in a segment
-    passes : factor on the blur, for each pass: a wide one catches, narrow ones measure
     """
+    count = len(corners_px)
+    result = RefinedCorners(corners_px.copy(), np.zeros((count, 4, 2, 2)), np.zeros(count), np.zeros(count))
+    active = np.arange(count)
+    for factor in _PASSES:
+        if len(active) == 0:
+            break
+        start = result.corners_px[active]
+        moved = _pass(image, start, camera, before[active], step[active], factor * blur_px, inner, columns)
+        result.corners_px[active] = moved.corners_px
+        result.covariances[active] = moved.covariances
+        result.contrast[active], result.noise[active] = moved.contrast, moved.noise
+        still = np.abs(moved.corners_px - start).max(axis=(1, 2)) > _SETTLED_PX
+        active = active[still | (factor > 1.0)]
+    return result
+
+
+def _pass(
+    image: Float32Array,
+    corners: FloatArray,
+    camera: Camera,
+    before: Float32Array,
+    step: Float32Array,
+    blur: float,
+    inner: bool,
+    columns: int,
+) -> RefinedCorners:
+    """One linearised adjustment of corners (N, 4, 2)."""
     cells = step.shape[-1]
     numbers = np.arange(cells + 1) if inner else np.array([0, cells])
-    corners = corners_px
-    for factor in passes:
-        blur = factor * blur_px
-        lines, extent = _lines(corners, camera, image.shape, numbers / cells, cells * columns, blur)
-        shifts = _measure(image, lines, before, step, numbers, extent, blur)
-        corners, covariances = _adjust(corners, lines, shifts, numbers / cells, cells)
-    count = len(corners)
-    good = shifts.variance.reshape(count, -1) < _HOPELESS
-    return RefinedCorners(
-        corners,
-        covariances,
-        _mean_where(shifts.contrast.reshape(count, -1), good),
-        np.sqrt(_mean_where(shifts.noise.reshape(count, -1), good)),
-    )
+    lines, extent = _lines(corners, camera, image.shape, numbers / cells, cells * columns, blur)
+    shifts = _measure(image, lines, before, step, numbers, extent, blur)
+    moved, covariances = _adjust(corners, lines, shifts, numbers / cells, cells)
+    good = shifts.variance.reshape(len(corners), -1) < _HOPELESS
+    contrast = _mean_where(shifts.contrast.reshape(good.shape), good)
+    noise = np.sqrt(_mean_where(shifts.noise.reshape(good.shape), good))
+    return RefinedCorners(moved, covariances, contrast, noise)
 
 
 def _mean_where(values: FloatArray, good: np.ndarray) -> FloatArray:

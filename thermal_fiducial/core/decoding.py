@@ -11,6 +11,9 @@ import numpy as np
 
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
+# How far off a side black and white are compared: in cells, and at most in pixels.
+_OUTSIDE = 0.4
+_OUTSIDE_PX = 2.5
 # Samples along a cell, in its middle, away from blurred edges.
 _SAMPLES = np.array([0.3, 0.5, 0.7])
 
@@ -33,6 +36,8 @@ class Reading:
     bit_errors: IntArray
     #: (Q,) the same of border cells
     border_errors: IntArray
+    #: (Q,) step from the black border to its white surroundings over the contrast, on the worst side but one
+    surround: FloatArray
 
 
 class Decoder:
@@ -61,6 +66,10 @@ class Decoder:
 
     def read(self, image: Float32Array, quads: FloatArray, allowed: BoolArray) -> Reading:
         """Most similar pattern of each quadrilateral (Q, 4, 2) among those ``allowed`` (M,)."""
+        if len(quads) == 0:
+            nothing = np.zeros(0)
+            none = nothing.astype(np.int64)
+            return Reading(none, none, nothing, nothing, nothing, none, none, nothing)
         values = self._cell_means(image, quads)
         values = values @ self._detrend
         spread = np.linalg.norm(values, axis=1, keepdims=True)
@@ -72,9 +81,11 @@ class Decoder:
         ids = best // 4
         others = np.abs(similar).reshape(len(quads), -1, 4).max(axis=-1)
         others[rows, ids] = 0.0
-        return self._judged(values, best, correlation, others.max(axis=1))
+        return self._judged(values, best, correlation, others.max(axis=1), self._steps(image, quads))
 
-    def _judged(self, values: FloatArray, best: IntArray, correlation: FloatArray, runner_up: FloatArray) -> Reading:
+    def _judged(
+        self, values: FloatArray, best: IntArray, correlation: FloatArray, runner_up: FloatArray, steps: FloatArray
+    ) -> Reading:
         expected = self._grids.reshape(-1, self.cells**2)[best]
         shape = expected @ self._detrend
         contrast = np.sum(values * shape, axis=1) / np.maximum(np.sum(shape * shape, axis=1), 1e-9)
@@ -90,7 +101,22 @@ class Decoder:
             contrast,
             np.sum(wrong & ~self._border, axis=1),
             np.sum(wrong & self._border, axis=1),
+            np.sort(steps / safe, axis=1)[:, 1],
         )
+
+    def _steps(self, image: Float32Array, quads: FloatArray) -> FloatArray:
+        """Mean counts just outside the sides (Q, 4) less those just inside."""
+        side = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1) / np.sqrt(2.0)
+        near = np.minimum(_OUTSIDE / self.cells, _OUTSIDE_PX / np.maximum(side, 1.0))[:, None]
+        t = np.broadcast_to((np.arange(self.cells) + 0.5) / self.cells, (len(quads), self.cells))
+        low, high = np.broadcast_to(-near, t.shape), np.broadcast_to(1.0 + near, t.shape)
+        inner_low, inner_high = np.broadcast_to(near, t.shape), np.broadcast_to(1.0 - near, t.shape)
+        a = np.concatenate([t, t, low, high, t, t, inner_low, inner_high], axis=1)
+        b = np.concatenate([low, high, t, t, inner_low, inner_high, t, t], axis=1)
+        uv = _inside(quads, a, b).astype(np.float32)
+        sampled = cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        means = sampled.reshape(len(quads), 2, 4, -1).mean(axis=-1, dtype=np.float64)
+        return np.asarray(means[:, 0] - means[:, 1])
 
     def _cell_means(self, image: Float32Array, quads: FloatArray) -> FloatArray:
         """Mean counts (Q, m * m) of the cells."""
@@ -107,12 +133,12 @@ def shrunk(quads: FloatArray, cells: int) -> FloatArray:
 
 
 def _inside(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Points (Q, P, 2) at shares a, b (P,) of quadrilaterals (Q, 4, 2), by the projective map of the unit square."""
+    """Points (Q, P, 2) at shares a, b (P,) or (Q, P) of quadrilaterals (Q, 4, 2), by the map of the unit square."""
     d1, d2, d3 = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2], c[:, 0] - c[:, 1] + c[:, 2] - c[:, 3]
     determinant = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
     determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
     g = ((d3[:, 0] * d2[:, 1] - d3[:, 1] * d2[:, 0]) / determinant)[:, None]
     h = ((d1[:, 0] * d3[:, 1] - d1[:, 1] * d3[:, 0]) / determinant)[:, None]
     right, down = c[:, 1] - c[:, 0] + g * c[:, 1], c[:, 3] - c[:, 0] + h * c[:, 3]
-    top = c[:, None, 0] + a[:, None] * right[:, None] + b[:, None] * down[:, None]
+    top = c[:, None, 0] + a[..., None] * right[:, None] + b[..., None] * down[:, None]
     return np.asarray(top / (1.0 + a * g + b * h)[..., None])

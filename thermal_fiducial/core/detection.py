@@ -19,7 +19,7 @@ from thermal_fiducial.core.marker_rows import marker_rows
 from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers, Odometry
 from thermal_fiducial.core.patterns import marker_bits
 from thermal_fiducial.core.pose import choose_branch, ippe_square, marker_corners, solve_marker_poses
-from thermal_fiducial.core.search import blind_search, Found, merged
+from thermal_fiducial.core.search import blind_search, confirmed, Found, merged
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 
 # Smear by lag below which neither the search nor the shape of an edge changes [px].
@@ -87,11 +87,8 @@ class MarkerDetector:
             image = counts.astype(np.float32)
             T_camera_map = self._predicted_pose(stamp_ns, odometry, twist)
             found = self._find(image, camera, twist, T_camera_map)
-            if len(found.ids) == 0:
-                self._motion.remember(stamp_ns, twist, found.ids, found.corners_px)
-                return np.zeros(0, dtype=MARKER_DTYPE)
-            refined = self._refined(stamp_ns, image, found, camera, twist)
-            return self._rows(found.ids, refined, camera, T_camera_map)
+            ids, refined = self._refined(stamp_ns, image, found, camera, twist)
+            return self._rows(ids, refined, camera, T_camera_map)
 
     def size(self, marker_id: int) -> float:
         """Side of a marker [m]: of the map, or of the overrides, or the common one."""
@@ -159,9 +156,13 @@ class MarkerDetector:
 
     def _refined(
         self, stamp_ns: int, image: Float32Array, found: Found, camera: Camera, predicted: Twist | None
-    ) -> RefinedCorners:
-        """Corners at the stamp: refined on the image freed of lag, by the twist that they themselves improve."""
+    ) -> tuple[IntArray, RefinedCorners]:
+        """Corners at the stamp, on the image freed of lag by the twist that they themselves improve, and their IDs."""
         ids, corners = found.ids, found.corners_px
+        refined = RefinedCorners(corners, np.zeros((0, 4, 2, 2)), np.zeros(0), np.zeros(0))
+        if len(ids) == 0:
+            self._motion.remember(stamp_ns, predicted, ids, corners)
+            return ids, refined
         # Freeing an image of lag costs noise: of faint markers only the delay is taken out.
         clear = np.abs(found.clarity) > _CLEAR
         before, step = self._pattern.before[ids], self._pattern.step[ids]
@@ -187,10 +188,14 @@ class MarkerDetector:
             refined = replace(refined, corners_px=corners, covariances=refined.covariances + spread)
             if np.abs(change[clear]).max(initial=0.0) < _SMEAR_THAT_MATTERS_PX:
                 break
+        keep = confirmed(scene, found, refined, self._decoder)
+        ids, refined = ids[keep], refined.only(keep)
         self._motion.remember(stamp_ns, twist, ids, camera.normalise(refined.corners_px))
-        return refined
+        return ids, refined
 
     def _rows(self, ids: IntArray, refined: RefinedCorners, camera: Camera, T_camera_map: FloatArray | None) -> Markers:
+        if len(ids) == 0:
+            return np.zeros(0, dtype=MARKER_DTYPE)
         poses = solve_marker_poses(refined.corners_px, refined.covariances, self._sizes_of(ids), camera)
         if T_camera_map is not None:
             poses = [

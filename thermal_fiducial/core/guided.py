@@ -11,16 +11,13 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.contrast import halved
 from thermal_fiducial.core.decoding import Decoder, Reading
 from thermal_fiducial.core.lag import Twist
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.pose import marker_corners
-from thermal_fiducial.core.search import Found
+from thermal_fiducial.core.search import Found, read_quads
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# Cells at least this wide are read at half the resolution, where a pixel has half the noise.
-_WIDE_CELL_PX = 8.0
 # A marker turned further from the camera than this shows too little to be expected.
 _MAX_TILT_COSINE = 0.2
 # Places round the prediction that are tried when nothing is found at it, in shares of a cell.
@@ -64,14 +61,14 @@ def look(
 ) -> tuple[Found, BoolArray]:
     """The expected markers (N,), (N, 4, 2) that the image shows, and which (N,) of them these are."""
     corners = corners.copy()
-    reading = _read(image, corners, decoder)
+    reading = read_quads(image, corners, decoder)
     good = _confirmed(reading, ids, noise, config)
     missing = np.flatnonzero(~good)
     if len(missing):
         cell = np.linalg.norm(corners[missing, 2] - corners[missing, 0], axis=-1) / (1.4 * decoder.cells)
         tried = corners[missing, None] + (cell[:, None, None] * _OFFSETS)[:, :, None]
         places = len(_OFFSETS)
-        around = _read(image, tried.reshape(-1, 4, 2), decoder)
+        around = read_quads(image, tried.reshape(-1, 4, 2), decoder)
         confirmed = _confirmed(around, np.repeat(ids[missing], places), noise, config)
         score = np.where(confirmed, np.abs(around.correlation), 0.0).reshape(-1, places)
         best = score.argmax(axis=1)
@@ -83,16 +80,7 @@ def look(
         contrast[missing] = around.contrast.reshape(-1, places)[rows, best]
     else:
         contrast = reading.contrast
-    return Found(ids[good], corners[good], contrast[good] / noise), good
-
-
-def _read(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
-    """Readings of (Q, 4, 2), at half the resolution when all are large enough for it."""
-    everything = np.ones(decoder.count, dtype=bool)
-    sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
-    if sides.min(initial=np.inf) >= _WIDE_CELL_PX * decoder.cells:
-        return decoder.read(halved(image), 0.5 * (quads - 0.5), everything)
-    return decoder.read(image, quads, everything)
+    return Found(ids[good], corners[good], contrast[good] / noise, np.ones(int(good.sum()), dtype=bool)), good
 
 
 def _confirmed(reading: Reading, ids: IntArray, noise: float, config: ArucoDetectorConfig) -> BoolArray:

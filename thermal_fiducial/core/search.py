@@ -6,6 +6,7 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.contrast import halved, noise_of, normalise
+from thermal_fiducial.core.corners import RefinedCorners
 from thermal_fiducial.core.decoding import Decoder, Reading, shrunk
 from thermal_fiducial.core.quads import find_quads
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
@@ -14,6 +15,19 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 _FINE = (1.5, 3.0, 15, 7.0)
 # Half resolution, smoothed more, sees markers of twice the noise.
 _FAINT = (1.2, 1.0, 7, 3.0)
+# Weight of white surroundings against correlation in choosing among the outlines of a marker.
+_SURROUNDED = 0.2
+# Cells at least this wide are read at half the resolution, where a pixel has half the noise.
+_WIDE_CELL_PX = 8.0
+# Correlation at the refined corners: of a marker with sharp sides, and (less when faint) of one with softer sides.
+_ALIKE = 0.77
+_CLEARLY_ALIKE = 0.9
+_CLEAR_MARGIN = 0.06
+# Corner deviation [px] times contrast over noise times root of the side [px]: 4 to 7 for four clean sides.
+_SHARP = 7.5
+_SOFT = 12.0
+# Pixels along a side that the refinement uses of a long one.
+_SEEN_PX = 60.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,16 +39,18 @@ class Found:
     ids : (N,)
     corners_px : (N, 4, 2) clockwise from the marker's top-left, to a pixel or two
     clarity : (N,) contrast over the noise of a pixel, negative where black is warmer than white
+    expected : (N,) whether it was sought where it was found
     """
 
     ids: IntArray
     corners_px: FloatArray
     clarity: FloatArray
+    expected: BoolArray
 
     @staticmethod
     def none() -> 'Found':
         """No markers."""
-        return Found(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros(0))
+        return Found(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros(0), np.zeros(0, dtype=bool))
 
 
 def blind_search(
@@ -63,7 +79,7 @@ def blind_search(
     best = _once(reading, quads, good, config.duplicates == 'drop')
     turned = (np.arange(4) - reading.turns[best][:, None]) % 4
     corners = np.take_along_axis(quads[best], turned[..., None], axis=1)
-    return Found(reading.ids[best], corners, reading.contrast[best] / noise)
+    return Found(reading.ids[best], corners, reading.contrast[best] / noise, np.zeros(len(best), dtype=bool))
 
 
 def _joined(first: Reading, second: Reading) -> Reading:
@@ -72,12 +88,15 @@ def _joined(first: Reading, second: Reading) -> Reading:
 
 
 def merged(first: Found, second: Found) -> Found:
-    """All markers of ``first``, and those of ``second`` that it does not have."""
-    new = ~np.isin(second.ids, first.ids)
+    """All markers of ``first``, and those of ``second`` that it does not have and that lie elsewhere."""
+    apart = np.linalg.norm(second.corners_px.mean(axis=1)[:, None] - first.corners_px.mean(axis=1), axis=-1)
+    extent = np.linalg.norm(first.corners_px[:, 2] - first.corners_px[:, 0], axis=-1)
+    new = ~np.isin(second.ids, first.ids) & (apart > 0.35 * extent).all(axis=1)
     return Found(
         np.concatenate([first.ids, second.ids[new]]),
         np.concatenate([first.corners_px, second.corners_px[new]]),
         np.concatenate([first.clarity, second.clarity[new]]),
+        np.concatenate([first.expected, second.expected[new]]),
     )
 
 
@@ -89,21 +108,61 @@ def accepted(reading: Reading, noise: float, config: ArucoDetectorConfig) -> Boo
         & (similarity - reading.runner_up >= config.min_margin)
         & (reading.bit_errors <= config.max_bit_errors)
         & (reading.border_errors <= config.max_border_errors)
+        & (reading.surround >= config.min_surround)
         & (np.abs(reading.contrast) >= config.min_contrast * noise)
     )
 
 
+def confirmed(image: Float32Array, found: Found, refined: RefinedCorners, decoder: Decoder) -> BoolArray:
+    """Which markers (N,) still look like themselves at their refined corners, with sides as sharp as their contrast.
+
+    Noise and clutter that happen to correlate with a pattern have no four straight sharp sides: their corners are far
+    less certain than contrast, noise and size of a marker make them.
+    """
+    if len(found.ids) == 0:
+        return np.zeros(0, dtype=bool)
+    reading = read_quads(image, refined.corners_px, decoder)
+    similarity = np.abs(reading.correlation)
+    contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
+    alike = (reading.ids == found.ids) & (similarity - reading.runner_up >= _CLEAR_MARGIN) & (reading.surround >= 0.4)
+    side = np.linalg.norm(refined.corners_px[:, 2] - refined.corners_px[:, 0], axis=-1) / np.sqrt(2.0)
+    deviation = np.sort(np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1)), axis=1)[:, 2]
+    softness = deviation * contrast * np.sqrt(np.minimum(side, _SEEN_PX))
+    sharp = (softness <= _SHARP) & (similarity >= _ALIKE)
+    soft = (softness <= _SOFT) & (similarity >= np.minimum(_CLEARLY_ALIKE, 0.7 + 0.07 * contrast))
+    return np.asarray(found.expected | (alike & (sharp | soft)))
+
+
+def read_quads(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
+    """Readings of (Q, 4, 2) among all IDs, at half the resolution when all are large enough for it."""
+    everything = np.ones(decoder.count, dtype=bool)
+    sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
+    if sides.min(initial=np.inf) >= _WIDE_CELL_PX * decoder.cells:
+        return decoder.read(halved(image), 0.5 * (quads - 0.5), everything)
+    return decoder.read(image, quads, everything)
+
+
 def _once(reading: Reading, quads: FloatArray, good: BoolArray, drop_duplicates: bool) -> IntArray:
-    """Places of the best reading of every ID; of an ID at two places neither, when such are to be dropped."""
-    order = np.flatnonzero(good)
-    order = order[np.argsort(-np.abs(reading.correlation[order]), kind='stable')]
-    ids, first = np.unique(reading.ids[order], return_index=True)
-    best = order[first]
-    if drop_duplicates and len(order) > len(best):
-        centre = quads.mean(axis=1)
-        extent = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)
-        owner = best[np.searchsorted(ids, reading.ids[order])]
-        apart = np.linalg.norm(centre[order] - centre[owner], axis=-1) > 0.5 * extent[owner]
-        keep = ~np.isin(ids, reading.ids[order][apart])
-        best = best[keep]
-    return np.asarray(best)
+    """Place of the best reading of every ID; of an ID at two places neither, when such are to be dropped."""
+    similarity = np.where(good, np.abs(reading.correlation) + _SURROUNDED * np.clip(reading.surround, 0.0, 1.0), 0.0)
+    across = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)
+    centre = quads.mean(axis=1)
+    best = []
+    for marker_id in np.unique(reading.ids[good]).tolist():
+        same = np.flatnonzero(good & (reading.ids == marker_id))
+        clearest = same[similarity[same].argmax()]
+        apart = np.linalg.norm(centre[same] - centre[clearest], axis=-1) > 0.5 * across[clearest]
+        if not (drop_duplicates and apart.any()):
+            best.append(clearest)
+    return _alone(np.array(best, dtype=np.int64), similarity, centre, across)
+
+
+def _alone(places: IntArray, similarity: FloatArray, centre: FloatArray, across: FloatArray) -> IntArray:
+    """Of markers that lie in one another the clearest: a plate round a marker may look like another, inside out."""
+    order = places[np.argsort(-similarity[places], kind='stable')]
+    kept: list[int] = []
+    for place in order.tolist():
+        distance = np.linalg.norm(centre[kept] - centre[place], axis=-1)
+        if np.all(distance > 0.35 * np.maximum(across[kept], across[place])):
+            kept.append(place)
+    return np.array(kept, dtype=np.int64)
