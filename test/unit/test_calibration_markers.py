@@ -1,0 +1,68 @@
+"""A board of our own stencils: found through the package's own detector, in part or whole."""
+
+import numpy as np
+from support.boards import plate_pose, random_view, render
+
+from thermal_fiducial.calibration.intrinsics import calibrate
+from thermal_fiducial.calibration.targets import MarkerBoard
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.fabrication.boards import marker_grid
+from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.sim.scenario import LENSES
+
+NAME, COLUMNS, ROWS, SIZE = 'STENCIL_4X4_100', 4, 3, 0.06
+CELL = SIZE / 6
+# Between two markers as much warm background as half a marker.
+GAP_CELLS = 3
+
+
+def board():
+    """Map of the board and the cells of its plate."""
+    bits = marker_bits(load_dictionary(NAME))
+    centres = marker_grid(COLUMNS, ROWS, SIZE, GAP_CELLS * CELL)
+    markers = {
+        index: MapMarker(index, SIZE, True, geometry.transform(np.eye(3), [*centre, 0.0]))
+        for index, centre in enumerate(centres.tolist())
+    }
+    pitch = 6 + GAP_CELLS
+    levels = np.ones((pitch * ROWS + GAP_CELLS, pitch * COLUMNS + GAP_CELLS), dtype=bool)
+    for index in markers:
+        row, column = (GAP_CELLS + pitch * step for step in divmod(index, COLUMNS))
+        levels[row : row + 6, column : column + 6] = np.pad(bits[index] > 0, 1)
+    return MarkerMap(markers, dictionary=NAME), levels
+
+
+def test_marker_board_calibrates():
+    marker_map, levels = board()
+    lens = LENSES['13mm']
+    detector = MarkerDetector(ArucoDetectorConfig(dictionary=NAME), load_dictionary(NAME))
+    detector.set_map(marker_map.geometry())
+    target = MarkerBoard(marker_map, detector)
+    camera = Camera(640, 512, lens.matrix, lens.model, np.array(lens.distortion))
+    rows, columns = levels.shape
+    u, v = 0.5 * CELL * columns, 0.5 * CELL * rows
+    outline = np.array([[-u, -v, 0.0], [u, -v, 0.0], [u, v, 0.0], [-u, v, 0.0]])
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    rng = np.random.default_rng(4)
+    sightings = []
+    for seed in range(12):
+        T = random_view(lens, outline, rng, fill=0.9, tilt=0.25)
+        counts = render(lens, plate_pose(T, np.zeros(2)), levels, columns * CELL, rows * CELL, 8.0, seed)
+        sighting = target.find(counts, camera)
+        if sighting is None:
+            continue
+        truth = lens.project(geometry.apply(T @ flip, sighting.points))
+        # A few hundredths of a pixel at 8 K; corners of small, oblique markers are the worst.
+        assert np.median(np.linalg.norm(sighting.pixels - truth, axis=1)) < 0.06
+        sightings.append(sighting)
+    assert len(sightings) >= 10
+    assert np.mean([len(sighting.points) for sighting in sightings]) > 0.7 * 4 * COLUMNS * ROWS
+    found = calibrate(sightings, 640, 512, 'plumb_bob')
+    # Twelve views in place of forty.
+    assert abs(found.camera.K[0, 0] / lens.focal[0] - 1.0) < 2e-3
+    assert np.all(np.abs(found.camera.K[:2, 2] - lens.centre) < 1.5)
