@@ -1,4 +1,4 @@
-"""Regenerates the tables of the README: ``python test/bench/readme.py`` (``make tables``).
+"""Regenerates the tables of the README and the parameter file: ``python test/bench/readme.py`` (``make tables``).
 
 A table stands between ``<!-- NAME -->`` and ``<!-- end -->``. Parameters come from ``config.py``; measured tables
 from the Markdown files that the benchmarks leave in ``.doc/tables/``.
@@ -8,6 +8,7 @@ from pathlib import Path
 import re
 
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, parameters, PoseEkfConfig, Tau2CameraConfig
+from thermal_fiducial.ros.parameter_file import parameter_file
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = {
@@ -48,3 +49,4 @@ if __name__ == '__main__':
     readme = ROOT / 'README.md'
     readme.write_text(spliced(readme.read_text(), tables()))
     print(f'{readme.name}: {len(tables())} tables')
+    (ROOT / 'config' / 'thermal_fiducial.yaml').write_text(parameter_file())

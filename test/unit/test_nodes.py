@@ -345,9 +345,13 @@ def test_reset_starts_afresh(graph):
     node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
     fly(graph, [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
     assert graph.diagnose(node)[1] == 'tracking'
+    assert graph.diagnose(node)[2]['jumps'] == '1'
     assert graph.call(Trigger, 'pose_ekf/reset', Trigger.Request()).success
     fly(graph, [imu(60)])
     assert graph.diagnose(node)[1] == 'waiting for markers'
+    fly(graph, [m for k in range(61, 120) for m in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
+    # Whoever keeps the last pose must know that the next one is not its continuation.
+    assert graph.diagnose(node)[2]['jumps'] == '2'
 
 
 # --- parameters ---------------------------------------------------------------------------------------

@@ -220,6 +220,11 @@ class PoseEkf:
         return main.state if main else None
 
     @property
+    def resets(self) -> int:
+        """How often it has started afresh since it was begun."""
+        return self._nodes[-1].belief.resets if self._nodes else 0
+
+    @property
     def status(self) -> str:
         """How the filter is, in words."""
         if self._imu_fault:

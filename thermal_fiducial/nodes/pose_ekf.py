@@ -37,6 +37,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._last_refusal = ''
         #: how often the pose has jumped: fresh starts and corrections of the map
         self._jumps = 0
+        self._resets: int | None = None
         self._corrections: deque[tuple[int, FloatArray]] = deque(maxlen=_CORRECTIONS)
         self._pose = self.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
         self._odometry = self.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
@@ -57,6 +58,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
 
     def _on_imu(self, message: Imu) -> None:
         odometry = self.filter.add_imu(convert.imu_sample(message))
+        self._count_jumps()
         if odometry is None:
             return
         head = convert.header(odometry.stamp_ns, self.config.map_frame)
@@ -73,22 +75,26 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
             self._transforms.send(pose)
         self._extend_path(odometry.stamp_ns, result.pose.pose)
 
+    def _count_jumps(self) -> None:
+        resets = None if self.filter.state is None else self.filter.resets
+        self._jumps += resets is not None and resets != self._resets
+        self._resets = resets
+
     def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
         update = self.filter.add_pose(self._in_present_map(convert.camera_pose(message)))
         self._last_refusal = '' if update.accepted or update.pending else update.reason
-        self._jumps += update.reset
 
     def _on_map_correction(self, message: TransformStamped) -> None:
         correction = convert.correction_of(message)
         self._corrections.append(correction)
         self.filter.move_map(correction[1])
         self._jumps += 1
-        self.get_logger().info('the map was corrected: the estimate moves with it')
 
     def _in_present_map(self, pose: CameraPose) -> CameraPose:
         """A pose that a correction overtook, moved like the map."""
+        window = self.config.max_delay * 1e9
         for stamp_ns, T_new_old in self._corrections:
-            if pose.stamp_ns <= stamp_ns:
+            if 0 <= stamp_ns - pose.stamp_ns <= window:
                 pose = in_moved_map(pose, T_new_old)
         return pose
 
