@@ -26,8 +26,10 @@ _NEIGHBOURS = (-2, -1, 1, 2)
 _PIXEL_OUTLIER = 4.5
 _SEGMENT_OUTLIER = 2.5
 # Factors on the blur, pass by pass: a wide one catches, narrow ones measure, until the corners no longer move.
-_PASSES = (1.4, 1.0, 1.0, 1.0, 1.0)
+_PASSES = (3.0, 1.4, 1.0, 1.0, 1.0, 1.0)
 _SETTLED_PX = 0.3
+# A linearised displacement is good for this many blurs.
+_REACHED = 2.0
 # Standard deviation of what is known of the corners beforehand [px].
 _PRIOR_PX = 3.0
 _HOPELESS = 1e6
@@ -122,6 +124,7 @@ def refine_corners(
     *,
     inner: bool = False,
     columns: int = 6,
+    coarse: bool = False,
 ) -> RefinedCorners:
     """Corners of N markers, refined.
 
@@ -133,11 +136,12 @@ def refine_corners(
     blur_px : standard deviation of optics and pixel
     inner : whether the lines between the bits are used besides the sides
     columns : of pixels, in a segment
+    coarse : whether the corners are only known to four pixels
     """
     count = len(corners_px)
     result = RefinedCorners(corners_px.copy(), np.zeros((count, 4, 2, 2)), np.zeros(count), np.zeros(count))
     active = np.arange(count)
-    for factor in _PASSES:
+    for factor in _PASSES if coarse else _PASSES[1:]:
         if len(active) == 0:
             break
         start = result.corners_px[active]
@@ -325,15 +329,15 @@ def _measure(
     middle = counts[:, counts.shape[1] // 2][:, None]
     X = np.stack([np.ones_like(counts), value.reshape(shape), slope.reshape(shape), counts - middle], axis=1)
     weight = weight.reshape(shape)
-    shifts, coefficients = _solve(X, weight, len(step))
+    shifts, coefficients = _solve(X, weight, len(step), _REACHED * blur)
     residual = X[:, 3] - (coefficients[:, None] @ X[:, :3])[:, 0]
     outlier = np.abs(residual) > _PIXEL_OUTLIER * np.sqrt(shifts.noise).reshape(-1, 1)
     if np.any(outlier & (weight > 0.0)):
-        shifts, _ = _solve(X, weight * ~outlier, len(step))
+        shifts, _ = _solve(X, weight * ~outlier, len(step), _REACHED * blur)
     return shifts
 
 
-def _solve(X: Float32Array, weight: Float32Array, count: int) -> tuple[_Shifts, Float32Array]:
+def _solve(X: Float32Array, weight: Float32Array, count: int, reach: float) -> tuple[_Shifts, Float32Array]:
     """Least squares of the last of four columns X (segments, 4, pixels) on the others: (1, model, derivative)."""
     gram = ((X * weight[:, None]) @ np.swapaxes(X, -1, -2)).astype(np.float64)
     number = gram[:, 0, 0]
@@ -350,7 +354,7 @@ def _solve(X: Float32Array, weight: Float32Array, count: int) -> tuple[_Shifts, 
     noise = np.where(noise > 2.5 * typical_noise, noise, typical_noise) + 1e-3
     usable &= contrast * np.sign(typical) > 0.3 * np.abs(typical)
     safe = np.where(usable, contrast, 1.0)
-    shift = np.where(usable, np.clip(-coefficients[:, 2].reshape(count, -1) / safe, -2.0, 2.0), 0.0)
+    shift = np.where(usable, np.clip(-coefficients[:, 2].reshape(count, -1) / safe, -reach, reach), 0.0)
     variance = np.where(usable, noise * inverse[:, 2, 2].reshape(count, -1) / safe**2, _HOPELESS)
     return _Shifts(shift, variance, contrast, noise), coefficients.astype(np.float32)
 

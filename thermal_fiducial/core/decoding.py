@@ -83,6 +83,12 @@ class Decoder:
         others[rows, ids] = 0.0
         return self._judged(values, best, correlation, others.max(axis=1), self._steps(image, quads))
 
+    def match(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
+        """Correlation (Q,) of quadrilaterals (Q, 4, 2) with the upright patterns of ``ids`` (Q,)."""
+        values = self._cell_means(image, quads) @ self._detrend
+        spread = np.maximum(np.linalg.norm(values, axis=1), 1e-9)
+        return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread)
+
     def _judged(
         self, values: FloatArray, best: IntArray, correlation: FloatArray, runner_up: FloatArray, steps: FloatArray
     ) -> Reading:

@@ -26,6 +26,8 @@ from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatAr
 _SMEAR_THAT_MATTERS_PX = 0.4
 # Contrast over noise from which smeared edges cost more than the noise of sharpening them.
 _CLEAR = 20.0
+# Columns of pixels used of a cell; all of a faint marker's count.
+_COLUMNS, _COLUMNS_FAINT = 6, 12
 # Pixels round a marker that the refinement may look at.
 _WINDOW_MARGIN_PX = 16
 # Depth of the scene while no marker has told it [m].
@@ -114,7 +116,7 @@ class MarkerDetector:
             return expected
         self._since_blind = 0
         scene = self._scene(image, camera, twist)
-        return merged(expected, blind_search(image, scene, self._decoder, self._allowed(), self.config))
+        return merged(blind_search(image, scene, self._decoder, self._allowed(), self.config), expected)
 
     def _guided(
         self, image: Float32Array, camera: Camera, twist: Twist, T_camera_map: FloatArray
@@ -170,13 +172,17 @@ class MarkerDetector:
         x = camera.normalise(corners)
         depth = _corner_depths(x, self._sizes_of(ids))
         self._depth = float(np.median(depth))
-        twist = predicted
+        twist, coarse = predicted, False
+        columns = _COLUMNS if clear.all() else _COLUMNS_FAINT
         for _ in range(2):
             scene, used = image, np.zeros_like(corners)
             if twist is not None:
                 used = smear(camera, x, depth, twist, tau)[0] * clear[:, None, None]
                 scene = markers_without_lag(image, corners[clear], used[clear], _WINDOW_MARGIN_PX)
-            refined = refine_corners(scene, corners, camera, before, step, self.config.blur_px)
+            refined = refine_corners(
+                scene, corners, camera, before, step, self.config.blur_px, columns=columns, coarse=coarse
+            )
+            coarse = False
             x = camera.normalise(refined.corners_px)
             noise = np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1).mean(axis=-1)) / camera.focal_px
             twist = self._motion.correct(stamp_ns, predicted, ids, x, depth, noise)
@@ -188,7 +194,7 @@ class MarkerDetector:
             refined = replace(refined, corners_px=corners, covariances=refined.covariances + spread)
             if np.abs(change[clear]).max(initial=0.0) < _SMEAR_THAT_MATTERS_PX:
                 break
-        keep = confirmed(scene, found, refined, self._decoder)
+        keep = confirmed(scene, found, refined, self._decoder, self.config)
         ids, refined = ids[keep], refined.only(keep)
         self._motion.remember(stamp_ns, twist, ids, camera.normalise(refined.corners_px))
         return ids, refined

@@ -20,8 +20,9 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 
 # A marker turned further from the camera than this shows too little to be expected.
 _MAX_TILT_COSINE = 0.2
-# Places round the prediction that are tried when nothing is found at it, in shares of a cell.
-_OFFSETS = np.stack(np.meshgrid([-1.0, -0.5, 0.0, 0.5, 1.0], [-1.0, -0.5, 0.0, 0.5, 1.0]), axis=-1).reshape(-1, 2)
+# Places round the prediction that are tried, in shares of a cell: near first, then far.
+_NEAR = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]), axis=-1).reshape(-1, 2)
+_FAR = np.stack(np.meshgrid([-1.4, -0.7, 0.0, 0.7, 1.4], [-1.4, -0.7, 0.0, 0.7, 1.4]), axis=-1).reshape(-1, 2)
 
 
 def expected_markers(
@@ -60,27 +61,29 @@ def look(
     config: ArucoDetectorConfig,
 ) -> tuple[Found, BoolArray]:
     """The expected markers (N,), (N, 4, 2) that the image shows, and which (N,) of them these are."""
-    corners = corners.copy()
+    corners = _shifted(image, ids, corners, decoder, _NEAR)
     reading = read_quads(image, corners, decoder)
-    good = _confirmed(reading, ids, noise, config)
+    good, contrast = _confirmed(reading, ids, noise, config), reading.contrast.copy()
     missing = np.flatnonzero(~good)
     if len(missing):
-        cell = np.linalg.norm(corners[missing, 2] - corners[missing, 0], axis=-1) / (1.4 * decoder.cells)
-        tried = corners[missing, None] + (cell[:, None, None] * _OFFSETS)[:, :, None]
-        places = len(_OFFSETS)
-        around = read_quads(image, tried.reshape(-1, 4, 2), decoder)
-        confirmed = _confirmed(around, np.repeat(ids[missing], places), noise, config)
-        score = np.where(confirmed, np.abs(around.correlation), 0.0).reshape(-1, places)
-        best = score.argmax(axis=1)
-        rows = np.arange(len(missing))
-        hit = score[rows, best] > 0.0
-        corners[missing[hit]] = tried[rows, best][hit]
-        good[missing] = hit
-        contrast = reading.contrast.copy()
-        contrast[missing] = around.contrast.reshape(-1, places)[rows, best]
-    else:
-        contrast = reading.contrast
+        far = _shifted(image, ids[missing], corners[missing], decoder, _FAR)
+        corners[missing] = _shifted(image, ids[missing], far, decoder, _NEAR)
+        reading = read_quads(image, corners[missing], decoder)
+        good[missing], contrast[missing] = _confirmed(reading, ids[missing], noise, config), reading.contrast
     return Found(ids[good], corners[good], contrast[good] / noise, np.ones(int(good.sum()), dtype=bool)), good
+
+
+def _shifted(
+    image: Float32Array, ids: IntArray, corners: FloatArray, decoder: Decoder, offsets: FloatArray
+) -> FloatArray:
+    """Corners (N, 4, 2) moved to where their patterns correlate best, between the places by the centre of gravity."""
+    cell = np.linalg.norm(corners[:, 2] - corners[:, 0], axis=-1) / (np.sqrt(2.0) * decoder.cells)
+    step = cell[:, None, None] * offsets
+    tried = (corners[:, None] + step[:, :, None]).reshape(-1, 4, 2)
+    similarity = np.abs(decoder.match(image, tried, np.repeat(ids, len(offsets)))).reshape(len(ids), -1)
+    weight = np.maximum(similarity - 0.8 * similarity.max(axis=1, keepdims=True), 0.0)
+    shift = np.einsum('np,npk->nk', weight, step) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
+    return np.asarray(corners + shift[:, None])
 
 
 def _confirmed(reading: Reading, ids: IntArray, noise: float, config: ArucoDetectorConfig) -> BoolArray:

@@ -26,6 +26,8 @@ _CLEAR_MARGIN = 0.06
 # Corner deviation [px] times contrast over noise times root of the side [px]: 4 to 7 for four clean sides.
 _SHARP = 7.5
 _SOFT = 12.0
+# Contrast over noise beyond which corners deviate by what optics and plates really are, and not by noise.
+_NOISY = 8.0
 # Pixels along a side that the refinement uses of a long one.
 _SEEN_PX = 60.0
 
@@ -96,7 +98,7 @@ def merged(first: Found, second: Found) -> Found:
         np.concatenate([first.ids, second.ids[new]]),
         np.concatenate([first.corners_px, second.corners_px[new]]),
         np.concatenate([first.clarity, second.clarity[new]]),
-        np.concatenate([first.expected, second.expected[new]]),
+        np.concatenate([first.expected | np.isin(first.ids, second.ids[second.expected]), second.expected[new]]),
     )
 
 
@@ -113,7 +115,9 @@ def accepted(reading: Reading, noise: float, config: ArucoDetectorConfig) -> Boo
     )
 
 
-def confirmed(image: Float32Array, found: Found, refined: RefinedCorners, decoder: Decoder) -> BoolArray:
+def confirmed(
+    image: Float32Array, found: Found, refined: RefinedCorners, decoder: Decoder, config: ArucoDetectorConfig
+) -> BoolArray:
     """Which markers (N,) still look like themselves at their refined corners, with sides as sharp as their contrast.
 
     Noise and clutter that happen to correlate with a pattern have no four straight sharp sides: their corners are far
@@ -124,13 +128,16 @@ def confirmed(image: Float32Array, found: Found, refined: RefinedCorners, decode
     reading = read_quads(image, refined.corners_px, decoder)
     similarity = np.abs(reading.correlation)
     contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
-    alike = (reading.ids == found.ids) & (similarity - reading.runner_up >= _CLEAR_MARGIN) & (reading.surround >= 0.4)
+    same = reading.ids == found.ids
+    alike = (similarity - reading.runner_up >= _CLEAR_MARGIN) & (reading.surround >= 0.4)
     side = np.linalg.norm(refined.corners_px[:, 2] - refined.corners_px[:, 0], axis=-1) / np.sqrt(2.0)
     deviation = np.sort(np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1)), axis=1)[:, 2]
-    softness = deviation * contrast * np.sqrt(np.minimum(side, _SEEN_PX))
+    softness = deviation * np.minimum(contrast, _NOISY) * np.sqrt(np.minimum(side, _SEEN_PX))
     sharp = (softness <= _SHARP) & (similarity >= _ALIKE)
     soft = (softness <= _SOFT) & (similarity >= np.minimum(_CLEARLY_ALIKE, 0.7 + 0.07 * contrast))
-    return np.asarray(found.expected | (alike & (sharp | soft)))
+    known = (similarity >= config.guided_min_correlation) & (similarity - reading.runner_up >= config.guided_min_margin)
+    there = np.abs(refined.corners_px - found.corners_px).max(axis=(1, 2)) < 0.7 * side / decoder.cells
+    return np.asarray(same & ((found.expected & known & there) | (alike & (sharp | soft))))
 
 
 def read_quads(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
