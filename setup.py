@@ -28,6 +28,7 @@ setup(
     extras_require={
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-common-interfaces==5.3.6'],
         'cloud': ['small_gicp', 'plyfile', 'pypcd4', 'scipy', 'rich', 'matplotlib'],
+        'smoother': ['gtsam>=4.3'],  # the reference of the filter's benchmark; brings pytest 9
         'tools': ['scipy', 'rich', 'matplotlib', 'ezdxf', 'jinja2'],
         'test': ['pytest', 'shapely', 'hypothesis', 'pytest-benchmark', 'pytest-xdist', 'evo'],
         'lint': ['ruff', 'mypy', 'import-linter', 'types-PyYAML'],
