@@ -127,14 +127,17 @@ class MarkerDetector:
             return Found.none(), False
         noise = noise_of(image)
         shift, _ = smear(camera, camera.normalise(corners), depth, twist, self.config.bolometer_lag)
-        found, seen = look(image, ids, corners + shift, self._decoder, noise, self.config)
-        found = replace(found, corners_px=found.corners_px - shift[seen])
-        blurred = ~seen & (np.abs(shift).max(axis=(1, 2)) > _SMEAR_THAT_MATTERS_PX)
-        if blurred.any():
-            scene = markers_without_lag(image, corners[blurred], shift[blurred], _WINDOW_MARGIN_PX)
-            sharp, also = look(scene, ids[blurred], corners[blurred], self._decoder, noise, self.config)
-            found = merged(found, sharp)
-            seen[np.flatnonzero(blurred)[also]] = True
+        blurred = np.abs(shift).max(axis=(1, 2)) > _SMEAR_THAT_MATTERS_PX
+        scene = markers_without_lag(image, corners[blurred], shift[blurred], _WINDOW_MARGIN_PX)
+        still = np.where(blurred[:, None, None], 0.0, shift)
+        found, seen = look(scene, ids, corners + still, self._decoder, noise, self.config)
+        found = replace(found, corners_px=found.corners_px - still[seen])
+        faint = np.flatnonzero(blurred & ~seen)
+        if len(faint):
+            # Freeing a faint marker of its lag may have drowned it in noise.
+            also, there = look(image, ids[faint], (corners + shift)[faint], self._decoder, noise, self.config)
+            found = merged(found, replace(also, corners_px=also.corners_px - shift[faint[there]]))
+            seen[faint[there]] = True
         return found, bool(seen.all())
 
     def _allowed(self) -> BoolArray:
