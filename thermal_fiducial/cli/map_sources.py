@@ -13,8 +13,8 @@ from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.map_building import build_map, Built, rows_from_corners
 from thermal_fiducial.core.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.measurements import CORNER_FIELDS, Markers
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE, Markers
+from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -22,6 +22,10 @@ from thermal_fiducial.files.map_history import save_with_history
 from thermal_fiducial.files.marker_map import load_map
 
 _IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
+#: Noise of OpenCV's sub-pixel corners in photos [px]; the mapper takes the actual noise from the pictures.
+PHOTO_SIGMA_PX = 0.2
+# Between unordered pictures the detector shall see no motion.
+_APART_NS = 100_000_000_000
 
 
 def add_build(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +57,7 @@ def add_refine(parser: argparse.ArgumentParser) -> None:
 def _build(args: argparse.Namespace) -> int:
     camera = load_camera(args.calibration)
     start = _start(args)
-    frames = _detect(_photos(args.images), camera, _detector(args))
+    frames = _detect(_photos(args.images), camera, args)
     if args.origin is not None and not any(args.origin in rows['id'] for rows in frames):
         raise InputError(f'{args.images}: marker {args.origin}, the origin, is in none of the {len(frames)} photos')
     return _grow(args, frames, camera, start, args.out, f'build from {args.images.name}')
@@ -137,7 +141,8 @@ def _photos(folder: Path) -> list[Path]:
     return photos
 
 
-def _detect(photos: list[Path], camera: Camera, detector: MarkerDetector) -> list[Markers]:
+def _detect(photos: list[Path], camera: Camera, args: argparse.Namespace) -> list[Markers]:
+    detector, photo_detector = _detector(args), _photo_detector(args)
     frames = []
     with Progress(transient=True) as progress:
         for k, photo in enumerate(progress.track(photos, description='detecting')):
@@ -149,9 +154,35 @@ def _detect(photos: list[Path], camera: Camera, detector: MarkerDetector) -> lis
                     f'{photo}: {counts.shape[1]}x{counts.shape[0]}, '
                     f'but the calibration is for {camera.width}x{camera.height}'
                 )
-            deep = counts.dtype == np.uint16
-            frames.append(detector.detect(k, counts.astype(np.uint16) if deep else counts.astype(np.uint8), camera))
+            if counts.dtype == np.uint16:
+                frames.append(detector.detect(k * _APART_NS, counts.astype(np.uint16), camera))
+            else:
+                frames.append(_detect_in_photo(photo_detector, counts.astype(np.uint8), camera, detector))
     return frames
+
+
+def _detect_in_photo(
+    photo_detector: cv2.aruco.ArucoDetector, gray: Gray, camera: Camera, sizes: MarkerDetector
+) -> Markers:
+    """Markers of an 8-bit photo.
+
+    Cameras for visible light sharpen their pictures and bend the grey scale, which shifts the edges that our own
+    detector finds on counts that are linear in radiance; OpenCV's corners follow the gradient alone.
+    """
+    corners, ids, _ = photo_detector.detectMarkers(gray)
+    if not len(corners):
+        return np.zeros(0, MARKER_DTYPE)
+    ids = ids.ravel()
+    once = np.array([np.count_nonzero(ids == key) == 1 for key in ids])
+    ids, uv = ids[once].astype(np.int64), np.array(corners, dtype=np.float64).reshape(-1, 4, 2)[once]
+    side = np.array([sizes.size(int(key)) for key in ids])
+    return rows_from_corners(ids, uv, _isotropic(np.full(len(ids), PHOTO_SIGMA_PX)), side, camera)
+
+
+def _photo_detector(args: argparse.Namespace) -> cv2.aruco.ArucoDetector:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return cv2.aruco.ArucoDetector(load_dictionary(args.dictionary), parameters)
 
 
 def _read_detections(path: Path, start: MarkerMap, config: MarkerMapperConfig, camera: Camera) -> list[Markers]:

@@ -28,8 +28,8 @@ DECISIVE = 25.0
 SYSTEMATIC_PX = 0.1
 #: Mean chi square of a view (8 residuals) above which the views don't belong to one marker that hangs still.
 INCONSISTENT = 200.0
-# Fits that end nearer to each other than this are one fit [rad].
-_SAME_FIT = np.deg2rad(2.0)
+#: Fits that end nearer to each other than this are one fit [rad].
+SAME_FIT = np.deg2rad(2.0)
 # How often a fit may change its mind about the cameras' poses.
 _CHOICES = 4
 
@@ -132,7 +132,7 @@ class Candidate:
         if not best.chi2 <= INCONSISTENT * len(self.views):
             return Placement(None, nothing, f'marker {self.id}: its views contradict each other')
         scale = max(1.0, best.chi2 / (8 * len(self.views) - 6))
-        rivals = [fit for fit in fits[1:] if rotation_angle(fit.T[:3, :3].T @ best.T[:3, :3]) > _SAME_FIT]
+        rivals = [fit for fit in fits[1:] if rotation_angle(fit.T[:3, :3].T @ best.T[:3, :3]) > SAME_FIT]
         if rivals and rivals[0].chi2 - best.chi2 < DECISIVE * scale:
             return Placement(None, nothing, f'planar ambiguity of marker {self.id} unsettled')
         return Placement(best.T, scale * best.noise + best.from_cameras)
@@ -141,7 +141,7 @@ class Candidate:
         """All poses (4, 4) that a fit to the views ends in, the best first."""
         poses: list[FloatArray] = []
         for fit in self._fits(camera):
-            if all(rotation_angle(fit.T[:3, :3].T @ T[:3, :3]) > _SAME_FIT for T in poses) and np.isfinite(fit.chi2):
+            if all(rotation_angle(fit.T[:3, :3].T @ T[:3, :3]) > SAME_FIT for T in poses) and np.isfinite(fit.chi2):
                 poses.append(fit.T)
         return poses
 

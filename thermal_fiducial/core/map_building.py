@@ -7,8 +7,8 @@ import numpy as np
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.candidates import Candidate, DECISIVE
-from thermal_fiducial.core.geometry import quaternion_from_rotation
+from thermal_fiducial.core.candidates import Candidate, DECISIVE, SAME_FIT
+from thermal_fiducial.core.geometry import quaternion_from_rotation, rotation_angle
 from thermal_fiducial.core.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.map_refinement import refine, Refinement
 from thermal_fiducial.core.marker_map import MarkerMapper
@@ -135,10 +135,15 @@ def _winner(
         refinement = refine(replace(snapshot, markers={**snapshot.markers, candidate.id: trial}))
         if refinement is not None and candidate.id in refinement.markers:
             outcomes.append((refinement.cost, refinement.markers[candidate.id]))
-    outcomes.sort(key=lambda outcome: outcome[0])
-    if not outcomes or (len(outcomes) == 2 and outcomes[1][0] - outcomes[0][0] < DECISIVE):
+    if not outcomes:
         return None
-    return outcomes[0][1].T_map_marker, outcomes[0][1].covariance
+    outcomes.sort(key=lambda outcome: outcome[0])
+    cost, best = outcomes[0]
+    for other_cost, other in outcomes[1:]:
+        apart = rotation_angle(best.T_map_marker[:3, :3].T @ other.T_map_marker[:3, :3])
+        if apart > SAME_FIT and other_cost - cost < DECISIVE:
+            return None
+    return best.T_map_marker, best.covariance
 
 
 def _with_statistics(built: MarkerMap, frames: Sequence[Markers], start: MarkerMap) -> MarkerMap:

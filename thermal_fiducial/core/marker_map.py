@@ -20,6 +20,7 @@ from thermal_fiducial.core.localization import locate, Location, positive, Refus
 from thermal_fiducial.core.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.map_refinement import prior_poses, refine, Refinement, Snapshot
 from thermal_fiducial.core.measurements import CameraPose, columns, corner_covariances, corners_px, Markers, Odometry
+from thermal_fiducial.core.noise_level import NoiseLevel
 from thermal_fiducial.core.reprojection import corners_in_map, linearise, reproject
 from thermal_fiducial.core.trust import culprits, DISAGREEMENT, Trust
 from thermal_fiducial.core.types import BoolArray, FloatArray
@@ -102,6 +103,7 @@ class MarkerMapper:
         self._quarantined = {key for key, marker in self.map.markers.items() if not marker.trusted}
         self._last: CameraPose | None = None
         self._cameras: list[Camera] = []
+        self._noise = NoiseLevel()
         self._gap: FloatArray | None = None
         self._keyframes = KeyframeStore(self.config.keyframe_budget)
         self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(self.map.markers)
@@ -118,6 +120,7 @@ class MarkerMapper:
         odometry : the filter's latest output; settles ambiguities, and bridges gaps between known markers
         """
         markers = _usable(markers)
+        self._noise.add(markers)
         # Step 2: known and new markers.
         is_known = np.array([int(key) in self.map.markers for key in markers['id']], dtype=bool)
         known = self._sight(markers[is_known])
@@ -165,7 +168,7 @@ class MarkerMapper:
     def _sight(self, rows: Markers) -> Sight:
         branches = np.stack([_poses(rows, ''), _poses(rows, 'a')], axis=1)
         known = [self.map.markers[int(key)] for key in rows['id'] if int(key) in self.map.markers]
-        return Sight(known, corners_px(rows), corner_covariances(rows), branches)
+        return Sight(known, corners_px(rows), self._noise.factor * corner_covariances(rows), branches)
 
     def _update_errors(self, stamp_ns: int, known: Sight, location: Location, camera: Camera) -> FloatArray:
         """Re-projection error (N,) [px] of each known marker, taken into its statistics."""
@@ -202,7 +205,7 @@ class MarkerMapper:
     ) -> tuple[bool, dict[int, str]]:
         """Show new markers to their candidates; whether any entered the map, and what the others wait for."""
         branches = np.stack([_poses(rows, ''), _poses(rows, 'a')], axis=1)
-        corners, covariances = corners_px(rows), corner_covariances(rows)
+        corners, covariances = corners_px(rows), self._noise.factor * corner_covariances(rows)
         shown = []
         for i, marker_id in enumerate(int(key) for key in rows['id']):
             size = self._sizes.get(marker_id, self.config.marker_size)
