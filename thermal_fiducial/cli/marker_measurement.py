@@ -13,7 +13,7 @@ from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.measurements import columns, corners_px, Markers
 from thermal_fiducial.core.patterns import marker_bits
 from thermal_fiducial.core.types import Counts, FloatArray
-from thermal_fiducial.fabrication.planning import Measurements
+from thermal_fiducial.fabrication.planning import expected_errors, Measurements, pose_errors
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.render import Quality, Renderer
@@ -32,6 +32,8 @@ _SENSOR = replace(Sensor(), bad_pixel_share=0.0, lag=0.0)
 _MOST_MARKERS = 12
 # Views of one kind at most: large markers come one or two a view.
 _MOST_VIEWS = 4
+# Poses whose median says something about the scale of their errors.
+_ENOUGH_POSES = 8
 
 
 @dataclass(frozen=True)
@@ -127,9 +129,63 @@ def camera_and_detector() -> tuple[Camera, MarkerDetector]:
     return camera, MarkerDetector(config, load_dictionary(DICTIONARY))
 
 
-def poses_of(rows: Markers) -> FloatArray:
-    """T_camera_marker (N, 4, 4) of rows."""
-    return geometry.transform_from_quaternion(columns(rows, ('x', 'y', 'z')), columns(rows, ('qx', 'qy', 'qz', 'qw')))
+def both_poses(rows: Markers) -> tuple[FloatArray, FloatArray]:
+    """T_camera_marker (N, 4, 4) of rows, the chosen branch and the other one."""
+    best = geometry.transform_from_quaternion(columns(rows, ('x', 'y', 'z')), columns(rows, ('qx', 'qy', 'qz', 'qw')))
+    other = columns(rows, ('ax', 'ay', 'az')), columns(rows, ('aqx', 'aqy', 'aqz', 'aqw'))
+    return best, geometry.transform_from_quaternion(*other)
+
+
+@dataclass
+class Tally:
+    """What the detector made of all views of one kind."""
+
+    shown: int
+    corner_errors: FloatArray
+    best: FloatArray
+    other: FloatArray
+    T_true: FloatArray
+
+    @property
+    def found(self) -> float:
+        """Share of the markers."""
+        return len(self.best) / self.shown
+
+    @property
+    def sigma_px(self) -> float:
+        """Noise of a corner coordinate, from the median: poses do not suffer from the one corner that went astray."""
+        return 1.4826 * float(np.median(np.abs(self.corner_errors))) if len(self.best) >= 3 else np.nan
+
+
+def show(
+    detector: MarkerDetector,
+    camera: Camera,
+    side_px: float,
+    kelvin: float,
+    tilt_deg: float,
+    markers: int,
+    seed: list[int],
+) -> Tally:
+    """Show about ``markers`` markers of one kind to the detector."""
+    rng = np.random.default_rng(seed)
+    shown, parts = 0, []
+    for _ in range(_MOST_VIEWS):
+        if shown >= markers:
+            break
+        view = render_view(side_px, kelvin, tilt_deg, rng)
+        rows, index = detect(view, detector, camera)
+        parts.append((corners_px(rows) - view.corners_px[index], *both_poses(rows), view.T_camera_marker[index]))
+        shown += len(view.ids)
+    return Tally(shown, *(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _pose_factor(tally: Tally, camera: Camera, side_px: float, tilt_deg: float) -> float:
+    """Error of the poses in that of poses from independent corners; NaN where too few were found to say."""
+    if len(tally.best) < _ENOUGH_POSES:
+        return np.nan
+    measured = pose_errors(tally.best, tally.other, tally.T_true)[0]
+    distance = camera.focal_px * _SIZE / side_px
+    return measured / expected_errors(camera, _SIZE, distance, tilt_deg, tally.sigma_px, 1)[0]
 
 
 def measure(
@@ -144,23 +200,13 @@ def measure(
     """Show about ``markers`` markers of every side, contrast (in NETD) and tilt to the detector."""
     camera, detector = camera_and_detector()
     shape = (len(side_px), len(contrast), len(tilt_deg))
-    found, sigma = np.zeros(shape), np.full(shape, np.nan)
+    found, sigma, factor = np.zeros(shape), np.full(shape, np.nan), np.full(shape, np.nan)
     for node in np.ndindex(*shape):
-        rng = np.random.default_rng([seed, *node])
         side, kelvin, tilt = float(side_px[node[0]]), float(contrast[node[1]]) * _SENSOR.netd, float(tilt_deg[node[2]])
-        shown, errors = 0, []
-        for _ in range(_MOST_VIEWS):
-            if shown >= markers:
-                break
-            view = render_view(side, kelvin, tilt, rng)
-            rows, index = detect(view, detector, camera)
-            errors.append(corners_px(rows) - view.corners_px[index])
-            shown += len(view.ids)
-        error = np.concatenate(errors)
-        found[node] = len(error) / shown
-        if len(error) >= 3:
-            # From the median: a corner in a thousand that went astray is not what poses suffer from.
-            sigma[node] = 1.4826 * float(np.median(np.abs(error)))
+        tally = show(detector, camera, side, kelvin, tilt, markers, [seed, *node])
+        found[node], sigma[node] = tally.found, tally.sigma_px
+        factor[node] = _pose_factor(tally, camera, side, tilt)
         if progress is not None:
             progress()
-    return Measurements(side_px, contrast, tilt_deg, found, sigma)
+    by_tilt = np.array([np.nanmedian(factor[:, :, index]) for index in range(len(tilt_deg))])
+    return Measurements(side_px, contrast, tilt_deg, found, sigma, by_tilt)

@@ -13,6 +13,7 @@ from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.contrast import Mounting, remaining_contrast
 from thermal_fiducial.fabrication.planning import (
+    DETECTED,
     expect,
     Expectation,
     load_measurements,
@@ -185,5 +186,7 @@ def _measure(args: argparse.Namespace) -> int:
         measurements = measure(*axes, markers=args.markers, seed=args.seed, progress=lambda: bar.advance(task))
     notes = {'dictionary': DICTIONARY, 'lens': LENS, 'markers': args.markers, 'seed': args.seed}
     save_measurements(args.out, measurements, notes)
-    print(f'{args.out}: {int(np.sum(measurements.found >= 0.9))} of {measurements.found.size} kinds of view detected')
+    print(
+        f'{args.out}: {int(np.sum(measurements.found >= DETECTED))} of {measurements.found.size} kinds of view detected'
+    )
     return 0

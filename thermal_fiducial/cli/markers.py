@@ -29,6 +29,7 @@ from thermal_fiducial.files.dictionary import load_dictionary, save_dictionary
 _OPTION_HELP = {
     'size': 'side of the black square',
     'hole_diameter': 'mounting holes (4.3: M4)',
+    'stand_off': 'spacers between warm surface and plate',
     'kerf': 'width of the cut',
     'corner_radius': 'radius of re-entrant corners',
     'bridge_width': 'webs that hold islands of standard dictionaries',
@@ -274,4 +275,5 @@ def _write_all(drawing: Drawing, args: argparse.Namespace) -> None:
         write(drawing, path)
         if kind == 'dxf' and not agree(read_dxf(path), drawing):
             raise InputError(f'{path}: what was read back is not what was written')
-    print(f'{args.out / stem}: {drawing.width:.1f} x {drawing.height:.1f} mm, {drawing.parts} parts')
+    notes = '\n  '.join(('', *drawing.notes))
+    print(f'{args.out / stem}: {drawing.width:.1f} x {drawing.height:.1f} mm, {drawing.parts} parts{notes}')

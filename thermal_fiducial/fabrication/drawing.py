@@ -93,7 +93,7 @@ class Drawing:
     engraving: tuple[Contour, ...] = ()
     #: number of separate pieces of acrylic that must come out
     parts: int = 1
-    #: what the drawing shows, one line each, for the title of a preview and the notes of a PDF
+    #: what to cut and how to mount it, one line a part
     notes: tuple[str, ...] = field(default=())
 
     def moved(self, dx: float, dy: float) -> 'Drawing':

@@ -17,17 +17,17 @@ import yaml
 
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.pose import marker_corners, PlanarPose, solve_marker_poses
+from thermal_fiducial.core.pose import marker_corners, solve_marker_poses
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
 FORMAT = 'thermal_fiducial/marker_measurements'
 #: What the package ships.
 PACKAGED = Path(__file__).resolve().parent / 'measured.yaml'
-#: A marker is planned as detected when so many of the measured ones were.
-DETECTED = 0.9
+#: A marker is planned as detected when so many of the measured ones were: four frames of five, 24 times a second.
+DETECTED = 0.8
 
-_TABLES = ('side_px', 'contrast', 'tilt_deg', 'found', 'sigma_px')
+_TABLES = ('side_px', 'contrast', 'tilt_deg', 'found', 'sigma_px', 'pose_factor')
 _SAMPLES = 200
 # Bits along a side of the markers that were measured: what counts for reading them is the size of a cell.
 _MEASURED_BITS = 4
@@ -44,6 +44,8 @@ class Measurements:
     tilt_deg : (T,) between the marker's normal and the line of sight
     found : (S, C, T) share of the markers that were found
     sigma_px : (S, C, T) noise of a corner coordinate; NaN where nothing was found
+    pose_factor : (T,) median error of the poses in that of poses from four corners with independent noise: the
+        corners of a marker lie on common lines, so their errors have much in common
     """
 
     side_px: FloatArray
@@ -51,9 +53,10 @@ class Measurements:
     tilt_deg: FloatArray
     found: FloatArray
     sigma_px: FloatArray
+    pose_factor: FloatArray
 
     def look_up(self, side_px: float, contrast: float, tilt_deg: float, bits: int = 4) -> tuple[float, float]:
-        """Share found and corner noise [px], linear between the measured points (logarithmic in side and contrast).
+        """Share found and corner noise [px], linear between the measured points; all but share and tilt logarithmic.
 
         Beyond the measured range the nearest end counts, except that nothing smaller or fainter than measured is
         found.
@@ -67,7 +70,7 @@ class Measurements:
         if readable >= self.side_px[0]:
             found = _interpolate(self.found, (_position(np.log(self.side_px), np.log(readable)), faint, tilted))
         large = _position(np.log(self.side_px), np.log(max(side_px, self.side_px[0])))
-        return found, _interpolate(self.sigma_px, (large, faint, tilted))
+        return found, float(np.exp(_interpolate(np.log(self.sigma_px), (large, faint, tilted))))
 
 
 def _position(axis: FloatArray, value: float) -> tuple[int, float]:
@@ -107,11 +110,11 @@ def load_measurements(path: str | os.PathLike[str] = PACKAGED) -> Measurements:
         tables = [np.array(document[name], dtype=np.float64) for name in _TABLES]
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f'{path}: {error} is missing or no table') from None
-    side, contrast, tilt, found, sigma = tables
+    side, contrast, tilt, found, sigma, factor = tables
     shape = len(side), len(contrast), len(tilt)
-    if found.shape != shape or sigma.shape != shape or min(shape) < 2:
+    if found.shape != shape or sigma.shape != shape or factor.shape != tilt.shape or min(shape) < 2:
         raise InputError(f'{path}: tables of {found.shape} and {sigma.shape} do not fit axes of {shape}')
-    return Measurements(side, contrast, tilt, found, sigma)
+    return Measurements(side, contrast, tilt, found, sigma, factor)
 
 
 def save_measurements(path: str | os.PathLike[str], measurements: Measurements, notes: dict[str, Any]) -> None:
@@ -180,14 +183,25 @@ def expect(
     found, sigma = measurements.look_up(side_px, contrast, tilt_deg, bits)
     if not np.isfinite(sigma):
         return Expectation(side_px, found, sigma)
+    errors = expected_errors(camera, size, distance, tilt_deg, sigma, seed)
+    factor = float(np.interp(tilt_deg, measurements.tilt_deg, measurements.pose_factor))
+    position, along, rotation = (factor * error for error in errors[:3])
+    return Expectation(side_px, found, sigma, position, along, rotation, errors[3])
+
+
+def expected_errors(
+    camera: Camera, size: float, distance: float, tilt_deg: float, sigma_px: float, seed: int
+) -> tuple[float, float, float, float]:
+    """See :func:`pose_errors`, of poses from corners with independent noise of ``sigma_px``."""
     rng = np.random.default_rng(seed)
     turned = rng.uniform(0.0, 2.0 * np.pi, _SAMPLES)
     T = viewed_at(distance, np.radians(tilt_deg), turned, camera)
     corners = camera.project(geometry.apply(T, marker_corners(size)))
-    noisy = corners + rng.normal(0.0, sigma, corners.shape)
-    covariances = np.broadcast_to(sigma**2 * np.eye(2), (*corners.shape, 2))
+    noisy = corners + rng.normal(0.0, sigma_px, corners.shape)
+    covariances = np.broadcast_to(sigma_px**2 * np.eye(2), (*corners.shape, 2))
     poses = solve_marker_poses(noisy, covariances, np.full(_SAMPLES, size), camera)
-    return Expectation(side_px, found, sigma, *pose_errors(poses, T))
+    best = np.stack([pose.T_camera_marker for pose in poses])
+    return pose_errors(best, np.stack([pose.T_alternative for pose in poses]), T)
 
 
 def viewed_at(distance: float, tilt: float, turned: npt.ArrayLike, camera: Camera) -> FloatArray:
@@ -207,27 +221,24 @@ def viewed_at(distance: float, tilt: float, turned: npt.ArrayLike, camera: Camer
     return geometry.transform(R, distance * middle)
 
 
-def pose_errors(poses: list[PlanarPose], T_true: FloatArray) -> tuple[float, float, float, float]:
+def pose_errors(best: FloatArray, other: FloatArray, T_true: FloatArray) -> tuple[float, float, float, float]:
     """Median errors of position [m], distance [m] and rotation [deg], and the share on the wrong branch.
 
     Parameters
     ----------
-    poses : N poses of a marker in the camera
+    best, other : (N, 4, 4) T_camera_marker of both branches, the chosen one first
     T_true : (N, 4, 4)
     """
-    best = np.stack([pose.T_camera_marker for pose in poses])
-    other = np.stack([pose.T_alternative for pose in poses])
-    angle, other_angle = (
-        geometry.rotation_angle(T[:, :3, :3] @ np.swapaxes(T_true[:, :3, :3], 1, 2)) for T in (best, other)
-    )
-    wrong = other_angle < angle
-    if np.all(wrong):
+    R_true = np.swapaxes(T_true[:, :3, :3], 1, 2)
+    angle, other_angle = (geometry.rotation_angle(T[:, :3, :3] @ R_true) for T in (best, other))
+    right = angle <= other_angle
+    if not np.any(right):
         return np.nan, np.nan, np.nan, 1.0
     seen_from = geometry.inverse(best)[:, :3, 3] - geometry.inverse(T_true)[:, :3, 3]
     along = np.linalg.norm(best[:, :3, 3], axis=1) - np.linalg.norm(T_true[:, :3, 3], axis=1)
     return (
-        float(np.median(np.linalg.norm(seen_from, axis=1)[~wrong])),
-        float(np.median(np.abs(along)[~wrong])),
-        float(np.degrees(np.median(angle[~wrong]))),
-        float(np.mean(wrong)),
+        float(np.median(np.linalg.norm(seen_from, axis=1)[right])),
+        float(np.median(np.abs(along)[right])),
+        float(np.degrees(np.median(angle[right]))),
+        float(np.mean(~right)),
     )

@@ -1,9 +1,9 @@
 """Drawings of one marker plate: the pattern and what holds it.
 
-Three mounts. ``ears``: the black square with a tab at the middle of each side, on a neck so narrow that the edges
-which the camera measures stay free; the warm surface behind must reach a cell beyond the square. ``frame``: a ring of hot background one cell wide, then a frame of acrylic, held
-together by ties; the ties break the outline of the black square where the camera resolves them. ``none``: the black
-square alone.
+Three mounts. ``ears``: the black square with a tab at the middle of each side, on a narrow neck, so that the edges
+which the camera measures stay free; the warm surface behind must reach a cell beyond the square. ``frame``: a ring of
+hot background one cell wide, then a frame of acrylic, held together by ties; the ties break the outline of the black
+square where the camera resolves them. ``none``: the black square alone.
 """
 
 from dataclasses import dataclass
@@ -36,6 +36,8 @@ class PlateOptions:
     mount: str = 'ears'
     #: diameter of the mounting holes (4.3: M4)
     hole_diameter: float = 4.3
+    #: length of the spacers between warm surface and plate
+    stand_off: float = 10.0
     #: width of the cut
     kerf: float = 0.15
     #: radius of re-entrant corners
@@ -60,7 +62,11 @@ class PlateOptions:
             self.frame_width,
             self.tie_width,
         )
-        if not all(np.isfinite(positive)) or min(positive) <= 0 or self.kerf < 0 or self.corner_radius < 0:
+        if (
+            not all(np.isfinite(positive))
+            or min(positive) <= 0
+            or min(self.kerf, self.corner_radius, self.stand_off) < 0
+        ):
             raise InputError('lengths of a marker plate must be positive')
         if self.mount == 'frame' and self.frame_width < self.hole_diameter + _WALL_MM:
             raise InputError(f'a frame of {self.frame_width:g} mm has no room for holes of {self.hole_diameter:g} mm')
@@ -102,6 +108,7 @@ def marker_drawing(bits: Gray, label: str, options: PlateOptions) -> Drawing:
     pattern = [_moved(r, origin) for r in marker_rectangles(bits, options)]
     contours = trace([*outline, *pattern])
     points, side = mounting_points(options, cells)
+    spacers = f'{len(points)} spacers of {options.stand_off:g} mm, holes of {options.hole_diameter:g} mm'
     holes = (Circle(x, y, 0.5 * (options.hole_diameter - options.kerf)) for x, y in (points + 0.5 * side).tolist())
     return Drawing(
         name=label,
@@ -110,7 +117,7 @@ def marker_drawing(bits: Gray, label: str, options: PlateOptions) -> Drawing:
         cuts=tuple(contour(corners, options.kerf, options.corner_radius) for corners in contours),
         holes=tuple(holes),
         engraving=tuple(engraving),
-        notes=(f'{label}: black square {options.size:g} mm, kerf {options.kerf:g} mm',),
+        notes=(f'{label}: black square {options.size:g} mm, kerf {options.kerf:g} mm; {spacers}',),
     )
 
 

@@ -4,6 +4,7 @@ ezdxf and matplotlib (extra ``tools``) are imported when they are needed.
 """
 
 from collections.abc import Iterable
+from html import escape
 import os
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,7 @@ def write_svg(drawing: Drawing, path: Path) -> None:
     }
     size = f'width="{_n(drawing.width)}mm" height="{_n(height)}mm" viewBox="0 0 {_n(drawing.width)} {_n(height)}"'
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<svg xmlns="http://www.w3.org/2000/svg" {size}>']
-    lines.append(f'<title>{drawing.name}</title>')
+    lines += [f'<title>{escape(drawing.name)}</title>', f'<desc>{escape("; ".join(drawing.notes))}</desc>']
     for layer, elements in groups.items():
         lines.append(f'<g id="{layer}" fill="none" stroke="{LAYERS[layer][1]}" stroke-width="0.01">')
         lines += [*elements, '</g>']

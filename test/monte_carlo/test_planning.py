@@ -1,0 +1,44 @@
+"""What is planned against what the detector does with frames that the tables were not made from."""
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.cli.marker_measurement import camera_and_detector, show
+from thermal_fiducial.fabrication.planning import expect, load_measurements, pose_errors
+
+NETD = 0.05
+SIZE = 0.30
+
+
+@pytest.mark.slow
+def test_planned_pose_errors_are_the_measured_ones():
+    camera, detector = camera_and_detector()
+    tables = load_measurements()
+    ratios = []
+    for side in (34.0, 50.0, 80.0):
+        for tilt in (20.0, 40.0, 58.0):
+            tally = show(detector, camera, side, 6.0, tilt, 36, [901, int(side), int(tilt)])
+            measured = pose_errors(tally.best, tally.other, tally.T_true)
+            planned = expect(
+                tables, camera, size=SIZE, distance=camera.focal_px * SIZE / side, tilt_deg=tilt, contrast=6.0 / NETD
+            )
+            if not planned.detected:
+                continue
+            # 36 markers: a share of 0.8 scatters by 0.07.
+            assert tally.found >= 0.6
+            ratios.append((planned.position / measured[0], planned.rotation_deg / measured[2]))
+    assert len(ratios) >= 7
+    # Medians of 36 errors scatter by a fifth, and so do those of the tables.
+    assert np.all(np.abs(np.log(np.median(ratios, axis=0))) < np.log(1.3))
+    assert np.mean(np.abs(np.log(ratios)) < np.log(1.5)) >= 0.9
+
+
+@pytest.mark.slow
+def test_faint_small_marker_is_found_as_planned():
+    camera, detector = camera_and_detector()
+    distance = camera.focal_px * SIZE / 40.0
+    planned = expect(load_measurements(), camera, size=SIZE, distance=distance, tilt_deg=15.0, contrast=0.2 / NETD)
+    tally = show(detector, camera, 40.0, 0.2, 15.0, 48, [902])
+    assert planned.detected
+    # 48 markers: a share of 0.8 scatters by 0.06.
+    assert tally.found >= 0.65
