@@ -1,14 +1,17 @@
 """Each fault that a bridge may have is found and named; a sound one passes."""
 
 from dataclasses import replace
+import json
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_typestore, Stores
 from support.flights import Motion
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry import quaternion_from_rotation, so3_exp
+from thermal_fiducial.files.bags import BagWriter
 from thermal_fiducial.report.bridge_check import check_bridge, Level
 from thermal_fiducial.report.bridge_record import BridgeRecord, Recorder
 
@@ -168,3 +171,30 @@ def test_the_command_wants_something_to_check(tmp_path, capsys):
     assert main(['check-bridge', str(tmp_path / 'nothing')]) == 2
     assert 'no such bag' in capsys.readouterr().err
     assert main(['check-bridge', '--seconds', '-1']) == 2
+
+
+def test_a_recorded_run_is_checked(tmp_path, flying, capsys):
+    """Written as messages of a bag, read back by the command; exit status 1 tells of a fault."""
+    types = get_typestore(Stores.ROS2_JAZZY).types
+    stamp_type, header_type = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
+    vector, point, quaternion = (types[f'geometry_msgs/msg/{name}'] for name in ('Vector3', 'Point', 'Quaternion'))
+    with BagWriter(tmp_path / 'output') as bag:
+        for index, stamp in enumerate(flying.stamps_ns):
+            header = header_type(stamp_type(int(stamp) // 10**9, int(stamp) % 10**9), 'map')
+            pose = types['geometry_msgs/msg/Pose'](
+                point(*flying.positions[index]), quaternion(*flying.quaternions[index])
+            )
+            twist = types['geometry_msgs/msg/Twist'](vector(*flying.velocities[index]), vector(*flying.rates[index]))
+            covariance = flying.covariances[index].ravel()
+            odometry = types['nav_msgs/msg/Odometry'](
+                header,
+                'base_link',
+                types['geometry_msgs/msg/PoseWithCovariance'](pose, covariance),
+                types['geometry_msgs/msg/TwistWithCovariance'](twist, covariance),
+            )
+            bag.write('bridge/odometry', int(stamp), odometry)
+    assert main(['check-bridge', str(tmp_path), '--json']) == 0
+    findings = {entry['check']: entry for entry in json.loads(capsys.readouterr().out)}
+    assert findings['yaw']['level'] == 'ok'
+    assert findings['gravity']['level'] == 'not tested'
+    assert main(['check-bridge', str(tmp_path), '--topic', 'nothing']) == 2

@@ -128,13 +128,18 @@ class PoseEkf:
             reason = 'refused: no IMU yet'
         elif pose.stamp_ns + self._offset_ns - self._nodes[-1].stamp_ns > self._config.max_imu_gap * _SECOND_NS:
             reason = 'refused: far ahead of the IMU'
-        elif self._due_ns(self._nodes[0].belief, pose) <= self._nodes[0].stamp_ns:
+        elif self._is_too_late(pose):
             reason = 'refused: too late'
         else:
             place = bisect_left(self._poses, pose.stamp_ns, key=lambda item: item.stamp_ns)
             if place < len(self._poses) and self._poses[place].stamp_ns == pose.stamp_ns:
                 reason = 'refused: stamp repeated'
         return PoseUpdate(pose.stamp_ns, False, reason, np.nan) if reason else None
+
+    def _is_too_late(self, pose: CameraPose) -> bool:
+        first, last = self._nodes[0], self._nodes[-1]
+        oldest_ns = max(first.stamp_ns, last.stamp_ns - round(self._config.max_delay * _SECOND_NS))
+        return self._due_ns(last.belief, pose) <= oldest_ns or self._due_ns(first.belief, pose) <= first.stamp_ns
 
     # --- the history ----------------------------------------------------------------------------------
 

@@ -1,0 +1,40 @@
+"""The promise of how long the pose may be used, against the filter's own covariance while it coasts."""
+
+import numpy as np
+import pytest
+from support.flights import config, Flight, Motion, run, timeline
+
+from thermal_fiducial.core.coasting import coasting_variance, HORIZON, usable_seconds
+from thermal_fiducial.core.ekf import PoseEkf
+from thermal_fiducial.core.gating import position_std
+from thermal_fiducial.core.navigation_state import Layout
+
+
+@pytest.fixture(scope='module')
+def hover():
+    """A filter at rest whose markers vanish after 4 s, there and 4 s later."""
+    data = Flight(seed=2, seconds=8.0, motion=Motion.still())
+    samples, ekf = data.samples(), PoseEkf(config())
+    last = samples[800]
+    run(ekf, timeline([s for s in samples if s.stamp_ns <= last.stamp_ns], data.poses[:114]))
+    then = ekf.state
+    run(ekf, samples[801:])
+    return then, ekf.state, (samples[-1].stamp_ns - last.stamp_ns) * 1e-9
+
+
+def test_the_variance_is_that_of_the_propagated_covariance(hover):
+    then, now, seconds = hover
+    coefficients = coasting_variance(then, Layout.of(config()), config().imu)
+    # the walks of the biases are left out: under 2 % of the standard deviation after 4 s
+    assert np.sqrt(np.polynomial.polynomial.polyval(seconds, coefficients)) == pytest.approx(
+        position_std(now), rel=0.02
+    )
+
+
+def test_usable_until_the_variance_is_too_large(hover):
+    then, now, seconds = hover
+    layout, noise = Layout.of(config()), config().imu
+    # the grid of 0.05 s and the 2 % above
+    assert usable_seconds(then, layout, noise, position_std(now)) == pytest.approx(seconds, abs=0.15)
+    assert usable_seconds(then, layout, noise, 0.0) == 0.0
+    assert usable_seconds(then, layout, noise, 1e6) == HORIZON
