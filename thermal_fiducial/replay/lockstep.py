@@ -21,7 +21,7 @@ from thermal_fiducial.nodes.tau2_camera import Tau2Camera
 from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.replay.recorder import Recorder, RunFiles
 from thermal_fiducial.replay.topics import PLAYED, Topics
-from thermal_fiducial.ros.node import CountingNode, Input, Output, StageNode
+from thermal_fiducial.ros.node import CountingNode, StageNode
 from thermal_fiducial.ros.run import initialise, make_executor
 
 _SECOND_NS = 1_000_000_000
@@ -116,20 +116,26 @@ class _Graph:
 
     def _connect(self) -> None:
         """Pair the topics' two ends, and wait until DDS has done so too, at both of them."""
-        inputs = [source for node in self._nodes for source in node.inputs]
+        self._inputs = [source for node in self._nodes for source in node.inputs]
         outputs = [output for node in self._nodes for output in node.outputs]
-        self._pairs = [(source, [o for o in outputs if o.topic == source.topic]) for source in inputs]
-        readers = [(output, sum(source.topic == output.topic for source in inputs)) for output in outputs]
-        self._wait(lambda: all(output.listeners == expected for output, expected in readers))
-        self._wait(lambda: all(source.publishers == len(writers) for source, writers in self._pairs))
+        readers = [(output, sum(source.topic == output.topic for source in self._inputs)) for output in outputs]
+        writers = [(source, sum(output.topic == source.topic for output in outputs)) for source in self._inputs]
+        self._wait(lambda: all(output.listeners == count for output, count in readers))
+        self._wait(lambda: all(source.publishers == count for source, count in writers))
+        self._heard = [(output, count) for output, count in readers if count]
 
     def _settle(self, time_ns: int, files: RunFiles) -> None:
         """Run callbacks until nothing is under way; hand what was recorded on in a fixed order of topics."""
-        self._wait(lambda: all(_received_all(source, writers) for source, writers in self._pairs))
+        self._wait(self._all_received)
         self._arrived.sort(key=lambda entry: self._order[entry[0]])
         for topic, data in self._arrived:
             files.add(topic, time_ns, data)
         self._arrived.clear()
+
+    def _all_received(self) -> bool:
+        """Whether as much was received as was sent; as no topic can receive more than that, each has all."""
+        sent = sum([output.count * readers for output, readers in self._heard])
+        return sent == sum([source.count for source in self._inputs])
 
     def _wait(self, condition: Callable[[], bool]) -> None:
         deadline = time.monotonic() + _PATIENCE_S
@@ -145,10 +151,6 @@ class _Graph:
         self._executor.shutdown()
         for node in self._nodes:
             node.destroy_node()
-
-
-def _received_all(source: Input, writers: list[Output]) -> bool:
-    return source.count == sum(writer.count for writer in writers)
 
 
 def _check(message: BagMessage) -> None:
