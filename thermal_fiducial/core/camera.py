@@ -18,8 +18,11 @@ from thermal_fiducial.errors import InputError
 #: Number of coefficients that each model takes (shorter lists are filled up with zeros).
 MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 
-# Newton's iteration gains two digits or more a step; ten leave nothing, also at the edge of a wide lens.
+# Newton's iteration doubles the digits: after a step this small nothing is left, and ten are enough at any lens's rim.
 _NEWTON_STEPS = 10
+_NEWTON_STEP = 1e-8
+# Widest angle from the axis that x/z can tell [rad].
+_WIDEST = 1.5
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,7 @@ class Camera:
         """
         points = np.asarray(points, dtype=np.float64)
         x, visible = self._normalised(points)
-        uv = self._to_pixels(self._distort(x)[0])
+        uv = self._to_pixels(self._distorted(x))
         return np.where(visible[..., None], uv, np.nan)
 
     def project_jacobian(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -99,7 +102,7 @@ class Camera:
 
     def distort(self, normalised: npt.ArrayLike) -> FloatArray:
         """Pixels (..., 2) of normalised image coordinates x/z, y/z (..., 2)."""
-        return self._to_pixels(self._distort(np.asarray(normalised, dtype=np.float64))[0])
+        return self._to_pixels(self._distorted(np.asarray(normalised, dtype=np.float64)))
 
     def distort_jacobian(self, normalised: npt.ArrayLike) -> FloatArray:
         """Derivative (..., 2, 2) [px] of :meth:`distort`."""
@@ -109,22 +112,13 @@ class Camera:
         """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`.
 
         Newton's method on the distortion, which at the rim of a fisheye converges where OpenCV's fixed-point
-        iteration does not.
+        iteration does not; in the angle alone where the model is purely radial.
         """
         uv = np.asarray(uv, dtype=np.float64)
-        target = (uv - self.K[:2, 2]) @ np.linalg.inv(self.K[:2, :2]).T
-        x = self._undistortion_start(target)
-        for _ in range(_NEWTON_STEPS):
-            distorted, J = self._distort(x)
-            a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
-            determinant = a * d - b * c
-            determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-            e0, e1 = target[..., 0] - distorted[..., 0], target[..., 1] - distorted[..., 1]
-            step = np.stack([(d * e0 - b * e1) / determinant, (a * e1 - c * e0) / determinant], axis=-1)
-            x = x + step
-            if np.all(np.abs(step) < 1e-14):
-                break
-        return x
+        target = (uv - self.K[:2, 2]) @ self._inverse_focal.T
+        if self.model == 'equidistant':
+            return _undistort_equidistant(target, self.D)
+        return self._undistort_polynomial(target)
 
     def rays(self, uv: npt.ArrayLike) -> FloatArray:
         """Unit viewing directions (..., 3) of pixels (..., 2)."""
@@ -166,13 +160,33 @@ class Camera:
         k[3:] = self.D[5:8] if self.model == 'rational_polynomial' else 0.0
         return k
 
-    def _undistortion_start(self, target: FloatArray) -> FloatArray:
-        if self.model != 'equidistant':
-            return target.copy()
-        theta = np.linalg.norm(target, axis=-1)
-        safe = np.where(theta < 1e-12, 1.0, theta)
-        scale = np.where(theta < 1e-12, 1.0, np.tan(np.minimum(safe, 1.45)) / safe)
-        return np.asarray(target * scale[..., None])
+    @cached_property
+    def _inverse_focal(self) -> FloatArray:
+        """(2, 2) [1/px]."""
+        return np.asarray(np.linalg.inv(self.K[:2, :2]))
+
+    def _undistort_polynomial(self, target: FloatArray) -> FloatArray:
+        x = target.copy()
+        for _ in range(_NEWTON_STEPS):
+            distorted, J = self._distort(x)
+            a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
+            determinant = a * d - b * c
+            determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+            e0, e1 = target[..., 0] - distorted[..., 0], target[..., 1] - distorted[..., 1]
+            step = np.stack([(d * e0 - b * e1) / determinant, (a * e1 - c * e0) / determinant], axis=-1)
+            x = x + step
+            if np.all(np.abs(step) < _NEWTON_STEP):
+                break
+        return x
+
+    def _distorted(self, x: FloatArray) -> FloatArray:
+        """Distorted normalised coordinates (..., 2)."""
+        if self.model == 'equidistant':
+            r = np.linalg.norm(x, axis=-1)
+            near = r < 1e-6
+            scale = np.where(near, 1.0, _equidistant_radius(np.arctan(r), self.D)[0] / np.where(near, 1.0, r))
+            return np.asarray(x * scale[..., None])
+        return _distort_polynomial(x, self._radial_coefficients, float(self.D[2]), float(self.D[3]))[0]
 
     def _distort(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Distorted normalised coordinates (..., 2) and their derivative (..., 2, 2)."""
@@ -208,13 +222,32 @@ def _distort_polynomial(x: FloatArray, k: FloatArray, p1: float, p2: float) -> t
     return distorted, J
 
 
+def _equidistant_radius(theta: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distorted radius at angles ``theta`` from the axis, and its derivative."""
+    t2 = theta * theta
+    return (
+        theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))),
+        1.0 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3]))),
+    )
+
+
+def _undistort_equidistant(target: FloatArray, k: FloatArray) -> FloatArray:
+    radius = np.linalg.norm(target, axis=-1)
+    theta = np.minimum(radius, _WIDEST)
+    for _ in range(_NEWTON_STEPS):
+        value, slope = _equidistant_radius(theta, k)
+        step = (radius - value) / np.where(np.abs(slope) < 1e-9, 1e-9, slope)
+        theta = np.clip(theta + step, 0.0, _WIDEST)
+        if np.all(np.abs(step) < _NEWTON_STEP):
+            break
+    near = radius < 1e-9
+    return np.asarray(target * np.where(near, 1.0, np.tan(theta) / np.where(near, 1.0, radius))[..., None])
+
+
 def _distort_equidistant(x: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
     r2 = np.sum(x * x, axis=-1)
     r = np.sqrt(r2)
-    theta = np.arctan(r)
-    t2 = theta * theta
-    theta_d = theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
-    d_theta_d = 1.0 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3])))
+    theta_d, d_theta_d = _equidistant_radius(np.arctan(r), k)
     near = r < 1e-6
     safe = np.where(near, 1.0, r)
     scale = np.where(near, 1.0, theta_d / safe)
