@@ -72,6 +72,8 @@ def test_a_pose_ahead_of_the_imu_waits(flight):
     [
         ({'angular_velocity': np.array([0.0, np.nan, 0.0])}, 'finite'),
         ({'linear_acceleration': np.array([0.0, np.inf, 0.0])}, 'finite'),
+        ({'angular_velocity': np.array([0.0, 1e30, 0.0])}, 'range'),
+        ({'linear_acceleration': np.array([0.0, 0.0, -1e4])}, 'range'),
         ({'stamp_ns': -5_000_000}, 'repeated'),
         ({'stamp_ns': -8_000_000}, 'back'),
         ({'stamp_ns': 3_000_000_000}, 'ahead'),

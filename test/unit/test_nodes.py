@@ -105,6 +105,17 @@ def test_a_truncated_image_is_refused_and_the_next_one_taken(graph):
     assert (level, figures['published /thermal/image']) == (OK, '1')
 
 
+def test_what_nobody_foresaw_is_said_and_the_next_image_taken(graph, monkeypatch):
+    node = graph.add(Tau2Camera)
+    first, second = frames(2)
+    with monkeypatch.context() as fault:
+        fault.setattr(node.cleaner, 'process', lambda *_: np.linalg.inv(np.zeros((2, 2))))
+        graph.send('thermal/image_raw', first)
+        assert 'internal error: LinAlgError' in graph.diagnose(node)[2]['last refusal']
+    graph.send('thermal/image_raw', second)
+    assert graph.diagnose(node)[2]['published /thermal/image'] == '1'
+
+
 def test_a_calibration_file_is_published_with_each_image(graph, tmp_path):
     save_camera(tmp_path / 'tau2.yaml', small_bag.CAMERA)
     graph.add(Tau2Camera, calibration_file=str(tmp_path / 'tau2.yaml'))

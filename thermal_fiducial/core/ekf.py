@@ -52,7 +52,7 @@ class PoseEkf:
         """Forget everything."""
         config = self._config
         self._gate = PoseGate(config)
-        self._input = ImuInput(config.max_imu_gap)
+        self._input = ImuInput(config.max_imu_gap, config.imu.gyroscope_range, config.imu.accelerometer_range)
         self._begin()
 
     def _begin(self) -> None:

@@ -8,6 +8,8 @@ from thermal_fiducial.core.measurements import ImuSample
 
 #: So many samples in a row must agree with each other on a new clock before it is believed [samples].
 CLOCK_EVIDENCE = 10
+#: A sensor saturates at its full scale; a reading so many times as large is a broken message.
+IMPOSSIBLE_RANGES = 2.0
 
 
 class Verdict(Enum):
@@ -15,6 +17,7 @@ class Verdict(Enum):
 
     USE = ''
     NOT_FINITE = 'IMU sample is not finite'
+    IMPOSSIBLE = 'IMU sample far beyond the range of its sensors'
     REPEATED = 'IMU stamp repeated'
     BACKWARD = 'IMU stamp went back'
     AHEAD = 'IMU stamp jumped ahead'
@@ -28,9 +31,10 @@ class ImuInput:
     set, the bag restarted, or the IMU was away: then everything begins anew.
     """
 
-    def __init__(self, max_gap: float) -> None:
-        """``max_gap``: longest step [s] that can be bridged."""
+    def __init__(self, max_gap: float, gyroscope_range: float, accelerometer_range: float) -> None:
+        """``max_gap``: longest step [s] that can be bridged; full scale of the sensors [rad/s], [m/s^2]."""
         self._max_gap_ns = round(max_gap * 1e9)
+        self._limits = IMPOSSIBLE_RANGES * gyroscope_range, IMPOSSIBLE_RANGES * accelerometer_range
         self._last_ns: int | None = None
         self._stray_ns = 0
         self._strays = 0
@@ -39,6 +43,10 @@ class ImuInput:
         """Verdict on ``sample``; it is remembered."""
         if not (np.isfinite(sample.angular_velocity).all() and np.isfinite(sample.linear_acceleration).all()):
             return Verdict.NOT_FINITE
+        if np.abs(sample.angular_velocity).max() > self._limits[0]:
+            return Verdict.IMPOSSIBLE
+        if np.abs(sample.linear_acceleration).max() > self._limits[1]:
+            return Verdict.IMPOSSIBLE
         if self._last_ns is None or 0 < sample.stamp_ns - self._last_ns <= self._max_gap_ns:
             self._last_ns, self._strays = sample.stamp_ns, 0
             return Verdict.USE

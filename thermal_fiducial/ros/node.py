@@ -6,6 +6,7 @@ when everything that was published has been received.
 """
 
 from collections.abc import Callable
+import traceback
 from typing import Any, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -147,11 +148,17 @@ class StageNode(CountingNode, Generic[Config]):
         self.get_logger().error(reason)
 
     def guard(self, callback: Callable[[Any], None], message: Any) -> None:
-        """Call ``callback``; warn of unusable input and live on."""
+        """Call ``callback``; warn of unusable input and live on.
+
+        What nobody foresaw is logged with its traceback: a node that dies in flight helps nobody find it.
+        """
         try:
             callback(message)
         except InputError as error:
             self.refuse(str(error))
+        except Exception as error:
+            self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
+            self.refuse(f'internal error: {type(error).__name__}: {error}')
 
     def refuse(self, reason: str) -> None:
         """Count a message that could not be used; the first and then one a second is logged."""
