@@ -25,6 +25,10 @@ _NEIGHBOURS = (-2, -1, 1, 2)
 # Weight of a pixel or segment falls off beyond this many standard deviations.
 _PIXEL_OUTLIER = 4.5
 _SEGMENT_OUTLIER = 2.5
+# Variance of a standard normal variable of which no more than that is kept.
+_KEPT_VARIANCE = 0.911
+# Standard deviation of a corner that no image noise explains: the optics' blur is not quite a Gaussian [px].
+_FLOOR_PX = 0.007
 # Factors on the blur, pass by pass: a wide one catches, narrow ones measure, until the corners no longer move.
 _PASSES = (3.0, 1.4, 1.0, 1.0, 1.0, 1.0)
 _SETTLED_PX = 0.3
@@ -74,7 +78,7 @@ class GridPattern:
     @property
     def cells(self) -> int:
         """Number of cells along a side, the border included."""
-        return self.step.shape[-1]
+        return int(self.step.shape[-1])
 
 
 def grid_pattern(bits: Gray) -> GridPattern:
@@ -190,12 +194,12 @@ def _lines(
     steep = np.abs(span[:, 1]) > np.abs(span[:, 0])
     curve = _QUARTIC @ np.where(steep[:, None, None], nodes[..., ::-1], nodes)
     along, across = curve[..., 0], curve[..., 1]
-    t = np.broadcast_to((np.arange(count) + 0.5) / count, (len(nodes), count))
-    whole = np.rint(_value(along, t))
+    t: FloatArray = np.tile((np.arange(count) + 0.5) / count, (len(nodes), 1))
+    whole: FloatArray = np.rint(_value(along, t))
     fresh = np.ones(whole.shape)
     fresh[:, 1:] = whole[:, 1:] != whole[:, :-1]
     for _ in range(2):
-        t = t - (_value(along, t) - whole) / _slope(along, t)
+        t = np.asarray(t - (_value(along, t) - whole) / _slope(along, t))
     centre, slope = _value(across, t), _slope(across, t) / _slope(along, t)
     # Distances grow downward across lines from left to right, and rightward across those from the top down.
     first = np.arange(len(nodes)) // len(levels) % 2 == 0
@@ -386,12 +390,12 @@ def _adjust(
         scale = np.maximum(1.4826 * _median_where(np.abs(normalised), used), 1.0)
         robust = 1.0 / np.maximum(np.abs(normalised) / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
     kept = used & (robust > 0.99)
-    chi2 = np.sum(np.where(kept, normalised**2, 0.0), axis=1)
+    chi2 = np.sum(np.where(kept, normalised**2, 0.0), axis=1) / _KEPT_VARIANCE
     free = np.maximum(kept.sum(axis=1) - 8.0, 0.0)
     # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
     covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None]
     blocks = np.einsum('nikil->nikl', covariance.reshape(count, 4, 2, 4, 2))
-    return corners + moved.reshape(count, 4, 2), blocks
+    return corners + moved.reshape(count, 4, 2), blocks + _FLOOR_PX**2 * np.eye(2)
 
 
 def _design(lines: _Lines, levels: FloatArray, cells: int, count: int) -> FloatArray:

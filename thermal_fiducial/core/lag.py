@@ -98,9 +98,9 @@ class MotionTracker:
             weight = np.repeat((dt / (1.5 * noise[now])) ** 2, 8)
             prior = predicted or Twist(np.zeros(6), _UNKNOWN)
             information = np.linalg.inv(prior.covariance)
-            posterior = np.linalg.inv(information + (A.T * weight) @ A)
+            posterior: FloatArray = np.asarray(np.linalg.inv(information + (A.T * weight) @ A))
             value = posterior @ (information @ prior.value + (A.T * weight) @ velocity)
-            twist = Twist(value, posterior)
+            twist = Twist(np.asarray(value), np.asarray(posterior))
         return twist
 
     def remember(self, stamp_ns: int, twist: Twist | None, ids: IntArray, x: FloatArray) -> None:

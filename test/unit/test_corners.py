@@ -1,0 +1,133 @@
+"""Corner refinement on images drawn from the model of a blurred pattern, under every lens model."""
+
+import cv2
+import numpy as np
+import pytest
+
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.corners import grid_pattern, refine_corners
+from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.core.pose import marker_corners
+from thermal_fiducial.files.dictionary import load_dictionary
+
+K = [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]]
+CAMERAS = {
+    'plumb_bob': Camera(640, 512, K, 'plumb_bob', [-0.3, 0.1, 1e-4, -2e-4, 0.0]),
+    'rational_polynomial': Camera(640, 512, K, 'rational_polynomial', [0.3, 0.05, 1e-4, -2e-4, 0.01, 0.6, 0.1, 0.02]),
+    'equidistant': Camera(640, 512, K, 'equidistant', [-0.12, -0.016, 0.0055, 0.0019]),
+}
+BITS = marker_bits(load_dictionary('DICT_4X4_50'))
+PATTERN = grid_pattern(BITS)
+SAMPLES = 8
+BLUR = 0.6
+# Optics, and the pixel's own square over which the drawing averages.
+BLUR_WITH_PIXEL = float(np.hypot(BLUR, np.sqrt(1 / 12)))
+
+
+def draw(camera, marker_id, T, size, contrast=200.0):
+    """Marker ``marker_id`` at T_camera_marker, white all round, sampled SAMPLES^2 times a pixel, and its corners."""
+    corners = camera.project(geometry.apply(T, marker_corners(size)))
+    low = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 12, 0)
+    high = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 13, (camera.width, camera.height))
+    u = low[0] + (np.arange((high[0] - low[0]) * SAMPLES) + 0.5) / SAMPLES - 0.5
+    v = low[1] + (np.arange((high[1] - low[1]) * SAMPLES) + 0.5) / SAMPLES - 0.5
+    x = camera.normalise(np.stack(np.meshgrid(u, v), axis=-1))
+    rays = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
+    on_plane = geometry.apply(geometry.inverse(T), rays * (T[:3, 2] @ T[:3, 3] / (rays @ T[:3, 2]))[..., None])
+    cells = BITS.shape[1] + 2
+    grid = np.pad(np.pad(BITS[marker_id].astype(float), 1), 1, constant_values=1.0)
+    column = np.clip(np.floor((on_plane[..., 0] / size + 0.5) * cells) + 1, 0, cells + 1).astype(int)
+    row = np.clip(np.floor((0.5 - on_plane[..., 1] / size) * cells) + 1, 0, cells + 1).astype(int)
+    fine = grid[row, column].reshape(high[1] - low[1], SAMPLES, high[0] - low[0], SAMPLES)
+    image = np.ones((camera.height, camera.width), dtype=np.float32)
+    image[low[1] : high[1], low[0] : high[0]] = fine.mean(axis=(1, 3))
+    return 7000.0 + contrast * cv2.GaussianBlur(image, (0, 0), BLUR), corners
+
+
+def marker_pose(distance, tilt, u=0.1, v=-0.1):
+    R = geometry.so3_exp(tilt) @ np.diag([1.0, -1.0, -1.0])
+    return geometry.transform(R, np.array([u, v, 1.0]) * distance)
+
+
+def refine(image, corners, camera, marker_id, **options):
+    ids = [marker_id]
+    return refine_corners(
+        image.astype(np.float32),
+        corners[None],
+        camera,
+        PATTERN.before[ids],
+        PATTERN.step[ids],
+        BLUR_WITH_PIXEL,
+        **options,
+    )
+
+
+@pytest.mark.parametrize('model', CAMERAS)
+@pytest.mark.parametrize(
+    ('distance', 'limit'),
+    # The widest side crosses half the image; the tiniest has cells of 2.5 px. Without noise what is left is sampling
+    # (8 x 8 a pixel: 0.04 px steps that average out along a side) and what the model simplifies, most where small.
+    [(0.42, 0.02), (1.5, 0.01), (2.6, 0.015), (5.0, 0.04), (10.0, 0.12)],
+)
+def test_without_noise(model, distance, limit):
+    camera, T = CAMERAS[model], marker_pose(distance, (0.3, -0.25, 0.4))
+    image, corners = draw(camera, 7, T, 0.3)
+    start = corners + np.random.default_rng(1).uniform(-0.7, 0.7, (4, 2)) * min(1.0, 2.0 / distance)
+    found = refine(image, start, camera, 7)
+    error = np.linalg.norm(found.corners_px[0] - corners, axis=-1)
+    assert np.sqrt(np.mean(error**2)) < limit
+    assert found.contrast[0] == pytest.approx(200.0, rel=0.05)
+
+
+def test_inverted_polarity():
+    camera, T = CAMERAS['plumb_bob'], marker_pose(1.5, (0.3, -0.25, 0.4))
+    image, corners = draw(camera, 7, T, 0.3, contrast=-200.0)
+    found = refine(image, corners + 0.4, camera, 7)
+    assert np.abs(found.corners_px[0] - corners).max() < 0.015
+    assert found.contrast[0] == pytest.approx(-200.0, rel=0.05)
+
+
+def test_dead_pixels_clutter_and_a_hidden_stretch_cost_little():
+    camera, T = CAMERAS['plumb_bob'], marker_pose(1.5, (0.2, 0.1, 0.05))
+    image, corners = draw(camera, 3, T, 0.3)
+    rng = np.random.default_rng(2)
+    image = image + rng.normal(0.0, 2.0, image.shape)
+    dead = rng.random(image.shape) < 0.002
+    image[dead] = rng.choice([0.0, 16383.0], dead.sum())
+    middle = corners.mean(axis=0).astype(int)
+    top = int(corners[:2, 1].mean())
+    image[top - 6 : top + 4, middle[0] - 10 : middle[0] + 12] = 7400.0
+    found = refine(image, corners + 0.3, camera, 3)
+    # A tenth of a pixel: the clean fit is good to 0.01, and the hidden stretch takes a fifth of one side.
+    assert np.abs(found.corners_px[0] - corners).max() < 0.1
+
+
+@pytest.mark.parametrize('contrast', [12.0, 50.0])
+def test_covariance_is_honest(contrast):
+    rng = np.random.default_rng(3)
+    squared, count = [], 0
+    for model, camera in CAMERAS.items():
+        T = marker_pose(1.8, (0.25, -0.3, 0.2 + len(model)))
+        image, corners = draw(camera, 11, T, 0.3, contrast)
+        for _ in range(40):
+            found = refine(image + rng.normal(0.0, 1.25, image.shape), corners + rng.normal(0, 0.3, (4, 2)), camera, 11)
+            error = found.corners_px[0] - corners
+            squared.append(np.einsum('ki,kij,kj->k', error, np.linalg.inv(found.covariances[0]), error).mean())
+            count += 4
+    # Two degrees of freedom a corner; within 10 % plus two standard errors of the mean of 480 corners (2 / sqrt(480),
+    # doubled because neighbouring corners share a side).
+    assert np.mean(squared) == pytest.approx(2.0, abs=0.2 + 2 * 2 * 2 / np.sqrt(count))
+
+
+def test_markers_do_not_disturb_each_other():
+    camera = CAMERAS['equidistant']
+    scenes = [(2, marker_pose(1.5, (0.1, 0.2, 0.3), -0.25, 0.1)), (9, marker_pose(3.0, (0.2, 0.1, -0.3), 0.25, 0.0))]
+    images, corners = zip(*(draw(camera, marker_id, T, 0.3) for marker_id, T in scenes), strict=True)
+    image = np.minimum(*images).astype(np.float32)
+    ids = [marker_id for marker_id, _ in scenes]
+    start = np.stack(corners) + 0.3
+    both = refine_corners(image, start, camera, PATTERN.before[ids], PATTERN.step[ids], BLUR_WITH_PIXEL)
+    for index, marker_id in enumerate(ids):
+        alone = refine(image, start[index], camera, marker_id)
+        np.testing.assert_allclose(both.corners_px[index], alone.corners_px[0], atol=1e-6)
