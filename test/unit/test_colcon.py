@@ -9,6 +9,7 @@ import sys
 import xml.etree.ElementTree as ElementTree
 
 import pytest
+from support.ros_graph import ros_graph
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf')
@@ -87,11 +88,10 @@ def test_an_executable_runs_until_it_is_told_to_stop(workspace, node):
         stderr=subprocess.STDOUT,
         text=True,
     )
-    try:
-        process.wait(3.0)
-    except subprocess.TimeoutExpired:
-        process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=20.0)
+    with ros_graph() as graph:
+        graph.spin_until(lambda: node in graph.tester.get_node_names() or process.poll() is not None, seconds=30.0)
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=30.0)
     assert process.returncode == 0, output
 
 
