@@ -19,7 +19,8 @@ from thermal_fiducial.errors import InputError
 #: Models from the fewest parameters to the most: a tie goes to the simpler one.
 CANDIDATES = ('equidistant', 'plumb_bob', 'rational_polynomial')
 
-_LEAST_VIEWS = 5
+# With all but one of them a camera can still be fitted.
+_LEAST_VIEWS = 6
 _FOLDS = 4
 # A view whose rms is this many times the median view's was moving, half hidden or wrongly numbered.
 _OUTLIER_RATIO = 2.5
@@ -31,7 +32,7 @@ _HUBER = 3.0
 _STEP = 1e-6
 _MAX_STEPS = 60
 # A step that lowers the cost by less than this share is the last; damping at which no step lowers it any more.
-_CONVERGED, _HOPELESS = 1e-9, 1e9
+_CONVERGED, _HOPELESS = 1e-7, 1e9
 _CIRCLE = np.stack([np.cos(np.arange(24) * np.pi / 12), np.sin(np.arange(24) * np.pi / 12), np.zeros(24)], axis=1)
 
 
@@ -133,12 +134,11 @@ def choose_model(
 def _held_out_error(sightings: Sequence[Sighting], camera: Camera, radius: float) -> float:
     """Rms [px] of views whose pose alone was fitted, with intrinsics from the other folds."""
     squares, count = 0.0, 0
-    order = np.arange(len(sightings))
-    for fold in range(_FOLDS):
-        training = [sightings[index] for index in order[order % _FOLDS != fold].tolist()]
-        held_out = [sightings[index] for index in order[order % _FOLDS == fold].tolist()]
-        if len(training) < _LEAST_VIEWS or not held_out:
-            return np.nan
+    # Few views: all but one at a time.
+    folds = _FOLDS if len(sightings) >= _FOLDS * (_LEAST_VIEWS - 1) else len(sightings)
+    for fold in range(folds):
+        training = [sighting for index, sighting in enumerate(sightings) if index % folds != fold]
+        held_out = list(sightings[fold::folds])
         fit = _Fit(training, camera, radius)
         trained, _, _ = fit.solve(np.stack([board_pose(sighting, camera) for sighting in training]))
         unseen = _Fit(held_out, trained, radius, poses_only=True)

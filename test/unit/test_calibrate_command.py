@@ -1,0 +1,74 @@
+"""``calibrate`` on bags: reading, choosing views, refusing."""
+
+import cv2
+import numpy as np
+import pytest
+from support.boards import chessboard_levels, plate_pose, random_view, render
+from support.small_bag import CAMERA, camera_info, image, Recording, recording, side_files, START_NS, T_BODY_CAMERA
+import yaml
+
+from thermal_fiducial.calibration.targets import Chessboard
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.core import geometry
+from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.sim.scenario import LENSES
+
+
+def test_camera_against_imu(tmp_path, capsys):
+    bag = recording(seconds=6.0).write(tmp_path / 'bag')
+    marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
+    out = tmp_path / 'extrinsics.yaml'
+    assert main(['calibrate', 'camera-imu', str(bag), '--map', str(marker_map), '--out', str(out)]) == 0
+    found = yaml.safe_load(out.read_text())['/**']['ros__parameters']
+    R = geometry.rotation_from_quaternion(found['camera_orientation'])
+    # Six seconds of gentle motion: enough for the rotation and the clock, hardly for the lever arm.
+    assert np.degrees(geometry.rotation_angle(R.T @ T_BODY_CAMERA[:3, :3])) < 1.0
+    # These frames have no lag, but the detector undoes the 10 ms that a bolometer has.
+    assert 0.0 < found['camera_time_offset'] < 0.02
+    assert '+-' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('missing', [IMU_TOPIC, IMAGE_TOPIC, CAMERA_INFO_TOPIC, 'bag', 'map', 'time'])
+def test_camera_against_imu_refuses(tmp_path, missing, capsys):
+    seconds = 1.0 if missing == 'time' else 0.2
+    bag = recording(seconds=seconds).without(missing).write(tmp_path / 'bag')
+    marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
+    source = tmp_path / 'none' if missing == 'bag' else bag
+    marker_map = tmp_path / 'none.yaml' if missing == 'map' else marker_map
+    out = tmp_path / 'extrinsics.yaml'
+    assert main(['calibrate', 'camera-imu', str(source), '--map', str(marker_map), '--out', str(out)]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert not out.exists()
+
+
+def test_intrinsics_from_a_bag(tmp_path, capsys):
+    lens, board, rng = LENSES['13mm'], Chessboard(8, 6, 0.05), np.random.default_rng(6)
+    events = []
+    for view in range(8):
+        plate = plate_pose(random_view(lens, board.points, rng), np.array([0.175, 0.125]))
+        # Two frames of each view, as of a board that is held still.
+        for repeat in range(2):
+            stamp = START_NS + (2 * view + repeat) * 33_333_333
+            counts = render(lens, plate, chessboard_levels(8, 6), 0.55, 0.45, 8.0, 2 * view + repeat)
+            events += [
+                (stamp, CAMERA_INFO_TOPIC, camera_info(stamp, CAMERA)),
+                (stamp, IMAGE_TOPIC, image(stamp, counts)),
+            ]
+    bag = Recording(events).write(tmp_path / 'bag')
+    out = tmp_path / 'camera.yaml'
+    arguments = ['--every', '1', '--models', 'plumb_bob', '--out', str(out), '--report', str(tmp_path / 'r.html')]
+    assert main(['calibrate', 'intrinsics', str(bag), *arguments]) == 0
+    assert capsys.readouterr().out.count('cells covered') >= 7
+    # Seven views in place of forty.
+    assert load_camera(out).K[0, 0] == pytest.approx(lens.focal[0], rel=3e-3)
+
+
+def test_pictures_of_different_sizes(tmp_path, capsys):
+    lens, board, rng = LENSES['13mm'], Chessboard(8, 6, 0.05), np.random.default_rng(6)
+    plate = plate_pose(random_view(lens, board.points, rng), np.array([0.175, 0.125]))
+    counts = render(lens, plate, chessboard_levels(8, 6), 0.55, 0.45, 8.0, 1)
+    cv2.imwrite(str(tmp_path / 'a.png'), counts)
+    cv2.imwrite(str(tmp_path / 'b.png'), counts[:400])
+    assert main(['calibrate', 'intrinsics', str(tmp_path), '--out', str(tmp_path / 'c.yaml')]) == 2
+    assert '640x400' in capsys.readouterr().err
