@@ -1,4 +1,4 @@
-"""Forty views of a heated board through a Tau 2's noise, both lens models: the numbers that a calibration must reach."""
+"""Forty views of a heated board through a Tau 2's noise, both lens models: what a calibration must reach."""
 
 import numpy as np
 import pytest

@@ -65,6 +65,11 @@ def test_errors_grow_with_distance_squared_and_noise():
     assert near[3] == 0.0
 
 
+def test_branches_that_meet_are_no_flips():
+    # So near and so well measured that the other branch is no minimum of its own.
+    assert expected_errors(CAMERA, 0.3, 1.0, 30.0, 0.007, 1)[3] == 0.0
+
+
 def test_pose_factor_scales_the_errors():
     plain = expect(table(1.0, 0.02), CAMERA, size=0.3, distance=3.0, tilt_deg=60.0, contrast=50.0)
     errors = expected_errors(CAMERA, 0.3, 3.0, 60.0, 0.02, 1)

@@ -231,7 +231,8 @@ def pose_errors(best: FloatArray, other: FloatArray, T_true: FloatArray) -> tupl
     """
     R_true = np.swapaxes(T_true[:, :3, :3], 1, 2)
     angle, other_angle = (geometry.rotation_angle(T[:, :3, :3] @ R_true) for T in (best, other))
-    right = angle <= other_angle
+    # Where both branches meet, they are the same pose but for rounding.
+    right = angle <= 1.01 * other_angle
     if not np.any(right):
         return np.nan, np.nan, np.nan, 1.0
     seen_from = geometry.inverse(best)[:, :3, 3] - geometry.inverse(T_true)[:, :3, 3]
