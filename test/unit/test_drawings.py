@@ -21,6 +21,7 @@ from thermal_fiducial.fabrication.sheet import nest
 from thermal_fiducial.fabrication.verification import acrylic_at, agree, problems, read_dxf
 from thermal_fiducial.fabrication.writers import write
 from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.marker_map import load_map
 
 BITS = marker_bits(load_dictionary('STENCIL_4X4_100'))
 # Geometry in a file is the pattern to this: DXF holds 16 digits, SVG 9 decimals.
@@ -243,3 +244,7 @@ def test_commands_write_what_they_say(tmp_path, capsys):
         main(['markers', 'board', 'markers', '--grid', '2', '1', '--formats', 'dxf', '--out', str(tmp_path / 'b')]) == 0
     )
     assert (Path(tmp_path) / 'b' / 'base-plate.dxf').is_file()
+    board = load_map(tmp_path / 'b' / 'board.yaml')
+    # Two markers of 80 mm with 40 mm between them.
+    assert [marker.T_map_marker[0, 3] for marker in board.markers.values()] == pytest.approx([-0.06, 0.06])
+    assert board.markers[0].size == pytest.approx(0.08)

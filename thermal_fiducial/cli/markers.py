@@ -12,8 +12,10 @@ from rich.progress import Progress
 from rich.table import Table
 
 from thermal_fiducial.cli import marker_planning
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.patterns import marker_bits
-from thermal_fiducial.core.types import Gray
+from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import base_plate, circle_board, marker_grid
 from thermal_fiducial.fabrication.bridges import darkest_white, find_bridges
@@ -25,6 +27,7 @@ from thermal_fiducial.fabrication.sheet import nest
 from thermal_fiducial.fabrication.verification import agree, problems, read_dxf
 from thermal_fiducial.fabrication.writers import FORMATS, write
 from thermal_fiducial.files.dictionary import load_dictionary, save_dictionary
+from thermal_fiducial.files.marker_map import save_map
 
 _OPTION_HELP = {
     'size': 'side of the black square',
@@ -165,7 +168,18 @@ def _board(args: argparse.Namespace) -> int:
         _write_all(marker_drawing(bits[int(label)], label, options), args)
     centres = marker_grid(columns, rows, options.size, args.spacing or 40.0)
     _write_all(base_plate(centres, labels, bits.shape[1] + 2, options), args)
+    save_map(args.out / 'board.yaml', _board_map(centres, options, args.dictionary))
     return 0
+
+
+def _board_map(centres: FloatArray, options: PlateOptions, dictionary: str) -> MarkerMap:
+    """Map of a board's markers, the origin in its middle; what ``calibrate intrinsics --board`` takes."""
+    metres = 1e-3 * np.column_stack([centres, np.zeros(len(centres))])
+    markers = {
+        index: MapMarker(index, 1e-3 * options.size, True, geometry.transform(np.eye(3), centre))
+        for index, centre in enumerate(metres)
+    }
+    return MarkerMap(markers, dictionary=dictionary)
 
 
 def _add_dictionary(parser: argparse.ArgumentParser) -> None:
