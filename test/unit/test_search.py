@@ -1,0 +1,75 @@
+"""Blind search and decoding: what is found, and above all what is not."""
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.decoding import Decoder, shrunk
+from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.core.search import blind_search
+from thermal_fiducial.files.dictionary import load_dictionary
+
+BITS = marker_bits(load_dictionary('DICT_4X4_50'))
+DECODER = Decoder(BITS)
+EVERY = np.ones(len(BITS), dtype=bool)
+
+
+def scene(marker_id, contrast, noise, seed=0, slope=0.0):
+    """A marker of 72 px at (200, 150) in a white plate on a grey wall, upright."""
+    rng = np.random.default_rng(seed)
+    image = np.full((512, 640), 7000.0 + 0.5 * contrast, dtype=np.float32)
+    image[138:234, 188:284] = 7000.0 + contrast
+    image[150:222, 200:272] = 7000.0 + contrast * np.kron(np.pad(BITS[marker_id], 1), np.ones((12, 12)))
+    image += slope * np.arange(640, dtype=np.float32)
+    return (image + rng.normal(0, noise, image.shape)).astype(np.float32)
+
+
+CORNERS = np.array([[199.5, 149.5], [271.5, 149.5], [271.5, 221.5], [199.5, 221.5]])
+
+
+def search(image, config=None, allowed=EVERY):
+    return blind_search(image, image, DECODER, allowed, config or ArucoDetectorConfig())
+
+
+@pytest.mark.parametrize('turn', range(4))
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_decoder_names_id_turn_and_polarity(turn, sign):
+    image = scene(13, sign * 100.0, 1.0, slope=0.5)
+    quad = np.roll(CORNERS, -turn, axis=0)[None]
+    reading = DECODER.read(image, quad, EVERY)
+    assert reading.ids[0] == 13
+    np.testing.assert_allclose(np.roll(quad[0], reading.turns[0], axis=0), CORNERS)
+    assert sign * reading.correlation[0] > 0.99
+    assert reading.contrast[0] == pytest.approx(sign * 100.0, rel=0.05)
+    assert reading.bit_errors[0] == 0
+    assert reading.border_errors[0] == 0
+
+
+def test_plate_shrinks_to_its_marker():
+    plate = np.array([[[187.5, 137.5], [283.5, 137.5], [283.5, 233.5], [187.5, 233.5]]])
+    np.testing.assert_allclose(shrunk(plate, DECODER.cells)[0], CORNERS, atol=1e-9)
+
+
+@pytest.mark.parametrize('contrast', [400.0, 20.0, 6.0, -20.0])
+def test_finds_the_marker_at_any_contrast(contrast):
+    found = search(scene(21, contrast, 2.0))
+    assert found.ids.tolist() == [21]
+    assert np.abs(found.corners_px[0] - CORNERS).max() < 4.0  # a third of a cell, which the refinement catches
+
+
+def test_rules():
+    image = scene(21, 100.0, 2.0)
+    image[300:396, 400:496] = image[138:234, 188:284]
+    assert search(image).ids.tolist() == []
+    assert search(image, ArucoDetectorConfig(duplicates='best')).ids.tolist() == [21]
+    alone = scene(21, 100.0, 2.0)
+    assert search(alone, allowed=np.arange(50) != 21).ids.tolist() == []
+    assert search(alone, ArucoDetectorConfig(min_side_px=80.0)).ids.tolist() == []
+    assert search(alone, ArucoDetectorConfig(min_contrast=100.0)).ids.tolist() == []
+
+
+def test_no_markers_in_noise():
+    rng = np.random.default_rng(4)
+    for frame in range(12):
+        noise = rng.normal(0, (1.0, 3.0, 30.0)[frame % 3], (512, 640))
+        assert search((7000 + noise).astype(np.float32)).ids.tolist() == []
