@@ -132,8 +132,17 @@ def test_single_bad_messages_are_said_and_the_replay_goes_on(replay, recording, 
     assert len((tmp_path / 'run' / 'fused.tum').read_text().splitlines()) > 50
 
 
+def uncalibrated(message):
+    return small_bag.replaced(message, k=np.zeros(9))
+
+
 @pytest.mark.parametrize(
-    ('topic', 'damage', 'word'), [(IMAGE_TOPIC, cut_short, '640x512'), (IMU_TOPIC, nan, 'not finite')]
+    ('topic', 'damage', 'word'),
+    [
+        (IMAGE_TOPIC, cut_short, '640x512'),
+        (IMU_TOPIC, nan, 'not finite'),
+        (CAMERA_INFO_TOPIC, uncalibrated, 'calibration'),
+    ],
 )
 def test_nothing_but_bad_messages(replay, recording, tmp_path, topic, damage, word):
     events = [(s, t, damage(m) if t == topic else m) for s, t, m in recording.events]
@@ -206,3 +215,9 @@ def test_localization_adds_nothing_to_a_map_but_the_sizes_that_it_left_out(repla
     (tmp_path / 'map.yaml').write_text(text.replace('size: 0.3, ', ''))
     assert replay(recording.write(tmp_path / 'bag'), '--mode', 'localization')[0] == 0
     assert (tmp_path / 'run' / 'marker_map.yaml').read_text() == text
+
+
+def test_a_map_of_another_dictionary(replay, recording, tmp_path):
+    foreign = tmp_path / 'foreign.yaml'
+    foreign.write_text((tmp_path / 'map.yaml').read_text().replace('{id: 0,', '{id: 333,'))
+    fails(replay(recording.write(tmp_path / 'bag'), map_file=foreign), 'foreign.yaml', '333', 'DICT_4X4_50')

@@ -12,7 +12,7 @@ from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.geometry import transform_from_quaternion
 from thermal_fiducial.core.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
@@ -126,7 +126,7 @@ def _report_refusals(files: RunFiles, warn: Callable[[str], None]) -> None:
     Raises
     ------
     InputError
-        Not one of the images or of the IMU messages could be used.
+        Not one of the images, of the calibrations or of the IMU messages could be used.
     """
     for node, topic in (
         ('tau2_camera', IMAGE_TOPIC),
@@ -138,6 +138,8 @@ def _report_refusals(files: RunFiles, warn: Callable[[str], None]) -> None:
         refused, reason = int(figures.get('refused messages', 0)), figures.get('last refusal', '')
         if topic and refused and refused >= int(figures[f'received /{topic}']):
             raise InputError(f'not one message on {topic} could be used: {reason}')
+        if figures.get('calibrations') == '0':
+            raise InputError(f'not one message on {CAMERA_INFO_TOPIC} holds a usable calibration')
         if refused:
             warn(f'{node}: {refused} messages refused, the last one: {reason}')
 

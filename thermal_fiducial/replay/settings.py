@@ -75,14 +75,17 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any]) -> Settings
 def _check_files(settings: Settings) -> None:
     """Raise what a node would report as a fault."""
     camera, mapper = settings.tau2_camera, settings.marker_mapper
-    load_dictionary(settings.aruco_detector.dictionary)
+    dictionary = load_dictionary(settings.aruco_detector.dictionary)
     sizes = size_overrides(mapper.marker_size_overrides)
     if camera.calibration_file:
         load_camera(camera.calibration_file)
     if camera.bad_pixel_file:
         load_bad_pixels(camera.bad_pixel_file)
     if mapper.map_file:
-        load_map(mapper.map_file, mapper.marker_size, sizes)
+        marker_map = load_map(mapper.map_file, mapper.marker_size, sizes)
+        foreign = sorted(set(marker_map.markers) - set(range(len(dictionary.bytesList))))
+        if foreign:
+            raise InputError(f'{mapper.map_file}: marker {foreign[0]} is not in {settings.aruco_detector.dictionary}')
 
 
 def _document(path: Path) -> dict[str, dict[str, Any]]:
