@@ -1,6 +1,7 @@
 # make demo    set everything up and run the main job: simulate, replay through the four nodes, score, report
 # make test    set everything up, check the code and run all tests
 # make bench   accuracy and speed against OpenCV and a batch smoother, in the same run
+# make tables  put measured tables, parameters and pictures into the README
 PYTHON ?= $(firstword $(foreach version,3.12 3.11,$(if $(shell python$(version) -c 'import venv, ensurepip' 2>/dev/null && echo yes),python$(version))) python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -11,7 +12,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 
-.PHONY: help demo test lint bench format clean
+.PHONY: help demo test lint bench tables format clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -42,6 +43,9 @@ test: lint
 bench: $(READY)
 	@echo '== Benchmarks, one thread'
 	$(BIN)/python -m pytest test/bench --benchmark-only --benchmark-columns=median,min,max,rounds $(PYTEST_ARGS)
+
+tables: $(READY)
+	$(BIN)/python test/bench/readme.py
 
 format: $(READY)
 	$(BIN)/ruff check --fix .

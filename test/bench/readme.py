@@ -4,6 +4,7 @@ A table stands between ``<!-- NAME -->`` and ``<!-- end -->``. Parameters come f
 from the Markdown files that the benchmarks leave in ``.doc/tables/``.
 """
 
+import json
 from pathlib import Path
 import re
 
@@ -26,8 +27,7 @@ def parameter_table(config: type) -> str:
         limits = item.metadata
         extra = f' One of: {", ".join(limits["choices"])}.' if limits['choices'] else ''
         live = ' Live.' if limits['live'] else ''
-        shown = list(default) if isinstance(default, tuple) else default
-        rows.append(f'| `{name}` | `{shown!r}` | {limits["description"]}{extra}{live} |'.replace("`''`", '`""`'))
+        rows.append(f'| `{name}` | `{json.dumps(default)}` | {limits["description"]}{extra}{live} |')
     return '\n'.join(rows)
 
 
