@@ -248,6 +248,12 @@ class ArucoDetectorConfig:
     blur_px: float = param(
         0.66, 'Standard deviation of the blur by optics and pixel.', unit='px', minimum=0.3, maximum=3.0
     )
+    refinement: str = param(
+        'auto',
+        'Corners from the lines of the sides, or each locally as OpenCV does. auto: local on 8-bit images only.',
+        choices=('auto', 'edges', 'subpix'),
+        live=True,
+    )
     whitelist: tuple[int, ...] = param((), 'IDs that may be found. Empty: all of the dictionary.')
     whitelist_from_map: bool = param(False, 'Find only the markers of the map, where there is one.')
     min_side_px: float = param(12.0, 'Shortest side of a marker.', unit='px', minimum=8.0, maximum=400.0, live=True)
@@ -259,7 +265,7 @@ class ArucoDetectorConfig:
         live=True,
     )
     min_correlation: float = param(
-        0.7, 'Smallest correlation of the cells with the pattern of a marker.', minimum=0.5, maximum=1.0, live=True
+        0.65, 'Smallest correlation of the cells with the pattern of a marker.', minimum=0.5, maximum=1.0, live=True
     )
     min_margin: float = param(
         0.07,
@@ -276,7 +282,11 @@ class ArucoDetectorConfig:
         live=True,
     )
     max_bit_errors: int = param(
-        1, 'Bits on the wrong side of the middle between black and white.', minimum=0, maximum=10, live=True
+        -1,
+        'Bits on the wrong side of the middle between black and white. -1: as many as the dictionary can correct.',
+        minimum=-1,
+        maximum=20,
+        live=True,
     )
     max_border_errors: int = param(2, 'The same for the cells of the black border.', minimum=0, maximum=20, live=True)
     guided: bool = param(True, 'With a map and odometry: look for known markers where they should be.', live=True)

@@ -46,9 +46,11 @@ class Decoder:
     Parameters
     ----------
     bits : (M, n, n)
+    correctable : number of wrong bits that still leave the nearest marker certain
     """
 
-    def __init__(self, bits: Gray) -> None:
+    def __init__(self, bits: Gray, correctable: int = 1) -> None:
+        self.correctable = correctable
         grid = np.pad(bits.astype(np.float64), ((0, 0), (1, 1), (1, 1)))
         self.count, self.cells = len(grid), grid.shape[-1]
         self._border = np.pad(np.zeros(bits.shape[1:], dtype=bool), 1, constant_values=True).ravel()

@@ -15,6 +15,7 @@ from thermal_fiducial.core.corners import grid_pattern, refine_corners, RefinedC
 from thermal_fiducial.core.decoding import Decoder
 from thermal_fiducial.core.guided import camera_in_map, expected_markers, look
 from thermal_fiducial.core.lag import markers_without_lag, MotionTracker, smear, SmearField, Twist, without_lag
+from thermal_fiducial.core.local_corners import local_corners
 from thermal_fiducial.core.marker_rows import marker_rows
 from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers, Odometry
 from thermal_fiducial.core.patterns import marker_bits
@@ -58,7 +59,7 @@ class MarkerDetector:
         self.config = config
         self._sizes = size_overrides(config.marker_size_overrides)
         bits = marker_bits(dictionary)
-        self._decoder = Decoder(bits)
+        self._decoder = Decoder(bits, int(dictionary.maxCorrectionBits))
         self._pattern = grid_pattern(bits)
         self._T_body_camera = geometry.transform(
             geometry.rotation_from_quaternion(config.camera_orientation), config.camera_position
@@ -90,6 +91,8 @@ class MarkerDetector:
             T_camera_map = self._predicted_pose(stamp_ns, odometry, twist)
             found = self._find(image, camera, twist, T_camera_map)
             ids, refined = self._refined(stamp_ns, image, found, camera, twist)
+            if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
+                refined = local_corners(image, refined, self._decoder.cells)
             return self._rows(ids, refined, camera, T_camera_map)
 
     def size(self, marker_id: int) -> float:

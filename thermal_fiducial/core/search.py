@@ -23,6 +23,8 @@ _WIDE_CELL_PX = 8.0
 _ALIKE = 0.77
 _CLEARLY_ALIKE = 0.9
 _CLEAR_MARGIN = 0.06
+# Margin over all other markers that speaks for itself, as large dictionaries of many bits give it.
+_WIDE_MARGIN = 0.18
 # Corner deviation [px] times contrast over noise times root of the side [px]: 4 to 7 for four clean sides.
 _SHARP = 7.5
 _SOFT = 12.0
@@ -77,7 +79,7 @@ def blind_search(
         return Found.none()
     reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, 0.5 * (quads[len(fine) :] - 0.5), allowed))
     sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1).min(axis=1)
-    good = accepted(reading, noise, config) & (sides >= config.min_side_px)
+    good = accepted(reading, noise, decoder.correctable, config) & (sides >= config.min_side_px)
     best = _once(reading, quads, good, config.duplicates == 'drop')
     turned = (np.arange(4) - reading.turns[best][:, None]) % 4
     corners = np.take_along_axis(quads[best], turned[..., None], axis=1)
@@ -102,13 +104,14 @@ def merged(first: Found, second: Found) -> Found:
     )
 
 
-def accepted(reading: Reading, noise: float, config: ArucoDetectorConfig) -> BoolArray:
+def accepted(reading: Reading, noise: float, correctable: int, config: ArucoDetectorConfig) -> BoolArray:
     """Which readings are evidence enough for a marker nobody expected."""
     similarity = np.abs(reading.correlation)
+    bits = config.max_bit_errors if config.max_bit_errors >= 0 else correctable
     return np.asarray(
         (similarity >= config.min_correlation)
         & (similarity - reading.runner_up >= config.min_margin)
-        & (reading.bit_errors <= config.max_bit_errors)
+        & (reading.bit_errors <= bits)
         & (reading.border_errors <= config.max_border_errors)
         & (reading.surround >= config.min_surround)
         & (np.abs(reading.contrast) >= config.min_contrast * noise)
@@ -129,11 +132,13 @@ def confirmed(
     similarity = np.abs(reading.correlation)
     contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
     same = reading.ids == found.ids
-    alike = (similarity - reading.runner_up >= _CLEAR_MARGIN) & (reading.surround >= 0.4)
+    margin = similarity - reading.runner_up
+    distinct = (similarity >= _ALIKE) | (margin >= _WIDE_MARGIN)
+    alike = distinct & (margin >= _CLEAR_MARGIN) & (reading.surround >= 0.4)
     side = np.linalg.norm(refined.corners_px[:, 2] - refined.corners_px[:, 0], axis=-1) / np.sqrt(2.0)
     deviation = np.sort(np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1)), axis=1)[:, 2]
     softness = deviation * np.minimum(contrast, _NOISY) * np.sqrt(np.minimum(side, _SEEN_PX))
-    sharp = (softness <= _SHARP) & (similarity >= _ALIKE)
+    sharp = softness <= _SHARP
     soft = (softness <= _SOFT) & (similarity >= np.minimum(_CLEARLY_ALIKE, 0.7 + 0.07 * contrast))
     known = (similarity >= config.guided_min_correlation) & (similarity - reading.runner_up >= config.guided_min_margin)
     there = np.abs(refined.corners_px - found.corners_px).max(axis=(1, 2)) < 0.7 * side / decoder.cells
