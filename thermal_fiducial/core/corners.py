@@ -192,7 +192,7 @@ def _lines(
     nodes = _nodes(corners, camera, levels).reshape(-1, len(_T_NODES), 2)
     span = nodes[:, -1] - nodes[:, 0]
     steep = np.abs(span[:, 1]) > np.abs(span[:, 0])
-    curve = _QUARTIC @ np.where(steep[:, None, None], nodes[..., ::-1], nodes)
+    curve: FloatArray = np.asarray(_QUARTIC @ np.where(steep[:, None, None], nodes[..., ::-1], nodes), dtype=np.float64)
     along, across = curve[..., 0], curve[..., 1]
     t: FloatArray = np.tile((np.arange(count) + 0.5) / count, (len(nodes), 1))
     whole: FloatArray = np.rint(_value(along, t))

@@ -189,6 +189,7 @@ class MarkerDetector:
                 scene, corners, camera, before, step, self.config.blur_px, columns=columns, coarse=coarse
             )
             coarse = False
+            sharpness = refined.covariances
             x = camera.normalise(refined.corners_px)
             noise = np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1).mean(axis=-1)) / camera.focal_px
             twist = self._motion.correct(stamp_ns, predicted, ids, x, depth, noise)
@@ -200,7 +201,9 @@ class MarkerDetector:
             refined = replace(refined, corners_px=corners, covariances=refined.covariances + spread)
             if np.abs(change[clear]).max(initial=0.0) < _SMEAR_THAT_MATTERS_PX:
                 break
-        keep = confirmed(scene, found, refined, self._decoder, self.config)
+        # How well the image shows the sides, apart from how well the motion is known.
+        shown = replace(refined, covariances=sharpness)
+        keep = confirmed(scene, found, shown, self._decoder, self.config)
         ids, refined = ids[keep], refined.only(keep)
         self._motion.remember(stamp_ns, twist, ids, camera.normalise(refined.corners_px))
         return ids, refined

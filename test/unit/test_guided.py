@@ -1,0 +1,97 @@
+"""Guided detection: known markers where the filter says they are, and nothing where they are not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.guided import expected_markers
+from thermal_fiducial.core.measurements import corners_px, Odometry
+from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.sim.camera import render_frames
+from thermal_fiducial.sim.scenario import named, with_contrast
+
+SCENARIO = named('wall')
+LENS = SCENARIO.lens
+CAMERA = Camera(LENS.width, LENS.height, LENS.matrix, LENS.model, LENS.distortion)
+MAP = {marker.id: (marker.T_map_marker, marker.size) for marker in SCENARIO.markers}
+CONFIG = ArucoDetectorConfig(
+    camera_position=SCENARIO.camera_position,
+    camera_orientation=tuple(Rotation.from_quat(SCENARIO.camera_orientation).as_quat()),
+)
+
+
+def frames(contrast, count=4):
+    sensor = replace(
+        SCENARIO.sensor, pixel_growth=0.0, column_growth=0.0, column_pattern=0.01, bad_pixel_share=0.0, ffc_period=0.0
+    )
+    scenario = replace(with_contrast(SCENARIO, contrast), sensor=sensor)
+    scenario = replace(scenario, acrylic=replace(scenario.acrylic, steady=0.0))
+    return list(render_frames(scenario, seconds=20.0, seed=3, start=120, stop=120 + count))
+
+
+def odometry(frame, shift=(0.003, -0.002, 0.002)):
+    T = frame.T_map_camera @ geometry.inverse(SCENARIO.T_body_camera)
+    T = geometry.transform(T[:3, :3], T[:3, 3] + shift)
+    return Odometry(frame.stamp_ns, T, np.zeros(3), np.zeros(3), 1e-6 * np.eye(6), 1e-2 * np.eye(6))
+
+
+def detector(**changes):
+    found = MarkerDetector(replace(CONFIG, **changes), load_dictionary('DICT_4X4_50'))
+    found.set_map(MAP)
+    return found
+
+
+def test_expected_markers_are_those_in_view():
+    frame = frames(8.0, 1)[0]
+    ids, corners, depth = expected_markers(MAP, geometry.inverse(frame.T_map_camera), CAMERA, 12.0)
+    assert set(frame.corners_px) >= set(ids.tolist())
+    for marker_id, expected in zip(ids.tolist(), corners, strict=True):
+        np.testing.assert_allclose(expected, frame.corners_px[marker_id], atol=1e-6)
+    assert np.all(depth > 1.0)
+
+
+def test_finds_markers_of_the_noise_s_own_contrast():
+    guided, blind, expected = detector(), detector(guided=False), 0
+    seen = {guided: 0, blind: 0}
+    for frame in frames(0.05):
+        expected += len(frame.corners_px)
+        for each in seen:
+            rows = each.detect(frame.stamp_ns, frame.counts, CAMERA, odometry(frame))
+            truth = np.array([frame.corners_px[marker_id] for marker_id in rows['id'].tolist()]).reshape(-1, 4, 2)
+            error = np.linalg.norm((corners_px(rows) - truth).mean(axis=1), axis=-1)
+            # A third of a cell: at this contrast a corner is good to a pixel or two, a marker's centre is better.
+            assert error.max(initial=0.0) < 4.0
+            seen[each] += len(rows)
+    assert seen[guided] >= 0.9 * expected
+    assert seen[blind] < 0.5 * expected
+
+
+@pytest.mark.parametrize('noise', [1.5, 20.0])
+def test_never_invents_a_marker(noise):
+    rng, guided = np.random.default_rng(0), detector()
+    frame = frames(8.0, 1)[0]
+    for index in range(10):
+        counts = np.rint(7000 + rng.normal(0, noise, frame.counts.shape)).astype(np.uint16)
+        hint = replace(odometry(frame), stamp_ns=frame.stamp_ns + index)
+        assert len(guided.detect(frame.stamp_ns + index, counts, CAMERA, hint)) == 0
+
+
+def test_wrong_prediction_leaves_the_blind_search_to_find_all():
+    frame = frames(8.0, 1)[0]
+    rows = detector().detect(frame.stamp_ns, frame.counts, CAMERA, odometry(frame, shift=(0.0, 0.4, 0.2)))
+    assert rows['id'].tolist() == sorted(frame.corners_px)
+
+
+def test_branch_follows_the_map():
+    frame = frames(8.0, 1)[0]
+    rows = detector().detect(frame.stamp_ns, frame.counts, CAMERA, odometry(frame))
+    for row in rows:
+        R = geometry.rotation_from_quaternion([row['qx'], row['qy'], row['qz'], row['qw']])
+        expected = frame.T_map_camera[:3, :3].T @ MAP[int(row['id'])][0][:3, :3]
+        assert np.linalg.norm(geometry.so3_log(R @ expected.T)) < np.radians(6.0)
