@@ -23,8 +23,10 @@ _WIDE_CELL_PX = 8.0
 _ALIKE = 0.77
 _CLEARLY_ALIKE = 0.9
 _CLEAR_MARGIN = 0.06
-# Margin over all other markers that speaks for itself, as large dictionaries of many bits give it.
+# Margin over all other markers that speaks for itself where markers differ in so many bits that this many wrong ones
+# can be corrected; noise often looks a little like one of the few patterns of a 4 x 4 dictionary.
 _WIDE_MARGIN = 0.18
+_MANY_BITS = 3
 # Corner deviation [px] times contrast over noise times root of the side [px]: 4 to 7 for four clean sides.
 _SHARP = 7.5
 _SOFT = 12.0
@@ -133,7 +135,7 @@ def confirmed(
     contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
     same = reading.ids == found.ids
     margin = similarity - reading.runner_up
-    distinct = (similarity >= _ALIKE) | (margin >= _WIDE_MARGIN)
+    distinct = (similarity >= _ALIKE) | ((margin >= _WIDE_MARGIN) & (decoder.correctable >= _MANY_BITS))
     alike = distinct & (margin >= _CLEAR_MARGIN) & (reading.surround >= 0.4)
     side = np.linalg.norm(refined.corners_px[:, 2] - refined.corners_px[:, 0], axis=-1) / np.sqrt(2.0)
     deviation = np.sort(np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1)), axis=1)[:, 2]
