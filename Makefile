@@ -45,6 +45,7 @@ bench: $(READY)
 	$(BIN)/python -m pytest test/bench --benchmark-only --benchmark-columns=median,min,max,rounds $(PYTEST_ARGS)
 
 tables: $(READY)
+	THERMAL_FIDUCIAL_TABLES=1 $(BIN)/python -m pytest --quiet test/real
 	$(BIN)/python test/bench/readme.py
 
 format: $(READY)

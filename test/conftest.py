@@ -22,6 +22,17 @@ hypothesis.settings.load_profile('default')
 
 
 @pytest.fixture(scope='session')
+def measured():
+    """Take (what, goal, value) of a test on real data; ``make tables`` asks for them as a table of the README."""
+    rows = []
+    yield lambda *row: rows.append(row)
+    if rows and os.environ.get('THERMAL_FIDUCIAL_TABLES'):
+        table = Path(__file__).resolve().parents[1] / '.doc' / 'tables' / 'real.md'
+        lines = [('real data', 'goal', 'measured'), ('---', '---', '---'), *rows]
+        table.write_text(''.join(f'| {" | ".join(map(str, line))} |\n' for line in lines))
+
+
+@pytest.fixture(scope='session')
 def real_data():
     """Folder of the real data; a test that needs it is skipped where it isn't there."""
     folder = os.environ.get('THERMAL_FIDUCIAL_DATA')

@@ -7,14 +7,18 @@ from test.support import tagslam
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('name', 'passes'), [('test_1', 1), ('test_16', 1), ('test_22', 1), ('test_12', 1)])
-def test_reprojection_error_against_the_reference(real_data, name, passes):
+def test_reprojection_error_against_the_reference(real_data, name, passes, measured):
     recording = tagslam.load(real_data / 'tagslam' / name)
     markers, refinement = tagslam.solve(recording, passes)
     ours, theirs, views = tagslam.compare(recording, markers, refinement)
     total = sum(len(seen) for seen in recording.views.values())
     placed = len(markers.keys() & recording.T_map_marker.keys())
-    print(f'{name}: {ours:.4f} px, reference {theirs:.4f} px, ratio {ours / theirs:.4f}, '
-          f'{views} of {total} views, {placed} of {len(recording.T_map_marker)} markers')  # fmt: skip
+    measured(
+        f'tag corners {name} ({placed} of {len(recording.T_map_marker)} markers, {views} of {total} views): '
+        're-projection rms, ours / reference',
+        'at most 1.05',
+        f'{ours:.3f} / {theirs:.3f} px = {ours / theirs:.3f}',
+    )
     # The number to reach: the reference is a batch solution by GTSAM.
     assert ours <= 1.05 * theirs
     assert placed >= (0.5 if name == 'test_12' else 1.0) * len(recording.T_map_marker)
