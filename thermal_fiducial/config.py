@@ -441,3 +441,12 @@ class PoseEkfConfig:
         maximum=1000.0,
     )
     px4: bool = param(False, 'Publish fmu/in/vehicle_visual_odometry at bridge_rate too (needs px4_msgs).')
+
+
+#: Node to its parameters.
+NODES: dict[str, type] = {
+    'tau2_camera': Tau2CameraConfig,
+    'aruco_detector': ArucoDetectorConfig,
+    'marker_mapper': MarkerMapperConfig,
+    'pose_ekf': PoseEkfConfig,
+}

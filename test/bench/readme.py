@@ -8,16 +8,10 @@ import json
 from pathlib import Path
 import re
 
-from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, parameters, PoseEkfConfig, Tau2CameraConfig
+from thermal_fiducial.config import NODES, parameters
 from thermal_fiducial.ros.parameter_file import parameter_file
 
 ROOT = Path(__file__).resolve().parents[2]
-NODES = {
-    'tau2_camera': Tau2CameraConfig,
-    'aruco_detector': ArucoDetectorConfig,
-    'marker_mapper': MarkerMapperConfig,
-    'pose_ekf': PoseEkfConfig,
-}
 
 
 def parameter_table(config: type) -> str:

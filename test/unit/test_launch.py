@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from thermal_fiducial import config
-from thermal_fiducial.ros.parameter_file import NODES as PARAMETERS
+from thermal_fiducial.config import NODES as PARAMETERS
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = ['tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf']

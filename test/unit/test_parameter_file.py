@@ -4,9 +4,9 @@ from pathlib import Path
 
 import yaml
 
-from thermal_fiducial.config import from_mapping, parameters
+from thermal_fiducial.config import from_mapping, NODES, parameters
 from thermal_fiducial.replay.settings import read_settings
-from thermal_fiducial.ros.parameter_file import NODES, parameter_file
+from thermal_fiducial.ros.parameter_file import parameter_file
 
 FILE = Path(__file__).resolve().parents[2] / 'config' / 'thermal_fiducial.yaml'
 

@@ -9,8 +9,8 @@ import sys
 import tempfile
 from typing import Self
 
+from thermal_fiducial.config import NODES
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.replay.settings import NODES
 
 _PATIENCE_S = 15.0
 _TICK = os.sysconf('SC_CLK_TCK')

@@ -11,6 +11,7 @@ from thermal_fiducial.config import (
     ArucoDetectorConfig,
     from_mapping,
     MarkerMapperConfig,
+    NODES,
     parameters,
     PoseEkfConfig,
     size_overrides,
@@ -21,13 +22,6 @@ from thermal_fiducial.files.bad_pixels import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map
-
-NODES: dict[str, type] = {
-    'tau2_camera': Tau2CameraConfig,
-    'aruco_detector': ArucoDetectorConfig,
-    'marker_mapper': MarkerMapperConfig,
-    'pose_ekf': PoseEkfConfig,
-}
 
 
 @dataclass(frozen=True)

@@ -40,10 +40,10 @@ from thermal_fiducial.core.measurements import (
     Markers,
     Odometry,
 )
-from thermal_fiducial.core.types import Counts, FloatArray, Gray
+from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.images import image_to_array
 
-_ENCODINGS = {'mono16': 2, '16UC1': 2, 'mono8': 1, '8UC1': 1}
 _POINT_TYPES = {
     PointField.INT8: 'i1',
     PointField.UINT8: 'u1',
@@ -102,28 +102,7 @@ def _matrix(message: Any, size: int) -> FloatArray:
 # --- images -------------------------------------------------------------------------------------------
 
 
-def image_array(message: Image) -> Counts | Gray:
-    """Pixels (H, W) of a mono image, native byte order, without row padding; a view where that is possible.
-
-    Raises
-    ------
-    InputError
-        An encoding other than 8 or 16 bit mono, or sizes that don't fit the data.
-    """
-    itemsize = _ENCODINGS.get(message.encoding)
-    if itemsize is None:
-        raise InputError(f'image of encoding {message.encoding!r}, not one of {", ".join(_ENCODINGS)}')
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    row = width * itemsize
-    needed = step * (height - 1) + row
-    if not (height > 0 and width > 0 and step >= row and len(message.data) >= needed):
-        raise InputError(
-            f'image {width}x{height} {message.encoding} with row step {step} needs {max(needed, 0)} bytes, '
-            f'has {len(message.data)}'
-        )
-    kind = 'u1' if itemsize == 1 else '>u2' if message.is_bigendian else '<u2'
-    pixels: npt.NDArray[Any] = np.ndarray((height, width), kind, message.data, strides=(step, itemsize))
-    return np.ascontiguousarray(pixels, np.uint8) if itemsize == 1 else np.ascontiguousarray(pixels, np.uint16)
+image_array = image_to_array
 
 
 def image(pixels: npt.NDArray[Any], head: Header) -> Image:

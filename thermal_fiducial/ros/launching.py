@@ -11,8 +11,9 @@ from launch.launch_description import LaunchDescription
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from thermal_fiducial.config import NODES
+
 PACKAGE = 'thermal_fiducial'
-NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf')
 
 _ARGUMENTS = {
     'params_file': ('', 'parameter file of the rig; default: the one of the package'),

@@ -11,20 +11,8 @@ from typing import Any
 
 import yaml
 
-from thermal_fiducial.config import (
-    ArucoDetectorConfig,
-    MarkerMapperConfig,
-    parameters,
-    PoseEkfConfig,
-    Tau2CameraConfig,
-)
+from thermal_fiducial.config import NODES, parameters
 
-NODES: dict[str, type] = {
-    'tau2_camera': Tau2CameraConfig,
-    'aruco_detector': ArucoDetectorConfig,
-    'marker_mapper': MarkerMapperConfig,
-    'pose_ekf': PoseEkfConfig,
-}
 _WIDTH = 118
 _END_OF_SCALAR = '...\n'
 _HEAD = """\
