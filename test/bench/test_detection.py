@@ -1,192 +1,272 @@
-"""Detection and corners beside OpenCV's detector, on the same rendered frames, one thread.
+"""Our corners beside OpenCV's: found markers, corner error and time on the same frames, on one thread.
 
-Leaves its table in ``.doc/tables/detection.md`` and its plot in ``.doc/detection.png``.
+The corner error is that of the shape: the shift that the four corners of a marker have in common is taken out, because
+OpenCV doesn't know of the bolometers' lag, which shifts them all. Rms per axis over the markers that each method finds.
 """
 
 from dataclasses import dataclass, replace
+from functools import cache
+import itertools
 from pathlib import Path
 import time
 
 import cv2
+from matplotlib.figure import Figure
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.measurements import corners_px, Odometry
 from thermal_fiducial.sim.camera import render_frames
-from thermal_fiducial.sim.scenario import named, with_contrast
+from thermal_fiducial.sim.render import Quality
+from thermal_fiducial.sim.scenario import named
 
-DOC = Path(__file__).resolve().parents[2] / '.doc'
-METHODS = {
-    'OpenCV': cv2.aruco.CORNER_REFINE_NONE,
-    'OpenCV SUBPIX': cv2.aruco.CORNER_REFINE_SUBPIX,
-    'OpenCV APRILTAG': cv2.aruco.CORNER_REFINE_APRILTAG,
-}
-#: Scenario, contrast [K], first and last frame.
-SCENES = {
-    'slow, 8 K': ('wall', 8.0, 120, 140),
-    'slow, 2 K': ('wall', 2.0, 120, 140),
-    'slow, 0.5 K': ('wall', 0.5, 120, 140),
-    'slow, 0.3 K': ('wall', 0.3, 120, 140),
-    'slow, 0.1 K': ('wall', 0.1, 120, 140),
-    'slow, 0.05 K': ('wall', 0.05, 120, 140),
-    'room, 25 to 50 px': ('room', 8.0, 150, 180),
-    'turning up to 140 deg/s': ('fast', 8.0, 250, 310),
-}
+PLOT = Path(__file__).resolve().parents[2] / '.doc' / 'detection.png'
+SECONDS, SEED = 20.0, 21
+#: Two stretches of flight, clear of the shutter; the first frames of each are for the motion estimate to settle.
+STRETCHES = ((120, 138), (300, 318))
+SETTLING = 3
+#: Markers that are wholly in the image and whose shortest side is at least so long should be found [px].
+SMALLEST_SIDE = 14.0
+#: A detection is a false one if its shape is farther off than this, or its place (the lag moves markers) [px].
+FALSE_SHAPE, FALSE_PLACE = 6.0, 15.0
+#: The odometry that guides: the truth of the last IMU sample with such errors [m], [rad], [m/s], [rad/s].
+ODOMETRY_ERRORS = (0.005, 0.002, 0.02, 0.005)
+ODOMETRY_AGE = 0.004
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Frames with truth, and what else the detector may know."""
+class Case:
+    """A scene, and how the camera sees it."""
 
-    camera: Camera
-    frames: list
-    odometry: list
-    markers: dict
-    size: float
-    T_body_camera: np.ndarray
+    scenario: str
+    contrast: float
+    lag: float = 0.010
+    stepwise: bool = False
+    #: right after the shutter's correction, so that noise is all that is left
+    corrected: bool = False
+
+    @property
+    def scene(self):
+        """Its contrast is constant, and dead pixels are not what is measured."""
+        scenario = named(self.scenario)
+        acrylic = replace(scenario.acrylic, contrast=self.contrast, steady=0.0)
+        sensor = replace(scenario.sensor, lag=self.lag, bad_pixel_share=0.0)
+        if self.corrected:
+            sensor = replace(sensor, pixel_growth=0.0, column_growth=0.0, column_pattern=0.01)
+        return replace(scenario, acrylic=acrylic, sensor=sensor)
 
 
-def scene(name, contrast, start, stop):
-    scenario = with_contrast(named(name), contrast)
-    # Seconds after the shutter's correction; bad pixels are the business of the stage before.
-    sensor = replace(scenario.sensor, bad_pixel_share=0.0, pixel_growth=0.0, column_growth=0.0, column_pattern=0.01)
-    scenario = replace(scenario, sensor=sensor, acrylic=replace(scenario.acrylic, steady=0.0))
-    frames = [f for f in render_frames(scenario, seconds=20.0, seed=3, start=start, stop=stop) if not f.shutter]
-    lens, T_body_camera = scenario.lens, scenario.T_body_camera
-    return Scene(
-        Camera(lens.width, lens.height, lens.matrix, lens.model, lens.distortion),
-        frames,
-        [odometry(frames, index, T_body_camera) for index in range(len(frames))],
-        {marker.id: (marker.T_map_marker, marker.size) for marker in scenario.markers},
-        scenario.markers[0].size,
-        T_body_camera,
+CONTRASTS = (8.0, 2.0, 0.5, 0.3, 0.1)
+CASES = {
+    **{f'slow, {contrast:g} K': Case('wall', contrast) for contrast in CONTRASTS},
+    'slow, 0.1 K, fresh from the shutter': Case('wall', 0.1, corrected=True),
+    'slow, 0.05 K, fresh from the shutter': Case('wall', 0.05, corrected=True),
+    'slow, 8 K, lag in steps': Case('wall', 8.0, stepwise=True),
+    'fast, 8 K': Case('fast', 8.0),
+    'fast, 8 K, lag in steps': Case('fast', 8.0, stepwise=True),
+    'fast, 8 K, lag of 14 ms': Case('fast', 8.0, lag=0.014),
+    'fast, 0.5 K': Case('fast', 0.5),
+}
+OPENCV = {
+    'OpenCV, no refinement': cv2.aruco.CORNER_REFINE_NONE,
+    'SUBPIX': cv2.aruco.CORNER_REFINE_SUBPIX,
+    'APRILTAG': cv2.aruco.CORNER_REFINE_APRILTAG,
+}
+METHODS = ['blind', 'guided', *OPENCV]
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    yield
+    cv2.setNumThreads(threads)
+
+
+@cache
+def stretches(case):
+    """Lists of frames."""
+    quality = Quality(stepwise=case.stepwise)
+    return [list(render_frames(case.scene, SECONDS, SEED, quality=quality, start=a, stop=b)) for a, b in STRETCHES]
+
+
+def odometry(case, frame, rng):
+    """What a filter would have said just before the frame."""
+    position, attitude, speed, rate = (sigma * rng.standard_normal(3) for sigma in ODOMETRY_ERRORS)
+    motion = case.scene.trajectory(SECONDS, SEED)([frame.seconds - ODOMETRY_AGE])
+    T = motion.T_map_body[0].copy()
+    T[:3, 3] += position
+    T[:3, :3] = T[:3, :3] @ cv2.Rodrigues(attitude)[0]
+    velocity = motion.rotation.inv().apply(motion.velocity)[0] + speed
+    return Odometry(
+        frame.stamp_ns - round(ODOMETRY_AGE * 1e9),
+        T,
+        velocity,
+        motion.angular_velocity_body[0] + rate,
+        np.diag([ODOMETRY_ERRORS[0] ** 2] * 3 + [ODOMETRY_ERRORS[1] ** 2] * 3),
+        np.diag([ODOMETRY_ERRORS[2] ** 2] * 3 + [ODOMETRY_ERRORS[3] ** 2] * 3),
     )
 
 
-def odometry(frames, index, T_body_camera):
-    """What a filter knows at a frame: 4 mm and 1 mrad off."""
-    rng = np.random.default_rng(index)
-    first, last = max(index - 1, 0), min(index + 1, len(frames) - 1)
-    dt = (frames[last].stamp_ns - frames[first].stamp_ns) * 1e-9
-    T = [frames[k].T_map_camera @ geometry.inverse(T_body_camera) for k in (first, index, last)]
-    turn = geometry.so3_log(T[0][:3, :3].T @ T[2][:3, :3]) / dt
-    velocity = T[1][:3, :3].T @ (T[2][:3, 3] - T[0][:3, 3]) / dt
-    R = geometry.so3_exp(rng.normal(0, 0.001, 3)) @ T[1][:3, :3]
-    pose = geometry.transform(R, T[1][:3, 3] + rng.normal(0, 0.004, 3))
-    covariances = np.diag([0.004] * 3 + [0.001] * 3) ** 2, np.diag([0.02] * 3 + [0.01] * 3) ** 2
-    return Odometry(frames[index].stamp_ns, pose, velocity, turn, *covariances)
+def our_detector(case, guided):
+    """A function of a frame: ID to corners."""
+    scene, rng = case.scene, np.random.default_rng(1)
+    lens = scene.lens
+    camera = Camera(lens.width, lens.height, lens.matrix, lens.model, lens.distortion)
+    config = ArucoDetectorConfig(
+        marker_size=scene.markers[0].size,
+        camera_position=scene.camera_position,
+        camera_orientation=scene.camera_orientation,
+    )
+    detector = MarkerDetector(config, scene.aruco_dictionary)
+    if guided:
+        detector.set_map({marker.id: (marker.T_map_marker, marker.size) for marker in scene.markers})
+
+    def prepared(frame):
+        return frame, odometry(case, frame, rng) if guided else None
+
+    def detect(frame, state):
+        rows = detector.detect(frame.stamp_ns, frame.counts, camera, state)
+        return list(zip(rows['id'].tolist(), corners_px(rows), strict=True))
+
+    return prepared, detect
 
 
 def eight_bits(counts):
-    low, high = np.percentile(counts[::4, ::4], (1, 99))
-    return np.clip((counts.astype(np.float32) - low) * (255.0 / max(high - low, 1.0)), 0, 255).astype(np.uint8)
+    """Between the 0.5 and 99.5 percentiles of the frame."""
+    low, high = np.percentile(counts, (0.5, 99.5))
+    return np.clip((counts - low) * (255.0 / max(high - low, 1.0)), 0, 255).astype(np.uint8)
 
 
-def opencv(data, method):
+def opencv_detector(case, refinement):
+    """A function of a frame: ID to corners. The conversion to 8 bits is not its time."""
     parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = METHODS[method]
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), parameters)
-    for frame in data.frames:
-        gray = eight_bits(frame.counts)
-        begin = time.thread_time()
-        corners, ids, _ = detector.detectMarkers(gray)
-        seconds = time.thread_time() - begin
-        yield seconds, {} if ids is None else {int(i): c[0] for i, c in zip(ids.ravel(), corners, strict=True)}
+    parameters.cornerRefinementMethod = refinement
+    detector = cv2.aruco.ArucoDetector(case.scene.aruco_dictionary, parameters)
+    # CORNER_REFINE_APRILTAG counts from the corner of the first pixel, all others from its centre.
+    origin = 0.5 if refinement == cv2.aruco.CORNER_REFINE_APRILTAG else 0.0
+
+    def prepared(frame):
+        return (eight_bits(frame.counts),)
+
+    def detect(image):
+        corners, ids, _ = detector.detectMarkers(image)
+        found = [] if ids is None else ids.ravel().tolist()
+        return [(marker_id, quad[0] - origin) for marker_id, quad in zip(found, corners, strict=True)]
+
+    return prepared, detect
 
 
-def ours(data, method):
-    orientation = tuple(Rotation.from_matrix(data.T_body_camera[:3, :3]).as_quat())
-    config = ArucoDetectorConfig(
-        marker_size=data.size, camera_position=tuple(data.T_body_camera[:3, 3]), camera_orientation=orientation
+def make(case, method):
+    if method in OPENCV:
+        return opencv_detector(case, OPENCV[method])
+    return our_detector(case, method == 'guided')
+
+
+@dataclass(frozen=True)
+class Score:
+    """Of one method in one case."""
+
+    rms_px: float
+    rate: float
+    false: int
+
+
+def expected(frame):
+    sides = {
+        marker_id: np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min()
+        for marker_id, corners in frame.corners_px.items()
+    }
+    return [marker_id for marker_id, side in sides.items() if side >= SMALLEST_SIDE]
+
+
+def is_the_marker(error):
+    place = error.mean(axis=0)
+    shape = np.linalg.norm(error - place, axis=1)
+    return bool(np.linalg.norm(place) < FALSE_PLACE and shape.mean() < FALSE_SHAPE)
+
+
+@cache
+def score(case, method):
+    """Run over the frames of a case."""
+    errors, wanted, seen, false = [], 0, 0, 0
+    present = {marker.id for marker in case.scene.markers}
+    for frames in stretches(case):
+        prepared, detect = make(case, method)
+        answers = [detect(*prepared(frame)) for frame in frames]
+        for frame, found in list(zip(frames, answers, strict=True))[SETTLING:]:
+            off = {i: corners - frame.corners_px[i] for i, corners in found if i in frame.corners_px}
+            good = {i: error for i, error in off.items() if is_the_marker(error)}
+            due = expected(frame)
+            wanted, seen = wanted + len(due), seen + sum(i in good for i in due)
+            false += len(off) - len(good) + sum(i not in present for i, _ in found)
+            errors += [error - error.mean(axis=0) for error in good.values()]
+    return Score(float(np.sqrt(np.mean(np.square(errors)))) if errors else np.nan, seen / wanted, false)
+
+
+def cell(result):
+    """In Markdown."""
+    false = f', {result.false} false' if result.false else ''
+    return f'{result.rms_px:.3f} px, {100 * result.rate:.1f} %{false}' if result.rate else f'-{false}'
+
+
+TIMES = {}
+
+
+@pytest.mark.benchmark(timer=time.thread_time)
+@pytest.mark.parametrize('scene', ['slow, 8 K', 'slow, 0.5 K', 'fast, 8 K'])
+@pytest.mark.parametrize('method', METHODS)
+def test_time(benchmark, scene, method):
+    """Median processor time of a frame of a settled detector."""
+    frames = stretches(CASES[scene])[0]
+    prepared, detect = make(CASES[scene], method)
+    rounds = iter([prepared(frame) for frame in frames])
+    for _ in range(SETTLING):
+        detect(*next(rounds))
+    benchmark.pedantic(detect, setup=lambda: (next(rounds), {}), rounds=len(frames) - SETTLING)
+    if benchmark.stats is not None:
+        TIMES[scene, method] = benchmark.stats.stats.median
+
+
+def test_table(benchmark, write_table):
+    results = benchmark.pedantic(
+        lambda: {(name, method): score(case, method) for name, case in CASES.items() for method in METHODS}, rounds=1
     )
-    detector = MarkerDetector(config, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
-    guided = method == 'guided'
-    if guided:
-        detector.set_map(data.markers)
-    for frame, hint in zip(data.frames, data.odometry, strict=True):
-        begin = time.thread_time()
-        rows = detector.detect(frame.stamp_ns, frame.counts, data.camera, hint if guided else None)
-        seconds = time.thread_time() - begin
-        yield seconds, dict(zip(rows['id'].tolist(), corners_px(rows), strict=True))
+    rows = [['scene', 'ours, blind', 'ours, guided', *OPENCV]]
+    rows += [[name, *(cell(results[name, method]) for method in METHODS)] for name in CASES]
+    for scene in dict.fromkeys(scene for scene, _ in TIMES):
+        reference = TIMES[scene, 'SUBPIX']
+        rows.append(
+            [f'time of a frame, {scene} (ratio to SUBPIX)']
+            + [f'{1e3 * TIMES[scene, method]:.1f} ms ({TIMES[scene, method] / reference:.2f})' for method in METHODS]
+        )
+    write_table('detection', rows)
+    plot(results)
+    ours = results['slow, 8 K', 'blind']
+    # a bound against regressions, far from the promise of 0.02 px: the table shows what is measured
+    assert ours.rms_px < 0.05
+    assert ours.rate > 0.95
 
 
-def shape_error(found, truth):
-    error = found - truth
-    return np.mean(np.sum((error - error.mean(axis=0)) ** 2, axis=-1))
-
-
-def score(data, results):
-    """Rate, corner rms (shape) [px], false IDs, median time [s]."""
-    expected = hits = false = 0
-    errors, times = [], []
-    for frame, (seconds, found) in zip(data.frames, results, strict=True):
-        times.append(seconds)
-        expected += len(frame.corners_px)
-        for marker_id, corners in found.items():
-            if marker_id in frame.corners_px:
-                hits += 1
-                errors.append(shape_error(corners, frame.corners_px[marker_id]))
-            false += marker_id not in data.markers
-    return hits / max(expected, 1), float(np.sqrt(np.mean(errors))) if errors else np.nan, false, np.median(times)
-
-
-def run_all(data):
-    results = {method: score(data, opencv(data, method)) for method in METHODS}
-    return results | {method: score(data, ours(data, method)) for method in ('blind', 'guided')}
-
-
-def table(scores):
-    methods = list(next(iter(scores.values())))
-    lines = ['| scene | ' + ' | '.join(methods) + ' |', '|---' * (len(methods) + 1) + '|']
-    for name, row in scores.items():
-        base = row['OpenCV SUBPIX'][3]
-        cells = [
-            f'{100 * rate:.0f} % · {"-" if np.isnan(rms) else f"{rms:.3f}"} px · {seconds / base:.1f}x'
-            + (f' · {false} false' if false else '')
-            for rate, rms, false, seconds in row.values()
-        ]
-        lines.append(f'| {name} | ' + ' | '.join(cells) + ' |')
-    return '\n'.join(lines)
-
-
-def plot(scores, path):
-    pyplot = pytest.importorskip('matplotlib.pyplot')
-    figure, axes = pyplot.subplots(1, 2, figsize=(11, 4))
-    slow = {name: row for name, row in scores.items() if name.startswith('slow')}
-    contrast = [float(name.split()[1]) for name in slow]
-    for method in next(iter(slow.values())):
-        axes[0].loglog(contrast, [row[method][1] for row in slow.values()], marker='o', label=method)
-        axes[1].semilogx(contrast, [100 * row[method][0] for row in slow.values()], marker='o', label=method)
-    axes[0].set(xlabel='contrast [K]', ylabel='corner rms (shape) [px]')
-    axes[1].set(xlabel='contrast [K]', ylabel='markers found [%]')
-    axes[0].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=120)
-    pyplot.close(figure)
-
-
-def test_against_opencv(benchmark):
-    cv2.setNumThreads(1)
-    scores = benchmark.pedantic(
-        lambda: {name: run_all(scene(*arguments)) for name, arguments in SCENES.items()}, rounds=1
-    )
-    (DOC / 'tables').mkdir(parents=True, exist_ok=True)
-    (DOC / 'tables' / 'detection.md').write_text(table(scores) + '\n')
-    plot(scores, DOC / 'detection.png')
-    for name, row in scores.items():
-        assert row['blind'][2] == row['guided'][2] == 0, name
-        if row['OpenCV SUBPIX'][0] > 0.5:
-            assert row['blind'][1] < 0.6 * row['OpenCV SUBPIX'][1], name
-
-
-@pytest.mark.parametrize('method', ['blind', 'guided', *METHODS])
-def test_time_of_a_frame(benchmark, method):
-    cv2.setNumThreads(1)
-    data = scene('wall', 8.0, 120, 132)
-    run = opencv if method in METHODS else ours
-    benchmark.pedantic(lambda: list(run(data, method)), rounds=3, warmup_rounds=1)
+def plot(results):
+    """Corner error over contrast, slow, and for all scenes at 8 K."""
+    figure = Figure(figsize=(10, 4), layout='constrained')
+    left, right = figure.subplots(1, 2, sharey=True)
+    scenes = [name for name, case in CASES.items() if case.contrast == 8.0]
+    shift = np.linspace(-0.32, 0.32, len(METHODS))
+    for method, marker, offset in zip(METHODS, itertools.cycle('os^vD'), shift, strict=False):
+        label = method if method in OPENCV else f'ours, {method}'
+        errors = [results[f'slow, {contrast:g} K', method].rms_px for contrast in CONTRASTS]
+        left.loglog(CONTRASTS, errors, marker=marker, label=label)
+        right.bar(np.arange(len(scenes)) + offset, [results[name, method].rms_px for name in scenes], 0.15)
+    left.set(xlabel='contrast [K], NETD 0.05 K', ylabel='corner error, rms per axis [px]')
+    left.set_title('slow flight: no point where nothing is found', fontsize=10)
+    left.legend(fontsize=8)
+    right.set_xticks(np.arange(len(scenes)), [name.replace(', ', '\n') for name in scenes], fontsize=7)
+    right.set_title('8 K', fontsize=10)
+    for axes in (left, right):
+        axes.grid(alpha=0.3, which='both')
+    figure.savefig(PLOT, dpi=110, metadata={'Software': None})
