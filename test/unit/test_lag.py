@@ -6,7 +6,16 @@ import pytest
 
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.lag import camera_twist, interaction, MotionTracker, smear, SmearField, Twist, without_lag
+from thermal_fiducial.core.lag import (
+    camera_twist,
+    interaction,
+    markers_without_lag,
+    MotionTracker,
+    smear,
+    SmearField,
+    Twist,
+    without_lag,
+)
 from thermal_fiducial.core.measurements import Odometry
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
@@ -84,3 +93,16 @@ def test_lag_is_undone(lag_px):
     error = np.abs(restored - seen(sharp))[:, middle].max()
     # Nyquist's frequency has no derivative; a sixth of the lag's own error is what a blur of 0.66 px leaves of it.
     assert error < np.abs(seen(lagging) - seen(sharp))[:, middle].max() / 5
+
+
+@pytest.mark.parametrize(('velocity', 'turn'), [(1e3, 0.0), (0.0, 1e3), (np.nan, 0.0)])
+def test_implausible_odometry_is_ignored(velocity, turn):
+    odometry = Odometry(0, np.eye(4), np.array([velocity, 0, 0]), np.array([0, turn, 0]), np.eye(6), np.eye(6))
+    assert MotionTracker(np.eye(4)).predict(10**7, odometry) is None
+
+
+def test_windows_outside_or_without_numbers_are_skipped():
+    image = np.random.default_rng(2).normal(size=(60, 80)).astype(np.float32)
+    square = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 20.0], [0.0, 20.0]])
+    corners = np.stack([square + 500.0, square - 500.0, square + np.nan])
+    np.testing.assert_array_equal(markers_without_lag(image, corners, np.ones((3, 4, 2)), 16), image)

@@ -121,15 +121,12 @@ class Decoder:
         inner_low, inner_high = np.broadcast_to(near, t.shape), np.broadcast_to(1.0 - near, t.shape)
         a = np.concatenate([t, t, low, high, t, t, inner_low, inner_high], axis=1)
         b = np.concatenate([low, high, t, t, inner_low, inner_high, t, t], axis=1)
-        uv = _inside(quads, a, b).astype(np.float32)
-        sampled = cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        means = sampled.reshape(len(quads), 2, 4, -1).mean(axis=-1, dtype=np.float64)
+        means = _sampled(image, quads, a, b).reshape(len(quads), 2, 4, -1).mean(axis=-1, dtype=np.float64)
         return np.asarray(means[:, 0] - means[:, 1])
 
     def _cell_means(self, image: Float32Array, quads: FloatArray) -> FloatArray:
         """Mean counts (Q, m * m) of the cells."""
-        uv = _inside(quads, self._a, self._b).astype(np.float32)
-        sampled = cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        sampled = _sampled(image, quads, self._a, self._b)
         blocks = sampled.reshape(len(quads), self.cells, len(_SAMPLES), self.cells, len(_SAMPLES))
         return np.asarray(blocks.mean(axis=(2, 4)).reshape(len(quads), -1), dtype=np.float64)
 
@@ -137,16 +134,22 @@ class Decoder:
 def shrunk(quads: FloatArray, cells: int) -> FloatArray:
     """The markers (Q, 4, 2) in plates (Q, 4, 2) that surround them with a white margin of one cell."""
     low, high = 1.0 / (cells + 2), (cells + 1.0) / (cells + 2)
-    return _inside(quads, np.array([low, high, high, low]), np.array([low, low, high, high]))
+    return np.moveaxis(_inside(quads, np.array([low, high, high, low]), np.array([low, low, high, high])), 0, -1)
+
+
+def _sampled(image: Float32Array, quads: FloatArray, a: FloatArray, b: FloatArray) -> Float32Array:
+    """Values (Q, P) of the image at shares a, b of quadrilaterals."""
+    u, v = _inside(quads, a, b).astype(np.float32)
+    return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def _inside(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Points (Q, P, 2) at shares a, b (P,) or (Q, P) of quadrilaterals (Q, 4, 2), by the map of the unit square."""
+    """Columns and rows (2, Q, P) at shares a, b (P,) or (Q, P) of quadrilaterals (Q, 4, 2): the unit square's map."""
     d1, d2, d3 = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2], c[:, 0] - c[:, 1] + c[:, 2] - c[:, 3]
     determinant = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
     determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
     g = ((d3[:, 0] * d2[:, 1] - d3[:, 1] * d2[:, 0]) / determinant)[:, None]
     h = ((d1[:, 0] * d3[:, 1] - d1[:, 1] * d3[:, 0]) / determinant)[:, None]
     right, down = c[:, 1] - c[:, 0] + g * c[:, 1], c[:, 3] - c[:, 0] + h * c[:, 3]
-    top = c[:, None, 0] + a[..., None] * right[:, None] + b[..., None] * down[:, None]
-    return np.asarray(top / (1.0 + a * g + b * h)[..., None])
+    inverse_depth = 1.0 / (1.0 + a * g + b * h)
+    return np.stack([(c[:, 0, [k]] + a * right[:, [k]] + b * down[:, [k]]) * inverse_depth for k in range(2)])

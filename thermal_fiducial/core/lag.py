@@ -27,6 +27,8 @@ _UNKNOWN = np.diag([1.5, 1.5, 1.5, 1.5, 1.5, 1.5]) ** 2
 # How much it changes within a second: 5 m/s^2 and 10 rad/s^2 sustained for a frame.
 _CHANGE_PER_S = np.diag([5.0, 5.0, 5.0, 10.0, 10.0, 10.0]) ** 2
 _STALE_S = 0.15
+# No camera that sees markers moves faster: such odometry tells nothing [m/s, rad/s].
+_FASTEST, _FASTEST_TURN = 20.0, 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +73,8 @@ class MotionTracker:
         """Twist expected at a frame; None when nothing is known."""
         if odometry is not None and 0.0 <= abs(stamp_ns - odometry.stamp_ns) * 1e-9 < _STALE_S:
             twist = camera_twist(odometry, self._T_body_camera)
-            return Twist(twist.value, twist.covariance + self._drift(stamp_ns, odometry.stamp_ns))
+            if _plausible(twist):
+                return Twist(twist.value, twist.covariance + self._drift(stamp_ns, odometry.stamp_ns))
         if self._twist is None or self._stamp_ns is None or not 0 < stamp_ns - self._stamp_ns < _STALE_S * 1e9:
             return None
         return Twist(self._twist.value, self._twist.covariance + self._drift(stamp_ns, self._stamp_ns))
@@ -112,6 +115,11 @@ class MotionTracker:
         return _CHANGE_PER_S * ((stamp_ns - since_ns) * 1e-9) ** 2
 
 
+def _plausible(twist: Twist) -> bool:
+    speed, turn = np.linalg.norm(twist.value[:3]), np.linalg.norm(twist.value[3:])
+    return bool(speed <= _FASTEST and turn <= _FASTEST_TURN and np.all(np.isfinite(twist.covariance)))
+
+
 def smear(camera: Camera, x: FloatArray, depth: FloatArray, twist: Twist, tau: float) -> tuple[FloatArray, FloatArray]:
     """Mean displacement by lag (..., 2) [px] at normalised points (..., 2), and its covariance (..., 2, 2)."""
     A = -tau * camera.distort_jacobian(x) @ interaction(x, depth)
@@ -131,10 +139,14 @@ def markers_without_lag(
     """``image`` with the windows round N markers (corners (N, 4, 2), smear (N, 4, 2) [px]) freed of lag."""
     result = image.copy()
     height, width = image.shape
+    finite = np.isfinite(corners_px).all(axis=(1, 2)) & np.isfinite(smear_px).all(axis=(1, 2))
+    corners_px, smear_px = corners_px[finite], smear_px[finite]
     affine = np.linalg.pinv(np.concatenate([corners_px, np.ones((len(corners_px), 4, 1))], axis=-1)) @ smear_px
     low = np.floor(corners_px.min(axis=1)).astype(int) - margin_px
     high = np.ceil(corners_px.max(axis=1)).astype(int) + margin_px + 1
     low, high = np.maximum(low, 0), np.minimum(high, (width, height))
+    seen = (low < high).all(axis=1)
+    low, high, affine = low[seen], high[seen], affine[seen]
     for (u0, v0), (u1, v1), map_uv in zip(low.tolist(), high.tolist(), affine.astype(np.float32), strict=True):
         # The derivative at the window's rim looks outside, where there is image.
         outer = np.s_[max(v0 - 3, 0) : v1 + 3, max(u0 - 3, 0) : u1 + 3]
