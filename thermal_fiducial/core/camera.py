@@ -198,27 +198,26 @@ class Camera:
 def _radial_factor(r2: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Radial factor of the (rational) polynomial and its derivative with respect to r^2."""
     top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))
-    bottom = 1.0 + r2 * (k[3] + r2 * (k[4] + r2 * k[5]))
     d_top = k[0] + r2 * (2.0 * k[1] + 3.0 * k[2] * r2)
+    if not k[3:].any():
+        return top, d_top
+    bottom = 1.0 + r2 * (k[3] + r2 * (k[4] + r2 * k[5]))
     d_bottom = k[3] + r2 * (2.0 * k[4] + 3.0 * k[5] * r2)
     return top / bottom, (d_top * bottom - top * d_bottom) / bottom**2
 
 
 def _distort_polynomial(x: FloatArray, k: FloatArray, p1: float, p2: float) -> tuple[FloatArray, FloatArray]:
     a, b = x[..., 0], x[..., 1]
-    r2 = a * a + b * b
+    aa, ab, bb = a * a, a * b, b * b
+    r2 = aa + bb
     factor, d_factor = _radial_factor(r2, k)
-    distorted = np.stack(
-        [
-            a * factor + 2.0 * p1 * a * b + p2 * (r2 + 2.0 * a * a),
-            b * factor + p1 * (r2 + 2.0 * b * b) + 2.0 * p2 * a * b,
-        ],
-        axis=-1,
-    )
+    distorted = x * factor[..., None]
+    distorted[..., 0] += 2.0 * p1 * ab + p2 * (r2 + 2.0 * aa)
+    distorted[..., 1] += p1 * (r2 + 2.0 * bb) + 2.0 * p2 * ab
     J = np.empty((*x.shape[:-1], 2, 2))
-    J[..., 0, 0] = factor + 2.0 * a * a * d_factor + 2.0 * p1 * b + 6.0 * p2 * a
-    J[..., 0, 1] = J[..., 1, 0] = 2.0 * a * b * d_factor + 2.0 * p1 * a + 2.0 * p2 * b
-    J[..., 1, 1] = factor + 2.0 * b * b * d_factor + 6.0 * p1 * b + 2.0 * p2 * a
+    J[..., 0, 0] = factor + 2.0 * aa * d_factor + 2.0 * p1 * b + 6.0 * p2 * a
+    J[..., 0, 1] = J[..., 1, 0] = 2.0 * ab * d_factor + 2.0 * p1 * a + 2.0 * p2 * b
+    J[..., 1, 1] = factor + 2.0 * bb * d_factor + 6.0 * p1 * b + 2.0 * p2 * a
     return distorted, J
 
 
