@@ -30,7 +30,7 @@ _KEPT_VARIANCE = 0.911
 # Standard deviation of a corner that no image noise explains: the optics' blur is not quite a Gaussian [px].
 _FLOOR_PX = 0.007
 # Factors on the blur, pass by pass: a wide one catches, narrow ones measure, until the corners no longer move.
-_PASSES = (3.0, 1.4, 1.0, 1.0, 1.0, 1.0)
+_PASSES = (1.4, 1.0, 1.0, 1.0, 1.0)
 _SETTLED_PX = 0.3
 # A linearised displacement is good for this many blurs.
 _REACHED = 2.0
@@ -128,7 +128,6 @@ def refine_corners(
     *,
     inner: bool = False,
     columns: int = 6,
-    coarse: bool = False,
 ) -> RefinedCorners:
     """Corners of N markers, refined.
 
@@ -140,12 +139,11 @@ def refine_corners(
     blur_px : standard deviation of optics and pixel
     inner : whether the lines between the bits are used besides the sides
     columns : of pixels, in a segment
-    coarse : whether the corners are only known to four pixels
     """
     count = len(corners_px)
     result = RefinedCorners(corners_px.copy(), np.zeros((count, 4, 2, 2)), np.zeros(count), np.zeros(count))
     active = np.arange(count)
-    for factor in _PASSES if coarse else _PASSES[1:]:
+    for factor in _PASSES:
         if len(active) == 0:
             break
         start = result.corners_px[active]

@@ -178,17 +178,14 @@ class MarkerDetector:
         x = camera.normalise(corners)
         depth = _corner_depths(x, self._sizes_of(ids))
         self._depth = float(np.median(depth))
-        twist, coarse = predicted, False
+        twist = predicted
         columns = _COLUMNS if clear.all() else _COLUMNS_FAINT
         for _ in range(2):
             scene, used = image, np.zeros_like(corners)
             if twist is not None:
                 used = smear(camera, x, depth, twist, tau)[0] * clear[:, None, None]
                 scene = markers_without_lag(image, corners[clear], used[clear], _WINDOW_MARGIN_PX)
-            refined = refine_corners(
-                scene, corners, camera, before, step, self.config.blur_px, columns=columns, coarse=coarse
-            )
-            coarse = False
+            refined = refine_corners(scene, corners, camera, before, step, self.config.blur_px, columns=columns)
             sharpness = refined.covariances
             x = camera.normalise(refined.corners_px)
             noise = np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1).mean(axis=-1)) / camera.focal_px
