@@ -12,6 +12,7 @@ from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.geometry import so3_exp, transform
 from thermal_fiducial.core.measurements import CORNER_COVARIANCE_FIELDS, MAP_DTYPE, MARKER_DTYPE, Odometry
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.ros import convert
 
 STAMP = 1_700_000_000_123_456_789
@@ -61,7 +62,7 @@ def raw_image(pixels, encoding, big=False, padding=0):
 def test_images_of_any_byte_order_and_row_step(encoding, big, padding):
     dtype = np.uint8 if '8' in encoding else np.uint16
     pixels = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (5, 7)).astype(dtype)
-    taken = convert.image_array(sent(raw_image(pixels, encoding, big, padding)))
+    taken = image_to_array(sent(raw_image(pixels, encoding, big, padding)))
     np.testing.assert_array_equal(taken, pixels)
     assert taken.dtype == dtype
     assert taken.dtype.isnative
@@ -71,7 +72,7 @@ def test_images_of_any_byte_order_and_row_step(encoding, big, padding):
 def test_a_last_row_without_its_padding_is_whole():
     message = raw_image(np.arange(12, dtype=np.uint16).reshape(3, 4), 'mono16', padding=4)
     message.data = message.data[:-4]
-    np.testing.assert_array_equal(convert.image_array(message), np.arange(12).reshape(3, 4))
+    np.testing.assert_array_equal(image_to_array(message), np.arange(12).reshape(3, 4))
 
 
 @pytest.mark.parametrize(
@@ -92,7 +93,7 @@ def test_an_image_whose_sizes_do_not_fit_is_refused(changes):
     for name, value in changes.items():
         setattr(message, name, value)
     with pytest.raises(InputError, match='image'):
-        convert.image_array(message)
+        image_to_array(message)
 
 
 @pytest.mark.parametrize(('shape', 'dtype', 'encoding'), [((3, 4), 'u2', 'mono16'), ((3, 4), 'u1', 'mono8')])
@@ -101,7 +102,7 @@ def test_images_come_back(shape, dtype, encoding):
     message = sent(convert.image(pixels, HEAD))
     assert message.encoding == encoding
     assert message.header == HEAD
-    np.testing.assert_array_equal(convert.image_array(message), pixels)
+    np.testing.assert_array_equal(image_to_array(message), pixels)
 
 
 def test_a_picture_in_colour():

@@ -15,6 +15,7 @@ from thermal_fiducial.core.geometry import so3_exp, transform
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import save_camera
+from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.nodes.aruco_detector import ArucoDetector
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
@@ -64,7 +65,7 @@ def test_clean_frames_go_out_with_their_stamp_and_frozen_ones_do_not(graph):
     node = graph.add(Tau2Camera)
     graph.listen(Image, 'thermal/image')
     first, second = frames(2)
-    frozen = convert.image(convert.image_array(first), convert.header(START + 2, 'camera'))
+    frozen = convert.image(image_to_array(first), convert.header(START + 2, 'camera'))
     graph.send('thermal/image_raw', first, frozen)
     level, reason, figures = graph.diagnose(node)
     assert (level, reason, figures['withheld: frozen']) == (WARN, 'frozen', '1')

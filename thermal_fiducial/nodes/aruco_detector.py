@@ -14,6 +14,7 @@ from thermal_fiducial.core.thermal import EightBitView
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.ros import convert, display, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
 from thermal_fiducial.ros.node import OK
@@ -48,7 +49,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         if self.detector is None:
             return
         stamp = convert.stamp_ns(message.header.stamp)
-        counts = convert.image_array(message)
+        counts = image_to_array(message)
         camera = self.camera()
         _check_size(counts, camera)
         markers = self.detector.detect(stamp, counts, camera, self.odometry())

@@ -11,6 +11,7 @@ from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.thermal import EightBitView, FrameCleaner
 from thermal_fiducial.files.bad_pixels import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.node import OK, StageNode, WARN
 from thermal_fiducial.ros.run import run
@@ -44,7 +45,7 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
 
     def _on_image(self, message: Image) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
-        frame = self.cleaner.process(stamp, convert.image_array(message))
+        frame = self.cleaner.process(stamp, image_to_array(message))
         self._reason = frame.reason
         if frame.counts is None:
             self._withheld[frame.reason] += 1

@@ -42,7 +42,6 @@ from thermal_fiducial.core.measurements import (
 )
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.images import image_to_array
 
 _POINT_TYPES = {
     PointField.INT8: 'i1',
@@ -100,9 +99,6 @@ def _matrix(message: Any, size: int) -> FloatArray:
 
 
 # --- images -------------------------------------------------------------------------------------------
-
-
-image_array = image_to_array
 
 
 def image(pixels: npt.NDArray[Any], head: Header) -> Image:
