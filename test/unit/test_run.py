@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 import os
+import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 
 import pytest
@@ -115,3 +117,22 @@ def test_arguments_that_ros_cannot_read_are_an_input_error(arguments):
         run.initialise(['--ros-args', *arguments], Context())
     assert '\n' not in str(caught.value)
     assert arguments[1] in str(caught.value)
+
+
+@pytest.mark.parametrize('told', ['os.kill(os.getpid(), signal.SIGINT)', 'rclpy.shutdown()'])
+def test_a_node_told_to_stop_while_it_is_made_stops_without_a_word(told):
+    program = f"""
+import os, signal, sys
+import rclpy
+from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
+from thermal_fiducial.ros.run import run
+
+class Stopped(MarkerMapperNode):
+    def declare_parameter(self, *args, **kwargs):
+        {told}
+        return super().declare_parameter(*args, **kwargs)
+
+sys.exit(run(Stopped))
+"""
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout + done.stderr) == (0, '')

@@ -65,24 +65,34 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     -------
     Exit status: 0 stopped, 2 unusable arguments or parameters (one line says which).
     """
+    node = None
     try:
         initialise(args)
         node = make_node()
+        _spin(node)
     except InputError as error:
         print(f'{Path(sys.argv[0]).name}: {error}', file=sys.stderr)
-        try_shutdown()
         return 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except Exception:
+        # Told to stop while the node is being made, rcl refuses the rest of it: not an error of the node.
+        if ok():
+            raise
+    finally:
+        if node is not None:
+            node.close()
+            node.destroy_node()
+        try_shutdown()
+    return 0
+
+
+def _spin(node: StageNode[Any]) -> None:
     executor = make_executor()
     executor.add_node(node)
     try:
         # EventsExecutor.spin() and spin_once(None) fire nothing on some builds.
         while ok():
             executor.spin_once(timeout_sec=1.0)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
     finally:
-        node.close()
         executor.shutdown()
-        node.destroy_node()
-        try_shutdown()
-    return 0
