@@ -325,6 +325,10 @@ class MarkerMapperConfig:
     map_file: str = _map_file()
     mode: str = _mode()
     map_frame: str = param('map', 'Frame of the map.')
+    cloud_file: str = param('', 'Point cloud of the place (.ply or .pcd) to show beside the markers. Empty: none.')
+    cloud_alignment_file: str = param(
+        '', 'Where the map lies in cloud_file, as map align writes it. Empty: both are in the same frame.'
+    )
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
     bridge_duration: float = param(

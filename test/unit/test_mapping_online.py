@@ -7,6 +7,7 @@ import numpy as np
 from test.support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry import so3_exp, transform
+from thermal_fiducial.core.map_editing import transformed
 from thermal_fiducial.core.map_refinement import refine
 from thermal_fiducial.core.marker_map import MapMarker, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import Odometry
@@ -87,6 +88,69 @@ def test_a_frozen_map_takes_no_refinement():
     assert m.apply(refinement) is None
     assert not m.refinement_due(stamp(1000))
     assert m.map == before
+
+
+def test_a_marker_that_hangs_twice_is_found_by_the_joint_refinement():
+    """Its two sheets take turns, so no run of frames is long enough to condemn it online; all frames together are."""
+    rng = np.random.default_rng(8)
+    poses = wall(rng)
+    m = from_one_marker(poses, refinement_period=0.0)
+    second = poses | {5: transform(np.eye(3), [0.0, 0.0, 0.08]) @ poses[5]}
+    for k in range(0, 300, 3):
+        m.process(stamp(k), see(flight(k / 30), poses if k % 20 < 10 else second, 0.05, rng), CAMERA)
+    assert m.map.markers[5].trusted
+    refinement = m.refine()
+    assert refinement.inconsistent == (5,)
+    assert not m.map.markers[5].trusted
+    # Left out of poses and of later refinements; the rest flies on.
+    result = m.process(stamp(301), see(flight(10.0), poses, 0.05, rng), CAMERA)
+    assert result.quarantined == (5,)
+    assert 5 not in result.pose.marker_ids
+    assert 5 not in m.snapshot().markers
+    # It is taken back when it has agreed for a while, and not before.
+    for k in range(302, 302 + 30):
+        result = m.process(stamp(k), see(flight(10.0), poses, 0.05, rng), CAMERA)
+    assert result.quarantined == (5,)
+
+
+def test_another_map_is_taken_over_and_the_jump_told():
+    rng = np.random.default_rng(9)
+    poses = wall(rng)
+    m = from_one_marker(poses)
+    for k in range(0, 90, 3):
+        m.process(stamp(k), see(flight(k / 30), poses, 0.02, rng), CAMERA)
+    m.refine()
+    late = refine(m.snapshot())
+    rows = see(flight(k / 30), poses, 0.02, rng)
+    before = m.process(stamp(k) + 1, rows, CAMERA)
+    T_new_old = transform(so3_exp([0.0, 0.0, 0.4]), [3.0, -1.0, 0.2])
+    jump = m.load(transformed(m.map, T_new_old))
+    np.testing.assert_allclose(jump.T_new_old, T_new_old, atol=1e-9)
+    assert (jump.resets, jump.map_version) == (2, m.map.version)
+    assert m.map.version > before.map_version
+    # A refinement that was under way knows nothing of the new map.
+    assert m.apply(late) is None
+    after = m.process(stamp(k) + 2, rows, CAMERA)
+    told = T_new_old @ before.pose.T_map_camera
+    # The same corners; the weights have forgotten the running errors.
+    assert np.linalg.norm(difference(after.pose.T_map_camera, told)[:3]) < 1e-4
+    elsewhere = MarkerMap({90: MapMarker(90, SIZE, True, np.eye(4))})
+    assert m.load(elsewhere) is None
+    assert sorted(m.map.markers) == [90]
+
+
+def test_refinement_goes_on_when_the_budget_is_used_up():
+    """Loops that close after hours must settle too."""
+    rng = np.random.default_rng(10)
+    poses = wall(rng)
+    m = from_one_marker(poses, keyframe_budget=40)
+    due = []
+    for k in range(200):
+        m.process(stamp(k), see(flight(k / 30), poses, 0.05, rng), CAMERA)
+        if m.refinement_due(stamp(k)):
+            due.append(k)
+            m.snapshot()
+    assert max(due) > 150
 
 
 def odometry(k, T, T_error, covariance):

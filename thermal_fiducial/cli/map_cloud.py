@@ -6,15 +6,13 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-import yaml
 
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.cloud_alignment import align_to_cloud, CloudAlignment
 from thermal_fiducial.core.geometry import apply, inverse, quaternion_from_rotation, transform_from_quaternion
-from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.marker_map import load_map, write_atomically
-from thermal_fiducial.files.point_cloud import load_cloud
+from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.point_cloud import load_cloud, save_alignment, thinned
 
 # Points of the cloud in the picture: more make it no clearer.
 _DRAWN = 200_000
@@ -50,12 +48,12 @@ def _align(args: argparse.Namespace) -> int:
         raise InputError("map align needs the extra 'cloud': pip install thermal_fiducial[cloud]") from error
     _tell(alignment)
     if args.out:
-        _write(args.out, alignment.T, marker_map.frame_id, args.cloud)
+        save_alignment(args.out, alignment.T, args.cloud.name, marker_map.frame_id)
+        print(f'{args.out} written')
     if args.plot:
         from thermal_fiducial.cli.map_plot import plot_map
 
-        shown = cloud[:: max(1, len(cloud) // _DRAWN)]
-        plot_map(marker_map, args.plot, apply(inverse(alignment.T), shown))
+        plot_map(marker_map, args.plot, apply(inverse(alignment.T), thinned(cloud, _DRAWN)))
         print(f'{args.plot} written')
     return 0
 
@@ -76,17 +74,3 @@ def _tell(alignment: CloudAlignment) -> None:
         print(f'the surfaces leave {alignment.open_directions} of 6 directions open: there the initial pose stands')
     position, q = alignment.T[:3, 3], quaternion_from_rotation(alignment.T[:3, :3])
     print('map in cloud: position', *(f'{v:.4f}' for v in position), 'orientation', *(f'{v:.6f}' for v in q))
-
-
-def _write(path: Path, T: FloatArray, frame_id: str, cloud: Path) -> None:
-    document = {
-        'parent': cloud.name,
-        'child': frame_id,
-        'position': [round(float(v), 9) for v in T[:3, 3]],
-        'orientation': [round(float(v), 9) for v in quaternion_from_rotation(T[:3, :3])],
-    }
-    try:
-        write_atomically(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
-    except OSError as error:
-        raise InputError(f'{path}: cannot write the transform: {error.strerror}') from error
-    print(f'{path} written')

@@ -95,9 +95,9 @@ def _tell(built: Built, frames: int) -> None:
     print(f'{built.frames_used} of {frames} frames used')
     if built.refinement is not None:
         print(f're-projection error {built.refinement.rms_px:.3f} px rms')
-        for key, share in built.refinement.outliers.items():
-            if share > 0.3:
-                print(f'marker {key}: {100 * share:.0f} % of its views disagree with the others; has it been moved?')
+        for key in built.refinement.inconsistent:
+            share = 100.0 * built.refinement.outliers[key]
+            print(f'marker {key}: {share:.0f} % of its views disagree with the others; has it been moved?')
     for key, why in sorted(built.unplaced.items()):
         print(f'marker {key} is not in the map: {why}')
 

@@ -66,10 +66,13 @@ class KeyframeStore:
     budget: int
     frames: dict[int, Keyframe] = field(default_factory=dict)
     links: list[Link] = field(default_factory=list)
+    #: frames that were ever added
+    added: int = 0
 
     def add(self, frame: Keyframe) -> None:
         """Keep ``frame``; thin out when there are too many."""
         self.frames[frame.stamp_ns] = frame
+        self.added += 1
         if len(self.frames) > self.budget:
             self._thin(int(_THINNED * self.budget))
 

@@ -1,4 +1,4 @@
-"""The marker map as data: what is known of each marker, and the frame in which it is known."""
+"""The marker map as data: what is known of each marker, in which frame, and what the mapper answers to a frame."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thermal_fiducial.core.geometry import quaternion_from_rotation
-from thermal_fiducial.core.measurements import MAP_DTYPE
+from thermal_fiducial.core.measurements import CameraPose, MAP_DTYPE
 from thermal_fiducial.core.types import FloatArray
 
 
@@ -71,6 +71,43 @@ class MarkerMap:
             rows[name] = [getattr(marker, name) for marker in markers]
         rows['in_view'] = [marker.id in in_view for marker in markers]
         return rows
+
+
+@dataclass(frozen=True)
+class MapperResult:
+    """What one frame came to."""
+
+    stamp_ns: int
+    pose: CameraPose | None
+    #: in words: why there is no pose; empty when there is one
+    reason: str
+    #: the map has another geometry, or trusts other markers, than before
+    map_changed: bool = False
+    #: rms re-projection error of each known marker in view [px], quarantined ones included
+    residuals_px: dict[int, float] = field(default_factory=dict)
+    #: markers on trial in view: ID to what each waits for
+    candidates: dict[int, str] = field(default_factory=dict)
+    #: all markers in quarantine
+    quarantined: tuple[int, ...] = ()
+    map_version: int = 0
+    #: how often a refinement has moved the map
+    map_resets: int = 0
+
+    @property
+    def in_view(self) -> frozenset[int]:
+        """IDs of the known markers in view."""
+        return frozenset(self.residuals_px)
+
+
+@dataclass(frozen=True)
+class MapJump:
+    """A refinement moved the map: poses told before and after don't compare as they are."""
+
+    map_version: int
+    #: how often this has happened
+    resets: int
+    #: (4, 4) moves poses near the robot from the old map to the new: T_new = T_new_old @ T_old
+    T_new_old: FloatArray
 
 
 def _fill(rows: np.ndarray, names: Collection[str], values: FloatArray) -> None:

@@ -29,6 +29,8 @@ MAX_ITERATIONS = 25
 _CONVERGED = 1e-7
 # Median of chi square of eight degrees of freedom.
 _MEDIAN_CHI2 = 7.34
+# Share of a marker's views that are outliers, and the fewest views, from which on it is inconsistent: moved, or twice.
+_INCONSISTENT, _FEWEST = 0.3, 10
 # Each round takes the corners' variance anew from the residuals.
 _ROUNDS = 4
 
@@ -64,6 +66,8 @@ class Refinement:
     variance_factor: float
     #: marker ID to the share of its views that are outliers
     outliers: dict[int, float]
+    #: adjusted markers whose views don't belong to one marker that hangs still
+    inconsistent: tuple[int, ...]
     iterations: int
     map_version: int
 
@@ -243,7 +247,9 @@ class _Problem:
             for i, key in enumerate(self.ids)
             if not self.held[i]
         }
-        outlying = np.bincount(self.marker, ~full) / np.bincount(self.marker)
+        views = np.bincount(self.marker)
+        outlying = np.bincount(self.marker, ~full) / views
+        inconsistent = ~self.held & (views >= _FEWEST) & (outlying > _INCONSISTENT)
         return Refinement(
             adjusted,
             dict(zip(self.stamps, state.T_map_rig, strict=True)),
@@ -252,6 +258,7 @@ class _Problem:
             after.cost / max(factor, 1.0),
             factor,
             dict(zip(self.ids, outlying.tolist(), strict=True)),
+            tuple(self.ids[i] for i in np.flatnonzero(inconsistent)),
             iterations,
             snapshot.map_version,
         )

@@ -7,7 +7,7 @@ markers that are seen together with known ones. Beyond the paper: planar ambigui
 on them, covariances carry the map's own uncertainty, and markers that stop agreeing are put in quarantine.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -17,13 +17,15 @@ from thermal_fiducial.core.candidates import Candidate, View, Viewpoint
 from thermal_fiducial.core.geometry import inverse, skew, so3_exp, transform, transform_from_quaternion
 from thermal_fiducial.core.keyframes import Keyframe, KeyframeStore, Link, Rig
 from thermal_fiducial.core.localization import locate, Location, positive, Refusal, Sight
-from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.map_data import MapJump, MapMarker, MapperResult, MarkerMap
+from thermal_fiducial.core.map_editing import align
 from thermal_fiducial.core.map_refinement import prior_poses, refine, Refinement, Snapshot
 from thermal_fiducial.core.measurements import CameraPose, columns, corner_covariances, corners_px, Markers, Odometry
 from thermal_fiducial.core.noise_level import NoiseLevel
 from thermal_fiducial.core.reprojection import corners_in_map, linearise, reproject
 from thermal_fiducial.core.trust import culprits, DISAGREEMENT, Trust
 from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.errors import InputError
 
 __all__ = ['MapJump', 'MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
 
@@ -35,45 +37,8 @@ TOLERANCE_PX = 0.3
 TRIALS = 3
 # A candidate is judged again when its views have grown by one in so many.
 _PATIENCE = 6
-# A refinement is worth its time when there are these many keyframes more than at the last one.
-_GROWTH, _FEW = 1.2, 15
-
-
-@dataclass(frozen=True)
-class MapperResult:
-    """What one frame came to."""
-
-    stamp_ns: int
-    pose: CameraPose | None
-    #: in words: why there is no pose; empty when there is one
-    reason: str
-    #: the map has another geometry, or trusts other markers, than before
-    map_changed: bool = False
-    #: rms re-projection error of each known marker in view [px], quarantined ones included
-    residuals_px: dict[int, float] = field(default_factory=dict)
-    #: markers on trial in view: ID to what each waits for
-    candidates: dict[int, str] = field(default_factory=dict)
-    #: all markers in quarantine
-    quarantined: tuple[int, ...] = ()
-    map_version: int = 0
-    #: how often a refinement has moved the map
-    map_resets: int = 0
-
-    @property
-    def in_view(self) -> frozenset[int]:
-        """IDs of the known markers in view."""
-        return frozenset(self.residuals_px)
-
-
-@dataclass(frozen=True)
-class MapJump:
-    """A refinement moved the map: poses told before and after don't compare as they are."""
-
-    map_version: int
-    #: how often this has happened
-    resets: int
-    #: (4, 4) moves poses near the robot from the old map to the new: T_new = T_new_old @ T_old
-    T_new_old: FloatArray
+# A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
+_GROWTH, _FEW = 0.2, 15
 
 
 class MarkerMapper:
@@ -89,15 +54,32 @@ class MarkerMapper:
         self.config = config
         self._sizes = size_overrides(config.marker_size_overrides)
         self._T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
-        self._initial = marker_map.copy()
         #: no new markers, no changes of the map, while True
         self.frozen = config.mode == 'localization'
-        self.reset()
-
-    def reset(self) -> None:
-        """Back to the map that it was started with."""
-        self.map = self._initial.copy()
         self.resets = 0
+        self._begin(marker_map)
+
+    def reset(self) -> MapJump | None:
+        """Back to the map that it was started with; see :meth:`load`."""
+        return self.load(self._initial)
+
+    def load(self, marker_map: MarkerMap) -> MapJump | None:
+        """Go on with another map of the place, of the next version; what was seen before is forgotten.
+
+        Returns
+        -------
+        The jump from the old map to the new by the markers that both have; None where they have none.
+        """
+        try:
+            T_new_old = align(marker_map.markers, self.map.markers).T
+        except InputError:
+            T_new_old = None
+        self._begin(replace(marker_map, version=max(self.map.version, marker_map.version) + 1))
+        self.resets += 1
+        return None if T_new_old is None else MapJump(self.map.version, self.resets, T_new_old)
+
+    def _begin(self, marker_map: MarkerMap) -> None:
+        self._initial, self.map = marker_map.copy(), marker_map.copy()
         self._candidates: dict[int, Candidate] = {}
         self._trust = Trust()
         self._quarantined = {key for key, marker in self.map.markers.items() if not marker.trusted}
@@ -107,6 +89,7 @@ class MarkerMapper:
         self._gap: FloatArray | None = None
         self._keyframes = KeyframeStore(self.config.keyframe_budget)
         self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(self.map.markers)
+        self._frames_then = 0
 
     def process(
         self, stamp_ns: int, markers: Markers, camera: Camera, odometry: Odometry | None = None
@@ -196,9 +179,12 @@ class MarkerMapper:
         blamed = culprits(disagrees, trusted, known.markers)
         changes = self._trust.judge(known.markers, blamed.tolist())
         for marker_id, trusted_now in changes.items():
-            self.map.markers[marker_id] = replace(self.map.markers[marker_id], trusted=trusted_now)
-            (self._quarantined.discard if trusted_now else self._quarantined.add)(marker_id)
+            self._set_standing(marker_id, trusted=trusted_now)
         return bool(changes)
+
+    def _set_standing(self, marker_id: int, *, trusted: bool) -> None:
+        self.map.markers[marker_id] = replace(self.map.markers[marker_id], trusted=trusted)
+        (self._quarantined.discard if trusted else self._quarantined.add)(marker_id)
 
     def _place_new(
         self, stamp_ns: int, rows: Markers, camera: Camera, viewpoint: Viewpoint
@@ -281,7 +267,7 @@ class MarkerMapper:
         period = self.config.refinement_period
         if self.frozen or not self._keyframes.frames or period == 0.0 or stamp_ns - self._refined_ns < period * 1e9:
             return False
-        enough = len(self._keyframes.frames) >= _GROWTH * self._refined_frames + _FEW
+        enough = self._keyframes.added - self._frames_then >= _GROWTH * self._refined_frames + _FEW
         return enough or len(self.map.markers) > self._refined_markers
 
     def snapshot(self) -> Snapshot | None:
@@ -294,6 +280,7 @@ class MarkerMapper:
         frames = tuple(self._keyframes.frames.values())
         self._refined_ns = frames[-1].stamp_ns
         self._refined_frames, self._refined_markers = len(frames), len(self.map.markers)
+        self._frames_then = self._keyframes.added
         return Snapshot(
             {key: marker for key, marker in self.map.markers.items() if marker.trusted},
             frames,
@@ -316,9 +303,9 @@ class MarkerMapper:
 
         Returns
         -------
-        The jump, to be told to whoever holds poses in the map; None where the map is frozen.
+        The jump, to be told to whoever holds poses in the map; None where the map is frozen, or was replaced since.
         """
-        if self.frozen:
+        if self.frozen or refinement.map_version < self._initial.version:
             return None
         for marker_id, adjusted in refinement.markers.items():
             marker = self.map.markers.get(marker_id)
@@ -326,6 +313,9 @@ class MarkerMapper:
                 self.map.markers[marker_id] = replace(
                     marker, T_map_marker=adjusted.T_map_marker, covariance=adjusted.covariance
                 )
+                if marker_id in refinement.inconsistent:
+                    self._trust.accuse(marker)
+                    self._set_standing(marker_id, trusted=False)
         T_new_old = self._keyframes.move(refinement.keyframes)
         for candidate in self._candidates.values():
             candidate.move(T_new_old)

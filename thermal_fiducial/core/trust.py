@@ -65,6 +65,10 @@ class Trust:
                 changes[marker.id] = True
         return changes
 
+    def accuse(self, marker: MapMarker) -> None:
+        """Take it from a joint adjustment that ``marker`` disagrees: it is trusted again when it has long agreed."""
+        self._record(marker).disagreement = 1.0
+
     def forget(self, ids: Iterable[int]) -> None:
         """Start anew with ``ids``: their poses have changed."""
         for marker_id in ids:

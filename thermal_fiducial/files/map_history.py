@@ -31,7 +31,7 @@ def history_folder(path: Path) -> Path:
 
 
 def save_with_history(path: Path, marker_map: MarkerMap, action: str) -> None:
-    """Write ``marker_map`` to ``path``, the map that is there now into its history.
+    """Write ``marker_map`` to ``path``, the file that is there now (whatever it holds) into its history.
 
     Raises
     ------
@@ -40,27 +40,32 @@ def save_with_history(path: Path, marker_map: MarkerMap, action: str) -> None:
     """
     if path.exists():
         folder = history_folder(path)
-        number = max((entry.number for entry in entries(path)), default=0) + 1
+        earlier = _files(path)
+        number = int(earlier[-1].stem) + 1 if earlier else 1
         try:
             folder.mkdir(exist_ok=True)
             text = path.read_text(encoding='utf-8')
             write_atomically(folder / f'{number:06d}.yaml', f'{_MARK}{" ".join(action.split())}\n{text}')
         except OSError as error:
             raise InputError(f'{folder}: cannot keep the earlier map: {error.strerror}') from error
-        for entry in entries(path)[:-KEPT]:
-            entry.path.unlink()
+        for file in _files(path)[:-KEPT]:
+            file.unlink()
     save_map(path, marker_map)
 
 
 def entries(path: Path) -> list[Entry]:
     """Earlier versions of the map at ``path``, the oldest first."""
     found = []
-    for file in sorted(history_folder(path).glob('[0-9]*.yaml')):
+    for file in _files(path):
         first = file.read_text(encoding='utf-8').partition('\n')[0]
         earlier = load_map(file, marker_size=1.0)
         action = first.removeprefix(_MARK) if first.startswith(_MARK) else ''
         found.append(Entry(int(file.stem), file, action, earlier.version, len(earlier.markers)))
     return found
+
+
+def _files(path: Path) -> list[Path]:
+    return sorted(history_folder(path).glob('[0-9]*.yaml'))
 
 
 def undo(path: Path) -> Entry:

@@ -1,11 +1,14 @@
-"""Point clouds of a place: PLY and PCD files, read by the libraries of the extra ``cloud``."""
+"""Point clouds of a place: PLY and PCD files, read by the libraries of the extra ``cloud``; where a map lies in one."""
 
 from pathlib import Path
 
 import numpy as np
+import yaml
 
+from thermal_fiducial.core.geometry import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.marker_map import write_atomically
 
 _NEEDED = "reading point clouds needs the extra 'cloud': pip install thermal_fiducial[cloud]"
 
@@ -36,6 +39,60 @@ def load_cloud(path: str | Path) -> FloatArray:
     if not len(points):
         raise InputError(f'{path}: no points')
     return points
+
+
+def thinned(points: FloatArray, most: int) -> FloatArray:
+    """At most ``most`` of the points (N, 3): one of each cell of a grid just coarse enough."""
+    if len(points) <= most:
+        return points
+    extent = np.ptp(points, axis=0).max()
+    cell = max(extent / 1024.0, 1e-6)
+    while len(points) > most:
+        cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+        _, firsts = np.unique(cells @ [1 << 40, 1 << 20, 1], return_index=True)
+        points, cell = points[np.sort(firsts)], 1.3 * cell
+    return points
+
+
+def save_alignment(path: Path, T_cloud_map: FloatArray, cloud: str, frame_id: str) -> None:
+    """Write where the map ``frame_id`` lies in ``cloud``: (4, 4), as position and quaternion.
+
+    Raises
+    ------
+    InputError
+        The file can't be written.
+    """
+    document = {
+        'parent': cloud,
+        'child': frame_id,
+        'position': [round(float(v), 9) for v in T_cloud_map[:3, 3]],
+        'orientation': [round(float(v), 9) for v in quaternion_from_rotation(T_cloud_map[:3, :3])],
+    }
+    try:
+        write_atomically(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None))
+    except OSError as error:
+        raise InputError(f'{path}: cannot write the transform: {error.strerror}') from error
+
+
+def load_alignment(path: str | Path) -> FloatArray:
+    """T_cloud_map (4, 4) from a file of :func:`save_alignment`.
+
+    Raises
+    ------
+    InputError
+        Not such a file.
+    """
+    try:
+        document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        numbers = [np.array([float(value) for value in document[key]]) for key in ('position', 'orientation')]
+    except OSError as error:
+        raise InputError(f'{path}: cannot read the transform: {error.strerror}') from error
+    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f'{path}: not a transform written by map align: {type(error).__name__}') from error
+    position, orientation = numbers
+    if position.shape != (3,) or orientation.shape != (4,) or not 0.99 < np.linalg.norm(orientation) < 1.01:
+        raise InputError(f'{path}: not a position and a unit quaternion x y z w')
+    return transform_from_quaternion(position, orientation)
 
 
 def _read_ply(path: Path) -> FloatArray:

@@ -1,6 +1,6 @@
 """Node ``marker_mapper``: markers to the camera's pose in the map, and the map itself."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 import sys
 from typing import Any
@@ -13,15 +13,22 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
+from thermal_fiducial.core.geometry import apply, inverse
 from thermal_fiducial.core.map_refinement import refine, Refinement, Snapshot
 from thermal_fiducial.core.marker_map import MapJump, MapperResult, MarkerMap, MarkerMapper
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.files.map_history import save_with_history, undo
+from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.point_cloud import load_alignment, load_cloud, thinned
 from thermal_fiducial.ros import convert, display, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
 from thermal_fiducial.ros.node import OK, WARN
 from thermal_fiducial.ros.run import run
 from thermal_fiducial.ros.worker import Background, Foreground
+
+# Points of the cloud that is shown: 0.7 MB, which goes through shared memory in one piece.
+_CLOUD_POINTS = 60_000
+_XYZ = np.dtype([(axis, '<f4') for axis in 'xyz'])
 
 
 class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
@@ -40,13 +47,17 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._marker_map = self.advertise(PointCloud2, 'marker_map', qos.LATCHED)
         self._map_markers = self.advertise(MarkerArray, 'marker_map/markers', qos.LATCHED)
         self._map_correction = self.advertise(TransformStamped, 'map_correction')
+        self._map_cloud = self.advertise(PointCloud2, 'marker_map/cloud', qos.LATCHED)
         self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT)
         self.follow_hints()
         self.create_service(Trigger, '~/save', self._on_save)
+        self.create_service(Trigger, '~/load', self._on_load)
+        self.create_service(Trigger, '~/undo', self._on_undo)
         self.create_service(Trigger, '~/reset', self._on_reset)
         self.create_service(Trigger, '~/refine', self._on_refine)
         self.create_service(SetBool, '~/freeze', self._on_freeze)
         self._publish_map()
+        self.attempt(self._publish_cloud, None)
 
     def _load_map(self) -> MarkerMap:
         config = self.config
@@ -80,10 +91,16 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             self._camera_pose.send(pose)
         jump = self._refine(stamp)
         if jump is not None:
-            frame = self.config.map_frame
-            self._map_correction.send(convert.transform_message(jump.T_new_old, stamp, frame, f'{frame}_before'))
-        if result.map_changed or jump is not None:
+            self._tell(jump)
+        elif result.map_changed:
             self._publish_map()
+
+    def _tell(self, jump: MapJump | None) -> None:
+        """Publish a map that has moved, and how, with the stamp of the last frame in the old one."""
+        if jump is not None:
+            frame, stamp = self.config.map_frame, self._result.stamp_ns
+            self._map_correction.send(convert.transform_message(jump.T_new_old, stamp, frame, f'{frame}_before'))
+        self._publish_map()
 
     def _refine(self, stamp: int) -> MapJump | None:
         """Start a joint refinement where one is due, take over one that is done."""
@@ -115,25 +132,57 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             head = convert.header(self._result.stamp_ns, self.config.map_frame)
             self._show_map(self.mapper.map.rows(self._result.in_view), head)
 
+    def _publish_cloud(self) -> None:
+        """The point cloud of the place, in the frame of the map, once: for RViz beside the markers."""
+        config = self.config
+        if not config.cloud_file:
+            return
+        T_cloud_map = load_alignment(config.cloud_alignment_file) if config.cloud_alignment_file else np.eye(4)
+        points = apply(inverse(T_cloud_map), thinned(load_cloud(config.cloud_file), _CLOUD_POINTS))
+        rows = np.ascontiguousarray(points, '<f4').view(_XYZ)[:, 0]
+        self._map_cloud.send(convert.cloud(rows, convert.header(0, config.map_frame)))
+
     def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        try:
-            response.message = self._save()
-            response.success = True
-        except InputError as error:
-            response.message = str(error)
-        return response
+        return _answered(response, self._save)
 
     def _save(self) -> str:
-        if self._save_path is None:
-            raise InputError('parameter map_file is empty: nowhere to save the map')
-        save_map(self._save_path, self.mapper.map)
+        save_with_history(self._map_file(), self.mapper.map, 'save')
         return f'{len(self.mapper.map.markers)} markers saved to {self._save_path}'
 
+    def _map_file(self) -> Path:
+        if self._save_path is None:
+            raise InputError('parameter map_file is empty: there is no map on disk')
+        return self._save_path
+
+    def _on_load(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return _answered(response, self._load)
+
+    def _load(self) -> str:
+        """Take over the map file as it is now: what ``thermal-fiducial map`` has made of it."""
+        self._refuse_frozen()
+        loaded = load_map(self._map_file(), self.config.marker_size, size_overrides(self.config.marker_size_overrides))
+        self._tell(self.mapper.load(loaded))
+        return f'{len(loaded.markers)} markers loaded from {self._save_path}'
+
+    def _on_undo(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        return _answered(response, self._undo)
+
+    def _undo(self) -> str:
+        self._refuse_frozen()
+        entry = undo(self._map_file())
+        return f'undone: {entry.action}; {self._load()}'
+
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.mapper.reset()
-        self._publish_map()
-        response.success, response.message = True, f'{len(self.mapper.map.markers)} markers left'
-        return response
+        return _answered(response, self._reset)
+
+    def _reset(self) -> str:
+        self._refuse_frozen()
+        self._tell(self.mapper.reset())
+        return f'{len(self.mapper.map.markers)} markers left'
+
+    def _refuse_frozen(self) -> None:
+        if self.mapper.frozen:
+            raise InputError('the map is frozen')
 
     def _on_refine(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if self._refiner.busy:
@@ -178,6 +227,16 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             'quarantined': _listed(result.quarantined),
             'candidates': waiting,
         }
+
+
+def _answered(response: Trigger.Response, act: Callable[[], str]) -> Trigger.Response:
+    """``response`` with what ``act`` says of what it did, or why it could not."""
+    try:
+        response.message = act()
+        response.success = True
+    except InputError as error:
+        response.message = str(error)
+    return response
 
 
 def _listed(ids: Iterable[int]) -> str:

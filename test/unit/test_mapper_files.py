@@ -1,0 +1,90 @@
+"""Node ``marker_mapper`` and its files: edits taken over in flight, history, the point cloud of the place."""
+
+from geometry_msgs.msg import TransformStamped
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
+from support import small_bag
+from support.ros_graph import ros_graph
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.geometry import apply, so3_exp, transform
+from thermal_fiducial.files.map_history import entries
+from thermal_fiducial.files.point_cloud import save_alignment
+from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
+from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.node import ERROR
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def graph():
+    with ros_graph() as graph:
+        yield graph
+
+
+@pytest.fixture
+def map_file(tmp_path):
+    return small_bag.side_files(tmp_path)[0]
+
+
+def test_edits_of_the_file_are_loaded_and_undone_in_flight(graph, map_file):
+    """What ``thermal-fiducial map`` does to the file (here: move) the running node takes over, and the filter hears."""
+    graph.listen(TransformStamped, 'map_correction')
+    graph.listen(PointCloud2, 'marker_map', qos.LATCHED)
+    node = graph.add(MarkerMapperNode, map_file=str(map_file))
+    before = node.mapper.map.markers[0].T_map_marker
+    position = [str(v) for v in before[:3, 3] + [0.5, 0.0, 0.0]]
+    assert main(['map', 'move', str(map_file), '0', '--position', *position]) == 0
+    assert graph.call(Trigger, 'marker_mapper/load', Trigger.Request()).success
+    graph.spin_until(lambda: graph.heard['map_correction'] and len(graph.heard['marker_map']) == 2)
+    _, T_new_old = convert.correction_of(graph.heard['map_correction'][0])
+    np.testing.assert_allclose(T_new_old[:3, 3], [0.5, 0.0, 0.0], atol=1e-9)
+    assert 'move 0' in graph.call(Trigger, 'marker_mapper/undo', Trigger.Request()).message
+    np.testing.assert_allclose(node.mapper.map.markers[0].T_map_marker, before, atol=1e-9)
+    assert node.mapper.resets == 2
+    response = graph.call(Trigger, 'marker_mapper/undo', Trigger.Request())
+    assert (response.success, 'no earlier version' in response.message) == (False, True)
+    node.mapper.frozen = True
+    assert graph.call(Trigger, 'marker_mapper/load', Trigger.Request()).message == 'the map is frozen'
+
+
+def test_saving_keeps_what_was_in_the_file(graph, map_file):
+    graph.add(MarkerMapperNode, map_file=str(map_file))
+    before = map_file.read_text()
+    assert graph.call(Trigger, 'marker_mapper/save', Trigger.Request()).success
+    (earlier,) = entries(map_file)
+    assert earlier.path.read_text().endswith(before)
+
+
+def test_the_point_cloud_of_the_place_is_shown_in_the_map(graph, tmp_path, map_file):
+    pytest.importorskip('plyfile')
+    points = np.random.default_rng(0).uniform(-3.0, 3.0, (100_000, 3))
+    header = 'ply\nformat binary_little_endian 1.0\nelement vertex 100000\n'
+    header += ''.join(f'property float {axis}\n' for axis in 'xyz') + 'end_header\n'
+    (tmp_path / 'hall.ply').write_bytes(header.encode() + points.astype('<f4').tobytes())
+    T_cloud_map = transform(so3_exp([0.0, 0.0, 0.5]), [1.0, 2.0, 3.0])
+    save_alignment(tmp_path / 'T.yaml', T_cloud_map, 'hall.ply', 'map')
+    files = {'cloud_file': str(tmp_path / 'hall.ply'), 'cloud_alignment_file': str(tmp_path / 'T.yaml')}
+    graph.listen(PointCloud2, 'marker_map/cloud', qos.LATCHED)
+    graph.add(MarkerMapperNode, map_file=str(map_file), **files)
+    graph.spin_until(lambda: graph.heard['marker_map/cloud'])
+    (message,) = graph.heard['marker_map/cloud']
+    rows = convert.cloud_rows(message, np.dtype([(axis, '<f4') for axis in 'xyz']))
+    assert message.header.frame_id == 'map'
+    assert 20_000 < len(rows) <= 60_000
+    shown = np.stack([rows[axis] for axis in 'xyz'], axis=-1).astype(float)
+    # Every point shown is one of the cloud's, put where the map has it: the cube, turned and moved.
+    back = apply(T_cloud_map, shown)
+    assert np.abs(back).max() < 3.0 + 1e-5
+    assert cKDTree(points).query(back)[0].max() < 1e-5
+
+
+def test_a_cloud_that_cannot_be_read_is_a_fault(graph, tmp_path, map_file):
+    node = graph.add(MarkerMapperNode, map_file=str(map_file), cloud_file=str(tmp_path / 'none.ply'))
+    level, reason, _ = graph.diagnose(node)
+    assert level == ERROR
+    assert 'none.ply' in reason
