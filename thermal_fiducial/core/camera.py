@@ -20,7 +20,7 @@ MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 
 # Newton's iteration doubles the digits: after a step this small nothing is left, and ten are enough at any lens's rim.
 _NEWTON_STEPS = 10
-_NEWTON_STEP = 1e-8
+_NEWTON_STEP = 1e-6
 # Widest angle from the axis that x/z can tell [rad].
 _WIDEST = 1.5
 
@@ -172,10 +172,13 @@ class Camera:
             a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
             determinant = a * d - b * c
             determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-            e0, e1 = target[..., 0] - distorted[..., 0], target[..., 1] - distorted[..., 1]
-            step = np.stack([(d * e0 - b * e1) / determinant, (a * e1 - c * e0) / determinant], axis=-1)
+            error = target - distorted
+            step = np.empty_like(x)
+            step[..., 0] = d * error[..., 0] - b * error[..., 1]
+            step[..., 1] = a * error[..., 1] - c * error[..., 0]
+            step /= determinant[..., None]
             x = x + step
-            if np.all(np.abs(step) < _NEWTON_STEP):
+            if np.abs(step).max(initial=0.0) < _NEWTON_STEP:
                 break
         return x
 

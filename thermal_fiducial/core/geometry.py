@@ -46,25 +46,24 @@ def _series(angle: FloatArray, exact: FloatArray, coefficients: tuple[float, ...
     return np.where(angle < SMALL_ANGLE, polynomial, exact)
 
 
-def _exp_coefficients(angle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """sin(a)/a, (1-cos(a))/a^2 and (a-sin(a))/a^3."""
+def _left_jacobian_coefficients(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(1-cos(a))/a^2 and (a-sin(a))/a^3."""
     a = np.where(angle < SMALL_ANGLE, 1.0, angle)
-    sine = np.sin(a)
     half = np.sin(0.5 * a)
     return (
-        _series(angle, sine / a, (1.0, -1 / 6, 1 / 120, -1 / 5040)),
         _series(angle, 2.0 * half * half / a**2, (1 / 2, -1 / 24, 1 / 720, -1 / 40320)),
-        _series(angle, (a - sine) / a**3, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880)),
+        _series(angle, (a - np.sin(a)) / a**3, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880)),
     )
 
 
 def so3_exp(phi: npt.ArrayLike) -> FloatArray:
     """Rotation matrix (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     phi = np.asarray(phi, dtype=np.float64)
-    angle = np.linalg.norm(phi, axis=-1)
-    a, b, _ = _exp_coefficients(angle)
+    # sin(h) / h is 1 to the last digit at the smallest half angle that is divided by.
+    half = np.maximum(0.5 * np.sqrt(np.sum(phi * phi, axis=-1)), 1e-12)[..., None, None]
+    s = np.sin(half) / half
     K = skew(phi)
-    return np.asarray(np.eye(3) + a[..., None, None] * K + b[..., None, None] * (K @ K))
+    return np.asarray(np.eye(3) + (s * np.cos(half)) * K + (0.5 * s * s) * (K @ K))
 
 
 def so3_log(R: npt.ArrayLike) -> FloatArray:
@@ -84,7 +83,7 @@ def so3_left_jacobian(phi: npt.ArrayLike) -> FloatArray:
     """J_l (..., 3, 3) with ``exp(phi + d) ~ exp(J_l(phi) d) exp(phi)`` (Sola et al., eq. 145)."""
     phi = np.asarray(phi, dtype=np.float64)
     angle = np.linalg.norm(phi, axis=-1)
-    _, b, c = _exp_coefficients(angle)
+    b, c = _left_jacobian_coefficients(angle)
     K = skew(phi)
     return np.asarray(np.eye(3) + b[..., None, None] * K + c[..., None, None] * (K @ K))
 
