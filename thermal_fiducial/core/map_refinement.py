@@ -20,6 +20,7 @@ from thermal_fiducial.core.keyframes import Keyframe, Link, Rig
 from thermal_fiducial.core.map_data import MapMarker
 from thermal_fiducial.core.normal_equations import Blocks, NormalEquations
 from thermal_fiducial.core.reprojection import difference, linearise, retract, whitening
+from thermal_fiducial.core.residual_checks import correlation_time, hangs_twice
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 #: Chi square of a view (8 residuals) up to which it counts in full: 99.9 % of honest ones.
@@ -29,8 +30,6 @@ MAX_ITERATIONS = 25
 _CONVERGED = 1e-7
 # Median of chi square of eight degrees of freedom.
 _MEDIAN_CHI2 = 7.34
-# Share of a marker's views that are outliers, and the fewest views, from which on it is inconsistent: moved, or twice.
-_INCONSISTENT, _FEWEST = 0.3, 10
 # Each round takes the corners' variance anew from the residuals.
 _ROUNDS = 4
 
@@ -239,7 +238,8 @@ class _Problem:
         freedom = max(8 * np.count_nonzero(full) - unknowns, 1)
         factor = float(np.sum(after.chi2[full]) / freedom)
         held_covariances = np.stack([snapshot.markers[key].covariance for key in self.ids])
-        covariances = self.equations.covariances(self._blocks(state, after), max(factor, 1.0), held_covariances)
+        noise = max(factor, 1.0) * correlation_time(after.r[full], self.marker[full])
+        covariances = self.equations.covariances(self._blocks(state, after), noise, held_covariances)
         if covariances is None:
             return None
         adjusted = {
@@ -247,9 +247,7 @@ class _Problem:
             for i, key in enumerate(self.ids)
             if not self.held[i]
         }
-        views = np.bincount(self.marker)
-        outlying = np.bincount(self.marker, ~full) / views
-        inconsistent = ~self.held & (views >= _FEWEST) & (outlying > _INCONSISTENT)
+        outlying = np.bincount(self.marker, ~full) / np.bincount(self.marker)
         return Refinement(
             adjusted,
             dict(zip(self.stamps, state.T_map_rig, strict=True)),
@@ -258,10 +256,14 @@ class _Problem:
             after.cost / max(factor, 1.0),
             factor,
             dict(zip(self.ids, outlying.tolist(), strict=True)),
-            tuple(self.ids[i] for i in np.flatnonzero(inconsistent)),
+            tuple(key for i, key in enumerate(self.ids) if not self.held[i] and self._hangs_twice(i, after)),
             iterations,
             snapshot.map_version,
         )
+
+    def _hangs_twice(self, marker: int, after: _Evaluation) -> bool:
+        own = self.marker == marker
+        return hangs_twice(after.r[own], after.J_marker[own], after.weights[own] < 1.0)
 
     def _blocks(self, state: _State, e: _Evaluation) -> Blocks:
         weighted_rig = np.swapaxes(e.J_rig, -1, -2) * e.weights[:, None, None]
