@@ -2,7 +2,7 @@
 
 from collections import defaultdict
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import yaml
@@ -11,7 +11,7 @@ from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.geometry import inverse, so3_exp, transform, transform_from_quaternion
 from thermal_fiducial.core.keyframes import Keyframe, Rig
-from thermal_fiducial.core.map_building import rows_from_corners
+from thermal_fiducial.core.map_building import decide, rows_from_corners
 from thermal_fiducial.core.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.map_refinement import refine, Snapshot
 from thermal_fiducial.core.marker_map import MarkerMapper
@@ -22,6 +22,8 @@ from thermal_fiducial.core.reprojection import corners_in_map, reproject
 SIGMA_PX = 0.3
 # Growth of the odometry's error with the way and with time: 2 % of the way is what drifting visual odometry has.
 _DRIFT, _WALK_M, _WALK_RAD = 0.02, 0.005, 0.003
+# And what that is of a velocity of 1 m/s and a turn of 1 rad/s.
+_SPEED_SIGMA, _TURN_SIGMA = 0.02, 0.01
 
 
 @dataclass
@@ -133,7 +135,8 @@ class _Filter:
         sigma_m = 0.005 + _DRIFT * np.linalg.norm(moved[:3, 3]) + _WALK_M * walk
         covariance = np.diag([sigma_m**2] * 3 + [(0.002 + _WALK_RAD * walk) ** 2] * 3)
         zero = np.zeros(3)
-        return Odometry(stamp, T_map_camera @ moved, zero, zero, covariance, np.eye(6))
+        twist = np.diag([_SPEED_SIGMA**2] * 3 + [_TURN_SIGMA**2] * 3)
+        return Odometry(stamp, T_map_camera @ moved, zero, zero, covariance, twist)
 
 
 def solve(recording, passes=1):
@@ -167,8 +170,14 @@ def solve(recording, passes=1):
     snapshot = mapper.snapshot()
     poses = {frame.stamp_ns: frame.T_map_rig @ T_camera_rig for frame in snapshot.keyframes}
     frames = [_keyframe(stamp, poses[stamp], recording.views[stamp]) for stamp in poses]
-    refinement = refine(Snapshot(snapshot.markers, tuple(frames), recording.rig, snapshot.links))
-    return {**snapshot.markers, **refinement.markers}, refinement
+    whole = Snapshot(snapshot.markers, tuple(frames), recording.rig, snapshot.links)
+    # Markers seen too briefly by one camera alone: all frames of all cameras decide between their two poses.
+    for candidate in mapper.candidates.values():
+        settled = decide(whole, candidate.id, candidate.size, candidate.solutions(camera)[:2])
+        if settled is not None:
+            whole = replace(whole, markers={**whole.markers, candidate.id: settled})
+    refinement = refine(whole)
+    return {**whole.markers, **refinement.markers}, refinement
 
 
 def _frame(recording, seen):

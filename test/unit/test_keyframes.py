@@ -38,13 +38,16 @@ def test_linked_frames_are_never_dropped():
     assert {3, 5} <= store.frames.keys()
 
 
-def test_frames_newer_than_the_adjustment_move_with_its_last():
+def test_frames_that_were_not_adjusted_move_with_the_nearest():
+    """After a loop is closed, its beginning and its end move differently."""
     store = KeyframeStore(10)
-    for k in range(4):
+    for k in range(6):
         store.add(frame(k, transform(np.eye(3), [k, 0.0, 0.0])))
-    T = transform(so3_exp([0.0, 0.0, 0.1]), [0.5, 0.0, 0.0])
-    moved = store.move({k: T @ store.frames[k].T_map_rig for k in range(3)})
-    np.testing.assert_allclose(moved, T, atol=1e-12)
-    for k in range(4):
+    early, late = transform(np.eye(3), [0.0, 0.1, 0.0]), transform(so3_exp([0.0, 0.0, 0.1]), [0.5, 0.0, 0.0])
+    moves = {0: early, 1: early, 2: early, 3: late, 4: late, 5: late}
+    moved = store.move({k: moves[k] @ store.frames[k].T_map_rig for k in (1, 4)})
+    for k, T in moves.items():
+        np.testing.assert_allclose(moved.at(k), T, atol=1e-12)
         np.testing.assert_allclose(store.frames[k].T_map_rig, T @ transform(np.eye(3), [k, 0.0, 0.0]), atol=1e-12)
-    np.testing.assert_array_equal(store.move({99: T}), np.eye(4))
+    np.testing.assert_allclose(moved.at(1000), late, atol=1e-12)
+    np.testing.assert_array_equal(store.move({99: early}).at(3), np.eye(4))

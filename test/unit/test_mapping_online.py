@@ -1,5 +1,6 @@
 """The mapper over whole flights: joint refinement behind it, jumps, gaps, starts in doubt, size of the map."""
 
+from dataclasses import replace
 import time
 
 import numpy as np
@@ -183,6 +184,25 @@ def test_odometry_spans_a_gap_between_markers():
         # 20 is three sigma of six degrees of freedom.
         assert d @ np.linalg.solve(marker.covariance, d) < 20.0
         assert np.sqrt(np.trace(marker.covariance[:3, :3])) > 0.01
+
+
+def test_drift_that_grows_with_the_way_does_not_set_neighbouring_frames_apart():
+    """Far from the last marker, frames still agree with each other to what the speed is known to."""
+    rng = np.random.default_rng(11)
+    poses = wall(rng)
+    m = from_one_marker(poses, bridge_duration=30.0, **AS_BODY)
+    for k in range(30):
+        m.process(stamp(k), see(flight(k / 30), {i: poses[i] for i in (0, 1)}, 0.02, rng), CAMERA)
+    speed = np.diag([0.01**2] * 3 + [0.002**2] * 3)
+    for k in range(390, 405):
+        T, seconds = flight(k / 30), (k - 30) / 30
+        covariance = np.diag([(0.05 * seconds) ** 2] * 3 + [(0.01 * seconds) ** 2] * 3)
+        told = replace(odometry(k, T, np.eye(4), covariance), twist_covariance=speed)
+        m.process(stamp(k), see(T, {6: poses[6]}, 2.0, rng), CAMERA, told)
+    apart = m.candidates[6].views[-1].viewpoint
+    # The common error is that of 12 s and more; within the 14 frames since, 1 cm/s is 5 mm, and 2 mrad/s is 1 mrad.
+    assert np.all(np.diag(apart.common)[:3] >= (0.05 * 12.0) ** 2)
+    assert np.all(np.sqrt(np.diag(apart.covariances[0])) < [0.005] * 3 + [0.001] * 3)
 
 
 def test_a_gap_too_long_is_not_spanned():

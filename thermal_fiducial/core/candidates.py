@@ -14,6 +14,7 @@ import numpy as np
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.fitting import fit_pose
 from thermal_fiducial.core.geometry import rotation_angle
+from thermal_fiducial.core.keyframes import Displacement
 from thermal_fiducial.core.reprojection import linearise, shared_covariances, whitening
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -113,13 +114,14 @@ class Candidate:
             self._drop_most_redundant()
         return True
 
-    def move(self, T_new_old: FloatArray) -> None:
-        """The map moved: the views' camera poses move with it."""
+    def move(self, displacement: Displacement) -> None:
+        """The map moved: each view's camera pose moves with the frames of its time."""
+        moves = [displacement.at(view.stamp_ns) for view in self.views]
         self.views = [
-            replace(view, viewpoint=replace(view.viewpoint, T_map_camera=T_new_old @ view.viewpoint.T_map_camera))
-            for view in self.views
+            replace(view, viewpoint=replace(view.viewpoint, T_map_camera=T @ view.viewpoint.T_map_camera))
+            for view, T in zip(self.views, moves, strict=True)
         ]
-        self._directions = [T_new_old[:3, :3] @ direction for direction in self._directions]
+        self._directions = [T[:3, :3] @ direction for direction, T in zip(self._directions, moves, strict=True)]
 
     def place(self, camera: Camera) -> Placement:
         """Pose in the map if the views settle it."""

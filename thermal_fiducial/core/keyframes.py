@@ -59,6 +59,22 @@ class Link:
     covariance: FloatArray
 
 
+@dataclass(frozen=True)
+class Displacement:
+    """How an adjustment has moved the map, which after a gap or round a loop is not the same everywhere."""
+
+    #: (n,) of the adjusted keyframes, ascending
+    stamps_ns: IntArray
+    #: (n, 4, 4) T_new_old near the keyframe of each
+    T_new_old: FloatArray
+
+    def at(self, stamp_ns: int) -> FloatArray:
+        """T_new_old (4, 4) for poses of the time ``stamp_ns``: that of the nearest keyframe."""
+        after = int(np.searchsorted(self.stamps_ns, stamp_ns))
+        near = [i for i in (after - 1, after) if 0 <= i < len(self.stamps_ns)]
+        return np.asarray(self.T_new_old[min(near, key=lambda i: abs(int(self.stamps_ns[i]) - stamp_ns))])
+
+
 @dataclass
 class KeyframeStore:
     """At most ``budget`` keyframes; of many alike (camera near, direction alike) only as many as there is room for."""
@@ -76,22 +92,23 @@ class KeyframeStore:
         if len(self.frames) > self.budget:
             self._thin(int(_THINNED * self.budget))
 
-    def move(self, adjusted: Mapping[int, FloatArray]) -> FloatArray:
-        """Take over adjusted poses by stamp; frames newer than these move like the last of them.
+    def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
+        """Take over adjusted poses by stamp; frames that were not adjusted move like the nearest in time.
 
         Returns
         -------
-        (4, 4) T_new_old of that last one; the identity when there is none.
+        How the map has moved at each time.
         """
-        last = max((stamp for stamp in adjusted if stamp in self.frames), default=None)
-        if last is None:
-            return np.eye(4)
-        T_new_old = adjusted[last] @ inverse(self.frames[last].T_map_rig)
+        stamps = sorted(adjusted.keys() & self.frames.keys())
+        if not stamps:
+            return Displacement(np.zeros(1, dtype=np.int64), np.eye(4)[None])
+        T = np.stack([adjusted[stamp] @ inverse(self.frames[stamp].T_map_rig) for stamp in stamps])
+        displacement = Displacement(np.array(stamps, dtype=np.int64), T)
         self.frames = {
-            stamp: replace(frame, T_map_rig=adjusted.get(stamp, T_new_old @ frame.T_map_rig))
+            stamp: replace(frame, T_map_rig=displacement.at(stamp) @ frame.T_map_rig)
             for stamp, frame in self.frames.items()
         }
-        return T_new_old
+        return displacement
 
     def _thin(self, room: int) -> None:
         linked = {stamp for link in self.links for stamp in (link.stamp_a_ns, link.stamp_b_ns)}

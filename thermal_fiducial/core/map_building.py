@@ -7,10 +7,10 @@ import numpy as np
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.candidates import Candidate, DECISIVE, SAME_FIT
+from thermal_fiducial.core.candidates import DECISIVE, SAME_FIT
 from thermal_fiducial.core.geometry import quaternion_from_rotation, rotation_angle
 from thermal_fiducial.core.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.map_refinement import refine, Refinement
+from thermal_fiducial.core.map_refinement import refine, Refinement, Snapshot
 from thermal_fiducial.core.marker_map import MarkerMapper
 from thermal_fiducial.core.measurements import CORNER_COVARIANCE_FIELDS, CORNER_FIELDS, MARKER_DTYPE, Markers
 from thermal_fiducial.core.pose import solve_marker_poses
@@ -113,28 +113,26 @@ def _stamp(k: int) -> int:
 
 def _settle(mapper: MarkerMapper, camera: Camera) -> bool:
     """Decide between the rival poses of a candidate by adjusting the map jointly with either; whether one was."""
+    snapshot = mapper.snapshot()
+    if snapshot is None:
+        return False
     for candidate in mapper.candidates.values():
-        winner = _winner(mapper, candidate, candidate.solutions(camera)[:2])
+        winner = decide(snapshot, candidate.id, candidate.size, candidate.solutions(camera)[:2])
         if winner is not None:
-            mapper.enter(candidate.views[-1].stamp_ns, candidate, *winner)
+            mapper.enter(candidate.views[-1].stamp_ns, candidate, winner.T_map_marker, winner.covariance)
             mapper.map.version += 1
             return True
     return False
 
 
-def _winner(
-    mapper: MarkerMapper, candidate: Candidate, rivals: list[FloatArray]
-) -> tuple[FloatArray, FloatArray] | None:
-    """Pose and covariance of the rival that the joint adjustment prefers decisively."""
-    snapshot = mapper.snapshot()
-    if snapshot is None or not rivals:
-        return None
+def decide(snapshot: Snapshot, marker_id: int, size: float, rivals: Sequence[FloatArray]) -> MapMarker | None:
+    """The new marker at that one of the ``rivals``, poses (4, 4), which the joint adjustment prefers decisively."""
     outcomes = []
     for T in rivals:
-        trial = MapMarker(candidate.id, candidate.size, False, T, _UNKNOWN)
-        refinement = refine(replace(snapshot, markers={**snapshot.markers, candidate.id: trial}))
-        if refinement is not None and candidate.id in refinement.markers:
-            outcomes.append((refinement.cost, refinement.markers[candidate.id]))
+        trial = MapMarker(marker_id, size, False, T, _UNKNOWN)
+        refinement = refine(replace(snapshot, markers={**snapshot.markers, marker_id: trial}))
+        if refinement is not None and marker_id in refinement.markers:
+            outcomes.append((refinement.cost, refinement.markers[marker_id]))
     if not outcomes:
         return None
     outcomes.sort(key=lambda outcome: outcome[0])
@@ -143,7 +141,7 @@ def _winner(
         apart = rotation_angle(best.T_map_marker[:3, :3].T @ other.T_map_marker[:3, :3])
         if apart > SAME_FIT and other_cost - cost < DECISIVE:
             return None
-    return best.T_map_marker, best.covariance
+    return best
 
 
 def _with_statistics(built: MarkerMap, frames: Sequence[Markers], start: MarkerMap) -> MarkerMap:

@@ -86,7 +86,7 @@ class MarkerMapper:
         self._last: CameraPose | None = None
         self._cameras: list[Camera] = []
         self._noise = NoiseLevel()
-        self._gap: FloatArray | None = None
+        self._gap: CameraPose | None = None
         self._keyframes = KeyframeStore(self.config.keyframe_budget)
         self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(self.map.markers)
         self._frames_then = 0
@@ -251,10 +251,10 @@ class MarkerMapper:
         elif len(rows) >= 2:
             self._keyframes.add(frame)
         if self._gap is None:
-            self._gap = pose.covariance
+            self._gap = pose
         # What the odometry had gathered when the gap's first marker came is the same for all its views.
-        growth = Viewpoint.known(pose.T_map_camera, positive(pose.covariance - self._gap))
-        return self._place_new(stamp_ns, rows, camera, replace(growth, common=self._gap))
+        viewpoint = Viewpoint.known(pose.T_map_camera, _growth(self._gap, pose, odometry))
+        return self._place_new(stamp_ns, rows, camera, replace(viewpoint, common=self._gap.covariance))
 
     def _from_odometry(self, stamp_ns: int, odometry: Odometry) -> CameraPose:
         T_map_body = predict(odometry, stamp_ns)
@@ -316,10 +316,12 @@ class MarkerMapper:
                 if marker_id in refinement.inconsistent:
                     self._trust.accuse(marker)
                     self._set_standing(marker_id, trusted=False)
-        T_new_old = self._keyframes.move(refinement.keyframes)
+        displacement = self._keyframes.move(refinement.keyframes)
         for candidate in self._candidates.values():
-            candidate.move(T_new_old)
+            candidate.move(displacement)
+        T_new_old = np.eye(4)
         if self._last is not None:
+            T_new_old = displacement.at(self._last.stamp_ns)
             self._last = replace(self._last, T_map_camera=T_new_old @ self._last.T_map_camera)
             self._last_frame = replace(self._last_frame, T_map_rig=T_new_old @ self._last_frame.T_map_rig)
         self.map.version += 1
@@ -359,6 +361,18 @@ def predict(odometry: Odometry, stamp_ns: int) -> FloatArray:
     dt = (stamp_ns - odometry.stamp_ns) * 1e-9
     step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
     return np.asarray(odometry.T_map_body @ step, dtype=np.float64)
+
+
+def _growth(first: CameraPose, pose: CameraPose, odometry: Odometry) -> FloatArray:
+    """Covariance (6, 6) of the odometry from ``first`` to ``pose``, from either of two bounds, whichever is closer.
+
+    Errors of odometry that grow add up like independent ones at most as the difference of the covariances says; and a
+    displacement is off by no more than the speed is, all the time.
+    """
+    seconds = (pose.stamp_ns - first.stamp_ns) * 1e-9
+    turn = np.kron(np.eye(2), odometry.T_map_body[:3, :3]) * seconds
+    bounds = positive(pose.covariance - first.covariance), turn @ odometry.twist_covariance @ turn.T
+    return min(bounds, key=lambda covariance: float(np.trace(covariance)))
 
 
 def _viewpoint(location: Location) -> Viewpoint:
