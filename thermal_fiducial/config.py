@@ -445,6 +445,12 @@ class PoseEkfConfig:
         maximum=1000.0,
     )
     px4: bool = param(False, 'Publish fmu/in/vehicle_visual_odometry at bridge_rate too (needs px4_msgs).')
+    realtime_priority: int = param(
+        1,
+        'Priority of the node under SCHED_FIFO, where the user may (rtprio in limits.conf); 0: an ordinary process.',
+        minimum=0,
+        maximum=99,
+    )
 
 
 #: Node to its parameters.

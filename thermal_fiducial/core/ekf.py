@@ -6,6 +6,7 @@ they came: a pose that comes late goes where it belongs, and everything after it
 
 from bisect import bisect_left, insort
 from dataclasses import dataclass
+from functools import partial
 import math
 
 import numpy as np
@@ -172,7 +173,7 @@ class PoseEkf:
             imu_there = before.imu + share * (node.imu - before.imu)
             belief = self._propagate(belief, (imu, imu_there), due_ns - time_ns, node.densities)
             time_ns, imu = due_ns, imu_there
-            belief, update = self._gate.weigh(belief, pose, due_ns, self._window(index, imu))
+            belief, update = self._gate.weigh(belief, pose, due_ns, imu, partial(self._window, index, imu))
             self._decide(update)
         node.belief = self._propagate(belief, (imu, node.imu), node.stamp_ns - time_ns, node.densities)
 

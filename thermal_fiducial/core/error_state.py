@@ -6,8 +6,8 @@ from filterpy.kalman import ExtendedKalmanFilter
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.geometry import inverse, skew, so3_left_jacobian_inverse, so3_log
-from thermal_fiducial.core.imu import ImuStep, Transition
+from thermal_fiducial.core.geometry import inverse, skew, so3_log
+from thermal_fiducial.core.imu import ImuStep, rotation_integrals, Transition
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.navigation_state import (
     ACCELEROMETER_BIAS,
@@ -177,7 +177,7 @@ def pose_innovation(state: NavigationState, T_map_body: FloatArray) -> FloatArra
     """Rotation and position (6,) of Log(X^-1 Z) on SE(3): exactly the error of ``state`` if ``T_map_body`` is true."""
     rotation = so3_log(state.R_map_body.T @ T_map_body[:3, :3])
     offset = (T_map_body[:3, 3] - state.position) @ state.R_map_body
-    return np.concatenate((rotation, so3_left_jacobian_inverse(rotation) @ offset))
+    return np.concatenate((rotation, np.linalg.solve(rotation_integrals(rotation)[1], offset)))
 
 
 def _random_walks(config: PoseEkfConfig, layout: Layout) -> FloatArray:

@@ -5,6 +5,7 @@ A rival that many poses agree with, while the belief accepts none, replaces it. 
 same thing without a belief to replace.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 import math
 
@@ -95,13 +96,16 @@ class PoseGate:
 
         return replace(belief, main=move(belief.main), rival=move(belief.rival))
 
-    def weigh(self, belief: Belief, pose: CameraPose, time_ns: int, imu: FloatArray) -> tuple[Belief, PoseUpdate]:
+    def weigh(
+        self, belief: Belief, pose: CameraPose, time_ns: int, imu: FloatArray, window: Callable[[], FloatArray]
+    ) -> tuple[Belief, PoseUpdate]:
         """Belief after a pose.
 
         Parameters
         ----------
         time_ns : its instant in the clock of the IMU
-        imu : (N, 6) samples up to that instant, the last one interpolated at it
+        imu : (6,) sample at that instant
+        window : gives the samples (N, 6) up to and with that one
         """
         main = belief.main
         if main and time_ns - main.accepted_ns > self._config.reinitialise_after * _SECOND_NS:
@@ -112,7 +116,7 @@ class PoseGate:
             if nis <= self._config.gate:
                 accepted = Belief(main.supported(state, time_ns), None, pose.stamp_ns, belief.resets)
                 return accepted, PoseUpdate(pose.stamp_ns, True, '', nis)
-        rival = self._challenge(belief.rival, main, pose, time_ns, imu)
+        rival = self._challenge(belief.rival, main, pose, time_ns, imu, window)
         if rival and self._convincing(rival, main, time_ns):
             resets = belief.resets + (belief.main is not None)
             reason = 'started afresh' if belief.main else 'initialised'
@@ -124,10 +128,16 @@ class PoseGate:
         return refused, PoseUpdate(pose.stamp_ns, False, reason, nis)
 
     def _correct(self, state: NavigationState, pose: CameraPose, imu: FloatArray) -> tuple[NavigationState, float]:
-        return self._filter.correct(state, self._filter.body_pose(pose, state.T_body_camera), imu[-1])
+        return self._filter.correct(state, self._filter.body_pose(pose, state.T_body_camera), imu)
 
     def _challenge(
-        self, rival: Track | None, main: Track | None, pose: CameraPose, time_ns: int, imu: FloatArray
+        self,
+        rival: Track | None,
+        main: Track | None,
+        pose: CameraPose,
+        time_ns: int,
+        imu: FloatArray,
+        window: Callable[[], FloatArray],
     ) -> Track | None:
         """The rival after a pose that the main estimate refused; one that fails too often gives way to the pose."""
         if rival:
@@ -138,7 +148,7 @@ class PoseGate:
                 return replace(rival, misses=rival.misses + 1)
         prior = main.state if main else self.blank
         body = self._filter.body_pose(pose, prior.T_body_camera)
-        first = start(self._config, self._filter, body, prior, imu)
+        first = start(self._config, self._filter, body, prior, window())
         return Track(first, time_ns, time_ns) if first else None
 
     def _convincing(self, rival: Track, main: Track | None, time_ns: int) -> bool:

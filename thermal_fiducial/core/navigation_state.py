@@ -15,7 +15,8 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.geometry import so3_exp, so3_left_jacobian, transform
+from thermal_fiducial.core.geometry import transform
+from thermal_fiducial.core.imu import rotation_integrals
 from thermal_fiducial.core.types import FloatArray
 
 #: Places of the error coordinates, in the robot frame [rad, m/s, m, rad/s, m/s^2].
@@ -87,11 +88,10 @@ class NavigationState:
 
 def inject(state: NavigationState, error: FloatArray, covariance: FloatArray, layout: Layout) -> NavigationState:
     """``state`` moved by ``error`` (n,), X Exp(xi) for the group part, with a new covariance (n, n)."""
-    rotation = error[ROTATION]
-    R_left = state.R_map_body @ so3_left_jacobian(rotation)
+    R, R_left = state.R_map_body @ rotation_integrals(error[ROTATION])[:2]
     moved = replace(
         state,
-        R_map_body=orthonormal(state.R_map_body @ so3_exp(rotation)),
+        R_map_body=orthonormal(R),
         velocity=state.velocity + R_left @ error[VELOCITY],
         position=state.position + R_left @ error[POSITION],
         bias=state.bias + error[BIAS],
@@ -102,8 +102,8 @@ def inject(state: NavigationState, error: FloatArray, covariance: FloatArray, la
     if layout.time_offset is not None:
         moved.time_offset = state.time_offset + float(error[layout.time_offset])
     if layout.extrinsics:
-        phi, rho = error[layout.extrinsics][:3], error[layout.extrinsics][3:]
-        moved.T_body_camera = transform(so3_exp(phi), so3_left_jacobian(phi) @ rho) @ state.T_body_camera
+        rotation, left, _ = rotation_integrals(error[layout.extrinsics][:3])
+        moved.T_body_camera = transform(rotation, left @ error[layout.extrinsics][3:]) @ state.T_body_camera
     return moved
 
 
@@ -135,4 +135,4 @@ def with_horizontal(gravity: FloatArray, horizontal: FloatArray) -> FloatArray:
 
 def orthonormal(R: FloatArray) -> FloatArray:
     """The rotation next to a matrix (3, 3) that rounding has moved: one Newton step of the polar decomposition."""
-    return np.asarray(R @ (1.5 * np.eye(3) - 0.5 * (R.T @ R)))
+    return np.asarray(1.5 * R - 0.5 * (R @ (R.T @ R)))

@@ -13,7 +13,7 @@ from std_srvs.srv import Trigger
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.ekf import PoseEkf
 from thermal_fiducial.core.geometry import transform_from_quaternion
-from thermal_fiducial.core.measurements import CameraPose, in_moved_map
+from thermal_fiducial.core.measurements import CameraPose, in_moved_map, Odometry
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.bridge import FlightControllerBridge
@@ -32,7 +32,11 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('pose_ekf', PoseEkfConfig, **kwargs)
+        self.realtime_priority = self.config.realtime_priority
         self.filter = PoseEkf(self.config)
+        #: what is published of each IMU message: one message that is filled anew, seen as two
+        self._message = convert.odometry_frames(self.config.map_frame, self.config.base_frame)
+        self._pose_message = PoseWithCovarianceStamped(header=self._message.header, pose=self._message.pose)
         self._path: deque[tuple[int, Pose]] = deque(maxlen=_PATH_LENGTH)
         self._last_refusal = ''
         #: how often the pose has jumped: fresh starts and corrections of the map
@@ -61,19 +65,18 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._count_jumps()
         if odometry is None:
             return
-        head = convert.header(odometry.stamp_ns, self.config.map_frame)
-        result = convert.odometry_message(odometry, head, self.config.base_frame)
-        pose = PoseWithCovarianceStamped(header=head, pose=result.pose)
-        self._odometry.send(result)
-        self._pose.send(pose)
+        convert.fill_odometry(self._message, odometry)
+        self._pose.send(self._pose_message)
+        self._odometry.send(self._message)
+        if self._transforms is not None:
+            self._transforms.send(self._pose_message)
         smooth = self.filter.smooth
         if smooth is not None:
-            self._smooth_odometry.send(convert.odometry_message(smooth, head, self.config.base_frame))
+            convert.fill_odometry(self._message, smooth)
+            self._smooth_odometry.send(self._message)
         if not self.filter.lost:
             self._bridge.send(smooth or odometry, self._jumps)
-        if self._transforms is not None:
-            self._transforms.send(pose)
-        self._extend_path(odometry.stamp_ns, result.pose.pose)
+        self._extend_path(odometry)
 
     def _count_jumps(self) -> None:
         resets = None if self.filter.state is None else self.filter.resets
@@ -98,9 +101,9 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
                 pose = in_moved_map(pose, T_new_old)
         return pose
 
-    def _extend_path(self, stamp: int, pose: Pose) -> None:
-        if not self._path or not 0 <= stamp - self._path[-1][0] < _PATH_STEP_NS:
-            self._path.append((stamp, pose))
+    def _extend_path(self, odometry: Odometry) -> None:
+        if not self._path or not 0 <= odometry.stamp_ns - self._path[-1][0] < _PATH_STEP_NS:
+            self._path.append((odometry.stamp_ns, convert.pose(odometry.T_map_body)))
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self.filter.reset()

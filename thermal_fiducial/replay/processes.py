@@ -1,19 +1,21 @@
 """One process a node, in real time: what the robot would see, with latencies and processor load measured."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 import time
 from typing import Any
 
 from rclpy.context import Context
 
-from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import BagMessage, BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.replay.children import NodeProcesses
 from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.replay.latency import header_stamp_ns, LatencyMeter
 from thermal_fiducial.replay.recorder import Recorder, RunFiles
 from thermal_fiducial.replay.topics import PLAYED, Topics
 from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.promptness import prompt
 from thermal_fiducial.ros.run import initialise, make_executor
 
 _PATIENCE_S = 30.0
@@ -23,6 +25,10 @@ _MATCHING_S = 0.7
 _SILENCE_S = 1.5
 #: With less time than this to the next message, nothing is written to disk before it.
 _SPARE_NS = 2_000_000
+#: What measures must not wait for what is measured: priority of the player, where the user may.
+_PRIORITY = 1
+#: Messages read ahead; a piece of a bag takes 25 ms to read.
+_AHEAD = 60
 _KINDS = {IMAGE_TOPIC: 'image', IMU_TOPIC: 'imu'}
 
 
@@ -54,7 +60,8 @@ def replay_processes(
                 player = _Player(context, played, files, recorded)
                 try:
                     player.connect(nodes)
-                    return player.play(bag, nodes, rate, progress)
+                    with prompt(_PRIORITY):
+                        return player.play(bag, nodes, rate, progress)
                 finally:
                     player.close()
         finally:
@@ -105,7 +112,7 @@ class _Player:
         self._bag_start_ns, self._rate = bag.start_ns, rate
         cpu = nodes.cpu_seconds()
         self._start_ns, late_ns, next_check = time.monotonic_ns(), 0, 0
-        for message in bag.messages(self._outputs):
+        for message in _read_ahead(bag.messages(self._outputs)):
             elapsed = message.stamp_ns - bag.start_ns
             due_ns = self._start_ns + round(elapsed / rate)
             self._spin_until(due_ns)
@@ -166,3 +173,12 @@ class _Player:
         self._executor.shutdown()
         self._player.destroy_node()
         self._recorder.destroy_node()
+
+
+def _read_ahead(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
+    """``messages``, read by another thread some way ahead."""
+    with ThreadPoolExecutor(1) as reader:
+        ahead = deque(reader.submit(next, messages, None) for _ in range(_AHEAD))
+        while (message := ahead.popleft().result()) is not None:
+            ahead.append(reader.submit(next, messages, None))
+            yield message

@@ -63,10 +63,10 @@ class FlightControllerBridge:
         # In step with the IMU, however its period divides ours; afresh after a gap or a clock that was set back.
         on_time = abs(stamp - self._due_ns) < self._period_ns
         self._due_ns = (self._due_ns if on_time else stamp) + self._period_ns
-        head = convert.header(stamp, self._config.map_frame)
-        message = convert.odometry_message(odometry, head, self._config.base_frame)
+        message = convert.odometry_frames(self._config.map_frame, self._config.base_frame)
+        convert.fill_odometry(message, odometry)
         self._odometry.send(message)
-        self._pose.send(PoseWithCovarianceStamped(header=head, pose=message.pose))
+        self._pose.send(PoseWithCovarianceStamped(header=message.header, pose=message.pose))
         if self._px4 is not None:
             self._px4_odometry.send(px4_odometry(self._px4, odometry, resets))
 

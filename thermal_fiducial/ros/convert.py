@@ -297,15 +297,27 @@ def camera_pose(message: PoseWithCovarianceStamped) -> CameraPose:
     return CameraPose(stamp_ns(message.header.stamp), T_map_camera, _matrix(message.pose.covariance, 6))
 
 
-def odometry_message(odometry: Odometry, head: Header, child_frame_id: str) -> OdometryMessage:
-    """Odometry message: pose in the header's frame, twist in ``child_frame_id``."""
-    message = OdometryMessage(header=head, child_frame_id=child_frame_id)
-    message.pose.pose = pose(odometry.T_map_body)
-    message.pose.covariance[:] = odometry.pose_covariance.ravel()
-    message.twist.twist.linear = vector(odometry.velocity_body)
-    message.twist.twist.angular = vector(odometry.angular_velocity_body)
-    message.twist.covariance[:] = odometry.twist_covariance.ravel()
+def odometry_frames(frame_id: str, child_frame_id: str) -> OdometryMessage:
+    """Odometry message with the pose in ``frame_id`` and the twist in ``child_frame_id``, both to be filled in."""
+    message = OdometryMessage(child_frame_id=child_frame_id)
+    message.header.frame_id = frame_id
     return message
+
+
+def fill_odometry(message: OdometryMessage, odometry: Odometry) -> None:
+    """Set everything of ``message`` but its frames: at the rate of an IMU, making messages anew counts."""
+    stamp = message.header.stamp
+    stamp.sec, stamp.nanosec = divmod(int(odometry.stamp_ns), 1_000_000_000)
+    place, twist = message.pose.pose, message.twist.twist
+    position, orientation = place.position, place.orientation
+    position.x, position.y, position.z = odometry.T_map_body[:3, 3].tolist()
+    orientation.x, orientation.y, orientation.z, orientation.w = quaternion_from_rotation(
+        odometry.T_map_body[:3, :3]
+    ).tolist()
+    message.pose.covariance[:] = odometry.pose_covariance.ravel()
+    twist.linear.x, twist.linear.y, twist.linear.z = odometry.velocity_body.tolist()
+    twist.angular.x, twist.angular.y, twist.angular.z = odometry.angular_velocity_body.tolist()
+    message.twist.covariance[:] = odometry.twist_covariance.ravel()
 
 
 def odometry(message: OdometryMessage) -> Odometry:

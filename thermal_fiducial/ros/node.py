@@ -114,6 +114,8 @@ class StageNode(CountingNode, Generic[Config]):
     def __init__(self, name: str, kind: type[Config], *, live: bool = True, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         self.live = live
+        #: of its process under SCHED_FIFO; 0: ordinary
+        self.realtime_priority = 0
         try:
             self.config = params.declare(self, kind)
         except InputError:

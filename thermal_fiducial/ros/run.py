@@ -13,6 +13,7 @@ from rclpy.utilities import ok, try_shutdown
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.node import StageNode
+from thermal_fiducial.ros.promptness import keep_for_good, take_priority
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
 #: Fast DDS 2 (Jazzy) reads the first, Fast DDS 3 the second.
@@ -69,6 +70,9 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     try:
         initialise(args)
         node = make_node()
+        keep_for_good()
+        if node.realtime_priority and not take_priority(node.realtime_priority):
+            node.get_logger().info('no real-time priority: this user may not')
         _spin(node)
     except InputError as error:
         print(f'{Path(sys.argv[0]).name}: {error}', file=sys.stderr)

@@ -1,0 +1,48 @@
+"""Real-time priority where the user may, and back."""
+
+import gc
+import os
+import threading
+
+import pytest
+
+from thermal_fiducial.ros import promptness
+
+
+@pytest.fixture
+def scheduler(monkeypatch):
+    """Policies of the threads as the kernel was told, instead of the kernel."""
+    policies = {}
+    monkeypatch.setattr(os, 'sched_getscheduler', lambda pid: policies.get(threading.get_native_id(), os.SCHED_OTHER))
+    monkeypatch.setattr(os, 'sched_setscheduler', lambda thread, policy, _: policies.__setitem__(thread, policy))
+    return policies
+
+
+def test_all_threads_get_the_priority_and_lose_it_again(scheduler):
+    done = threading.Event()
+    other = threading.Thread(target=done.wait)
+    other.start()
+    threads = {threading.get_native_id(), other.native_id}
+    with promptness.prompt(1):
+        assert {scheduler[thread] for thread in threads} == {os.SCHED_FIFO}
+        assert gc.get_freeze_count() > 0
+    done.set()
+    other.join()
+    assert {scheduler[thread] for thread in threads} == {os.SCHED_OTHER}
+    assert gc.get_freeze_count() == 0
+
+
+def test_what_the_user_chose_stays(scheduler):
+    scheduler[threading.get_native_id()] = os.SCHED_RR
+    assert promptness.take_priority(5)
+    with promptness.prompt(5):
+        pass
+    assert scheduler == {threading.get_native_id(): os.SCHED_RR}
+
+
+def test_a_user_who_may_not_stays_ordinary(scheduler, monkeypatch):
+    def refuse(*_):
+        raise PermissionError
+
+    monkeypatch.setattr(os, 'sched_setscheduler', refuse)
+    assert not promptness.take_priority(1)
