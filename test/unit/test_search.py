@@ -68,6 +68,22 @@ def test_rules():
     assert search(alone, ArucoDetectorConfig(min_contrast=100.0)).ids.tolist() == []
 
 
+def test_a_marker_at_the_rim_may_be_cut_off():
+    """Half a cell beyond the image, or with a corner in its outermost pixels, is too near; clear of them is not."""
+    image = scene(21, 100.0, 2.0)
+    for left, ids in ((206, []), (199, []), (194, [21])):
+        cropped = np.ascontiguousarray(image[:, left:])
+        assert search(cropped).ids.tolist() == ids
+
+
+def test_columns_of_fixed_pattern_do_not_hide_a_faint_marker():
+    rng = np.random.default_rng(2)
+    columns = rng.normal(0.0, 2.0, 640).astype(np.float32)
+    found = search(scene(21, 6.0, 2.0) + columns)
+    assert found.ids.tolist() == [21]
+    assert np.abs(found.corners_px[0] - CORNERS).max() < 4.0
+
+
 def test_no_markers_in_noise():
     rng = np.random.default_rng(4)
     for frame in range(12):

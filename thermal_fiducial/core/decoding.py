@@ -14,6 +14,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 # How far off a side black and white are compared: in cells, and at most in pixels.
 _OUTSIDE = 0.4
 _OUTSIDE_PX = 2.5
+# Correlation below which nothing is a marker whatever surrounds it.
+_ALIKE = 0.5
 # Samples along a cell, in its middle, away from blurred edges.
 _SAMPLES = np.array([0.3, 0.5, 0.7])
 
@@ -36,7 +38,8 @@ class Reading:
     bit_errors: IntArray
     #: (Q,) the same of border cells
     border_errors: IntArray
-    #: (Q,) step from the black border to its white surroundings over the contrast, on the worst side but one
+    #: (Q,) step from the black border to its white surroundings over the contrast, on the worst side but one; 0 of what
+    #: is unlike any marker
     surround: FloatArray
 
 
@@ -57,12 +60,17 @@ class Decoder:
         # Pattern k after `turn` steps: as it looks in a quadrilateral whose first corner is the marker's corner `turn`.
         self._grids = np.stack([np.rot90(grid, turn, axes=(1, 2)) for turn in range(4)], axis=1)
         flat = self._grids.reshape(-1, self.cells**2)
-        x, y = np.meshgrid(np.linspace(-1.0, 1.0, self.cells), np.linspace(-1.0, 1.0, self.cells))
-        plane = np.linalg.qr(np.stack([np.ones(x.size), x.ravel(), y.ravel()], axis=1))[0]
-        # A background that rises across the marker is no pattern: planes are projected out of both.
-        self._detrend = np.eye(x.size) - plane @ plane.T
+        across = np.linspace(-1.0, 1.0, self.cells)
+        x, y = np.tile(across, self.cells), np.repeat(across, self.cells)
+        smooth = np.linalg.qr(np.stack([np.ones(x.size), x, y, x * x, x * y, y * y], axis=1))[0]
+        # A background that rises or bends across the marker is no pattern: it is projected out of both.
+        self._detrend = np.eye(x.size) - smooth @ smooth.T
         detrended = flat @ self._detrend
         self._patterns = detrended / np.maximum(np.linalg.norm(detrended, axis=1, keepdims=True), 1e-9)
+        likeness = np.abs(self._patterns[::4] @ self._patterns.T).reshape(self.count, -1, 4).max(axis=-1)
+        np.fill_diagonal(likeness, 0.0)
+        #: (M,) by how much a perfect view of each marker correlates better with itself than with any other
+        self.isolation = 1.0 - likeness.max(axis=1)
         share = ((np.arange(self.cells)[:, None] + _SAMPLES) / self.cells).ravel()
         self._a, self._b = (axis.ravel() for axis in np.meshgrid(share, share))
 
@@ -83,13 +91,21 @@ class Decoder:
         ids = best // 4
         others = np.abs(similar).reshape(len(quads), -1, 4).max(axis=-1)
         others[rows, ids] = 0.0
-        return self._judged(values, best, correlation, others.max(axis=1), self._steps(image, quads))
+        steps = np.zeros((len(quads), 4))
+        alike = np.flatnonzero(np.abs(correlation) >= _ALIKE)
+        if len(alike):
+            steps[alike] = self._steps(image, quads[alike])
+        return self._judged(values, best, correlation, others.max(axis=1), steps)
 
     def match(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
         """Correlation (Q,) of quadrilaterals (Q, 4, 2) with the upright patterns of ``ids`` (Q,)."""
         values = self._cell_means(image, quads) @ self._detrend
         spread = np.maximum(np.linalg.norm(values, axis=1), 1e-9)
         return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread)
+
+    def seen(self, ids: IntArray, turns: IntArray) -> FloatArray:
+        """Cells (Q, m, m), 1 for white, as quadrilaterals show markers whose corners they name ``turns`` late."""
+        return np.asarray(self._grids[ids, turns])
 
     def _judged(
         self, values: FloatArray, best: IntArray, correlation: FloatArray, runner_up: FloatArray, steps: FloatArray
@@ -121,13 +137,13 @@ class Decoder:
         inner_low, inner_high = np.broadcast_to(near, t.shape), np.broadcast_to(1.0 - near, t.shape)
         a = np.concatenate([t, t, low, high, t, t, inner_low, inner_high], axis=1)
         b = np.concatenate([low, high, t, t, inner_low, inner_high, t, t], axis=1)
-        means = _sampled(image, quads, a, b).reshape(len(quads), 2, 4, -1).mean(axis=-1, dtype=np.float64)
+        means = sampled(image, quads, a, b).reshape(len(quads), 2, 4, -1).mean(axis=-1, dtype=np.float64)
         return np.asarray(means[:, 0] - means[:, 1])
 
     def _cell_means(self, image: Float32Array, quads: FloatArray) -> FloatArray:
         """Mean counts (Q, m * m) of the cells."""
-        sampled = _sampled(image, quads, self._a, self._b)
-        blocks = sampled.reshape(len(quads), self.cells, len(_SAMPLES), self.cells, len(_SAMPLES))
+        values = sampled(image, quads, self._a, self._b)
+        blocks = values.reshape(len(quads), self.cells, len(_SAMPLES), self.cells, len(_SAMPLES))
         return np.asarray(blocks.mean(axis=(2, 4)).reshape(len(quads), -1), dtype=np.float64)
 
 
@@ -137,7 +153,7 @@ def shrunk(quads: FloatArray, cells: int) -> FloatArray:
     return np.moveaxis(_inside(quads, np.array([low, high, high, low]), np.array([low, low, high, high])), 0, -1)
 
 
-def _sampled(image: Float32Array, quads: FloatArray, a: FloatArray, b: FloatArray) -> Float32Array:
+def sampled(image: Float32Array, quads: FloatArray, a: FloatArray, b: FloatArray) -> Float32Array:
     """Values (Q, P) of the image at shares a, b of quadrilaterals."""
     u, v = _inside(quads, a, b).astype(np.float32)
     return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
@@ -148,8 +164,12 @@ def _inside(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
     d1, d2, d3 = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2], c[:, 0] - c[:, 1] + c[:, 2] - c[:, 3]
     determinant = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
     determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-    g = ((d3[:, 0] * d2[:, 1] - d3[:, 1] * d2[:, 0]) / determinant)[:, None]
-    h = ((d1[:, 0] * d3[:, 1] - d1[:, 1] * d3[:, 0]) / determinant)[:, None]
-    right, down = c[:, 1] - c[:, 0] + g * c[:, 1], c[:, 3] - c[:, 0] + h * c[:, 3]
-    inverse_depth = 1.0 / (1.0 + a * g + b * h)
-    return np.stack([(c[:, 0, [k]] + a * right[:, [k]] + b * down[:, [k]]) * inverse_depth for k in range(2)])
+    H = np.ones((3, len(c), 3))
+    H[2, :, 0] = g = (d3[:, 0] * d2[:, 1] - d3[:, 1] * d2[:, 0]) / determinant
+    H[2, :, 1] = h = (d1[:, 0] * d3[:, 1] - d1[:, 1] * d3[:, 0]) / determinant
+    H[:2, :, 0] = (c[:, 1] - c[:, 0] + g[:, None] * c[:, 1]).T
+    H[:2, :, 1] = (c[:, 3] - c[:, 0] + h[:, None] * c[:, 3]).T
+    H[:2, :, 2] = c[:, 0].T
+    shares = np.stack([a, b, np.ones_like(a)], axis=-2)
+    u, v, depth = H @ shares if a.ndim == 1 else (H[:, :, None] @ shares)[:, :, 0]
+    return np.asarray((u / depth, v / depth))

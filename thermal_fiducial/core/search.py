@@ -5,33 +5,40 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.contrast import halved, noise_of, normalise
+from thermal_fiducial.core.alignment import aligned
+from thermal_fiducial.core.contrast import halved, noise_of, normalise, without_columns
 from thermal_fiducial.core.corners import RefinedCorners
 from thermal_fiducial.core.decoding import Decoder, Reading, shrunk
 from thermal_fiducial.core.quads import find_quads
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 # Full resolution sees small and smeared markers: smoothing [px], floor [noise], window [px], threshold [levels].
-_FINE = (1.5, 3.0, 15, 7.0)
-# Half resolution, smoothed more, sees markers of twice the noise.
-_FAINT = (1.2, 1.0, 7, 3.0)
+_FINE = (1.0, 3.0, 15, 12.0)
+# Half resolution, without the pattern of columns, sees markers of twice the noise.
+_FAINT = (1.2, 1.0, 5, 3.0)
 # Weight of white surroundings against correlation in choosing among the outlines of a marker.
 _SURROUNDED = 0.2
+# Correlation beyond which an outline needs no alignment, and from which, by such a margin, it is worth one.
+_CLEAR = 0.95
+_HINT, _HINT_MARGIN = 0.5, 0.06
 # Cells at least this wide are read at half the resolution, where a pixel has half the noise.
 _WIDE_CELL_PX = 8.0
 # Correlation at the refined corners: of a marker with sharp sides, and (less when faint) of one with softer sides.
-_ALIKE = 0.77
+_ALIKE = 0.82
 _CLEARLY_ALIKE = 0.9
-_CLEAR_MARGIN = 0.06
-# Margin over all other markers that speaks for itself where markers differ in so many bits that this many wrong ones
-# can be corrected; noise often looks a little like one of the few patterns of a 4 x 4 dictionary.
-_WIDE_MARGIN = 0.18
+# Share of a marker's isolation by which it must stand out among all others; and the share that speaks for itself where
+# markers differ in so many bits that this many wrong ones can be corrected: noise and clutter often look a little like
+# one of the few patterns of a 4 x 4 dictionary.
+_CLEAR_MARGIN = 0.4
+_WIDE_MARGIN = 0.5
 _MANY_BITS = 3
 # Corner deviation [px] times contrast over noise times root of the side [px]: 4 to 7 for four clean sides.
 _SHARP = 7.5
 _SOFT = 12.0
 # Contrast over noise beyond which corners deviate by what optics and plates really are, and not by noise.
 _NOISY = 8.0
+# Nearer to the rim of the image than this [px] a marker may be cut off.
+_RIM = 2.0
 # Pixels along a side that the refinement uses of a long one.
 _SEEN_PX = 60.0
 
@@ -73,19 +80,40 @@ def blind_search(
     smoothing, floor, window, threshold = _FINE
     fine = find_quads(normalise(scene, noise, smoothing, floor), window, threshold, config.min_side_px)
     half = halved(image)
+    half_noise = 0.5 * noise
+    half = without_columns(half, half_noise)
     smoothing, floor, window, threshold = _FAINT
-    view = normalise(half, noise_of(half), smoothing, floor, 2)
+    view = normalise(half, half_noise, smoothing, floor, 2)
     faint = 2.0 * find_quads(view, window, threshold, 0.5 * config.min_side_px + 2.0) + 0.5
     quads = np.concatenate([fine, faint, shrunk(faint, decoder.cells)])
     if len(quads) == 0:
         return Found.none()
     reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, 0.5 * (quads[len(fine) :] - 0.5), allowed))
+    rough = _rough(reading, quads)
+    if len(rough):
+        better = aligned(half, 0.5 * (quads[rough] - 0.5), reading.ids[rough], reading.turns[rough], decoder)
+        reading = _joined(reading, decoder.read(half, better, allowed))
+        quads = np.concatenate([quads, 2.0 * better + 0.5])
     sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1).min(axis=1)
     good = accepted(reading, noise, decoder.correctable, config) & (sides >= config.min_side_px)
+    good &= _whole(quads, image, _RIM)
     best = _once(reading, quads, good, config.duplicates == 'drop')
     turned = (np.arange(4) - reading.turns[best][:, None]) % 4
     corners = np.take_along_axis(quads[best], turned[..., None], axis=1)
     return Found(reading.ids[best], corners, reading.contrast[best] / noise, np.zeros(len(best), dtype=bool))
+
+
+def _rough(reading: Reading, quads: FloatArray) -> IntArray:
+    """Places of the best readings of IDs that show, but not clearly, where none does: their outlines may be off."""
+    similarity = np.abs(reading.correlation)
+    clear = similarity >= _CLEAR
+    hinted = (similarity >= _HINT) & (similarity - reading.runner_up >= _HINT_MARGIN)
+    hinted &= ~np.isin(reading.ids, reading.ids[clear])
+    places = np.flatnonzero(hinted)[np.argsort(-similarity[hinted], kind='stable')]
+    places = places[np.unique(reading.ids[places], return_index=True)[1]]
+    centre, across = quads.mean(axis=1), np.linalg.norm(quads[clear, 2] - quads[clear, 0], axis=-1)
+    distance = np.linalg.norm(centre[places, None] - centre[clear], axis=-1)
+    return np.asarray(places[(distance > 0.5 * across).all(axis=1)])
 
 
 def _joined(first: Reading, second: Reading) -> Reading:
@@ -134,7 +162,7 @@ def confirmed(
     similarity = np.abs(reading.correlation)
     contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
     same = reading.ids == found.ids
-    margin = similarity - reading.runner_up
+    margin = (similarity - reading.runner_up) / decoder.isolation[reading.ids]
     distinct = (similarity >= _ALIKE) | ((margin >= _WIDE_MARGIN) & (decoder.correctable >= _MANY_BITS))
     alike = distinct & (margin >= _CLEAR_MARGIN) & (reading.surround >= 0.4)
     side = np.linalg.norm(refined.corners_px[:, 2] - refined.corners_px[:, 0], axis=-1) / np.sqrt(2.0)
@@ -144,7 +172,14 @@ def confirmed(
     soft = (softness <= _SOFT) & (similarity >= np.minimum(_CLEARLY_ALIKE, 0.7 + 0.07 * contrast))
     known = (similarity >= config.guided_min_correlation) & (similarity - reading.runner_up >= config.guided_min_margin)
     there = np.abs(refined.corners_px - found.corners_px).max(axis=(1, 2)) < 0.7 * side / decoder.cells
-    return np.asarray(same & ((found.expected & known & there) | (alike & (sharp | soft))))
+    seen = same & ((found.expected & known & there) | (alike & (sharp | soft)))
+    return np.asarray(seen & _whole(refined.corners_px, image, 0.5 * _RIM))
+
+
+def _whole(quads: FloatArray, image: Float32Array, rim: float) -> BoolArray:
+    """Which quadrilaterals (Q, 4, 2) lie in the image, ``rim`` away from its edges."""
+    height, width = image.shape
+    return np.asarray(((quads >= rim) & (quads <= (width - 1 - rim, height - 1 - rim))).all(axis=(1, 2)))
 
 
 def read_quads(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:

@@ -1,0 +1,64 @@
+"""Rough outlines of markers pulled onto the pattern that they show.
+
+An outline of a faint marker has a corner or two off by up to a cell. Once its cells tell which marker it is, the whole
+pattern with its white surroundings is fitted to the image: Gauss-Newton on the four corners, together with contrast
+and a background that may bend (B. Lucas, T. Kanade, "An iterative image registration technique", 1981).
+"""
+
+import math
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.core.decoding import Decoder, sampled
+from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
+
+_STEPS = 3
+# Smoothing of the image [px], so that its slope tells the way from half a cell away.
+_SMOOTHING = 1.0
+# Samples along a cell, and one outside the sides, in cells.
+_SAMPLES = (0.17, 0.5, 0.83)
+_OUTSIDE = 0.35
+# What the smoothing, the optics and the pixels make of an edge [cells].
+_BLUR = 0.25
+# Share of its own information that each coordinate is held back with.
+_DAMPING = 0.1
+# Longest step of a corner [cells].
+_LONGEST = 0.6
+
+
+def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArray, decoder: Decoder) -> FloatArray:
+    """Quadrilaterals (Q, 4, 2) moved to where ``image`` looks most like the markers ``ids`` (Q,), turned (Q,)."""
+    share = np.concatenate(
+        [[-_OUTSIDE], (np.arange(decoder.cells)[:, None] + _SAMPLES).ravel(), [decoder.cells + _OUTSIDE]]
+    )
+    blur = _blur(share, decoder.cells)
+    cells = np.pad(decoder.seen(ids, turns), ((0, 0), (1, 1), (1, 1)), constant_values=1.0)
+    pattern = (blur @ cells @ blur.T).reshape(len(ids), -1, 1)
+    a, b = (axis.ravel() / decoder.cells for axis in np.meshgrid(share, share))
+    x, y = a - 0.5, b - 0.5
+    smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    weights = np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), a * b, (1.0 - a) * b], axis=-1)
+    picture = cv2.GaussianBlur(image - np.float32(image.mean()), (0, 0), _SMOOTHING)
+    slope_u = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.125)
+    slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.125)
+    planes: list[Float32Array] = [np.asarray(plane) for plane in (picture, slope_u, slope_v)]
+    smooth = np.broadcast_to(smooth, (len(ids), *smooth.shape))
+    for _ in range(_STEPS):
+        value, du, dv = (sampled(plane, quads, a, b)[..., None] for plane in planes)
+        J = np.concatenate([du * weights, dv * weights, smooth, pattern], axis=-1)
+        information = np.swapaxes(J, -1, -2) @ J
+        diagonal = np.einsum('qii->qi', information)
+        diagonal[:, :8] *= 1.0 + _DAMPING
+        diagonal += 1e-9 + 1e-9 * diagonal.max(axis=1, keepdims=True)
+        step = -np.linalg.solve(information, np.swapaxes(J, -1, -2) @ value)[:, :8, 0]
+        longest = _LONGEST / decoder.cells * np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)[:, None] / np.sqrt(2.0)
+        quads = quads + np.swapaxes(np.clip(step, -longest, longest).reshape(-1, 2, 4), -1, -2)
+    return quads
+
+
+def _blur(places: FloatArray, cells: int) -> FloatArray:
+    """Weights (P, cells + 2) of blurred cells at ``places`` (P,) [cells]; the outermost two reach on without end."""
+    edges = np.concatenate([[-np.inf], np.arange(cells + 1), [np.inf]])
+    below = [[math.erf(z) for z in row] for row in ((edges - places[:, None]) / (_BLUR * math.sqrt(2.0))).tolist()]
+    return np.asarray(0.5 * np.diff(np.array(below), axis=1))
