@@ -166,6 +166,10 @@ def _camera_orientation() -> Any:
     )
 
 
+def _camera_time_offset() -> Any:
+    return param(0.0, 'Clock offset of the camera, t_imu = t_camera + offset.', unit='s', minimum=-1.0, maximum=1.0)
+
+
 def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
     """Marker ID to side [m] from strings "ID:SIZE".
 
@@ -238,6 +242,7 @@ class ArucoDetectorConfig:
     marker_size_overrides: tuple[str, ...] = _marker_size_overrides()
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
+    camera_time_offset: float = _camera_time_offset()
     bolometer_lag: float = param(
         0.010,
         'Thermal time constant of the bolometers; 0: none, or a camera of another kind.',
@@ -371,9 +376,7 @@ class PoseEkfConfig:
 
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
-    camera_time_offset: float = param(
-        0.0, 'Clock offset of the camera, t_imu = t_camera + offset.', unit='s', minimum=-1.0, maximum=1.0
-    )
+    camera_time_offset: float = _camera_time_offset()
     estimate_time_offset: bool = param(True, 'Estimate what is left of the time offset while running.')
     time_offset_std: float = param(
         0.03,

@@ -95,3 +95,14 @@ def test_branch_follows_the_map():
         R = geometry.rotation_from_quaternion([row['qx'], row['qy'], row['qz'], row['qw']])
         expected = frame.T_map_camera[:3, :3].T @ MAP[int(row['id'])][0][:3, :3]
         assert np.linalg.norm(geometry.so3_log(R @ expected.T)) < np.radians(6.0)
+
+
+def test_odometry_is_read_on_the_camera_s_clock():
+    """A filter on a clock 60 ms behind the camera's tells of the frame's own time with the offset known."""
+    frame = frames(8.0, 1)[0]
+    state = odometry(frame)
+    velocity = np.array([0.0, 4.0, 0.0])
+    late = replace(state, stamp_ns=frame.stamp_ns - 60_000_000, velocity_body=velocity)
+    camera_clock = detector(camera_time_offset=-0.060, blind_interval=1000)._on_camera_clock(late)
+    assert camera_clock.stamp_ns == frame.stamp_ns
+    assert detector()._on_camera_clock(replace(late, angular_velocity_body=np.full(3, 1e3))) is None

@@ -28,15 +28,19 @@ _SEGMENT_OUTLIER = 2.5
 # Variance of a standard normal variable of which no more than that is kept.
 _KEPT_VARIANCE = 0.911
 # Standard deviation of a corner that no image noise explains: the optics' blur is not quite a Gaussian [px].
-_FLOOR_PX = 0.007
+_FLOOR_PX = 0.010
 # Factors on the blur, pass by pass: a wide one catches, narrow ones measure, until the corners no longer move.
 _PASSES = (1.4, 1.0, 1.0, 1.0, 1.0)
 _SETTLED_PX = 0.3
 # A linearised displacement is good for this many blurs.
 _REACHED = 2.0
-# Standard deviation of what is known of the corners beforehand [px].
-_PRIOR_PX = 3.0
+# Standard deviation of what is known of the corners beforehand, and of their places among themselves [px].
+_PRIOR_PX, _PRIOR_SHAPE_PX = 3.0, 0.7
+_PRIOR = np.eye(8) / _PRIOR_PX**2
+_PRIOR_OF_SHAPE = np.linalg.inv(_PRIOR_SHAPE_PX**2 * np.eye(8) + _PRIOR_PX**2 * np.kron(np.ones((4, 4)), np.eye(2)))
 _HOPELESS = 1e6
+# Pixels of the image that a line must have on both sides.
+_BOTH_SIDES = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,9 +129,10 @@ def refine_corners(
     before: Float32Array,
     step: Float32Array,
     blur_px: float,
+    smear_px: FloatArray | None = None,
+    columns: int = 6,
     *,
     inner: bool = False,
-    columns: int = 6,
 ) -> RefinedCorners:
     """Corners of N markers, refined.
 
@@ -137,17 +142,30 @@ def refine_corners(
     corners_px : (N, 4, 2) to within two pixels, or a third of a cell
     before, step : (N, 2, m + 1, m) of :class:`GridPattern`
     blur_px : standard deviation of optics and pixel
-    inner : whether the lines between the bits are used besides the sides
+    smear_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
     columns : of pixels, in a segment
+    inner : whether the lines between the bits are used besides the sides
     """
     count = len(corners_px)
     result = RefinedCorners(corners_px.copy(), np.zeros((count, 4, 2, 2)), np.zeros(count), np.zeros(count))
     active = np.arange(count)
+    smear = np.zeros((count, 2)) if smear_px is None else smear_px
     for factor in _PASSES:
         if len(active) == 0:
             break
         start = result.corners_px[active]
-        moved = _pass(image, start, camera, before[active], step[active], factor * blur_px, inner, columns)
+        moved = _pass(
+            image,
+            start,
+            camera,
+            before[active],
+            step[active],
+            factor * blur_px,
+            smear[active],
+            _PRIOR_OF_SHAPE if factor > 1.0 else _PRIOR,
+            inner,
+            columns,
+        )
         result.corners_px[active] = moved.corners_px
         result.covariances[active] = moved.covariances
         result.contrast[active], result.noise[active] = moved.contrast, moved.noise
@@ -162,20 +180,32 @@ def _pass(
     camera: Camera,
     before: Float32Array,
     step: Float32Array,
-    blur: float,
+    optics: float,
+    smear: FloatArray,
+    prior: FloatArray,
     inner: bool,
     columns: int,
 ) -> RefinedCorners:
     """One linearised adjustment of corners (N, 4, 2)."""
     cells = step.shape[-1]
     numbers = np.arange(cells + 1) if inner else np.array([0, cells])
-    lines, extent = _lines(corners, camera, image.shape, numbers / cells, cells * columns, blur)
+    widest = math.hypot(optics, float(np.linalg.norm(smear, axis=1).max()))
+    lines, extent = _lines(corners, camera, image.shape, numbers / cells, cells * columns, widest)
+    blur = _blur_of_lines(lines.normal[:, cells * columns // 2], optics, smear)
     shifts = _measure(image, lines, before, step, numbers, extent, blur)
-    moved, covariances = _adjust(corners, lines, shifts, numbers / cells, cells)
+    moved, covariances = _adjust(corners, lines, shifts, numbers / cells, cells, prior)
     good = shifts.variance.reshape(len(corners), -1) < _HOPELESS
     contrast = _mean_where(shifts.contrast.reshape(good.shape), good)
     noise = np.sqrt(_mean_where(shifts.noise.reshape(good.shape), good))
     return RefinedCorners(moved, covariances, contrast, noise)
+
+
+def _blur_of_lines(normal: FloatArray, optics: float, smear: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Blur (E,) across and along lines with normals (E, 2), of markers with smear (N, 2) [px]."""
+    vector = np.repeat(smear, len(normal) // len(smear), axis=0)
+    across = np.sum(vector * normal, axis=1)
+    along = vector[:, 1] * normal[:, 0] - vector[:, 0] * normal[:, 1]
+    return np.hypot(optics, across), np.hypot(optics, along)
 
 
 def _mean_where(values: FloatArray, good: np.ndarray) -> FloatArray:
@@ -209,7 +239,7 @@ def _lines(
     distance = (((base - centre)[..., None] + offsets) * pitch[..., None]).astype(np.float32)
     place = base.astype(np.int64)[..., None] + offsets
     far, end = np.where(steep, width, height)[:, None, None], np.where(steep, height, width)[:, None]
-    fresh = fresh * ((whole >= 0) & (whole < end))
+    fresh = fresh * ((whole >= 0) & (whole < end) & (base >= _BOTH_SIDES) & (base < far[..., 0] - _BOTH_SIDES))
     inside = (place >= 0) & (place < far)
     across_stride, along_stride = np.where(steep, 1, width)[:, None, None], np.where(steep, width, 1)[:, None]
     pixel = place * across_stride + (whole.astype(np.int64) * along_stride)[..., None]
@@ -259,16 +289,16 @@ _NORMAL = np.array(
 _DENSITY = np.gradient(_NORMAL, 1.0 / _FINENESS).astype(np.float32)
 
 
-def _blurred_step(distance: Float32Array, blur: float) -> tuple[Float32Array, Float32Array]:
-    """A step from 0 to 1 at zero, and its derivative [1/px]."""
+def _blurred_step(distance: Float32Array, sharpness: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """A step from 0 to 1 at zero, and its derivative, both [1/px] blurred by the inverse of ``sharpness``."""
     limit = np.float32(_REACH * _FINENESS)
-    index = (np.clip(distance * np.float32(_FINENESS / blur), -limit, limit) + (limit + np.float32(0.5))).astype(
+    index = (np.clip(distance * (sharpness * np.float32(_FINENESS)), -limit, limit) + (limit + np.float32(0.5))).astype(
         np.intp
     )
-    return _NORMAL.take(index), _DENSITY.take(index) * np.float32(1.0 / blur)
+    return _NORMAL.take(index), _DENSITY.take(index) * sharpness
 
 
-def _along(values: Float32Array, t: FloatArray, extent: FloatArray, blur: float) -> Float32Array:
+def _along(values: Float32Array, t: FloatArray, extent: FloatArray, blur: FloatArray) -> Float32Array:
     """Values (E, m, V) of the cells along the lines, 0 beyond, as blurred columns at t (E, K) see them: (E, K, V)."""
     cells = values.shape[1]
     z = (t[..., None] * cells - np.arange(cells + 1)) * (extent / (cells * blur))[:, None, None]
@@ -282,15 +312,17 @@ def _model(
     step: Float32Array,
     numbers: IntArray,
     extent: tuple[FloatArray, FloatArray],
-    blur: float,
+    blurs: tuple[FloatArray, FloatArray],
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
     """White's share of every pixel, its derivative by distance, and the weight of the pixel, each (E, K, M)."""
     cells = step.shape[-1]
     cell, along = extent[0] / cells, extent[1]
+    blur, blur_along = blurs
+    sharpness = (1.0 / blur).astype(np.float32)[:, None, None]
     # Black is what the cells take away from the white around: nothing beyond the ends of a line.
     near = np.stack([1.0 - before[:, :, numbers], step[:, :, numbers]], axis=-1).reshape(-1, cells, 2)
-    black, own = np.split(_along(near, lines.t, along, blur), 2, axis=-1)
-    value, slope = _blurred_step(lines.distance, blur)
+    black, own = np.split(_along(near, lines.t, along, blur_along), 2, axis=-1)
+    value, slope = _blurred_step(lines.distance, sharpness)
     value, slope = own * value - black, own * slope
     narrow = np.flatnonzero(cell < _NARROW * blur)
     if len(narrow):
@@ -298,14 +330,14 @@ def _model(
         width = cell[narrow].astype(np.float32)[:, None, None]
         padded = np.pad(step, ((0, 0), (0, 0), (2, 2), (0, 0)))
         beyond = np.stack([padded[:, :, numbers + 2 + offset] for offset in _NEIGHBOURS], axis=-1)
-        amounts = _along(beyond.reshape(-1, cells, len(_NEIGHBOURS))[narrow], t, along[narrow], blur)
+        amounts = _along(beyond.reshape(-1, cells, len(_NEIGHBOURS))[narrow], t, along[narrow], blur_along[narrow])
         for index, offset in enumerate(_NEIGHBOURS):
-            share, rise = _blurred_step(distance - offset * width, blur)
+            share, rise = _blurred_step(distance - offset * width, sharpness[narrow])
             amount = amounts[..., index : index + 1]
             value[narrow] += amount * (share if offset > 0 else share - 1.0)
             slope[narrow] += amount * rise
     reach = np.where(cell < _NARROW * blur, 1.6 * cell, cell - 2.0 * blur)
-    quiet = np.minimum(reach, np.maximum(cell, 2.5))
+    quiet = np.minimum(reach, np.maximum(cell - blur, 2.5))
     number = np.tile(numbers, len(cell) // len(numbers))
     low = np.where(number == 0, quiet, reach)[:, None, None]
     high = np.where(number == cells, quiet, reach)[:, None, None]
@@ -321,25 +353,26 @@ def _measure(
     step: Float32Array,
     numbers: IntArray,
     extent: tuple[FloatArray, FloatArray],
-    blur: float,
+    blurs: tuple[FloatArray, FloatArray],
 ) -> _Shifts:
     """Displacement of each segment, one a cell long, by least squares over level, contrast and displacement."""
-    value, slope, weight = _model(lines, before, step, numbers, extent, blur)
+    value, slope, weight = _model(lines, before, step, numbers, extent, blurs)
     cells = step.shape[-1]
+    reach = _REACHED * np.repeat(blurs[0], cells).reshape(len(step), -1)
     shape = (value.shape[0] * cells, -1)
     counts = image.ravel().take(lines.pixel, mode='clip').reshape(shape)
     middle = counts[:, counts.shape[1] // 2][:, None]
     X = np.stack([np.ones_like(counts), value.reshape(shape), slope.reshape(shape), counts - middle], axis=1)
     weight = weight.reshape(shape)
-    shifts, coefficients = _solve(X, weight, len(step), _REACHED * blur)
+    shifts, coefficients = _solve(X, weight, len(step), reach)
     residual = X[:, 3] - (coefficients[:, None] @ X[:, :3])[:, 0]
     outlier = np.abs(residual) > _PIXEL_OUTLIER * np.sqrt(shifts.noise).reshape(-1, 1)
     if np.any(outlier & (weight > 0.0)):
-        shifts, _ = _solve(X, weight * ~outlier, len(step), _REACHED * blur)
+        shifts, _ = _solve(X, weight * ~outlier, len(step), reach)
     return shifts
 
 
-def _solve(X: Float32Array, weight: Float32Array, count: int, reach: float) -> tuple[_Shifts, Float32Array]:
+def _solve(X: Float32Array, weight: Float32Array, count: int, reach: FloatArray) -> tuple[_Shifts, Float32Array]:
     """Least squares of the last of four columns X (segments, 4, pixels) on the others: (1, model, derivative)."""
     gram = ((X * weight[:, None]) @ np.swapaxes(X, -1, -2)).astype(np.float64)
     number = gram[:, 0, 0]
@@ -370,14 +403,13 @@ def _median_where(values: FloatArray, good: np.ndarray) -> FloatArray:
 
 
 def _adjust(
-    corners: FloatArray, lines: _Lines, shifts: _Shifts, levels: FloatArray, cells: int
+    corners: FloatArray, lines: _Lines, shifts: _Shifts, levels: FloatArray, cells: int, prior: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Corners (N, 4, 2) moved to explain the shifts of all segments, and their covariances (N, 4, 2, 2)."""
     count = len(corners)
     A = _design(lines, levels, cells, count)
     deviation = np.sqrt(shifts.variance)
     robust = np.ones_like(deviation)
-    prior = np.eye(8) / _PRIOR_PX**2
     for _ in range(3):
         weighted = A * (robust / shifts.variance)[..., None]
         information = np.swapaxes(weighted, -1, -2) @ A + prior

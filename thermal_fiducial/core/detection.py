@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -14,7 +14,18 @@ from thermal_fiducial.core.contrast import noise_of
 from thermal_fiducial.core.corners import grid_pattern, refine_corners, RefinedCorners
 from thermal_fiducial.core.decoding import Decoder
 from thermal_fiducial.core.guided import camera_in_map, expected_markers, look
-from thermal_fiducial.core.lag import markers_without_lag, MotionTracker, smear, SmearField, Twist, without_lag
+from thermal_fiducial.core.lag import (
+    markers_sharpened,
+    model_error,
+    MotionTracker,
+    plausible,
+    REMAINING,
+    smear,
+    SmearField,
+    SPREAD,
+    Twist,
+    without_lag,
+)
 from thermal_fiducial.core.local_corners import local_corners
 from thermal_fiducial.core.marker_rows import marker_rows
 from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers, Odometry
@@ -86,6 +97,7 @@ class MarkerDetector:
         odometry : the filter's latest state, where there is one
         """
         with one_thread():
+            odometry = self._on_camera_clock(odometry)
             twist = self._motion.predict(stamp_ns, odometry)
             image = counts.astype(np.float32)
             T_camera_map = self._predicted_pose(stamp_ns, odometry, twist)
@@ -100,6 +112,12 @@ class MarkerDetector:
         if marker_id in self._map:
             return self._map[marker_id][1]
         return self._sizes.get(marker_id, self.config.marker_size)
+
+    def _on_camera_clock(self, odometry: Odometry | None) -> Odometry | None:
+        """The filter's state, where it can be true, with the stamp that the camera would have given it."""
+        if odometry is None or not plausible(odometry):
+            return None
+        return replace(odometry, stamp_ns=odometry.stamp_ns - round(self.config.camera_time_offset * 1e9))
 
     def _predicted_pose(self, stamp_ns: int, odometry: Odometry | None, twist: Twist | None) -> FloatArray | None:
         """T_camera_map at the frame, where odometry that is fresh enough tells it."""
@@ -131,8 +149,8 @@ class MarkerDetector:
         noise = noise_of(image)
         shift, _ = smear(camera, camera.normalise(corners), depth, twist, self.config.bolometer_lag)
         blurred = np.abs(shift).max(axis=(1, 2)) > _SMEAR_THAT_MATTERS_PX
-        scene = markers_without_lag(image, corners[blurred], shift[blurred], _WINDOW_MARGIN_PX)
-        still = np.where(blurred[:, None, None], 0.0, shift)
+        scene = markers_sharpened(image, corners[blurred], shift[blurred], _WINDOW_MARGIN_PX)
+        still = np.where(blurred[:, None, None], REMAINING * shift, shift)
         found, seen = look(scene, ids, corners + still, self._decoder, noise, self.config)
         found = replace(found, corners_px=found.corners_px - still[seen])
         faint = np.flatnonzero(blurred & ~seen)
@@ -174,33 +192,32 @@ class MarkerDetector:
         # Freeing an image of lag costs noise: of faint markers only the delay is taken out.
         clear = np.abs(found.clarity) > _CLEAR
         before, step = self._pattern.before[ids], self._pattern.step[ids]
-        tau = self.config.bolometer_lag
         x = camera.normalise(corners)
         depth = _corner_depths(x, self._sizes_of(ids))
         self._depth = float(np.median(depth))
-        twist = predicted
+        twist, tau = predicted, self.config.bolometer_lag
         columns = _COLUMNS if clear.all() else _COLUMNS_FAINT
         for _ in range(2):
-            scene, used = image, np.zeros_like(corners)
-            if twist is not None:
-                used = smear(camera, x, depth, twist, tau)[0] * clear[:, None, None]
-                scene = markers_without_lag(image, corners[clear], used[clear], _WINDOW_MARGIN_PX)
-            refined = refine_corners(scene, corners, camera, before, step, self.config.blur_px, columns=columns)
-            sharpness = refined.covariances
-            x = camera.normalise(refined.corners_px)
-            noise = np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1).mean(axis=-1)) / camera.focal_px
+            smeared = np.zeros_like(corners) if twist is None else smear(camera, x, depth, twist, tau)[0]
+            view = _view(image, corners, smeared, clear)
+            seen = refine_corners(
+                view.image, corners + view.shift, camera, before, step, self.config.blur_px, view.spread, columns
+            )
+            refined, x = seen, camera.normalise(seen.corners_px - view.shift)
+            noise = np.sqrt(0.5 * np.trace(seen.covariances, axis1=-2, axis2=-1).mean(axis=-1)) / camera.focal_px
             twist = self._motion.correct(stamp_ns, predicted, ids, x, depth, noise)
             if twist is None:
                 break
-            better, spread = smear(camera, x, depth, twist, tau)
-            change = better - used
-            corners = refined.corners_px - change
-            refined = replace(refined, corners_px=corners, covariances=refined.covariances + spread)
-            if np.abs(change[clear]).max(initial=0.0) < _SMEAR_THAT_MATTERS_PX:
+            smeared, unknown = smear(camera, x, depth, twist, tau)
+            shift = smeared - view.removed
+            corners = seen.corners_px - shift
+            unknown = unknown + model_error(smeared, _sides(corners) / self._decoder.cells)
+            refined = replace(seen, corners_px=corners, covariances=seen.covariances + unknown)
+            if np.abs(shift - view.shift)[clear].max(initial=0.0) < _SMEAR_THAT_MATTERS_PX:
                 break
         # How well the image shows the sides, apart from how well the motion is known.
-        shown = replace(refined, covariances=sharpness)
-        keep = confirmed(scene, found, shown, self._decoder, self.config)
+        there = replace(found, corners_px=found.corners_px + view.shift)
+        keep = confirmed(view.image, there, seen, self._decoder, self.config)
         ids, refined = ids[keep], refined.only(keep)
         self._motion.remember(stamp_ns, twist, ids, camera.normalise(refined.corners_px))
         return ids, refined
@@ -218,6 +235,33 @@ class MarkerDetector:
 
     def _sizes_of(self, ids: IntArray) -> FloatArray:
         return np.array([self.size(marker_id) for marker_id in ids.tolist()])
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """A frame in which the smear of N markers is short."""
+
+    image: Float32Array
+    #: (N, 4, 2) where the corners appear in it, off their places at the stamp [px]
+    shift: FloatArray
+    #: (N, 4, 2) how much of the smear's shift has been taken out
+    removed: FloatArray
+    #: (N, 2) standard deviation of what is left of the smear, along it
+    spread: FloatArray
+
+
+def _view(image: Float32Array, corners: FloatArray, smeared: FloatArray, clear: BoolArray) -> _View:
+    """``image`` sharpened round those markers (N, 4, 2) that are clear, which shows them all with known smear."""
+    removed = (1.0 - REMAINING) * smeared * clear[:, None, None]
+    shift = smeared - removed
+    moving = clear & (np.abs(smeared).max(axis=(1, 2)) > 0.0)
+    sharp = markers_sharpened(image, (corners + shift)[moving], smeared[moving], _WINDOW_MARGIN_PX)
+    return _View(sharp, shift, removed, smeared.mean(axis=1) * np.where(clear, SPREAD, 1.0)[:, None])
+
+
+def _sides(corners: FloatArray) -> FloatArray:
+    """Mean sides (N,) of quadrilaterals (N, 4, 2)."""
+    return np.asarray(np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1).mean(axis=1))
 
 
 def _corner_depths(x: FloatArray, sizes: FloatArray) -> FloatArray:

@@ -1,8 +1,11 @@
-"""Image motion, and the bolometers' lag that it smears.
+"""Image motion, and the bolometers' lag that smears it.
 
 A bolometer answers the scene x with y, ``tau dy/dt + y = x``. While the image moves with velocity w, the pattern y is
-carried along, ``dy/dt = -w . grad y``, so the scene at the very stamp is ``x = y - tau w . grad y``: one derivative of
-the image undoes the smear, and corners come out where they were at the stamp, without the lag's delay.
+carried along, ``dy/dt = -w . grad y``, so the scene at the very stamp is ``x = y - tau w . grad y``: the search for
+markers takes that one derivative. Corners must not depend so much on the response being exactly exponential (renderers
+integrate the lag in a few steps, and a derivative makes a ghost of every step). For them only what is older than a
+time m is taken out, ``(y(t) - b y(t - m)) / (1 - b)`` with ``b = exp(-m / tau)``, where the older image is the present
+one, shifted. What is left is a short blur along the motion, that the model of an edge knows, and its mean delay.
 
 The motion is that of a rigid scene seen from a camera with twist (v, omega) (F. Chaumette, S. Hutchinson, "Visual
 servo control I", 2006, eq. 11). A Kalman filter holds the twist: predicted from the filter's odometry or the last
@@ -10,6 +13,7 @@ frame, corrected by how the markers' corners moved since.
 """
 
 from dataclasses import dataclass
+import math
 
 import cv2
 import numpy as np
@@ -21,12 +25,23 @@ from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
 
 # First derivative, exact up to the sixth order: on images blurred by a pixel's optics the eighth does not matter.
 _DERIVATIVE = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0], dtype=np.float32) / 60.0
-DERIVATIVE_REACH = 3
+_WARP = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
 # Twist of which nothing is known: m/s and rad/s of a brisk flight.
 _UNKNOWN = np.diag([1.5, 1.5, 1.5, 1.5, 1.5, 1.5]) ** 2
 # How much it changes within a second: 5 m/s^2 and 10 rad/s^2 sustained for a frame.
 _CHANGE_PER_S = np.diag([5.0, 5.0, 5.0, 10.0, 10.0, 10.0]) ** 2
 _STALE_S = 0.15
+# How much of the past is taken out of the image, in time constants, and its weight.
+_MEMORY = 0.75
+_FORGOTTEN = math.exp(-_MEMORY)
+_GAIN = 1.0 / (1.0 - _FORGOTTEN)
+#: What is left of the smear: its mean, and its standard deviation about that, as shares of the whole.
+REMAINING = 1.0 - _MEMORY * _FORGOTTEN * _GAIN
+SPREAD = math.sqrt(1.0 - _MEMORY**2 * _FORGOTTEN * _GAIN**2)
+# How far the time constant may be off, and the displacement of an edge by a response that is no exponential: a share of
+# the smear, and one that grows with the cells that the smear covers.
+_LAG_UNSURE = 0.35
+_FORM_UNSURE, _FORM_UNSURE_IN_CELLS = 0.008, 0.010
 # No camera that sees markers moves faster: such odometry tells nothing [m/s, rad/s].
 _FASTEST, _FASTEST_TURN = 20.0, 30.0
 
@@ -73,8 +88,7 @@ class MotionTracker:
         """Twist expected at a frame; None when nothing is known."""
         if odometry is not None and 0.0 <= abs(stamp_ns - odometry.stamp_ns) * 1e-9 < _STALE_S:
             twist = camera_twist(odometry, self._T_body_camera)
-            if _plausible(twist):
-                return Twist(twist.value, twist.covariance + self._drift(stamp_ns, odometry.stamp_ns))
+            return Twist(twist.value, twist.covariance + self._drift(stamp_ns, odometry.stamp_ns))
         if self._twist is None or self._stamp_ns is None or not 0 < stamp_ns - self._stamp_ns < _STALE_S * 1e9:
             return None
         return Twist(self._twist.value, self._twist.covariance + self._drift(stamp_ns, self._stamp_ns))
@@ -115,15 +129,33 @@ class MotionTracker:
         return _CHANGE_PER_S * ((stamp_ns - since_ns) * 1e-9) ** 2
 
 
-def _plausible(twist: Twist) -> bool:
-    speed, turn = np.linalg.norm(twist.value[:3]), np.linalg.norm(twist.value[3:])
-    return bool(speed <= _FASTEST and turn <= _FASTEST_TURN and np.all(np.isfinite(twist.covariance)))
+def plausible(odometry: Odometry) -> bool:
+    """Whether a camera that sees markers may move so: anything else tells nothing."""
+    speed, turn = np.linalg.norm(odometry.velocity_body), np.linalg.norm(odometry.angular_velocity_body)
+    finite = np.isfinite(odometry.T_map_body).all() and np.isfinite(odometry.twist_covariance).all()
+    return bool(speed <= _FASTEST and turn <= _FASTEST_TURN and finite)
 
 
 def smear(camera: Camera, x: FloatArray, depth: FloatArray, twist: Twist, tau: float) -> tuple[FloatArray, FloatArray]:
     """Mean displacement by lag (..., 2) [px] at normalised points (..., 2), and its covariance (..., 2, 2)."""
     A = -tau * camera.distort_jacobian(x) @ interaction(x, depth)
     return np.asarray(A @ twist.value), A @ twist.covariance @ np.swapaxes(A, -1, -2)
+
+
+def model_error(smear_px: FloatArray, cell_px: FloatArray) -> FloatArray:
+    """Covariances (N, 4, 2, 2) [px^2] of what is wrong with an exponential lag of this time constant.
+
+    A wrong time constant displaces the corners along their smear (N, 4, 2). What they have in common no marker can
+    tell, and covariances of single corners cannot say; it is a delay, and belongs to the filter's time offset. The
+    differences change the marker's shape. So does a response of another form, and the more the farther it carries the
+    neighbouring edges, one cell (N,) away, into one another.
+    """
+    common = smear_px.mean(axis=1)
+    change = _LAG_UNSURE * (smear_px - common[:, None])
+    square = np.sum(common**2, axis=1)
+    form = (_FORM_UNSURE**2 + (_FORM_UNSURE_IN_CELLS / cell_px) ** 2 * square)[:, None, None]
+    along = common[:, :, None] * common[:, None, :] + square[:, None, None] * np.eye(2)
+    return np.asarray(change[..., :, None] * change[..., None, :] + 0.5 * (form * along)[:, None])
 
 
 def without_lag(image: Float32Array, smear_u: Float32Array, smear_v: Float32Array) -> Float32Array:
@@ -133,10 +165,10 @@ def without_lag(image: Float32Array, smear_u: Float32Array, smear_v: Float32Arra
     return np.asarray(image + smear_u * du + smear_v * dv)
 
 
-def markers_without_lag(
+def markers_sharpened(
     image: Float32Array, corners_px: FloatArray, smear_px: FloatArray, margin_px: int
 ) -> Float32Array:
-    """``image`` with the windows round N markers (corners (N, 4, 2), smear (N, 4, 2) [px]) freed of lag."""
+    """``image`` with the windows round N markers (corners (N, 4, 2), smear (N, 4, 2) [px]) freed of old memories."""
     result = image.copy()
     height, width = image.shape
     finite = np.isfinite(corners_px).all(axis=(1, 2)) & np.isfinite(smear_px).all(axis=(1, 2))
@@ -147,17 +179,12 @@ def markers_without_lag(
     low, high = np.maximum(low, 0), np.minimum(high, (width, height))
     seen = (low < high).all(axis=1)
     low, high, affine = low[seen], high[seen], affine[seen]
-    for (u0, v0), (u1, v1), map_uv in zip(low.tolist(), high.tolist(), affine.astype(np.float32), strict=True):
-        # The derivative at the window's rim looks outside, where there is image.
-        outer = np.s_[max(v0 - 3, 0) : v1 + 3, max(u0 - 3, 0) : u1 + 3]
-        inner = np.s_[v0 - outer[0].start : v1 - outer[0].start, u0 - outer[1].start : u1 - outer[1].start]
-        u, v = np.arange(u0, u1, dtype=np.float32), np.arange(v0, v1, dtype=np.float32)[:, None]
-        window = image[outer]
-        du = cv2.filter2D(window, cv2.CV_32F, _DERIVATIVE[None, :])[inner]
-        dv = cv2.filter2D(window, cv2.CV_32F, _DERIVATIVE[:, None])[inner]
-        su = map_uv[0, 0] * u + map_uv[1, 0] * v + map_uv[2, 0]
-        sv = map_uv[0, 1] * u + map_uv[1, 1] * v + map_uv[2, 1]
-        result[v0:v1, u0:u1] += su * du + sv * dv
+    # Where the memory of a pixel lies: what it saw earlier, the scene now has farther on.
+    to_memory = (-_MEMORY * np.swapaxes(affine, -1, -2) + np.eye(2, 3)).astype(np.float32)
+    to_memory[:, :, 2:] += to_memory[:, :, :2] @ low[..., None].astype(np.float32)
+    for (u0, v0), (u1, v1), inverse in zip(low.tolist(), high.tolist(), to_memory, strict=True):
+        memory = cv2.warpAffine(image, inverse, (u1 - u0, v1 - v0), flags=_WARP, borderMode=cv2.BORDER_REPLICATE)
+        cv2.addWeighted(image[v0:v1, u0:u1], _GAIN, memory, 1.0 - _GAIN, 0.0, dst=result[v0:v1, u0:u1])
     return result
 
 
