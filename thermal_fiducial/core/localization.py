@@ -36,6 +36,8 @@ SAME_POSE = np.deg2rad(2.0)
 WIDE = np.deg2rad(25.0)
 # Re-projection error at which a hypothesis stops getting worse [px]: single-marker poses are rough.
 _HYPOTHESIS_PX = 3.0
+# Markers that propose hypotheses: with many in view the largest are precise enough, and the rest only votes.
+_PROPOSERS = 8
 
 
 @dataclass(frozen=True)
@@ -195,9 +197,10 @@ def positive(covariances: FloatArray) -> FloatArray:
 
 
 def _hypotheses(sight: Sight, points: FloatArray, camera: Camera, prior: FloatArray | None) -> FloatArray:
-    """Camera poses (H, 4, 4) from either branch of every single marker and from the prior, the best first."""
-    branches = sight.branches.reshape(-1, 4, 4)
-    poses = np.repeat(sight.T_map_marker, 2, axis=0) @ inverse(branches)
+    """Camera poses (H, 4, 4) from either branch of each of the largest markers and from the prior, the best first."""
+    largest = np.argsort(-np.sum(np.ptp(sight.corners, axis=1), axis=-1), kind='stable')[:_PROPOSERS]
+    branches = sight.branches[largest].reshape(-1, 4, 4)
+    poses = np.repeat(sight.T_map_marker[largest], 2, axis=0) @ inverse(branches)
     poses = poses[np.all(np.isfinite(poses), axis=(1, 2))]
     if prior is not None:
         poses = np.concatenate([poses, prior[None]])

@@ -20,7 +20,15 @@ from thermal_fiducial.core.localization import locate, Location, positive, Refus
 from thermal_fiducial.core.map_data import MapJump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.map_editing import align
 from thermal_fiducial.core.map_refinement import prior_poses, refine, Refinement, Snapshot
-from thermal_fiducial.core.measurements import CameraPose, columns, corner_covariances, corners_px, Markers, Odometry
+from thermal_fiducial.core.measurements import (
+    CameraPose,
+    columns,
+    CORNER_COVARIANCE_FIELDS,
+    corner_covariances,
+    corners_px,
+    Markers,
+    Odometry,
+)
 from thermal_fiducial.core.noise_level import NoiseLevel
 from thermal_fiducial.core.reprojection import corners_in_map, linearise, reproject
 from thermal_fiducial.core.trust import culprits, DISAGREEMENT, Trust
@@ -402,7 +410,8 @@ def _usable(markers: Markers) -> Markers:
     ids, counts = np.unique(markers['id'], return_counts=True)
     twice = np.isin(markers['id'], ids[counts > 1])
     finite = np.all(np.isfinite(corners_px(markers)), axis=(1, 2))
-    sound = np.all(np.linalg.eigvalsh(np.nan_to_num(corner_covariances(markers))) > 0.0, axis=(1, 2))
+    uu, uv, vv = np.moveaxis(columns(markers, CORNER_COVARIANCE_FIELDS).reshape(-1, 4, 3), -1, 0)
+    sound = np.all((uu > 0.0) & (uu * vv > uv * uv), axis=1)
     return np.asarray(markers[~twice & finite & sound])
 
 

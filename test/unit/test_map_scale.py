@@ -1,0 +1,78 @@
+"""Maps of many markers and mapping for hours: what a frame costs, and what is kept."""
+
+import pickle
+import sys
+
+import numpy as np
+from support.crowds import crowd, frames, mapped, SIZE
+from support.walls import CAMERA, FRAME_NS, look, see, stamp, wall
+
+from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.geometry import transform
+from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.marker_map import MarkerMapper
+from thermal_fiducial.core.measurements import Odometry
+
+
+def calls_a_frame(marker_map, seen):
+    """Function calls, of Python and of C, that the last of some frames takes: time without the machine's moods."""
+    m = MarkerMapper(MarkerMapperConfig(marker_size=SIZE), marker_map)
+    for k, rows in enumerate(seen[:-1]):
+        m.process(stamp(k), rows, CAMERA)
+    count = 0
+
+    def profile(frame, event, argument):
+        nonlocal count
+        count += event in ('call', 'c_call')
+
+    sys.setprofile(profile)
+    try:
+        result = m.process(stamp(len(seen)), seen[-1], CAMERA)
+    finally:
+        sys.setprofile(None)
+    assert result.pose is not None
+    return count
+
+
+def test_twenty_of_a_thousand_take_hardly_more_work_than_ten_of_ten():
+    ten, twenty = crowd(10), crowd(20)
+    small = calls_a_frame(mapped(ten, 10), frames(ten, 8))
+    assert calls_a_frame(mapped(twenty, 1000), frames(twenty, 8)) <= 1.2 * small
+    # The rest of the map costs nothing at all.
+    assert calls_a_frame(mapped(ten, 1000), frames(ten, 8)) == small
+
+
+def endless_flight(count):
+    """Frames past a wall and past markers that never settle, with gaps that the odometry spans."""
+    rng = np.random.default_rng(0)
+    poses = wall(rng, 4)
+    far = {i: transform(np.eye(3), [0.0, 0.0, 20.0]) @ T for i, T in wall(rng, 4).items()}
+    for k in range(count):
+        t = k * FRAME_NS * 1e-9
+        T = look([-3.0 + 0.5 * np.sin(1.1 * t), np.sin(0.9 * t), 1.5 + 0.4 * np.sin(1.3 * t)], [0.0, 0.0, 1.5])
+        zero = np.zeros(3)
+        odometry = Odometry(stamp(k), T, zero, zero, 1e-6 * np.eye(6), 1e-4 * np.eye(6))
+        if k % 50 > 44:
+            # Markers far off, from hardly more than one direction: their ambiguity is never settled.
+            key = 10 + k // 50 % 5
+            T = look([-6.0, 0.1 * np.sin(t), 21.5], far[1][:3, 3])
+            yield k, see(T, {key: far[1]}, 0.5, rng, size=0.1), odometry
+        else:
+            yield k, see(T, poses, 0.05, rng), odometry
+
+
+def test_memory_does_not_grow_once_the_budget_is_used_up():
+    start = MarkerMap({0: MapMarker(0, 0.3, True, wall(np.random.default_rng(0), 4)[0])})
+    config = MarkerMapperConfig(keyframe_budget=60, camera_orientation=(0.0, 0.0, 0.0, 1.0))
+    m = MarkerMapper(config, start)
+    held = []
+    for k, rows, odometry in endless_flight(3001):
+        m.process(stamp(k), rows, CAMERA, odometry)
+        if k % 500 == 0 and k:
+            held.append(len(pickle.dumps(m)))
+    assert len(m.map.markers) == 4
+    assert sorted(m.candidates) == [10, 11, 12, 13, 14]
+    assert len(m.snapshot().keyframes) <= 60 + 2 * 5
+    # All that it holds, as bytes, every 500 frames. After 2000 of them the doubtful markers have shown all views that
+    # are kept; then only keyframes of more and of fewer markers (2 kB each) come and go.
+    assert max(held[4:]) < 1.05 * held[3]
