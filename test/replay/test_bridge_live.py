@@ -1,0 +1,119 @@
+"""``check-bridge`` beside a running ``pose_ekf``: what leaves for a flight controller, checked as it would be on a robot.
+
+The drone stands still for a second, then flies and turns; data come in real time, stamped by this clock.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
+import pytest
+from rclpy.context import Context
+from sensor_msgs.msg import Imu
+from support.flights import CAMERA_ORIENTATION, CAMERA_POSITION, Flight, Motion, START_NS, timeline
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.replay.domain import own_domain
+from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.node import CountingNode
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+STILL, SECONDS = 1.0, 5.0
+#: Amplitude, frequency [rad/s], phase: 1 - cos, which starts at rest.
+REST_THEN = np.array([[(1.0, 0.0, np.pi / 2), (1.0, 1.5, -np.pi / 2)]])
+
+
+class FromRest(Motion):
+    """Still at first."""
+
+    def pose(self, t):
+        return super().pose(np.maximum(np.asarray(t) - STILL, 0.0))
+
+    def velocity(self, t):
+        return np.where(np.asarray(t)[..., None] < STILL, 0.0, super().velocity(np.asarray(t) - STILL))
+
+    def imu(self, t):
+        moving = super().imu(np.asarray(t) - STILL)
+        return np.where(np.asarray(t)[..., None] < STILL, Motion.still().imu(t), moving)
+
+
+def flight():
+    amplitudes = np.array([[0.4, 0.5, 0.2], [0.1, 0.1, 0.5]])[..., None, None] * [1.0, 0.0, 0.0] + [0.0, 1.0, 1.0]
+    position, rotation = REST_THEN * amplitudes
+    return Flight(seed=3, seconds=SECONDS, motion=FromRest(position, rotation))
+
+
+def message(item, start_ns):
+    head = convert.header(item.stamp_ns - START_NS + start_ns, 'base_link')
+    if not isinstance(item, ImuSample):
+        return convert.pose_with_covariance(item.T_map_camera, item.covariance, head)
+    return Imu(
+        header=head,
+        angular_velocity=convert.vector(item.angular_velocity),
+        linear_acceleration=convert.vector(item.linear_acceleration),
+    )
+
+
+def fly(data, domain, begun):
+    """Publish the flight, each message when it is due."""
+    context = Context()
+    context.init(args=[], domain_id=domain)
+    node = CountingNode('drone', context=context)
+    outputs = {
+        ImuSample: node.advertise(Imu, 'imu/data', qos.IMU_RATE_RESULT),
+        None: node.advertise(PoseWithCovarianceStamped, 'camera_pose'),
+    }
+    while not all(output.listeners for output in outputs.values()):
+        time.sleep(0.02)
+    begun.set()
+    start_ns = time.time_ns()
+    for item in timeline(data.samples(), data.poses, 0.03):
+        late = 0 if isinstance(item, ImuSample) else 30_000_000
+        wait = item.stamp_ns - START_NS + start_ns + late - time.time_ns()
+        time.sleep(max(wait * 1e-9, 0.0))
+        outputs[ImuSample if isinstance(item, ImuSample) else None].send(message(item, start_ns))
+    node.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.fixture
+def flying(monkeypatch):
+    """A filter in a process of its own that gets a flight."""
+    with own_domain() as domain:
+        monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+        parameters = {
+            'camera_position': list(CAMERA_POSITION),
+            'camera_orientation': list(CAMERA_ORIENTATION),
+            'bridge_rate': 40.0,
+        }
+        arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+        command = [sys.executable, '-m', 'thermal_fiducial.nodes.pose_ekf', '--ros-args', *arguments]
+        node = subprocess.Popen(command, env=os.environ, stderr=subprocess.DEVNULL)
+        begun = threading.Event()
+        drone = threading.Thread(target=fly, args=(flight(), domain, begun), daemon=True)
+        drone.start()
+        assert begun.wait(30.0)
+        yield
+        drone.join()
+        node.terminate()
+        node.wait(10.0)
+
+
+def test_the_filter_as_a_flight_controller_sees_it(flying, capfd):
+    status = main(['check-bridge', '--seconds', str(SECONDS - 0.5), '--json'])
+    printed = capfd.readouterr().out
+    findings = {finding['check']: finding for finding in json.loads(printed[printed.index('[') :])}
+    levels = {name: finding['level'] for name, finding in findings.items()}
+    # a machine that tests keep busy may deliver late; all else is the same on any
+    assert {levels.pop(name) for name in ('rate', 'age', 'jumps')} <= {'ok', 'warning'}
+    assert levels == dict.fromkeys(
+        ('values', 'stamps', 'frame names', 'gravity', 'yaw', 'velocity', 'covariance'), 'ok'
+    )
+    assert status == 0
