@@ -1,4 +1,4 @@
-"""``check-bridge`` beside a running ``pose_ekf``: what leaves for a flight controller, checked as it would be on a robot.
+"""``check-bridge`` beside a running ``pose_ekf``: what leaves for a flight controller, checked as on a robot.
 
 The drone stands still for a second, then flies and turns; data come in real time, stamped by this clock.
 """
