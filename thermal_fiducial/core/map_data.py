@@ -65,7 +65,8 @@ class MarkerMap:
         T = np.stack([marker.T_map_marker for marker in markers])
         _fill(rows, 'xyz', T[:, :3, 3])
         _fill(rows, ('qx', 'qy', 'qz', 'qw'), quaternion_from_rotation(T[:, :3, :3]))
-        rows['sigma_m'] = [np.sqrt(max(np.trace(marker.covariance[:3, :3]) / 3.0, 0.0)) for marker in markers]
+        variances = np.stack([marker.covariance for marker in markers])[:, [0, 1, 2], [0, 1, 2]]
+        rows['sigma_m'] = np.sqrt(np.maximum(np.mean(variances, axis=1), 0.0))
         rows['rms_px'] = [marker.reprojection_error_px for marker in markers]
         for name in ('id', 'size', 'observations', 'fixed', 'trusted'):
             rows[name] = [getattr(marker, name) for marker in markers]

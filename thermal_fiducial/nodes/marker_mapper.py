@@ -1,6 +1,7 @@
 """Node ``marker_mapper``: markers to the camera's pose in the map, and the map itself."""
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 import sys
 from typing import Any
@@ -8,7 +9,6 @@ from typing import Any
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 import numpy as np
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
@@ -31,6 +31,14 @@ _CLOUD_POINTS = 60_000
 _XYZ = np.dtype([(axis, '<f4') for axis in 'xyz'])
 
 
+@dataclass(frozen=True)
+class _Drawing:
+    """What RViz has been shown, and how many it was."""
+
+    in_view: frozenset[int]
+    listeners: int
+
+
 class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     """Algorithm 1 of the paper behind topics and services; saves the map on request and on shutdown."""
 
@@ -42,7 +50,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._save_path = self._choose_save_path()
         self._refiner = self._make_refiner()
         self._result = MapperResult(0, None, 'no markers yet')
-        self._shown_in_view: frozenset[int] = frozenset()
+        self._drawn: _Drawing | None = None
         self._camera_pose = self.advertise(PoseWithCovarianceStamped, 'camera_pose')
         self._marker_map = self.advertise(PointCloud2, 'marker_map', qos.LATCHED)
         self._map_markers = self.advertise(MarkerArray, 'marker_map/markers', qos.LATCHED)
@@ -57,6 +65,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self.create_service(Trigger, '~/refine', self._on_refine)
         self.create_service(SetBool, '~/freeze', self._on_freeze)
         self._publish_map()
+        self._draw_map()
         self.attempt(self._publish_cloud, None)
 
     def _load_map(self) -> MarkerMap:
@@ -117,20 +126,28 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
 
     def _publish_map(self) -> None:
         rows = self.mapper.map.rows(self._result.in_view)
-        head = convert.header(self._result.stamp_ns, self.config.map_frame)
-        self._marker_map.send(convert.cloud(rows, head))
-        self._show_map(rows, head)
+        self._marker_map.send(convert.cloud(rows, convert.header(self._result.stamp_ns, self.config.map_frame)))
+        self._drawn = None
 
-    def _show_map(self, rows: np.ndarray, head: Header) -> None:
-        self._map_markers.send(display.map_markers(rows, head))
-        self._shown_in_view = self._result.in_view
+    def _draw_map(self) -> None:
+        """The markers for RViz: all when they have changed or someone new looks on, else those of another colour."""
+        now = _Drawing(self._result.in_view, self._map_markers.listeners)
+        whole = self._drawn is None or now.listeners > self._drawn.listeners
+        recoloured = now.in_view if self._drawn is None else now.in_view ^ self._drawn.in_view
+        if whole or recoloured:
+            rows = self.mapper.map.rows(now.in_view)
+            head = convert.header(self._result.stamp_ns, self.config.map_frame)
+            shown = rows if whole else rows[np.isin(rows['id'], list(recoloured))]
+            self._map_markers.send(display.map_markers(shown, head, whole=whole))
+        self._drawn = now
 
     def diagnose(self, stamp_ns: int) -> None:
-        """Publish the diagnostics; colour the markers anew where others are in view."""
+        """Publish the diagnostics, and draw the map: once a second, as a thousand markers take a while."""
         super().diagnose(stamp_ns)
-        if self._result.in_view != self._shown_in_view:
-            head = convert.header(self._result.stamp_ns, self.config.map_frame)
-            self._show_map(self.mapper.map.rows(self._result.in_view), head)
+        if self._map_markers.listeners:
+            self._draw_map()
+        else:
+            self._drawn = None
 
     def _publish_cloud(self) -> None:
         """The point cloud of the place, in the frame of the map, once: for RViz beside the markers."""

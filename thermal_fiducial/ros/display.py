@@ -19,9 +19,12 @@ _BGR_EDGE = (0, 0, 255)
 _BGR_FIRST_CORNER = (0, 255, 255)
 
 
-def map_markers(rows: 'np.ndarray[Any, np.dtype[Any]]', head: Header) -> MarkerArray:
-    """Plates and IDs of the rows (N,) of a marker map: in view red, out of view green, distrusted grey."""
-    array = MarkerArray(markers=[Marker(header=head, action=Marker.DELETEALL)])
+def map_markers(rows: 'np.ndarray[Any, np.dtype[Any]]', head: Header, *, whole: bool = True) -> MarkerArray:
+    """Plates and IDs of the rows (N,) of a marker map: in view red, out of view green, distrusted grey.
+
+    ``whole``: these are all, others disappear; else they are drawn over what is there.
+    """
+    array = MarkerArray(markers=[Marker(header=head, action=Marker.DELETEALL)] if whole else [])
     for row in rows:
         array.markers += [_plate(row, head), _label(row, head)]
     return array

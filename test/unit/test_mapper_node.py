@@ -1,4 +1,4 @@
-"""Node ``marker_mapper`` and its files: edits taken over in flight, history, the point cloud of the place."""
+"""Node ``marker_mapper``: edits taken over in flight, history, what RViz is shown."""
 
 from geometry_msgs.msg import TransformStamped
 import numpy as np
@@ -8,10 +8,13 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from support import small_bag
 from support.ros_graph import ros_graph
+from visualization_msgs.msg import Marker, MarkerArray
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry import apply, so3_exp, transform
+from thermal_fiducial.core.map_data import MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.files.map_history import entries
+from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.files.point_cloud import save_alignment
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.ros import convert, qos
@@ -88,3 +91,29 @@ def test_a_cloud_that_cannot_be_read_is_a_fault(graph, tmp_path, map_file):
     level, reason, _ = graph.diagnose(node)
     assert level == ERROR
     assert 'none.ply' in reason
+
+
+def test_all_markers_are_drawn_once_and_then_those_that_change_colour(graph, tmp_path):
+    path = tmp_path / 'map.yaml'
+    save_map(path, MarkerMap({i: MapMarker(i, 0.3, True, transform(np.eye(3), [i, 0.0, 0.0])) for i in range(3)}))
+    node = graph.add(MarkerMapperNode, map_file=str(path))
+    graph.listen(MarkerArray, 'marker_map/markers', qos.LATCHED)
+    heard = graph.heard['marker_map/markers']
+    graph.spin_until(lambda: heard and node._map_markers.listeners == 1)
+    graph.diagnose(node)
+    graph.spin_until(lambda: len(heard) == 2)
+    plates = [[m.id for m in message.markers if m.ns == 'plates'] for message in heard]
+    assert plates[-1] == [0, 1, 2]
+    assert heard[-1].markers[0].action == Marker.DELETEALL
+    node._result = MapperResult(1, None, '', residuals_px={1: 0.1})
+    graph.diagnose(node)
+    graph.spin_until(lambda: len(heard) == 3)
+    assert [(m.ns, m.id, m.action, m.color.r > 0.5) for m in heard[2].markers if m.ns == 'plates'] == [
+        ('plates', 1, Marker.ADD, True)
+    ]
+    # Nothing has changed: nothing is drawn. Another map: all of it is.
+    graph.diagnose(node)
+    assert graph.call(Trigger, 'marker_mapper/reset', Trigger.Request()).success
+    graph.diagnose(node)
+    graph.spin_until(lambda: len(heard) == 4)
+    assert len(heard[3].markers) == 7
