@@ -202,6 +202,23 @@ def test_without_a_link_the_other_side_of_a_gap_is_left_alone():
     assert refine(replace(s, keyframes=())) is None
 
 
+def test_what_has_lost_its_connection_stays_and_the_rest_is_adjusted():
+    """Thinned keyframes may no longer join a part of the map to the rest."""
+    rng = np.random.default_rng(12)
+    poses = wall(rng)
+    s = snapshot(rng, poses, count=12)
+    halves = []
+    for k, f in enumerate(s.keyframes):
+        own = (f.ids < 4) == (k % 2 == 0)
+        halves.append(replace(f, ids=f.ids[own], corners=f.corners[own], covariances=f.covariances[own],
+                              cameras=f.cameras[own]))  # fmt: skip
+    refinement = refine(replace(s, keyframes=tuple(halves)))
+    assert sorted(refinement.markers) == [1, 2, 3]
+    for i, marker in refinement.markers.items():
+        assert np.linalg.norm(difference(marker.T_map_marker, poses[i])[:3]) < 5e-3
+        assert np.trace(marker.covariance[:3, :3]) < 1e-4
+
+
 def test_two_cameras_of_a_rig_are_one():
     rng = np.random.default_rng(9)
     poses = wall(rng)

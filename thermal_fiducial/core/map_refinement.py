@@ -160,6 +160,7 @@ class _Problem:
     @classmethod
     def build(cls, snapshot: Snapshot) -> '_Problem | None':
         frames, links = _useful(snapshot)
+        frames, links = _anchored(snapshot, frames, links)
         seen = sorted({int(key) for frame in frames for key in frame.ids if int(key) in snapshot.markers})
         markers = [snapshot.markers[key] for key in seen]
         held = _gauge(markers)
@@ -310,6 +311,28 @@ def _useful(snapshot: Snapshot) -> tuple[list[Keyframe], list[Link]]:
             frames.append(frame)
     kept = {frame.stamp_ns for frame in frames}
     return frames, [link for link in links if {link.stamp_a_ns, link.stamp_b_ns} <= kept]
+
+
+def _anchored(snapshot: Snapshot, frames: list[Keyframe], links: list[Link]) -> tuple[list[Keyframe], list[Link]]:
+    """Keyframes that hang together with a marker that is held: what has lost its connection stays where it is."""
+    seen = {frame.stamp_ns: {int(key) for key in frame.ids} & snapshot.markers.keys() for frame in frames}
+    markers = [snapshot.markers[key] for key in sorted(set().union(*seen.values()))]
+    reached = {
+        marker.id for marker, held in zip(markers, _gauge(markers), strict=True) if held
+    } | snapshot.priors.keys()
+    stamps: set[int] = set()
+    before = -1
+    while len(stamps) > before:
+        before = len(stamps)
+        stamps |= {stamp for stamp, ids in seen.items() if ids & reached}
+        for link in links:
+            if {link.stamp_a_ns, link.stamp_b_ns} & stamps:
+                stamps |= {link.stamp_a_ns, link.stamp_b_ns}
+        reached |= set().union(*(seen[stamp] for stamp in stamps))
+    return (
+        [frame for frame in frames if frame.stamp_ns in stamps],
+        [link for link in links if link.stamp_a_ns in stamps],
+    )
 
 
 def _gauge(markers: list[MapMarker]) -> BoolArray:
