@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.core.patterns import correctable_bits, marker_bits
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary, save_dictionary
 
@@ -20,6 +20,15 @@ def test_bits_are_what_opencv_draws(name):
     for marker_id in (0, 3, len(bits) - 1):
         drawn = cv2.aruco.generateImageMarker(dictionary, marker_id, 4 * cells)[2::4, 2::4] > 0
         np.testing.assert_array_equal(bits[marker_id], drawn[1:-1, 1:-1])
+
+
+@pytest.mark.parametrize(
+    ('name', 'count'), [('DICT_4X4_50', 1), ('DICT_4X4_1000', 0), ('DICT_5X5_1000', 2), ('DICT_APRILTAG_36h11', 5)]
+)
+def test_correctable_bits_are_those_of_the_hamming_distance(name, count):
+    """As the dictionaries were published; what OpenCV says of them depends on its version."""
+    dictionary = load_dictionary(name)
+    assert dictionary.maxCorrectionBits == correctable_bits(marker_bits(dictionary)) == count
 
 
 @pytest.mark.parametrize('name', NAMES)

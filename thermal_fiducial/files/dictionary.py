@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import yaml
 
-from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.core.patterns import correctable_bits, marker_bits
 from thermal_fiducial.errors import InputError
 
 FORMAT = 'thermal_fiducial/dictionary'
@@ -38,7 +38,10 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> cv2.aruco.Dictionar
     name = str(name_or_path)
     predefined = getattr(cv2.aruco, name, None) if name.startswith('DICT_') else None
     if predefined is not None:
-        return cv2.aruco.getPredefinedDictionary(predefined)
+        dictionary = cv2.aruco.getPredefinedDictionary(predefined)
+        # OpenCV 4 knows of no bit that the AprilTag families could correct.
+        dictionary.maxCorrectionBits = max(dictionary.maxCorrectionBits, correctable_bits(marker_bits(dictionary)))
+        return dictionary
     packaged = PACKAGED / f'{name}.yaml'
     path = packaged if '/' not in name and packaged.is_file() else Path(name)
     try:
