@@ -12,23 +12,17 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
+from thermal_fiducial.core.bridging import camera_pose, growth, link, predict
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.candidates import Candidate, View, Viewpoint
-from thermal_fiducial.core.geometry import inverse, skew, so3_exp, transform, transform_from_quaternion
-from thermal_fiducial.core.keyframes import Keyframe, KeyframeStore, Link, Rig
+from thermal_fiducial.core.geometry import transform_from_quaternion
+from thermal_fiducial.core.keyframes import Keyframe, KeyframeStore, Rig
 from thermal_fiducial.core.localization import locate, Location, positive, Refusal, Sight
 from thermal_fiducial.core.map_data import MapJump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.map_editing import align
 from thermal_fiducial.core.map_refinement import prior_poses, refine, Refinement, Snapshot
-from thermal_fiducial.core.measurements import (
-    CameraPose,
-    columns,
-    CORNER_COVARIANCE_FIELDS,
-    corner_covariances,
-    corners_px,
-    Markers,
-    Odometry,
-)
+from thermal_fiducial.core.map_rows import marker_poses, usable
+from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers, Odometry
 from thermal_fiducial.core.noise_level import NoiseLevel
 from thermal_fiducial.core.reprojection import corners_in_map, linearise, reproject
 from thermal_fiducial.core.trust import culprits, DISAGREEMENT, Trust
@@ -110,7 +104,7 @@ class MarkerMapper:
         camera : its intrinsics
         odometry : the filter's latest output; settles ambiguities, and bridges gaps between known markers
         """
-        markers = _usable(markers)
+        markers = usable(markers)
         self._noise.add(markers)
         # Step 2: known and new markers.
         is_known = np.array([int(key) in self.map.markers for key in markers['id']], dtype=bool)
@@ -157,7 +151,7 @@ class MarkerMapper:
         return None
 
     def _sight(self, rows: Markers) -> Sight:
-        branches = np.stack([_poses(rows, ''), _poses(rows, 'a')], axis=1)
+        branches = np.stack([marker_poses(rows, ''), marker_poses(rows, 'a')], axis=1)
         known = [self.map.markers[int(key)] for key in rows['id'] if int(key) in self.map.markers]
         return Sight(known, corners_px(rows), self._noise.factor * corner_covariances(rows), branches)
 
@@ -198,7 +192,7 @@ class MarkerMapper:
         self, stamp_ns: int, rows: Markers, camera: Camera, viewpoint: Viewpoint
     ) -> tuple[bool, dict[int, str]]:
         """Show new markers to their candidates; whether any entered the map, and what the others wait for."""
-        branches = np.stack([_poses(rows, ''), _poses(rows, 'a')], axis=1)
+        branches = np.stack([marker_poses(rows, ''), marker_poses(rows, 'a')], axis=1)
         corners, covariances = corners_px(rows), self._noise.factor * corner_covariances(rows)
         shown = []
         for i, marker_id in enumerate(int(key) for key in rows['id']):
@@ -248,27 +242,21 @@ class MarkerMapper:
 
     def _bridge(self, stamp_ns: int, rows: Markers, camera: Camera, odometry: Odometry) -> tuple[bool, dict[int, str]]:
         """Place new markers from the odometry while no known one is in view."""
-        pose = self._from_odometry(stamp_ns, odometry)
+        pose = camera_pose(odometry, stamp_ns, self._T_body_camera)
         frame = _keyframe(rows, pose, self._camera_index(camera))
         if not any(int(key) in self._candidates for key in rows['id']):
             # Nothing but the odometry joins these markers to the map. Once is enough: its error is the same for all
             # that follow, which hang together through the markers themselves.
             self._keyframes.add(self._last_frame)
-            self._keyframes.links.append(_link(self._last_frame, frame, pose.covariance))
+            self._keyframes.links.append(link(self._last_frame, frame, pose.covariance))
             self._keyframes.add(frame)
         elif len(rows) >= 2:
             self._keyframes.add(frame)
         if self._gap is None:
             self._gap = pose
         # What the odometry had gathered when the gap's first marker came is the same for all its views.
-        viewpoint = Viewpoint.known(pose.T_map_camera, _growth(self._gap, pose, odometry))
+        viewpoint = Viewpoint.known(pose.T_map_camera, growth(self._gap, pose, odometry))
         return self._place_new(stamp_ns, rows, camera, replace(viewpoint, common=self._gap.covariance))
-
-    def _from_odometry(self, stamp_ns: int, odometry: Odometry) -> CameraPose:
-        T_map_body = predict(odometry, stamp_ns)
-        A = np.eye(6)
-        A[:3, 3:] = -skew(T_map_body[:3, :3] @ self._T_body_camera[:3, 3])
-        return CameraPose(stamp_ns, T_map_body @ self._T_body_camera, A @ odometry.pose_covariance @ A.T)
 
     def refinement_due(self, stamp_ns: int) -> bool:
         """Whether enough has been seen since the last joint refinement for another to be worth its time."""
@@ -364,25 +352,6 @@ class MarkerMapper:
         )
 
 
-def predict(odometry: Odometry, stamp_ns: int) -> FloatArray:
-    """T_map_body (4, 4) at ``stamp_ns``, velocities constant since the odometry."""
-    dt = (stamp_ns - odometry.stamp_ns) * 1e-9
-    step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
-    return np.asarray(odometry.T_map_body @ step, dtype=np.float64)
-
-
-def _growth(first: CameraPose, pose: CameraPose, odometry: Odometry) -> FloatArray:
-    """Covariance (6, 6) of the odometry from ``first`` to ``pose``, from either of two bounds, whichever is closer.
-
-    Errors of odometry that grow add up like independent ones at most as the difference of the covariances says; and a
-    displacement is off by no more than the speed is, all the time.
-    """
-    seconds = (pose.stamp_ns - first.stamp_ns) * 1e-9
-    turn = np.kron(np.eye(2), odometry.T_map_body[:3, :3]) * seconds
-    bounds = positive(pose.covariance - first.covariance), turn @ odometry.twist_covariance @ turn.T
-    return min(bounds, key=lambda covariance: float(np.trace(covariance)))
-
-
 def _viewpoint(location: Location) -> Viewpoint:
     known = Viewpoint.known(location.T_map_camera, location.relative_covariance)
     return replace(known, common=positive(location.covariance - location.relative_covariance))
@@ -397,29 +366,6 @@ def _keyframe(rows: Markers, pose: CameraPose, camera: int) -> Keyframe:
         corner_covariances(rows),
         np.full(len(rows), camera),
     )
-
-
-def _link(a: Keyframe, b: Keyframe, covariance: FloatArray) -> Link:
-    """Odometry from ``a``, whose pose is known, to ``b``, whose pose in the map has ``covariance``."""
-    rotation = np.kron(np.eye(2), a.T_map_rig[:3, :3].T)
-    return Link(a.stamp_ns, b.stamp_ns, inverse(a.T_map_rig) @ b.T_map_rig, rotation @ covariance @ rotation.T)
-
-
-def _usable(markers: Markers) -> Markers:
-    """Rows with finite corners and covariances whose ID is there once: of two alike, nobody knows which is which."""
-    ids, counts = np.unique(markers['id'], return_counts=True)
-    twice = np.isin(markers['id'], ids[counts > 1])
-    finite = np.all(np.isfinite(corners_px(markers)), axis=(1, 2))
-    uu, uv, vv = np.moveaxis(columns(markers, CORNER_COVARIANCE_FIELDS).reshape(-1, 4, 3), -1, 0)
-    sound = np.all((uu > 0.0) & (uu * vv > uv * uv), axis=1)
-    return np.asarray(markers[~twice & finite & sound])
-
-
-def _poses(rows: Markers, prefix: str) -> FloatArray:
-    """T_camera_marker (N, 4, 4) of the rows' pose ('') or alternative pose ('a'), NaN where there is none."""
-    q = columns(rows, tuple(f'{prefix}q{axis}' for axis in 'xyzw'))
-    with np.errstate(invalid='ignore', divide='ignore'):
-        return transform_from_quaternion(columns(rows, tuple(f'{prefix}{axis}' for axis in 'xyz')), q)
 
 
 def _expected_errors(known: Sight, location: Location, camera: Camera) -> FloatArray:

@@ -1,0 +1,42 @@
+"""Odometry in place of known markers: over gaps between those that are known and new ones."""
+
+import numpy as np
+
+from thermal_fiducial.core.geometry import inverse, skew, so3_exp, transform
+from thermal_fiducial.core.keyframes import Keyframe, Link
+from thermal_fiducial.core.localization import positive
+from thermal_fiducial.core.measurements import CameraPose, Odometry
+from thermal_fiducial.core.types import FloatArray
+
+
+def predict(odometry: Odometry, stamp_ns: int) -> FloatArray:
+    """T_map_body (4, 4) at ``stamp_ns``, velocities constant since the odometry."""
+    dt = (stamp_ns - odometry.stamp_ns) * 1e-9
+    step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
+    return np.asarray(odometry.T_map_body @ step, dtype=np.float64)
+
+
+def camera_pose(odometry: Odometry, stamp_ns: int, T_body_camera: FloatArray) -> CameraPose:
+    """The camera where the odometry has it at ``stamp_ns``, with the odometry's covariance."""
+    T_map_body = predict(odometry, stamp_ns)
+    A = np.eye(6)
+    A[:3, 3:] = -skew(T_map_body[:3, :3] @ T_body_camera[:3, 3])
+    return CameraPose(stamp_ns, T_map_body @ T_body_camera, A @ odometry.pose_covariance @ A.T)
+
+
+def growth(first: CameraPose, pose: CameraPose, odometry: Odometry) -> FloatArray:
+    """Covariance (6, 6) of the odometry from ``first`` to ``pose``, from either of two bounds, whichever is closer.
+
+    Errors of odometry that grow add up like independent ones at most as the difference of the covariances says; and a
+    displacement is off by no more than the speed is, all the time.
+    """
+    seconds = (pose.stamp_ns - first.stamp_ns) * 1e-9
+    turn = np.kron(np.eye(2), odometry.T_map_body[:3, :3]) * seconds
+    bounds = positive(pose.covariance - first.covariance), turn @ odometry.twist_covariance @ turn.T
+    return min(bounds, key=lambda covariance: float(np.trace(covariance)))
+
+
+def link(a: Keyframe, b: Keyframe, covariance: FloatArray) -> Link:
+    """Odometry from ``a``, whose pose is known, to ``b``, whose pose in the map has ``covariance``."""
+    rotation = np.kron(np.eye(2), a.T_map_rig[:3, :3].T)
+    return Link(a.stamp_ns, b.stamp_ns, inverse(a.T_map_rig) @ b.T_map_rig, rotation @ covariance @ rotation.T)
