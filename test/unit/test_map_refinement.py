@@ -1,6 +1,7 @@
 """Joint adjustment: exactness, the Schur complement, robustness, gauge, links, priors."""
 
 from dataclasses import replace
+import pickle
 
 import numpy as np
 import pytest
@@ -200,6 +201,20 @@ def test_without_a_link_the_other_side_of_a_gap_is_left_alone():
               for f in s.keyframes]  # fmt: skip
     assert refine(replace(s, keyframes=tuple(lonely))) is None
     assert refine(replace(s, keyframes=())) is None
+
+
+@pytest.mark.parametrize('count', [0, 12])
+def test_a_snapshot_goes_to_another_process_and_back_unchanged(count):
+    rng = np.random.default_rng(13)
+    s = snapshot(rng, wall(rng), count=count)
+    there = pickle.loads(pickle.dumps(s))
+    assert len(there.keyframes) == count
+    for one, other in zip(s.keyframes, there.keyframes, strict=True):
+        assert one.stamp_ns == other.stamp_ns
+        for name in ('T_map_rig', 'ids', 'corners', 'covariances', 'cameras'):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert there.markers.keys() == s.markers.keys()
+    assert there.map_version == s.map_version
 
 
 def test_what_has_lost_its_connection_stays_and_the_rest_is_adjusted():

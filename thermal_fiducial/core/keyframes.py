@@ -1,7 +1,7 @@
 """Frames kept for the joint refinement: few enough for hours, different enough to hold the map together."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -57,6 +57,32 @@ class Link:
     T_a_b: FloatArray
     #: (6, 6) of T_a_b, ROS convention, in frame a
     covariance: FloatArray
+
+
+def packed(frames: Sequence[Keyframe]) -> tuple[FloatArray | IntArray, ...]:
+    """Keyframes as a few large arrays: thousands of small ones take a process long to hand to another."""
+    return (
+        np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
+        np.array([frame.T_map_rig for frame in frames]).reshape(-1, 4, 4),
+        np.array([len(frame.ids) for frame in frames], dtype=np.int64),
+        *(
+            np.concatenate([getattr(frame, name) for frame in frames]) if frames else np.zeros(0)
+            for name in ('ids', 'corners', 'covariances', 'cameras')
+        ),
+    )
+
+
+def unpacked(
+    stamps: IntArray, T_map_rig: FloatArray, counts: IntArray, *views: FloatArray | IntArray
+) -> tuple[Keyframe, ...]:
+    """The keyframes again."""
+    ends = np.cumsum(counts)[:-1]
+    parts = [np.split(array, ends) for array in views]
+    return (
+        tuple(Keyframe(*fields) for fields in zip(stamps.tolist(), T_map_rig, *parts, strict=True))
+        if len(stamps)
+        else ()
+    )
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,13 @@ A pure function on a snapshot: it may run in another thread or process while the
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from thermal_fiducial.core.geometry import inverse, skew
-from thermal_fiducial.core.keyframes import Keyframe, Link, Rig
+from thermal_fiducial.core.keyframes import Keyframe, Link, packed, Rig, unpacked
 from thermal_fiducial.core.map_data import MapMarker
 from thermal_fiducial.core.normal_equations import Blocks, NormalEquations
 from thermal_fiducial.core.reprojection import difference, linearise, retract, whitening
@@ -46,6 +47,14 @@ class Snapshot:
     #: pose and covariance (6, 6) by ID of markers that were known beforehand; see :func:`prior_poses`
     priors: Mapping[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     map_version: int = 0
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        rest = (self.rig, self.links, self.priors, self.map_version)
+        return _snapshot, (self.markers, packed(self.keyframes), *rest)
+
+
+def _snapshot(markers: Mapping[int, MapMarker], keyframes: tuple[Any, ...], *rest: Any) -> Snapshot:
+    return Snapshot(markers, unpacked(*keyframes), *rest)
 
 
 @dataclass(frozen=True)
