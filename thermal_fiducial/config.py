@@ -296,7 +296,7 @@ class ArucoDetectorConfig:
     max_border_errors: int = param(2, 'The same for the cells of the black border.', minimum=0, maximum=20, live=True)
     guided: bool = param(True, 'With a map and odometry: look for known markers where they should be.', live=True)
     blind_interval: int = param(
-        5,
+        10,
         'A blind search follows every so many frames, and whenever an expected marker is not seen.',
         minimum=1,
         maximum=1000,

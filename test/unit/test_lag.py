@@ -18,6 +18,7 @@ from thermal_fiducial.core.lag import (
     REMAINING,
     smear,
     SmearField,
+    Tracked,
     Twist,
     without_lag,
 )
@@ -60,12 +61,25 @@ def test_tracker_finds_the_twist_from_two_frames():
     tracker, ids, dt = MotionTracker(np.eye(4)), np.arange(5), 1 / 30
     later = moved(points, dt)
     x = [p[..., :2] / p[..., 2:] for p in (points, later)]
-    tracker.remember(10**9, None, ids, x[0])
+    tracker.remember(10**9, None, Tracked(ids, x[0], points[..., 2], np.full(5, 100.0)))
     assert tracker.predict(10**9 + 10**10, None) is None
     found = tracker.correct(10**9 + round(dt * 1e9), None, ids, x[1], later[..., 2], np.full(5, 1e-5))
     # A finite step of a thirtieth of a second differs from the derivative in second order; the prior pulls a little.
     np.testing.assert_allclose(found.value, TWIST, atol=0.03)
     assert np.all(np.linalg.eigvalsh(found.covariance) > 0)
+
+
+def test_markers_are_expected_where_the_motion_carries_them():
+    rng = np.random.default_rng(4)
+    points, dt = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3)), 1 / 30
+    later, twist = moved(points, dt), Twist(TWIST, np.eye(6))
+    tracker = MotionTracker(np.eye(4))
+    tracker.remember(0, twist, Tracked(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5)))
+    expected = tracker.expected(round(dt * 1e9), twist)
+    # The stamp is a whole number of nanoseconds.
+    np.testing.assert_allclose(expected.x, later[..., :2] / later[..., 2:], atol=1e-8)
+    np.testing.assert_allclose(expected.depth, later[..., 2], atol=1e-8)
+    assert len(tracker.expected(10**9, twist).ids) == 0
 
 
 def test_field_agrees_with_the_points():
@@ -74,7 +88,7 @@ def test_field_agrees_with_the_points():
     assert field.shape == (512, 640, 2)
     pixels = np.array([[100, 80], [320, 250], [550, 430]])
     x = CAMERA.normalise(pixels.astype(float))
-    expected, _ = smear(CAMERA, x, np.full(3, 3.0), twist, 0.01)
+    expected = smear(CAMERA, x, np.full(3, 3.0), twist, 0.01)
     # The coarse field is interpolated linearly between nodes 16 px apart.
     np.testing.assert_allclose(field[pixels[:, 1], pixels[:, 0]], expected, atol=0.01)
 

@@ -44,6 +44,40 @@ _BOTH_SIDES = 3
 
 
 @dataclass(frozen=True, slots=True)
+class Corners:
+    """Corners of N markers in both coordinates.
+
+    Parameters
+    ----------
+    px : (N, 4, 2)
+    x : (N, 4, 2) normalised
+    J : (N, 4, 2, 2) derivative of pixels by normalised coordinates
+    inverse : (N, 4, 2, 2) that of normalised coordinates by pixels; both also for corners some pixels away
+    """
+
+    px: FloatArray
+    x: FloatArray
+    J: FloatArray
+    inverse: FloatArray
+
+    @staticmethod
+    def at(px: FloatArray, camera: Camera) -> 'Corners':
+        """Those at pixels (N, 4, 2)."""
+        x = camera.normalise(px)
+        J = camera.distort_jacobian(x)
+        return Corners(px, x, J, np.asarray(np.linalg.inv(J), dtype=np.float64))
+
+    def moved(self, shift_px: FloatArray, camera: Camera) -> 'Corners':
+        """Those some pixels (N, 4, 2) away: undistorting them anew would cost more than it tells."""
+        x = self.x + (self.inverse @ shift_px[..., None])[..., 0]
+        return Corners(camera.distort(x), x, self.J, self.inverse)
+
+    def only(self, keep: BoolArray | IntArray) -> 'Corners':
+        """Those of the markers ``keep``."""
+        return Corners(self.px[keep], self.x[keep], self.J[keep], self.inverse[keep])
+
+
+@dataclass(frozen=True, slots=True)
 class RefinedCorners:
     """Corners of N markers.
 
@@ -124,7 +158,7 @@ class _Shifts:
 
 def refine_corners(
     image: Float32Array,
-    corners_px: FloatArray,
+    corners: Corners,
     camera: Camera,
     before: Float32Array,
     step: Float32Array,
@@ -132,6 +166,7 @@ def refine_corners(
     smear_px: FloatArray | None = None,
     columns: int = 6,
     *,
+    near: BoolArray | None = None,
     inner: bool = False,
 ) -> RefinedCorners:
     """Corners of N markers, refined.
@@ -139,65 +174,59 @@ def refine_corners(
     Parameters
     ----------
     image : (height, width) counts
-    corners_px : (N, 4, 2) to within two pixels, or a third of a cell
+    corners : to within two pixels, or a third of a cell
     before, step : (N, 2, m + 1, m) of :class:`GridPattern`
     blur_px : standard deviation of optics and pixel
     smear_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
     columns : of pixels, in a segment
+    near : (N,) which corners are good to a pixel already, so that nothing wide need catch them
     inner : whether the lines between the bits are used besides the sides
     """
-    count = len(corners_px)
-    result = RefinedCorners(corners_px.copy(), np.zeros((count, 4, 2, 2)), np.zeros(count), np.zeros(count))
-    active = np.arange(count)
+    count = len(corners.px)
+    px, covariances = corners.px.copy(), np.zeros((count, 4, 2, 2))
+    contrast, noise = np.zeros(count), np.zeros(count)
     smear = np.zeros((count, 2)) if smear_px is None else smear_px
+    away = np.ones(count, dtype=bool) if near is None else ~near
     for factor in _PASSES:
+        active = np.flatnonzero(away)
         if len(active) == 0:
-            break
-        start = result.corners_px[active]
-        moved = _pass(
-            image,
-            start,
-            camera,
-            before[active],
-            step[active],
-            factor * blur_px,
-            smear[active],
-            _PRIOR_OF_SHAPE if factor > 1.0 else _PRIOR,
-            inner,
-            columns,
-        )
-        result.corners_px[active] = moved.corners_px
-        result.covariances[active] = moved.covariances
-        result.contrast[active], result.noise[active] = moved.contrast, moved.noise
-        still = np.abs(moved.corners_px - start).max(axis=(1, 2)) > _SETTLED_PX
-        active = active[still | (factor > 1.0)]
-    return result
+            away[:] = factor > 1.0
+            continue
+        part = corners if len(active) == count else corners.only(active)
+        start = part.moved(px[active] - part.px, camera)
+        blur = (factor * blur_px, smear[active])
+        prior = _PRIOR_OF_SHAPE if factor > 1.0 else _PRIOR
+        shift, *rest = _pass(image, start, camera, before[active], step[active], blur, prior, inner, columns)
+        px[active] = start.px + shift
+        covariances[active], contrast[active], noise[active] = rest
+        away[active] = np.abs(shift).max(axis=(1, 2)) > _SETTLED_PX
+        away |= factor > 1.0
+    return RefinedCorners(px, covariances, contrast, noise)
 
 
 def _pass(
     image: Float32Array,
-    corners: FloatArray,
+    corners: Corners,
     camera: Camera,
     before: Float32Array,
     step: Float32Array,
-    optics: float,
-    smear: FloatArray,
+    blur: tuple[float, FloatArray],
     prior: FloatArray,
     inner: bool,
     columns: int,
-) -> RefinedCorners:
-    """One linearised adjustment of corners (N, 4, 2)."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """One linearised adjustment: shifts (N, 4, 2), covariances (N, 4, 2, 2), contrasts (N,), noise (N,)."""
     cells = step.shape[-1]
+    optics, smear = blur
     numbers = np.arange(cells + 1) if inner else np.array([0, cells])
     widest = math.hypot(optics, float(np.linalg.norm(smear, axis=1).max()))
-    lines, extent = _lines(corners, camera, image.shape, numbers / cells, cells * columns, widest)
-    blur = _blur_of_lines(lines.normal[:, cells * columns // 2], optics, smear)
-    shifts = _measure(image, lines, before, step, numbers, extent, blur)
-    moved, covariances = _adjust(corners, lines, shifts, numbers / cells, cells, prior)
-    good = shifts.variance.reshape(len(corners), -1) < _HOPELESS
-    contrast = _mean_where(shifts.contrast.reshape(good.shape), good)
-    noise = np.sqrt(_mean_where(shifts.noise.reshape(good.shape), good))
-    return RefinedCorners(moved, covariances, contrast, noise)
+    lines, extent = _lines(corners.x, camera, image.shape, numbers / cells, cells * columns, widest)
+    blurs = _blur_of_lines(lines.normal[:, cells * columns // 2], optics, smear)
+    shifts = _measure(image, lines, before, step, numbers, extent, blurs)
+    moved, covariances = _adjust(lines, shifts, numbers / cells, cells, prior)
+    good = shifts.variance < _HOPELESS
+    contrast = _mean_where(shifts.contrast, good)
+    return moved, covariances, contrast, np.sqrt(_mean_where(shifts.noise, good))
 
 
 def _blur_of_lines(normal: FloatArray, optics: float, smear: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -213,11 +242,11 @@ def _mean_where(values: FloatArray, good: np.ndarray) -> FloatArray:
 
 
 def _lines(
-    corners: FloatArray, camera: Camera, shape: tuple[int, ...], levels: FloatArray, count: int, blur: float
+    x: FloatArray, camera: Camera, shape: tuple[int, ...], levels: FloatArray, count: int, blur: float
 ) -> tuple[_Lines, tuple[FloatArray, FloatArray]]:
     """Pixels across the grid lines at ``levels`` (L,) of both directions, and the marker's extent there."""
     height, width = shape
-    nodes = _nodes(corners, camera, levels).reshape(-1, len(_T_NODES), 2)
+    nodes = _nodes(x, camera, levels).reshape(-1, len(_T_NODES), 2)
     span = nodes[:, -1] - nodes[:, 0]
     steep = np.abs(span[:, 1]) > np.abs(span[:, 0])
     curve: FloatArray = np.asarray(_QUARTIC @ np.where(steep[:, None, None], nodes[..., ::-1], nodes), dtype=np.float64)
@@ -255,9 +284,8 @@ def _cell_sizes(nodes: FloatArray, levels: int, normal: FloatArray) -> tuple[Flo
     return np.abs(np.sum(across * normal, axis=-1)), np.linalg.norm(nodes[:, -1] - nodes[:, 0], axis=-1)
 
 
-def _nodes(corners: FloatArray, camera: Camera, levels: FloatArray) -> FloatArray:
-    """Pixels (N, 2, L, 5, 2) of five points on every grid line of quadrilaterals (N, 4, 2) [px]."""
-    c = camera.normalise(corners)
+def _nodes(c: FloatArray, camera: Camera, levels: FloatArray) -> FloatArray:
+    """Pixels (N, 2, L, 5, 2) of five points on every grid line of quadrilaterals (N, 4, 2), normalised."""
     # Projective map of the unit square (P. Heckbert, "Fundamentals of texture mapping", 1989, section 2.2.3).
     d1, d2, d3 = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2], c[:, 0] - c[:, 1] + c[:, 2] - c[:, 3]
     determinant = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
@@ -267,7 +295,7 @@ def _nodes(corners: FloatArray, camera: Camera, levels: FloatArray) -> FloatArra
     level, t = np.meshgrid(levels, _T_NODES, indexing='ij')
     a, b = np.stack([t, level]).ravel(), np.stack([level, t]).ravel()
     x = (c[:, None, 0] + a[:, None] * right[:, None] + b[:, None] * down[:, None]) / (1.0 + a * g + b * h)[..., None]
-    return camera.distort(x).reshape(len(corners), 2, len(levels), len(_T_NODES), 2)
+    return camera.distort(x).reshape(len(c), 2, len(levels), len(_T_NODES), 2)
 
 
 def _value(quartic: FloatArray, t: FloatArray) -> FloatArray:
@@ -364,34 +392,50 @@ def _measure(
     middle = counts[:, counts.shape[1] // 2][:, None]
     X = np.stack([np.ones_like(counts), value.reshape(shape), slope.reshape(shape), counts - middle], axis=1)
     weight = weight.reshape(shape)
-    shifts, coefficients = _solve(X, weight, len(step), reach)
-    residual = X[:, 3] - (coefficients[:, None] @ X[:, :3])[:, 0]
-    outlier = np.abs(residual) > _PIXEL_OUTLIER * np.sqrt(shifts.noise).reshape(-1, 1)
-    if np.any(outlier & (weight > 0.0)):
-        shifts, _ = _solve(X, weight * ~outlier, len(step), reach)
+    fit = _fit(X, weight)
+    shifts = _judged(fit, reach)
+    residual = X[:, 3] - (fit[0].astype(np.float32)[:, None] @ X[:, :3])[:, 0]
+    outlier = (np.abs(residual) > _PIXEL_OUTLIER * np.sqrt(shifts.noise).reshape(-1, 1)) & (weight > 0.0)
+    touched = np.flatnonzero(outlier.any(axis=1))
+    if len(touched):
+        for all_of, again in zip(fit, _fit(X[touched], weight[touched] * ~outlier[touched]), strict=True):
+            all_of[touched] = again
+        shifts = _judged(fit, reach)
     return shifts
 
 
-def _solve(X: Float32Array, weight: Float32Array, count: int, reach: FloatArray) -> tuple[_Shifts, Float32Array]:
+#: Coefficients (..., 3) of level, contrast and their product with the displacement, its variance for noise of 1 (...),
+#: sum of squared residuals (...), number of pixels (...).
+_Fit = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+
+
+def _fit(X: Float32Array, weight: Float32Array) -> _Fit:
     """Least squares of the last of four columns X (segments, 4, pixels) on the others: (1, model, derivative)."""
     gram = ((X * weight[:, None]) @ np.swapaxes(X, -1, -2)).astype(np.float64)
-    number = gram[:, 0, 0]
-    inverse = np.linalg.inv(gram[:, :3, :3] + (1e-6 * number + 1e-6)[:, None, None] * np.eye(3))
+    number = gram[:, 0, 0].copy()
+    ridge = (1e-6 * number + 1e-6)[:, None, None] * np.eye(3)
+    inverse: FloatArray = np.asarray(np.linalg.inv(gram[:, :3, :3] + ridge), dtype=np.float64)
     right = gram[:, :3, 3]
-    coefficients = (inverse @ right[..., None])[..., 0]
-    square = np.maximum(gram[:, 3, 3] - np.sum(coefficients * right, axis=-1), 0.0)
-    free = number - 3.0
-    usable = (free > 1.5).reshape(count, -1)
-    noise = (square / np.maximum(free, 1.0)).reshape(count, -1)
-    contrast = coefficients[:, 1].reshape(count, -1)
-    typical_noise = _median_where(noise, usable)
-    typical = _median_where(contrast, usable)
+    coefficients: FloatArray = np.asarray((inverse @ right[..., None])[..., 0])
+    square: FloatArray = np.maximum(gram[:, 3, 3] - np.sum(coefficients * right, axis=-1), 0.0)
+    return coefficients, inverse[:, 2, 2].copy(), square, number
+
+
+def _judged(fit: _Fit, reach: FloatArray) -> _Shifts:
+    """Which segments measure anything, within their reach (N, S)."""
+    shape = reach.shape
+    coefficients, unit_variance, square, number = fit
+    free = (number - 3.0).reshape(shape)
+    usable = free > 1.5
+    noise = square.reshape(shape) / np.maximum(free, 1.0)
+    contrast = coefficients[:, 1].reshape(shape)
+    typical_noise, typical = _median_where(noise, usable), _median_where(contrast, usable)
     noise = np.where(noise > 2.5 * typical_noise, noise, typical_noise) + 1e-3
     usable &= contrast * np.sign(typical) > 0.3 * np.abs(typical)
     safe = np.where(usable, contrast, 1.0)
-    shift = np.where(usable, np.clip(-coefficients[:, 2].reshape(count, -1) / safe, -reach, reach), 0.0)
-    variance = np.where(usable, noise * inverse[:, 2, 2].reshape(count, -1) / safe**2, _HOPELESS)
-    return _Shifts(shift, variance, contrast, noise), coefficients.astype(np.float32)
+    shift = np.where(usable, np.clip(-coefficients[:, 2].reshape(shape) / safe, -reach, reach), 0.0)
+    variance = np.where(usable, noise * unit_variance.reshape(shape) / safe**2, _HOPELESS)
+    return _Shifts(shift, variance, contrast, noise)
 
 
 def _median_where(values: FloatArray, good: np.ndarray) -> FloatArray:
@@ -403,10 +447,10 @@ def _median_where(values: FloatArray, good: np.ndarray) -> FloatArray:
 
 
 def _adjust(
-    corners: FloatArray, lines: _Lines, shifts: _Shifts, levels: FloatArray, cells: int, prior: FloatArray
+    lines: _Lines, shifts: _Shifts, levels: FloatArray, cells: int, prior: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Corners (N, 4, 2) moved to explain the shifts of all segments, and their covariances (N, 4, 2, 2)."""
-    count = len(corners)
+    """How corners move (N, 4, 2) to explain the shifts of all segments, and their covariances (N, 4, 2, 2)."""
+    count = len(shifts.shift)
     A = _design(lines, levels, cells, count)
     deviation = np.sqrt(shifts.variance)
     robust = np.ones_like(deviation)
@@ -425,7 +469,7 @@ def _adjust(
     # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
     covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None]
     blocks = np.einsum('nikil->nikl', covariance.reshape(count, 4, 2, 4, 2))
-    return corners + moved.reshape(count, 4, 2), blocks + _FLOOR_PX**2 * np.eye(2)
+    return moved.reshape(count, 4, 2), blocks + _FLOOR_PX**2 * np.eye(2)
 
 
 def _design(lines: _Lines, levels: FloatArray, cells: int, count: int) -> FloatArray:

@@ -11,7 +11,7 @@ from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.contrast import noise_of
-from thermal_fiducial.core.corners import grid_pattern, refine_corners, RefinedCorners
+from thermal_fiducial.core.corners import Corners, grid_pattern, refine_corners, RefinedCorners
 from thermal_fiducial.core.decoding import Decoder
 from thermal_fiducial.core.guided import camera_in_map, expected_markers, look
 from thermal_fiducial.core.lag import (
@@ -21,8 +21,10 @@ from thermal_fiducial.core.lag import (
     plausible,
     REMAINING,
     smear,
+    smear_by_twist,
     SmearField,
     SPREAD,
+    Tracked,
     Twist,
     without_lag,
 )
@@ -36,6 +38,8 @@ from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatAr
 
 # Smear by lag below which neither the search nor the shape of an edge changes [px].
 _SMEAR_THAT_MATTERS_PX = 0.4
+# Correlation with its pattern of a marker that is still where motion has carried it, seen through the lag.
+_STILL_ALIKE = 0.7
 # Contrast over noise from which smeared edges cost more than the noise of sharpening them.
 _CLEAR = 20.0
 # Columns of pixels used of a cell; all of a faint marker's count.
@@ -101,8 +105,9 @@ class MarkerDetector:
             twist = self._motion.predict(stamp_ns, odometry)
             image = counts.astype(np.float32)
             T_camera_map = self._predicted_pose(stamp_ns, odometry, twist)
-            found = self._find(image, camera, twist, T_camera_map)
-            ids, refined = self._refined(stamp_ns, image, found, camera, twist)
+            noise = noise_of(image)
+            found, tracked = self._find(stamp_ns, image, noise, camera, twist, T_camera_map)
+            ids, refined = self._refined(stamp_ns, image, noise, found, np.isin(found.ids, tracked), camera, twist)
             if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
                 refined = local_corners(image, refined, self._decoder.cells)
             return self._rows(ids, refined, camera, T_camera_map)
@@ -127,39 +132,69 @@ class MarkerDetector:
             return None
         return geometry.inverse(camera_in_map(stamp_ns, odometry, self._T_body_camera, twist))
 
-    def _find(self, image: Float32Array, camera: Camera, twist: Twist | None, T_camera_map: FloatArray | None) -> Found:
-        """The expected markers where they should be, and whatever a blind search shows, when that is due."""
-        expected, complete = Found.none(), False
+    def _find(
+        self,
+        stamp_ns: int,
+        image: Float32Array,
+        noise: float,
+        camera: Camera,
+        twist: Twist | None,
+        T_camera_map: FloatArray | None,
+    ) -> tuple[Found, IntArray]:
+        """Markers where they should be, and whatever a blind search shows, when that is due; and which are tracked."""
+        expected, tracked, complete = Found.none(), np.zeros(0, dtype=np.int64), False
         if T_camera_map is not None and twist is not None and self.config.guided:
-            expected, complete = self._guided(image, camera, twist, T_camera_map)
+            ids, corners, depth = expected_markers(self._map, T_camera_map, camera, self.config.min_side_px)
+            expected = self._tracked(stamp_ns, image, camera, twist, ids)
+            tracked = expected.ids
+            new = ~np.isin(ids, tracked)
+            if new.any():
+                also = self._guided(image, noise, camera, twist, ids[new], corners[new], depth[new])
+                expected = merged(expected, also)
+            complete = len(ids) > 0 and len(expected.ids) >= len(ids)
         self._since_blind += 1
         if complete and self._since_blind < self.config.blind_interval:
-            return expected
+            return expected, tracked
         self._since_blind = 0
         scene = self._scene(image, camera, twist)
-        return merged(blind_search(image, scene, self._decoder, self._allowed(), self.config), expected)
+        blind = blind_search(image, scene, self._decoder, self._allowed(), self.config)
+        return merged(expected, blind), tracked
+
+    def _tracked(self, stamp_ns: int, image: Float32Array, camera: Camera, twist: Twist, ids: IntArray) -> Found:
+        """Those of the markers ``ids`` that the last frame showed, and this one where the motion has carried them."""
+        last = self._motion.expected(stamp_ns, twist)
+        last = last.only(np.isin(last.ids, ids))
+        if len(last.ids) == 0:
+            return Found.none()
+        corners = camera.distort(last.x)
+        shown = corners + smear(camera, last.x, last.depth, twist, self.config.bolometer_lag)
+        similarity = self._decoder.match(image, shown, last.ids) * np.sign(last.clarity)
+        alike = (similarity > _STILL_ALIKE) & camera.contains(shown).all(axis=1)
+        return Found(last.ids[alike], corners[alike], last.clarity[alike], np.ones(int(alike.sum()), dtype=bool))
 
     def _guided(
-        self, image: Float32Array, camera: Camera, twist: Twist, T_camera_map: FloatArray
-    ) -> tuple[Found, bool]:
-        """Known markers that are seen where they should be, and whether these are all that should be."""
-        ids, corners, depth = expected_markers(self._map, T_camera_map, camera, self.config.min_side_px)
-        if len(ids) == 0:
-            return Found.none(), False
-        noise = noise_of(image)
-        shift, _ = smear(camera, camera.normalise(corners), depth, twist, self.config.bolometer_lag)
+        self,
+        image: Float32Array,
+        noise: float,
+        camera: Camera,
+        twist: Twist,
+        ids: IntArray,
+        corners: FloatArray,
+        depth: FloatArray,
+    ) -> Found:
+        """Known markers that are seen near where the map and the filter say."""
+        shift = smear(camera, camera.normalise(corners), depth, twist, self.config.bolometer_lag)
         blurred = np.abs(shift).max(axis=(1, 2)) > _SMEAR_THAT_MATTERS_PX
         scene = markers_sharpened(image, corners[blurred], shift[blurred], _WINDOW_MARGIN_PX)
         still = np.where(blurred[:, None, None], REMAINING * shift, shift)
         found, seen = look(scene, ids, corners + still, self._decoder, noise, self.config)
         found = replace(found, corners_px=found.corners_px - still[seen])
         faint = np.flatnonzero(blurred & ~seen)
-        if len(faint):
-            # Freeing a faint marker of its lag may have drowned it in noise.
-            also, there = look(image, ids[faint], (corners + shift)[faint], self._decoder, noise, self.config)
-            found = merged(found, replace(also, corners_px=also.corners_px - shift[faint[there]]))
-            seen[faint[there]] = True
-        return found, bool(seen.all())
+        if len(faint) == 0:
+            return found
+        # Freeing a faint marker of its lag may have drowned it in noise.
+        also, there = look(image, ids[faint], (corners + shift)[faint], self._decoder, noise, self.config)
+        return merged(found, replace(also, corners_px=also.corners_px - shift[faint[there]]))
 
     def _allowed(self) -> BoolArray:
         """Which IDs of the dictionary may be found."""
@@ -181,45 +216,57 @@ class MarkerDetector:
         return without_lag(image, field[..., 0], field[..., 1])
 
     def _refined(
-        self, stamp_ns: int, image: Float32Array, found: Found, camera: Camera, predicted: Twist | None
+        self,
+        stamp_ns: int,
+        image: Float32Array,
+        noise: float,
+        found: Found,
+        near: BoolArray,
+        camera: Camera,
+        predicted: Twist | None,
     ) -> tuple[IntArray, RefinedCorners]:
         """Corners at the stamp, on the image freed of lag by the twist that they themselves improve, and their IDs."""
         ids, corners = found.ids, found.corners_px
         refined = RefinedCorners(corners, np.zeros((0, 4, 2, 2)), np.zeros(0), np.zeros(0))
         if len(ids) == 0:
-            self._motion.remember(stamp_ns, predicted, ids, corners)
+            self._motion.remember(stamp_ns, predicted, Tracked.none())
             return ids, refined
         # Freeing an image of lag costs noise: of faint markers only the delay is taken out.
         clear = np.abs(found.clarity) > _CLEAR
         before, step = self._pattern.before[ids], self._pattern.step[ids]
-        x = camera.normalise(corners)
-        depth = _corner_depths(x, self._sizes_of(ids))
+        at_stamp = Corners.at(found.corners_px, camera)
+        depth = _corner_depths(at_stamp.x, self._sizes_of(ids))
         self._depth = float(np.median(depth))
         twist, tau = predicted, self.config.bolometer_lag
+        by_twist = smear_by_twist(at_stamp.x, at_stamp.J, depth, tau)
         columns = _COLUMNS if clear.all() else _COLUMNS_FAINT
         for _ in range(2):
-            smeared = np.zeros_like(corners) if twist is None else smear(camera, x, depth, twist, tau)[0]
-            view = _view(image, corners, smeared, clear)
+            smeared = np.zeros_like(corners) if twist is None else by_twist @ twist.value
+            view = _view(image, at_stamp.px, smeared, clear)
+            start = at_stamp.moved(view.shift, camera)
             seen = refine_corners(
-                view.image, corners + view.shift, camera, before, step, self.config.blur_px, view.spread, columns
+                view.image, start, camera, before, step, self.config.blur_px, view.spread, columns, near=near
             )
-            refined, x = seen, camera.normalise(seen.corners_px - view.shift)
-            noise = np.sqrt(0.5 * np.trace(seen.covariances, axis1=-2, axis2=-1).mean(axis=-1)) / camera.focal_px
-            twist = self._motion.correct(stamp_ns, predicted, ids, x, depth, noise)
+            refined, at_stamp = seen, start.moved(seen.corners_px - start.px - view.shift, camera)
+            deviation = np.sqrt(0.5 * np.trace(seen.covariances, axis1=-2, axis2=-1).mean(axis=-1)) / camera.focal_px
+            twist = self._motion.correct(stamp_ns, predicted, ids, at_stamp.x, depth, deviation)
             if twist is None:
                 break
-            smeared, unknown = smear(camera, x, depth, twist, tau)
+            smeared = by_twist @ twist.value
             shift = smeared - view.removed
             corners = seen.corners_px - shift
+            unknown = by_twist @ twist.covariance @ np.swapaxes(by_twist, -1, -2)
             unknown = unknown + model_error(smeared, _sides(corners) / self._decoder.cells)
             refined = replace(seen, corners_px=corners, covariances=seen.covariances + unknown)
+            at_stamp, near = start.moved(corners - start.px, camera), np.ones(len(ids), dtype=bool)
             if np.abs(shift - view.shift)[clear].max(initial=0.0) < _SMEAR_THAT_MATTERS_PX:
                 break
         # How well the image shows the sides, apart from how well the motion is known.
         there = replace(found, corners_px=found.corners_px + view.shift)
         keep = confirmed(view.image, there, seen, self._decoder, self.config)
         ids, refined = ids[keep], refined.only(keep)
-        self._motion.remember(stamp_ns, twist, ids, camera.normalise(refined.corners_px))
+        seen_now = Tracked(ids, at_stamp.x[keep], depth[keep], refined.contrast / noise)
+        self._motion.remember(stamp_ns, twist, seen_now)
         return ids, refined
 
     def _rows(self, ids: IntArray, refined: RefinedCorners, camera: Camera, T_camera_map: FloatArray | None) -> Markers:

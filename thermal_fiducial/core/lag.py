@@ -12,7 +12,7 @@ servo control I", 2006, eq. 11). A Kalman filter holds the twist: predicted from
 frame, corrected by how the markers' corners moved since.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 
 import cv2
@@ -21,7 +21,7 @@ import numpy as np
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.measurements import Odometry
-from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 # First derivative, exact up to the sixth order: on images blurred by a pixel's optics the eighth does not matter.
 _DERIVATIVE = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0], dtype=np.float32) / 60.0
@@ -74,24 +74,62 @@ def camera_twist(odometry: Odometry, T_body_camera: FloatArray) -> Twist:
     return Twist(transfer @ body, covariance)
 
 
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """Markers of a frame that the next one should show.
+
+    Parameters
+    ----------
+    ids : (N,)
+    x : (N, 4, 2) normalised corners
+    depth : (N, 4) [m]
+    clarity : (N,) contrast over the noise of a pixel
+    """
+
+    ids: IntArray
+    x: FloatArray
+    depth: FloatArray
+    clarity: FloatArray
+
+    def only(self, keep: BoolArray) -> 'Tracked':
+        """Those of the markers ``keep`` (N,)."""
+        return Tracked(self.ids[keep], self.x[keep], self.depth[keep], self.clarity[keep])
+
+    @staticmethod
+    def none() -> 'Tracked':
+        """No markers."""
+        return Tracked(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4)), np.zeros(0))
+
+
 class MotionTracker:
-    """The camera's twist over the frames."""
+    """The camera's twist over the frames, and the markers that it saw."""
 
     def __init__(self, T_body_camera: FloatArray) -> None:
         self._T_body_camera = T_body_camera
         self._stamp_ns: int | None = None
         self._twist: Twist | None = None
-        self._ids: IntArray = np.zeros(0, dtype=np.int64)
-        self._x: FloatArray = np.zeros((0, 4, 2))
+        self._seen = Tracked.none()
 
     def predict(self, stamp_ns: int, odometry: Odometry | None) -> Twist | None:
         """Twist expected at a frame; None when nothing is known."""
         if odometry is not None and 0.0 <= abs(stamp_ns - odometry.stamp_ns) * 1e-9 < _STALE_S:
             twist = camera_twist(odometry, self._T_body_camera)
             return Twist(twist.value, twist.covariance + self._drift(stamp_ns, odometry.stamp_ns))
-        if self._twist is None or self._stamp_ns is None or not 0 < stamp_ns - self._stamp_ns < _STALE_S * 1e9:
+        if self._twist is None or self._stamp_ns is None or self._since(stamp_ns) is None:
             return None
         return Twist(self._twist.value, self._twist.covariance + self._drift(stamp_ns, self._stamp_ns))
+
+    def expected(self, stamp_ns: int, twist: Twist) -> Tracked:
+        """The last frame's markers where the camera's motion since has carried them."""
+        dt = self._since(stamp_ns)
+        if dt is None or self._twist is None or len(self._seen.ids) == 0:
+            return Tracked.none()
+        step = (0.5 * dt) * (twist.value + self._twist.value)
+        moved = geometry.inverse(geometry.transform(geometry.so3_exp(step[3:]), step[:3]))
+        rays = np.concatenate([self._seen.x, np.ones((*self._seen.x.shape[:-1], 1))], axis=-1)
+        points = (rays * self._seen.depth[..., None]) @ moved[:3, :3].T + moved[:3, 3]
+        depth = np.maximum(points[..., 2], 1e-3)
+        return replace(self._seen, x=points[..., :2] / depth[..., None], depth=depth)
 
     def correct(
         self, stamp_ns: int, predicted: Twist | None, ids: IntArray, x: FloatArray, depth: FloatArray, noise: FloatArray
@@ -106,12 +144,12 @@ class MotionTracker:
         noise : (N,) standard deviation of a corner in normalised coordinates
         """
         twist = predicted
-        common, now, before = np.intersect1d(ids, self._ids, return_indices=True)
-        if len(common) and self._stamp_ns is not None and 0 < stamp_ns - self._stamp_ns < _STALE_S * 1e9:
-            dt = (stamp_ns - self._stamp_ns) * 1e-9
-            middle = 0.5 * (x[now] + self._x[before])
+        common, now, before = np.intersect1d(ids, self._seen.ids, assume_unique=True, return_indices=True)
+        dt = self._since(stamp_ns)
+        if len(common) and dt is not None:
+            middle = 0.5 * (x[now] + self._seen.x[before])
             A = interaction(middle, depth[now]).reshape(-1, 6)
-            velocity = (x[now] - self._x[before]).reshape(-1) / dt
+            velocity = (x[now] - self._seen.x[before]).reshape(-1) / dt
             weight = np.repeat((dt / (1.5 * noise[now])) ** 2, 8)
             prior = predicted or Twist(np.zeros(6), _UNKNOWN)
             information = np.linalg.inv(prior.covariance)
@@ -120,9 +158,15 @@ class MotionTracker:
             twist = Twist(np.asarray(value), np.asarray(posterior))
         return twist
 
-    def remember(self, stamp_ns: int, twist: Twist | None, ids: IntArray, x: FloatArray) -> None:
-        """Keep a frame's twist and normalised corners (N, 4, 2) for the next one."""
-        self._stamp_ns, self._twist, self._ids, self._x = stamp_ns, twist, ids, x
+    def remember(self, stamp_ns: int, twist: Twist | None, seen: Tracked) -> None:
+        """Keep a frame's twist and markers for the next one."""
+        self._stamp_ns, self._twist, self._seen = stamp_ns, twist, seen
+
+    def _since(self, stamp_ns: int) -> float | None:
+        """Time since the last frame [s]; None when that tells nothing of this one."""
+        if self._stamp_ns is None or not 0 < stamp_ns - self._stamp_ns < _STALE_S * 1e9:
+            return None
+        return (stamp_ns - self._stamp_ns) * 1e-9
 
     @staticmethod
     def _drift(stamp_ns: int, since_ns: int) -> FloatArray:
@@ -136,10 +180,14 @@ def plausible(odometry: Odometry) -> bool:
     return bool(speed <= _FASTEST and turn <= _FASTEST_TURN and finite)
 
 
-def smear(camera: Camera, x: FloatArray, depth: FloatArray, twist: Twist, tau: float) -> tuple[FloatArray, FloatArray]:
-    """Mean displacement by lag (..., 2) [px] at normalised points (..., 2), and its covariance (..., 2, 2)."""
-    A = -tau * camera.distort_jacobian(x) @ interaction(x, depth)
-    return np.asarray(A @ twist.value), A @ twist.covariance @ np.swapaxes(A, -1, -2)
+def smear_by_twist(x: FloatArray, J: FloatArray, depth: FloatArray, tau: float) -> FloatArray:
+    """Derivative (..., 2, 6) of :func:`smear` by the twist, where distortion has the derivative J (..., 2, 2) [px]."""
+    return np.asarray(-tau * J @ interaction(x, depth))
+
+
+def smear(camera: Camera, x: FloatArray, depth: FloatArray, twist: Twist, tau: float) -> FloatArray:
+    """Mean displacement by lag (..., 2) [px] at normalised points (..., 2)."""
+    return np.asarray(smear_by_twist(x, camera.distort_jacobian(x), depth, tau) @ twist.value)
 
 
 def model_error(smear_px: FloatArray, cell_px: FloatArray) -> FloatArray:
@@ -173,7 +221,7 @@ def markers_sharpened(
     height, width = image.shape
     finite = np.isfinite(corners_px).all(axis=(1, 2)) & np.isfinite(smear_px).all(axis=(1, 2))
     corners_px, smear_px = corners_px[finite], smear_px[finite]
-    affine = np.linalg.pinv(np.concatenate([corners_px, np.ones((len(corners_px), 4, 1))], axis=-1)) @ smear_px
+    affine = _affine(corners_px, smear_px)
     low = np.floor(corners_px.min(axis=1)).astype(int) - margin_px
     high = np.ceil(corners_px.max(axis=1)).astype(int) + margin_px + 1
     low, high = np.maximum(low, 0), np.minimum(high, (width, height))
@@ -186,6 +234,13 @@ def markers_sharpened(
         memory = cv2.warpAffine(image, inverse, (u1 - u0, v1 - v0), flags=_WARP, borderMode=cv2.BORDER_REPLICATE)
         cv2.addWeighted(image[v0:v1, u0:u1], _GAIN, memory, 1.0 - _GAIN, 0.0, dst=result[v0:v1, u0:u1])
     return result
+
+
+def _affine(points: FloatArray, values: FloatArray) -> FloatArray:
+    """Least squares (N, 3, 2) of values (N, 4, 2) on (u, v, 1) of points (N, 4, 2)."""
+    A = np.concatenate([points, np.ones((len(points), 4, 1))], axis=-1)
+    A_T = np.swapaxes(A, -1, -2)
+    return np.asarray(np.linalg.solve(A_T @ A, A_T @ values))
 
 
 class SmearField:
