@@ -46,6 +46,10 @@ _CLEAR = 20.0
 _COLUMNS, _COLUMNS_FAINT = 6, 12
 # Pixels round a marker that the refinement may look at.
 _WINDOW_MARGIN_PX = 16
+# Nearer to the rim of the image than this a marker is not expected to be seen.
+_RIM_PX = 2.0
+# Without a map nothing tells which markers come into view: a blind search follows at least every so many frames.
+_UNMAPPED = 3
 # Depth of the scene while no marker has told it [m].
 _TYPICAL_DEPTH = 3.0
 
@@ -143,8 +147,8 @@ class MarkerDetector:
     ) -> tuple[Found, IntArray]:
         """Markers where they should be, and whatever a blind search shows, when that is due; and which are tracked."""
         expected, tracked, complete = Found.none(), np.zeros(0, dtype=np.int64), False
-        if T_camera_map is not None and twist is not None and self.config.guided:
-            ids, corners, depth = expected_markers(self._map, T_camera_map, camera, self.config.min_side_px)
+        if twist is not None and self.config.guided:
+            ids, corners, depth = self._expected(stamp_ns, camera, twist, T_camera_map)
             expected = self._tracked(stamp_ns, image, camera, twist, ids)
             tracked = expected.ids
             new = ~np.isin(ids, tracked)
@@ -153,12 +157,32 @@ class MarkerDetector:
                 expected = merged(expected, also)
             complete = len(ids) > 0 and len(expected.ids) >= len(ids)
         self._since_blind += 1
-        if complete and self._since_blind < self.config.blind_interval:
+        interval = self.config.blind_interval
+        if T_camera_map is None:
+            interval = min(interval, _UNMAPPED)
+        if complete and self._since_blind < interval:
             return expected, tracked
         self._since_blind = 0
         scene = self._scene(image, camera, twist)
         blind = blind_search(image, scene, self._decoder, self._allowed(), self.config)
         return merged(expected, blind), tracked
+
+    def _expected(
+        self, stamp_ns: int, camera: Camera, twist: Twist, T_camera_map: FloatArray | None
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """IDs (N,) of the map's markers and of the last frame's others, their corners (N, 4, 2) [px], depths (N, 4)."""
+        last = self._motion.expected(stamp_ns, twist)
+        corners = camera.distort(last.x)
+        new = camera.contains(corners, _RIM_PX).all(axis=1)
+        if T_camera_map is None:
+            return last.ids[new], corners[new], last.depth[new]
+        new &= ~np.isin(last.ids, list(self._map))
+        ids, there, depth = expected_markers(self._map, T_camera_map, camera, self.config.min_side_px)
+        return (
+            np.concatenate([ids, last.ids[new]]),
+            np.concatenate([there, corners[new]]),
+            np.concatenate([depth, last.depth[new]]),
+        )
 
     def _tracked(self, stamp_ns: int, image: Float32Array, camera: Camera, twist: Twist, ids: IntArray) -> Found:
         """Those of the markers ``ids`` that the last frame showed, and this one where the motion has carried them."""

@@ -26,12 +26,13 @@ _WIDE_CELL_PX = 8.0
 # Correlation at the refined corners: of a marker with sharp sides, and (less when faint) of one with softer sides.
 _ALIKE = 0.82
 _CLEARLY_ALIKE = 0.9
-# Share of a marker's isolation by which it must stand out among all others; and the share that speaks for itself where
-# markers differ in so many bits that this many wrong ones can be corrected: noise and clutter often look a little like
-# one of the few patterns of a 4 x 4 dictionary.
-_CLEAR_MARGIN = 0.4
-_WIDE_MARGIN = 0.5
+# Share of a marker's isolation by which it must stand out among all others. That speaks for itself where markers differ
+# in so many bits that this many wrong ones can be corrected; noise and clutter often look a little like one of the few
+# patterns of a 4 x 4 dictionary.
+_CLEAR_MARGIN = 0.5
 _MANY_BITS = 3
+# White surroundings are as white as white bits, give or take the background; the rim of a plate seen inside out is not.
+_WHITE = (0.4, 1.75)
 # Corner deviation [px] times contrast over noise times root of the side [px]: 4 to 7 for four clean sides.
 _SHARP = 7.5
 _SOFT = 12.0
@@ -163,8 +164,9 @@ def confirmed(
     contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
     same = reading.ids == found.ids
     margin = (similarity - reading.runner_up) / decoder.isolation[reading.ids]
-    distinct = (similarity >= _ALIKE) | ((margin >= _WIDE_MARGIN) & (decoder.correctable >= _MANY_BITS))
-    alike = distinct & (margin >= _CLEAR_MARGIN) & (reading.surround >= 0.4)
+    distinct = (similarity >= _ALIKE) | (decoder.correctable >= _MANY_BITS)
+    white = (reading.surround >= _WHITE[0]) & (reading.surround <= _WHITE[1])
+    alike = distinct & (margin >= _CLEAR_MARGIN) & white
     side = np.linalg.norm(refined.corners_px[:, 2] - refined.corners_px[:, 0], axis=-1) / np.sqrt(2.0)
     deviation = np.sort(np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1)), axis=1)[:, 2]
     softness = deviation * np.minimum(contrast, _NOISY) * np.sqrt(np.minimum(side, _SEEN_PX))

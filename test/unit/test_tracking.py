@@ -1,0 +1,70 @@
+"""Markers of the last frame looked for where the motion has carried them, without a map or odometry."""
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core import detection
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.measurements import corners_px
+from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.files.dictionary import load_dictionary
+
+DICTIONARY = load_dictionary('DICT_4X4_50')
+BITS = marker_bits(DICTIONARY)
+CAMERA = Camera(640, 512, np.array([[600.0, 0, 319.5], [0, 600.0, 255.5], [0, 0, 1]]))
+PERIOD_NS = 33_333_333
+#: Pixels that the markers move to the right in a frame.
+SPEED = 3
+
+
+def frame(index, rng, shown=(4, 7)):
+    """Two markers of 60 px in white plates, moving."""
+    image = np.full((512, 640), 7000.0)
+    for k, marker_id in enumerate(shown):
+        u, v = 100 + SPEED * index, 80 + 200 * k
+        image[v - 10 : v + 70, u - 10 : u + 70] = 7040.0
+        image[v : v + 60, u : u + 60] = 7000.0 + 40.0 * np.kron(np.pad(BITS[marker_id], 1), np.ones((10, 10)))
+    return np.rint(image + rng.normal(0.0, 2.0, image.shape)).astype(np.uint16)
+
+
+@pytest.fixture
+def searches(monkeypatch):
+    """How often a frame was searched blindly."""
+    count = []
+    search = detection.blind_search
+    monkeypatch.setattr(detection, 'blind_search', lambda *args: count.append(1) or search(*args))
+    return count
+
+
+def test_seen_markers_are_followed(searches):
+    detector = detection.MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.0), DICTIONARY)
+    rng = np.random.default_rng(1)
+    for k in range(11):
+        rows = detector.detect(k * PERIOD_NS, frame(k, rng), CAMERA)
+        assert rows['id'].tolist() == [4, 7]
+        top_left = corners_px(rows)[:, 0]
+        # Noise of a tenth of the contrast's half leaves some hundredths of a pixel; refined is refined.
+        np.testing.assert_allclose(top_left, [[99.5 + SPEED * k, 79.5], [99.5 + SPEED * k, 279.5]], atol=0.2)
+    # Two frames until the motion is known, then one in three.
+    assert len(searches) == 5
+
+
+def test_a_marker_that_is_gone_is_not_followed(searches):
+    detector = detection.MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.0), DICTIONARY)
+    rng = np.random.default_rng(2)
+    for k in range(4):
+        detector.detect(k * PERIOD_NS, frame(k, rng), CAMERA)
+    before = len(searches)
+    rows = detector.detect(4 * PERIOD_NS, frame(4, rng, shown=(4, 9)), CAMERA)
+    # What is missing where it should be starts a search, which finds what stands there instead.
+    assert rows['id'].tolist() == [4, 9]
+    assert len(searches) == before + 1
+
+
+def test_nothing_is_followed_across_a_gap(searches):
+    detector = detection.MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.0), DICTIONARY)
+    rng = np.random.default_rng(3)
+    for k in range(6):
+        detector.detect(k * 10**9, frame(k, rng), CAMERA)
+    assert len(searches) == 6
