@@ -297,7 +297,7 @@ class ArucoDetectorConfig:
     guided: bool = param(True, 'With a map and odometry: look for known markers where they should be.', live=True)
     blind_interval: int = param(
         10,
-        'A blind search follows every so many frames, and whenever an expected marker is not seen.',
+        'A blind search follows every so many frames, and whenever most of the expected markers are not seen.',
         minimum=1,
         maximum=1000,
         live=True,
@@ -388,7 +388,7 @@ class PoseEkfConfig:
     time_offset_random_walk: float = param(
         5.0e-5, 'Drift of the two clocks against each other.', unit='s/sqrt(s)', minimum=0.0
     )
-    stamp_jitter: float = param(0.0005, 'Jitter of the camera stamps.', unit='s', minimum=0.0, maximum=0.05)
+    stamp_jitter: float = param(0.0005, 'Jitter of the camera stamps.', unit='s', minimum=0.0, maximum=0.05, live=True)
     estimate_extrinsics: bool = param(False, 'Refine camera_position and camera_orientation while running.')
     extrinsics_position_std: float = param(0.02, 'Standard deviation of camera_position.', unit='m', minimum=0.0)
     extrinsics_orientation_std: float = param(
@@ -411,26 +411,46 @@ class PoseEkfConfig:
         3.0,
         'Factor on the standard deviation of the camera poses: their errors last for about ten frames, not one.',
         minimum=0.1,
+        live=True,
     )
-    position_floor: float = param(0.001, 'Least standard deviation of a camera pose, position.', unit='m', minimum=0.0)
+    position_floor: float = param(
+        0.0003, 'Least standard deviation of a camera pose, position.', unit='m', minimum=0.0, live=True
+    )
     attitude_floor: float = param(
-        0.0003, 'Least standard deviation of a camera pose, attitude.', unit='rad', minimum=0.0
+        0.0001, 'Least standard deviation of a camera pose, attitude.', unit='rad', minimum=0.0, live=True
+    )
+    motion_floor: float = param(
+        0.001,
+        'What motion adds to these in all directions: so much of the speed and of the turn rate (smear, lag).',
+        unit='s',
+        minimum=0.0,
+        maximum=0.05,
+        live=True,
     )
     gate: float = param(
         22.5,
         'A pose is refused beyond this squared Mahalanobis distance (22.5: 99.9 % of chi-square, 6 d.o.f.).',
         minimum=1.0,
+        live=True,
     )
     reset_after: float = param(
-        1.0, 'Start afresh when refused poses have agreed with each other for so long.', unit='s', minimum=0.0
+        1.0,
+        'Start afresh when refused poses have agreed with each other for so long.',
+        unit='s',
+        minimum=0.0,
+        live=True,
     )
     max_delay: float = param(1.0, 'Poses that arrive later than this are refused.', unit='s', minimum=0.0, maximum=10.0)
     max_imu_gap: float = param(1.0, 'Start afresh after an IMU gap or clock jump beyond this.', unit='s', minimum=0.01)
     lost_position_std: float = param(
-        0.3, 'The pose counts as lost when its position is known no better than this.', unit='m', minimum=0.001
+        0.3,
+        'The pose counts as lost when its position is known no better than this.',
+        unit='m',
+        minimum=0.001,
+        live=True,
     )
     reinitialise_after: float = param(
-        60.0, 'Start afresh after so long without an accepted pose.', unit='s', minimum=1.0
+        60.0, 'Start afresh after so long without an accepted pose.', unit='s', minimum=1.0, live=True
     )
     smoothing_time: float = param(
         0.0, 'Spread corrections of the smooth output over this time; 0: no smooth output.', unit='s', minimum=0.0

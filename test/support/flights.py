@@ -134,6 +134,7 @@ def matched(**changes) -> PoseEkfConfig:
         'map_tilt_std': 0.0,
         'position_floor': 0.0,
         'attitude_floor': 0.0,
+        'motion_floor': 0.0,
         'pose_noise_scale': 1.0,
         'initial_gyroscope_bias_std': 0.005,
         'initial_accelerometer_bias_std': 0.05,

@@ -52,6 +52,24 @@ def test_late_and_out_of_order_poses_equal_in_order_processing(flight, delay):
         np.testing.assert_allclose(getattr(late_now, name), getattr(now, name), rtol=1e-9, atol=1e-12)
 
 
+def test_live_parameters_hold_from_then_on(flight):
+    ekf = PoseEkf(config())
+    arrivals = timeline(flight.samples(), flight.poses, 0.03)
+    half = len(arrivals) // 2
+    _, before = run(ekf, arrivals[:half])
+    ekf.configure(config(gate=1e-3))
+    _, after = run(ekf, arrivals[half:])
+    assert all(update.accepted for update in before[3:])
+    assert not any(update.accepted and not update.reset for update in after)
+
+
+def test_innovations_are_told_in_the_diagnostics(flight):
+    ekf = PoseEkf(matched())
+    run(ekf, timeline(flight.samples(), flight.poses, 0.03))
+    # 30 poses of 6 degrees of freedom: the mean is known to sqrt(12 / 30); four of that
+    assert ekf.diagnostics()['nis'] == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / 30.0))
+
+
 def test_a_pose_ahead_of_the_imu_waits(flight):
     ekf = PoseEkf(config())
     samples = flight.samples()

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from support.flights import CAMERA_POSITION, config
 
-from thermal_fiducial.core.error_state import ErrorStateFilter, pose_innovation
+from thermal_fiducial.core.error_state import BodyPose, ErrorStateFilter, pose_innovation
 from thermal_fiducial.core.geometry import so3_exp, so3_left_jacobian, so3_log, transform
 from thermal_fiducial.core.imu import ImuStep
 from thermal_fiducial.core.initialisation import blank_state
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.navigation_state import inject, Layout
+from thermal_fiducial.core.navigation_state import inject, Layout, POSE
 
 FULL = config(estimate_extrinsics=True, pose_noise_scale=1.0)
 LAYOUT = Layout.of(FULL)
@@ -155,3 +155,20 @@ def test_alignment_column_of_tilt_bias_and_gravity(state):
         filter_.align(state, truth.bias[3:] - truth.gravity @ truth.R_map_body, 0.1)
         # 1e-10: second order of a tilt of 1e-6 under 10 m/s^2, with rounding
         np.testing.assert_allclose(seen['y'], seen['H'] @ error, atol=1e-10)
+
+
+def test_motion_adds_to_the_floors_in_all_directions(state):
+    """A perfect pose is worth its floors: what the corners' covariances leave out."""
+    floors = config(
+        attitude_floor=1e-4, position_floor=1e-3, motion_floor=2e-3, stamp_jitter=0.0, estimate_time_offset=False,
+        time_offset_std=0.0,
+    )  # fmt: skip
+    filter_ = ErrorStateFilter(floors)
+    wide = replace(state, clock_open=False, covariance=1e3 * np.eye(filter_.layout.size))
+    body = BodyPose(state.T_map_body, np.zeros((6, 6)))
+    rate = np.array([0.1, -0.2, 0.4])
+    imu = np.concatenate((rate + state.bias[:3], np.zeros(3)))
+    corrected, _ = filter_.correct(wide, body, imu)
+    speed = np.linalg.norm(state.velocity)
+    expected = [1e-4**2 + (2e-3 * np.linalg.norm(rate)) ** 2] * 3 + [1e-3**2 + (2e-3 * speed) ** 2] * 3
+    np.testing.assert_allclose(np.diag(corrected.covariance)[POSE], expected, rtol=1e-6)

@@ -412,6 +412,16 @@ def test_live_parameters_take_effect(graph):
     assert node.cleaner.config.settle_frames == node.view.config.settle_frames == 7
 
 
+def test_live_parameters_of_the_filter_reach_it(graph, monkeypatch):
+    node = graph.add(PoseEkfNode)
+    taken = []
+    monkeypatch.setattr(node.filter, 'configure', taken.append)
+    request = SetParameters.Request(parameters=[Parameter('gate', value=50.0).to_parameter_msg()])
+    (result,) = graph.call(SetParameters, 'pose_ekf/set_parameters', request).results
+    assert result.successful
+    assert [config.gate for config in taken] == [50.0]
+
+
 def test_names_are_relative(graph):
     with ros_graph('-r', '__ns:=/drone', '-r', 'pose:=vision/pose') as other:
         node = other.add(PoseEkfNode)

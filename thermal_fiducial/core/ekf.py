@@ -7,6 +7,7 @@ they came: a pose that comes late goes where it belongs, and everything after it
 from bisect import bisect_left, insort
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 import math
 
 import numpy as np
@@ -26,6 +27,8 @@ from thermal_fiducial.core.types import FloatArray
 _SECOND_NS = 1_000_000_000
 #: Farther than this [ns] an estimated time offset never goes: the history is searched from there.
 _LARGEST_OFFSET_NS = 200_000_000
+#: Poses whose mean normalised innovation squared is told.
+_NIS_POSES = 30
 
 
 @dataclass(slots=True)
@@ -48,6 +51,11 @@ class PoseEkf:
         self._config = config
         self._offset_ns = round(config.camera_time_offset * _SECOND_NS)
         self.reset()
+
+    def configure(self, config: PoseEkfConfig) -> None:
+        """Take over the live parameters of ``config``."""
+        self._config = config
+        self._gate.configure(config)
 
     def reset(self) -> None:
         """Forget everything."""
@@ -269,12 +277,18 @@ class PoseEkf:
             return 0.0
         return usable_seconds(self.state, self._gate.layout, self._config.imu, self._config.lost_position_std)
 
+    def _mean_nis(self) -> float:
+        """Of the latest poses; 6 where their covariances are the truth, less where the parameters allow for more."""
+        values = [update.nis for update in islice(reversed(self.decided.values()), _NIS_POSES)]
+        return float(np.mean([value for value in values if not math.isnan(value)] or math.nan))
+
     def diagnostics(self) -> dict[str, float]:
         """How the filter is, in numbers (SI units)."""
         rate, force = self._noise.vibration
         numbers = {
             'poses accepted': float(self._accepted),
             'poses refused': float(self._refused),
+            'nis': self._mean_nis(),
             'vibration rad/s': rate,
             'vibration m/s^2': force,
         }

@@ -47,16 +47,19 @@ class ErrorStateFilter:
 
     def __init__(self, config: PoseEkfConfig) -> None:
         self.layout = Layout.of(config)
-        self._config = config
+        self.configure(config)
         self._transition = Transition(self.layout.size, _random_walks(config, self.layout))
         self._algebra = ExtendedKalmanFilter(dim_x=self.layout.size, dim_z=6)
-        self._floor = np.repeat((config.attitude_floor**2, config.position_floor**2), 3)
-        clock = 0.0 if config.estimate_time_offset else config.time_offset_std
-        self._clock_variance = config.stamp_jitter**2 + clock**2
         self._H_pose = np.zeros((6, self.layout.size))
         self._H_pose[np.arange(6), POSE] = 1.0
         if self.layout.extrinsics:
             self._H_pose[:, self.layout.extrinsics] = np.eye(6)
+
+    def configure(self, config: PoseEkfConfig) -> None:
+        """Take over the live parameters of ``config``."""
+        self._config = config
+        clock = 0.0 if config.estimate_time_offset else config.time_offset_std
+        self._clock_variance = config.stamp_jitter**2 + clock**2
 
     def predict(self, state: NavigationState, step: ImuStep) -> NavigationState:
         """State after an inertial step."""
@@ -108,9 +111,17 @@ class ErrorStateFilter:
             H = H.copy()
             H[:, self.layout.time_offset] = motion
         noise = pose.covariance + self._clock_noise(state, motion)
-        noise[_SIX, _SIX] += self._floor
+        noise[_SIX, _SIX] += self._floor(motion)
         corrected, nis = self._update(state, pose_innovation(state, pose.T_map_body), H, noise)
         return self._open_clock(corrected, imu), nis
+
+    def _floor(self, motion: FloatArray) -> FloatArray:
+        """Variances (6,) of what the corner covariances don't know: errors that all corners share, more in motion."""
+        share = self._config.motion_floor**2
+        rate, speed = float(motion[:3] @ motion[:3]), float(motion[3:] @ motion[3:])
+        attitude = self._config.attitude_floor**2 + share * rate
+        position = self._config.position_floor**2 + share * speed
+        return np.array((attitude, attitude, attitude, position, position, position))
 
     def _clock_noise(self, state: NavigationState, motion: FloatArray) -> FloatArray:
         """What a clock error that isn't in the state, or is there to first order only, makes of a pose (6, 6).

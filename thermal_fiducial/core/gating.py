@@ -75,6 +75,11 @@ class PoseGate:
         self.layout = self._filter.layout
         self.blank = blank_state(config, self.layout)
 
+    def configure(self, config: PoseEkfConfig) -> None:
+        """Take over the live parameters of ``config``."""
+        self._config = config
+        self._filter.configure(config)
+
     def predict(self, belief: Belief, step: ImuStep) -> Belief:
         """Belief after an inertial step."""
         if belief.main is None and belief.rival is None:

@@ -55,6 +55,11 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.subscribe(TransformStamped, 'map_correction', self._on_map_correction, qos.RESULT)
         self.create_service(Trigger, '~/reset', self._on_reset)
 
+    def configure(self, config: PoseEkfConfig) -> None:
+        """Take over the live parameters of ``config``."""
+        super().configure(config)
+        self.filter.configure(config)
+
     def _make_transforms(self) -> TransformBroadcaster:
         config = self.config
         T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
