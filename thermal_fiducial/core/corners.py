@@ -63,9 +63,13 @@ class Corners:
     @staticmethod
     def at(px: FloatArray, camera: Camera) -> 'Corners':
         """Those at pixels (N, 4, 2)."""
-        x = camera.normalise(px)
+        return Corners.seen_at(camera.normalise(px), camera)
+
+    @staticmethod
+    def seen_at(x: FloatArray, camera: Camera) -> 'Corners':
+        """Those at normalised coordinates (N, 4, 2)."""
         J = camera.distort_jacobian(x)
-        return Corners(px, x, J, np.asarray(np.linalg.inv(J), dtype=np.float64))
+        return Corners(camera.distort(x), x, J, np.asarray(np.linalg.inv(J), dtype=np.float64))
 
     def moved(self, shift_px: FloatArray, camera: Camera) -> 'Corners':
         """Those some pixels (N, 4, 2) away: undistorting them anew would cost more than it tells."""

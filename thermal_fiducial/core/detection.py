@@ -40,12 +40,14 @@ from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatAr
 _SMEAR_THAT_MATTERS_PX = 0.4
 # Correlation with its pattern of a marker that is still where motion has carried it, seen through the lag.
 _STILL_ALIKE = 0.7
+# Share of the expected markers that, seen, shows that the prediction holds: a blind search would not find the others.
+_ENOUGH = 0.5
 # Contrast over noise from which smeared edges cost more than the noise of sharpening them.
 _CLEAR = 20.0
 # Columns of pixels used of a cell; all of a faint marker's count.
 _COLUMNS, _COLUMNS_FAINT = 6, 12
 # Pixels round a marker that the refinement may look at.
-_WINDOW_MARGIN_PX = 16
+_WINDOW_MARGIN_PX = 14
 # Nearer to the rim of the image than this a marker is not expected to be seen.
 _RIM_PX = 2.0
 # Without a map nothing tells which markers come into view: a blind search follows at least every so many frames.
@@ -109,9 +111,9 @@ class MarkerDetector:
             twist = self._motion.predict(stamp_ns, odometry)
             image = counts.astype(np.float32)
             T_camera_map = self._predicted_pose(stamp_ns, odometry, twist)
-            noise = noise_of(image)
-            found, tracked = self._find(stamp_ns, image, noise, camera, twist, T_camera_map)
-            ids, refined = self._refined(stamp_ns, image, noise, found, np.isin(found.ids, tracked), camera, twist)
+            frame = _Frame(stamp_ns, image, noise_of(image), camera, twist)
+            found, tracked = self._find(frame, T_camera_map)
+            ids, refined = self._refined(frame, found, tracked)
             if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
                 refined = local_corners(image, refined, self._decoder.cells)
             return self._rows(ids, refined, camera, T_camera_map)
@@ -136,26 +138,20 @@ class MarkerDetector:
             return None
         return geometry.inverse(camera_in_map(stamp_ns, odometry, self._T_body_camera, twist))
 
-    def _find(
-        self,
-        stamp_ns: int,
-        image: Float32Array,
-        noise: float,
-        camera: Camera,
-        twist: Twist | None,
-        T_camera_map: FloatArray | None,
-    ) -> tuple[Found, IntArray]:
+    def _find(self, frame: '_Frame', T_camera_map: FloatArray | None) -> tuple[Found, Tracked]:
         """Markers where they should be, and whatever a blind search shows, when that is due; and which are tracked."""
-        expected, tracked, complete = Found.none(), np.zeros(0, dtype=np.int64), False
-        if twist is not None and self.config.guided:
-            ids, corners, depth = self._expected(stamp_ns, camera, twist, T_camera_map)
-            expected = self._tracked(stamp_ns, image, camera, twist, ids)
-            tracked = expected.ids
-            new = ~np.isin(ids, tracked)
+        expected, tracked, complete = Found.none(), Tracked.none(), False
+        if frame.twist is not None and self.config.guided:
+            last = self._motion.expected(frame.stamp_ns, frame.twist)
+            ids, corners, depth = self._expected(frame.camera, last, T_camera_map)
+            tracked = self._tracked(frame, frame.twist, last.only(np.isin(last.ids, ids)))
+            everywhere = np.ones(len(tracked.ids), dtype=bool)
+            expected = Found(tracked.ids, frame.camera.distort(tracked.x), tracked.clarity, everywhere)
+            new = ~np.isin(ids, tracked.ids)
             if new.any():
-                also = self._guided(image, noise, camera, twist, ids[new], corners[new], depth[new])
-                expected = merged(expected, also)
-            complete = len(ids) > 0 and len(expected.ids) >= len(ids)
+                expected = merged(expected, self._guided(frame, frame.twist, ids[new], corners[new], depth[new]))
+            enough = _ENOUGH if T_camera_map is not None else 1.0
+            complete = len(ids) > 0 and len(expected.ids) >= enough * len(ids)
         self._since_blind += 1
         interval = self.config.blind_interval
         if T_camera_map is None:
@@ -163,15 +159,14 @@ class MarkerDetector:
         if complete and self._since_blind < interval:
             return expected, tracked
         self._since_blind = 0
-        scene = self._scene(image, camera, twist)
-        blind = blind_search(image, scene, self._decoder, self._allowed(), self.config)
+        scene = self._scene(frame.image, frame.camera, frame.twist)
+        blind = blind_search(frame.image, scene, self._decoder, self._allowed(), self.config)
         return merged(expected, blind), tracked
 
     def _expected(
-        self, stamp_ns: int, camera: Camera, twist: Twist, T_camera_map: FloatArray | None
+        self, camera: Camera, last: Tracked, T_camera_map: FloatArray | None
     ) -> tuple[IntArray, FloatArray, FloatArray]:
         """IDs (N,) of the map's markers and of the last frame's others, their corners (N, 4, 2) [px], depths (N, 4)."""
-        last = self._motion.expected(stamp_ns, twist)
         corners = camera.distort(last.x)
         new = camera.contains(corners, _RIM_PX).all(axis=1)
         if T_camera_map is None:
@@ -184,29 +179,19 @@ class MarkerDetector:
             np.concatenate([depth, last.depth[new]]),
         )
 
-    def _tracked(self, stamp_ns: int, image: Float32Array, camera: Camera, twist: Twist, ids: IntArray) -> Found:
-        """Those of the markers ``ids`` that the last frame showed, and this one where the motion has carried them."""
-        last = self._motion.expected(stamp_ns, twist)
-        last = last.only(np.isin(last.ids, ids))
+    def _tracked(self, frame: '_Frame', twist: Twist, last: Tracked) -> Tracked:
+        """Those of the last frame's markers that this one shows where the motion has carried them."""
         if len(last.ids) == 0:
-            return Found.none()
-        corners = camera.distort(last.x)
-        shown = corners + smear(camera, last.x, last.depth, twist, self.config.bolometer_lag)
-        similarity = self._decoder.match(image, shown, last.ids) * np.sign(last.clarity)
-        alike = (similarity > _STILL_ALIKE) & camera.contains(shown).all(axis=1)
-        return Found(last.ids[alike], corners[alike], last.clarity[alike], np.ones(int(alike.sum()), dtype=bool))
+            return last
+        smeared = smear(frame.camera, last.x, last.depth, twist, self.config.bolometer_lag)
+        shown = frame.camera.distort(last.x) + smeared
+        similarity = self._decoder.match(frame.image, shown, last.ids) * np.sign(last.clarity)
+        alike = (similarity > _STILL_ALIKE) & frame.camera.contains(shown).all(axis=1)
+        return last.only(alike)
 
-    def _guided(
-        self,
-        image: Float32Array,
-        noise: float,
-        camera: Camera,
-        twist: Twist,
-        ids: IntArray,
-        corners: FloatArray,
-        depth: FloatArray,
-    ) -> Found:
+    def _guided(self, frame: '_Frame', twist: Twist, ids: IntArray, corners: FloatArray, depth: FloatArray) -> Found:
         """Known markers that are seen near where the map and the filter say."""
+        camera, image, noise = frame.camera, frame.image, frame.noise
         shift = smear(camera, camera.normalise(corners), depth, twist, self.config.bolometer_lag)
         blurred = np.abs(shift).max(axis=(1, 2)) > _SMEAR_THAT_MATTERS_PX
         scene = markers_sharpened(image, corners[blurred], shift[blurred], _WINDOW_MARGIN_PX)
@@ -239,41 +224,36 @@ class MarkerDetector:
         field = self._field.full(coarse)
         return without_lag(image, field[..., 0], field[..., 1])
 
-    def _refined(
-        self,
-        stamp_ns: int,
-        image: Float32Array,
-        noise: float,
-        found: Found,
-        near: BoolArray,
-        camera: Camera,
-        predicted: Twist | None,
-    ) -> tuple[IntArray, RefinedCorners]:
+    def _refined(self, frame: '_Frame', found: Found, tracked: Tracked) -> tuple[IntArray, RefinedCorners]:
         """Corners at the stamp, on the image freed of lag by the twist that they themselves improve, and their IDs."""
-        ids, corners = found.ids, found.corners_px
+        ids, corners, camera, predicted = found.ids, found.corners_px, frame.camera, frame.twist
         refined = RefinedCorners(corners, np.zeros((0, 4, 2, 2)), np.zeros(0), np.zeros(0))
         if len(ids) == 0:
-            self._motion.remember(stamp_ns, predicted, Tracked.none())
+            self._motion.remember(frame.stamp_ns, predicted, Tracked.none())
             return ids, refined
         # Freeing an image of lag costs noise: of faint markers only the delay is taken out.
         clear = np.abs(found.clarity) > _CLEAR
         before, step = self._pattern.before[ids], self._pattern.step[ids]
-        at_stamp = Corners.at(found.corners_px, camera)
-        depth = _corner_depths(at_stamp.x, self._sizes_of(ids))
+        if len(tracked.ids) == len(ids) and self._since_blind > 0:
+            at_stamp, depth = Corners.seen_at(tracked.x, camera), tracked.depth
+        else:
+            at_stamp = Corners.at(corners, camera)
+            depth = _corner_depths(at_stamp.x, self._sizes_of(ids))
+        near = np.isin(ids, tracked.ids)
         self._depth = float(np.median(depth))
         twist, tau = predicted, self.config.bolometer_lag
         by_twist = smear_by_twist(at_stamp.x, at_stamp.J, depth, tau)
         columns = _COLUMNS if clear.all() else _COLUMNS_FAINT
         for _ in range(2):
             smeared = np.zeros_like(corners) if twist is None else by_twist @ twist.value
-            view = _view(image, at_stamp.px, smeared, clear)
+            view = _view(frame.image, at_stamp.px, smeared, clear)
             start = at_stamp.moved(view.shift, camera)
             seen = refine_corners(
                 view.image, start, camera, before, step, self.config.blur_px, view.spread, columns, near=near
             )
             refined, at_stamp = seen, start.moved(seen.corners_px - start.px - view.shift, camera)
             deviation = np.sqrt(0.5 * np.trace(seen.covariances, axis1=-2, axis2=-1).mean(axis=-1)) / camera.focal_px
-            twist = self._motion.correct(stamp_ns, predicted, ids, at_stamp.x, depth, deviation)
+            twist = self._motion.correct(frame.stamp_ns, predicted, ids, at_stamp.x, depth, deviation)
             if twist is None:
                 break
             smeared = by_twist @ twist.value
@@ -289,8 +269,8 @@ class MarkerDetector:
         there = replace(found, corners_px=found.corners_px + view.shift)
         keep = confirmed(view.image, there, seen, self._decoder, self.config)
         ids, refined = ids[keep], refined.only(keep)
-        seen_now = Tracked(ids, at_stamp.x[keep], depth[keep], refined.contrast / noise)
-        self._motion.remember(stamp_ns, twist, seen_now)
+        seen_now = Tracked(ids, at_stamp.x[keep], depth[keep], refined.contrast / frame.noise)
+        self._motion.remember(frame.stamp_ns, twist, seen_now)
         return ids, refined
 
     def _rows(self, ids: IntArray, refined: RefinedCorners, camera: Camera, T_camera_map: FloatArray | None) -> Markers:
@@ -306,6 +286,18 @@ class MarkerDetector:
 
     def _sizes_of(self, ids: IntArray) -> FloatArray:
         return np.array([self.size(marker_id) for marker_id in ids.tolist()])
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """An image, and what is known of the camera's motion at its stamp."""
+
+    stamp_ns: int
+    image: Float32Array
+    #: standard deviation of a pixel [counts]
+    noise: float
+    camera: Camera
+    twist: Twist | None
 
 
 @dataclass(frozen=True, slots=True)
