@@ -59,11 +59,14 @@ def test_a_node_that_refuses_its_parameters_ends_the_replay(tmp_path, capfd):
 
 def test_latencies_are_paired_by_stamp():
     meter = LatencyMeter()
-    meter.sent('image', 100, now_ns=1_000_000)
-    meter.sent('imu', 110, now_ns=3_000_000)
-    meter.camera_pose(100, now_ns=5_000_000)
-    meter.pose(110, now_ns=7_000_000)
-    meter.pose(999, now_ns=9_000_000)
+    meter.sent('image', 90, now_ns=0)
+    meter.camera_pose(90, now_ns=4_000_000)  # starts the filter, corrects nothing
+    meter.pose(95, now_ns=900_000_000)
+    meter.sent('image', 100, now_ns=901_000_000)
+    meter.sent('imu', 110, now_ns=903_000_000)
+    meter.camera_pose(100, now_ns=905_000_000)
+    meter.pose(110, now_ns=907_000_000)
+    meter.pose(999, now_ns=909_000_000)
     summary = meter.summary()
     assert {kind: values['max'] for kind, values in summary.items()} == {
         'imu_to_pose': 4.0, 'image_to_camera_pose': 4.0, 'image_to_corrected_pose': 6.0

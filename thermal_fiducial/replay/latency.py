@@ -23,6 +23,7 @@ class LatencyMeter:
     def __init__(self) -> None:
         self._sent: dict[str, dict[int, int]] = {'image': {}, 'imu': {}}
         self._uncorrected: list[int] = []
+        self._running = False
         self._rows: list[tuple[str, int, float]] = []
 
     def sent(self, kind: str, stamp_ns: int, now_ns: int) -> None:
@@ -30,12 +31,14 @@ class LatencyMeter:
         self._sent[kind][stamp_ns] = now_ns
 
     def camera_pose(self, stamp_ns: int, now_ns: int) -> None:
-        """A camera pose came."""
+        """A camera pose came. It corrects something if the filter is running, else it is one of those that start it."""
         self._pair(IMAGE_TO_CAMERA_POSE, 'image', stamp_ns, now_ns)
-        self._uncorrected.append(stamp_ns)
+        if self._running:
+            self._uncorrected.append(stamp_ns)
 
     def pose(self, stamp_ns: int, now_ns: int) -> None:
         """A pose came: the first after a camera pose carries its correction."""
+        self._running = True
         self._pair(IMU_TO_POSE, 'imu', stamp_ns, now_ns)
         for frame_ns in self._uncorrected:
             self._pair(IMAGE_TO_CORRECTED_POSE, 'image', frame_ns, now_ns)
