@@ -57,6 +57,13 @@ def test_finds_the_marker_at_any_contrast(contrast):
     assert np.abs(found.corners_px[0] - CORNERS).max() < 4.0  # a third of a cell, which the refinement catches
 
 
+def test_what_is_seen_already_is_not_sought():
+    image = scene(21, 100.0, 2.0)
+    image[300:396, 400:496] = scene(8, 100.0, 2.0)[138:234, 188:284]
+    found = blind_search(image, image, DECODER, EVERY, ArucoDetectorConfig(), CORNERS[None])
+    assert found.ids.tolist() == [8]
+
+
 def test_rules():
     image = scene(21, 100.0, 2.0)
     image[300:396, 400:496] = image[138:234, 188:284]

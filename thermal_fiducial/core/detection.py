@@ -160,7 +160,8 @@ class MarkerDetector:
             return expected, tracked
         self._since_blind = 0
         scene = self._scene(frame.image, frame.camera, frame.twist)
-        blind = blind_search(frame.image, scene, self._decoder, self._allowed(), self.config)
+        allowed = self._allowed()
+        blind = blind_search(frame.image, scene, self._decoder, allowed, self.config, expected.corners_px)
         return merged(expected, blind), tracked
 
     def _expected(

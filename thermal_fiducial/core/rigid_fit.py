@@ -16,7 +16,7 @@ from thermal_fiducial.core.types import BoolArray, FloatArray
 _MAX_STEPS = 20
 # Costs are chi-squares: a step that lowers one by less is a ten-thousandth of a standard deviation, and the last. Of a
 # pose that the image refutes anyway a share of the cost is enough, lest all wait for it to creep along its valley.
-_LAST_GAIN, _REFUTED, _LAST_SHARE = 1e-8, 100.0, 1e-3
+_LAST_GAIN, _REFUTED, _LAST_SHARE = 1e-8, 50.0, 1e-2
 # Damping at which Levenberg-Marquardt finds no better pose at all.
 _HOPELESS = 1e6
 # Depth [m] from which a point is in front of the camera.

@@ -38,6 +38,8 @@ _SHARP = 7.5
 _SOFT = 12.0
 # Contrast over noise beyond which corners deviate by what optics and plates really are, and not by noise.
 _NOISY = 8.0
+# Width of a plate round its marker [cells], and what smear may add.
+_PLATE_CELLS = 1.6
 # Nearer to the rim of the image than this [px] a marker may be cut off.
 _RIM = 2.0
 # Pixels along a side that the refinement uses of a long one.
@@ -68,7 +70,12 @@ class Found:
 
 
 def blind_search(
-    image: Float32Array, scene: Float32Array, decoder: Decoder, allowed: BoolArray, config: ArucoDetectorConfig
+    image: Float32Array,
+    scene: Float32Array,
+    decoder: Decoder,
+    allowed: BoolArray,
+    config: ArucoDetectorConfig,
+    seen: FloatArray | None = None,
 ) -> Found:
     """Markers with IDs ``allowed`` (M,), each ID once.
 
@@ -76,23 +83,19 @@ def blind_search(
     ----------
     image : (height, width) the frame
     scene : the same freed of lag, which costs noise: the finest markers are sought there, the faintest in ``image``
+    seen : (N, 4, 2) corners of markers that are there [px]: nothing is sought in them and their plates
     """
     noise = noise_of(image)
-    smoothing, floor, window, threshold = _FINE
-    fine = find_quads(normalise(scene, noise, smoothing, floor), window, threshold, config.min_side_px)
-    half = halved(image)
-    half_noise = 0.5 * noise
-    half = without_columns(half, half_noise)
-    smoothing, floor, window, threshold = _FAINT
-    view = normalise(half, half_noise, smoothing, floor, 2)
-    faint = 2.0 * find_quads(view, window, threshold, 0.5 * config.min_side_px + 2.0) + 0.5
+    hidden = None if seen is None else _grown(seen, 1.0 + 2.0 * _PLATE_CELLS / decoder.cells)
+    half = without_columns(halved(image), 0.5 * noise)
+    fine, faint = _outlines(scene, half, noise, config.min_side_px, hidden)
     quads = np.concatenate([fine, faint, shrunk(faint, decoder.cells)])
     if len(quads) == 0:
         return Found.none()
-    reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, 0.5 * (quads[len(fine) :] - 0.5), allowed))
+    reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, _halfway(quads[len(fine) :]), allowed))
     rough = _rough(reading, quads)
     if len(rough):
-        better = aligned(half, 0.5 * (quads[rough] - 0.5), reading.ids[rough], reading.turns[rough], decoder)
+        better = aligned(half, _halfway(quads[rough]), reading.ids[rough], reading.turns[rough], decoder)
         reading = _joined(reading, decoder.read(half, better, allowed))
         quads = np.concatenate([quads, 2.0 * better + 0.5])
     sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1).min(axis=1)
@@ -102,6 +105,31 @@ def blind_search(
     turned = (np.arange(4) - reading.turns[best][:, None]) % 4
     corners = np.take_along_axis(quads[best], turned[..., None], axis=1)
     return Found(reading.ids[best], corners, reading.contrast[best] / noise, np.zeros(len(best), dtype=bool))
+
+
+def _outlines(
+    scene: Float32Array, half: Float32Array, noise: float, min_side_px: float, hidden: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Quadrilaterals of fine markers (Q, 4, 2) and of faint ones, both in pixels of the full resolution."""
+    smoothing, floor, window, threshold = _FINE
+    view = normalise(scene, noise, smoothing, floor)
+    fine = find_quads(view, window, threshold, min_side_px, hidden)
+    smoothing, floor, window, threshold = _FAINT
+    view = normalise(half, 0.5 * noise, smoothing, floor, 2)
+    hidden = None if hidden is None else _halfway(hidden)
+    faint = find_quads(view, window, threshold, 0.5 * min_side_px + 2.0, hidden)
+    return fine, 2.0 * faint + 0.5
+
+
+def _halfway(quads: FloatArray) -> FloatArray:
+    """Corners (..., 2) in pixels of half the resolution."""
+    return 0.5 * (quads - 0.5)
+
+
+def _grown(quads: FloatArray, factor: float) -> FloatArray:
+    """Quadrilaterals (N, 4, 2) larger by a factor about their middles."""
+    middle = quads.mean(axis=1, keepdims=True)
+    return np.asarray(middle + factor * (quads - middle))
 
 
 def _rough(reading: Reading, quads: FloatArray) -> IntArray:
