@@ -74,6 +74,9 @@ def test_markers_are_expected_where_the_motion_carries_them():
     points, dt = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3)), 1 / 30
     later, twist = moved(points, dt), Twist(TWIST, np.eye(6))
     tracker = MotionTracker(np.eye(4))
+    tracker.remember(-round(dt * 1e9), twist, Tracked.none())
+    # One twist alone may be that of markers whose own lag nobody knew.
+    assert len(tracker.expected(0, twist).ids) == 0
     tracker.remember(0, twist, Tracked(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5)))
     expected = tracker.expected(round(dt * 1e9), twist)
     # The stamp is a whole number of nanoseconds.

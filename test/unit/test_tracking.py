@@ -46,7 +46,7 @@ def test_seen_markers_are_followed(searches):
         top_left = corners_px(rows)[:, 0]
         # Noise of a tenth of the contrast's half leaves some hundredths of a pixel; refined is refined.
         np.testing.assert_allclose(top_left, [[99.5 + SPEED * k, 79.5], [99.5 + SPEED * k, 279.5]], atol=0.2)
-    # Two frames until the motion is known, then one in three.
+    # Three frames until the motion is known well enough, then one in three.
     assert len(searches) == 5
 
 

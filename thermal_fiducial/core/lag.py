@@ -109,6 +109,8 @@ class MotionTracker:
         self._stamp_ns: int | None = None
         self._twist: Twist | None = None
         self._seen = Tracked.none()
+        # The first twist comes from corners whose own lag nobody knew: it tells little of where they will be.
+        self._settled = False
 
     def predict(self, stamp_ns: int, odometry: Odometry | None) -> Twist | None:
         """Twist expected at a frame; None when nothing is known."""
@@ -122,7 +124,7 @@ class MotionTracker:
     def expected(self, stamp_ns: int, twist: Twist) -> Tracked:
         """The last frame's markers where the camera's motion since has carried them."""
         dt = self._since(stamp_ns)
-        if dt is None or self._twist is None or len(self._seen.ids) == 0:
+        if dt is None or self._twist is None or not self._settled or len(self._seen.ids) == 0:
             return Tracked.none()
         step = (0.5 * dt) * (twist.value + self._twist.value)
         moved = geometry.inverse(geometry.transform(geometry.so3_exp(step[3:]), step[:3]))
@@ -160,6 +162,7 @@ class MotionTracker:
 
     def remember(self, stamp_ns: int, twist: Twist | None, seen: Tracked) -> None:
         """Keep a frame's twist and markers for the next one."""
+        self._settled = self._twist is not None and self._since(stamp_ns) is not None
         self._stamp_ns, self._twist, self._seen = stamp_ns, twist, seen
 
     def _since(self, stamp_ns: int) -> float | None:
