@@ -7,6 +7,7 @@ from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.pose import (
     choose_branch,
+    choose_branches,
     ippe_square,
     marker_corners,
     solve_camera_pose,
@@ -67,6 +68,35 @@ def test_expectation_cannot_choose_a_branch_that_the_image_excludes():
     camera, T = CAMERAS['plumb_bob'], pose((0.7, 0.0, 0.0), (0.0, 0.0, 1.0))
     found = solve_marker_pose(image(camera, T), ISOTROPIC, 0.3, camera)
     assert choose_branch(found, found.T_alternative).rms_px == found.rms_px
+
+
+def test_other_known_markers_choose_the_branch():
+    """Of three small markers far away each alone is ambiguous; together they are not, whatever was predicted."""
+    camera = CAMERAS['plumb_bob']
+    T_camera_map = geometry.transform(geometry.so3_exp([0.2, -0.1, 0.1]), [0.1, 0.0, 5.0])
+    poses_in_map = [
+        geometry.transform(geometry.so3_exp(tilt) @ FACING, p)
+        for tilt, p in [
+            ((0.3, 0, 0), (-1.0, 0.3, 0.0)),
+            ((0, -0.3, 0), (0.9, -0.4, 0.5)),
+            ((0.2, 0.2, 0), (0, 0.8, -0.4)),
+        ]
+    ]
+    corners = np.stack([image(camera, T_camera_map @ T, 0.2) for T in poses_in_map])
+    covs = np.broadcast_to(16.0 * ISOTROPIC, (3, 4, 2, 2))
+    poses = solve_marker_poses(corners, covs, np.full(3, 0.2), camera)
+    assert all(pose.ambiguous() for pose in poses)
+    wrong = [poses[0].swapped(), poses[1], poses[2].swapped()]
+    known = [(T, 0.2) for T in poses_in_map]
+    for predicted in (None, T_camera_map, wrong[0].T_camera_marker @ geometry.inverse(poses_in_map[0])):
+        chosen = choose_branches(wrong, corners, covs, known, camera, predicted)
+        for pose, T in zip(chosen, poses_in_map, strict=True):
+            np.testing.assert_allclose(pose.T_camera_marker, T_camera_map @ T, atol=1e-5)
+    # A lone known marker has the prediction alone, one of unknown pose nothing.
+    lone = choose_branches(wrong, corners, covs, [known[0], None, None], camera, T_camera_map)
+    np.testing.assert_allclose(lone[0].T_camera_marker, poses[0].T_camera_marker)
+    assert lone[2] is wrong[2]
+    assert choose_branches(wrong, corners, covs, [known[0], None, None], camera) is wrong
 
 
 @pytest.mark.parametrize(

@@ -32,7 +32,7 @@ from thermal_fiducial.core.local_corners import local_corners
 from thermal_fiducial.core.marker_rows import marker_rows
 from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers, Odometry
 from thermal_fiducial.core.patterns import marker_bits
-from thermal_fiducial.core.pose import choose_branch, ippe_square, marker_corners, solve_marker_poses
+from thermal_fiducial.core.pose import choose_branches, ippe_square, marker_corners, solve_marker_poses
 from thermal_fiducial.core.search import blind_search, confirmed, Found, merged
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 
@@ -278,11 +278,8 @@ class MarkerDetector:
         if len(ids) == 0:
             return np.zeros(0, dtype=MARKER_DTYPE)
         poses = solve_marker_poses(refined.corners_px, refined.covariances, self._sizes_of(ids), camera)
-        if T_camera_map is not None:
-            poses = [
-                choose_branch(pose, T_camera_map @ self._map[marker_id][0]) if marker_id in self._map else pose
-                for marker_id, pose in zip(ids.tolist(), poses, strict=True)
-            ]
+        in_map = [self._map.get(marker_id) for marker_id in ids.tolist()]
+        poses = choose_branches(poses, refined.corners_px, refined.covariances, in_map, camera, T_camera_map)
         return marker_rows(ids, refined, poses)
 
     def _sizes_of(self, ids: IntArray) -> FloatArray:

@@ -23,6 +23,7 @@ __all__ = [
     'JointPose',
     'PlanarPose',
     'choose_branch',
+    'choose_branches',
     'ippe_square',
     'marker_corners',
     'solve_camera_pose',
@@ -54,6 +55,13 @@ class PlanarPose:
     #: weighted squared errors of both: with honest corner covariances, chi-square of two degrees of freedom
     chi2: float
     alternative_chi2: float
+
+    def ambiguous(self, ratio: float = 10.0) -> bool:
+        """Whether the image allows the other branch: its squared error is below ``ratio`` times this one's, or of 2.
+
+        2 is what the errors of corners with honest covariances come to.
+        """
+        return bool(self.alternative_chi2 <= ratio * max(self.chi2, 2.0))
 
     def swapped(self) -> 'PlanarPose':
         """The other branch first."""
@@ -140,14 +148,55 @@ def choose_branch(pose: PlanarPose, T_camera_marker_expected: FloatArray, ratio:
     """``pose`` with that branch first whose rotation is closer to the expected one.
 
     The expectation (from other markers of the frame, or the filter) decides only between branches that the image
-    allows: one whose squared error is over ``ratio`` times the other's (or its expectation, 2) stays second.
+    allows: :meth:`PlanarPose.ambiguous`.
     """
-    if not pose.alternative_chi2 <= ratio * max(pose.chi2, 2.0):
+    if not pose.ambiguous(ratio):
         return pose
     # The smaller the angle between two rotations, the larger the trace of R_1^T R_2.
     R = T_camera_marker_expected[:3, :3]
     nearer = np.sum(pose.T_alternative[:3, :3] * R) > np.sum(pose.T_camera_marker[:3, :3] * R)
     return pose.swapped() if nearer else pose
+
+
+def choose_branches(
+    poses: list[PlanarPose],
+    corners_px: FloatArray,
+    corner_covs: FloatArray,
+    in_map: list[tuple[FloatArray, float] | None],
+    camera: Camera,
+    T_camera_map: FloatArray | None = None,
+) -> list[PlanarPose]:
+    """The poses of a frame's markers with the likelier branch first.
+
+    What decides between branches that the image allows is the pose of the camera: jointly from all known markers in
+    view where there are several, else the predicted one, if any.
+
+    Parameters
+    ----------
+    poses : of N markers
+    corners_px, corner_covs : (N, 4, 2), (N, 4, 2, 2)
+    in_map : N times T_map_marker (4, 4) and side [m], or None for a marker of unknown pose
+    T_camera_map : (4, 4) predicted
+    """
+    known = [k for k, entry in enumerate(in_map) if entry is not None]
+    if not any(poses[k].ambiguous() for k in known):
+        return poses
+    T_map_marker = {k: entry[0] for k, entry in enumerate(in_map) if entry is not None}
+    if len(known) > 1:
+        squares = [geometry.apply(entry[0], marker_corners(entry[1])) for entry in in_map if entry is not None]
+        initial = None if T_camera_map is None else geometry.inverse(T_camera_map)
+        try:
+            joint = solve_camera_pose(corners_px[known], corner_covs[known], np.stack(squares), camera, initial)
+            T_camera_map = geometry.inverse(joint.T_map_camera)
+        except InputError:
+            # No camera sees them all like this: the prediction is what is left.
+            pass
+    if T_camera_map is None:
+        return poses
+    return [
+        choose_branch(pose, T_camera_map @ T_map_marker[k]) if k in T_map_marker else pose
+        for k, pose in enumerate(poses)
+    ]
 
 
 def solve_camera_pose(
