@@ -297,7 +297,7 @@ class ArucoDetectorConfig:
     guided: bool = param(True, 'With a map and odometry: look for known markers where they should be.', live=True)
     blind_interval: int = param(
         10,
-        'A blind search follows every so many frames, and whenever most of the expected markers are not seen.',
+        'A blind search follows every so many frames, and sooner where expected markers are not seen.',
         minimum=1,
         maximum=1000,
         live=True,

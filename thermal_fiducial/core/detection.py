@@ -10,7 +10,7 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.contrast import noise_of
+from thermal_fiducial.core.contrast import noise_of, without_columns
 from thermal_fiducial.core.corners import Corners, grid_pattern, refine_corners, RefinedCorners
 from thermal_fiducial.core.decoding import Decoder
 from thermal_fiducial.core.guided import camera_in_map, expected_markers, look
@@ -40,18 +40,20 @@ from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatAr
 _SMEAR_THAT_MATTERS_PX = 0.4
 # Correlation with its pattern of a marker that is still where motion has carried it, seen through the lag.
 _STILL_ALIKE = 0.7
-# Share of the expected markers that, seen, shows that the prediction holds: a blind search would not find the others.
+# Share of the map's expected markers that, seen, shows that the prediction holds.
 _ENOUGH = 0.5
 # Contrast over noise from which smeared edges cost more than the noise of sharpening them.
 _CLEAR = 20.0
+# Contrast over noise beyond which the column pattern of the array displaces no side.
+_CLEARER_THAN_COLUMNS = 100.0
 # Columns of pixels used of a cell; all of a faint marker's count.
 _COLUMNS, _COLUMNS_FAINT = 6, 12
 # Pixels round a marker that the refinement may look at.
 _WINDOW_MARGIN_PX = 14
 # Nearer to the rim of the image than this a marker is not expected to be seen.
 _RIM_PX = 2.0
-# Without a map nothing tells which markers come into view: a blind search follows at least every so many frames.
-_UNMAPPED = 3
+# Where not all markers are known, or not all seen that should be, a blind search follows at least every so many frames.
+_INCOMPLETE = 2
 # Depth of the scene while no marker has told it [m].
 _TYPICAL_DEPTH = 3.0
 
@@ -111,7 +113,10 @@ class MarkerDetector:
             twist = self._motion.predict(stamp_ns, odometry)
             image = counts.astype(np.float32)
             T_camera_map = self._predicted_pose(stamp_ns, odometry, twist)
-            frame = _Frame(stamp_ns, image, noise_of(image), camera, twist)
+            noise = noise_of(image)
+            if counts.dtype != np.uint8 and not self._motion.all_clearer_than(_CLEARER_THAN_COLUMNS):
+                image = without_columns(image, noise)
+            frame = _Frame(stamp_ns, image, noise, camera, twist)
             found, tracked = self._find(frame, T_camera_map)
             ids, refined = self._refined(frame, found, tracked)
             if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
@@ -140,7 +145,7 @@ class MarkerDetector:
 
     def _find(self, frame: '_Frame', T_camera_map: FloatArray | None) -> tuple[Found, Tracked]:
         """Markers where they should be, and whatever a blind search shows, when that is due; and which are tracked."""
-        expected, tracked, complete = Found.none(), Tracked.none(), False
+        expected, tracked, complete, holds = Found.none(), Tracked.none(), False, False
         if frame.twist is not None and self.config.guided:
             last = self._motion.expected(frame.stamp_ns, frame.twist)
             ids, corners, depth = self._expected(frame.camera, last, T_camera_map)
@@ -149,14 +154,15 @@ class MarkerDetector:
             expected = Found(tracked.ids, frame.camera.distort(tracked.x), tracked.clarity, everywhere)
             new = ~np.isin(ids, tracked.ids)
             if new.any():
+                corners = corners + _common_shift(ids, corners, expected)
                 expected = merged(expected, self._guided(frame, frame.twist, ids[new], corners[new], depth[new]))
-            enough = _ENOUGH if T_camera_map is not None else 1.0
-            complete = len(ids) > 0 and len(expected.ids) >= enough * len(ids)
+            complete = len(ids) > 0 and len(expected.ids) >= len(ids)
+            holds = len(ids) > 0 and len(expected.ids) >= _ENOUGH * len(ids)
         self._since_blind += 1
         interval = self.config.blind_interval
-        if T_camera_map is None:
-            interval = min(interval, _UNMAPPED)
-        if complete and self._since_blind < interval:
+        if T_camera_map is None or not complete:
+            interval = min(interval, _INCOMPLETE)
+        if (complete or (holds and T_camera_map is not None)) and self._since_blind < interval:
             return expected, tracked
         self._since_blind = 0
         scene = self._scene(frame.image, frame.camera, frame.twist)
@@ -309,6 +315,14 @@ class _View:
     removed: FloatArray
     #: (N, 2) standard deviation of what is left of the smear, along it
     spread: FloatArray
+
+
+def _common_shift(ids: IntArray, corners: FloatArray, seen: Found) -> FloatArray:
+    """By how much (2,) markers are off their predicted corners (N, 4, 2), as those that are seen tell."""
+    _, predicted, found = np.intersect1d(ids, seen.ids, assume_unique=True, return_indices=True)
+    if len(found) == 0:
+        return np.zeros(2)
+    return np.asarray(np.median((seen.corners_px[found] - corners[predicted]).mean(axis=1), axis=0))
 
 
 def _view(image: Float32Array, corners: FloatArray, smeared: FloatArray, clear: BoolArray) -> _View:

@@ -160,6 +160,10 @@ class MotionTracker:
             twist = Twist(np.asarray(value), np.asarray(posterior))
         return twist
 
+    def all_clearer_than(self, clarity: float) -> bool:
+        """Whether there were markers, all of more contrast over noise."""
+        return len(self._seen.ids) > 0 and bool(np.abs(self._seen.clarity).min() > clarity)
+
     def remember(self, stamp_ns: int, twist: Twist | None, seen: Tracked) -> None:
         """Keep a frame's twist and markers for the next one."""
         self._settled = self._twist is not None and self._since(stamp_ns) is not None
