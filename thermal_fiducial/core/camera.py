@@ -8,6 +8,7 @@ fish-eye lenses", 2006, as ``cv2.fisheye`` has it (equidistant).
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -106,7 +107,10 @@ class Camera:
 
     def distort_jacobian(self, normalised: npt.ArrayLike) -> FloatArray:
         """Derivative (..., 2, 2) [px] of :meth:`distort`."""
-        return np.asarray(self.K[:2, :2] @ self._distort(np.asarray(normalised, dtype=np.float64))[1])
+        x = np.asarray(normalised, dtype=np.float64)
+        if self.model == 'equidistant':
+            return np.asarray(self.K[:2, :2] @ _distort_equidistant(x, self.D)[1])
+        return np.asarray(self.K[:2, :2] @ _polynomial_derivative(x, self._polynomial))
 
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
         """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`.
@@ -148,17 +152,14 @@ class Camera:
         r = np.linspace(0.0, 12.0, 4801)
         radial = self._distort(np.stack([r, np.zeros_like(r)], axis=-1))[0][:, 0]
         if self.model != 'equidistant':
-            radial = r * _radial_factor(r * r, self._radial_coefficients)[0]
+            radial = r * _radial_factor(r * r, self._polynomial)
         falling = np.flatnonzero(np.diff(radial) <= 0.0)
         return float(r[falling[0]]) if len(falling) else np.inf
 
     @cached_property
-    def _radial_coefficients(self) -> FloatArray:
-        """k1 k2 k3 k4 k5 k6."""
-        k = np.zeros(6)
-        k[:2], k[2] = self.D[:2], self.D[4]
-        k[3:] = self.D[5:8] if self.model == 'rational_polynomial' else 0.0
-        return k
+    def _polynomial(self) -> '_Polynomial':
+        k1, k2, p1, p2, k3, *rational = self.D.tolist()
+        return _Polynomial((k1, k2, k3), tuple(rational) if any(rational) else (), p1, p2)
 
     @cached_property
     def _inverse_focal(self) -> FloatArray:
@@ -189,39 +190,69 @@ class Camera:
             near = r < 1e-6
             scale = np.where(near, 1.0, _equidistant_radius(np.arctan(r), self.D)[0] / np.where(near, 1.0, r))
             return np.asarray(x * scale[..., None])
-        return _distort_polynomial(x, self._radial_coefficients, float(self.D[2]), float(self.D[3]))[0]
+        return _distort_polynomial(x, self._polynomial)
 
     def _distort(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Distorted normalised coordinates (..., 2) and their derivative (..., 2, 2)."""
         if self.model == 'equidistant':
             return _distort_equidistant(x, self.D)
-        return _distort_polynomial(x, self._radial_coefficients, float(self.D[2]), float(self.D[3]))
+        return _distort_polynomial(x, self._polynomial), _polynomial_derivative(x, self._polynomial)
 
 
-def _radial_factor(r2: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Radial factor of the (rational) polynomial and its derivative with respect to r^2."""
-    top = 1.0 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))
-    d_top = k[0] + r2 * (2.0 * k[1] + 3.0 * k[2] * r2)
-    if not k[3:].any():
-        return top, d_top
-    bottom = 1.0 + r2 * (k[3] + r2 * (k[4] + r2 * k[5]))
-    d_bottom = k[3] + r2 * (2.0 * k[4] + 3.0 * k[5] * r2)
-    return top / bottom, (d_top * bottom - top * d_bottom) / bottom**2
+class _Polynomial(NamedTuple):
+    """Distortion of plumb_bob, and of rational_polynomial where there is a denominator."""
+
+    #: k1 k2 k3
+    k: tuple[float, ...]
+    #: k4 k5 k6, or nothing
+    denominator: tuple[float, ...]
+    p1: float
+    p2: float
 
 
-def _distort_polynomial(x: FloatArray, k: FloatArray, p1: float, p2: float) -> tuple[FloatArray, FloatArray]:
+def _radial_factor(r2: FloatArray, model: _Polynomial) -> FloatArray:
+    """Factor by which points at a squared distance from the axis are moved outwards."""
+    k1, k2, k3 = model.k
+    top = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if not model.denominator:
+        return top
+    k4, k5, k6 = model.denominator
+    return np.asarray(top / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))))
+
+
+def _radial_slope(r2: FloatArray, factor: FloatArray, model: _Polynomial) -> FloatArray:
+    """Derivative of the ``factor`` with respect to the squared distance."""
+    k1, k2, k3 = model.k
+    d_top = k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2)
+    if not model.denominator:
+        return d_top
+    k4, k5, k6 = model.denominator
+    d_bottom = k4 + r2 * (2.0 * k5 + 3.0 * k6 * r2)
+    return np.asarray((d_top - factor * d_bottom) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))))
+
+
+def _distort_polynomial(x: FloatArray, model: _Polynomial) -> FloatArray:
     a, b = x[..., 0], x[..., 1]
-    aa, ab, bb = a * a, a * b, b * b
+    aa, bb, twice = a * a, b * b, 2.0 * a * b
     r2 = aa + bb
-    factor, d_factor = _radial_factor(r2, k)
-    distorted = x * factor[..., None]
-    distorted[..., 0] += 2.0 * p1 * ab + p2 * (r2 + 2.0 * aa)
-    distorted[..., 1] += p1 * (r2 + 2.0 * bb) + 2.0 * p2 * ab
+    distorted = x * _radial_factor(r2, model)[..., None]
+    distorted[..., 0] += model.p1 * twice + model.p2 * (r2 + 2.0 * aa)
+    distorted[..., 1] += model.p1 * (r2 + 2.0 * bb) + model.p2 * twice
+    return distorted
+
+
+def _polynomial_derivative(x: FloatArray, model: _Polynomial) -> FloatArray:
+    """Derivative (..., 2, 2) of :func:`_distort_polynomial`."""
+    p1, p2 = model.p1, model.p2
+    a, b = x[..., 0], x[..., 1]
+    r2 = a * a + b * b
+    factor = _radial_factor(r2, model)
+    slope = 2.0 * _radial_slope(r2, factor, model)
     J = np.empty((*x.shape[:-1], 2, 2))
-    J[..., 0, 0] = factor + 2.0 * aa * d_factor + 2.0 * p1 * b + 6.0 * p2 * a
-    J[..., 0, 1] = J[..., 1, 0] = 2.0 * ab * d_factor + 2.0 * p1 * a + 2.0 * p2 * b
-    J[..., 1, 1] = factor + 2.0 * bb * d_factor + 6.0 * p1 * b + 2.0 * p2 * a
-    return distorted, J
+    J[..., 0, 0] = factor + a * (a * slope + 6.0 * p2) + 2.0 * p1 * b
+    J[..., 0, 1] = J[..., 1, 0] = a * (b * slope + 2.0 * p1) + 2.0 * p2 * b
+    J[..., 1, 1] = factor + b * (b * slope + 6.0 * p1) + 2.0 * p2 * a
+    return J
 
 
 def _equidistant_radius(theta: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:

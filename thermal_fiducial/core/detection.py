@@ -36,8 +36,8 @@ from thermal_fiducial.core.pose import choose_branches, ippe_square, marker_corn
 from thermal_fiducial.core.search import blind_search, confirmed, Found, merged
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 
-# Smear by lag below which neither the search nor the shape of an edge changes [px].
-_SMEAR_THAT_MATTERS_PX = 0.4
+# Smear by lag below which the shape of an edge doesn't change, and below which the search misses nothing [px].
+_SMEAR_THAT_MATTERS_PX, _SMEAR_THAT_HIDES_PX = 0.4, 2.0
 # Correlation with its pattern of a marker that is still where motion has carried it, seen through the lag.
 _STILL_ALIKE = 0.7
 # Share of the map's expected markers that, seen, shows that the prediction holds.
@@ -226,7 +226,7 @@ class MarkerDetector:
         if self._field is None or self._field.camera is not camera:
             self._field = SmearField(camera)
         coarse = self._field.at(twist, self._depth, self.config.bolometer_lag)
-        if np.abs(coarse).max() < _SMEAR_THAT_MATTERS_PX:
+        if np.abs(coarse).max() < _SMEAR_THAT_HIDES_PX:
             return image
         field = self._field.full(coarse)
         return without_lag(image, field[..., 0], field[..., 1])

@@ -16,6 +16,8 @@ from thermal_fiducial.core.types import FloatArray
 
 # Below this angle [rad] the Taylor series is exact to double precision (the next term is angle^6 / 5040).
 SMALL_ANGLE = 1e-2
+# So many matrices are faster one by one.
+_FEW = 20
 
 
 def skew(v: npt.ArrayLike) -> FloatArray:
@@ -141,6 +143,8 @@ def quaternion_from_rotation(R: npt.ArrayLike) -> FloatArray:
     R = np.asarray(R, dtype=np.float64)
     if R.ndim == 2:
         return _quaternion_of_one(R)
+    if R.ndim == 3 and len(R) <= _FEW:
+        return np.array([_quaternion_of_one(one) for one in R]).reshape(-1, 4)
     d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     squares = np.stack([1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2, 1 + d0 + d1 + d2], axis=-1)
     sums = [R[..., i, j] + R[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
@@ -161,7 +165,7 @@ def quaternion_from_rotation(R: npt.ArrayLike) -> FloatArray:
 
 
 def _quaternion_of_one(R: FloatArray) -> FloatArray:
-    """The same for a single matrix (3, 3): many times faster without arrays, and needed at IMU rate."""
+    """The same for a single matrix (3, 3): many times faster without arrays."""
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
     rows = (
         (1 + a - e - i, b + d, c + g, h - f),
