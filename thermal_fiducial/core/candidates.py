@@ -15,7 +15,7 @@ from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.fitting import fit_pose
 from thermal_fiducial.core.geometry import rotation_angle
 from thermal_fiducial.core.keyframes import Displacement
-from thermal_fiducial.core.reprojection import linearise, shared_covariances, whitening
+from thermal_fiducial.core.reprojection import linearise
 from thermal_fiducial.core.types import FloatArray, IntArray
 
 #: Views closer in direction than this tell nothing new of the ambiguity [rad].
@@ -135,7 +135,7 @@ class Candidate:
             return Placement(None, nothing, f'marker {self.id}: its views contradict each other')
         scale = max(1.0, best.chi2 / (8 * len(self.views) - 6))
         rivals = [fit for fit in fits[1:] if rotation_angle(fit.T[:3, :3].T @ best.T[:3, :3]) > SAME_FIT]
-        if rivals and rivals[0].chi2 - best.chi2 < DECISIVE * scale:
+        if rivals and rivals[0].cost - best.cost < DECISIVE * scale:
             return Placement(None, nothing, f'planar ambiguity of marker {self.id} unsettled')
         return Placement(best.T, scale * best.noise + best.from_cameras)
 
@@ -159,13 +159,15 @@ class Candidate:
         pairs = [view.viewpoint.poses[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
         starts = np.concatenate([pair.reshape(-1, 4, 4) for pair in pairs])
         starts = starts[np.all(np.isfinite(starts), axis=(1, 2))]
-        return sorted((_fit(start, self.size, self.views, camera) for start in starts), key=lambda fit: fit.chi2)
+        return sorted((_fit(start, self.size, self.views, camera) for start in starts), key=lambda fit: fit.cost)
 
 
 @dataclass(frozen=True)
 class _Fit:
     T: FloatArray
     chi2: float
+    #: minus twice the logarithm of the likelihood: comparable where the residuals' covariances are not the same
+    cost: float
     noise: FloatArray
     from_cameras: FloatArray
 
@@ -189,11 +191,10 @@ def _choose(T: FloatArray, size: float, views: list[View], camera: Camera) -> In
         return np.zeros(n, dtype=np.int64)
     T_map_camera = np.concatenate([view.viewpoint.T_map_camera for view in views])
     uv, J, _ = linearise(camera, T_map_camera, np.broadcast_to(T, (2 * n, 4, 4)), np.full(2 * n, size))
-    W = _weighting(
-        [view for view in views for _ in range(2)], J, np.concatenate([view.viewpoint.covariances for view in views])
-    )
-    r = W @ (np.repeat([view.corners for view in views], 2, axis=0) - uv)[..., None]
-    cost = np.sum(r**2, axis=(1, 2, 3)).reshape(n, 2)
+    covariances = np.concatenate([view.viewpoint.covariances for view in views])
+    W, log_determinants = _whitening([view for view in views for _ in range(2)], J, covariances)
+    r = W @ (np.repeat([view.corners for view in views], 2, axis=0) - uv).reshape(-1, 8, 1)
+    cost = (np.sum(r**2, axis=(1, 2)) + log_determinants).reshape(n, 2)
     return np.asarray(np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=1), dtype=np.int64)
 
 
@@ -204,33 +205,39 @@ def _fit_chosen(start: FloatArray, size: float, views: list[View], chosen: IntAr
     corners = np.stack([view.corners for view in views])
     sizes = np.full(n, size)
     _, J, _ = linearise(camera, T_map_camera, np.broadcast_to(start, (n, 4, 4)), sizes)
-    W = _weighting(views, J, camera_covariances)
+    W, log_determinants = _whitening(views, J, camera_covariances)
 
     def evaluate(T: FloatArray) -> tuple[FloatArray, FloatArray]:
         uv, _, J = linearise(camera, T_map_camera, np.broadcast_to(T, (n, 4, 4)), sizes)
-        return (W @ (corners - uv)[..., None]).ravel(), _whitened(W, J).reshape(-1, 6)
+        return (W @ (corners - uv).reshape(n, 8, 1)).ravel(), (W @ J).reshape(-1, 6)
 
     T, chi2 = fit_pose(start, evaluate)
     if not np.isfinite(chi2):
-        return _Fit(T, np.inf, np.zeros((6, 6)), np.zeros((6, 6)))
+        return _Fit(T, np.inf, np.inf, np.zeros((6, 6)), np.zeros((6, 6)))
     _, J_camera, J_marker = linearise(camera, T_map_camera, np.broadcast_to(T, (n, 4, 4)), sizes)
-    J_camera, J_marker = _whitened(W, J_camera), _whitened(W, J_marker)
+    J_camera, J_marker = W @ J_camera, W @ J_marker
     noise = np.linalg.inv(np.einsum('vri,vrj->ij', J_marker, J_marker))
     gains = -noise @ np.einsum('vri,vrj->vij', J_marker, J_camera)
     common = np.stack([view.viewpoint.common for view in views])
     from_cameras = correlated_sum(gains, camera_covariances) + correlated_sum(gains, common)
-    return _Fit(T, chi2, noise, from_cameras)
+    return _Fit(T, chi2, chi2 + float(np.sum(log_determinants)), noise, from_cameras)
 
 
-def _weighting(views: Sequence[View], J_camera: FloatArray, camera_covariances: FloatArray) -> FloatArray:
-    """Whitening (n, 4, 2, 2) by the corners' noise, the systematic part, and the camera's own uncertainty."""
+def _whitening(
+    views: Sequence[View], J_camera: FloatArray, camera_covariances: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Matrices (n, 8, 8) that make the residuals of n views unit white, and the logarithms of their determinants (n,).
+
+    A residual comes of the corners' noise, of the systematic part, and of the camera's own pose, which moves all four
+    corners together.
+    """
+    n = len(views)
+    C = np.nan_to_num(J_camera @ camera_covariances @ np.swapaxes(J_camera, -1, -2))
+    corner = np.arange(4)
     noise = np.stack([view.corner_covariances for view in views]) + SYSTEMATIC_PX**2 * np.eye(2)
-    return whitening(noise + np.nan_to_num(shared_covariances(J_camera, camera_covariances)))
-
-
-def _whitened(W: FloatArray, J: FloatArray) -> FloatArray:
-    """Whitening (n, 4, 2, 2) of a Jacobian (n, 8, 6)."""
-    return np.asarray((W @ J.reshape(-1, 4, 2, 6)).reshape(-1, 8, 6))
+    C.reshape(n, 4, 2, 4, 2)[:, corner, :, corner] += np.swapaxes(noise, 0, 1)
+    L = np.linalg.cholesky(C)
+    return np.linalg.inv(L), 2.0 * np.sum(np.log(np.einsum('nii->ni', L)), axis=-1)
 
 
 def correlated_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:

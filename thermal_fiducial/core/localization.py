@@ -72,6 +72,13 @@ class Sight:
         """(N, 6, 6) of the markers' poses in the map."""
         return np.stack([marker.covariance for marker in self.markers])
 
+    @property
+    def relative_covariances(self) -> FloatArray:
+        """(N, 6, 6) the same without what the best-known one is uncertain by: the error that all of them share."""
+        covariances = self.map_covariances
+        best = covariances[np.argmin(np.trace(covariances, axis1=1, axis2=2))]
+        return positive(covariances - best)
+
 
 @dataclass(frozen=True)
 class Location:
@@ -185,9 +192,8 @@ def pose_covariances(
     )
     noise *= max(1.0, chi2 / max(8 * n - 6, 1))
     map_gains = -np.einsum('ncir,ncrj->nij', gains, J_marker.reshape(n, 4, 2, 6))
-    shared = sight.map_covariances[np.argmin(np.trace(sight.map_covariances, axis1=1, axis2=2))]
-    own = positive(sight.map_covariances - shared)
-    return noise + correlated_sum(map_gains, sight.map_covariances), noise + correlated_sum(map_gains, own)
+    whole, relative = sight.map_covariances, sight.relative_covariances
+    return noise + correlated_sum(map_gains, whole), noise + correlated_sum(map_gains, relative)
 
 
 def positive(covariances: FloatArray) -> FloatArray:
@@ -212,12 +218,16 @@ def _hypotheses(sight: Sight, points: FloatArray, camera: Camera, prior: FloatAr
 
 
 def _with_map_uncertainty(sight: Sight, T_map_camera: FloatArray, camera: Camera) -> FloatArray:
-    """Corner covariances (N, 4, 2, 2) to weight with: the noise and what the marker's own pose may be wrong by."""
-    if not np.any(sight.map_covariances):
+    """Corner covariances (N, 4, 2, 2) to weight with: the noise, and what markers may be wrong by among each other.
+
+    What all of them may be wrong by together moves the camera along, and says nothing for one pose against another.
+    """
+    relative = sight.relative_covariances
+    if not np.any(relative):
         return sight.covariances
     T = np.broadcast_to(T_map_camera, (len(sight.markers), 4, 4))
     _, _, J = linearise(camera, T, sight.T_map_marker, sight.sizes)
-    shared = np.nan_to_num(shared_covariances(J, sight.map_covariances))
+    shared = np.nan_to_num(shared_covariances(J, relative))
     return np.asarray(sight.covariances + shared, dtype=np.float64)
 
 
