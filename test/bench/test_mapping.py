@@ -45,7 +45,9 @@ def an_hour():
             snapshot = m.snapshot()
             refinements += 1
             if refinements % 10 == 0:
-                m.apply(refine(snapshot))
+                refinement = refine(snapshot)
+                assert refinement is not None
+                m.apply(refinement)
         if k + 1 in (HOUR // 10, HOUR):
             memory[k + 1] = resident_mb()
     return len(m.snapshot().keyframes), memory[HOUR // 10], memory[HOUR]
