@@ -120,6 +120,20 @@ def test_dead_pixels_clutter_and_a_hidden_stretch_cost_little():
     assert np.abs(found.corners_px[0] - corners).max() < 0.1
 
 
+def test_the_edge_of_something_hotter_is_not_taken_for_a_side():
+    camera, T = CAMERAS['plumb_bob'], marker_pose(2.6, (0.0, 0.0, 0.0))
+    image, corners = draw(camera, 3, T, 0.3, contrast=12.0)
+    image = image + np.random.default_rng(5).normal(0.0, 1.25, image.shape)
+    right = int(corners[:, 0].max())
+    image[:, right + 4 :] += 300.0
+    found = refine(image, corners + 0.3, camera, 3)
+    error = found.corners_px[0] - corners
+    squared = np.einsum('ki,kij,kj->k', error, np.linalg.inv(found.covariances[0]), error)
+    # Four standard deviations of both coordinates; the sides without a neighbour are measured as ever.
+    assert squared.max() < 16.0
+    assert np.sqrt(found.covariances[0, [0, 3], 0, 0]).max() < 0.2
+
+
 @pytest.mark.parametrize('contrast', [12.0, 50.0])
 def test_covariance_is_honest(contrast):
     rng = np.random.default_rng(3)

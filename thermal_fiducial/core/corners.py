@@ -32,6 +32,9 @@ _FLOOR_PX = 0.010
 # Factors on the blur, pass by pass: a wide one catches, narrow ones measure, until the corners no longer move.
 _PASSES = (1.4, 1.0, 1.0, 1.0, 1.0)
 _SETTLED_PX = 0.3
+# Contrast of a segment over that of the marker: less is hidden, more is the edge of something else; and by how much the
+# contrast of a plate varies.
+_LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
 # A linearised displacement is good for this many blurs.
 _REACHED = 2.0
 # Standard deviation of what is known of the corners beforehand, and of their places among themselves [px].
@@ -408,8 +411,8 @@ def _measure(
     return shifts
 
 
-#: Coefficients (..., 3) of level, contrast and their product with the displacement, its variance for noise of 1 (...),
-#: sum of squared residuals (...), number of pixels (...).
+#: Coefficients (..., 3) of level, contrast and its product with the displacement, variances (..., 2) of the last two
+#: for noise of 1, sum of squared residuals (...), number of pixels (...).
 _Fit = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
@@ -422,23 +425,28 @@ def _fit(X: Float32Array, weight: Float32Array) -> _Fit:
     right = gram[:, :3, 3]
     coefficients: FloatArray = np.asarray((inverse @ right[..., None])[..., 0])
     square: FloatArray = np.maximum(gram[:, 3, 3] - np.sum(coefficients * right, axis=-1), 0.0)
-    return coefficients, inverse[:, 2, 2].copy(), square, number
+    return coefficients, inverse[:, [1, 2], [1, 2]], square, number
 
 
 def _judged(fit: _Fit, reach: FloatArray) -> _Shifts:
     """Which segments measure anything, within their reach (N, S)."""
     shape = reach.shape
-    coefficients, unit_variance, square, number = fit
+    coefficients, unit_variances, square, number = fit
     free = (number - 3.0).reshape(shape)
     usable = free > 1.5
     noise = square.reshape(shape) / np.maximum(free, 1.0)
     contrast = coefficients[:, 1].reshape(shape)
     typical_noise, typical = _median_where(noise, usable), _median_where(contrast, usable)
     noise = np.where(noise > 2.5 * typical_noise, noise, typical_noise) + 1e-3
-    usable &= contrast * np.sign(typical) > 0.3 * np.abs(typical)
-    safe = np.where(usable, contrast, 1.0)
+    own = noise * unit_variances[:, 0].reshape(shape)
+    scale = np.sign(typical) / np.maximum(np.abs(typical), 1e-6)
+    relative, unsure = contrast * scale, 2.0 * np.sqrt(own) * np.abs(scale)
+    usable &= (relative > _LEAST_CONTRAST - unsure) & (relative < _MOST_CONTRAST + unsure)
+    # A faint segment hardly tells its contrast, by which its displacement is divided: the others tell it better.
+    others = (_CONTRAST_VARIES * typical) ** 2 + 1e-9
+    safe = np.where(usable, (contrast * others + typical * own) / (others + own), 1.0)
     shift = np.where(usable, np.clip(-coefficients[:, 2].reshape(shape) / safe, -reach, reach), 0.0)
-    variance = np.where(usable, noise * unit_variance.reshape(shape) / safe**2, _HOPELESS)
+    variance = np.where(usable, noise * unit_variances[:, 1].reshape(shape) / safe**2, _HOPELESS)
     return _Shifts(shift, variance, contrast, noise)
 
 
