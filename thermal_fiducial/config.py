@@ -364,7 +364,8 @@ class ImuNoise:
     accelerometer_range: float = param(156.0, 'Readings beyond this are saturated.', unit='m/s^2', minimum=10.0)
     vibration: float = param(
         1.0,
-        'Share of the sample-to-sample noise that counts as white noise where it exceeds the densities; 0: none.',
+        'Share of the sample-to-sample noise that counts as white noise (half of it for the accelerometer) where it '
+        'exceeds the densities; 0: none.',
         minimum=0.0,
         maximum=1.0,
     )

@@ -14,6 +14,9 @@ SMALL_ANGLE = 1e-2
 GAP = 0.03
 #: Standard deviation of rate [rad/s] and specific force [m/s^2] in a gap; of a saturated sample, hit or fault.
 UNKNOWN_RATE, UNKNOWN_FORCE, SATURATED_FORCE = 0.5, 3.0, 150.0
+#: How much less the force's shaking counts than the rate's: rotors make tones, not white noise, and the position, its
+#: second integral, hardly feels those above the bandwidth of the filter; the attitude, a first integral, feels more.
+FORCE_SHARE = 0.5
 #: Time constant of the running vibration level [s].
 VIBRATION_TIME = 0.3
 
@@ -170,7 +173,7 @@ class NoiseMonitor:
         if self._noise.vibration > 0.0:
             share = self._noise.vibration * math.sqrt(min(seconds, GAP))
             shaken_rate, shaken_force = self.vibration
-            rate, force = max(rate, share * shaken_rate), max(force, share * shaken_force)
+            rate, force = max(rate, share * shaken_rate), max(force, FORCE_SHARE * share * shaken_force)
         unknown = math.sqrt(seconds)
         rate_lost, force_lost = self._saturated(imu.tolist())
         if seconds > GAP or rate_lost:
