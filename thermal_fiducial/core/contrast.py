@@ -1,20 +1,18 @@
-"""An 8-bit view of raw counts in which markers of any contrast look alike, and noise stays below the threshold.
+"""What is darker than its surroundings, by a share of the local contrast: the same of markers of any contrast.
 
-The local mean is taken out and the local spread divided by, down to a floor of the order of the noise, below which the
-view fades: next to strong structures little is amplified, a marker of twice the noise fills the range, a bare wall
-stays gray.
+The local spread is the measure, down to a floor of the order of the noise, below which ever more is asked for: next to
+strong structures little shows, of a marker of twice the noise all, of a bare wall nearly nothing.
 """
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from thermal_fiducial.core.types import Float32Array, Gray
 
-# Mean and spread are taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
-_SHRINK = 4
+# The spread is taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
 _LOCAL = 17
-# Levels that one local standard deviation fills.
-_GAIN = 60.0
 # Half-resolution pixels along a row over which columns are compared.
 _COLUMNS = 9
 # Mean of Gaussian noise clipped at one standard deviation moves by 0.68 of a small offset.
@@ -53,26 +51,39 @@ def without_columns(counts: Float32Array, noise: float) -> Float32Array:
     return np.asarray(counts - _CLIPPED * cv2.reduce(deviation, 0, cv2.REDUCE_AVG))
 
 
-def normalise(counts: Float32Array, noise: float, smoothing_px: float, floor: float, shrink: int = _SHRINK) -> Gray:
-    """8-bit view of ``counts``.
+class Scale(NamedTuple):
+    """How dark places are sought at one resolution."""
+
+    #: standard deviation of the Gaussian before the search [px]
+    smoothing_px: float
+    #: odd width of the surroundings
+    window_px: int
+    #: how much darker than the mean of the surroundings, in local standard deviations
+    depth: float
+    #: spread below which it shows less and less, in standard deviations of the noise of a pixel
+    floor: float
+    #: by how much lower the resolution is at which the spread is taken
+    shrink: int
+    #: odd width of the median that takes out specks, 1 for none [px]
+    specks_px: int = 1
+
+
+def dark(counts: Float32Array, noise: float, scale: Scale) -> Gray:
+    """Mask (height, width) of what is darker than its surroundings, 255 where it is.
 
     Parameters
     ----------
     counts : (height, width) counts or gray levels
     noise : standard deviation of the noise of a pixel [counts]
-    smoothing_px : standard deviation of the Gaussian before the search, 0 for none
-    floor : spread below which it shows less and less, in standard deviations of the noise of a pixel
-    shrink : by which mean and spread are taken at a lower resolution
     """
-    smooth = cv2.GaussianBlur(counts, (0, 0), smoothing_px) if smoothing_px > 0 else counts
+    reach = 2 * round(2.5 * scale.smoothing_px) + 1
+    smooth = cv2.GaussianBlur(counts, (reach, reach), scale.smoothing_px)
+    around = cv2.blur(smooth, (scale.window_px, scale.window_px))
     height, width = counts.shape
-    small = cv2.resize(counts, (width // shrink, height // shrink), interpolation=cv2.INTER_AREA)
-    mean = cv2.blur(small, (_LOCAL, _LOCAL))
-    deviation = small - mean
-    variance = cv2.blur(deviation * deviation, (_LOCAL, _LOCAL))
-    gain = _GAIN * np.sqrt(variance) / (variance + (floor * noise) ** 2)
-    offset = 128.0 - mean * gain
-    full_gain = cv2.resize(gain, (width, height), interpolation=cv2.INTER_LINEAR)
-    full_offset = cv2.resize(offset, (width, height), interpolation=cv2.INTER_LINEAR)
-    np.multiply(smooth, full_gain, out=full_gain)
-    return np.asarray(cv2.add(full_gain, full_offset, dtype=cv2.CV_8U))
+    small = cv2.resize(counts, (width // scale.shrink, height // scale.shrink), interpolation=cv2.INTER_AREA)
+    deviation = small - cv2.blur(small, (_LOCAL, _LOCAL))
+    variance = np.maximum(cv2.blur(deviation * deviation, (_LOCAL, _LOCAL)), 1e-6)
+    step = (scale.depth / np.sqrt(variance)) * (variance + (scale.floor * noise) ** 2)
+    asked = cv2.resize(step, (width, height), interpolation=cv2.INTER_LINEAR)
+    mask = cv2.compare(cv2.subtract(around, smooth, dst=around), asked, cv2.CMP_GT)
+    return np.asarray(cv2.medianBlur(mask, scale.specks_px) if scale.specks_px > 1 else mask)

@@ -1,4 +1,4 @@
-"""Quadrilaterals in the outlines of a thresholded view: where markers may be."""
+"""Quadrilaterals in the outlines of a mask: where markers may be."""
 
 import cv2
 import numpy as np
@@ -9,25 +9,20 @@ from thermal_fiducial.core.types import FloatArray, Gray
 _STRAIGHT = 0.05
 
 
-def find_quads(
-    gray: Gray, window_px: int, threshold: float, min_side_px: float, hidden: FloatArray | None = None
-) -> FloatArray:
-    """Convex quadrilaterals (Q, 4, 2) [px], clockwise, of what is darker or brighter than its surroundings.
+def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray | None = None) -> FloatArray:
+    """Convex quadrilaterals (Q, 4, 2) [px], clockwise, among the outlines in a mask, of its spots and of its holes.
 
     Parameters
     ----------
-    gray : (height, width)
-    window_px : odd width of the surroundings
-    threshold : levels below the mean of the surroundings
+    mask : (height, width); overwritten where ``hidden``
     min_side_px : shortest side
     hidden : (N, 4, 2) where not to look [px]
     """
-    mask = cv2.adaptiveThreshold(gray, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window_px, threshold)
     if hidden is not None:
         for quad in np.rint(hidden).astype(np.int32):
             cv2.fillConvexPoly(mask, quad, 0)
     outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    shortest, longest = 3.2 * min_side_px, 2.0 * sum(gray.shape)
+    shortest, longest = 3.2 * min_side_px, 2.0 * sum(mask.shape)
     quads = []
     for outline in outlines:
         if not shortest <= len(outline) <= longest:

@@ -6,16 +6,15 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.alignment import aligned
-from thermal_fiducial.core.contrast import halved, noise_of, normalise, without_columns
+from thermal_fiducial.core.contrast import dark, halved, noise_of, Scale, without_columns
 from thermal_fiducial.core.corners import RefinedCorners
 from thermal_fiducial.core.decoding import Decoder, Reading, shrunk
 from thermal_fiducial.core.quads import find_quads
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# Full resolution sees small and smeared markers: smoothing [px], floor [noise], window [px], threshold [levels].
-_FINE = (1.0, 3.0, 15, 12.0)
-# Half resolution, without the pattern of columns, sees markers of twice the noise.
-_FAINT = (1.2, 1.0, 5, 3.0)
+# Full resolution sees small and smeared markers; half resolution, without the pattern of columns, faint ones.
+_FINE = Scale(smoothing_px=1.0, window_px=15, depth=0.2, floor=3.0, shrink=4)
+_FAINT = Scale(smoothing_px=1.2, window_px=5, depth=0.03, floor=1.0, shrink=2, specks_px=3)
 # Weight of white surroundings against correlation in choosing among the outlines of a marker.
 _SURROUNDED = 0.2
 # Correlation beyond which an outline needs no alignment, and from which, by such a margin, it is worth one.
@@ -111,13 +110,9 @@ def _outlines(
     scene: Float32Array, half: Float32Array, noise: float, min_side_px: float, hidden: FloatArray | None
 ) -> tuple[FloatArray, FloatArray]:
     """Quadrilaterals of fine markers (Q, 4, 2) and of faint ones, both in pixels of the full resolution."""
-    smoothing, floor, window, threshold = _FINE
-    view = normalise(scene, noise, smoothing, floor)
-    fine = find_quads(view, window, threshold, min_side_px, hidden)
-    smoothing, floor, window, threshold = _FAINT
-    view = normalise(half, 0.5 * noise, smoothing, floor, 2)
+    fine = find_quads(dark(scene, noise, _FINE), min_side_px, hidden)
     hidden = None if hidden is None else _halfway(hidden)
-    faint = find_quads(view, window, threshold, 0.5 * min_side_px + 2.0, hidden)
+    faint = find_quads(dark(half, 0.5 * noise, _FAINT), 0.5 * min_side_px + 2.0, hidden)
     return fine, 2.0 * faint + 0.5
 
 
