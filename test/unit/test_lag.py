@@ -69,6 +69,23 @@ def test_tracker_finds_the_twist_from_two_frames():
     assert np.all(np.linalg.eigvalsh(found.covariance) > 0)
 
 
+def test_twist_is_that_of_the_time_that_smears():
+    """A camera that turns faster and faster: the lag of 10 ms shows how it turned 10 ms ago."""
+    points = np.random.default_rng(5).uniform([-0.6, -0.5, 2], [0.6, 0.5, 4], (5, 4, 3))
+    lag, dt, acceleration = 0.010, 1 / 30, np.array([0.0, 6.0, 2.0])
+    tracker, ids, twist = MotionTracker(np.eye(4), lag), np.arange(5), None
+    for frame in range(8):
+        turned = geometry.so3_exp(0.5 * acceleration * (frame * dt) ** 2)
+        seen = points @ turned
+        stamp = round(frame * dt * 1e9)
+        x = seen[..., :2] / seen[..., 2:]
+        twist = tracker.correct(stamp, tracker.predict(stamp, None), ids, x, seen[..., 2], np.full(5, 1e-5))
+        tracker.remember(stamp, twist, Tracked(ids, x, seen[..., 2], np.full(5, 100.0)))
+    expected = acceleration * (7 * dt - lag)
+    # Half a frame ago it turned slower by 0.04 rad/s, of which a quarter is left by what steps of 1/30 s curve.
+    np.testing.assert_allclose(twist.value[3:], expected, atol=0.012)
+
+
 def test_markers_are_expected_where_the_motion_carries_them():
     rng = np.random.default_rng(4)
     points, dt = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3)), 1 / 30

@@ -87,7 +87,7 @@ class MarkerDetector:
         self._T_body_camera = geometry.transform(
             geometry.rotation_from_quaternion(config.camera_orientation), config.camera_position
         )
-        self._motion = MotionTracker(self._T_body_camera)
+        self._motion = MotionTracker(self._T_body_camera, config.bolometer_lag)
         self._field: SmearField | None = None
         self._depth = _TYPICAL_DEPTH
         self._map: dict[int, tuple[FloatArray, float]] = {}

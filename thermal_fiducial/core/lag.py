@@ -104,8 +104,8 @@ class Tracked:
 class MotionTracker:
     """The camera's twist over the frames, and the markers that it saw."""
 
-    def __init__(self, T_body_camera: FloatArray) -> None:
-        self._T_body_camera = T_body_camera
+    def __init__(self, T_body_camera: FloatArray, lag: float = 0.0) -> None:
+        self._T_body_camera, self._lag = T_body_camera, lag
         self._stamp_ns: int | None = None
         self._twist: Twist | None = None
         self._seen = Tracked.none()
@@ -157,6 +157,9 @@ class MotionTracker:
             information = np.linalg.inv(prior.covariance)
             posterior: FloatArray = np.asarray(np.linalg.inv(information + (A.T * weight) @ A))
             value = posterior @ (information @ prior.value + (A.T * weight) @ velocity)
+            if self._twist is not None:
+                # That was half a frame ago; what smears this one is the motion of one time constant ago.
+                value = value + (0.5 * dt - self._lag) / (0.5 * dt + self._lag) * (value - self._twist.value)
             twist = Twist(np.asarray(value), np.asarray(posterior))
         return twist
 
