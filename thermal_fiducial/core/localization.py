@@ -5,6 +5,7 @@ filled environments", ISVC 2018.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -57,22 +58,22 @@ class Sight:
         markers = [marker for marker, keep in zip(self.markers, chosen, strict=True) if keep]
         return Sight(markers, self.corners[chosen], self.covariances[chosen], self.branches[chosen])
 
-    @property
+    @cached_property
     def T_map_marker(self) -> FloatArray:
         """(N, 4, 4)."""
         return np.stack([marker.T_map_marker for marker in self.markers])
 
-    @property
+    @cached_property
     def sizes(self) -> FloatArray:
         """(N,) [m]."""
         return np.array([marker.size for marker in self.markers])
 
-    @property
+    @cached_property
     def map_covariances(self) -> FloatArray:
         """(N, 6, 6) of the markers' poses in the map."""
         return np.stack([marker.covariance for marker in self.markers])
 
-    @property
+    @cached_property
     def relative_covariances(self) -> FloatArray:
         """(N, 6, 6) the same without what the best-known one is uncertain by: the error that all of them share."""
         covariances = self.map_covariances
@@ -178,20 +179,19 @@ def pose_covariances(
     T = np.broadcast_to(T_map_camera, (n, 4, 4))
     uv, J_camera, J_marker = linearise(camera, T, sight.T_map_marker, sight.sizes)
     blocks = J_camera.reshape(n, 4, 2, 6)
-    weighted = np.linalg.inv(covariances) @ blocks * weights[:, None, None, None]
-    A = np.einsum('ncri,ncrj->ij', blocks, weighted)
+    information = np.linalg.inv(covariances) * weights[:, None, None, None]
+    weighted = information @ blocks
+    A = np.sum(np.moveaxis(blocks, -1, -2) @ weighted, axis=(0, 1))
     try:
         A_inverse = np.linalg.inv(A)
     except np.linalg.LinAlgError:
         return np.full((6, 6), np.nan), np.full((6, 6), np.nan)
     gains = A_inverse @ np.moveaxis(weighted, -1, -2)
-    noise = np.einsum('ncir,ncrs,ncjs->ij', gains, sight.covariances, gains)
+    noise = np.sum(gains @ sight.covariances @ np.moveaxis(gains, -1, -2), axis=(0, 1))
     residuals = (sight.corners - uv)[..., None]
-    chi2 = float(
-        np.sum(np.swapaxes(residuals, -1, -2) @ np.linalg.inv(covariances) @ residuals * weights[:, None, None, None])
-    )
+    chi2 = float(np.sum(residuals * (information @ residuals)))
     noise *= max(1.0, chi2 / max(8 * n - 6, 1))
-    map_gains = -np.einsum('ncir,ncrj->nij', gains, J_marker.reshape(n, 4, 2, 6))
+    map_gains = -np.sum(gains @ J_marker.reshape(n, 4, 2, 6), axis=1)
     whole, relative = sight.map_covariances, sight.relative_covariances
     return noise + correlated_sum(map_gains, whole), noise + correlated_sum(map_gains, relative)
 
