@@ -11,6 +11,7 @@ from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.reprojection import difference
 from thermal_fiducial.files.camera_info import save_camera
+from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map
 
 
@@ -18,8 +19,7 @@ def opencv_corners(photos):
     """Photo, ID and corners of every tag that OpenCV finds."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    detector = cv2.aruco.ArucoDetector(dictionary, parameters)
+    detector = cv2.aruco.ArucoDetector(load_dictionary('DICT_APRILTAG_36h11'), parameters)
     views = []
     for photo in sorted(photos.iterdir()):
         corners, ids, _ = detector.detectMarkers(cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE))
@@ -53,8 +53,9 @@ def test_photos_become_a_map(real_data, tmp_path, measured):
     assert np.median(distance) < 15.0
     # A flip is tens of degrees.
     assert angle.max() < 2.0
-    views = opencv_corners(folder / 'photos')
     cameras = {name: np.linalg.inv(np.array(T)) for name, T in reference['cams_T_cw'].items()}
+    # Of a photo or two, which tags are found depends on OpenCV's version; the reference has no camera for them all.
+    views = [view for view in opencv_corners(folder / 'photos') if view[0] in cameras]
     best, _ = adjust(np.array(reference['K']), 0.127, views, cameras, tags, held=13)
     from_best = [1e3 * np.linalg.norm(difference(built.markers[key].T_map_marker, best[key])[:3]) for key in tags]
     from_reference = [1e3 * np.linalg.norm(difference(best[key], tags[key])[:3]) for key in tags]
