@@ -62,6 +62,7 @@ class Case:
 CONTRASTS = (8.0, 2.0, 0.5, 0.3, 0.1)
 CASES = {
     **{f'slow, {contrast:g} K': Case('wall', contrast) for contrast in CONTRASTS},
+    'slow, 0.05 K': Case('wall', 0.05),
     'slow, 0.1 K, fresh from the shutter': Case('wall', 0.1, corrected=True),
     'slow, 0.05 K, fresh from the shutter': Case('wall', 0.05, corrected=True),
     'slow, 8 K, lag in steps': Case('wall', 8.0, stepwise=True),
