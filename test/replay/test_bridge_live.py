@@ -61,7 +61,7 @@ def message(item, start_ns):
     )
 
 
-def fly(data, domain, begun):
+def fly(data, domain, ready):
     """Publish the flight, each message when it is due."""
     context = Context()
     context.init(args=[], domain_id=domain)
@@ -70,9 +70,12 @@ def fly(data, domain, begun):
         ImuSample: node.advertise(Imu, 'imu/data', qos.IMU_RATE_RESULT),
         None: node.advertise(PoseWithCovarianceStamped, 'camera_pose'),
     }
+    # First the filter, then check-bridge too, so that none misses the seconds at rest.
     while not all(output.listeners for output in outputs.values()):
         time.sleep(0.02)
-    begun.set()
+    ready.set()
+    while outputs[ImuSample].listeners < 2:
+        time.sleep(0.02)
     start_ns = time.time_ns()
     for item in timeline(data.samples(), data.poses, 0.03):
         late = 0 if isinstance(item, ImuSample) else 30_000_000
@@ -96,18 +99,18 @@ def flying(monkeypatch):
         arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
         command = [sys.executable, '-m', 'thermal_fiducial.nodes.pose_ekf', '--ros-args', *arguments]
         node = subprocess.Popen(command, env=os.environ, stderr=subprocess.DEVNULL)
-        begun = threading.Event()
-        drone = threading.Thread(target=fly, args=(flight(), domain, begun), daemon=True)
+        ready = threading.Event()
+        drone = threading.Thread(target=fly, args=(flight(), domain, ready), daemon=True)
         drone.start()
-        assert begun.wait(30.0)
+        assert ready.wait(30.0)
         yield
-        drone.join()
+        drone.join(30.0)
         node.terminate()
         node.wait(10.0)
 
 
 def test_the_filter_as_a_flight_controller_sees_it(flying, capfd):
-    status = main(['check-bridge', '--seconds', str(SECONDS - 0.5), '--json'])
+    status = main(['check-bridge', '--seconds', str(SECONDS + 0.5), '--json'])
     printed = capfd.readouterr().out
     findings = {finding['check']: finding for finding in json.loads(printed[printed.index('[') :])}
     levels = {name: finding['level'] for name, finding in findings.items()}
