@@ -1,106 +1,260 @@
-"""Points of a board to a few hundredths of a pixel, on raw counts."""
+"""Points of a board to a few hundredths of a pixel, on raw counts.
 
-import cv2
+What the board looks like around a point (:mod:`appearance`) is fitted to the counts in a window, on ground that may
+slope. The grid tells how the board is seen there, so perspective and lens bend the pattern as they bend the image.
+Three rounds: each point alone; with the blur and the width that the board has in common; and with the contrast that the
+neighbours lead one to expect. So neither a lamp's spot of heat nor contrast that fades over the board, or reverses in
+a reflection, moves a point, and what covers a point is noticed.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import numpy as np
 
+from thermal_fiducial.calibration.appearance import Appearance
+from thermal_fiducial.calibration.surface import local_surface, Surface
 from thermal_fiducial.core.types import Float32Array, FloatArray
 
-# Share of the distance to the nearest corner that a window reaches: no other edge may enter it.
-_REACH = 0.45
-_LEAST_REACH = 2.5
-# Blur before the gradients [px]: less than the optics', so that it only tames the noise.
-_BLUR = 0.7
-_STEPS = 10
-# The gradients need two pixels beyond the window.
-_RIM = 2.0
+# Points closer than this [px] are too close to give sub-pixel points.
+_LEAST_SPACING = 5.0
+# Blur to start from, in steps of the grid and at least in pixels; and its bounds.
+_BLUR, _LEAST_BLUR, _BLUR_BOUNDS = 0.06, 0.8, (0.2, 60.0)
+_MOST_STEPS, _CONVERGED_PX, _DIFFERENCE, _HOPELESS = 20, 1e-3, 1e-4, 1e3
+# A point is lost when its standard deviation is larger than this [px], when the fit goes further from the start, in
+# steps of the grid, or when its contrast is not, within these shares, what the neighbours promise.
+_MOST_SIGMA_PX, _MOST_MOVE, _CONTRAST = 0.5, 0.25, (0.6, 1.6)
+# Where contrast reverses, at this share of the neighbours' or less, nothing tells where the point is.
+_LEAST_CONTRAST = 0.25
+# Nodes whose contrast tells of that of another, in steps, how many of them, and how firmly the slope is held down.
+_NEAR, _LEAST_NEIGHBOURS, _SLOPE_RIDGE = 2, 4, 0.1
+_LEAST_POINTS, _LEAST_PIXELS = 6, 12
+# What the linear part of a fit determines: ground (level and slope) and contrast.
+_LINEAR = 4
 
 
-def saddle_points(image: Float32Array, corners: FloatArray, spacing: FloatArray) -> FloatArray | None:
-    """Corners (N, 2) of a chessboard; None when one of them runs away.
-
-    At every edge through a corner the gradient g is perpendicular to the way to the corner c, so c solves
-    sum w g g^T (x - c) = 0 over the pixels x of a round window (W. Foerstner, E. Guelch, "A fast operator for
-    detection and precise location of distinct points, corners and centres of circular features", 1987). Gradients
-    stay on their pixels; interpolating them, as ``cornerSubPix`` does, costs 0.02 px.
+def refine(
+    image: Float32Array, nodes: FloatArray, pixels: FloatArray, board: FloatArray, appearance: Appearance
+) -> FloatArray:
+    """Points (N, 2) of a board, NaN where they are lost.
 
     Parameters
     ----------
-    corners : (N, 2) within a pixel or two
-    spacing : (N,) to the nearest other corner [px]
+    nodes : (N, 2) place of each in the grid
+    pixels : (N, 2) within a few pixels, or a tenth of their distance
+    board : (M, 2) places of all points of the board
     """
-    smooth = cv2.GaussianBlur(image, (0, 0), _BLUR)
-    slopes = [np.asarray(cv2.Sobel(smooth, cv2.CV_64F, *order), dtype=np.float64) for order in ((1, 0), (0, 1))]
-    gradient = np.stack(slopes, axis=-1)
-    high = np.array([image.shape[1], image.shape[0]]) - 1.0 - _RIM
-    refined = np.empty_like(corners)
-    for index, (start, distance) in enumerate(zip(corners, spacing, strict=True)):
-        corner = start
-        for _ in range(_STEPS):
-            reach = min(max(_LEAST_REACH, _REACH * distance), *(corner - _RIM), *(high - corner))
-            moved = _gradient_intersection(gradient, corner, reach) if reach >= _LEAST_REACH else None
-            if moved is None or np.linalg.norm(moved - start) > 0.5 * reach:
-                return None
-            step, corner = np.abs(moved - corner).max(), moved
-            if step < 1e-4:
+    shared: list[_Shared | None] = [None] * len(nodes)
+    contrast: FloatArray | None = None
+    for last in (False, False, True):
+        fits = _round(image, nodes, pixels, board, appearance, shared, contrast)
+        found = np.flatnonzero([fit is not None for fit in fits])
+        kept = [fit for fit in fits if fit is not None]
+        refined = np.full_like(pixels, np.nan)
+        if len(kept) < _LEAST_POINTS:
+            return refined
+        refined[found] = [fit.pixel for fit in kept]
+        if last:
+            return refined
+        pixels = np.where(np.isfinite(refined), refined, pixels)
+        if shared[0] is None:
+            log_blur = _plane(nodes[found], np.array([fit.log_blur for fit in kept]), nodes)
+            width = float(np.median([fit.width for fit in kept]))
+            shared = [_Shared(value, width) for value in log_blur.tolist()]
+        else:
+            contrast = np.full(len(nodes), np.nan)
+            contrast[found] = [fit.contrast for fit in kept]
+    raise AssertionError('the last round returns')
+
+
+class _Shared(NamedTuple):
+    """What a board's points have in common: blur at a point [log px], width [steps]."""
+
+    log_blur: float
+    width: float
+
+
+class _Fitted(NamedTuple):
+    pixel: FloatArray
+    log_blur: float
+    width: float
+    contrast: float
+
+
+def _round(
+    image: Float32Array,
+    nodes: FloatArray,
+    pixels: FloatArray,
+    board: FloatArray,
+    appearance: Appearance,
+    shared: list[_Shared | None],
+    contrast: FloatArray | None,
+) -> list[_Fitted | None]:
+    """Fit all points once; with ``contrast``, points without one are lost ones and tell nothing of the grid."""
+    known = np.ones(len(nodes), dtype=np.bool_) if contrast is None else np.isfinite(contrast)
+    fits = []
+    for node, start, common in zip(nodes, pixels, shared, strict=True):
+        surface, here = local_surface(nodes[known], pixels[known], node), appearance.at(node, board)
+        window = None if surface is None else _window(image, start, surface, here, common)
+        if window is not None and contrast is not None:
+            window = _promised(window, nodes[known] - node, contrast[known])
+        fits.append(None if window is None else _fit(window, here, common))
+    return fits
+
+
+def _plane(nodes: FloatArray, values: FloatArray, places: FloatArray) -> FloatArray:
+    """Values at ``places`` of the plane through those at ``nodes``, without those that stick out."""
+    off = np.abs(values - np.median(values))
+    kept = off <= 4.0 * np.median(off) + 0.05
+    design = np.column_stack([np.ones(len(nodes)), nodes])
+    coefficients = np.linalg.lstsq(design[kept], values[kept], rcond=None)[0]
+    return np.asarray(np.column_stack([np.ones(len(places)), places]) @ coefficients)
+
+
+@dataclass(frozen=True)
+class _Window:
+    """Pixels around a point.
+
+    Parameters
+    ----------
+    start : (2,) [px]
+    place : (N, 2) on the board, relative to ``start`` [steps]
+    counts : (N,) times their weight, what the ground explains taken out
+    weight : (N,)
+    ground : (N, 3) orthonormal: what level and slope explain
+    inverse : (2, 2) steps of the grid by pixels
+    promise : (N,) contrast that the neighbours promise, or 1 everywhere
+    promised : whether they do
+    """
+
+    start: FloatArray
+    place: FloatArray
+    counts: FloatArray
+    weight: FloatArray
+    ground: FloatArray
+    inverse: FloatArray
+    promise: FloatArray
+    promised: bool
+
+    def above_ground(self, values: FloatArray) -> FloatArray:
+        """Weighted values (N,) without what ground could explain."""
+        return np.asarray(values - self.ground @ (self.ground.T @ values))
+
+    def shape(self, parameters: FloatArray, appearance: Appearance) -> FloatArray:
+        """The pattern (N,) above ground, by the point's offset [px], the blur's logarithm and the width."""
+        place = self.place - self.inverse @ parameters[:2]
+        blur = np.clip(np.exp(parameters[2]), *_BLUR_BOUNDS) * np.linalg.norm(self.inverse, axis=1)
+        return self.above_ground(self.weight * self.promise * appearance.shape(place, blur, float(parameters[3])))
+
+
+def _window(
+    image: Float32Array, start: FloatArray, surface: Surface, appearance: Appearance, shared: _Shared | None
+) -> _Window | None:
+    """Pixels within the reach of a pattern, with weights that fall towards the rim."""
+    spacing = float(np.linalg.norm(surface.steps, axis=0).min())
+    if spacing < _LEAST_SPACING:
+        return None
+    reach = appearance.reach(spacing, None if shared is None else float(np.exp(shared.log_blur)))
+    extent = 1.2 * reach * np.abs(surface.steps).sum(axis=1)
+    low = np.maximum(np.ceil(start - extent), 0).astype(int).tolist()
+    high = np.minimum(np.floor(start + extent), np.array(image.shape[::-1]) - 1).astype(int).tolist()
+    v, u = np.mgrid[low[1] : high[1] + 1, low[0] : high[0] + 1]
+    offset = np.column_stack([u.reshape(-1), v.reshape(-1)]) - start
+    inverse = np.asarray(np.linalg.inv(surface.steps), dtype=np.float64)
+    place = surface.place(offset) if appearance.bent else offset @ inverse.T
+    away = np.sum(place**2, axis=1) / reach**2
+    inside = away < 1.0
+    whole = np.pi * reach**2 * abs(float(np.linalg.det(surface.steps)))
+    if np.sum(inside) < max(_LEAST_PIXELS, appearance.least_seen * whole):
+        return None
+    weight = np.asarray(np.sqrt(1.0 - away[inside]), dtype=np.float64)
+    ground, _ = np.linalg.qr(np.column_stack([np.ones(len(weight)), offset[inside]]) * weight[:, None])
+    counts = image[low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(-1)[inside].astype(np.float64) * weight
+    counts -= ground @ (ground.T @ counts)
+    return _Window(start, place[inside], counts, weight, ground, inverse, np.ones(len(weight)), promised=False)
+
+
+def _promised(window: _Window, away: FloatArray, contrast: FloatArray) -> _Window | None:
+    """Window with the contrast, linear over it, that neighbours ``away`` (K, 2) [steps] promise by theirs (K,)."""
+    near = np.max(np.abs(away), axis=1) <= _NEAR
+    if np.sum(near) < _LEAST_NEIGHBOURS:
+        return None
+    design = np.column_stack([np.ones(np.sum(near)), away[near]])
+    normal = design.T @ design + np.diag([0.0, _SLOPE_RIDGE, _SLOPE_RIDGE])
+    level_and_slope = np.linalg.solve(normal, design.T @ contrast[near])
+    if abs(level_and_slope[0]) < _LEAST_CONTRAST * np.abs(contrast[near]).max():
+        return None
+    promise = level_and_slope[0] + window.place @ level_and_slope[1:]
+    return _Window(
+        window.start,
+        window.place,
+        window.counts,
+        window.weight,
+        window.ground,
+        window.inverse,
+        promise,
+        promised=True,
+    )
+
+
+def _fit(window: _Window, appearance: Appearance, shared: _Shared | None) -> _Fitted | None:
+    """Fit a point by Levenberg's and Marquardt's method: all of it, or the point alone with what is shared given."""
+    if shared is None:
+        blur = max(_LEAST_BLUR, _BLUR / float(np.linalg.norm(window.inverse, axis=1).max()))
+        parameters = np.array([0.0, 0.0, np.log(blur), appearance.width])
+        free = 4 if appearance.width_free else 3
+    else:
+        parameters, free = np.array([0.0, 0.0, *shared]), 2
+    state, damping = _State.at(window, appearance, parameters), 1e-3
+    J = state.jacobian(window, appearance, free)
+    for _ in range(_MOST_STEPS):
+        normal, gradient = J.T @ J, J.T @ state.residual
+        while damping < _HOPELESS:
+            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-9), gradient)[:free]
+            moved = _State.at(window, appearance, state.parameters + np.pad(step, (0, 4 - free)))
+            if moved.cost <= state.cost:
                 break
-        refined[index] = corner
-    return refined
-
-
-def _gradient_intersection(gradient: FloatArray, centre: FloatArray, reach: float) -> FloatArray | None:
-    """Point (2,) that the edges within ``reach`` [px] of ``centre`` run through."""
-    low, high = np.ceil(centre - reach).astype(int).tolist(), np.floor(centre + reach).astype(int).tolist()
-    window = slice(low[1], high[1] + 1), slice(low[0], high[0] + 1)
-    v, u = np.mgrid[window]
-    away = np.stack([u, v], axis=-1) - centre
-    weight = np.maximum(1.0 - np.sum(away**2, axis=-1) / reach**2, 0.0)
-    g = gradient[window]
-    weighted = (weight[..., None] * g).reshape(-1, 2)
-    g, away = g.reshape(-1, 2), away.reshape(-1, 2)
-    information = weighted.T @ g
-    if np.linalg.det(information) <= 1e-6 * np.trace(information) ** 2:
+            damping *= 10.0
+        else:
+            break
+        state, damping = moved, 0.1 * damping
+        J = state.jacobian(window, appearance, free)
+        if np.abs(step[:2]).max() < _CONVERGED_PX:
+            break
+    variance = state.cost / max(1.0, float(np.sum(window.weight**2)) - free - _LINEAR)
+    sigma = float(np.sqrt(variance * np.trace(np.linalg.pinv(J.T @ J, hermitian=True)[:2, :2])))
+    moved_steps = float(np.linalg.norm(window.inverse @ state.parameters[:2]))
+    kept = not window.promised or _CONTRAST[0] < state.contrast < _CONTRAST[1]
+    if not (sigma < _MOST_SIGMA_PX and moved_steps < _MOST_MOVE and kept):
         return None
-    return np.asarray(centre + np.linalg.solve(information, weighted.T @ np.sum(g * away, axis=1)))
+    log_blur, width = state.parameters[2:].tolist()
+    return _Fitted(window.start + state.parameters[:2], log_blur, width, state.contrast)
 
 
-def centroids(image: Float32Array, centres: FloatArray, nearest: FloatArray, share: float) -> FloatArray:
-    """Centroids (N, 2) of the counts above (or below) the ground between the circles; NaN where there is none.
+@dataclass(frozen=True)
+class _State:
+    """Parameters of a fit, with the best contrast for them and what is left of the counts (N,)."""
 
-    Within a window that ends half-way to the neighbours' rims the first moments of a blurred disc are those of the
-    sharp one.
+    parameters: FloatArray
+    shape: FloatArray
+    contrast: float
+    residual: FloatArray
 
-    Parameters
-    ----------
-    nearest : (N,) distance to the nearest other circle [px]
-    share : diameter of a circle in that distance
-    """
-    pixels = np.full(centres.shape, np.nan)
-    for index, (centre, distance) in enumerate(zip(centres, nearest, strict=True)):
-        disc, outer = 0.5 * share * distance, distance * (1.0 - 0.5 * share) - 1.0
-        moment: FloatArray | None = centre
-        for _ in range(3):
-            if moment is not None:
-                moment = _first_moment(image, moment, disc, min(outer, disc + 3.0))
-        if moment is not None and np.linalg.norm(moment - centre) < 0.3 * distance:
-            pixels[index] = moment
-    return pixels
+    @classmethod
+    def at(cls, window: _Window, appearance: Appearance, parameters: FloatArray) -> '_State':
+        """State at ``parameters``."""
+        shape = window.shape(parameters, appearance)
+        contrast = float(shape @ window.counts) / float(shape @ shape + 1e-12)
+        return cls(parameters, shape, contrast, window.counts - contrast * shape)
 
+    @property
+    def cost(self) -> float:
+        """Sum of squares."""
+        return float(self.residual @ self.residual)
 
-def _first_moment(image: Float32Array, centre: FloatArray, disc: float, window: float) -> FloatArray | None:
-    """Centroid within ``window`` [px] of ``centre``, over the ground seen just outside ``disc``; None off the image."""
-    reach = int(np.ceil(window)) + 1
-    u0, v0 = (np.rint(centre).astype(int) - reach).tolist()
-    height, width = image.shape
-    if u0 < 0 or v0 < 0 or u0 + 2 * reach + 1 > width or v0 + 2 * reach + 1 > height:
-        return None
-    patch = image[v0 : v0 + 2 * reach + 1, u0 : u0 + 2 * reach + 1].astype(np.float64)
-    v, u = np.mgrid[v0 : v0 + 2 * reach + 1, u0 : u0 + 2 * reach + 1]
-    radius = np.hypot(u - centre[0], v - centre[1])
-    ring = (radius > disc + 1.5) & (radius <= window)
-    if ring.sum() < 6:
-        return None
-    weight = (patch - np.median(patch[ring])) * np.clip(window + 0.5 - radius, 0.0, 1.0)
-    total = weight.sum()
-    if abs(total) < 1e-9:
-        return None
-    return np.array([np.sum(weight * u) / total, np.sum(weight * v) / total])
+    def jacobian(self, window: _Window, appearance: Appearance, free: int) -> FloatArray:
+        """Derivative (N, free + 1) of the pattern by the first ``free`` parameters and the contrast."""
+        columns = []
+        for ahead in self.parameters + _DIFFERENCE * np.eye(4)[:free]:
+            columns.append((window.shape(ahead, appearance) - self.shape) * (self.contrast / _DIFFERENCE))
+        return np.column_stack([*columns, self.shape])

@@ -1,31 +1,25 @@
 """Calibration boards and how their points are found in raw frames: chessboard, circle grid, marker board."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
-import cv2
 import numpy as np
 
-from thermal_fiducial.calibration.subpixel import centroids, saddle_points
-from thermal_fiducial.calibration.views import board_views, without_speckles
+from thermal_fiducial.calibration.appearance import Appearance, Disc, SquaresMeet
+from thermal_fiducial.calibration.keypoints import blobs, Keypoints, saddles, without_speckles
+from thermal_fiducial.calibration.lattice import find_board
+from thermal_fiducial.calibration.placement import BoardNodes
+from thermal_fiducial.calibration.subpixel import refine
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.map_data import MarkerMap
 from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.reprojection import corners_in_map
-from thermal_fiducial.core.types import Counts, FloatArray, Gray
+from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import asymmetric_circles
 
-# Share of a grid's circles that must be wholly in the image.
-_LEAST_SHARE = 0.6
-# Blobs to choose the circles from, in circles of the board.
-_MOST_BLOBS = 3
 _APART_NS = 10_000_000_000
-# Images up to this width [px] are enlarged for the search.
-_SMALL = 400
-_GRID = cv2.CALIB_CB_ASYMMETRIC_GRID | cv2.CALIB_CB_CLUSTERING
-# A board whose points lie closer than this [px] is too far away to give sub-pixel points.
-_LEAST_SPACING = 6.0
 
 
 @dataclass(frozen=True)
@@ -73,80 +67,71 @@ class Chessboard:
     def __init__(self, columns: int, rows: int, square: float) -> None:
         if columns < 3 or rows < 3 or not square > 0.0:
             raise InputError('a chessboard needs 3 x 3 inner corners or more and squares with a size')
-        self._size = (columns, rows)
-        row, column = np.divmod(np.arange(rows * columns), columns)
-        self.points = np.stack([column * square, row * square, np.zeros(rows * columns)], axis=1)
+        nodes = _rectangle(columns, rows)
+        self.points = _on_board(square * nodes.astype(np.float64))
+        self._board = BoardNodes(nodes)
 
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting | None:
         """See :class:`Target`."""
         image = without_speckles(counts)
-        for view in board_views(image):
-            corners = self._corners(view)
-            if corners is not None:
-                spacing = _spacing(corners, self._size[0])
-                pixels = saddle_points(image, corners, spacing) if spacing.min() >= _LEAST_SPACING else None
-                return None if pixels is None else Sighting(self.points, pixels)
-        return None
-
-    def _corners(self, view: Gray) -> FloatArray | None:
-        # Small sensors: the search wants squares of ten pixels or more.
-        scale = 2 if view.shape[1] <= _SMALL else 1
-        view = cv2.resize(view, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC).astype(np.uint8)
-        found, corners = cv2.findChessboardCornersSB(view, self._size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
-        if not found:
-            flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-            found, corners = cv2.findChessboardCorners(view, self._size, flags=flags)
-        return (np.asarray(corners, dtype=np.float64).reshape(-1, 2) + 0.5) / scale - 0.5 if found else None
+        return _sighting(image, saddles(image), self._board, self.points, SquaresMeet())
 
 
 class CircleGrid:
-    """An asymmetric grid of round holes.
+    """A grid of round holes or spots.
 
     Parameters
     ----------
     columns, rows : as ``cv2.findCirclesGrid`` counts them, e.g. 4 and 11
     spacing : between two rows [m]
     diameter : of a circle [m]
+    asymmetric : whether every other row is shifted by ``spacing``, circles in a row two of them apart
     """
 
-    def __init__(self, columns: int, rows: int, spacing: float, diameter: float) -> None:
-        if columns < 2 or rows < 3 or not 0.0 < diameter < 2.0 * spacing:
+    def __init__(self, columns: int, rows: int, spacing: float, diameter: float, *, asymmetric: bool = True) -> None:
+        pitch = spacing * np.sqrt(2.0) if asymmetric else spacing
+        if columns < 2 or rows < 3 or not 0.0 < diameter < pitch:
             raise InputError('a circle grid needs 2 x 3 circles or more, and circles smaller than their spacing')
-        self._size = (columns, rows)
-        self.points = np.column_stack([asymmetric_circles(columns, rows, spacing), np.zeros(rows * columns)])
-        self._share = diameter / (spacing * np.sqrt(2.0))
+        nodes = _rectangle(columns, rows)
+        centres = asymmetric_circles(columns, rows, spacing) if asymmetric else spacing * nodes.astype(np.float64)
+        self.points = _on_board(centres)
+        if asymmetric:
+            # The nearest circles are those of the next row: the grid's axes run along the diagonals.
+            x, y = np.rint(self.points[:, :2].T / spacing).astype(np.int64)
+            nodes = np.stack([(x + y) // 2, (y - x) // 2], axis=1)
+        self._board = BoardNodes(nodes)
+        self._disc = Disc(0.5 * diameter / pitch)
         self.radius = 0.5 * diameter
 
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting | None:
         """See :class:`Target`."""
         image = without_speckles(counts)
-        for view in board_views(image):
-            centres = self._centres(view)
-            if centres is not None:
-                nearest = _nearest_neighbour(centres)
-                pixels = centroids(image, centres, nearest, self._share)
-                seen = np.isfinite(pixels[:, 0])
-                if np.mean(seen) < _LEAST_SHARE or nearest.min() < _LEAST_SPACING:
-                    return None
-                return Sighting(self.points[seen], pixels[seen])
+        return _sighting(image, blobs(image), self._board, self.points, self._disc)
+
+
+def _rectangle(columns: int, rows: int) -> IntArray:
+    """Nodes (rows * columns, 2) row by row."""
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    return np.stack([column, row], axis=1).astype(np.int64)
+
+
+def _on_board(points: FloatArray) -> FloatArray:
+    return np.asarray(np.column_stack([points, np.zeros(len(points))]), dtype=np.float64)
+
+
+def _sighting(
+    image: Float32Array, keypoints: Iterable[Keypoints], board: BoardNodes, points: FloatArray, appearance: Appearance
+) -> Sighting | None:
+    """Find a board roughly, then its points to a few hundredths of a pixel."""
+    found = find_board(keypoints, board)
+    if found is None:
         return None
-
-    def _centres(self, view: Gray) -> FloatArray | None:
-        """Circles in the order of the board.
-
-        OpenCV's search for the grid takes minutes on thousands of specks, so it is shown the largest blobs only,
-        drawn anew; their centres are refined later anyway.
-        """
-        detector = _blob_detector()
-        blobs = sorted(detector.detect(view), key=lambda blob: -blob.size)[: _MOST_BLOBS * len(self.points)]
-        if len(blobs) < len(self.points):
-            return None
-        canvas = np.full_like(view, 255)
-        for blob in blobs:
-            centre = round(blob.pt[0]), round(blob.pt[1])
-            cv2.circle(canvas, centre, max(2, round(0.35 * blob.size)), 0, -1)
-        found, centres = cv2.findCirclesGrid(canvas, self._size, flags=_GRID, blobDetector=detector)
-        return np.asarray(centres, dtype=np.float64).reshape(-1, 2) if found else None
+    nodes = board.nodes.astype(np.float64)
+    pixels = refine(image, nodes[found.points], found.pixels, nodes, appearance)
+    seen = np.isfinite(pixels[:, 0])
+    kept = found.points[seen]
+    # What turns out to be no point of the board may have been all that told where in the grid it lies.
+    return Sighting(points[kept], pixels[seen]) if board.place(board.nodes[kept]) is not None else None
 
 
 class MarkerBoard:
@@ -176,36 +161,3 @@ class MarkerBoard:
         T = np.stack([marker.T_map_marker for marker in markers])
         points = corners_in_map(T, np.array([marker.size for marker in markers]))
         return Sighting(points.reshape(-1, 3), corners_px(rows).reshape(-1, 2))
-
-
-def _blob_detector() -> cv2.SimpleBlobDetector:
-    """Dark blobs of any usable size; views of both polarities are tried."""
-    parameters = cv2.SimpleBlobDetector.Params()
-    parameters.minArea, parameters.maxArea = 12.0, 20000.0
-    parameters.minDistBetweenBlobs = 4.0
-    parameters.minThreshold, parameters.maxThreshold, parameters.thresholdStep = 30.0, 226.0, 12.0
-    parameters.filterByColor, parameters.blobColor = True, 0
-    parameters.filterByConvexity, parameters.minConvexity = True, 0.8
-    parameters.filterByInertia, parameters.filterByCircularity = False, False
-    return cv2.SimpleBlobDetector.create(parameters)
-
-
-def _spacing(corners: FloatArray, columns: int) -> FloatArray:
-    """Distance (N,) of each corner to the nearest of its neighbours in its row and column [px]."""
-    grid = corners.reshape(-1, columns, 2)
-    along = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
-    down = np.linalg.norm(np.diff(grid, axis=0), axis=-1)
-    far = np.inf
-    steps = [
-        np.pad(along, ((0, 0), (1, 0)), constant_values=far),
-        np.pad(along, ((0, 0), (0, 1)), constant_values=far),
-        np.pad(down, ((1, 0), (0, 0)), constant_values=far),
-        np.pad(down, ((0, 1), (0, 0)), constant_values=far),
-    ]
-    return np.asarray(np.min(steps, axis=0).reshape(-1))
-
-
-def _nearest_neighbour(points: FloatArray) -> FloatArray:
-    distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
-    np.fill_diagonal(distance, np.inf)
-    return np.asarray(distance.min(axis=1))

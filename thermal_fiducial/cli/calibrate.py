@@ -39,6 +39,8 @@ from thermal_fiducial.files.marker_map import load_map
 # A view of a bag must have moved by this much since the last one kept, and by less than that to the next frame [px].
 _NEW_VIEW_PX, _STILL_PX = 12.0, 0.7
 _SHADES = ' .:+#'
+#: Boards; ``circles`` are OpenCV's asymmetric grid.
+TARGETS = ('chessboard', 'circles', 'symmetric-circles', 'markers')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,11 +63,17 @@ def _add_intrinsics(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('source', type=Path, help='folder of pictures (8 or 16 bit), or a bag with thermal/image_raw')
     parser.add_argument('--out', type=Path, default=Path('camera_info.yaml'), help='calibration to write')
     parser.add_argument('--report', type=Path, help='report to write (default: next to the calibration, .html)')
-    parser.add_argument('--target', choices=('chessboard', 'circles', 'markers'), default='chessboard')
+    parser.add_argument('--target', choices=TARGETS, default='chessboard')
     parser.add_argument(
-        '--grid', type=int, nargs=2, metavar=('COLUMNS', 'ROWS'), help='inner corners (8 6) or circles (4 11)'
+        '--grid',
+        type=int,
+        nargs=2,
+        metavar=('COLUMNS', 'ROWS'),
+        help='inner corners (8 6), or circles as OpenCV counts them (circles: 4 11; symmetric-circles: 7 5)',
     )
-    parser.add_argument('--spacing', type=float, default=50.0, metavar='MM', help='square, or between rows of circles')
+    parser.add_argument(
+        '--spacing', type=float, default=50.0, metavar='MM', help='square, or between two rows of circles'
+    )
     parser.add_argument('--diameter', type=float, default=20.0, metavar='MM', help='of the circles')
     parser.add_argument('--board', type=Path, metavar='MAP', help='marker map of a marker board')
     parser.add_argument('--models', default=','.join(CANDIDATES), help='to choose among, by held-out error')
@@ -106,9 +114,10 @@ def _target(args: argparse.Namespace) -> Target:
     if args.target == 'chessboard':
         columns, rows = args.grid or (8, 6)
         return Chessboard(columns, rows, spacing)
-    if args.target == 'circles':
-        columns, rows = args.grid or (4, 11)
-        return CircleGrid(columns, rows, spacing, diameter)
+    if args.target != 'markers':
+        asymmetric = args.target == 'circles'
+        columns, rows = args.grid or ((4, 11) if asymmetric else (7, 5))
+        return CircleGrid(columns, rows, spacing, diameter, asymmetric=asymmetric)
     if args.board is None:
         raise InputError('--target markers needs --board, the marker map of the board')
     board = load_map(args.board)

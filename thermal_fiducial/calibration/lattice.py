@@ -1,0 +1,171 @@
+"""Regular grids among the points of an image, grown point by point, and the board in them.
+
+Everything is local: a grid is continued from its own nearest points, so neither lens distortion nor perspective nor
+contrast that fades, or reverses, over a board stops it.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from thermal_fiducial.calibration.keypoints import Keypoints
+from thermal_fiducial.calibration.placement import BoardNodes
+from thermal_fiducial.calibration.surface import local_surface, REACH
+from thermal_fiducial.core.types import FloatArray, IntArray
+
+#: Place in a grid, (along its first axis, along its second).
+Node = tuple[int, int]
+#: A keypoint, its two neighbours along one axis and the two along another.
+Seed = tuple[int, int, int, int, int]
+
+_NEIGHBOURS, _MOST_SEEDS = 12, 40
+# Least likeness (cosine) of the Hessians of neighbours, but for their sign.
+_LIKE = 0.5
+# Deviation from where the grid predicts a point, in steps of the grid. Points of a board deviate by a tenth or less on
+# average, whatever the lens; those of noise by as much as is allowed.
+_TOLERANCE, _SEED_TOLERANCE, _ORDERLY, _ENOUGH = 0.3, 0.25, 0.15, 6
+# Directions of a grid's axes differ by this much (sine).
+_LEAST_SINE = 0.35
+
+
+@dataclass(frozen=True)
+class BoardPoints:
+    """Points of a board in an image.
+
+    Parameters
+    ----------
+    points : (N,) their index on the board
+    pixels : (N, 2) where they are, to a pixel or a tenth of their spacing
+    """
+
+    points: IntArray
+    pixels: FloatArray
+
+
+def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | None:
+    """Most complete sighting of a board among several sets of keypoints; None where there is none."""
+    best: BoardPoints | None = None
+    for keypoints in views:
+        for grid in Grower(keypoints).grids():
+            nodes = np.array(list(grid), dtype=np.int64)
+            pixels = keypoints.pixels[list(grid.values())]
+            placed = board.place(_facing(nodes, pixels))
+            if placed is not None and (best is None or len(placed[0]) > len(best.points)):
+                best = BoardPoints(placed[0], pixels[placed[1]])
+        if best is not None and len(best.points) == len(board.nodes):
+            break
+    return best
+
+
+def _facing(nodes: IntArray, pixels: FloatArray) -> IntArray:
+    """Nodes of a grid with axes that turn like those of the image."""
+    design = np.column_stack([np.ones(len(nodes)), nodes])
+    steps = np.linalg.lstsq(design, pixels, rcond=None)[0][1:]
+    return nodes if np.linalg.det(steps) > 0.0 else np.ascontiguousarray(nodes[:, ::-1])
+
+
+class Grower:
+    """Grows grids of keypoints."""
+
+    def __init__(self, keypoints: Keypoints) -> None:
+        self._pixels, self._hessians = keypoints.pixels, keypoints.hessians
+        self._sign = -1.0 if keypoints.alternate else 1.0
+        self._tree = cKDTree(self._pixels)
+
+    def grids(self) -> Iterator[dict[Node, int]]:
+        """Keypoints (their index) by their place in a grid, strongest seeds first; those of a grid seed no other."""
+        taken: set[int] = set()
+        tried = 0
+        for seed in self._seeds():
+            if tried == _MOST_SEEDS:
+                return
+            if seed[0] not in taken:
+                tried += 1
+                grid = self._grow(seed)
+                taken.update(grid.values())
+                yield grid
+
+    def _seeds(self) -> Iterator[Seed]:
+        """Points with like neighbours on four sides, the nearest such."""
+        if len(self._pixels) < 5:
+            return
+        _, near = self._tree.query(self._pixels, min(_NEIGHBOURS + 1, len(self._pixels)))
+        near = near[:, 1:]
+        offset = self._pixels[near] - self._pixels[:, None]
+        length = np.linalg.norm(offset, axis=-1)
+        like = self._sign * np.einsum('nki,ni->nk', self._hessians[near], self._hessians) > _LIKE
+        closing = np.linalg.norm(offset[:, :, None] + offset[:, None], axis=-1)
+        opposite = closing < _SEED_TOLERANCE * np.minimum(length[:, :, None], length[:, None])
+        opposite &= like[:, :, None] & like[:, None]
+        for index in np.flatnonzero(opposite.any(axis=(1, 2))).tolist():
+            pairs = [(j, k) for j, k in np.argwhere(opposite[index]).tolist() if j < k]
+            unit = offset[index] / length[index][:, None]
+            along = unit[pairs[0][0]]
+            for pair in pairs[1:]:
+                if abs(along[0] * unit[pair[0], 1] - along[1] * unit[pair[0], 0]) > _LEAST_SINE:
+                    first, second, third, fourth = near[index, [*pairs[0], *pair]].tolist()
+                    yield index, first, second, third, fourth
+                    break
+
+    def _grow(self, seed: Seed) -> dict[Node, int]:
+        """Grid from a seed: first what is next to it, then over gaps of one point; given up where it is no grid."""
+        grid: dict[Node, int] = dict(zip(((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)), seed, strict=True))
+        asked: dict[Node, int] = {}
+        off: list[float] = []
+        growing = True
+        while growing and (len(off) < _ENOUGH or np.mean(off) < _ORDERLY):
+            growing = any(self._add(grid, reach, asked, off) for reach in (1, 2))
+        return grid
+
+    def _add(self, grid: dict[Node, int], reach: int, asked: dict[Node, int], off: list[float]) -> bool:
+        """Add the points ``reach`` steps from the grid; whether there were any.
+
+        Parameters
+        ----------
+        asked : support of each place that was looked at before: with the same the answer is the same
+        off : how far each point that was added lay from where it was expected [steps]
+        """
+        before = len(grid)
+        for node in {n: None for known in grid for n in _around(known, reach) if n not in grid}:
+            support = _support(grid, node)
+            if asked.get(node) == len(support):
+                continue
+            asked[node] = len(support)
+            found = self._next(grid, node, support)
+            if found is not None:
+                grid[node] = found[0]
+                off.append(found[1])
+        return len(grid) > before
+
+    def _next(self, grid: dict[Node, int], node: Node, support: list[Node]) -> tuple[int, float] | None:
+        """Keypoint at ``node`` and how far it is off [steps], predicted from the nodes of ``support``."""
+        pixels = self._pixels[[grid[n] for n in support]]
+        surface = local_surface(np.array(support, dtype=np.float64), pixels, np.array(node, dtype=np.float64))
+        if surface is None:
+            return None
+        radius = _TOLERANCE * float(np.linalg.norm(surface.steps, axis=0).max())
+        nearby = self._tree.query_ball_point(surface.centre, radius)
+        off = np.linalg.norm(np.linalg.solve(surface.steps, (self._pixels[nearby] - surface.centre).T), axis=0)
+        used = set(grid.values())
+        for away, index in sorted(zip(off.tolist(), nearby, strict=True)):
+            if away <= _TOLERANCE and index not in used and self._fits(grid, node, index):
+                return int(index), away
+        return None
+
+    def _fits(self, grid: dict[Node, int], node: Node, index: int) -> bool:
+        """Whether the Hessian is like those of the neighbours; of any sign, for contrast may reverse."""
+        neighbours = [grid[n] for n in _around(node, 1) if n in grid]
+        likeness = np.abs(self._hessians[neighbours] @ self._hessians[index])
+        return len(neighbours) == 0 or float(likeness.max()) > _LIKE
+
+
+def _around(node: Node, reach: int) -> list[Node]:
+    a, b = node
+    return [(a + reach, b), (a - reach, b), (a, b + reach), (a, b - reach)]
+
+
+def _support(grid: dict[Node, int], node: Node) -> list[Node]:
+    steps = range(-REACH, REACH + 1)
+    return [n for i in steps for j in steps if (n := (node[0] + i, node[1] + j)) in grid]
