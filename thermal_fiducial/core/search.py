@@ -13,7 +13,7 @@ from thermal_fiducial.core.quads import find_quads
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 # Full resolution sees small and smeared markers; half resolution, without the pattern of columns, faint ones.
-_FINE = Scale(smoothing_px=1.0, window_px=15, depth=0.2, floor=3.0, shrink=4)
+_FINE = Scale(smoothing_px=1.0, window_px=15, depth=0.2, floor=1.5, shrink=4)
 _FAINT = Scale(smoothing_px=1.2, window_px=5, depth=0.03, floor=1.0, shrink=2, specks_px=3)
 # Weight of white surroundings against correlation in choosing among the outlines of a marker.
 _SURROUNDED = 0.2
