@@ -51,3 +51,17 @@ def test_frames_that_were_not_adjusted_move_with_the_nearest():
         np.testing.assert_allclose(store.frames[k].T_map_rig, T @ transform(np.eye(3), [k, 0.0, 0.0]), atol=1e-12)
     np.testing.assert_allclose(moved.at(1000), late, atol=1e-12)
     np.testing.assert_array_equal(store.move({99: early}).at(3), np.eye(4))
+
+
+def test_rotations_stay_rotations_however_often_the_map_moves():
+    """Rounding errors must not double from one adjustment to the next: in half an hour there are hundreds."""
+    rng = np.random.default_rng(0)
+    store = KeyframeStore(10)
+    for k in range(6):
+        store.add(frame(k, transform(so3_exp(rng.normal(size=3)), rng.normal(size=3))))
+    for _ in range(300):
+        stamps = rng.choice(6, 4, replace=False).tolist()
+        steps = {k: transform(so3_exp(0.01 * rng.normal(size=3)), 0.01 * rng.normal(size=3)) for k in stamps}
+        moved = store.move({k: step @ store.frames[k].T_map_rig for k, step in steps.items()})
+        R = np.stack([f.T_map_rig[:3, :3] for f in store.frames.values()] + [moved.at(3)[:3, :3]])
+        np.testing.assert_allclose(np.swapaxes(R, -1, -2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-12)

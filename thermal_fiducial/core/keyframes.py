@@ -129,9 +129,9 @@ class KeyframeStore:
         if not stamps:
             return Displacement(np.zeros(1, dtype=np.int64), np.eye(4)[None])
         T = np.stack([adjusted[stamp] @ inverse(self.frames[stamp].T_map_rig) for stamp in stamps])
-        displacement = Displacement(np.array(stamps, dtype=np.int64), T)
+        displacement = Displacement(np.array(stamps, dtype=np.int64), _rigid(T))
         self.frames = {
-            stamp: replace(frame, T_map_rig=displacement.at(stamp) @ frame.T_map_rig)
+            stamp: replace(frame, T_map_rig=adjusted.get(stamp, displacement.at(stamp) @ frame.T_map_rig))
             for stamp, frame in self.frames.items()
         }
         return displacement
@@ -156,6 +156,14 @@ class KeyframeStore:
         for stamp, key in zip(self.frames, np.floor(scaled).astype(int).tolist(), strict=True):
             cells[tuple(key)].append(stamp)
         return cells
+
+
+def _rigid(T: FloatArray) -> FloatArray:
+    """Transforms (n, 4, 4) freed of what rounding has made of their rotations: else it doubles with every product."""
+    U, _, Vt = np.linalg.svd(T[:, :3, :3])
+    result = T.copy()
+    result[:, :3, :3] = U @ Vt
+    return result
 
 
 def _fair_share(counts: list[int], room: int) -> int:
