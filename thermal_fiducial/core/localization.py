@@ -38,7 +38,7 @@ WIDE = np.deg2rad(25.0)
 # Re-projection error at which a hypothesis stops getting worse [px]: single-marker poses are rough.
 _HYPOTHESIS_PX = 3.0
 # Markers that propose hypotheses: with many in view the largest are precise enough, and the rest only votes.
-_PROPOSERS = 8
+_PROPOSERS = 6
 
 
 @dataclass(frozen=True)

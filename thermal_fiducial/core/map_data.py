@@ -35,6 +35,14 @@ class MapMarker:
     #: False: in quarantine, because it persistently disagrees with the others; no pose rests on it
     trusted: bool = True
 
+    def seen(self, stamp_ns: int, error_px: float) -> 'MapMarker':
+        """The marker after one more sight; written out, as every marker of every frame goes through here."""
+        first = self.first_seen_ns if self.observations else stamp_ns
+        return MapMarker(
+            self.id, self.size, self.fixed, self.T_map_marker, self.covariance,
+            error_px, self.observations + 1, first, stamp_ns, self.trusted,
+        )  # fmt: skip
+
 
 @dataclass
 class MarkerMap:

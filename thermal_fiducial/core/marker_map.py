@@ -164,13 +164,7 @@ class MarkerMapper:
         self._trust.add_errors(known.markers, errors)
         if not self.frozen:
             for marker in known.markers:
-                self.map.markers[marker.id] = replace(
-                    marker,
-                    reprojection_error_px=self._trust.running_error(marker),
-                    observations=marker.observations + 1,
-                    first_seen_ns=marker.first_seen_ns if marker.observations else stamp_ns,
-                    last_seen_ns=stamp_ns,
-                )
+                self.map.markers[marker.id] = marker.seen(stamp_ns, self._trust.running_error(marker))
         return np.asarray(errors)
 
     def _judge(self, known: Sight, trusted: BoolArray, errors: FloatArray, location: Location, camera: Camera) -> bool:
