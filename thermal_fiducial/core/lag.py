@@ -157,9 +157,11 @@ class MotionTracker:
             information = np.linalg.inv(prior.covariance)
             posterior: FloatArray = np.asarray(np.linalg.inv(information + (A.T * weight) @ A))
             value = posterior @ (information @ prior.value + (A.T * weight) @ velocity)
-            if self._twist is not None:
+            if self._twist is not None and self._settled:
                 # That was half a frame ago; what smears this one is the motion of one time constant ago.
-                value = value + (0.5 * dt - self._lag) / (0.5 * dt + self._lag) * (value - self._twist.value)
+                apart = 0.5 * dt + self._lag
+                limit = apart * np.sqrt(np.diag(_CHANGE_PER_S))
+                value = value + (0.5 * dt - self._lag) / apart * np.clip(value - self._twist.value, -limit, limit)
             twist = Twist(np.asarray(value), np.asarray(posterior))
         return twist
 
