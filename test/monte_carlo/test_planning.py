@@ -27,10 +27,11 @@ def test_planned_pose_errors_are_the_measured_ones():
             # 36 markers: a share of 0.8 scatters by 0.07.
             assert tally.found >= 0.6
             ratios.append((planned.position / measured[0], planned.rotation_deg / measured[2]))
-    assert len(ratios) >= 7
-    # Medians of 36 errors scatter by a fifth, and so do those of the tables.
-    assert np.all(np.abs(np.log(np.median(ratios, axis=0))) < np.log(1.3))
-    assert np.mean(np.abs(np.log(ratios)) < np.log(1.5)) >= 0.9
+    assert len(ratios) == 9
+    # Medians of 36 errors scatter by a sixth, and so do those of the tables: the goal holds for each view.
+    assert np.all(np.abs(np.log(ratios)) < np.log(1.5))
+    # Over all views scatter averages out.
+    assert np.all(np.abs(np.log(np.median(ratios, axis=0))) < np.log(1.25))
 
 
 @pytest.mark.slow

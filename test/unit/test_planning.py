@@ -19,7 +19,12 @@ SIDES, CONTRASTS, TILTS = np.array([10.0, 40.0]), np.array([1.0, 100.0]), np.arr
 def table(found, sigma):
     shape = (2, 2, 2)
     return Measurements(
-        SIDES, CONTRASTS, TILTS, np.broadcast_to(found, shape), np.broadcast_to(sigma, shape), np.array([1.0, 0.5])
+        SIDES,
+        CONTRASTS,
+        TILTS,
+        np.broadcast_to(found, shape),
+        np.broadcast_to(sigma, shape),
+        np.array([[1.0, 0.5], [1.0, 0.5]]),
     )
 
 
@@ -63,6 +68,13 @@ def test_errors_grow_with_distance_squared_and_noise():
     assert far[1] / near[1] == pytest.approx(4.0, rel=0.15)
     assert noisy[0] / near[0] == pytest.approx(2.0, rel=0.1)
     assert near[3] == 0.0
+
+
+def test_noise_is_a_floor_and_a_part_that_falls_with_contrast():
+    noise = np.sqrt(0.01**2 + (0.5 / CONTRASTS) ** 2)
+    measurements = table(1.0, noise[None, :, None])
+    for contrast in (1.5, 5.0, 40.0):
+        assert measurements.look_up(20.0, contrast, 30.0)[1] == pytest.approx(np.hypot(0.01, 0.5 / contrast))
 
 
 def test_branches_that_meet_are_no_flips():

@@ -208,5 +208,16 @@ def measure(
         factor[node] = _pose_factor(tally, camera, side, tilt)
         if progress is not None:
             progress()
-    by_tilt = np.array([np.nanmedian(factor[:, :, index]) for index in range(len(tilt_deg))])
-    return Measurements(side_px, contrast, tilt_deg, found, sigma, by_tilt)
+    return Measurements(side_px, contrast, tilt_deg, found, sigma, _over_sides(factor))
+
+
+def _over_sides(factor: FloatArray) -> FloatArray:
+    """Median (C, T) of factors (S, C, T); where nothing was found, that of the next higher contrast."""
+    medians = np.full(factor.shape[1:], np.nan)
+    for node in np.ndindex(*medians.shape):
+        values = factor[:, node[0], node[1]]
+        if np.any(np.isfinite(values)):
+            medians[node] = np.nanmedian(values)
+    for row in range(len(medians) - 2, -1, -1):
+        medians[row] = np.where(np.isfinite(medians[row]), medians[row], medians[row + 1])
+    return medians

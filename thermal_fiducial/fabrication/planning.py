@@ -44,8 +44,8 @@ class Measurements:
     tilt_deg : (T,) between the marker's normal and the line of sight
     found : (S, C, T) share of the markers that were found
     sigma_px : (S, C, T) noise of a corner coordinate; NaN where nothing was found
-    pose_factor : (T,) median error of the poses in that of poses from four corners with independent noise: the
-        corners of a marker lie on common lines, so their errors have much in common
+    pose_factor : (C, T) median error of the poses in that of poses from four corners with independent noise: the
+        corners of a marker lie on common lines, so their errors have much in common, the more the fainter it is
     """
 
     side_px: FloatArray
@@ -56,21 +56,37 @@ class Measurements:
     pose_factor: FloatArray
 
     def look_up(self, side_px: float, contrast: float, tilt_deg: float, bits: int = 4) -> tuple[float, float]:
-        """Share found and corner noise [px], linear between the measured points; all but share and tilt logarithmic.
+        """Share found and corner noise [px], between the measured points.
 
-        Beyond the measured range the nearest end counts, except that nothing smaller or fainter than measured is
-        found.
+        The share is linear over the logarithms of side and contrast. The noise is a power of the side in pixels as the
+        camera sees it, so its logarithm is linear over those of side and of the tilt's cosine; and its square is a
+        floor, from optics and from the fixed pattern, plus a part that falls with the square of the contrast. Beyond
+        the measured range the nearest end counts, except that nothing smaller or fainter than measured is found.
         """
         if contrast < self.contrast[0]:
             return 0.0, np.nan
-        faint = _position(np.log(self.contrast), np.log(contrast))
-        tilted = _position(self.tilt_deg, tilt_deg)
+        faint, tilted = _position(np.log(self.contrast), np.log(contrast)), self._tilted(tilt_deg)
         readable = side_px * (_MEASURED_BITS + 2) / (bits + 2)
         found = 0.0
         if readable >= self.side_px[0]:
             found = _interpolate(self.found, (_position(np.log(self.side_px), np.log(readable)), faint, tilted))
         large = _position(np.log(self.side_px), np.log(max(side_px, self.side_px[0])))
-        return found, float(np.exp(_interpolate(np.log(self.sigma_px), (large, faint, tilted))))
+        index, _ = faint
+        inverse = self.contrast[index : index + 2] ** -2.0
+        share = float(np.clip((inverse[0] - contrast**-2.0) / (inverse[0] - inverse[1]), 0.0, 1.0))
+        ends = [_interpolate(np.log(self.sigma_px), (large, (index, end), tilted)) for end in (0.0, 1.0)]
+        if not np.all(np.isfinite(ends)):
+            return found, float(np.exp(_interpolate(np.log(self.sigma_px), (large, faint, tilted))))
+        variances = np.exp(2.0 * np.array(ends))
+        return found, float(np.sqrt((1.0 - share) * variances[0] + share * variances[1]))
+
+    def factor(self, contrast: float, tilt_deg: float) -> float:
+        """``pose_factor`` between the measured points."""
+        faint = _position(np.log(self.contrast), np.log(contrast))
+        return _interpolate(self.pose_factor[None].repeat(2, axis=0), ((0, 0.0), faint, self._tilted(tilt_deg)))
+
+    def _tilted(self, tilt_deg: float) -> tuple[int, float]:
+        return _position(-np.log(np.cos(np.radians(self.tilt_deg))), -np.log(np.cos(np.radians(tilt_deg))))
 
 
 def _position(axis: FloatArray, value: float) -> tuple[int, float]:
@@ -112,7 +128,7 @@ def load_measurements(path: str | os.PathLike[str] = PACKAGED) -> Measurements:
         raise InputError(f'{path}: {error} is missing or no table') from None
     side, contrast, tilt, found, sigma, factor = tables
     shape = len(side), len(contrast), len(tilt)
-    if found.shape != shape or sigma.shape != shape or factor.shape != tilt.shape or min(shape) < 2:
+    if found.shape != shape or sigma.shape != shape or factor.shape != shape[1:] or min(shape) < 2:
         raise InputError(f'{path}: tables of {found.shape} and {sigma.shape} do not fit axes of {shape}')
     return Measurements(side, contrast, tilt, found, sigma, factor)
 
@@ -184,7 +200,7 @@ def expect(
     if not np.isfinite(sigma):
         return Expectation(side_px, found, sigma)
     errors = expected_errors(camera, size, distance, tilt_deg, sigma, seed)
-    factor = float(np.interp(tilt_deg, measurements.tilt_deg, measurements.pose_factor))
+    factor = measurements.factor(contrast, tilt_deg)
     position, along, rotation = (factor * error for error in errors[:3])
     return Expectation(side_px, found, sigma, position, along, rotation, errors[3])
 
