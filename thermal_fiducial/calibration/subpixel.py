@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.calibration.appearance import Appearance
-from thermal_fiducial.calibration.surface import local_surface, Surface
+from thermal_fiducial.calibration.surface import CLOSELY, local_surface, ROUGHLY, Surface
 from thermal_fiducial.core.types import Float32Array, FloatArray
 
 # Points closer than this [px] are too close to give sub-pixel points.
@@ -92,9 +92,10 @@ def _round(
 ) -> list[_Fitted | None]:
     """Fit all points once; with ``contrast``, points without one are lost ones and tell nothing of the grid."""
     known = np.ones(len(nodes), dtype=np.bool_) if contrast is None else np.isfinite(contrast)
+    ridge = ROUGHLY if shared[0] is None else CLOSELY
     fits = []
     for node, start, common in zip(nodes, pixels, shared, strict=True):
-        surface, here = local_surface(nodes[known], pixels[known], node), appearance.at(node, board)
+        surface, here = local_surface(nodes[known], pixels[known], node, ridge), appearance.at(node, board)
         window = None if surface is None else _window(image, start, surface, here, common)
         if window is not None and contrast is not None:
             window = _promised(window, nodes[known] - node, contrast[known])

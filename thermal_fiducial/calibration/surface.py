@@ -8,19 +8,20 @@ from thermal_fiducial.core.types import FloatArray
 
 # How far the points that predict another one lie away from it, in steps of the grid.
 REACH = 3
-# Curvature that few points hardly show is held down by this much.
-_RIDGE = 0.03
+#: How firmly curvature is held down where points are known to a pixel and lie on one side only; and where they are
+#: known so well that perspective and lens show: held down then, it would cost 0.02 % of the focal length.
+ROUGHLY, CLOSELY = 0.03, 0.00001
 
 
 @dataclass(frozen=True)
 class Surface:
-    """A grid around one of its nodes: pixel = centre + steps n + bend (n1 n1, n1 n2, n2 n2).
+    """A grid around one of its nodes: pixel = centre + steps n + bend t(n), t its second and third powers.
 
     Parameters
     ----------
     centre : (2,) pixel of the node
     steps : (2, 2) to the next nodes along the two axes, by columns [px]
-    bend : (2, 3) [px]
+    bend : (2, 7) [px]
     """
 
     centre: FloatArray
@@ -32,27 +33,34 @@ class Surface:
         inverse = np.linalg.inv(self.steps)
         place = offset @ inverse.T
         for _ in range(2):
-            bent = np.column_stack([place[:, 0] ** 2, place[:, 0] * place[:, 1], place[:, 1] ** 2]) @ self.bend.T
+            bent = _bends(place) @ self.bend.T
             place = (offset - bent) @ inverse.T
         return np.asarray(place)
 
 
-def local_surface(nodes: FloatArray, pixels: FloatArray, node: FloatArray) -> Surface | None:
+def _bends(place: FloatArray) -> FloatArray:
+    """Terms (N, 7) of second and third order."""
+    a, b = place.T
+    return np.column_stack([a * a, a * b, b * b, a**3, a * a * b, a * b * b, b**3])
+
+
+def local_surface(nodes: FloatArray, pixels: FloatArray, node: FloatArray, ridge: float = ROUGHLY) -> Surface | None:
     """Surface around ``node`` through points (N, 2) near it, the nearer the closer; None where they don't say.
 
     Parameters
     ----------
     nodes, pixels : (N, 2) of the grid; those farther than :data:`REACH` do not count
+    ridge : :data:`ROUGHLY` or :data:`CLOSELY`
     """
     away = nodes - node
     near = np.max(np.abs(away), axis=1) <= REACH
     a, b = away[near].T
-    weight = 1.0 / (1.0 + a * a + b * b)
-    design = np.stack([np.ones_like(a), a, b, a * a, a * b, b * b], axis=1) * weight[:, None]
+    weight = 1.0 / (1.0 + a * a + b * b) ** 2
+    design = np.column_stack([np.ones_like(a), a, b, _bends(away[near])]) * weight[:, None]
     normal = design.T @ design
     if len(a) < 3 or np.linalg.det(normal[:3, :3]) < 1e-4 * normal[0, 0] ** 3:
         return None
-    normal[range(3, 6), range(3, 6)] += _RIDGE * weight.max() ** 2
+    normal[range(3, 10), range(3, 10)] += ridge * weight.max() ** 2
     surface = np.linalg.solve(normal, design.T @ (pixels[near] * weight[:, None]))
     steps = surface[1:3].T
     if abs(np.linalg.det(steps)) < 1.0:
