@@ -42,7 +42,12 @@ _SMEAR_THAT_MATTERS_PX, _SMEAR_THAT_HIDES_PX = 0.4, 2.0
 _STILL_ALIKE = 0.7
 # Share of the map's expected markers that, seen, shows that the prediction holds.
 _ENOUGH = 0.5
-# Contrast over noise from which smeared edges cost more than the noise of sharpening them.
+# What both ways to measure smeared corners cost: sharpening adds noise, in pixels times contrast over noise times root
+# of the side; without it the tail of the lag passes for a symmetric blur, which displaces corners by so much of the
+# square of the smear over a cell.
+_NOISE_OF_SHARPENING, _COST_OF_SMEAR = 6.5, 0.22
+# Contrast over noise below which a marker is faint; a clearer one is always sharpened, as its corners are good enough for
+# even a short tail to show in what they have in common.
 _CLEAR = 20.0
 # Contrast over noise beyond which the column pattern of the array displaces no side.
 _CLEARER_THAN_COLUMNS = 100.0
@@ -238,8 +243,6 @@ class MarkerDetector:
         if len(ids) == 0:
             self._motion.remember(frame.stamp_ns, predicted, Tracked.none())
             return ids, refined
-        # Freeing an image of lag costs noise: of faint markers only the delay is taken out.
-        clear = np.abs(found.clarity) > _CLEAR
         before, step = self._pattern.before[ids], self._pattern.step[ids]
         if len(tracked.ids) == len(ids) and self._since_blind > 0:
             at_stamp, depth = Corners.seen_at(tracked.x, camera), tracked.depth
@@ -250,10 +253,12 @@ class MarkerDetector:
         self._depth = float(np.median(depth))
         twist, tau = predicted, self.config.bolometer_lag
         by_twist = smear_by_twist(at_stamp.x, at_stamp.J, depth, tau)
-        columns = _COLUMNS if clear.all() else _COLUMNS_FAINT
+        columns = _COLUMNS if np.abs(found.clarity).min() > _CLEAR else _COLUMNS_FAINT
+        sides = _sides(corners)
         for _ in range(2):
             smeared = np.zeros_like(corners) if twist is None else by_twist @ twist.value
-            view = _view(frame.image, at_stamp.px, smeared, clear)
+            sharpen = _worth_sharpening(smeared, sides, self._decoder.cells, found.clarity)
+            view = _view(frame.image, at_stamp.px, smeared, sharpen)
             start = at_stamp.moved(view.shift, camera)
             seen = refine_corners(
                 view.image, start, camera, before, step, self.config.blur_px, view.spread, columns, near=near
@@ -267,10 +272,10 @@ class MarkerDetector:
             shift = smeared - view.removed
             corners = seen.corners_px - shift
             unknown = by_twist @ twist.covariance @ np.swapaxes(by_twist, -1, -2)
-            unknown = unknown + model_error(smeared, _sides(corners) / self._decoder.cells)
+            unknown = unknown + model_error(smeared, sides / self._decoder.cells)
             refined = replace(seen, corners_px=corners, covariances=seen.covariances + unknown)
             at_stamp, near = start.moved(corners - start.px, camera), np.ones(len(ids), dtype=bool)
-            if np.abs(shift - view.shift)[clear].max(initial=0.0) < _SMEAR_THAT_MATTERS_PX:
+            if np.abs(shift - view.shift)[sharpen].max(initial=0.0) < _SMEAR_THAT_MATTERS_PX:
                 break
         # How well the image shows the sides, apart from how well the motion is known.
         there = replace(found, corners_px=found.corners_px + view.shift)
@@ -325,13 +330,19 @@ def _common_shift(ids: IntArray, corners: FloatArray, seen: Found) -> FloatArray
     return np.asarray(np.median((seen.corners_px[found] - corners[predicted]).mean(axis=1), axis=0))
 
 
-def _view(image: Float32Array, corners: FloatArray, smeared: FloatArray, clear: BoolArray) -> _View:
-    """``image`` sharpened round those markers (N, 4, 2) that are clear, which shows them all with known smear."""
-    removed = (1.0 - REMAINING) * smeared * clear[:, None, None]
+def _worth_sharpening(smeared: FloatArray, sides: FloatArray, cells: int, clarity: FloatArray) -> BoolArray:
+    """For which markers with smear (N, 4, 2) and sides (N,) [px] smeared edges cost more than sharpening's noise."""
+    square = np.sum(smeared.mean(axis=1) ** 2, axis=1)
+    systematic, noise = _COST_OF_SMEAR * square * cells / sides, _NOISE_OF_SHARPENING / np.sqrt(sides)
+    return np.asarray((np.abs(clarity) > _CLEAR) | (systematic * np.abs(clarity) > noise))
+
+
+def _view(image: Float32Array, corners: FloatArray, smeared: FloatArray, sharpen: BoolArray) -> _View:
+    """``image`` with known smear round all markers (N, 4, 2), sharpened round some (N,)."""
+    removed = (1.0 - REMAINING) * smeared * sharpen[:, None, None]
     shift = smeared - removed
-    moving = clear & (np.abs(smeared).max(axis=(1, 2)) > 0.0)
-    sharp = markers_sharpened(image, (corners + shift)[moving], smeared[moving], _WINDOW_MARGIN_PX)
-    return _View(sharp, shift, removed, smeared.mean(axis=1) * np.where(clear, SPREAD, 1.0)[:, None])
+    sharp = markers_sharpened(image, (corners + shift)[sharpen], smeared[sharpen], _WINDOW_MARGIN_PX)
+    return _View(sharp, shift, removed, smeared.mean(axis=1) * np.where(sharpen, SPREAD, 1.0)[:, None])
 
 
 def _sides(corners: FloatArray) -> FloatArray:
