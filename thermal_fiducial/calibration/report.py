@@ -123,5 +123,5 @@ def _draw_field(axes: Any, calibration: Calibration, pixels: FloatArray, residua
         for values in (*pixels.T, *residuals.T)
     )
     arrows = axes.quiver(u, v, du, dv, angles='xy')
-    axes.quiverkey(arrows, 0.8, 1.03, 0.02, '0.02 px', labelpos='E')
+    axes.quiverkey(arrows, 0.85, 1.03, 0.02, '0.02 px', labelpos='E')
     axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), title='mean residual', xlabel='u [px]', ylabel='v [px]')
