@@ -169,12 +169,25 @@ def test_odometry_is_in_ros_frames():
 
 
 def test_at_rest_the_gyroscope_bias_is_known_from_the_start():
-    flight = Flight(seed=4, seconds=2.0, motion=Motion.still(), bias_std=(0.02, 0.05))
+    flight = Flight(seed=4, seconds=2.0, motion=Motion.still(), bias_std=(0.002, 0.05))
     ekf = PoseEkf(config())
     run(ekf, timeline(flight.samples(), flight.poses[:3]))
     # RATE_STD, three sigma
     np.testing.assert_allclose(ekf.state.bias[:3], flight.bias[-1, :3], atol=0.015)
     assert rms(np.sqrt(np.diag(ekf.state.covariance)[9:12])) < 0.006
+
+
+@pytest.mark.parametrize(('turn', 'bias'), [(0.0, 0.02), (0.02, 0.0), (0.05, 0.01), (0.09, 0.0)])
+def test_a_slow_flight_is_not_taken_for_rest(turn, bias):
+    """As quiet as on the ground, and what the gyroscope feels may be either."""
+    motion = Motion.still()
+    motion.rotation[2, 0] = 10.0 * turn, 0.1, 0.0
+    flight = Flight(seed=5, seconds=2.0, motion=motion, bias_std=(bias, 0.05))
+    ekf = PoseEkf(config())
+    run(ekf, timeline(flight.samples(), flight.poses[:3]))
+    error = ekf.state.bias[:3] - flight.bias[-1, :3]
+    # Three sigma.
+    assert np.all(np.abs(error) < 3.0 * np.sqrt(np.diag(ekf.state.covariance)[9:12]))
 
 
 def test_reset_forgets(flight):

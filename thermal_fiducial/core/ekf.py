@@ -181,7 +181,7 @@ class PoseEkf:
             imu_there = before.imu + share * (node.imu - before.imu)
             belief = self._propagate(belief, (imu, imu_there), due_ns - time_ns, node.densities)
             time_ns, imu = due_ns, imu_there
-            belief, update = self._gate.weigh(belief, pose, due_ns, imu, partial(self._window, index, imu))
+            belief, update = self._gate.weigh(belief, pose, due_ns, partial(self._window, index, imu))
             self._decide(update)
         node.belief = self._propagate(belief, (imu, node.imu), node.stamp_ns - time_ns, node.densities)
 
@@ -193,9 +193,9 @@ class PoseEkf:
             return belief
         return self._gate.predict(belief, ImuStep(0.5 * (ends[0] + ends[1]), nanoseconds / _SECOND_NS, *densities))
 
-    def _window(self, index: int, imu: FloatArray) -> FloatArray:
-        """Samples (N, 6) of the last half second before node ``index``, then ``imu``."""
-        begin = self._nodes[index].stamp_ns - round(WINDOW_SECONDS * _SECOND_NS)
+    def _window(self, index: int, imu: FloatArray, seconds: float) -> FloatArray:
+        """Samples (N, 6) of the last ``seconds`` before node ``index``, then ``imu``."""
+        begin = self._nodes[index].stamp_ns - round(seconds * _SECOND_NS)
         first = bisect_left(self._nodes, begin, key=lambda node: node.stamp_ns)
         return np.array([*(node.imu for node in self._nodes[first:index]), imu])
 

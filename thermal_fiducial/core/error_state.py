@@ -103,7 +103,7 @@ class ErrorStateFilter:
     def correct(self, state: NavigationState, pose: BodyPose, imu: FloatArray) -> tuple[NavigationState, float]:
         """State corrected by a pose at its own instant, and the normalised innovation squared.
 
-        ``imu`` (6,): sample at that instant.
+        ``imu`` (6,): mean of the samples up to that instant.
         """
         motion = np.concatenate((imu[:3] - state.bias[:3], state.velocity_body))
         H = self._H_pose

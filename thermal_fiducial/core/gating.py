@@ -12,12 +12,15 @@ import math
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.error_state import ErrorStateFilter
 from thermal_fiducial.core.imu import ImuStep
-from thermal_fiducial.core.initialisation import blank_state, start
+from thermal_fiducial.core.initialisation import blank_state, start, WINDOW_SECONDS
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.navigation_state import in_moved_map, NavigationState
 from thermal_fiducial.core.types import FloatArray
 
 _SECOND_NS = 1_000_000_000
+#: What shows a clock error is the motion, not the noise and shaking of one sample, which would count as motion that
+#: shows no error and lead a slow flight's time offset astray: so the mean of this long. Its age matters less.
+_MOTION_SECONDS = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,16 +105,16 @@ class PoseGate:
         return replace(belief, main=move(belief.main), rival=move(belief.rival))
 
     def weigh(
-        self, belief: Belief, pose: CameraPose, time_ns: int, imu: FloatArray, window: Callable[[], FloatArray]
+        self, belief: Belief, pose: CameraPose, time_ns: int, window: Callable[[float], FloatArray]
     ) -> tuple[Belief, PoseUpdate]:
         """Belief after a pose.
 
         Parameters
         ----------
         time_ns : its instant in the clock of the IMU
-        imu : (6,) sample at that instant
-        window : gives the samples (N, 6) up to and with that one
+        window : gives the samples (N, 6) of so many seconds up to that instant
         """
+        imu = window(_MOTION_SECONDS).mean(axis=0)
         main = belief.main
         if main and time_ns - main.accepted_ns > self._config.reinitialise_after * _SECOND_NS:
             main = None
@@ -142,7 +145,7 @@ class PoseGate:
         pose: CameraPose,
         time_ns: int,
         imu: FloatArray,
-        window: Callable[[], FloatArray],
+        window: Callable[[float], FloatArray],
     ) -> Track | None:
         """The rival after a pose that the main estimate refused; one that fails too often gives way to the pose."""
         if rival:
@@ -153,7 +156,7 @@ class PoseGate:
                 return replace(rival, misses=rival.misses + 1)
         prior = main.state if main else self.blank
         body = self._filter.body_pose(pose, prior.T_body_camera)
-        first = start(self._config, self._filter, body, prior, window())
+        first = start(self._config, self._filter, body, prior, window(WINDOW_SECONDS))
         return Track(first, time_ns, time_ns) if first else None
 
     def _convincing(self, rival: Track, main: Track | None, time_ns: int) -> bool:

@@ -86,8 +86,10 @@ def start(
     state = _unaligned(config, filter_.layout, pose, prior)
     still = rest(imu, config.gravity)
     if still:
-        state, _ = filter_.align(state, still.force, FORCE_STD)
-        state, _ = filter_.settle(state, still.rate, RATE_STD)
+        # A slow flight may be as quiet: the larger the mean rate, the rather it is one, and the less it says.
+        doubt = max(float(np.linalg.norm(still.rate)) / RATE_STD, 1.0)
+        state, _ = filter_.align(state, still.force, doubt * FORCE_STD)
+        state, _ = filter_.settle(state, still.rate, doubt * RATE_STD)
     return state
 
 
