@@ -10,11 +10,13 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.clock_offset import ClockOffset
 from thermal_fiducial.core.contrast import noise_of, without_columns
 from thermal_fiducial.core.corners import Corners, grid_pattern, refine_corners, RefinedCorners
 from thermal_fiducial.core.decoding import Decoder
-from thermal_fiducial.core.guided import camera_in_map, expected_markers, look
+from thermal_fiducial.core.guided import camera_in_map, Expected, expected_markers, look
 from thermal_fiducial.core.lag import (
+    image_velocity,
     markers_sharpened,
     model_error,
     MotionTracker,
@@ -46,8 +48,8 @@ _ENOUGH = 0.5
 # of the side; without it the tail of the lag passes for a symmetric blur, which displaces corners by so much of the
 # square of the smear over a cell.
 _NOISE_OF_SHARPENING, _COST_OF_SMEAR = 6.5, 0.22
-# Contrast over noise below which a marker is faint; a clearer one is always sharpened, as its corners are good enough for
-# even a short tail to show in what they have in common.
+# Contrast over noise below which a marker is faint. A clearer one is always sharpened: its corners are so good that
+# even a short tail shows in what they have in common.
 _CLEAR = 20.0
 # Contrast over noise beyond which the column pattern of the array displaces no side.
 _CLEARER_THAN_COLUMNS = 100.0
@@ -93,6 +95,7 @@ class MarkerDetector:
             geometry.rotation_from_quaternion(config.camera_orientation), config.camera_position
         )
         self._motion = MotionTracker(self._T_body_camera, config.bolometer_lag)
+        self._clock_offset = ClockOffset()
         self._field: SmearField | None = None
         self._depth = _TYPICAL_DEPTH
         self._map: dict[int, tuple[FloatArray, float]] = {}
@@ -122,8 +125,12 @@ class MarkerDetector:
             if counts.dtype != np.uint8 and not self._motion.all_clearer_than(_CLEARER_THAN_COLUMNS):
                 image = without_columns(image, noise)
             frame = _Frame(stamp_ns, image, noise, camera, twist)
-            found, tracked = self._find(frame, T_camera_map)
+            in_map = None
+            if T_camera_map is not None and self.config.guided:
+                in_map = expected_markers(self._map, T_camera_map, camera, self.config.min_side_px)
+            found, tracked = self._find(frame, in_map)
             ids, refined = self._refined(frame, found, tracked)
+            self._learn_offset(frame, in_map, ids, refined.corners_px)
             if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
                 refined = local_corners(image, refined, self._decoder.cells)
             return self._rows(ids, refined, camera, T_camera_map)
@@ -138,7 +145,17 @@ class MarkerDetector:
         """The filter's state, where it can be true, with the stamp that the camera would have given it."""
         if odometry is None or not plausible(odometry):
             return None
-        return replace(odometry, stamp_ns=odometry.stamp_ns - round(self.config.camera_time_offset * 1e9))
+        offset = round(self.config.camera_time_offset * 1e9) + self._clock_offset.ns
+        return replace(odometry, stamp_ns=odometry.stamp_ns - offset)
+
+    def _learn_offset(self, frame: '_Frame', in_map: Expected | None, ids: IntArray, corners: FloatArray) -> None:
+        """How far seen corners (N, 4, 2) are off their places tells what is left of the clocks' offset."""
+        if in_map is None or frame.twist is None:
+            return
+        _, predicted, seen = np.intersect1d(in_map.ids, ids, assume_unique=True, return_indices=True)
+        x, depth = frame.camera.normalise(in_map.corners_px[predicted]), in_map.depth[predicted]
+        velocity = image_velocity(frame.camera, x, depth, frame.twist)
+        self._clock_offset.learn(frame.stamp_ns, corners[seen] - in_map.corners_px[predicted], velocity)
 
     def _predicted_pose(self, stamp_ns: int, odometry: Odometry | None, twist: Twist | None) -> FloatArray | None:
         """T_camera_map at the frame, where odometry that is fresh enough tells it."""
@@ -148,12 +165,12 @@ class MarkerDetector:
             return None
         return geometry.inverse(camera_in_map(stamp_ns, odometry, self._T_body_camera, twist))
 
-    def _find(self, frame: '_Frame', T_camera_map: FloatArray | None) -> tuple[Found, Tracked]:
+    def _find(self, frame: '_Frame', in_map: Expected | None) -> tuple[Found, Tracked]:
         """Markers where they should be, and whatever a blind search shows, when that is due; and which are tracked."""
         expected, tracked, complete, holds = Found.none(), Tracked.none(), False, False
         if frame.twist is not None and self.config.guided:
             last = self._motion.expected(frame.stamp_ns, frame.twist)
-            ids, corners, depth = self._expected(frame.camera, last, T_camera_map)
+            ids, corners, depth = self._expected(frame.camera, last, in_map)
             tracked = self._tracked(frame, frame.twist, last.only(np.isin(last.ids, ids)))
             everywhere = np.ones(len(tracked.ids), dtype=bool)
             expected = Found(tracked.ids, frame.camera.distort(tracked.x), tracked.clarity, everywhere)
@@ -165,9 +182,9 @@ class MarkerDetector:
             holds = len(ids) > 0 and len(expected.ids) >= _ENOUGH * len(ids)
         self._since_blind += 1
         interval = self.config.blind_interval
-        if T_camera_map is None or not complete:
+        if in_map is None or not complete:
             interval = min(interval, _INCOMPLETE)
-        if (complete or (holds and T_camera_map is not None)) and self._since_blind < interval:
+        if (complete or (holds and in_map is not None)) and self._since_blind < interval:
             return expected, tracked
         self._since_blind = 0
         scene = self._scene(frame.image, frame.camera, frame.twist)
@@ -175,20 +192,17 @@ class MarkerDetector:
         blind = blind_search(frame.image, scene, self._decoder, allowed, self.config, expected.corners_px)
         return merged(expected, blind), tracked
 
-    def _expected(
-        self, camera: Camera, last: Tracked, T_camera_map: FloatArray | None
-    ) -> tuple[IntArray, FloatArray, FloatArray]:
-        """IDs (N,) of the map's markers and of the last frame's others, their corners (N, 4, 2) [px], depths (N, 4)."""
+    def _expected(self, camera: Camera, last: Tracked, in_map: Expected | None) -> Expected:
+        """The map's markers and the last frame's others."""
         corners = camera.distort(last.x)
         new = camera.contains(corners, _RIM_PX).all(axis=1)
-        if T_camera_map is None:
-            return last.ids[new], corners[new], last.depth[new]
+        if in_map is None:
+            return Expected(last.ids[new], corners[new], last.depth[new])
         new &= ~np.isin(last.ids, list(self._map))
-        ids, there, depth = expected_markers(self._map, T_camera_map, camera, self.config.min_side_px)
-        return (
-            np.concatenate([ids, last.ids[new]]),
-            np.concatenate([there, corners[new]]),
-            np.concatenate([depth, last.depth[new]]),
+        return Expected(
+            np.concatenate([in_map.ids, last.ids[new]]),
+            np.concatenate([in_map.corners_px, corners[new]]),
+            np.concatenate([in_map.depth, last.depth[new]]),
         )
 
     def _tracked(self, frame: '_Frame', twist: Twist, last: Tracked) -> Tracked:

@@ -5,6 +5,7 @@ the image clearly, and better than the pattern of any other marker or any other 
 """
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,13 +26,24 @@ _NEAR = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]), axis=-1).resha
 _FAR = np.stack(np.meshgrid([-1.4, -0.7, 0.0, 0.7, 1.4], [-1.4, -0.7, 0.0, 0.7, 1.4]), axis=-1).reshape(-1, 2)
 
 
+class Expected(NamedTuple):
+    """Places of N markers in a frame."""
+
+    #: (N,)
+    ids: IntArray
+    #: (N, 4, 2)
+    corners_px: FloatArray
+    #: (N, 4) of the corners [m]
+    depth: FloatArray
+
+
 def expected_markers(
     marker_map: Mapping[int, tuple[FloatArray, float]], T_camera_map: FloatArray, camera: Camera, min_side_px: float
-) -> tuple[IntArray, FloatArray, FloatArray]:
-    """IDs (N,), corners (N, 4, 2) [px] and their depths (N, 4) [m] of the markers wholly in view that show a face."""
+) -> Expected:
+    """The markers of the map that are wholly in view and show a face."""
     ids = np.array(sorted(marker_map), dtype=np.int64)
     if len(ids) == 0:
-        return ids, np.zeros((0, 4, 2)), np.zeros((0, 4))
+        return Expected(ids, np.zeros((0, 4, 2)), np.zeros((0, 4)))
     T_map_marker = np.stack([marker_map[marker_id][0] for marker_id in ids.tolist()])
     sizes = np.array([marker_map[marker_id][1] for marker_id in ids.tolist()])
     T = T_camera_map @ T_map_marker
@@ -42,7 +54,7 @@ def expected_markers(
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
     inside = camera.contains(corners, 2.0).all(axis=1)
     seen = inside & facing & (np.min(np.nan_to_num(sides), axis=1) >= min_side_px)
-    return ids[seen], corners[seen], points[seen][..., 2]
+    return Expected(ids[seen], corners[seen], points[seen][..., 2])
 
 
 def camera_in_map(stamp_ns: int, odometry: Odometry, T_body_camera: FloatArray, twist: Twist) -> FloatArray:

@@ -202,6 +202,11 @@ def smear(camera: Camera, x: FloatArray, depth: FloatArray, twist: Twist, tau: f
     return np.asarray(smear_by_twist(x, camera.distort_jacobian(x), depth, tau) @ twist.value)
 
 
+def image_velocity(camera: Camera, x: FloatArray, depth: FloatArray, twist: Twist) -> FloatArray:
+    """Velocity (..., 2) [px/s] of normalised points (..., 2)."""
+    return np.asarray(camera.distort_jacobian(x) @ (interaction(x, depth) @ twist.value)[..., None])[..., 0]
+
+
 def model_error(smear_px: FloatArray, cell_px: FloatArray) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] of what is wrong with an exponential lag of this time constant.
 
