@@ -135,6 +135,20 @@ def test_time_offset_is_found_within_a_millisecond(offset):
     assert abs(ekf.diagnostics()['time offset'] - offset) < 4.0 * ekf.diagnostics()['time offset std']
 
 
+@pytest.mark.parametrize('seed', SEEDS)
+def test_shaking_does_not_lead_the_time_offset_astray(seed):
+    """A slow flight, its rates hidden below the noise of single samples."""
+    noise = ImuNoise(gyroscope_noise_density=0.0018, accelerometer_noise_density=0.04)
+    motion = Motion.random(np.random.default_rng(seed), speed=0.3, turn=0.06)
+    accurate = {'rotation_std': (0.001, 0.001, 0.0003), 'translation_std': (0.0006, 0.0006, 0.002)}
+    data = Flight(seed, 20.0, motion, imu_noise=noise, offset=0.015, **accurate)
+    _, _, ekf, _ = flown(data, config())
+    numbers = ekf.diagnostics()
+    # Four sigma, as above; and sigma says something.
+    assert abs(numbers['time offset'] - 0.015) < 4.0 * numbers['time offset std']
+    assert numbers['time offset std'] < 0.005
+
+
 @pytest.mark.parametrize('offset', [0.01, 0.04])
 def test_an_offset_that_is_not_estimated_stays_bounded(offset):
     """No lock-out: at most twice speed times offset, 1.7 m/s at the peaks."""

@@ -18,9 +18,9 @@ from thermal_fiducial.core.navigation_state import in_moved_map, NavigationState
 from thermal_fiducial.core.types import FloatArray
 
 _SECOND_NS = 1_000_000_000
-#: What shows a clock error is the motion, not the noise and shaking of one sample, which would count as motion that
-#: shows no error and lead a slow flight's time offset astray: so the mean of this long. Its age matters less.
-_MOTION_SECONDS = 0.1
+#: Seconds whose mean motion shows a clock error. The noise of one sample would count as motion that shows none, and it
+#: is in the predicted attitude too: in a slow, shaking flight the two together lead the time offset astray.
+_MOTION_SECONDS = 0.2
 
 
 @dataclass(frozen=True, slots=True)
