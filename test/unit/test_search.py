@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.decoding import Decoder, shrunk
+from thermal_fiducial.core.decoding import Decoder, Reading, shrunk
 from thermal_fiducial.core.patterns import marker_bits
-from thermal_fiducial.core.search import blind_search
+from thermal_fiducial.core.search import _inside_out, blind_search
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))
@@ -55,6 +55,29 @@ def test_finds_the_marker_at_any_contrast(contrast):
     found = search(scene(21, contrast, 2.0))
     assert found.ids.tolist() == [21]
     assert np.abs(found.corners_px[0] - CORNERS).max() < 4.0  # a third of a cell, which the refinement catches
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_rim_of_a_plate_is_no_marker_inside_out(sign):
+    """Readings at one place: a marker without much of a surround, the rim of its plate, bits in it, another marker."""
+    correlation = sign * np.array([0.96, -0.89, -0.88, -0.9])
+    reading = Reading(
+        np.array([19, 10, 17, 4]),
+        np.zeros(4, dtype=np.int64),
+        correlation,
+        np.full(4, 0.6),
+        100.0 * correlation,
+        np.zeros(4, dtype=np.int64),
+        np.zeros(4, dtype=np.int64),
+        np.array([0.5, 1.2, 0.9, 1.0]),
+    )
+    factor = np.array([1.0, 1.5, 0.6, 1.0])[:, None, None]
+    quads = CORNERS.mean(axis=0) + factor * (CORNERS - CORNERS.mean(axis=0))
+    quads[3] += 200.0
+    everything = np.ones(4, dtype=bool)
+    assert _inside_out(reading, quads, everything, everything).tolist() == [False, True, True, False]
+    # What cannot be read is no evidence against another.
+    assert not _inside_out(reading, quads, everything, ~everything).any()
 
 
 def test_what_is_seen_already_is_not_sought():

@@ -30,6 +30,8 @@ _CLEARLY_ALIKE = 0.9
 # patterns of a 4 x 4 dictionary.
 _CLEAR_MARGIN = 0.5
 _MANY_BITS = 3
+# Middles of outlines of one marker, in one another, are nearer than this share of the larger one's diagonal.
+_TOGETHER = 0.35
 # White surroundings are as white as white bits, give or take the background; the rim of a plate seen inside out is not.
 _WHITE = (0.4, 1.75)
 # Corner deviation [px] times contrast over noise times root of the side [px]: 4 to 7 for four clean sides.
@@ -100,6 +102,7 @@ def blind_search(
     sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1).min(axis=1)
     good = accepted(reading, noise, decoder.correctable, config) & (sides >= config.min_side_px)
     good &= _whole(quads, image, _RIM)
+    good &= ~_inside_out(reading, quads, good, distinct(reading, noise, config))
     best = _once(reading, quads, good, config.duplicates == 'drop')
     turned = (np.arange(4) - reading.turns[best][:, None]) % 4
     corners = np.take_along_axis(quads[best], turned[..., None], axis=1)
@@ -158,18 +161,38 @@ def merged(first: Found, second: Found) -> Found:
     )
 
 
-def accepted(reading: Reading, noise: float, correctable: int, config: ArucoDetectorConfig) -> BoolArray:
-    """Which readings are evidence enough for a marker nobody expected."""
+def distinct(reading: Reading, noise: float, config: ArucoDetectorConfig) -> BoolArray:
+    """Which readings look like one marker of the dictionary, whatever the bits and sides are like."""
     similarity = np.abs(reading.correlation)
-    bits = config.max_bit_errors if config.max_bit_errors >= 0 else correctable
     return np.asarray(
         (similarity >= config.min_correlation)
         & (similarity - reading.runner_up >= config.min_margin)
+        & (np.abs(reading.contrast) >= config.min_contrast * noise)
+    )
+
+
+def accepted(reading: Reading, noise: float, correctable: int, config: ArucoDetectorConfig) -> BoolArray:
+    """Which readings are evidence enough for a marker nobody expected."""
+    bits = config.max_bit_errors if config.max_bit_errors >= 0 else correctable
+    return np.asarray(
+        distinct(reading, noise, config)
         & (reading.bit_errors <= bits)
         & (reading.border_errors <= config.max_border_errors)
         & (reading.surround >= config.min_surround)
-        & (np.abs(reading.contrast) >= config.min_contrast * noise)
     )
+
+
+def _inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: BoolArray) -> BoolArray:
+    """Which good readings (Q,) are of a plate's rim or of bits: at a more similar readable one of other polarity."""
+    mine, others = np.flatnonzero(good), np.flatnonzero(readable)
+    similarity, centre = np.abs(reading.correlation), quads.mean(axis=1)
+    across = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)
+    apart = np.linalg.norm(centre[mine, None] - centre[others], axis=-1)
+    together = apart < _TOGETHER * np.maximum(across[mine, None], across[others])
+    opposite = reading.correlation[mine, None] * reading.correlation[others] < 0.0
+    result = np.zeros(len(good), dtype=bool)
+    result[mine] = (together & opposite & (similarity[others] > similarity[mine, None])).any(axis=1)
+    return result
 
 
 def confirmed(
@@ -237,6 +260,6 @@ def _alone(places: IntArray, similarity: FloatArray, centre: FloatArray, across:
     kept: list[int] = []
     for place in order.tolist():
         distance = np.linalg.norm(centre[kept] - centre[place], axis=-1)
-        if np.all(distance > 0.35 * np.maximum(across[kept], across[place])):
+        if np.all(distance > _TOGETHER * np.maximum(across[kept], across[place])):
             kept.append(place)
     return np.array(kept, dtype=np.int64)
