@@ -1,6 +1,7 @@
 """One run loop for all nodes."""
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 import os
 from pathlib import Path
 import sys
@@ -66,37 +67,34 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     -------
     Exit status: 0 stopped, 2 unusable arguments or parameters (one line says which).
     """
-    node = None
-    try:
-        initialise(args)
-        node = make_node()
-        keep_for_good()
-        if node.realtime_priority and not take_priority(node.realtime_priority):
-            node.get_logger().info('no real-time priority: this user may not')
-        _spin(node)
-    except InputError as error:
-        print(f'{Path(sys.argv[0]).name}: {error}', file=sys.stderr)
-        return 2
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except Exception:
-        # Told to stop while the node is being made, rcl refuses the rest of it: not an error of the node.
-        if ok():
-            raise
-    finally:
-        if node is not None:
-            node.close()
-            node.destroy_node()
-        try_shutdown()
+    # What must be saved is saved first, before anything is taken down that may fail or hang.
+    with ExitStack() as ending:
+        ending.callback(try_shutdown)
+        try:
+            initialise(args)
+            node = make_node()
+            ending.callback(node.destroy_node)
+            executor = make_executor()
+            ending.callback(executor.shutdown)
+            ending.callback(node.close)
+            executor.add_node(node)
+            _spin(node, executor)
+        except InputError as error:
+            print(f'{Path(sys.argv[0]).name}: {error}', file=sys.stderr)
+            return 2
+        except (KeyboardInterrupt, ExternalShutdownException):
+            pass
+        except Exception:
+            # Told to stop while the node is being made, rcl refuses the rest of it: not an error of the node.
+            if ok():
+                raise
     return 0
 
 
-def _spin(node: StageNode[Any]) -> None:
-    executor = make_executor()
-    executor.add_node(node)
-    try:
-        # EventsExecutor.spin() and spin_once(None) fire nothing on some builds.
-        while ok():
-            executor.spin_once(timeout_sec=1.0)
-    finally:
-        executor.shutdown()
+def _spin(node: StageNode[Any], executor: Any) -> None:
+    keep_for_good()
+    if node.realtime_priority and not take_priority(node.realtime_priority):
+        node.get_logger().info('no real-time priority: this user may not')
+    # EventsExecutor.spin() and spin_once(None) fire nothing on some builds.
+    while ok():
+        executor.spin_once(timeout_sec=1.0)
