@@ -14,10 +14,8 @@ import cv2
 from matplotlib.figure import Figure
 import numpy as np
 import pytest
+from support.scenes import camera_of, detector_of
 
-from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.measurements import corners_px, Odometry
 from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.render import Quality
@@ -114,17 +112,8 @@ def odometry(case, frame, rng):
 
 def our_detector(case, guided):
     """A function of a frame: ID to corners."""
-    scene, rng = case.scene, np.random.default_rng(1)
-    lens = scene.lens
-    camera = Camera(lens.width, lens.height, lens.matrix, lens.model, lens.distortion)
-    config = ArucoDetectorConfig(
-        marker_size=scene.markers[0].size,
-        camera_position=scene.camera_position,
-        camera_orientation=scene.camera_orientation,
-    )
-    detector = MarkerDetector(config, scene.aruco_dictionary)
-    if guided:
-        detector.set_map({marker.id: (marker.T_map_marker, marker.size) for marker in scene.markers})
+    rng = np.random.default_rng(1)
+    camera, detector = camera_of(case.scene), detector_of(case.scene, with_map=guided)
 
     def prepared(frame):
         return frame, odometry(case, frame, rng) if guided else None

@@ -4,11 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.scenes import camera_of, detector_of
 
-from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.clock_offset import ClockOffset, LIMIT_S
-from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.scenario import named
@@ -62,15 +60,7 @@ def test_offset_may_change():
 def test_detector_learns_the_clock_of_its_odometry(offset_s):
     scenario = named('fast')
     scenario = replace(scenario, sensor=replace(scenario.sensor, bad_pixel_share=0.0))
-    lens = scenario.lens
-    camera = Camera(lens.width, lens.height, lens.matrix, lens.model, lens.distortion)
-    config = ArucoDetectorConfig(
-        marker_size=scenario.markers[0].size,
-        camera_position=scenario.camera_position,
-        camera_orientation=scenario.camera_orientation,
-    )
-    detector = MarkerDetector(config, scenario.aruco_dictionary)
-    detector.set_map({marker.id: (marker.T_map_marker, marker.size) for marker in scenario.markers})
+    camera, detector = camera_of(scenario), detector_of(scenario, with_map=True)
     path = scenario.trajectory(SECONDS, SEED)
     for frame in render_frames(scenario, SECONDS, SEED, start=300, stop=314):
         motion = path([frame.seconds])

@@ -2,19 +2,14 @@
 
 import numpy as np
 import pytest
+from support.scenes import camera_of
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.measurements import corners_px, MARKER_DTYPE
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.scenario import named
-
-
-def camera_of(scenario):
-    lens = scenario.lens
-    return Camera(lens.width, lens.height, lens.matrix, lens.model, lens.distortion)
 
 
 @pytest.fixture(scope='module')
