@@ -10,11 +10,11 @@ from scipy.stats import chi2
 from support.flights import config, errors, Flight, matched, rms, run, START_NS, timeline
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.coasting import coasting_variance
 from thermal_fiducial.core.ekf import PoseEkf
+from thermal_fiducial.core.filter.coasting import coasting_variance
+from thermal_fiducial.core.filter.navigation_state import Layout
 from thermal_fiducial.core.geometry import rotation_angle
 from thermal_fiducial.core.measurements import ImuSample
-from thermal_fiducial.core.navigation_state import Layout
 
 SETTLED = 5.0
 #: One marker at 2 m with 0.3 px corners, and several markers.

@@ -8,7 +8,7 @@ from support.crowds import crowd, frames, mapped, SIZE
 from support.walls import CAMERA, flight, FRAME_NS, see, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.marker_map import MarkerMapper
 
 ROUNDS, FRAMES = 7, 60

@@ -3,9 +3,9 @@
 import numpy as np
 
 from support.walls import flight, see
+from thermal_fiducial.core.adjustment.reprojection import retract
 from thermal_fiducial.core.geometry import so3_exp, transform
-from thermal_fiducial.core.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.reprojection import retract
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 
 SIZE = 0.15
 _UPRIGHT = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -15,7 +15,7 @@ import yaml
 from support.flights import Motion
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.geometry import apply, inverse, transform
-from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.pose import marker_corners
 from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import save_map

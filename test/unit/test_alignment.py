@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.alignment import aligned
-from thermal_fiducial.core.decoding import Decoder
-from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.core.vision.alignment import aligned
+from thermal_fiducial.core.vision.decoding import Decoder
+from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))

@@ -9,7 +9,7 @@ from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.measurements import corners_px
-from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.fabrication.bridges import find_bridges
 from thermal_fiducial.fabrication.plate import marker_drawing, pattern_origin, PlateOptions
 from thermal_fiducial.fabrication.verification import acrylic_at

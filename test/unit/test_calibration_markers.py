@@ -9,8 +9,8 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
-from thermal_fiducial.core.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.fabrication.boards import marker_grid
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.scenario import LENSES

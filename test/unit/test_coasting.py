@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from support.flights import config, Flight, Motion, run, timeline
 
-from thermal_fiducial.core.coasting import coasting_variance, HORIZON, usable_seconds
 from thermal_fiducial.core.ekf import PoseEkf
-from thermal_fiducial.core.gating import position_std
-from thermal_fiducial.core.navigation_state import Layout
+from thermal_fiducial.core.filter.coasting import coasting_variance, HORIZON, usable_seconds
+from thermal_fiducial.core.filter.gating import position_std
+from thermal_fiducial.core.filter.navigation_state import Layout
 
 
 @pytest.fixture(scope='module')

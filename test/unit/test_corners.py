@@ -7,8 +7,8 @@ import pytest
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.corners import Corners, grid_pattern, refine_corners
-from thermal_fiducial.core.patterns import marker_bits
 from thermal_fiducial.core.pose import marker_corners
+from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.files.dictionary import load_dictionary
 
 K = [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from support.flights import CAMERA_POSITION, config
 
-from thermal_fiducial.core.error_state import BodyPose, ErrorStateFilter, pose_innovation
+from thermal_fiducial.core.filter.error_state import BodyPose, ErrorStateFilter, pose_innovation
+from thermal_fiducial.core.filter.imu import ImuStep
+from thermal_fiducial.core.filter.initialisation import blank_state
+from thermal_fiducial.core.filter.navigation_state import inject, Layout, POSE
 from thermal_fiducial.core.geometry import so3_exp, so3_left_jacobian, so3_log, transform
-from thermal_fiducial.core.imu import ImuStep
-from thermal_fiducial.core.initialisation import blank_state
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.navigation_state import inject, Layout, POSE
 
 FULL = config(estimate_extrinsics=True, pose_noise_scale=1.0)
 LAYOUT = Layout.of(FULL)

@@ -10,9 +10,9 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import _common_shift, MarkerDetector
-from thermal_fiducial.core.guided import expected_markers
 from thermal_fiducial.core.measurements import corners_px, Odometry
-from thermal_fiducial.core.search import Found
+from thermal_fiducial.core.vision.guided import expected_markers
+from thermal_fiducial.core.vision.search import Found
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.scenario import named, with_contrast

@@ -4,7 +4,7 @@ import numpy as np
 
 from test.support.walls import flight
 from thermal_fiducial.core.geometry import so3_exp, transform
-from thermal_fiducial.core.keyframes import Keyframe, KeyframeStore, Link
+from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore, Link
 
 
 def frame(stamp, T):

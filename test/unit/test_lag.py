@@ -8,7 +8,8 @@ import pytest
 
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.lag import (
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.vision.lag import (
     camera_twist,
     interaction,
     markers_sharpened,
@@ -22,7 +23,6 @@ from thermal_fiducial.core.lag import (
     Twist,
     without_lag,
 )
-from thermal_fiducial.core.measurements import Odometry
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
 TWIST = np.array([0.5, -0.3, 0.8, 0.4, -0.6, 0.7])

@@ -5,11 +5,11 @@ import pytest
 
 from test.support.walls import CAMERA, flight, see, SIZE, stamp, wall
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.adjustment.reprojection import corners_in_map, difference
 from thermal_fiducial.core.geometry import apply, inverse, so3_exp, transform
-from thermal_fiducial.core.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.map_editing import transformed
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_editing import transformed
 from thermal_fiducial.core.measurements import CORNER_FIELDS
-from thermal_fiducial.core.reprojection import corners_in_map, difference
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.marker_map import load_map, save_map
 

@@ -8,12 +8,12 @@ import pytest
 
 from test.support.walls import CAMERA, flight, see, SIZE, wall
 from thermal_fiducial.core import map_refinement
+from thermal_fiducial.core.adjustment.reprojection import difference, retract
 from thermal_fiducial.core.geometry import inverse, so3_exp, transform
-from thermal_fiducial.core.keyframes import Keyframe, Link, Rig
-from thermal_fiducial.core.map_data import MapMarker
 from thermal_fiducial.core.map_refinement import prior_poses, refine, Snapshot
+from thermal_fiducial.core.mapping.keyframes import Keyframe, Link, Rig
+from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
-from thermal_fiducial.core.reprojection import difference, retract
 
 
 def keyframe(stamp, T_map_rig, rows, camera=0):

@@ -9,7 +9,7 @@ from support.walls import CAMERA, FRAME_NS, look, see, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry import transform
-from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.marker_map import MarkerMapper
 from thermal_fiducial.core.measurements import Odometry
 

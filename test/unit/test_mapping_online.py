@@ -7,12 +7,12 @@ import numpy as np
 
 from test.support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.adjustment.reprojection import difference, retract
 from thermal_fiducial.core.geometry import so3_exp, transform
-from thermal_fiducial.core.map_editing import transformed
 from thermal_fiducial.core.map_refinement import refine
+from thermal_fiducial.core.mapping.map_editing import transformed
 from thermal_fiducial.core.marker_map import MapMarker, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import Odometry
-from thermal_fiducial.core.reprojection import difference, retract
 
 # The body is the camera: odometry and camera pose are one.
 AS_BODY = {'camera_orientation': (0.0, 0.0, 0.0, 1.0)}

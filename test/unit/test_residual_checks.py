@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.residual_checks import correlation_time, hangs_twice
+from thermal_fiducial.core.mapping.residual_checks import correlation_time, hangs_twice
 
 
 @pytest.mark.parametrize('memory', [0.0, 0.5, 0.9])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.decoding import Decoder, Reading, shrunk
-from thermal_fiducial.core.patterns import marker_bits
-from thermal_fiducial.core.search import _inside_out, blind_search
+from thermal_fiducial.core.vision.decoding import Decoder, Reading, shrunk
+from thermal_fiducial.core.vision.patterns import marker_bits
+from thermal_fiducial.core.vision.search import _inside_out, blind_search
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))

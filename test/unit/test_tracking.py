@@ -7,7 +7,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core import detection
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.measurements import corners_px
-from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.files.dictionary import load_dictionary
 
 DICTIONARY = load_dictionary('DICT_4X4_50')

@@ -24,12 +24,12 @@ from thermal_fiducial.calibration.sources import (
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Sighting, Target
 from thermal_fiducial.config import ArucoDetectorConfig, ImuNoise
 from thermal_fiducial.core import geometry
+from thermal_fiducial.core.adjustment.reprojection import corners_in_map
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
-from thermal_fiducial.core.map_data import MarkerMap
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px
 from thermal_fiducial.core.pose import solve_camera_pose
-from thermal_fiducial.core.reprojection import corners_in_map
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import load_camera, save_camera

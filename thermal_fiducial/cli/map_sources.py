@@ -12,7 +12,7 @@ from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, siz
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.map_building import build_map, Built, rows_from_corners
-from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE, Markers
 from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError

@@ -11,8 +11,8 @@ from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.measurements import columns, corners_px, Markers
-from thermal_fiducial.core.patterns import marker_bits
 from thermal_fiducial.core.types import Counts, FloatArray
+from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.fabrication.planning import expected_errors, Measurements, pose_errors
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.lens import Lens

@@ -13,9 +13,9 @@ from rich.table import Table
 
 from thermal_fiducial.cli import marker_planning
 from thermal_fiducial.core import geometry
-from thermal_fiducial.core.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.patterns import marker_bits
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray, Gray
+from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import base_plate, circle_board, marker_grid
 from thermal_fiducial.fabrication.bridges import darkest_white, find_bridges

@@ -10,12 +10,15 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.clock_offset import ClockOffset
-from thermal_fiducial.core.contrast import noise_of, without_columns
 from thermal_fiducial.core.corners import Corners, grid_pattern, refine_corners, RefinedCorners
-from thermal_fiducial.core.decoding import Decoder
-from thermal_fiducial.core.guided import camera_in_map, Expected, expected_markers, look
-from thermal_fiducial.core.lag import (
+from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers, Odometry
+from thermal_fiducial.core.pose import choose_branches, ippe_square, marker_corners, solve_marker_poses
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.vision.clock_offset import ClockOffset
+from thermal_fiducial.core.vision.contrast import noise_of, without_columns
+from thermal_fiducial.core.vision.decoding import Decoder
+from thermal_fiducial.core.vision.guided import camera_in_map, Expected, expected_markers, look
+from thermal_fiducial.core.vision.lag import (
     image_velocity,
     markers_sharpened,
     model_error,
@@ -30,13 +33,10 @@ from thermal_fiducial.core.lag import (
     Twist,
     without_lag,
 )
-from thermal_fiducial.core.local_corners import local_corners
-from thermal_fiducial.core.marker_rows import marker_rows
-from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers, Odometry
-from thermal_fiducial.core.patterns import marker_bits
-from thermal_fiducial.core.pose import choose_branches, ippe_square, marker_corners, solve_marker_poses
-from thermal_fiducial.core.search import blind_search, confirmed, Found, merged
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.vision.local_corners import local_corners
+from thermal_fiducial.core.vision.marker_rows import marker_rows
+from thermal_fiducial.core.vision.patterns import marker_bits
+from thermal_fiducial.core.vision.search import blind_search, confirmed, Found, merged
 
 # Smear by lag below which the shape of an edge doesn't change, and below which the search misses nothing [px].
 _SMEAR_THAT_MATTERS_PX, _SMEAR_THAT_HIDES_PX = 0.4, 2.0

@@ -13,15 +13,15 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.coasting import usable_seconds
-from thermal_fiducial.core.gating import Belief, PoseGate, PoseUpdate, position_std, Track
-from thermal_fiducial.core.imu import ImuStep, NoiseMonitor
-from thermal_fiducial.core.imu_input import ImuInput, Verdict
-from thermal_fiducial.core.initialisation import WINDOW_SECONDS
+from thermal_fiducial.core.filter.coasting import usable_seconds
+from thermal_fiducial.core.filter.gating import Belief, PoseGate, PoseUpdate, position_std, Track
+from thermal_fiducial.core.filter.imu import ImuStep, NoiseMonitor
+from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
+from thermal_fiducial.core.filter.initialisation import WINDOW_SECONDS
+from thermal_fiducial.core.filter.navigation_state import NavigationState
+from thermal_fiducial.core.filter.smoothing import SmoothOutput
+from thermal_fiducial.core.filter.state_output import odometry
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, in_moved_map, Odometry
-from thermal_fiducial.core.navigation_state import NavigationState
-from thermal_fiducial.core.smoothing import SmoothOutput
-from thermal_fiducial.core.state_output import odometry
 from thermal_fiducial.core.types import FloatArray
 
 _SECOND_NS = 1_000_000_000

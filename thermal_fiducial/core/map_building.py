@@ -7,10 +7,10 @@ import numpy as np
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.candidates import DECISIVE, SAME_FIT
 from thermal_fiducial.core.geometry import quaternion_from_rotation, rotation_angle
-from thermal_fiducial.core.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.map_refinement import refine, Refinement, Snapshot
+from thermal_fiducial.core.mapping.candidates import DECISIVE, SAME_FIT
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.marker_map import MarkerMapper
 from thermal_fiducial.core.measurements import CORNER_COVARIANCE_FIELDS, CORNER_FIELDS, MARKER_DTYPE, Markers
 from thermal_fiducial.core.pose import solve_marker_poses

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermal_fiducial.core.adjustment.normal_equations import Blocks, NormalEquations
+from thermal_fiducial.core.adjustment.reprojection import difference, linearise, retract, whitening
 from thermal_fiducial.core.geometry import inverse, skew
-from thermal_fiducial.core.keyframes import Keyframe, Link, packed, Rig, unpacked
-from thermal_fiducial.core.map_data import MapMarker
-from thermal_fiducial.core.normal_equations import Blocks, NormalEquations
-from thermal_fiducial.core.reprojection import difference, linearise, retract, whitening
-from thermal_fiducial.core.residual_checks import correlation_time, hangs_twice
+from thermal_fiducial.core.mapping.keyframes import Keyframe, Link, packed, Rig, unpacked
+from thermal_fiducial.core.mapping.map_data import MapMarker
+from thermal_fiducial.core.mapping.residual_checks import correlation_time, hangs_twice
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 #: Chi square of a view (8 residuals) up to which it counts in full: 99.9 % of honest ones.

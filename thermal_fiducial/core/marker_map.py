@@ -12,20 +12,20 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
-from thermal_fiducial.core.bridging import camera_pose, growth, link, predict
+from thermal_fiducial.core.adjustment.reprojection import corners_in_map, linearise, reproject
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.candidates import Candidate, View, Viewpoint
 from thermal_fiducial.core.geometry import transform_from_quaternion
-from thermal_fiducial.core.keyframes import Keyframe, KeyframeStore, Rig
-from thermal_fiducial.core.localization import locate, Location, positive, Refusal, Sight
-from thermal_fiducial.core.map_data import MapJump, MapMarker, MapperResult, MarkerMap
-from thermal_fiducial.core.map_editing import align
 from thermal_fiducial.core.map_refinement import prior_poses, refine, Refinement, Snapshot
-from thermal_fiducial.core.map_rows import marker_poses, usable
+from thermal_fiducial.core.mapping.bridging import camera_pose, growth, link, predict
+from thermal_fiducial.core.mapping.candidates import Candidate, View, Viewpoint
+from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore, Rig
+from thermal_fiducial.core.mapping.localization import locate, Location, positive, Refusal, Sight
+from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
+from thermal_fiducial.core.mapping.map_editing import align
+from thermal_fiducial.core.mapping.map_rows import marker_poses, usable
+from thermal_fiducial.core.mapping.noise_level import NoiseLevel
+from thermal_fiducial.core.mapping.trust import culprits, DISAGREEMENT, Trust
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers, Odometry
-from thermal_fiducial.core.noise_level import NoiseLevel
-from thermal_fiducial.core.reprojection import corners_in_map, linearise, reproject
-from thermal_fiducial.core.trust import culprits, DISAGREEMENT, Trust
 from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
 

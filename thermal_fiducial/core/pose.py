@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from thermal_fiducial.core import geometry
+from thermal_fiducial.core.adjustment.ippe import ippe_square, marker_corners
+from thermal_fiducial.core.adjustment.reprojection import whitening
+from thermal_fiducial.core.adjustment.rigid_fit import covariances, evaluate, fit, Images
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.ippe import ippe_square, marker_corners
-from thermal_fiducial.core.reprojection import whitening
-from thermal_fiducial.core.rigid_fit import covariances, evaluate, fit, Images
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import yaml
 
-from thermal_fiducial.core.patterns import correctable_bits, marker_bits
+from thermal_fiducial.core.vision.patterns import correctable_bits, marker_bits
 from thermal_fiducial.errors import InputError
 
 FORMAT = 'thermal_fiducial/dictionary'

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from thermal_fiducial.core.map_data import MarkerMap
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import load_map, save_map, write_atomically
 

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from thermal_fiducial.core.geometry import quaternion_from_rotation, transform_from_quaternion
-from thermal_fiducial.core.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from thermal_fiducial.core.map_data import MarkerMap
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError

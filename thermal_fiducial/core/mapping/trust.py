@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.map_data import MapMarker
+from thermal_fiducial.core.mapping.map_data import MapMarker
 
 #: Weight of a new frame in the running error and in the share of disagreeing frames: a memory of 20 frames.
 MEMORY = 0.05

@@ -12,12 +12,12 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.decoding import Decoder, Reading
-from thermal_fiducial.core.lag import Twist
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.pose import marker_corners
-from thermal_fiducial.core.search import Found, read_quads
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.vision.decoding import Decoder, Reading
+from thermal_fiducial.core.vision.lag import Twist
+from thermal_fiducial.core.vision.search import Found, read_quads
 
 # A marker turned further from the camera than this shows too little to be expected.
 _MAX_TILT_COSINE = 0.2

@@ -10,9 +10,8 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.error_state import BodyPose, ErrorStateFilter
-from thermal_fiducial.core.geometry import transform_from_quaternion
-from thermal_fiducial.core.navigation_state import (
+from thermal_fiducial.core.filter.error_state import BodyPose, ErrorStateFilter
+from thermal_fiducial.core.filter.navigation_state import (
     ACCELEROMETER_BIAS,
     GYROSCOPE_BIAS,
     Layout,
@@ -22,6 +21,7 @@ from thermal_fiducial.core.navigation_state import (
     ROTATION,
     VELOCITY,
 )
+from thermal_fiducial.core.geometry import transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 
 #: Seconds of samples that stillness is judged on, and the fewest of them.

@@ -9,13 +9,8 @@ from functools import cached_property
 
 import numpy as np
 
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.candidates import correlated_sum
-from thermal_fiducial.core.fitting import fit_pose
-from thermal_fiducial.core.geometry import inverse, rotation_angle
-from thermal_fiducial.core.map_data import MapMarker
-from thermal_fiducial.core.pose import solve_camera_pose
-from thermal_fiducial.core.reprojection import (
+from thermal_fiducial.core.adjustment.fitting import fit_pose
+from thermal_fiducial.core.adjustment.reprojection import (
     corners_in_map,
     difference,
     linearise,
@@ -23,6 +18,11 @@ from thermal_fiducial.core.reprojection import (
     shared_covariances,
     whitening,
 )
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry import inverse, rotation_angle
+from thermal_fiducial.core.mapping.candidates import correlated_sum
+from thermal_fiducial.core.mapping.map_data import MapMarker
+from thermal_fiducial.core.pose import solve_camera_pose
 from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
 

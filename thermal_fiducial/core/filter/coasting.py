@@ -4,8 +4,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.geometry import skew
-from thermal_fiducial.core.navigation_state import (
+from thermal_fiducial.core.filter.navigation_state import (
     ACCELEROMETER_BIAS,
     GYROSCOPE_BIAS,
     Layout,
@@ -14,6 +13,7 @@ from thermal_fiducial.core.navigation_state import (
     ROTATION,
     VELOCITY,
 )
+from thermal_fiducial.core.geometry import skew
 from thermal_fiducial.core.types import FloatArray
 
 #: Farther than this [s] nobody needs to look ahead, and in this grid.

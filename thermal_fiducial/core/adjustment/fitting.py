@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from thermal_fiducial.core.reprojection import retract
+from thermal_fiducial.core.adjustment.reprojection import retract
 from thermal_fiducial.core.types import FloatArray
 
 _ITERATIONS = 15

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import math
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.error_state import ErrorStateFilter
-from thermal_fiducial.core.imu import ImuStep
-from thermal_fiducial.core.initialisation import blank_state, start, WINDOW_SECONDS
+from thermal_fiducial.core.filter.error_state import ErrorStateFilter
+from thermal_fiducial.core.filter.imu import ImuStep
+from thermal_fiducial.core.filter.initialisation import blank_state, start, WINDOW_SECONDS
+from thermal_fiducial.core.filter.navigation_state import in_moved_map, NavigationState
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.navigation_state import in_moved_map, NavigationState
 from thermal_fiducial.core.types import FloatArray
 
 _SECOND_NS = 1_000_000_000

@@ -15,8 +15,8 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.imu import rotation_integrals
 from thermal_fiducial.core.geometry import transform
-from thermal_fiducial.core.imu import rotation_integrals
 from thermal_fiducial.core.types import FloatArray
 
 #: Places of the error coordinates, in the robot frame [rad, m/s, m, rad/s, m/s^2].

@@ -5,12 +5,12 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.alignment import aligned
-from thermal_fiducial.core.contrast import dark, halved, noise_of, Scale, without_columns
 from thermal_fiducial.core.corners import RefinedCorners
-from thermal_fiducial.core.decoding import Decoder, Reading, shrunk
-from thermal_fiducial.core.quads import find_quads
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.vision.alignment import aligned
+from thermal_fiducial.core.vision.contrast import dark, halved, noise_of, Scale, without_columns
+from thermal_fiducial.core.vision.decoding import Decoder, Reading, shrunk
+from thermal_fiducial.core.vision.quads import find_quads
 
 # Full resolution sees small and smeared markers; half resolution, without the pattern of columns, faint ones.
 _FINE = Scale(smoothing_px=1.0, window_px=15, depth=0.2, floor=1.5, shrink=4)

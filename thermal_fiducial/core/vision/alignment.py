@@ -10,8 +10,8 @@ import math
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.decoding import Decoder, sampled
 from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.vision.decoding import Decoder, sampled
 
 _STEPS = 3
 # Smoothing of the image [px], so that its slope tells the way from half a cell away.

@@ -6,10 +6,8 @@ from filterpy.kalman import ExtendedKalmanFilter
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.geometry import inverse, skew, so3_log
-from thermal_fiducial.core.imu import ImuStep, rotation_integrals, Transition
-from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.navigation_state import (
+from thermal_fiducial.core.filter.imu import ImuStep, rotation_integrals, Transition
+from thermal_fiducial.core.filter.navigation_state import (
     ACCELEROMETER_BIAS,
     GYROSCOPE_BIAS,
     inject,
@@ -20,6 +18,8 @@ from thermal_fiducial.core.navigation_state import (
     ROTATION,
     VELOCITY,
 )
+from thermal_fiducial.core.geometry import inverse, skew, so3_log
+from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
 #: Angular [rad/s^2] and linear [m/s^2] acceleration of ordinary flight. While the time offset is uncertain by s, a pose

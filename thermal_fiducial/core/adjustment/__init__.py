@@ -1,0 +1,1 @@
+"""Least squares on re-projection errors: closed forms, robust fits, normal equations."""

@@ -1,0 +1,1 @@
+"""The parts of the filter: error state, IMU propagation, gate, start, output."""

@@ -1,0 +1,1 @@
+"""Seeing markers in a frame: search, reading, sharpening, rows."""
