@@ -250,6 +250,14 @@ class ArucoDetectorConfig:
         minimum=0.0,
         maximum=0.05,
     )
+    readout_time: float = param(
+        0.0,
+        'From the sampling of the first row to that of the last; the stamp is that of the middle row. '
+        '0: all rows at once.',
+        unit='s',
+        minimum=0.0,
+        maximum=0.05,
+    )
     blur_px: float = param(
         0.66, 'Standard deviation of the blur by optics and pixel.', unit='px', minimum=0.3, maximum=3.0
     )
