@@ -51,6 +51,25 @@ def test_noise_has_the_densities():
     assert abs(white.std() / (3e-2 * np.sqrt(rate)) - 1) < 0.01
 
 
+def test_rattle_and_jitter_come_on_top():
+    rate = 200.0
+    t = np.arange(0.0, 100.0, 1 / rate)
+    stamps = np.round(t * 1e9).astype(np.int64)
+    trajectory = SCENARIOS['wall'].trajectory(20.0, 0)
+    model = ImuModel(rate=rate, gyroscope_rattle=0.02, accelerometer_rattle=0.3, stamp_jitter=3e-4)
+    rattling, quiet = (case.sample(trajectory, t, stamps, 3) for case in (model, ImuModel(rate=rate)))
+    np.testing.assert_array_equal(rattling.gyroscope_bias, quiet.gyroscope_bias)
+    # 20000 samples, three axes: 0.3 % of statistics.
+    assert abs((rattling.angular_velocity - quiet.angular_velocity).std() / 0.02 - 1) < 0.02
+    assert abs((rattling.linear_acceleration - quiet.linear_acceleration).std() / 0.3 - 1) < 0.02
+    late = rattling.stamps_ns - stamps
+    # 20000 of them: 0.5 % of statistics, and the mean's deviation is 2 us.
+    assert abs(late.std() / 3e5 - 1) < 0.03
+    assert abs(late.mean()) < 1e4
+    assert np.all(np.diff(rattling.stamps_ns) > 0)
+    np.testing.assert_array_equal(quiet.stamps_ns, stamps)
+
+
 def test_stamps_and_seeds():
     first, again, other = (simulate_imu('wall', 12.0, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(np.diff(first.stamps_ns), 5_000_000)

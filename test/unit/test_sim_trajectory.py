@@ -14,7 +14,7 @@ STEP = 1e-4
 
 @pytest.mark.parametrize('name', SCENARIOS)
 def test_derivatives_are_those_of_the_motion(name):
-    trajectory = SCENARIOS[name].trajectory(24.0, seed=4)
+    trajectory = SCENARIOS[name].flight.trajectory(24.0, seed=4)
     t = np.linspace(1.0, 23.0, 57)
     before, here, after = trajectory(t - STEP), trajectory(t), trajectory(t + STEP)
     turn = (before.rotation.inv() * after.rotation).as_rotvec() / (2 * STEP)
@@ -26,13 +26,29 @@ def test_derivatives_are_those_of_the_motion(name):
 
 @pytest.mark.parametrize('name', SCENARIOS)
 def test_takes_off_and_lands_at_the_same_point(name):
-    trajectory = SCENARIOS[name].trajectory(30.0, seed=1)
+    trajectory = SCENARIOS[name].flight.trajectory(30.0, seed=1)
     start, high, end = trajectory([0.0]), trajectory([6.0]), trajectory([30.0])
     # The splines' ripple from where the motion begins; it has decayed below a micrometre.
     np.testing.assert_allclose(start.position, end.position, atol=1e-6)
     np.testing.assert_allclose(start.velocity, 0.0, atol=1e-5)
     assert high.position[0, 2] > start.position[0, 2] + 0.5
     assert (start.rotation.inv() * end.rotation).magnitude()[0] < 1e-5
+
+
+def test_derivatives_of_a_vibration_are_those_of_its_motion():
+    scenario, step = SCENARIOS['rough'], 1e-6
+    shaken, smooth = scenario.trajectory(24.0, seed=4), scenario.flight.trajectory(24.0, seed=4)
+    t = np.linspace(1.0, 23.0, 57)
+    before, here, after = shaken(t - step), shaken(t), shaken(t + step)
+    turn = (before.rotation.inv() * after.rotation).as_rotvec() / (2 * step)
+    # Central differences: step^2/6 times a third derivative of 1e5, five lines of 0.4 m/s^2 at up to 179 Hz.
+    np.testing.assert_allclose(here.velocity, (after.position - before.position) / (2 * step), atol=1e-6)
+    np.testing.assert_allclose(here.acceleration, (after.velocity - before.velocity) / (2 * step), atol=1e-5)
+    np.testing.assert_allclose(here.angular_velocity_body, turn, atol=1e-6)
+    quiet = smooth(t)
+    assert 0.3 < np.std(here.acceleration - quiet.acceleration) / (0.4 * np.sqrt(5 / 2)) < 2.0
+    assert np.abs(here.position - quiet.position).max() < 1e-5
+    assert 1e-5 < (quiet.rotation.inv() * here.rotation).magnitude().max() < 2e-4
 
 
 def test_seeds_fly_differently():

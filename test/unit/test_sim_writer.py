@@ -107,6 +107,31 @@ def test_maps_truth_and_rig_beside_it(bag):
     assert math.isclose(config.imu.gyroscope_noise_density, 1.7e-4)
 
 
+def test_a_rough_rig_is_named_as_calibrated_and_its_stamps_jitter_about_the_offset(tmp_path):
+    scenario = replace(
+        TINY,
+        camera_time_offset=-0.02,
+        stamp_jitter=0.002,
+        sensor=replace(TINY.sensor, readout=0.016),
+        imu=replace(TINY.imu, stamp_jitter=2e-4),
+    )
+    write_flight(tmp_path / 'bag', plan(scenario, SECONDS, 3))
+    parameters = yaml.safe_load((tmp_path / 'bag' / 'params.yaml').read_text())['/**']['ros__parameters']
+    assert parameters['readout_time'] == 0.016
+    assert parameters['camera_time_offset'] == -0.02
+    with BagReader(tmp_path / 'bag') as reader:
+        entries = [(m.topic, m.stamp_ns, stamp_to_ns(m.message.header.stamp)) for m in reader.messages()]
+    images = [stamp - (arrived - IMAGE_DELAY_NS) for topic, arrived, stamp in entries if topic == 'thermal/image_raw']
+    # 60 stamps, 2 ms of deviation: their mean is known to 0.26 ms; none is earlier than the mean by more than that.
+    assert abs(np.mean(images) - 20e6) < 1e6
+    assert 1e6 < np.std(images) < 4e6
+    assert min(images) >= 18e6
+    truth, imu = ([s for topic, _, s in entries if topic == name] for name in ('ground_truth/odometry', 'imu/data'))
+    assert set(np.diff(truth).tolist()) == {5_000_000}
+    # A difference of two stamps of 0.2 ms.
+    assert 0.2e6 < np.std(np.diff(imu)) < 0.4e6
+
+
 def test_true_corners_beside_it(bag):
     rows = np.loadtxt(bag / 'ground_truth_corners.csv', delimiter=',', skiprows=1, dtype=str)
     frame = next(render_frames(replace(TINY, camera_time_offset=-0.02), SECONDS, 3))
@@ -143,12 +168,26 @@ def tiny_scenario(monkeypatch):
 
 def test_command_writes_a_bag_and_says_how_to_replay_it(tiny_scenario, tmp_path, capsys):
     out = tmp_path / 'new' / 'bag'
-    options = ['--scenario', 'tiny', '--seconds', '2', '--contrast', '6', '--fog', '0.2', '--ffc', 'never']
+    options = [
+        '--scenario',
+        'tiny',
+        '--seconds',
+        '2',
+        '--contrast',
+        '6',
+        '--fog',
+        '0.2',
+        '--ffc',
+        'never',
+        '--readout',
+        '0.01',
+    ]
     assert main(['simulate', str(out), *options, '--storage', 'sqlite3', '--inverted', '--workers', '1']) == 0
     assert f'replay {out}' in capsys.readouterr().out
     with BagReader(out) as reader:
         assert reader.message_count(['thermal/image_raw']) == 60
     assert list(out.glob('*.db3'))
+    assert 'readout_time: 0.01' in (out / 'params.yaml').read_text()
 
 
 def test_command_follows_a_trajectory(tiny_scenario, tmp_path):

@@ -13,7 +13,7 @@ from thermal_fiducial.files.bags import STORAGES
 from thermal_fiducial.sim.camera import FlightPlan, plan
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.scenario import LENSES, named, Scenario, SCENARIOS, with_contrast, with_lens
-from thermal_fiducial.sim.sensor import FFC_BEHAVIOURS
+from thermal_fiducial.sim.sensor import FFC_BEHAVIOURS, Sensor
 from thermal_fiducial.sim.writer import write_flight
 
 #: Inclusive ranges of the numbers.
@@ -23,6 +23,7 @@ _RANGES = {
     'contrast': (0.01, 400.0),
     'fog': (0.0, 100.0),
     'lag': (0.0, 0.1),
+    'readout': (0.0, 0.05),
     'time_offset': (-1.0, 1.0),
     'workers': (1, 64),
 }
@@ -46,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--inverted', action='store_true', help='warm code on a cold ground')
     parser.add_argument('--fog', type=float, metavar='E', help='extinction in the long-wave infrared [1/m]')
     parser.add_argument('--lag', type=float, metavar='S', help='thermal time constant of the bolometers [s]')
+    parser.add_argument('--readout', type=float, metavar='S', help="from the first row's sampling to the last's [s]")
     parser.add_argument('--ffc', choices=(*FFC_BEHAVIOURS, 'never'), help='what a shutter event sends')
     parser.add_argument('--time-offset', type=float, metavar='S', help="camera's clock: t_imu = t_camera + S [s]")
     parser.add_argument('--trajectory', type=Path, metavar='TUM', help='fly these poses of base_link in map instead')
@@ -79,18 +81,22 @@ def _scenario(args: argparse.Namespace) -> Scenario:
         scenario = replace(scenario, acrylic=replace(scenario.acrylic, inverted=True))
     if args.fog is not None:
         scenario = replace(scenario, fog=replace(scenario.fog, extinction=args.fog))
-    if args.lag is not None:
-        scenario = replace(scenario, sensor=replace(scenario.sensor, lag=args.lag))
-    if args.ffc == 'never':
-        scenario = replace(scenario, sensor=replace(scenario.sensor, ffc_period=0.0))
-    elif args.ffc is not None:
-        scenario = replace(scenario, sensor=replace(scenario.sensor, ffc_behaviour=args.ffc))
     if args.time_offset is not None:
         scenario = replace(scenario, camera_time_offset=args.time_offset)
     if args.trajectory is not None:
         recorded = RecordedFlight.load(args.trajectory)
         scenario = replace(scenario, flight=recorded, seconds=recorded.seconds)
-    return scenario
+    return replace(scenario, sensor=_sensor(scenario.sensor, args))
+
+
+def _sensor(sensor: Sensor, args: argparse.Namespace) -> Sensor:
+    if args.lag is not None:
+        sensor = replace(sensor, lag=args.lag)
+    if args.readout is not None:
+        sensor = replace(sensor, readout=args.readout)
+    if args.ffc == 'never':
+        return replace(sensor, ffc_period=0.0)
+    return sensor if args.ffc is None else replace(sensor, ffc_behaviour=args.ffc)
 
 
 def _summary(out: Path, flight: FlightPlan) -> str:

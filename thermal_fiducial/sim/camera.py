@@ -28,12 +28,12 @@ class SimFrame:
 
     Parameters
     ----------
-    stamp_ns : when it was read out, by the camera's clock
+    stamp_ns : when it was read out (its middle row), by the camera's clock
     seconds : the same since the start, by the IMU's clock
     counts : (height, width) uint16
     shutter : whether the counts are no live view
-    T_map_camera : (4, 4) at the stamp
-    corners_px : ID to true corners (4, 2) at the stamp, for each marker that lies wholly in the image, shows
+    T_map_camera : (4, 4) then
+    corners_px : ID to true corners (4, 2) then, for each marker that lies wholly in the image, shows
         its face and isn't hidden, also when the shutter is closed
     """
 
@@ -67,7 +67,7 @@ class FlightPlan:
         if self.noise:
             return self.scenario
         sensor = self.scenario.sensor
-        kept = ('lag', 'psf_sigma_px', 'counts_per_kelvin', 'offset_counts', 'frame_rate')
+        kept = ('lag', 'readout', 'psf_sigma_px', 'counts_per_kelvin', 'offset_counts', 'frame_rate')
         return replace(self.scenario, sensor=replace(IDEAL, **{name: getattr(sensor, name) for name in kept}))
 
     @property
@@ -81,10 +81,11 @@ class FlightPlan:
 
     def stamp_ns(self, index: int) -> int:
         """The camera's stamp of it."""
-        return START_NS + round((self.frame_time(index) - self.scenario.camera_time_offset) * 1e9)
+        late = self.scenario.stamp_jitter * (np.random.default_rng([self.seed, 9, index]).exponential() - 1.0)
+        return START_NS + round((self.frame_time(index) - self.scenario.camera_time_offset + late) * 1e9)
 
     def imu_stamps(self) -> tuple[FloatArray, IntArray]:
-        """Times [s] and stamps [ns] of the IMU's samples."""
+        """Times [s] and true stamps [ns] of the IMU's samples."""
         rate = self.scenario.imu.rate
         ticks = np.arange(int(self.seconds * rate) + 1, dtype=np.int64)
         nanoseconds = np.round(ticks * (1e9 / rate)).astype(np.int64)
@@ -177,6 +178,7 @@ class ThermalCamera:
             1.0 / scenario.sensor.frame_rate,
             scenario.sensor.lag,
             flight.quality,
+            scenario.sensor.readout,
         )
         self._last: tuple[int, Counts] | None = None
 

@@ -12,7 +12,8 @@ from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.scene import Acrylic, Clutter, clutter_plate, Fog, Marker, marker_plate, Plate, Room
 from thermal_fiducial.sim.sensor import Sensor
-from thermal_fiducial.sim.trajectory import Flight, pose_matrix, Trajectory
+from thermal_fiducial.sim.trajectory import Flight, Path, pose_matrix
+from thermal_fiducial.sim.vibration import Shaken, Vibration
 
 #: Lenses of a Tau 2 (17 um pixels) by name.
 LENSES = {
@@ -35,6 +36,8 @@ class Scenario:
     markers : the first one is the fixed one of the map that mapping starts with
     camera_position, camera_orientation : of the camera in the body (IMU) frame [m], quaternion x y z w
     camera_time_offset : clock of the camera, t_imu = t_camera + offset [s]
+    stamp_jitter : of the camera's stamps, exponential: most a little early, few late; the offset is their mean [s]
+    vibration : of the body, or none
     dictionary : name of an OpenCV dictionary
     seconds : default length
     """
@@ -46,6 +49,8 @@ class Scenario:
     camera_position: tuple[float, float, float] = (0.12, 0.02, -0.04)
     camera_orientation: tuple[float, float, float, float] = (-0.49307, 0.489088, -0.497699, 0.519587)
     camera_time_offset: float = 0.0
+    stamp_jitter: float = 0.0
+    vibration: Vibration | None = None
     dictionary: str = 'DICT_4X4_50'
     flight: Flight | RecordedFlight = Flight()  # noqa: RUF009
     acrylic: Acrylic = Acrylic()  # noqa: RUF009
@@ -81,9 +86,10 @@ class Scenario:
         markers = [marker_plate(marker, self.aruco_dictionary, self.acrylic) for marker in self.markers]
         return markers + [clutter_plate(item) for item in self.clutter]
 
-    def trajectory(self, seconds: float, seed: int) -> Trajectory:
-        """The flight."""
-        return self.flight.trajectory(seconds, seed)
+    def trajectory(self, seconds: float, seed: int) -> Path:
+        """The flight, shaken by the vibration."""
+        smooth = self.flight.trajectory(seconds, seed)
+        return smooth if self.vibration is None else Shaken(smooth, self.vibration, seed)
 
 
 def _wall() -> tuple[Marker, ...]:
@@ -155,6 +161,19 @@ _SCENARIOS = (
         'markers in one half of the view only: twice none is seen for more than two seconds',
         _wall(),
         flight=Flight(turns=((9.0, 1.5, 75.0), (12.8, 1.5, -75.0), (18.5, 1.5, -80.0), (22.3, 1.5, 80.0))),
+    ),
+    Scenario(
+        'rough',
+        'a flight in the room as it really is: rolling read-out, vibration, jitter of all stamps, a late camera',
+        _room(),
+        lens=LENSES['9mm'],
+        flight=Flight(amplitude=(1.6, 1.6, 0.4), period=(9.0, 8.0, 4.5), turns=_TURNS),
+        clutter=_PEOPLE,
+        camera_time_offset=-0.018,
+        stamp_jitter=0.002,
+        vibration=Vibration(),
+        sensor=Sensor(readout=0.016),
+        imu=ImuModel(gyroscope_rattle=0.015, accelerometer_rattle=0.35, stamp_jitter=2e-4),
     ),
     Scenario('low_contrast', 'the wall at 2 K', _wall(), acrylic=Acrylic(contrast=2.0, steady=0.1), seconds=20.0),
 )

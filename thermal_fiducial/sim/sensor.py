@@ -26,6 +26,7 @@ class Sensor:
     Parameters
     ----------
     lag : thermal time constant of the bolometers [s]
+    readout : from the sampling of the first row to that of the last [s]; the stamp is that of the middle row
     psf_sigma_px : of optics and pixel together [px]
     netd : temporal noise [K]
     counts_per_kelvin, offset_counts : scale, and counts of something at ambient temperature
@@ -42,6 +43,7 @@ class Sensor:
     """
 
     lag: float = 0.010
+    readout: float = 0.0
     psf_sigma_px: float = 0.6
     netd: float = 0.05
     counts_per_kelvin: float = 30.0

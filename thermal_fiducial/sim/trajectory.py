@@ -1,6 +1,7 @@
 """Smooth flights with analytic derivatives, so that the IMU's samples are exact."""
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -37,6 +38,13 @@ def pose_matrix(rotation: Rotation, position: npt.ArrayLike) -> FloatArray:
     T = np.zeros((*R.shape[:-2], 4, 4))
     T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = R, position, 1.0
     return T
+
+
+class Path(Protocol):
+    """Where a body is and how it moves."""
+
+    def __call__(self, t: npt.ArrayLike, /) -> Motion:
+        """The motion at times ``t`` (N,) [s]."""
 
 
 class Trajectory:

@@ -113,9 +113,9 @@ def _body_events(flight: FlightPlan) -> Iterator[_Event]:
     record, motion = scenario.imu.sample(trajectory, times, stamps, flight.seed), trajectory(times)
     quaternions, velocities = motion.rotation.as_quat(), motion.rotation.inv().apply(motion.velocity)
     truth = zip(motion.position, quaternions, velocities, motion.angular_velocity_body, strict=True)
-    samples = zip(record.angular_velocity, record.linear_acceleration, strict=True)
+    samples = zip(record.stamps_ns.tolist(), record.angular_velocity, record.linear_acceleration, strict=True)
     for stamp, sample, state in zip(stamps.tolist(), samples, truth, strict=True):
-        yield _Event(stamp + IMU_DELAY_NS, IMU_TOPIC, messages.imu(stamp, *sample, scenario.imu))
+        yield _Event(stamp + IMU_DELAY_NS, IMU_TOPIC, messages.imu(*sample, scenario.imu))
         yield _Event(stamp + IMU_DELAY_NS, TRUTH_TOPIC, messages.odometry(stamp, *state))
 
 
@@ -193,5 +193,6 @@ def _parameters(scenario: Scenario) -> dict[str, Any]:
         'camera_position': [float(value) for value in scenario.camera_position],
         'camera_orientation': [float(value) for value in scenario.camera_orientation],
         'camera_time_offset': float(scenario.camera_time_offset),
+        **({'readout_time': scenario.sensor.readout} if scenario.sensor.readout else {}),
         'imu': {item.name: getattr(noise, item.name) for item in fields(noise)},
     }
