@@ -72,8 +72,8 @@ def rows(ids, corners, sigma, size=SIZE, camera=CAMERA):
         result[f'c{c}uu'] = result[f'c{c}vv'] = sigma**2
     if n:
         poses = solve_marker_poses(corners, covariances, np.full(n, size), camera)
-        _fill(result, '', np.stack([pose.T_camera_marker for pose in poses]))
-        _fill(result, 'a', np.stack([pose.T_alternative for pose in poses]))
+        _fill(result, '', poses.T_camera_marker[:, 0])
+        _fill(result, 'a', poses.T_camera_marker[:, 1])
     return result
 
 

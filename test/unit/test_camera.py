@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.errors import InputError
 
 K = np.array([[441.2, 0.0, 322.1], [0.0, 439.8, 251.3], [0.0, 0.0, 1.0]])
@@ -95,6 +95,16 @@ def test_a_wide_fisheye_is_inverted_to_its_rim():
     camera = Camera(640, 512, np.array([[240.0, 0, 320], [0, 240.0, 256], [0, 0, 1]]), 'equidistant', [0.0] * 4)
     uv = np.array([[0.0, 256.0], [639.0, 256.0], [320.0, 0.0], [20.0, 100.0]])
     assert np.allclose(camera.distort(camera.normalise(uv)), uv, atol=1e-8)
+
+
+@every_model
+def test_points_move_in_both_coordinates(name):
+    camera = CAMERAS[name]
+    px = np.array([[100.0, 80.0], [180.0, 90.0], [170.0, 160.0], [95.0, 150.0]])
+    there = ImagePoints.at(px, camera).moved(np.full((4, 2), 2.0), camera)
+    np.testing.assert_allclose(camera.distort(there.x), there.px, atol=1e-9)
+    # Over three pixels a lens bends by a hundredth; twice that allows for its rim.
+    np.testing.assert_allclose(there.px, px + 2.0, atol=0.02)
 
 
 def test_single_points_and_batches():

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.corners import Corners, grid_pattern, refine_corners
+from thermal_fiducial.core.camera import Camera, ImagePoints
+from thermal_fiducial.core.corners import grid_pattern, refine_corners
 from thermal_fiducial.core.pose import marker_corners
 from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -54,7 +54,7 @@ def refine(image, corners, camera, marker_id, **options):
     ids = [marker_id]
     return refine_corners(
         image.astype(np.float32),
-        Corners.at(corners[None], camera),
+        ImagePoints.at(corners[None], camera),
         camera,
         PATTERN.before[ids],
         PATTERN.step[ids],
@@ -86,15 +86,6 @@ def test_corners_near_by_need_no_wide_pass():
     found = refine(image, corners + 0.25, camera, 7, near=np.array([True]))
     # One step from a quarter of a pixel away; as good as the steps that follow a wide one.
     assert np.abs(found.corners_px[0] - corners).max() < 0.02
-
-
-def test_corners_move_in_both_coordinates():
-    for camera in CAMERAS.values():
-        px = np.array([[[100.0, 80.0], [180.0, 90.0], [170.0, 160.0], [95.0, 150.0]]])
-        there = Corners.at(px, camera).moved(np.full((1, 4, 2), 2.0), camera)
-        np.testing.assert_allclose(camera.distort(there.x), there.px, atol=1e-9)
-        # Over three pixels a lens bends by a hundredth; twice that allows for its rim.
-        np.testing.assert_allclose(there.px, px + 2.0, atol=0.02)
 
 
 def test_inverted_polarity():
@@ -159,7 +150,7 @@ def test_markers_do_not_disturb_each_other():
     ids = [marker_id for marker_id, _ in scenes]
     start = np.stack(corners) + 0.3
     both = refine_corners(
-        image, Corners.at(start, camera), camera, PATTERN.before[ids], PATTERN.step[ids], BLUR_WITH_PIXEL
+        image, ImagePoints.at(start, camera), camera, PATTERN.before[ids], PATTERN.step[ids], BLUR_WITH_PIXEL
     )
     for index, marker_id in enumerate(ids):
         alone = refine(image, start[index], camera, marker_id)

@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.pose import (
-    choose_branch,
     choose_branches,
     ippe_square,
     marker_corners,
     solve_camera_pose,
-    solve_marker_pose,
     solve_marker_poses,
 )
 from thermal_fiducial.errors import InputError
@@ -34,18 +32,22 @@ def image(camera, T_camera_marker, size=0.3):
     return camera.project(geometry.apply(T_camera_marker, marker_corners(size)))
 
 
+def solve_one(corners, camera, size=0.3):
+    return solve_marker_poses(corners[None], ISOTROPIC[None], np.array([size]), camera)
+
+
 @pytest.mark.parametrize('model', CAMERAS)
 @pytest.mark.parametrize('tilt', [(0, 0, 0), (1e-9, 0, 0), (0.3, 0, 0), (0, -0.9, 0.4), (0.5, 0.5, 3.0), (0, 0, 1.57)])
 @pytest.mark.parametrize('position', [(0, 0, 1.0), (0.3, -0.2, 2.0), (-0.6, 0.4, 1.5)])
 def test_noiseless_is_exact(model, tilt, position):
     camera, T = CAMERAS[model], pose(tilt, position)
-    found = solve_marker_pose(image(camera, T), ISOTROPIC, 0.3, camera)
+    found = solve_one(image(camera, T), camera)
     # The branches differ by over 1e-3 px unless they meet; the error left is rounding times the conditioning of a
     # front-parallel square, which is quadratic in its tilt.
-    best = min((found.T_camera_marker, found.T_alternative), key=lambda X: np.abs(X - T).max())
+    best = min(found.T_camera_marker[0], key=lambda X: np.abs(X - T).max())
     np.testing.assert_allclose(best, T, atol=1e-5)
-    assert found.rms_px < 1e-7
-    assert found.rms_px <= found.alternative_rms_px
+    assert found.rms_px[0, 0] < 1e-7
+    assert found.rms_px[0, 0] <= found.rms_px[0, 1]
 
 
 def test_front_parallel_branches_are_both_proper():
@@ -56,18 +58,27 @@ def test_front_parallel_branches_are_both_proper():
 
 def test_alternative_is_the_mirrored_tilt():
     camera, T = CAMERAS['plumb_bob'], pose((0.4, 0.0, 0.0), (0.0, 0.0, 4.0))
-    found = solve_marker_pose(image(camera, T), ISOTROPIC, 0.3, camera)
-    tilt = geometry.so3_log(found.T_alternative[:3, :3] @ FACING.T)
+    found = solve_one(image(camera, T), camera)
+    tilt = geometry.so3_log(found.T_camera_marker[0, 1, :3, :3] @ FACING.T)
     np.testing.assert_allclose(tilt, (-0.4, 0.0, 0.0), atol=0.05)
-    assert 0.01 < found.alternative_rms_px < 1.0
-    assert choose_branch(found, found.T_alternative, ratio=1e9).rms_px == found.alternative_rms_px
-    assert choose_branch(found, found.T_camera_marker).rms_px == found.rms_px
+    assert 0.01 < found.rms_px[0, 1] < 1.0
 
 
-def test_expectation_cannot_choose_a_branch_that_the_image_excludes():
-    camera, T = CAMERAS['plumb_bob'], pose((0.7, 0.0, 0.0), (0.0, 0.0, 1.0))
-    found = solve_marker_pose(image(camera, T), ISOTROPIC, 0.3, camera)
-    assert choose_branch(found, found.T_alternative).rms_px == found.rms_px
+@pytest.mark.parametrize(('distance', 'allowed'), [(5.0, True), (1.0, False)])
+def test_expectation_chooses_among_branches_that_the_image_allows(distance, allowed):
+    camera, T = CAMERAS['plumb_bob'], pose((0.5, 0.0, 0.0), (0.0, 0.0, distance))
+    corners = image(camera, T)[None]
+    found = solve_marker_poses(corners, 16.0 * ISOTROPIC[None], np.array([0.3]), camera)
+    assert found.ambiguous() == allowed
+    for branch in (0, 1):
+        chosen = choose_branches(
+            found,
+            ImagePoints.at(corners, camera),
+            ISOTROPIC[None],
+            [(np.eye(4), 0.3)],
+            found.T_camera_marker[0, branch],
+        )
+        assert chosen.rms_px[0, 0] == found.rms_px[0, branch if allowed else 0]
 
 
 def test_other_known_markers_choose_the_branch():
@@ -85,18 +96,17 @@ def test_other_known_markers_choose_the_branch():
     corners = np.stack([image(camera, T_camera_map @ T, 0.2) for T in poses_in_map])
     covs = np.broadcast_to(16.0 * ISOTROPIC, (3, 4, 2, 2))
     poses = solve_marker_poses(corners, covs, np.full(3, 0.2), camera)
-    assert all(pose.ambiguous() for pose in poses)
-    wrong = [poses[0].swapped(), poses[1], poses[2].swapped()]
-    known = [(T, 0.2) for T in poses_in_map]
-    for predicted in (None, T_camera_map, wrong[0].T_camera_marker @ geometry.inverse(poses_in_map[0])):
-        chosen = choose_branches(wrong, corners, covs, known, camera, predicted)
-        for pose, T in zip(chosen, poses_in_map, strict=True):
-            np.testing.assert_allclose(pose.T_camera_marker, T_camera_map @ T, atol=1e-5)
+    assert poses.ambiguous().all()
+    wrong = poses.swapped(np.array([True, False, True]))
+    known, points = [(T, 0.2) for T in poses_in_map], ImagePoints.at(corners, camera)
+    for predicted in (None, T_camera_map, wrong.T_camera_marker[0, 0] @ geometry.inverse(poses_in_map[0])):
+        chosen = choose_branches(wrong, points, covs, known, predicted)
+        np.testing.assert_allclose(chosen.T_camera_marker[:, 0], T_camera_map @ np.stack(poses_in_map), atol=1e-5)
     # A lone known marker has the prediction alone, one of unknown pose nothing.
-    lone = choose_branches(wrong, corners, covs, [known[0], None, None], camera, T_camera_map)
-    np.testing.assert_allclose(lone[0].T_camera_marker, poses[0].T_camera_marker)
-    assert lone[2] is wrong[2]
-    assert choose_branches(wrong, corners, covs, [known[0], None, None], camera) is wrong
+    lone = choose_branches(wrong, points, covs, [known[0], None, None], T_camera_map)
+    np.testing.assert_allclose(lone.T_camera_marker[0], poses.T_camera_marker[0])
+    np.testing.assert_allclose(lone.T_camera_marker[2], wrong.T_camera_marker[2])
+    assert choose_branches(wrong, points, covs, [known[0], None, None]) is wrong
 
 
 @pytest.mark.parametrize(
@@ -104,16 +114,15 @@ def test_other_known_markers_choose_the_branch():
     [np.full((4, 2), np.nan), np.tile([300.0, 200.0], (4, 1)), [[9, 9], [50, 9], [50, 9], [9, 9]]],
 )
 def test_degenerate_corners_have_no_pose(corners):
-    with pytest.raises(InputError, match='no pose'):
-        solve_marker_pose(corners, ISOTROPIC, 0.3, CAMERAS['plumb_bob'])
+    assert np.isinf(solve_one(np.array(corners, dtype=float), CAMERAS['plumb_bob']).rms_px).all()
 
 
 def test_degenerate_marker_leaves_the_others_alone():
     camera, T = CAMERAS['equidistant'], pose((0.3, 0.2, 0.1), (0.1, 0.2, 2.0))
     corners = np.stack([np.full((4, 2), np.nan), image(camera, T)])
-    bad, good = solve_marker_poses(corners, np.stack([ISOTROPIC, ISOTROPIC]), np.array([0.3, 0.3]), camera)
-    assert bad.rms_px == np.inf
-    np.testing.assert_allclose(good.T_camera_marker, T, atol=1e-9)
+    found = solve_marker_poses(corners, np.stack([ISOTROPIC, ISOTROPIC]), np.array([0.3, 0.3]), camera)
+    assert np.isinf(found.rms_px[0]).all()
+    np.testing.assert_allclose(found.T_camera_marker[1, 0], T, atol=1e-9)
 
 
 def scene(camera):
@@ -156,7 +165,7 @@ def test_prediction_decides_between_the_branches_of_a_lone_marker():
     camera, T = CAMERAS['plumb_bob'], pose((0.25, 0.0, 0.0), (0.0, 0.0, 5.0))
     covs = np.broadcast_to(25.0 * ISOTROPIC, (1, 4, 2, 2))
     corners, squares = image(camera, T)[None], marker_corners(0.3)[None]
-    other = solve_marker_pose(corners[0], covs[0], 0.3, camera).T_alternative
+    other = solve_marker_poses(corners, covs, np.array([0.3]), camera).T_camera_marker[0, 1]
     for expected in (T, other):
         found = solve_camera_pose(corners, covs, squares, camera, initial=geometry.inverse(expected))
         np.testing.assert_allclose(found.T_map_camera, geometry.inverse(expected), atol=1e-5)
@@ -179,14 +188,14 @@ def test_marker_covariance_is_honest():
     covs = correlated_covariances(count, rng, 0.1)
     noise = np.linalg.cholesky(covs) @ rng.normal(size=(count, 4, 2, 1))
     poses = solve_marker_poses(image(camera, T) + noise[..., 0], covs, np.full(count, 0.3), camera)
-    found = np.stack([p.T_camera_marker for p in poses])
+    found = poses.T_camera_marker[:, 0]
     error = np.concatenate(
         [T[:3, 3] - found[:, :3, 3], geometry.so3_log(T[:3, :3] @ np.swapaxes(found[:, :3, :3], -1, -2))], axis=-1
     )
-    nees = np.einsum('bi,bij,bj->b', error, np.linalg.inv(np.stack([p.covariance for p in poses])), error)
+    nees = np.einsum('bi,bij,bj->b', error, np.linalg.inv(poses.covariances[:, 0]), error)
     # Chi-square of 6: standard deviation of the mean over 2000 is 0.08; 4 of them.
     assert np.mean(nees) == pytest.approx(6.0, abs=0.31)
-    assert np.mean([p.chi2 for p in poses]) == pytest.approx(2.0, abs=0.18)
+    assert np.mean(poses.chi2[:, 0]) == pytest.approx(2.0, abs=0.18)
 
 
 def test_joint_covariance_is_honest():

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 
 #: Number of coefficients that each model takes (shorter lists are filled up with zeros).
@@ -197,6 +197,53 @@ class Camera:
         if self.model == 'equidistant':
             return _distort_equidistant(x, self.D)
         return _distort_polynomial(x, self._polynomial), _polynomial_derivative(x, self._polynomial)
+
+
+@dataclass(frozen=True, slots=True)
+class ImagePoints:
+    """Points of an image in both coordinates.
+
+    Parameters
+    ----------
+    px : (..., 2)
+    x : (..., 2) normalised
+    J : (..., 2, 2) derivative of pixels by normalised coordinates
+    inverse : (..., 2, 2) that of normalised coordinates by pixels; both also for points some pixels away
+    """
+
+    px: FloatArray
+    x: FloatArray
+    J: FloatArray
+    inverse: FloatArray
+
+    @staticmethod
+    def at(px: FloatArray, camera: Camera) -> 'ImagePoints':
+        """Those at pixels (..., 2)."""
+        return ImagePoints.seen_at(camera.normalise(px), camera)
+
+    @staticmethod
+    def seen_at(x: FloatArray, camera: Camera) -> 'ImagePoints':
+        """Those at normalised coordinates (..., 2)."""
+        J = camera.distort_jacobian(x)
+        return ImagePoints(camera.distort(x), x, J, _inverse(J))
+
+    def moved(self, shift_px: FloatArray, camera: Camera) -> 'ImagePoints':
+        """Those some pixels (..., 2) away: undistorting them anew would cost more than it tells."""
+        x = self.x + (self.inverse @ shift_px[..., None])[..., 0]
+        return ImagePoints(camera.distort(x), x, self.J, self.inverse)
+
+    def only(self, keep: BoolArray | IntArray) -> 'ImagePoints':
+        """Those at the places ``keep`` of the first axis."""
+        return ImagePoints(self.px[keep], self.x[keep], self.J[keep], self.inverse[keep])
+
+
+def _inverse(J: FloatArray) -> FloatArray:
+    """Inverses of matrices (..., 2, 2), not finite where they are singular."""
+    inverse = np.empty_like(J)
+    inverse[..., 0, 0], inverse[..., 1, 1] = J[..., 1, 1], J[..., 0, 0]
+    inverse[..., 0, 1], inverse[..., 1, 0] = -J[..., 0, 1], -J[..., 1, 0]
+    determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+    return np.asarray(inverse / determinant[..., None, None])
 
 
 class _Polynomial(NamedTuple):

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # A curved line is a quartic through five of its points.
@@ -44,44 +44,6 @@ _PRIOR_OF_SHAPE = np.linalg.inv(_PRIOR_SHAPE_PX**2 * np.eye(8) + _PRIOR_PX**2 * 
 _HOPELESS = 1e6
 # Pixels of the image that a line must have on both sides.
 _BOTH_SIDES = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Corners:
-    """Corners of N markers in both coordinates.
-
-    Parameters
-    ----------
-    px : (N, 4, 2)
-    x : (N, 4, 2) normalised
-    J : (N, 4, 2, 2) derivative of pixels by normalised coordinates
-    inverse : (N, 4, 2, 2) that of normalised coordinates by pixels; both also for corners some pixels away
-    """
-
-    px: FloatArray
-    x: FloatArray
-    J: FloatArray
-    inverse: FloatArray
-
-    @staticmethod
-    def at(px: FloatArray, camera: Camera) -> 'Corners':
-        """Those at pixels (N, 4, 2)."""
-        return Corners.seen_at(camera.normalise(px), camera)
-
-    @staticmethod
-    def seen_at(x: FloatArray, camera: Camera) -> 'Corners':
-        """Those at normalised coordinates (N, 4, 2)."""
-        J = camera.distort_jacobian(x)
-        return Corners(camera.distort(x), x, J, np.asarray(np.linalg.inv(J), dtype=np.float64))
-
-    def moved(self, shift_px: FloatArray, camera: Camera) -> 'Corners':
-        """Those some pixels (N, 4, 2) away: undistorting them anew would cost more than it tells."""
-        x = self.x + (self.inverse @ shift_px[..., None])[..., 0]
-        return Corners(camera.distort(x), x, self.J, self.inverse)
-
-    def only(self, keep: BoolArray | IntArray) -> 'Corners':
-        """Those of the markers ``keep``."""
-        return Corners(self.px[keep], self.x[keep], self.J[keep], self.inverse[keep])
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +127,7 @@ class _Shifts:
 
 def refine_corners(
     image: Float32Array,
-    corners: Corners,
+    corners: ImagePoints,
     camera: Camera,
     before: Float32Array,
     step: Float32Array,
@@ -213,7 +175,7 @@ def refine_corners(
 
 def _pass(
     image: Float32Array,
-    corners: Corners,
+    corners: ImagePoints,
     camera: Camera,
     before: Float32Array,
     step: Float32Array,

@@ -9,10 +9,10 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.corners import Corners, grid_pattern, refine_corners, RefinedCorners
+from thermal_fiducial.core.camera import Camera, ImagePoints
+from thermal_fiducial.core.corners import grid_pattern, refine_corners, RefinedCorners
 from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers, Odometry
-from thermal_fiducial.core.pose import choose_branches, ippe_square, marker_corners, solve_marker_poses
+from thermal_fiducial.core.pose import choose_branches, ippe_square, marker_corners, planar_poses
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 from thermal_fiducial.core.vision.clock_offset import ClockOffset
 from thermal_fiducial.core.vision.contrast import noise_of, without_columns
@@ -259,9 +259,9 @@ class MarkerDetector:
             return ids, refined
         before, step = self._pattern.before[ids], self._pattern.step[ids]
         if len(tracked.ids) == len(ids) and self._since_blind > 0:
-            at_stamp, depth = Corners.seen_at(tracked.x, camera), tracked.depth
+            at_stamp, depth = ImagePoints.seen_at(tracked.x, camera), tracked.depth
         else:
-            at_stamp = Corners.at(corners, camera)
+            at_stamp = ImagePoints.at(corners, camera)
             depth = _corner_depths(at_stamp.x, self._sizes_of(ids))
         near = np.isin(ids, tracked.ids)
         self._depth = float(np.median(depth))
@@ -302,10 +302,11 @@ class MarkerDetector:
     def _rows(self, ids: IntArray, refined: RefinedCorners, camera: Camera, T_camera_map: FloatArray | None) -> Markers:
         if len(ids) == 0:
             return np.zeros(0, dtype=MARKER_DTYPE)
-        poses = solve_marker_poses(refined.corners_px, refined.covariances, self._sizes_of(ids), camera)
+        corners, covariances = ImagePoints.at(refined.corners_px, camera), refined.covariances
+        poses = planar_poses(corners, covariances, self._sizes_of(ids))
         in_map = [self._map.get(marker_id) for marker_id in ids.tolist()]
-        poses = choose_branches(poses, refined.corners_px, refined.covariances, in_map, camera, T_camera_map)
-        return marker_rows(ids, refined, poses)
+        poses = choose_branches(poses, corners, covariances, in_map, T_camera_map)
+        return marker_rows(ids, corners.px, covariances, poses, refined.contrast)
 
     def _sizes_of(self, ids: IntArray) -> FloatArray:
         return np.array([self.size(marker_id) for marker_id in ids.tolist()])

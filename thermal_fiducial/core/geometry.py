@@ -16,8 +16,6 @@ from thermal_fiducial.core.types import FloatArray
 
 # Below this angle [rad] the Taylor series is exact to double precision (the next term is angle^6 / 5040).
 SMALL_ANGLE = 1e-2
-# So many matrices are faster one by one.
-_FEW = 20
 
 
 def skew(v: npt.ArrayLike) -> FloatArray:
@@ -143,39 +141,36 @@ def quaternion_from_rotation(R: npt.ArrayLike) -> FloatArray:
     R = np.asarray(R, dtype=np.float64)
     if R.ndim == 2:
         return _quaternion_of_one(R)
-    if R.ndim == 3 and len(R) <= _FEW:
-        return np.array([_quaternion_of_one(one) for one in R]).reshape(-1, 4)
-    d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
-    squares = np.stack([1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2, 1 + d0 + d1 + d2], axis=-1)
-    sums = [R[..., i, j] + R[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
-    differences = [R[..., i, j] - R[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0))]
-    rows = np.stack(
-        [
-            np.stack([squares[..., 0], sums[0], sums[1], differences[0]], axis=-1),
-            np.stack([sums[0], squares[..., 1], sums[2], differences[1]], axis=-1),
-            np.stack([sums[1], sums[2], squares[..., 2], differences[2]], axis=-1),
-            np.stack([differences[0], differences[1], differences[2], squares[..., 3]], axis=-1),
-        ],
-        axis=-2,
-    )
-    largest = np.argmax(squares, axis=-1)
-    q = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.asarray(np.where(q[..., 3:] < 0.0, -q, q))
+    flat = R.reshape(*R.shape[:-2], 9)
+    products = (flat @ _PRODUCTS_OF_ENTRIES).reshape(*R.shape[:-2], 4, 4) + np.eye(4)
+    largest = np.einsum('...ii->...i', products).argmax(axis=-1)
+    q = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
+    return np.asarray(q * np.copysign(1.0 / np.sqrt(np.sum(q * q, axis=-1)), q[..., 3])[..., None])
 
 
 def _quaternion_of_one(R: FloatArray) -> FloatArray:
     """The same for a single matrix (3, 3): many times faster without arrays."""
-    (a, b, c), (d, e, f), (g, h, i) = R.tolist()
-    rows = (
+    products = _quaternion_products(R.tolist())
+    x, y, z, w = products[max(range(4), key=lambda k: products[k][k])]
+    scale = (-1.0 if w < 0.0 else 1.0) / math.sqrt(x * x + y * y + z * z + w * w)
+    return np.array([x * scale, y * scale, z * scale, w * scale])
+
+
+def _quaternion_products(R: list[list[float]]) -> tuple[tuple[float, ...], ...]:
+    """Four times the products of a quaternion x y z w with each of its components."""
+    (a, b, c), (d, e, f), (g, h, i) = R
+    return (
         (1 + a - e - i, b + d, c + g, h - f),
         (b + d, 1 - a + e - i, f + h, c - g),
         (c + g, f + h, 1 - a - e + i, d - b),
         (h - f, c - g, d - b, 1 + a + e + i),
     )
-    x, y, z, w = rows[max(range(4), key=lambda k: rows[k][k])]
-    scale = (-1.0 if w < 0.0 else 1.0) / math.sqrt(x * x + y * y + z * z + w * w)
-    return np.array([x * scale, y * scale, z * scale, w * scale])
+
+
+# The products grow linearly with the entries of the matrix, (9, 16), from the identity.
+_PRODUCTS_OF_ENTRIES = np.array(
+    [np.ravel(_quaternion_products(entry.tolist()) - np.eye(4)) for entry in np.eye(9).reshape(9, 3, 3)]
+)
 
 
 def transform_from_quaternion(position: npt.ArrayLike, q_xyzw: npt.ArrayLike) -> FloatArray:

@@ -7,14 +7,15 @@ import numpy as np
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.geometry import quaternion_from_rotation, rotation_angle
+from thermal_fiducial.core.geometry import rotation_angle
 from thermal_fiducial.core.map_refinement import refine, Refinement, Snapshot
 from thermal_fiducial.core.mapping.candidates import DECISIVE, SAME_FIT
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.marker_map import MarkerMapper
-from thermal_fiducial.core.measurements import CORNER_COVARIANCE_FIELDS, CORNER_FIELDS, MARKER_DTYPE, Markers
+from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers
 from thermal_fiducial.core.pose import solve_marker_poses
 from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.vision.marker_rows import marker_rows
 
 # Passes over all frames: more than any chain of markers needs of which each is seen with the last alone.
 _MAX_PASSES = 50
@@ -75,35 +76,16 @@ def build_map(
 def rows_from_corners(
     ids: IntArray, corners: FloatArray, covariances: FloatArray, sizes: FloatArray, camera: Camera
 ) -> Markers:
-    """Rows (N,) of MARKER_DTYPE of markers known by their corners alone, as a file of detections holds them.
+    """Rows (N,) of MARKER_DTYPE by rising ID of markers known by their corners alone, as in a file of detections.
 
     Parameters
     ----------
     ids, sizes : (N,), (N,) [m]
     corners, covariances : (N, 4, 2) [px], (N, 4, 2, 2) [px^2]
     """
-    rows = np.zeros(len(ids), MARKER_DTYPE)
     if not len(ids):
-        return rows
-    poses = solve_marker_poses(corners, covariances, sizes, camera)
-    rows['id'] = ids
-    _fill(rows, CORNER_FIELDS, corners.reshape(-1, 8))
-    _fill(rows, CORNER_COVARIANCE_FIELDS, covariances.reshape(-1, 4, 4)[..., [0, 1, 3]].reshape(-1, 12))
-    rows['sigma_px'] = np.sqrt(np.trace(covariances, axis1=-2, axis2=-1).mean(axis=-1) / 2.0)
-    rows['rms_px'] = [pose.rms_px for pose in poses]
-    rows['arms_px'] = [pose.alternative_rms_px for pose in poses]
-    for prefix, T in (
-        ('', np.stack([pose.T_camera_marker for pose in poses])),
-        ('a', np.stack([pose.T_alternative for pose in poses])),
-    ):
-        _fill(rows, tuple(prefix + axis for axis in 'xyz'), T[:, :3, 3])
-        _fill(rows, tuple(f'{prefix}q{axis}' for axis in 'xyzw'), quaternion_from_rotation(T[:, :3, :3]))
-    return np.asarray(rows[np.isfinite(rows['rms_px'])])
-
-
-def _fill(rows: Markers, names: tuple[str, ...], values: FloatArray) -> None:
-    for name, column in zip(names, values.T, strict=True):
-        rows[name] = column
+        return np.zeros(0, MARKER_DTYPE)
+    return marker_rows(ids, corners, covariances, solve_marker_poses(corners, covariances, sizes, camera))
 
 
 def _stamp(k: int) -> int:

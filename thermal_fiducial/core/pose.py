@@ -15,19 +15,18 @@ from thermal_fiducial.core import geometry
 from thermal_fiducial.core.adjustment.ippe import ippe_square, marker_corners
 from thermal_fiducial.core.adjustment.reprojection import whitening
 from thermal_fiducial.core.adjustment.rigid_fit import covariances, evaluate, fit, Images
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.camera import Camera, ImagePoints
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 
 __all__ = [
     'JointPose',
-    'PlanarPose',
-    'choose_branch',
+    'PlanarPoses',
     'choose_branches',
     'ippe_square',
     'marker_corners',
+    'planar_poses',
     'solve_camera_pose',
-    'solve_marker_pose',
     'solve_marker_poses',
 ]
 
@@ -38,43 +37,40 @@ _AMBIGUOUS_RATIO = 4.0
 
 
 @dataclass(frozen=True, slots=True)
-class PlanarPose:
-    """Both poses of one marker in the camera; the better one first."""
+class PlanarPoses:
+    """Both poses of N markers in the camera; the better one of each first."""
 
-    #: (4, 4)
+    #: (N, 2, 4, 4)
     T_camera_marker: FloatArray
-    #: (6, 6), ROS convention, in the camera frame [m, rad]
-    covariance: FloatArray
-    #: re-projection error, rms over the four corners (length of the 2-vector) [px]; inf: no pose found
-    rms_px: float
-    #: (4, 4) the other branch; the same pose where both branches meet
-    T_alternative: FloatArray
-    alternative_rms_px: float
-    #: (6, 6) of the other branch
-    alternative_covariance: FloatArray
-    #: weighted squared errors of both: with honest corner covariances, chi-square of two degrees of freedom
-    chi2: float
-    alternative_chi2: float
+    #: (N, 2, 6, 6) information matrices, ROS convention, in the camera frame
+    information: FloatArray
+    #: (N, 2) re-projection error, rms over the four corners (length of the 2-vector) [px]; inf: no pose found
+    rms_px: FloatArray
+    #: (N, 2) weighted squared errors: with honest corner covariances, chi-square of two degrees of freedom
+    chi2: FloatArray
 
-    def ambiguous(self, ratio: float = 10.0) -> bool:
-        """Whether the image allows the other branch: its squared error is below ``ratio`` times this one's, or of 2.
+    @property
+    def covariances(self) -> FloatArray:
+        """(N, 2, 6, 6) of the poses [m, rad]."""
+        return covariances(self.information)
 
-        2 is what the errors of corners with honest covariances come to.
+    def ambiguous(self, ratio: float = 10.0) -> BoolArray:
+        """Of which markers (N,) the image allows the other branch.
+
+        Its squared error is below ``ratio`` times the first one's, or of 2, which is what the errors of corners with
+        honest covariances come to.
         """
-        return bool(self.alternative_chi2 <= ratio * max(self.chi2, 2.0))
+        return np.asarray(self.chi2[:, 1] <= ratio * np.maximum(self.chi2[:, 0], 2.0))
 
-    def swapped(self) -> 'PlanarPose':
-        """The other branch first."""
-        return PlanarPose(
-            self.T_alternative,
-            self.alternative_covariance,
-            self.alternative_rms_px,
-            self.T_camera_marker,
-            self.rms_px,
-            self.covariance,
-            self.alternative_chi2,
-            self.chi2,
-        )
+    def swapped(self, which: BoolArray) -> 'PlanarPoses':
+        """The other branch of the markers ``which`` (N,) first."""
+        return self.ordered(np.stack([which, ~which], axis=1).astype(np.intp))
+
+    def ordered(self, branches: IntArray) -> 'PlanarPoses':
+        """Those of the branches (N, 2) that come first and second."""
+        rows = np.arange(len(branches))[:, None]
+        arrays = self.T_camera_marker, self.information, self.rms_px, self.chi2
+        return PlanarPoses(*(array[rows, branches] for array in arrays))
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,110 +89,78 @@ class JointPose:
     chi2: float
 
 
-def solve_marker_pose(corners_px: npt.ArrayLike, corner_cov: npt.ArrayLike, size: float, camera: Camera) -> PlanarPose:
-    """Both poses of one marker.
+def solve_marker_poses(
+    corners_px: FloatArray, corner_covs: FloatArray, sizes: FloatArray, camera: Camera
+) -> PlanarPoses:
+    """Both poses of N markers.
 
     Parameters
     ----------
-    corners_px : (4, 2) in the raw image, in the order of :func:`marker_corners`
-    corner_cov : (4, 2, 2) [px^2]
-    size : side [m]
-
-    Raises
-    ------
-    InputError
-        Corners from which no pose in front of the camera follows.
+    corners_px : (N, 4, 2) in the raw image, in the order of :func:`marker_corners`
+    corner_covs : (N, 4, 2, 2) [px^2]
+    sizes : (N,) sides [m]
     """
-    corners = np.asarray(corners_px, dtype=np.float64)[None]
-    pose = solve_marker_poses(corners, np.asarray(corner_cov, dtype=np.float64)[None], np.array([size]), camera)[0]
-    if not np.isfinite(pose.rms_px):
-        raise InputError(f'no pose of a marker follows from the corners {corners[0].tolist()}')
-    return pose
+    return planar_poses(ImagePoints.at(corners_px, camera), corner_covs, sizes)
 
 
-def solve_marker_poses(
-    corners_px: FloatArray, corner_covs: FloatArray, sizes: FloatArray, camera: Camera
-) -> list[PlanarPose]:
-    """Both poses of N markers: (N, 4, 2), (N, 4, 2, 2), (N,); where there is none, ``rms_px`` is inf."""
-    count = len(corners_px)
-    W = whitening(corner_covs)
-    images = Images.of(corners_px, W, camera)
+def planar_poses(corners: ImagePoints, corner_covs: FloatArray, sizes: FloatArray) -> PlanarPoses:
+    """:func:`solve_marker_poses` of corners (N, 4) that are known in both coordinates."""
+    images = Images.of(corners, whitening(corner_covs)).repeated(2)
     points = np.repeat(sizes[:, None, None] * marker_corners(1.0), 2, axis=0)
-    T, cost, information = fit(
-        ippe_square(images.normalised, sizes).reshape(2 * count, 4, 4), points, images.repeated(2)
-    )
-    residuals = np.repeat(corners_px, 2, axis=0) - camera.project(geometry.apply(T, points))
-    rms = np.sqrt(0.25 * np.sum(residuals**2, axis=(-2, -1)))
-    chi2 = np.sum((np.repeat(W, 2, axis=0) @ residuals[..., None]) ** 2, axis=(-3, -2, -1))
+    starts = ippe_square(corners.x, sizes).reshape(-1, 4, 4)
+    T, cost, information = fit(starts, points, images, rivals=2)
+    residuals = images.residuals(T, points)[..., None]
     facing = np.sum(T[:, :3, 2] * T[:, :3, 3], axis=-1) < 0.0
-    rms = np.where(np.isfinite(cost) & np.isfinite(chi2) & facing, rms, np.inf)
-    covariance = covariances(information)
-    poses = []
-    for first in range(0, 2 * count, 2):
-        a, b = first, first + 1
-        if not np.isfinite(rms[a]) or (np.isfinite(rms[b]) and chi2[b] < chi2[a]):
-            a, b = b, a
-        if not np.isfinite(rms[b]):
-            b = a
-        poses.append(
-            PlanarPose(T[a], covariance[a], float(rms[a]), T[b], float(rms[b]), covariance[b], chi2[a], chi2[b])
-        )
-    return poses
-
-
-def choose_branch(pose: PlanarPose, T_camera_marker_expected: FloatArray, ratio: float = 10.0) -> PlanarPose:
-    """``pose`` with that branch first whose rotation is closer to the expected one.
-
-    The expectation (from other markers of the frame, or the filter) decides only between branches that the image
-    allows: :meth:`PlanarPose.ambiguous`.
-    """
-    if not pose.ambiguous(ratio):
-        return pose
-    # The smaller the angle between two rotations, the larger the trace of R_1^T R_2.
-    R = T_camera_marker_expected[:3, :3]
-    nearer = np.sum(pose.T_alternative[:3, :3] * R) > np.sum(pose.T_camera_marker[:3, :3] * R)
-    return pose.swapped() if nearer else pose
+    chi2 = np.sum((images.whitening @ residuals) ** 2, axis=(-3, -2, -1))
+    chi2 = np.where(np.isfinite(cost) & np.isfinite(chi2) & facing, chi2, np.inf).reshape(-1, 2)
+    residuals_px = corners.J[:, None] @ residuals.reshape(-1, 2, 4, 2, 1)
+    rms = np.where(np.isfinite(chi2), np.sqrt(0.25 * np.sum(residuals_px**2, axis=(-3, -2, -1))), np.inf)
+    poses = PlanarPoses(T.reshape(-1, 2, 4, 4), information.reshape(-1, 2, 6, 6), rms, chi2)
+    first = (chi2[:, 1] < chi2[:, 0]).astype(np.intp)
+    second = np.where(np.isfinite(chi2).all(axis=1), 1 - first, first)
+    return poses.ordered(np.stack([first, second], axis=1))
 
 
 def choose_branches(
-    poses: list[PlanarPose],
-    corners_px: FloatArray,
+    poses: PlanarPoses,
+    corners: ImagePoints,
     corner_covs: FloatArray,
     in_map: list[tuple[FloatArray, float] | None],
-    camera: Camera,
     T_camera_map: FloatArray | None = None,
-) -> list[PlanarPose]:
+) -> PlanarPoses:
     """The poses of a frame's markers with the likelier branch first.
 
-    What decides between branches that the image allows is the pose of the camera: jointly from all known markers in
-    view where there are several, else the predicted one, if any.
+    What decides between branches that the image allows is the attitude of the camera. Where several known markers are
+    in view, it is that of the branch, or of the prediction, that explains all of them best; else the predicted one.
 
     Parameters
     ----------
     poses : of N markers
-    corners_px, corner_covs : (N, 4, 2), (N, 4, 2, 2)
+    corners, corner_covs : (N, 4), (N, 4, 2, 2) [px^2]
     in_map : N times T_map_marker (4, 4) and side [m], or None for a marker of unknown pose
     T_camera_map : (4, 4) predicted
     """
-    known = [k for k, entry in enumerate(in_map) if entry is not None]
-    if not any(poses[k].ambiguous() for k in known):
+    known = np.array([k for k, entry in enumerate(in_map) if entry is not None], dtype=np.intp)
+    ambiguous = poses.ambiguous()
+    if not ambiguous[known].any():
         return poses
-    T_map_marker = {k: entry[0] for k, entry in enumerate(in_map) if entry is not None}
+    T_map_marker = np.stack([entry[0] for entry in in_map if entry is not None])
     if len(known) > 1:
-        squares = [geometry.apply(entry[0], marker_corners(entry[1])) for entry in in_map if entry is not None]
-        initial = None if T_camera_map is None else geometry.inverse(T_camera_map)
-        try:
-            joint = solve_camera_pose(corners_px[known], corner_covs[known], np.stack(squares), camera, initial)
-            T_camera_map = geometry.inverse(joint.T_map_camera)
-        except InputError:
-            # No camera sees them all like this: the prediction is what is left.
-            pass
+        starts = (poses.T_camera_marker[known] @ geometry.inverse(T_map_marker)[:, None]).reshape(-1, 4, 4)
+        if T_camera_map is not None:
+            starts = np.concatenate([starts, T_camera_map[None]])
+        sizes = np.array([entry[1] for entry in in_map if entry is not None])
+        squares = geometry.apply(T_map_marker, sizes[:, None, None] * marker_corners(1.0))
+        images = Images.of(corners.only(known), whitening(corner_covs[known])).joined()
+        T_camera_map = starts[np.argmin(evaluate(starts, squares.reshape(1, -1, 3), images, _INLIER)[0])]
     if T_camera_map is None:
         return poses
-    return [
-        choose_branch(pose, T_camera_map @ T_map_marker[k]) if k in T_map_marker else pose
-        for k, pose in enumerate(poses)
-    ]
+    # The larger the trace of R_1^T R_2, the smaller the angle between two rotations.
+    expected = T_camera_map[:3, :3] @ T_map_marker[:, :3, :3]
+    likeness = np.sum(poses.T_camera_marker[known, :, :3, :3] * expected[:, None], axis=(-1, -2))
+    nearer = np.zeros(len(ambiguous), dtype=bool)
+    nearer[known] = likeness[:, 1] > likeness[:, 0]
+    return poses.swapped(nearer & ambiguous)
 
 
 def solve_camera_pose(
@@ -235,7 +199,7 @@ def solve_camera_pose(
     W = whitening(np.asarray(covs, dtype=np.float64))
     if weights is not None:
         W = W * np.sqrt(np.asarray(weights, dtype=np.float64))[:, None, None, None]
-    images = Images.of(corners.reshape(1, -1, 2), W.reshape(1, -1, 2, 2), camera)
+    images = Images.of(ImagePoints.at(corners.reshape(1, -1, 2), camera), W.reshape(1, -1, 2, 2))
     # Turned about their middle, translation and rotation of the points hardly depend on each other.
     middle = geometry.transform(np.eye(3), squares.mean(axis=(0, 1)))
     points = (squares - middle[:3, 3]).reshape(1, -1, 3)
@@ -245,7 +209,7 @@ def solve_camera_pose(
         others = _camera_starts(images.normalised.reshape(corners.shape), squares) @ middle
         cost = evaluate(others, points, images, _INLIER)[0]
         starts = np.concatenate([starts, others[np.argsort(cost)[:2]]])
-    T_camera_middle, chi2, information = fit(starts, points, images, _INLIER)
+    T_camera_middle, chi2, information = fit(starts, points, images, _INLIER, rivals=len(starts))
     best = int(np.argmin(chi2))
     if initial is not None and chi2[0] <= _AMBIGUOUS_RATIO * max(chi2[best], 8.0 * len(corners) - 6.0):
         best = 0

@@ -216,8 +216,7 @@ def expected_errors(
     noisy = corners + rng.normal(0.0, sigma_px, corners.shape)
     covariances = np.broadcast_to(sigma_px**2 * np.eye(2), (*corners.shape, 2))
     poses = solve_marker_poses(noisy, covariances, np.full(_SAMPLES, size), camera)
-    best = np.stack([pose.T_camera_marker for pose in poses])
-    return pose_errors(best, np.stack([pose.T_alternative for pose in poses]), T)
+    return pose_errors(poses.T_camera_marker[:, 0], poses.T_camera_marker[:, 1], T)
 
 
 def viewed_at(distance: float, tilt: float, turned: npt.ArrayLike, camera: Camera) -> FloatArray:

@@ -10,13 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
 _MAX_STEPS = 20
 # Costs are chi-squares: a step that lowers one by less is a ten-thousandth of a standard deviation, and the last. Of a
-# pose that the image refutes anyway a share of the cost is enough, lest all wait for it to creep along its valley.
-_LAST_GAIN, _REFUTED, _LAST_SHARE = 1e-8, 50.0, 1e-2
+# pose that the image refutes anyway a share of the cost is enough, lest all wait for it to creep along its valley; and
+# none waits for one that costs so many times more than its best rival.
+_LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-8, 50.0, 1e-2, 10.0
 # Damping at which Levenberg-Marquardt finds no better pose at all.
 _HOPELESS = 1e6
 # Depth [m] from which a point is in front of the camera.
@@ -25,8 +26,9 @@ _NEAR = 1e-6
 _AHEAD = geometry.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.0])
 # Variance of a parameter, over what it would be with the others known, from which it counts as unknown.
 _UNKNOWN = 1e13
-# v @ _MINUS_SKEW is -skew(v), its rows one after the other.
-_MINUS_SKEW = -geometry.skew(np.eye(3)).reshape(3, 9)
+# v @ _SKEW is skew(v), its rows one after the other.
+_SKEW = geometry.skew(np.eye(3)).reshape(3, 9)
+_MINUS_SKEW = -_SKEW
 
 #: At poses (B, 4, 4): cost (B,), gradient (B, 6), information (B, 6, 6).
 _Evaluation = tuple[FloatArray, FloatArray, FloatArray]
@@ -48,24 +50,33 @@ class Images:
     normalised: FloatArray
 
     @staticmethod
-    def of(uv: FloatArray, whitening: FloatArray, camera: Camera) -> 'Images':
-        """Of pixels (B, K, 2) whose noise ``whitening`` (B, K, 2, 2) [1/px] makes unit white."""
-        x = camera.normalise(uv)
-        W = whitening @ camera.distort_jacobian(x)
-        return Images(W, (W @ x[..., None])[..., 0], x)
+    def of(points: ImagePoints, whitening: FloatArray) -> 'Images':
+        """Of points (B, K) whose noise ``whitening`` (B, K, 2, 2) [1/px] makes unit white."""
+        W = whitening @ points.J
+        return Images(W, (W @ points.x[..., None])[..., 0], points.x)
 
     def repeated(self, times: int) -> 'Images':
         """Every body so many times in a row."""
         return Images(*(np.repeat(a, times, axis=0) for a in (self.whitening, self.target, self.normalised)))
 
+    def joined(self) -> 'Images':
+        """The points of all bodies as those of a single one."""
+        return Images(*(a.reshape(1, -1, *a.shape[2:]) for a in (self.whitening, self.target, self.normalised)))
 
-def fit(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> _Evaluation:
+    def residuals(self, T: FloatArray, points: FloatArray) -> FloatArray:
+        """Measured minus predicted (B, K, 2) in normalised coordinates, NaN behind the camera: see :func:`fit`."""
+        p = geometry.apply(T, points)
+        return np.asarray(self.normalised - p[..., :2] / np.where(p[..., 2:] > _NEAR, p[..., 2:], np.nan))
+
+
+def fit(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf, rivals: int = 1) -> _Evaluation:
     """Poses of bodies in the camera with the least squared errors, from starts ``T`` (B, 4, 4).
 
     Parameters
     ----------
     points : (B or 1, K, 3) [m] in their bodies
     inlier : Mahalanobis distance up to which errors are squared; beyond, their influence falls to nothing
+    rivals : so many starts in a row are of the same body, and matter only where they may be the best
 
     Returns
     -------
@@ -73,18 +84,20 @@ def fit(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.in
     and rotation in the camera frame.
     """
     possible: BoolArray = np.asarray(np.isfinite(T).all(axis=(-1, -2)))
-    T = np.where(possible[:, None, None], T, _AHEAD)
+    if not possible.all():
+        T = np.where(possible[:, None, None], T, _AHEAD)
     cost, gradient, information = evaluate(T, points, images, inlier)
     possible = possible & np.isfinite(cost)
-    information = np.where(possible[:, None, None], information, np.eye(6))
-    gradient = np.where(possible[:, None], gradient, 0.0)
+    if not possible.all():
+        information = np.where(possible[:, None, None], information, np.eye(6))
+        gradient = np.where(possible[:, None], gradient, 0.0)
     damping = np.full(len(T), 1e-6)
-    for _ in range(_MAX_STEPS):
-        step = -_solve(information, damping, gradient)
-        gain = -np.sum(step * gradient, axis=-1)
+    for steps in range(_MAX_STEPS):
+        step = _solve(information, damping, gradient)
+        gain = np.sum(step * gradient, axis=-1)
         last = gain < np.maximum(_LAST_GAIN, _LAST_SHARE * (cost - _REFUTED))
-        trial = _moved(T, step)
-        if np.all(last | (damping > _HOPELESS)):
+        trial = _moved(T, -step)
+        if np.all(last | (damping > _HOPELESS) | (_refuted(cost, rivals) & (steps > 0))):
             T = np.where(last[:, None, None], trial, T)
             break
         new = evaluate(trial, points, images, inlier)
@@ -98,6 +111,13 @@ def fit(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.in
             information = np.where(better[:, None, None], new[2], information)
         damping *= np.where(better, 0.1, 10.0)
     return T, np.where(possible, cost, np.inf), information
+
+
+def _refuted(cost: FloatArray, rivals: int) -> BoolArray:
+    """Which poses (B,) cost so much more than the best of their rivals that they cannot be theirs."""
+    groups = cost.reshape(-1, rivals)
+    best = groups.min(axis=1, keepdims=True)
+    return np.asarray((groups > _REFUTED + _TIMES_THE_BEST * best).ravel())
 
 
 def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> _Evaluation:
@@ -144,9 +164,15 @@ def covariances(information: FloatArray) -> FloatArray:
 
 
 def _moved(T: FloatArray, step: FloatArray) -> FloatArray:
-    """Poses (B, 4, 4) after steps (B, 6): translation added, rotation from the left."""
+    """Poses (B, 4, 4) after steps (B, 6): translation added, rotation from the left.
+
+    The rotation is that of Cayley's transform, which differs from the exponential in the third order only.
+    """
+    half = 0.5 * step[:, 3:]
+    K = (half @ _SKEW).reshape(-1, 3, 3)
     moved = T.copy()
-    moved[:, :3, :3] = geometry.so3_exp(step[:, 3:]) @ T[:, :3, :3]
+    turn = (2.0 / (1.0 + np.sum(half * half, axis=-1)))[:, None, None] * (K + K @ K)
+    moved[:, :3, :3] += turn @ T[:, :3, :3]
     moved[:, :3, 3] += step[:, :3]
     return moved
 
