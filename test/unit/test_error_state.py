@@ -145,6 +145,32 @@ def test_time_offset_and_extrinsics_columns(state):
         np.testing.assert_allclose(seen['y'], 1e-6 * seen['H'][:, LAYOUT.extrinsics][:, axis], atol=1e-11)
 
 
+def test_before_the_time_offset_is_estimated_the_covariance_counts_it(state):
+    """A state in the camera's clock is off by the motion in the offset, and goes on to be so when that is opened."""
+    filter_ = ErrorStateFilter(FULL)
+    known = replace(state, clock_open=False, covariance=1e-8 * np.eye(LAYOUT.size))
+    imu = np.array([0.5, -1.0, 0.7, 3.0, -1.0, 9.0])
+    P = filter_.in_clock_of_imu(known, imu).covariance
+    step = ImuStep(imu, 1e-6, 0.0, 0.0)
+    slide = difference(filter_.predict(known, step), known)[:9] / 1e-6
+    # 1e-3: the rest of the covariance, and the second order of the difference
+    np.testing.assert_allclose(P[:9, LAYOUT.time_offset], FULL.time_offset_std**2 * slide, rtol=1e-3)
+    np.testing.assert_allclose(P[:9, :9], FULL.time_offset_std**2 * np.outer(slide, slide), rtol=1e-2, atol=1e-7)
+    opened = replace(state, clock_open=True)
+    assert filter_.in_clock_of_imu(opened, imu) is opened
+
+
+def test_another_time_offset_moves_what_depends_on_it(state):
+    """The state's mean given the offset; as uncertain as before."""
+    filter_ = ErrorStateFilter(FULL)
+    moved = filter_.at_offset(state, 0.02)
+    column = state.covariance[:, LAYOUT.time_offset]
+    assert moved.time_offset == pytest.approx(0.02)
+    # 1e-9: rounding
+    np.testing.assert_allclose(difference(state, moved), 0.02 * column / column[LAYOUT.time_offset], atol=1e-9)
+    assert moved.covariance is state.covariance
+
+
 def test_alignment_column_of_tilt_bias_and_gravity(state):
     filter_ = ErrorStateFilter(FULL)
     seen = intercepted(filter_)

@@ -4,7 +4,7 @@ The belief at a sample is a function of the samples and poses up to it, ordered 
 they came: a pose that comes late goes where it belongs, and everything after it is computed again.
 """
 
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right, insort
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -14,7 +14,7 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.coasting import usable_seconds
-from thermal_fiducial.core.filter.gating import Belief, PoseGate, PoseUpdate, position_std, Track
+from thermal_fiducial.core.filter.gating import Belief, PoseGate, PoseUpdate, position_std, Sighting, Track
 from thermal_fiducial.core.filter.imu import ImuStep, NoiseMonitor
 from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
 from thermal_fiducial.core.filter.initialisation import WINDOW_SECONDS
@@ -29,6 +29,8 @@ _SECOND_NS = 1_000_000_000
 _LARGEST_OFFSET_NS = 200_000_000
 #: Poses whose mean normalised innovation squared is told.
 _NIS_POSES = 30
+#: The last seconds that are linearised anew when the time offset has become known [s].
+AGAIN_SECONDS = 2.0
 
 
 @dataclass(slots=True)
@@ -154,13 +156,13 @@ class PoseEkf:
 
     def _due_ns(self, belief: Belief, pose: CameraPose) -> int:
         """Instant of a pose in the clock of the IMU, as a belief sees it."""
-        estimated = belief.main.state.time_offset if belief.main else 0.0
+        estimated = belief.main.state.time_offset if belief.main else belief.time_offset
         return pose.stamp_ns + self._offset_ns + round(estimated * _SECOND_NS)
 
     def _first_node_after(self, pose: CameraPose) -> int:
         """First node with a belief that ``pose`` takes part in."""
         earliest = pose.stamp_ns + self._offset_ns - _LARGEST_OFFSET_NS
-        index = max(bisect_left(self._nodes, earliest, key=lambda node: node.stamp_ns), 1)
+        index = max(self._index_at(earliest), 1)
         while index < len(self._nodes):
             if self._due_ns(self._nodes[index - 1].belief, pose) <= self._nodes[index].stamp_ns:
                 break
@@ -168,11 +170,34 @@ class PoseEkf:
         return index
 
     def _advance(self, index: int) -> None:
-        """Compute the belief of node ``index`` from the node before, with the poses that fall in between."""
+        """Compute the belief of node ``index`` from the node before."""
+        belief = self._step(index, self._nodes[index - 1].belief, self._poses)
+        if self._gate.outgrown(belief):
+            belief = self._linearised_anew(index, belief)
+        self._nodes[index].belief = belief
+
+    def _linearised_anew(self, index: int, belief: Belief) -> Belief:
+        """``belief`` of node ``index``, its last seconds gone through again with the time offset that they have shown.
+
+        An offset that is wrong by tens of milliseconds is more than the filter's first order can bear: in a turn it
+        would leave errors in the biases that last.
+        """
+        assert belief.main
+        state = belief.main.state
+        first = self._index_at(self._nodes[index].stamp_ns - round(AGAIN_SECONDS * _SECOND_NS))
+        skipped_ns = self._nodes[first].stamp_ns - self._offset_ns - round(state.time_offset * _SECOND_NS)
+        again = self._gate.at_offset(self._nodes[first].belief, state.time_offset, skipped_ns)
+        # Those that were not due yet are for the nodes that follow, as they will be if they come late.
+        poses = self._poses[: _place_after(belief.pose_stamp_ns, self._poses)]
+        for i in range(first + 1, index + 1):
+            again = self._step(i, again, poses)
+        return self._gate.linearised(again if again.main else belief, self._gate.filter.time_offset_std(state))
+
+    def _step(self, index: int, belief: Belief, poses: list[CameraPose]) -> Belief:
+        """Belief at node ``index`` after ``belief`` at the node before, with those of ``poses`` in between."""
         before, node = self._nodes[index - 1], self._nodes[index]
-        belief, time_ns, imu = before.belief, before.stamp_ns, before.imu
-        place = bisect_left(self._poses, belief.pose_stamp_ns + 1, key=lambda item: item.stamp_ns)
-        for pose in self._poses[place:]:
+        time_ns, imu = before.stamp_ns, before.imu
+        for pose in poses[_place_after(belief.pose_stamp_ns, poses) :]:
             due_ns = self._due_ns(belief, pose)
             if due_ns > node.stamp_ns:
                 break
@@ -181,9 +206,9 @@ class PoseEkf:
             imu_there = before.imu + share * (node.imu - before.imu)
             belief = self._propagate(belief, (imu, imu_there), due_ns - time_ns, node.densities)
             time_ns, imu = due_ns, imu_there
-            belief, update = self._gate.weigh(belief, pose, due_ns, partial(self._window, index, imu))
+            belief, update = self._gate.weigh(belief, Sighting(pose, due_ns, partial(self._window, index, imu)))
             self._decide(update)
-        node.belief = self._propagate(belief, (imu, node.imu), node.stamp_ns - time_ns, node.densities)
+        return self._propagate(belief, (imu, node.imu), node.stamp_ns - time_ns, node.densities)
 
     def _propagate(
         self, belief: Belief, ends: tuple[FloatArray, FloatArray], nanoseconds: int, densities: tuple[float, float]
@@ -195,9 +220,12 @@ class PoseEkf:
 
     def _window(self, index: int, imu: FloatArray, seconds: float) -> FloatArray:
         """Samples (N, 6) of the last ``seconds`` before node ``index``, then ``imu``."""
-        begin = self._nodes[index].stamp_ns - round(seconds * _SECOND_NS)
-        first = bisect_left(self._nodes, begin, key=lambda node: node.stamp_ns)
+        first = self._index_at(self._nodes[index].stamp_ns - round(seconds * _SECOND_NS))
         return np.array([*(node.imu for node in self._nodes[first:index]), imu])
+
+    def _index_at(self, stamp_ns: int) -> int:
+        """First node at ``stamp_ns`` or later."""
+        return bisect_left(self._nodes, stamp_ns, key=lambda node: node.stamp_ns)
 
     def _decide(self, update: PoseUpdate) -> None:
         if update.stamp_ns not in self.decided:
@@ -207,12 +235,12 @@ class PoseEkf:
 
     def _prune(self) -> None:
         """Forget what no pose may reach any more; in blocks, as deleting from a list's head moves the rest."""
-        kept_ns = round((self._config.max_delay + WINDOW_SECONDS) * _SECOND_NS)
+        kept_ns = round((self._config.max_delay + AGAIN_SECONDS + WINDOW_SECONDS) * _SECOND_NS)
         horizon = self._nodes[-1].stamp_ns - kept_ns
         if self._nodes[len(self._nodes) // 2].stamp_ns >= horizon:
             return
-        del self._nodes[: bisect_left(self._nodes, horizon, key=lambda node: node.stamp_ns)]
-        stale = bisect_left(self._poses, self._nodes[0].belief.pose_stamp_ns + 1, key=lambda item: item.stamp_ns)
+        del self._nodes[: self._index_at(horizon)]
+        stale = _place_after(self._nodes[0].belief.pose_stamp_ns, self._poses)
         for pose in self._poses[:stale]:
             self.decided.pop(pose.stamp_ns, None)
         del self._poses[:stale]
@@ -222,7 +250,8 @@ class PoseEkf:
     def _output(self, node: _Node) -> Odometry | None:
         if node.belief.main is None:
             return None
-        return odometry(node.stamp_ns, node.belief.main.state, node.imu[:3], self._rate_variance(node))
+        state = self._gate.filter.in_clock_of_imu(node.belief.main.state, node.imu)
+        return odometry(node.stamp_ns, state, node.imu[:3], self._rate_variance(node))
 
     def _rate_variance(self, node: _Node) -> float:
         return node.densities[0] ** 2 * _SECOND_NS / (node.stamp_ns - self._nodes[-2].stamp_ns)
@@ -258,13 +287,6 @@ class PoseEkf:
     def _coasting(self, track: Track) -> float:
         return (self._nodes[-1].stamp_ns - track.accepted_ns) / _SECOND_NS
 
-    def _time_offset_std(self, state: NavigationState) -> float:
-        """Of the estimate; before it is begun, and where there is none, what the parameter says [s]."""
-        place = self._gate.layout.time_offset
-        if place is None or not state.clock_open:
-            return self._config.time_offset_std
-        return math.sqrt(state.covariance[place, place])
-
     @property
     def lost(self) -> bool:
         """Whether there is no pose, or none as good as ``lost_position_std`` asks."""
@@ -275,7 +297,7 @@ class PoseEkf:
         """Seconds [s] for which the pose stays as good as ``lost_position_std`` asks, if no marker comes any more."""
         if self.state is None:
             return 0.0
-        return usable_seconds(self.state, self._gate.layout, self._config.imu, self._config.lost_position_std)
+        return usable_seconds(self.state, self._gate.filter.layout, self._config.imu, self._config.lost_position_std)
 
     def _mean_nis(self) -> float:
         """Of the latest poses; 6 where their covariances are the truth, less where the parameters allow for more."""
@@ -301,9 +323,14 @@ class PoseEkf:
                 'position std': position_std(self.state),
                 'usable for': self.usable_for,
                 'time offset': self._config.camera_time_offset + self.state.time_offset,
-                'time offset std': self._time_offset_std(self.state),
+                'time offset std': self._gate.filter.time_offset_std(self.state),
                 'gyroscope bias': float(np.linalg.norm(self.state.bias[:3])),
                 'accelerometer bias': float(np.linalg.norm(self.state.bias[3:])),
                 'map tilt': math.asin(float(np.hypot(*self.state.gravity[:2])) / self._config.gravity),
             }
         return numbers
+
+
+def _place_after(stamp_ns: int, poses: list[CameraPose]) -> int:
+    """Index of the first pose that is later."""
+    return bisect_right(poses, stamp_ns, key=lambda pose: pose.stamp_ns)

@@ -1,6 +1,7 @@
 """Prediction and correction of one estimate. Covariances are filterpy's work, the state on the group is ours."""
 
 from dataclasses import dataclass, replace
+import math
 
 from filterpy.kalman import ExtendedKalmanFilter
 import numpy as np
@@ -142,21 +143,48 @@ class ErrorStateFilter:
         return noise
 
     def _open_clock(self, state: NavigationState, imu: FloatArray) -> NavigationState:
-        """Begin to estimate the time offset once the velocity is known.
-
-        Before, it would multiply an unknown velocity. Until then the state follows the clock of the camera, thus the
-        offset starts fully correlated with it: X(t + s) = X(t) Exp((rate, acceleration, velocity) s).
-        """
-        place = self.layout.time_offset
-        if place is None or state.clock_open or state.covariance[VELOCITY, VELOCITY].trace() > _KNOWN_VELOCITY**2:
+        """Begin to estimate the time offset once the velocity is known: before, it would multiply an unknown one."""
+        if state.clock_open or self.layout.time_offset is None:
             return state
+        if state.covariance[VELOCITY, VELOCITY].trace() > _KNOWN_VELOCITY**2:
+            return state
+        return replace(state, clock_open=True, covariance=self._slid_covariance(state, imu))
+
+    def _slid_covariance(self, state: NavigationState, imu: FloatArray) -> FloatArray:
+        """Covariance with the time offset in it, of a state that has followed the clock of the camera until now.
+
+        It is off by what moves in the meantime, fully correlated with the offset s:
+        X(t + s) = X(t) Exp((rate, acceleration, velocity) s).
+        """
         slide = np.zeros(self.layout.size)
         slide[ROTATION] = state.bias[:3] - imu[:3]
         slide[VELOCITY] = state.bias[3:] - imu[3:] - state.gravity @ state.R_map_body
         slide[POSITION] = -state.velocity_body
-        slide[place] = 1.0
-        covariance = state.covariance + self._config.time_offset_std**2 * np.outer(slide, slide)
-        return replace(state, clock_open=True, covariance=covariance)
+        slide[self.layout.time_offset] = 1.0
+        return np.asarray(state.covariance + self._config.time_offset_std**2 * np.outer(slide, slide))
+
+    def in_clock_of_imu(self, state: NavigationState, imu: FloatArray) -> NavigationState:
+        """``state`` with a covariance that counts the time offset even before that is estimated."""
+        if state.clock_open or self.layout.time_offset is None:
+            return state
+        covariance = self._slid_covariance(state, imu)
+        covariance[POSITION, POSITION] += self._config.time_offset_std**2 * state.covariance[VELOCITY, VELOCITY]
+        return replace(state, covariance=covariance)
+
+    def at_offset(self, state: NavigationState, time_offset: float) -> NavigationState:
+        """``state`` if the time offset were ``time_offset`` [s]: what depends on it moves along, nothing is learned."""
+        place = self.layout.time_offset
+        assert place is not None
+        column = state.covariance[:, place]
+        error = column / column[place] * (time_offset - state.time_offset)
+        return inject(state, error, state.covariance, self.layout)
+
+    def time_offset_std(self, state: NavigationState) -> float:
+        """Of the estimate; before it is begun, and where there is none, what the parameter says [s]."""
+        place = self.layout.time_offset
+        if place is None or not state.clock_open:
+            return self._config.time_offset_std
+        return math.sqrt(state.covariance[place, place])
 
     def align(self, state: NavigationState, force: FloatArray, std: float) -> tuple[NavigationState, float]:
         """State corrected by the specific force (3,) of a robot at rest, known to ``std`` [m/s^2]."""

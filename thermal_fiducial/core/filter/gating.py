@@ -7,7 +7,10 @@ same thing without a belief to replace.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 import math
+
+import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.error_state import ErrorStateFilter
@@ -21,6 +24,9 @@ _SECOND_NS = 1_000_000_000
 #: Seconds whose mean motion shows a clock error. The noise of one sample would count as motion that shows none, and it
 #: is in the predicted attitude too: in a slow, shaking flight the two together lead the time offset astray.
 _MOTION_SECONDS = 0.2
+#: Poses are linearised anew when the time offset has become known so many times better, and well enough when it is
+#: known to this [s]: half an angular acceleration of 5 rad/s^2 times its square is 0.01 mrad.
+_BETTER, _WELL_KNOWN = 2.0, 0.002
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +55,14 @@ class Track:
     #: instants of its first and of its last accepted pose, clock of the IMU
     started_ns: int
     accepted_ns: int
+    #: standard deviation of the time offset that its poses were linearised at [s]
+    linearised_std: float
     hits: int = 1
     misses: int = 0
 
     def supported(self, state: NavigationState, time_ns: int) -> 'Track':
         """The track after a pose that it accepts."""
-        return Track(state, self.started_ns, time_ns, self.hits + 1, self.misses)
+        return replace(self, state=state, accepted_ns=time_ns, hits=self.hits + 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +75,24 @@ class Belief:
     pose_stamp_ns: int = -(1 << 62)
     #: times that it started afresh
     resets: int = 0
+    #: time offset [s] that holds while there is no estimate
+    time_offset: float = 0.0
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A camera pose at its instant."""
+
+    pose: CameraPose
+    #: the instant in the clock of the IMU
+    time_ns: int
+    #: gives the IMU samples (N, 6) of so many seconds up to it
+    samples: Callable[[float], FloatArray]
+
+    @cached_property
+    def motion(self) -> FloatArray:
+        """(6,) rate and specific force that show a clock error."""
+        return np.asarray(self.samples(_MOTION_SECONDS).mean(axis=0))
 
 
 class PoseGate:
@@ -74,90 +100,97 @@ class PoseGate:
 
     def __init__(self, config: PoseEkfConfig) -> None:
         self._config = config
-        self._filter = ErrorStateFilter(config)
-        self.layout = self._filter.layout
-        self.blank = blank_state(config, self.layout)
+        self.filter = ErrorStateFilter(config)
+        self._blank = blank_state(config, self.filter.layout)
 
     def configure(self, config: PoseEkfConfig) -> None:
         """Take over the live parameters of ``config``."""
         self._config = config
-        self._filter.configure(config)
+        self.filter.configure(config)
 
     def predict(self, belief: Belief, step: ImuStep) -> Belief:
         """Belief after an inertial step."""
         if belief.main is None and belief.rival is None:
             return belief
         main, rival = self._moved(belief.main, step), self._moved(belief.rival, step)
-        return Belief(main, rival, belief.pose_stamp_ns, belief.resets)
+        return Belief(main, rival, belief.pose_stamp_ns, belief.resets, belief.time_offset)
 
     def _moved(self, track: Track | None, step: ImuStep) -> Track | None:
         if track is None:
             return None
-        state = self._filter.predict(track.state, step)
-        return Track(state, track.started_ns, track.accepted_ns, track.hits, track.misses)
+        state = self.filter.predict(track.state, step)
+        return Track(state, track.started_ns, track.accepted_ns, track.linearised_std, track.hits, track.misses)
 
     def in_moved_map(self, belief: Belief, T_new_old: FloatArray) -> Belief:
         """``belief`` in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
 
         def move(track: Track | None) -> Track | None:
-            return track and replace(track, state=in_moved_map(track.state, T_new_old, self._filter.layout))
+            return track and replace(track, state=in_moved_map(track.state, T_new_old, self.filter.layout))
 
         return replace(belief, main=move(belief.main), rival=move(belief.rival))
 
-    def weigh(
-        self, belief: Belief, pose: CameraPose, time_ns: int, window: Callable[[float], FloatArray]
-    ) -> tuple[Belief, PoseUpdate]:
-        """Belief after a pose.
-
-        Parameters
-        ----------
-        time_ns : its instant in the clock of the IMU
-        window : gives the samples (N, 6) of so many seconds up to that instant
-        """
-        imu = window(_MOTION_SECONDS).mean(axis=0)
-        main = belief.main
+    def weigh(self, belief: Belief, sighting: Sighting) -> tuple[Belief, PoseUpdate]:
+        """Belief after a pose."""
+        stamp_ns, time_ns, main = sighting.pose.stamp_ns, sighting.time_ns, belief.main
         if main and time_ns - main.accepted_ns > self._config.reinitialise_after * _SECOND_NS:
             main = None
         nis = math.nan
         if main:
-            state, nis = self._correct(main.state, pose, imu)
+            state, nis = self._correct(main.state, sighting)
             if nis <= self._config.gate:
-                accepted = Belief(main.supported(state, time_ns), None, pose.stamp_ns, belief.resets)
-                return accepted, PoseUpdate(pose.stamp_ns, True, '', nis)
-        rival = self._challenge(belief.rival, main, pose, time_ns, imu, window)
+                accepted = Belief(main.supported(state, time_ns), None, stamp_ns, belief.resets)
+                return accepted, PoseUpdate(stamp_ns, True, '', nis)
+        rival = self._challenge(belief, sighting)
         if rival and self._convincing(rival, main, time_ns):
             resets = belief.resets + (belief.main is not None)
             reason = 'started afresh' if belief.main else 'initialised'
-            return Belief(rival, None, pose.stamp_ns, resets), PoseUpdate(pose.stamp_ns, True, reason, nis, True)
+            return Belief(rival, None, stamp_ns, resets), PoseUpdate(stamp_ns, True, reason, nis, True)
         reason = f'refused: {math.sqrt(nis):.1f} sigma' if main else 'initialising'
         if rival is None:
             reason = 'refused: contradicts gravity'
-        refused = Belief(belief.main, rival, pose.stamp_ns, belief.resets)
-        return refused, PoseUpdate(pose.stamp_ns, False, reason, nis)
+        return replace(belief, rival=rival, pose_stamp_ns=stamp_ns), PoseUpdate(stamp_ns, False, reason, nis)
 
-    def _correct(self, state: NavigationState, pose: CameraPose, imu: FloatArray) -> tuple[NavigationState, float]:
-        return self._filter.correct(state, self._filter.body_pose(pose, state.T_body_camera), imu)
+    def _correct(self, state: NavigationState, sighting: Sighting) -> tuple[NavigationState, float]:
+        body = self.filter.body_pose(sighting.pose, state.T_body_camera)
+        return self.filter.correct(state, body, sighting.motion)
 
-    def _challenge(
-        self,
-        rival: Track | None,
-        main: Track | None,
-        pose: CameraPose,
-        time_ns: int,
-        imu: FloatArray,
-        window: Callable[[float], FloatArray],
-    ) -> Track | None:
+    def _challenge(self, belief: Belief, sighting: Sighting) -> Track | None:
         """The rival after a pose that the main estimate refused; one that fails too often gives way to the pose."""
+        rival, time_ns = belief.rival, sighting.time_ns
         if rival:
-            state, nis = self._correct(rival.state, pose, imu)
+            state, nis = self._correct(rival.state, sighting)
             if nis <= self._config.gate:
                 return rival.supported(state, time_ns)
             if rival.misses + 1 < rival.hits:
                 return replace(rival, misses=rival.misses + 1)
-        prior = main.state if main else self.blank
-        body = self._filter.body_pose(pose, prior.T_body_camera)
-        first = start(self._config, self._filter, body, prior, window(WINDOW_SECONDS))
-        return Track(first, time_ns, time_ns) if first else None
+        prior = belief.main.state if belief.main else replace(self._blank, time_offset=belief.time_offset)
+        body = self.filter.body_pose(sighting.pose, prior.T_body_camera)
+        first = start(self._config, self.filter, body, prior, sighting.samples(WINDOW_SECONDS))
+        return Track(first, time_ns, time_ns, self._config.time_offset_std) if first else None
+
+    def outgrown(self, belief: Belief) -> bool:
+        """Whether the time offset is known so much better by now that its poses should be linearised anew."""
+        main = belief.main
+        if main is None or not main.state.clock_open or main.linearised_std <= _WELL_KNOWN:
+            return False
+        return _BETTER * self.filter.time_offset_std(main.state) < main.linearised_std
+
+    def at_offset(self, belief: Belief, time_offset: float, skipped_ns: int) -> Belief:
+        """A past ``belief`` to go on from, as it would be for another ``time_offset`` [s].
+
+        What it knew of the offset stays as uncertain as it was, about another value: the poses that follow are what
+        told that value, and are not to count twice. Poses up to the stamp ``skipped_ns`` are left out.
+        """
+        seen_ns = max(belief.pose_stamp_ns, skipped_ns)
+        if belief.main is None or not belief.main.state.clock_open:
+            return Belief(None, None, seen_ns, belief.resets, time_offset)
+        state = self.filter.at_offset(belief.main.state, time_offset)
+        return Belief(replace(belief.main, state=state), None, seen_ns, belief.resets)
+
+    def linearised(self, belief: Belief, std: float) -> Belief:
+        """``belief``, marked as linearised at a time offset known to ``std`` [s]."""
+        assert belief.main
+        return replace(belief, main=replace(belief.main, linearised_std=std))
 
     def _convincing(self, rival: Track, main: Track | None, time_ns: int) -> bool:
         if rival.hits < self._config.initial_poses:
