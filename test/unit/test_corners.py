@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core import geometry
+from thermal_fiducial.core.adjustment.edges import edges_behind
 from thermal_fiducial.core.camera import Camera, ImagePoints
-from thermal_fiducial.core.corners import grid_pattern, refine_corners
+from thermal_fiducial.core.corners import refine_corners
 from thermal_fiducial.core.pose import marker_corners
 from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -18,7 +19,7 @@ CAMERAS = {
     'equidistant': Camera(640, 512, K, 'equidistant', [-0.12, -0.016, 0.0055, 0.0019]),
 }
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))
-PATTERN = grid_pattern(BITS)
+BEHIND = edges_behind(BITS)
 SAMPLES = 8
 BLUR = 0.6
 # Optics, and the pixel's own square over which the drawing averages.
@@ -56,8 +57,7 @@ def refine(image, corners, camera, marker_id, **options):
         image.astype(np.float32),
         ImagePoints.at(corners[None], camera),
         camera,
-        PATTERN.before[ids],
-        PATTERN.step[ids],
+        BEHIND[ids],
         BLUR_WITH_PIXEL,
         **options,
     )
@@ -149,9 +149,7 @@ def test_markers_do_not_disturb_each_other():
     image = np.minimum(*images).astype(np.float32)
     ids = [marker_id for marker_id, _ in scenes]
     start = np.stack(corners) + 0.3
-    both = refine_corners(
-        image, ImagePoints.at(start, camera), camera, PATTERN.before[ids], PATTERN.step[ids], BLUR_WITH_PIXEL
-    )
+    both = refine_corners(image, ImagePoints.at(start, camera), camera, BEHIND[ids], BLUR_WITH_PIXEL)
     for index, marker_id in enumerate(ids):
         alone = refine(image, start[index], camera, marker_id)
         np.testing.assert_allclose(both.corners_px[index], alone.corners_px[0], atol=1e-6)

@@ -168,7 +168,8 @@ def test_prediction_decides_between_the_branches_of_a_lone_marker():
     other = solve_marker_poses(corners, covs, np.array([0.3]), camera).T_camera_marker[0, 1]
     for expected in (T, other):
         found = solve_camera_pose(corners, covs, squares, camera, initial=geometry.inverse(expected))
-        np.testing.assert_allclose(found.T_map_camera, geometry.inverse(expected), atol=1e-5)
+        # The branches lie half a radian and a metre apart; the worse one is known to a tenth of its deviation.
+        np.testing.assert_allclose(found.T_map_camera, geometry.inverse(expected), atol=1e-3)
 
 
 def test_no_markers():

@@ -9,8 +9,9 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core import geometry
+from thermal_fiducial.core.adjustment.edges import edges_behind
 from thermal_fiducial.core.camera import Camera, ImagePoints
-from thermal_fiducial.core.corners import grid_pattern, refine_corners, RefinedCorners
+from thermal_fiducial.core.corners import refine_corners, RefinedCorners
 from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers, Odometry
 from thermal_fiducial.core.pose import choose_branches, ippe_square, marker_corners, planar_poses
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
@@ -90,7 +91,7 @@ class MarkerDetector:
         self._sizes = size_overrides(config.marker_size_overrides)
         bits = marker_bits(dictionary)
         self._decoder = Decoder(bits, int(dictionary.maxCorrectionBits))
-        self._pattern = grid_pattern(bits)
+        self._behind = edges_behind(bits)
         self._T_body_camera = geometry.transform(
             geometry.rotation_from_quaternion(config.camera_orientation), config.camera_position
         )
@@ -257,7 +258,7 @@ class MarkerDetector:
         if len(ids) == 0:
             self._motion.remember(frame.stamp_ns, predicted, Tracked.none())
             return ids, refined
-        before, step = self._pattern.before[ids], self._pattern.step[ids]
+        behind = self._behind[ids]
         if len(tracked.ids) == len(ids) and self._since_blind > 0:
             at_stamp, depth = ImagePoints.seen_at(tracked.x, camera), tracked.depth
         else:
@@ -275,7 +276,7 @@ class MarkerDetector:
             view = _view(frame.image, at_stamp.px, smeared, sharpen)
             start = at_stamp.moved(view.shift, camera)
             seen = refine_corners(
-                view.image, start, camera, before, step, self.config.blur_px, view.spread, columns, near=near
+                view.image, start, camera, behind, self.config.blur_px, view.spread, columns, near=near
             )
             refined, at_stamp = seen, start.moved(seen.corners_px - start.px - view.shift, camera)
             deviation = np.sqrt(0.5 * np.trace(seen.covariances, axis1=-2, axis2=-1).mean(axis=-1)) / camera.focal_px

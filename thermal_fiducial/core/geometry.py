@@ -181,3 +181,23 @@ def transform_from_quaternion(position: npt.ArrayLike, q_xyzw: npt.ArrayLike) ->
 def rotation_angle(R: npt.ArrayLike) -> FloatArray:
     """Angle (...) [rad] of rotation matrices (..., 3, 3)."""
     return np.asarray(np.linalg.norm(so3_log(R), axis=-1))
+
+
+def in_quadrilaterals(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
+    """Points (2, Q, P) at shares a, b, (P,) or (Q, P), of plane quadrilaterals (Q, 4, 2).
+
+    The projective map of the unit square (P. Heckbert, "Fundamentals of texture mapping and image warping", 1989,
+    section 2.2.3): a from the first corner to the second, b from the first to the fourth.
+    """
+    d1, d2, d3 = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2], c[:, 0] - c[:, 1] + c[:, 2] - c[:, 3]
+    determinant = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+    determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
+    H = np.ones((3, len(c), 3))
+    H[2, :, 0] = g = (d3[:, 0] * d2[:, 1] - d3[:, 1] * d2[:, 0]) / determinant
+    H[2, :, 1] = h = (d1[:, 0] * d3[:, 1] - d1[:, 1] * d3[:, 0]) / determinant
+    H[:2, :, 0] = (c[:, 1] - c[:, 0] + g[:, None] * c[:, 1]).T
+    H[:2, :, 1] = (c[:, 3] - c[:, 0] + h[:, None] * c[:, 3]).T
+    H[:2, :, 2] = c[:, 0].T
+    shares = np.stack([a, b, np.ones_like(a)], axis=-2)
+    u, v, depth = H @ shares if a.ndim == 1 else (H[:, :, None] @ shares)[:, :, 0]
+    return np.asarray((u / depth, v / depth))

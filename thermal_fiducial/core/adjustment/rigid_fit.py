@@ -14,10 +14,10 @@ from thermal_fiducial.core.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
 _MAX_STEPS = 20
-# Costs are chi-squares: a step that lowers one by less is a ten-thousandth of a standard deviation, and the last. Of a
-# pose that the image refutes anyway a share of the cost is enough, lest all wait for it to creep along its valley; and
-# none waits for one that costs so many times more than its best rival.
-_LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-8, 50.0, 1e-2, 10.0
+# Costs are chi-squares: a step that lowers one by less is a thousandth of a standard deviation, and the last. Of a pose
+# that the image refutes anyway a share of the cost is enough, lest it creep along its valley; of one that is worse than
+# a rival, a share of what it is worse by. One that costs so many times more even after a step is given up.
+_LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-6, 50.0, 1e-2, 10.0
 # Damping at which Levenberg-Marquardt finds no better pose at all.
 _HOPELESS = 1e6
 # Depth [m] from which a point is in front of the camera.
@@ -92,32 +92,26 @@ def fit(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.in
         information = np.where(possible[:, None, None], information, np.eye(6))
         gradient = np.where(possible[:, None], gradient, 0.0)
     damping = np.full(len(T), 1e-6)
+    active = possible
     for steps in range(_MAX_STEPS):
         step = _solve(information, damping, gradient)
         gain = np.sum(step * gradient, axis=-1)
-        last = gain < np.maximum(_LAST_GAIN, _LAST_SHARE * (cost - _REFUTED))
+        best = np.repeat(cost.reshape(-1, rivals).min(axis=1), rivals)
+        last = gain < np.maximum(_LAST_GAIN, _LAST_SHARE * (cost - np.minimum(best, _REFUTED)))
+        given_up = (damping > _HOPELESS) | ((cost > _REFUTED + _TIMES_THE_BEST * best) & (steps > 0))
         trial = _moved(T, -step)
-        if np.all(last | (damping > _HOPELESS) | (_refuted(cost, rivals) & (steps > 0))):
-            T = np.where(last[:, None, None], trial, T)
+        T = np.where((active & last & ~given_up)[:, None, None], trial, T)
+        active = active & ~last & ~given_up
+        if not active.any():
             break
         new = evaluate(trial, points, images, inlier)
-        better = new[0] <= cost
-        if better.all():
-            T, (cost, gradient, information) = trial, new
-        else:
-            T = np.where(better[:, None, None], trial, T)
-            cost = np.where(better, new[0], cost)
-            gradient = np.where(better[:, None], new[1], gradient)
-            information = np.where(better[:, None, None], new[2], information)
+        better = active & (new[0] <= cost)
+        T = np.where(better[:, None, None], trial, T)
+        cost = np.where(better, new[0], cost)
+        gradient = np.where(better[:, None], new[1], gradient)
+        information = np.where(better[:, None, None], new[2], information)
         damping *= np.where(better, 0.1, 10.0)
     return T, np.where(possible, cost, np.inf), information
-
-
-def _refuted(cost: FloatArray, rivals: int) -> BoolArray:
-    """Which poses (B,) cost so much more than the best of their rivals that they cannot be theirs."""
-    groups = cost.reshape(-1, rivals)
-    best = groups.min(axis=1, keepdims=True)
-    return np.asarray((groups > _REFUTED + _TIMES_THE_BEST * best).ravel())
 
 
 def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> _Evaluation:

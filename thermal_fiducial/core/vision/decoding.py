@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from thermal_fiducial.core.geometry import in_quadrilaterals
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # How far off a side black and white are compared: in cells, and at most in pixels.
@@ -150,26 +151,12 @@ class Decoder:
 def shrunk(quads: FloatArray, cells: int) -> FloatArray:
     """The markers (Q, 4, 2) in plates (Q, 4, 2) that surround them with a white margin of one cell."""
     low, high = 1.0 / (cells + 2), (cells + 1.0) / (cells + 2)
-    return np.moveaxis(_inside(quads, np.array([low, high, high, low]), np.array([low, low, high, high])), 0, -1)
+    return np.moveaxis(
+        in_quadrilaterals(quads, np.array([low, high, high, low]), np.array([low, low, high, high])), 0, -1
+    )
 
 
 def sampled(image: Float32Array, quads: FloatArray, a: FloatArray, b: FloatArray) -> Float32Array:
     """Values (Q, P) of the image at shares a, b of quadrilaterals."""
-    u, v = _inside(quads, a, b).astype(np.float32)
+    u, v = in_quadrilaterals(quads, a, b).astype(np.float32)
     return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
-
-
-def _inside(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Columns and rows (2, Q, P) at shares a, b (P,) or (Q, P) of quadrilaterals (Q, 4, 2): the unit square's map."""
-    d1, d2, d3 = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2], c[:, 0] - c[:, 1] + c[:, 2] - c[:, 3]
-    determinant = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-    H = np.ones((3, len(c), 3))
-    H[2, :, 0] = g = (d3[:, 0] * d2[:, 1] - d3[:, 1] * d2[:, 0]) / determinant
-    H[2, :, 1] = h = (d1[:, 0] * d3[:, 1] - d1[:, 1] * d3[:, 0]) / determinant
-    H[:2, :, 0] = (c[:, 1] - c[:, 0] + g[:, None] * c[:, 1]).T
-    H[:2, :, 1] = (c[:, 3] - c[:, 0] + h[:, None] * c[:, 3]).T
-    H[:2, :, 2] = c[:, 0].T
-    shares = np.stack([a, b, np.ones_like(a)], axis=-2)
-    u, v, depth = H @ shares if a.ndim == 1 else (H[:, :, None] @ shares)[:, :, 0]
-    return np.asarray((u / depth, v / depth))

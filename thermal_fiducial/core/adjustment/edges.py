@@ -1,0 +1,106 @@
+"""Model of the pixels across a marker's side: a blurred step from white to black, and the nearest edges behind it."""
+
+import numpy as np
+
+from thermal_fiducial.core.adjustment.sides import Sides
+from thermal_fiducial.core.types import Float32Array, FloatArray, Gray
+
+#: Neighbouring edges that the model knows: so many cells behind the side.
+NEIGHBOURS = (1, 2)
+# Cells narrower than this many blurs show their neighbours' edges in every profile.
+_NARROW = 5.0
+# Approximation of the normal distribution by a hyperbolic tangent, good to 2e-4 (E. Page, "Approximations to the
+# cumulative normal function and its inverse for use on a pocket calculator", 1977).
+_LINEAR, _CUBIC = 0.7988, 0.7988 * 0.04417
+# Share of the side that a column must see: beyond its ends there is none.
+_MOSTLY = 0.7
+
+
+def edges_behind(bits: Gray) -> Float32Array:
+    """Change of value, 0 black and 1 white, across the edges behind the sides of markers with ``bits`` (M, n, n).
+
+    Returns
+    -------
+    (M, 4, m, 2) for the sides of :mod:`sides`, the m = n + 2 cells along each, and edges one and two cells inward.
+    """
+    grid = np.pad(bits.astype(np.float32), ((0, 0), (1, 1), (1, 1)))
+    turned = np.swapaxes(grid, 1, 2)
+    inward = np.stack([grid, grid[:, ::-1], turned, turned[:, ::-1]], axis=1)
+    return np.ascontiguousarray(np.moveaxis(np.diff(inward[:, :, : len(NEIGHBOURS) + 1], axis=2), 2, 3))
+
+
+def blurs(normal: FloatArray, optics: float, smear: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Blur (E,) across and along sides with normals (E, 2), of markers with smear (N, 2) [px]."""
+    vector = np.repeat(smear, len(normal) // len(smear), axis=0)
+    across = np.sum(vector * normal, axis=1)
+    along = vector[:, 1] * normal[:, 0] - vector[:, 0] * normal[:, 1]
+    return np.hypot(optics, across), np.hypot(optics, along)
+
+
+def model(
+    sides: Sides, behind: Float32Array, blur: tuple[FloatArray, FloatArray]
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """White's share of every pixel but for a constant, its derivative by distance, and the pixel's weight, (E, K, M).
+
+    Parameters
+    ----------
+    behind : (N, 4, m, 2) of :func:`edges_behind`
+    blur : (E,) across and along the sides
+    """
+    cells = behind.shape[2]
+    cell = sides.across / cells
+    own = _seen_along(sides, blur[1])
+    value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32)[:, None, None])
+    value *= -own[..., None]
+    slope *= -own[..., None]
+    narrow = cell < _NARROW * blur[0]
+    if narrow.any():
+        _add_neighbours(value, slope, sides, np.flatnonzero(narrow), behind.reshape(-1, cells, len(NEIGHBOURS)), blur)
+    reach = np.where(narrow, 1.6 * cell, cell - 2.0 * blur[0])
+    quiet = np.minimum(reach, np.maximum(cell - blur[0], 2.5))
+    weight = (sides.distance >= -quiet[:, None, None]) & (sides.distance <= reach[:, None, None])
+    weight &= (sides.fresh & (own > _MOSTLY))[..., None]
+    if sides.inside is not None:
+        weight &= sides.inside
+    return value, slope, weight.astype(np.float32)
+
+
+def blurred_step(distance: Float32Array, sharpness: Float32Array) -> tuple[Float32Array, Float32Array]:
+    """A step from 0 to 1 at zero, and its derivative, blurred by a Gaussian; ``sharpness`` is its inverse width."""
+    z = distance * sharpness
+    square = z * z
+    bent = np.tanh(z * (square * _CUBIC + _LINEAR))
+    slope = (1.0 - bent * bent) * (square * (1.5 * _CUBIC) + 0.5 * _LINEAR) * sharpness
+    bent *= 0.5
+    bent += 0.5
+    return bent, slope
+
+
+def _seen_along(sides: Sides, blur_along: FloatArray) -> Float32Array:
+    """How much of its side a column (E, K) sees, blurred along it: less than 1 near its ends."""
+    length = (sides.along / blur_along).astype(np.float32)[:, None]
+    t = sides.t.astype(np.float32)
+    z = np.stack([t, 1.0 - t]) * length
+    ends = np.tanh(z * (z * z * _CUBIC + _LINEAR))
+    return np.asarray(0.5 * (ends[0] + ends[1]))
+
+
+def _add_neighbours(
+    value: Float32Array,
+    slope: Float32Array,
+    sides: Sides,
+    which: np.ndarray,
+    behind: Float32Array,
+    blur: tuple[FloatArray, FloatArray],
+) -> None:
+    """Add to the model of the sides ``which`` what the edges ``behind`` (E, m, 2) contribute, blurred along."""
+    cells = behind.shape[1]
+    z = (sides.t[which, :, None] * cells - np.arange(cells + 1)) * (sides.along / (cells * blur[1]))[which, None, None]
+    step = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR))
+    amounts = (step[..., :-1] - step[..., 1:]).astype(np.float32) @ behind[which]
+    width = (sides.across / cells)[which, None, None].astype(np.float32)
+    sharpness = (1.0 / blur[0])[which, None, None].astype(np.float32)
+    for index, number in enumerate(NEIGHBOURS):
+        share, rise = blurred_step(sides.distance[which] - number * width, sharpness)
+        value[which] += amounts[..., index : index + 1] * share
+        slope[which] += amounts[..., index : index + 1] * rise

@@ -1,0 +1,189 @@
+"""Displacements of a marker's sides, segment by segment, and of the corners that explain them.
+
+One segment, a bit long, measures how far its side is off with a level and a contrast of its own and a variance from its
+own residuals; a robust adjustment of the four corners to all segments of the marker follows. Clutter, dead pixels and
+hidden stretches cost the segments that they touch.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from thermal_fiducial.core.adjustment.sides import ENDS, Sides, STARTS
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
+
+#: Variance of a segment that measures nothing.
+HOPELESS = 1e6
+# Weight of a pixel or segment falls off beyond this many standard deviations.
+_PIXEL_OUTLIER = 4.5
+_SEGMENT_OUTLIER = 2.5
+# Variance of a standard normal variable of which no more than that is kept.
+_KEPT_VARIANCE = 0.911
+# Standard deviation of a corner that no image noise explains: the optics' blur is not quite a Gaussian [px].
+_FLOOR = 0.010**2 * np.eye(2)
+# Contrast of a segment over that of the marker: less is hidden, more is the edge of something else; and by how much the
+# contrast of a plate varies.
+_LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
+_SIDES = np.arange(4)
+
+
+class Segments(NamedTuple):
+    """What the S segments of each of N markers measured, (N, S) each."""
+
+    #: displacement of their sides along the normals, inward [px]
+    shift: FloatArray
+    #: its variance [px^2]
+    variance: FloatArray
+    contrast: FloatArray
+    #: variance of a pixel about the model
+    noise: FloatArray
+
+
+class _Fit(NamedTuple):
+    """Least squares of segments (...) over level, contrast and contrast times displacement."""
+
+    contrast: FloatArray
+    #: contrast times displacement
+    product: FloatArray
+    #: their variances for noise of 1
+    contrast_variance: FloatArray
+    product_variance: FloatArray
+    level: FloatArray
+    #: sum of squared residuals, and number of pixels
+    square: FloatArray
+    number: FloatArray
+
+
+def measure(
+    image: Float32Array,
+    sides: Sides,
+    modelled: tuple[Float32Array, Float32Array, Float32Array],
+    cells: int,
+    reach: FloatArray,
+) -> Segments:
+    """Displacement of each segment, one of ``cells`` on a side.
+
+    Parameters
+    ----------
+    modelled : value, derivative and weight of each pixel, of :func:`thermal_fiducial.core.adjustment.edges.model`
+    reach : (E,) longest displacement for which the model can be linearised [px]
+    """
+    value, slope, weight = modelled
+    count = value.shape[0] * cells
+    weight = weight.reshape(count, -1)
+    X = np.empty((count, 4, weight.shape[1]), dtype=np.float32)
+    counts = image.ravel().take(sides.pixel, mode='clip').reshape(weight.shape)
+    X[:, 0], X[:, 1], X[:, 2] = 1.0, value.reshape(weight.shape), slope.reshape(weight.shape)
+    np.subtract(counts, counts[:, weight.shape[1] // 2, None], out=X[:, 3])
+    fit = _fit(X, weight)
+    shape = (-1, 4 * cells)
+    noise = _noise(fit, shape)
+    residual = np.abs(_residuals(fit, X)) * weight
+    outlier = residual > (_PIXEL_OUTLIER * np.sqrt(noise)).astype(np.float32).reshape(-1, 1)
+    touched = np.flatnonzero(outlier.any(axis=1))
+    if len(touched):
+        for all_of, again in zip(fit, _fit(X[touched], weight[touched] * ~outlier[touched]), strict=True):
+            all_of[touched] = again
+        noise = _noise(fit, shape)
+    return _judged(fit, noise, np.repeat(reach, cells).reshape(shape))
+
+
+def _fit(X: Float32Array, weight: Float32Array) -> _Fit:
+    """Least squares of the last of four columns X (segments, 4, pixels) on the others: (1, model, derivative)."""
+    sums = ((X * weight[:, None]) @ np.swapaxes(X, 1, 2)).astype(np.float64)
+    number = sums[:, 0, 0].copy()
+    safe = np.maximum(number, 1.0)
+    mean = sums[:, 0] / safe[:, None]
+    # Without their means the columns leave two unknowns.
+    about = np.moveaxis(sums[:, 1:, 1:] - sums[:, 1:, :1] * mean[:, None, 1:], 0, -1)
+    ridge = 1e-6 * number + 1e-6
+    a, b, c, p, q = about[0, 0] + ridge, about[0, 1], about[1, 1] + ridge, about[0, 2], about[1, 2]
+    determinant = a * c - b * b
+    a, b, c = a / determinant, b / determinant, c / determinant
+    contrast, product = c * p - b * q, a * q - b * p
+    square = np.maximum(about[2, 2] - contrast * p - product * q, 0.0)
+    level = mean[:, 3] - contrast * mean[:, 1] - product * mean[:, 2]
+    return _Fit(contrast, product, c, a, level, square, number)
+
+
+def _residuals(fit: _Fit, X: Float32Array) -> Float32Array:
+    """What the model leaves of the pixels (segments, pixels)."""
+    level, contrast, product = (a.astype(np.float32)[:, None] for a in (fit.level, fit.contrast, fit.product))
+    return np.asarray(X[:, 3] - X[:, 1] * contrast - X[:, 2] * product - level)
+
+
+def _noise(fit: _Fit, shape: tuple[int, int]) -> FloatArray:
+    """Variances of pixels (N, S): of a marker's typical segment, or a segment's own where that is much larger."""
+    free = fit.number.reshape(shape) - 3.0
+    own = fit.square.reshape(shape) / np.maximum(free, 1.0)
+    typical = _median_where(own, free > 1.5)
+    return np.where(own > 2.5 * typical, own, typical) + 1e-3
+
+
+def _judged(fit: _Fit, noise: FloatArray, reach: FloatArray) -> Segments:
+    """Which segments measure anything, within their reach (N, S)."""
+    contrast, product, number, own, unit = (
+        a.reshape(reach.shape)
+        for a in (fit.contrast, fit.product, fit.number, fit.contrast_variance, fit.product_variance)
+    )
+    usable = number > 4.5
+    typical = _median_where(contrast, usable)
+    own = noise * own
+    scale = np.sign(typical) / np.maximum(np.abs(typical), 1e-6)
+    relative, unsure = contrast * scale, 2.0 * np.sqrt(own) * np.abs(scale)
+    usable &= (relative > _LEAST_CONTRAST - unsure) & (relative < _MOST_CONTRAST + unsure)
+    # A faint segment hardly tells its contrast, by which its displacement is divided: the others tell it better.
+    others = (_CONTRAST_VARIES * typical) ** 2 + 1e-9
+    safe = np.where(usable, (contrast * others + typical * own) / (others + own), 1.0)
+    shift = np.where(usable, np.minimum(np.maximum(-product / safe, -reach), reach), 0.0)
+    return Segments(shift, np.where(usable, noise * unit / (safe * safe), HOPELESS), contrast, noise)
+
+
+def _median_where(values: FloatArray, good: BoolArray) -> FloatArray:
+    """Medians (N, 1) of the good ones of values (N, S), 0 where there is none."""
+    order = np.sort(np.where(good, values, np.inf), axis=1)
+    middle = np.maximum(np.count_nonzero(good, axis=1) - 1, 0) // 2
+    median = order[np.arange(len(order)), middle][:, None]
+    return np.where(np.isfinite(median), median, 0.0)
+
+
+def adjust(sides: Sides, segments: Segments, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """How corners move (N, 4, 2) to explain the shifts of all segments, and their covariances (N, 4, 2, 2).
+
+    Parameters
+    ----------
+    prior : (8, 8) information on the eight numbers beforehand
+    """
+    used = segments.variance < HOPELESS
+    deviation = np.sqrt(segments.variance)
+    A = _design(sides, deviation.shape) / deviation[..., None]
+    shift = segments.shift / deviation
+    robust = np.ones_like(deviation)
+    for _ in range(3):
+        weighted = np.swapaxes(A * robust[..., None], 1, 2)
+        covariance = np.linalg.inv(weighted @ A + prior)
+        moved = covariance @ (weighted @ shift[..., None])
+        left = np.abs(shift - (A @ moved)[..., 0])
+        scale = np.maximum(1.4826 * _median_where(left, used), 1.0)
+        robust = 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
+    kept = used & (robust > 0.99)
+    chi2 = np.sum(left * left * kept, axis=1) / _KEPT_VARIANCE
+    free = np.maximum(np.count_nonzero(kept, axis=1) - 8.0, 0.0)
+    # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
+    covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None]
+    blocks = np.einsum('nikil->nikl', covariance.reshape(-1, 4, 2, 4, 2))
+    return moved.reshape(-1, 4, 2), blocks + _FLOOR
+
+
+def _design(sides: Sides, shape: tuple[int, ...]) -> FloatArray:
+    """Derivative (N, S, 8) of the segments' displacements along their normals by the corners'."""
+    cells = shape[1] // 4
+    fresh = sides.fresh.reshape(len(sides.t), cells, -1)
+    t = np.sum(sides.t.reshape(fresh.shape) * fresh, axis=-1) / np.maximum(np.count_nonzero(fresh, axis=-1), 1)
+    normal = sides.normal.reshape(*fresh.shape, 2)[:, :, fresh.shape[-1] // 2].reshape(-1, 4, cells, 2)
+    by_end = t.reshape(-1, 4, cells, 1) * normal
+    A = np.zeros((len(normal), 4, cells, 4, 2))
+    # Separated by a slice, the two indices come first.
+    A[:, _SIDES, :, STARTS] = np.swapaxes(normal - by_end, 0, 1)
+    A[:, _SIDES, :, ENDS] = np.swapaxes(by_end, 0, 1)
+    return A.reshape(-1, 4 * cells, 8)
