@@ -4,9 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.scenes import camera_of
 
-from thermal_fiducial.calibration.camera_imu import _first_state, _imu_errors, _Problem, calibrate_camera_imu
+from thermal_fiducial.calibration.batch import first_state, imu_errors, Problem
+from thermal_fiducial.calibration.camera_imu import calibrate_camera_imu, calibrate_rolling_camera_imu
 from thermal_fiducial.calibration.preintegration import ImuTrack, preintegrate
+from thermal_fiducial.calibration.rolling import FrameCorners
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.measurements import CameraPose
@@ -37,6 +40,44 @@ def recording(scenario, seconds, seed, sigma_m=0.002, sigma_rad=0.0006):
     poses = [CameraPose(flight.stamp_ns(k), pose, covariance) for k, pose in enumerate(T)]
     imu = ImuTrack((record.stamps_ns - START_NS) * 1e-9, record.angular_velocity, record.linear_acceleration)
     return poses, imu
+
+
+def rolling_recording(scenario, seconds, seed, readout, sigma_px):
+    """Corners as they are when their own rows are read out, and IMU samples."""
+    flight, lens, markers = plan(scenario, seconds, seed), scenario.lens, scenario.markers
+    trajectory, rng = scenario.trajectory(seconds, seed), np.random.default_rng([seed, 78])
+    points = np.stack([marker.corners_map for marker in markers]).reshape(-1, 3)
+    normals = np.repeat([marker.T_map_marker[:3, 2] for marker in markers], 4, axis=0)
+    times = np.array([flight.frame_time(k) for k in range(flight.frame_count)])
+    pixels = np.full((len(times), len(points), 2), lens.height / 2)
+    for _ in range(5):
+        delays = readout * (pixels[..., 1].clip(0, lens.height) / (lens.height - 1) - 0.5)
+        T = trajectory((times[:, None] + delays).ravel()).T_map_body @ scenario.T_body_camera
+        T = T.reshape(*delays.shape, 4, 4)
+        away = points - T[..., :3, 3]
+        local = (np.swapaxes(T[..., :3, :3], -1, -2) @ away[..., None])[..., 0]
+        pixels = lens.project(np.where(local[..., 2:] > 0.3, local, [9.0, 9.0, 1.0]))
+    visible = (local[..., 2] > 0.3) & (np.sum(away * normals, axis=-1) < 0)
+    visible &= np.all((pixels > 5) & (pixels < [lens.width - 5, lens.height - 5]), axis=-1)
+    visible &= np.linalg.norm(local[..., :2], axis=-1) < local[..., 2]
+    pixels = (pixels + rng.normal(0.0, sigma_px, pixels.shape)).reshape(len(times), -1, 4, 2)
+    visible = visible.reshape(len(times), -1, 4).all(axis=-1)
+    covariance = max(sigma_px, 0.01) ** 2 * np.eye(2)
+    T_map_marker, sizes = np.stack([m.T_map_marker for m in markers]), np.array([m.size for m in markers])
+    frames = [
+        FrameCorners(
+            flight.stamp_ns(k),
+            pixels[k, seen],
+            np.tile(covariance, (seen.sum(), 4, 1, 1)),
+            T_map_marker[seen],
+            sizes[seen],
+        )
+        for k, seen in enumerate(visible)
+        if seen.any()
+    ]
+    record = simulate_imu(scenario, seconds, seed)
+    imu = ImuTrack((record.stamps_ns - START_NS) * 1e-9, record.angular_velocity, record.linear_acceleration)
+    return frames, camera_of(scenario), imu
 
 
 def error_of(result, scenario):
@@ -87,16 +128,16 @@ def test_derivatives_of_the_batch_against_differences():
     stamps = np.array([(pose.stamp_ns - START_NS) * 1e-9 for pose in chosen])
     measured = np.stack([pose.T_map_camera for pose in chosen])
     root = np.tile(np.eye(6), (len(chosen), 1, 1))
-    problem = _Problem(stamps, measured, root, imu, ImuNoise())
-    state = _first_state(stamps, measured, imu, GRAVITY)
+    problem = Problem(stamps, measured, root, imu, ImuNoise())
+    state = first_state(stamps, measured, imu, GRAVITY)
     state = replace(state, p_body_camera=np.array([0.1, 0.0, -0.05]))
     increments = preintegrate(imu, stamps + state.offset, state.bias[:-1], ImuNoise())
     _, pose_own, pose_shared = problem._pose_errors(state)
-    _, first, second, imu_shared = _imu_errors(state, increments, ImuNoise())
+    _, first, second, imu_shared = imu_errors(state, increments, ImuNoise())
     count, h = len(chosen), 1e-6
 
     def both(moved):
-        return problem._pose_errors(moved)[0], _imu_errors(moved, increments, ImuNoise())[0]
+        return problem._pose_errors(moved)[0], imu_errors(moved, increments, ImuNoise())[0]
 
     def derivative(own, shared):
         ahead, behind = (both(problem._moved(state, sign * own, sign * shared)) for sign in (1.0, -1.0))
@@ -105,14 +146,14 @@ def test_derivatives_of_the_batch_against_differences():
     for column in range(15):
         own = np.zeros((count, 15))
         own[:, column] = h
-        by_pose, by_imu = derivative(own, np.zeros(9))
+        by_pose, by_imu = derivative(own, np.zeros(10))
         # Rotation errors of noisy poses are up to 0.01 rad: their right and left derivatives differ by half of that.
         assert by_pose == pytest.approx(pose_own[:, :, column], abs=2e-2)
         if column < 9:
             expected = first[:, :, column] + second[:, :, column]
             assert by_imu == pytest.approx(expected, rel=1e-3, abs=1e-3 * np.abs(expected).max() + 1e-3)
     for column in (0, 1, 2, 3, 4, 5, 7, 8):
-        shared = np.zeros(9)
+        shared = np.zeros(10)
         shared[column] = h
         by_pose, by_imu = derivative(np.zeros((count, 15)), shared)
         assert by_pose == pytest.approx(pose_shared[:, :, column], abs=2e-2)
@@ -161,3 +202,40 @@ def test_refuses_what_it_cannot_answer():
     still = [replace(pose, T_map_camera=poses[0].T_map_camera) for pose in poses]
     with pytest.raises(InputError, match='three axes'):
         calibrate_camera_imu(still, imu, START_NS, ImuNoise())
+
+
+# --- rolling read-out ---------------------------------------------------------------------------------
+
+READOUT = 0.016
+
+
+def test_noiseless_rolling_recording_gives_the_readout_time_back():
+    scenario = replace(SCENARIO, imu=NO_NOISE)
+    frames, camera, imu = rolling_recording(scenario, 13.0, 2, READOUT, sigma_px=0.0)
+    result = calibrate_rolling_camera_imu(frames, camera, imu, START_NS, ImuNoise())
+    error = np.abs(error_of(result, scenario))
+    # As without a read-out: samples are interpolated. A microsecond at 1000 px/s is 0.001 px.
+    assert abs(result.readout_time - READOUT) < 1e-6
+    assert np.all(error[:3] < 2e-5)
+    assert np.all(error[3:6] < 1e-4)
+    assert error[6] < 2e-6
+
+
+@pytest.mark.parametrize('readout', [0.0, READOUT])
+def test_readout_time_and_extrinsics_within_their_errors(readout):
+    frames, camera, imu = rolling_recording(SCENARIO, 15.0, 1, readout, sigma_px=0.1)
+    result = calibrate_rolling_camera_imu(frames, camera, imu, START_NS, ImuNoise())
+    assert 1e-5 < result.readout_sigma < 1e-4
+    # Four standard deviations; exactly zero where it is not clearly more.
+    assert abs(result.readout_time - readout) < 4.0 * result.readout_sigma
+    assert (result.readout_time == 0.0) == (readout == 0.0)
+    error = error_of(result, SCENARIO)
+    # Chi-square of seven degrees of freedom, 99.9 %.
+    assert error @ np.linalg.solve(result.covariance, error) < 24.3
+
+
+def test_poses_alone_say_nothing_of_the_readout_time():
+    poses, imu = recording(SCENARIO, 20.0, 1)
+    result = calibrate_camera_imu(poses, imu, START_NS, ImuNoise())
+    assert result.readout_time == 0.0
+    assert np.isinf(result.readout_sigma)

@@ -9,9 +9,10 @@ import numpy as np
 from rich.progress import track
 import yaml
 
-from thermal_fiducial.calibration.camera_imu import calibrate_camera_imu, CameraImuCalibration
+from thermal_fiducial.calibration.camera_imu import calibrate_rolling_camera_imu, CameraImuCalibration
 from thermal_fiducial.calibration.intrinsics import Calibration, CANDIDATES, choose_model
 from thermal_fiducial.calibration.report import coverage, parameter_rows, write_report
+from thermal_fiducial.calibration.rolling import FrameCorners
 from thermal_fiducial.calibration.sources import (
     clean_frames,
     Frame,
@@ -24,12 +25,10 @@ from thermal_fiducial.calibration.sources import (
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Sighting, Target
 from thermal_fiducial.config import ArucoDetectorConfig, ImuNoise
 from thermal_fiducial.core import geometry
-from thermal_fiducial.core.adjustment.reprojection import corners_in_map
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.mapping.map_data import MarkerMap
-from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px
-from thermal_fiducial.core.pose import solve_camera_pose
+from thermal_fiducial.core.measurements import corner_covariances, corners_px
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import load_camera, save_camera
@@ -285,32 +284,25 @@ def _camera_imu(args: argparse.Namespace) -> int:
         camera = recorded_camera(bag) if args.calibration is None else load_camera(args.calibration)
         imu, start_ns = imu_track(bag)
         frames = track(clean_frames(bag), 'finding markers', bag.message_count(['thermal/image_raw']), transient=True)
-        poses = list(_camera_poses(frames, marker_map, camera))
-    result = calibrate_camera_imu(poses, imu, start_ns, noise)
+        seen = list(_mapped_corners(frames, marker_map, camera))
+    result = calibrate_rolling_camera_imu(seen, camera, imu, start_ns, noise)
     args.out.write_text(_extrinsics_text(result), encoding='utf-8')
     print(_extrinsics_text(result))
     return 0
 
 
-def _camera_poses(frames: Iterable[Frame], marker_map: MarkerMap, camera: Camera) -> Iterator[CameraPose]:
-    """Pose of the camera from each frame that shows markers of the map."""
+def _mapped_corners(frames: Iterable[Frame], marker_map: MarkerMap, camera: Camera) -> Iterator[FrameCorners]:
+    """Markers of the map in each frame that shows any."""
     detector = _detector(marker_map)
-    before = None
     for frame in frames:
         rows = detector.detect(frame.stamp_ns, frame.counts, camera)
         rows = rows[np.isin(rows['id'], list(marker_map.markers))]
         if len(rows) == 0:
             continue
         markers = [marker_map.markers[marker_id] for marker_id in rows['id'].tolist()]
-        corners = corners_in_map(
-            np.stack([marker.T_map_marker for marker in markers]), np.array([marker.size for marker in markers])
-        )
-        try:
-            pose = solve_camera_pose(corners_px(rows), corner_covariances(rows), corners, camera, before)
-        except InputError:
-            continue
-        before = pose.T_map_camera
-        yield CameraPose(frame.stamp_ns, pose.T_map_camera, pose.covariance, tuple(rows['id'].tolist()), pose.rms_px)
+        T_map_marker = np.stack([marker.T_map_marker for marker in markers])
+        sizes = np.array([marker.size for marker in markers])
+        yield FrameCorners(frame.stamp_ns, corners_px(rows), corner_covariances(rows), T_map_marker, sizes)
 
 
 def _extrinsics_text(result: CameraImuCalibration) -> str:
@@ -329,6 +321,7 @@ def _extrinsics_text(result: CameraImuCalibration) -> str:
             f'    camera_position: {np.round(p, 6).tolist()}  # +- {np.round(position, 2).tolist()} mm',
             f'    camera_orientation: {np.round(q, 8).tolist()}  # +- {np.round(rotation, 4).tolist()} deg',
             f'    camera_time_offset: {result.time_offset:.6f}  # +- {1e3 * sigma[6]:.3f} ms',
+            f'    readout_time: {result.readout_time:.6f}  # +- {1e3 * result.readout_sigma:.3f} ms',
             '',
         ]
     )

@@ -1,0 +1,309 @@
+"""The adjustment of a whole recording: body states at the camera's frames, and what all of them share.
+
+Gauss-Newton on states in a band (consecutive ones are held together by the preintegrated IMU samples between them) and
+the shared unknowns beside it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+from thermal_fiducial.calibration.preintegration import ImuTrack, Increments, preintegrate
+from thermal_fiducial.calibration.rolling import RowMoments
+from thermal_fiducial.config import ImuNoise
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.errors import InputError
+
+_STATE = 15
+#: Shared unknowns: rotation and position of the camera in the body, time offset, direction of gravity, read-out time.
+_SHARED = 10
+#: Largest time offset that is looked for [s].
+LARGEST_OFFSET = 0.15
+_COARSE_STEP = 0.002
+_MAX_STEPS = 15
+# Change of the shared unknowns [rad, m, s] that no digit of the answer shows.
+_CONVERGED = 1e-7
+# Mahalanobis distance of a pose (six degrees of freedom, 99 %) beyond which it loses weight.
+_INLIER = 4.1
+# What biases may be at most, as a prior on the first state [rad/s, m/s^2].
+_BIAS_PRIOR = np.array([0.1] * 3 + [1.0] * 3)
+# Standard deviation of the read-out time about zero: while it is sought, and while it is held there [s].
+_READOUT_PRIOR, _READOUT_HELD = 0.05, 1e-12
+
+
+@dataclass(frozen=True)
+class State:
+    """All unknowns; leading dimension (N,) where there is one a frame."""
+
+    R: FloatArray
+    p: FloatArray
+    v: FloatArray
+    bias: FloatArray
+    R_body_camera: FloatArray
+    p_body_camera: FloatArray
+    offset: float
+    gravity: FloatArray
+    readout: float = 0.0
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The best states.
+
+    Parameters
+    ----------
+    state : all unknowns
+    covariance : (10, 10) of the shared ones, scaled by ``scale`` squared
+    residuals : (N, 6) of the camera poses, position and rotation, in the map [m, rad]
+    scale : factor on the given covariances at which the residuals are what they should be
+    """
+
+    state: State
+    covariance: FloatArray
+    residuals: FloatArray
+    scale: float
+
+
+def root_information(covariance: FloatArray) -> FloatArray:
+    """W (6, 6) with W^T W the inverse of ``covariance``."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors / np.sqrt(np.maximum(values, 1e-14))).T)
+
+
+def first_state(stamps: FloatArray, measured: FloatArray, imu: ImuTrack, gravity: float) -> State:
+    """Offset and rotation from the angular velocities, everything else from these."""
+    R, p = measured[:, :3, :3], measured[:, :3, 3]
+    dt = np.diff(stamps)
+    turned = geometry.so3_log(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / dt[:, None]
+    steady = dt < 2.0 * np.median(dt)
+    middle = 0.5 * (stamps[:-1] + stamps[1:])[steady]
+    turned = turned[steady]
+    if np.min(np.std(turned, axis=0)) < 0.01:
+        raise InputError('the camera turned about fewer than three axes: neither rotation nor lever arm show in that')
+    offsets = np.arange(-LARGEST_OFFSET, LARGEST_OFFSET, _COARSE_STEP)
+    aligned = [_aligned(turned, imu.at(middle + offset)[0]) for offset in offsets]
+    best = int(np.argmin([error for _, _, error in aligned]))
+    R_body_camera, rate_bias, _ = aligned[best]
+    R_body = R @ R_body_camera.T
+    _, force = imu.at(stamps + offsets[best])
+    up = np.mean((R_body @ force[:, :, None])[:, :, 0], axis=0)
+    bias = np.tile(np.concatenate([rate_bias, np.zeros(3)]), (len(stamps), 1))
+    v = np.gradient(p, stamps, axis=0)
+    down = -gravity * up / np.linalg.norm(up)
+    return State(R_body, p.copy(), v, bias, R_body_camera, np.zeros(3), float(offsets[best]), down)
+
+
+def _aligned(camera: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """R, b and mean squared error of body = R camera + b (Kabsch)."""
+    mean_camera, mean_body = camera.mean(axis=0), body.mean(axis=0)
+    U, _, Vt = np.linalg.svd((body - mean_body).T @ (camera - mean_camera))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    b = mean_body - R @ mean_camera
+    return R, b, float(np.mean((body - camera @ R.T - b) ** 2))
+
+
+class Problem:
+    """All that was measured.
+
+    Parameters
+    ----------
+    stamps : (N,) of the frames, by the camera's clock [s]
+    measured : (N, 4, 4) T_map_camera
+    root : (N, 6, 6) of their information, as :func:`root_information` has it
+    imu, noise : samples, and what their noise is
+    rows, readout : of the frames, and the read-out time that their poses allow for [s]; without rows it is held at zero
+    """
+
+    def __init__(
+        self,
+        stamps: FloatArray,
+        measured: FloatArray,
+        root: FloatArray,
+        imu: ImuTrack,
+        noise: ImuNoise,
+        rows: RowMoments | None = None,
+        readout: float = 0.0,
+    ) -> None:
+        self._stamps, self._measured, self._root, self._imu, self._noise = stamps, measured, root, imu, noise
+        self._rows, self._about = rows, readout
+        if rows is not None:
+            covariance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
+            # By how much the true pose is off the measured one for a twist and a read-out time of one, and what the
+            # corners know beyond that.
+            self._drift = -covariance @ rows.cross
+            self._beyond = rows.square + rows.cross @ self._drift
+
+    def solved(self, state: State) -> Solution:
+        """The best states, from first ones."""
+        for _ in range(_MAX_STEPS):
+            state, change, covariance = self.improved(state)
+            if change < _CONVERGED:
+                break
+        error, _, _ = self._pose_errors(state)
+        whitened = (self._root @ error[:, :, None])[:, :, 0]
+        scale = max(1.0, 1.4826 * float(np.median(np.abs(whitened))))
+        return Solution(state, covariance * scale**2, error, scale)
+
+    def camera_poses(self, state: State, frames: IntArray, delays: FloatArray) -> FloatArray:
+        """T_map_camera (K, 4, 4) by ``delays`` (K,) [s] after ``frames`` (K,)."""
+        chosen = replace(state, R=state.R[frames], p=state.p[frames], v=state.v[frames], bias=state.bias[frames])
+        moved = self._shifted(chosen, delays[:, None], self._stamps[frames])
+        T_map_body = geometry.transform(moved.R, moved.p)
+        return np.asarray(T_map_body @ geometry.transform(state.R_body_camera, state.p_body_camera))
+
+    def improved(self, state: State) -> tuple[State, float, FloatArray]:
+        """The next state, the largest change of a shared unknown, and the covariance (10, 10) of these."""
+        count = len(self._stamps)
+        H = np.zeros((count, 2, _STATE, _STATE))  # of each state with itself, and with the next one
+        B = np.zeros((count, _STATE, _SHARED))
+        C, c = np.zeros((_SHARED, _SHARED)), np.zeros(_SHARED)
+        g = np.zeros((count, _STATE))
+        self._add_poses(state, H, B, C, g, c)
+        self._add_imu(state, H, B, C, g, c)
+        H[0, 0, 9:, 9:] += np.diag(1.0 / _BIAS_PRIOR**2)
+        g[0, 9:] += state.bias[0] / _BIAS_PRIOR**2
+        prior = _READOUT_HELD if self._rows is None else _READOUT_PRIOR
+        C[9, 9] += 1.0 / prior**2
+        c[9] += state.readout / prior**2
+        solved = solveh_banded(_band(H), np.concatenate([g.reshape(-1, 1), B.reshape(-1, _SHARED)], axis=1), lower=True)
+        by_shared = solved[:, 1:]
+        flat = B.reshape(-1, _SHARED)
+        reduced = C - flat.T @ by_shared
+        covariance = np.linalg.inv(reduced)
+        shared = -covariance @ (c - flat.T @ solved[:, 0])
+        own = (-solved[:, 0] - by_shared @ shared).reshape(count, _STATE)
+        return self._moved(state, own, shared), float(np.abs(shared).max()), covariance
+
+    def _pose_errors(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Predicted minus measured (N, 6), and its derivatives by state (N, 6, 15) and shared unknowns (N, 6, 10)."""
+        count = len(state.p)
+        rate, _ = self._imu.at(self._stamps + state.offset)
+        rate = rate - state.bias[:, :3]
+        arm = state.p_body_camera
+        R = state.R @ state.R_body_camera
+        error = np.zeros((count, 6))
+        error[:, :3] = state.p + state.R @ arm - self._measured[:, :3, 3]
+        error[:, 3:] = geometry.so3_log(R @ np.swapaxes(self._measured[:, :3, :3], 1, 2))
+        own, shared = np.zeros((count, 6, _STATE)), np.zeros((count, 6, _SHARED))
+        own[:, :3, :3] = np.eye(3)
+        own[:, :3, 3:6] = -state.R @ geometry.skew(arm)
+        own[:, 3:, 3:6] = state.R
+        shared[:, 3:, :3] = R
+        shared[:, :3, 3:6] = state.R
+        shared[:, :3, 6] = state.v + (state.R @ np.cross(rate, arm)[:, :, None])[:, :, 0]
+        shared[:, 3:, 6] = (state.R @ rate[:, :, None])[:, :, 0]
+        if self._rows is not None:
+            # What the twist's own errors add is of second order: they are centimetres a second, for milliseconds.
+            shared[:, :, 9] = -(self._drift @ shared[:, :, 6, None])[:, :, 0]
+            error += (state.readout - self._about) * shared[:, :, 9]
+        return error, own, shared
+
+    def _add_poses(
+        self, state: State, H: FloatArray, B: FloatArray, C: FloatArray, g: FloatArray, c: FloatArray
+    ) -> None:
+        error, own, shared = self._pose_errors(state)
+        e = (self._root @ error[:, :, None])[:, :, 0]
+        distance = np.linalg.norm(e, axis=1)
+        weight = np.sqrt(np.minimum(1.0, _INLIER / np.maximum(distance, 1e-12)))[:, None]
+        if self._rows is not None:
+            twist = weight * shared[:, :, 6]
+            information = np.einsum('ni,nij,nj->', twist, self._beyond, twist)
+            C[9, 9] += information
+            c[9] += information * (state.readout - self._about) - np.sum(weight * twist * self._rows.residual)
+        e, own, shared = weight * e, weight[:, :, None] * (self._root @ own), weight[:, :, None] * (self._root @ shared)
+        H[:, 0] += np.swapaxes(own, 1, 2) @ own
+        B += np.swapaxes(own, 1, 2) @ shared
+        C += np.einsum('nij,nik->jk', shared, shared)
+        g += (np.swapaxes(own, 1, 2) @ e[:, :, None])[:, :, 0]
+        c += np.einsum('nij,ni->j', shared, e)
+
+    def _add_imu(self, state: State, H: FloatArray, B: FloatArray, C: FloatArray, g: FloatArray, c: FloatArray) -> None:
+        increments = preintegrate(self._imu, self._stamps + state.offset, state.bias[:-1], self._noise)
+        e, first, second, shared = imu_errors(state, increments, self._noise)
+        for index, J in ((slice(None, -1), first), (slice(1, None), second)):
+            H[index, 0] += np.swapaxes(J, 1, 2) @ J
+            B[index] += np.swapaxes(J, 1, 2) @ shared
+            g[index] += (np.swapaxes(J, 1, 2) @ e[:, :, None])[:, :, 0]
+        H[:-1, 1] += np.swapaxes(second, 1, 2) @ first
+        C += np.einsum('nij,nik->jk', shared, shared)
+        c += np.einsum('nij,ni->j', shared, e)
+
+    def _moved(self, state: State, own: FloatArray, shared: FloatArray) -> State:
+        moved = replace(
+            state,
+            R=state.R @ geometry.so3_exp(own[:, 3:6]),
+            p=state.p + own[:, :3],
+            v=state.v + own[:, 6:9],
+            bias=state.bias + own[:, 9:],
+            R_body_camera=state.R_body_camera @ geometry.so3_exp(shared[:3]),
+            p_body_camera=state.p_body_camera + shared[3:6],
+            gravity=geometry.so3_exp(_horizontal(state.gravity) @ shared[7:9]) @ state.gravity,
+            readout=state.readout + shared[9],
+        )
+        delay = float(np.clip(shared[6], -0.05, 0.05))
+        return replace(self._shifted(moved, np.array([[delay]]), self._stamps), offset=state.offset + delay)
+
+    def _shifted(self, state: State, delay: FloatArray, stamps: FloatArray) -> State:
+        """States at ``stamps`` moved along their motion by ``delay`` (1,) or (N, 1) [s]."""
+        rate, force = self._imu.at(stamps + state.offset + 0.5 * delay[:, 0])
+        acceleration = (state.R @ (force - state.bias[:, 3:])[:, :, None])[:, :, 0] + state.gravity
+        return replace(
+            state,
+            R=state.R @ geometry.so3_exp((rate - state.bias[:, :3]) * delay),
+            p=state.p + state.v * delay + 0.5 * acceleration * delay**2,
+            v=state.v + acceleration * delay,
+        )
+
+
+def _horizontal(gravity: FloatArray) -> FloatArray:
+    """Axes (3, 2) about which the direction of gravity can turn."""
+    _, _, Vt = np.linalg.svd(gravity[None])
+    return np.asarray(Vt[1:].T)
+
+
+def imu_errors(
+    state: State, increments: Increments, noise: ImuNoise
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Whitened errors (K, 15) of consecutive states, and derivatives by the first, the second and the shared ones."""
+    count = len(increments.dt)
+    dt = increments.dt[:, None]
+    R0, R1 = state.R[:-1], state.R[1:]
+    R0t = np.swapaxes(R0, 1, 2)
+    gravity = state.gravity
+    dv = (R0t @ (state.v[1:] - state.v[:-1] - gravity * dt)[:, :, None])[:, :, 0]
+    dp = (R0t @ (state.p[1:] - state.p[:-1] - state.v[:-1] * dt - 0.5 * gravity * dt**2)[:, :, None])[:, :, 0]
+    turn = geometry.so3_log(np.swapaxes(increments.R, 1, 2) @ R0t @ R1)
+    error = np.concatenate([turn, dv - increments.v, dp - increments.p, state.bias[1:] - state.bias[:-1]], axis=1)
+    first, second = np.zeros((count, _STATE, _STATE)), np.zeros((count, _STATE, _STATE))
+    shared = np.zeros((count, _STATE, _SHARED))
+    # log(D^T R0^T R1 exp(d)) = turn + Jr^-1 d, and Jr^-1 is the transpose of Jl^-1.
+    by_turn = np.swapaxes(geometry.so3_left_jacobian_inverse(turn), 1, 2)
+    first[:, :3, 3:6] = -by_turn @ np.swapaxes(R1, 1, 2) @ R0
+    second[:, :3, 3:6] = by_turn
+    first[:, 3:6, 3:6], first[:, 3:6, 6:9], second[:, 3:6, 6:9] = geometry.skew(dv), -R0t, R0t
+    first[:, 6:9, 3:6], first[:, 6:9, :3], second[:, 6:9, :3] = geometry.skew(dp), -R0t, R0t
+    first[:, 6:9, 6:9] = -R0t * dt[:, :, None]
+    first[:, :9, 9:] = -increments.by_bias
+    first[:, 9:, 9:], second[:, 9:, 9:] = -np.eye(6), np.eye(6)
+    by_gravity = -geometry.skew(gravity) @ _horizontal(gravity)
+    shared[:, 3:6, 7:9] = -R0t @ by_gravity * dt[:, :, None]
+    shared[:, 6:9, 7:9] = -0.5 * R0t @ by_gravity * dt[:, :, None] ** 2
+    root = np.zeros((count, _STATE, _STATE))
+    root[:, :9, :9] = np.linalg.inv(np.linalg.cholesky(increments.covariance + 1e-18 * np.eye(9)))
+    walk = np.array([max(noise.gyroscope_random_walk, 1e-9)] * 3 + [max(noise.accelerometer_random_walk, 1e-9)] * 3)
+    root[:, 9:, 9:] = (1.0 / (walk * np.sqrt(dt)))[:, :, None] * np.eye(6)
+    return (root @ error[:, :, None])[:, :, 0], root @ first, root @ second, root @ shared
+
+
+def _band(H: FloatArray) -> FloatArray:
+    """Lower band (2 * 15, 15 N) of the block tridiagonal matrix, as LAPACK stores it."""
+    count = len(H)
+    band = np.zeros((2 * _STATE, count, _STATE))
+    column = np.arange(_STATE)
+    for row in range(_STATE):
+        inside = column <= row
+        band[row - column[inside], :, column[inside]] = H[:, 0, row, inside].T
+        band[_STATE + row - column, :, column] = H[:, 1, row, :].T
+    return band.reshape(2 * _STATE, -1)

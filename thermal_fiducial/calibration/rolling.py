@@ -1,0 +1,108 @@
+"""What the corners of a frame say of when their rows were sampled.
+
+Row v is sampled at ``stamp + readout_time (v / (height - 1) - 1/2)``. While the camera moves with the twist tau (map
+frame, as pose errors are), a corner at the share s of the read-out appears at ``u + J s tau readout_time``. With the
+pose of the frame eliminated, all that the corners know of the read-out time are the moments below, whatever the twist.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.core.adjustment.reprojection import corners_in_map, linearise, whitening
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.pose import solve_camera_pose
+from thermal_fiducial.core.types import FloatArray
+
+# Mahalanobis distance of a corner beyond which it loses weight, as in the solution of the pose.
+_INLIER = 3.0
+
+
+@dataclass(frozen=True)
+class RowMoments:
+    """Sums over the whitened corners of a frame, or of N frames with a leading dimension.
+
+    Parameters
+    ----------
+    cross : (6, 6) J' S J, with S the shares of the read-out, -1/2 in the first row and 1/2 in the last
+    square : (6, 6) J' S S J
+    residual : (6,) J' S rho, of what the frame's pose leaves of the corners
+    """
+
+    cross: FloatArray
+    square: FloatArray
+    residual: FloatArray
+
+    @staticmethod
+    def stacked(moments: Sequence['RowMoments']) -> 'RowMoments':
+        """Those of N frames."""
+        parts = zip(*((m.cross, m.square, m.residual) for m in moments), strict=True)
+        return RowMoments(*(np.stack(part) for part in parts))
+
+
+@dataclass(frozen=True)
+class FrameCorners:
+    """Mapped markers that a frame shows.
+
+    Parameters
+    ----------
+    stamp_ns : by the camera's clock
+    corners_px, covariances : (N, 4, 2), (N, 4, 2, 2) in the raw image, where they were when their rows were sampled
+    T_map_marker, sizes : (N, 4, 4), (N,)
+    """
+
+    stamp_ns: int
+    corners_px: FloatArray
+    covariances: FloatArray
+    T_map_marker: FloatArray
+    sizes: FloatArray
+
+    @property
+    def points(self) -> FloatArray:
+        """Corners (N, 4, 3) in the map [m]."""
+        return corners_in_map(self.T_map_marker, self.sizes)
+
+    def shares(self, height: int) -> FloatArray:
+        """Shares (N, 4) of the read-out, -1/2 in the first row and 1/2 in the last."""
+        return self.corners_px[..., 1] / (height - 1) - 0.5
+
+    def solved(
+        self, camera: Camera, shift: FloatArray | None = None, initial: FloatArray | None = None
+    ) -> 'SolvedFrame':
+        """Pose of the camera, from the corners moved by ``shift`` (N, 4, 2) [px].
+
+        Raises
+        ------
+        InputError
+            No pose sees them.
+        """
+        corners = self.corners_px if shift is None else self.corners_px + shift
+        pose = solve_camera_pose(corners, self.covariances, self.points, camera, initial)
+        moments = self._moments(camera, pose.T_map_camera, corners)
+        return SolvedFrame(self, CameraPose(self.stamp_ns, pose.T_map_camera, pose.covariance), moments)
+
+    def _moments(self, camera: Camera, T_map_camera: FloatArray, corners: FloatArray) -> RowMoments:
+        count = len(corners)
+        poses = np.broadcast_to(T_map_camera, (count, 4, 4))
+        predicted, J, _ = linearise(camera, poses, self.T_map_marker, self.sizes)
+        W = whitening(self.covariances)
+        rho = (W @ (corners - predicted)[..., None])[..., 0].reshape(-1, 2)
+        weight = np.minimum(1.0, _INLIER / np.maximum(np.linalg.norm(rho, axis=1), 1e-12))
+        J = (W @ J.reshape(count, 4, 2, 6)).reshape(-1, 2, 6) * weight[:, None, None]
+        moved = J * self.shares(camera.height).reshape(-1, 1, 1)
+        return RowMoments(
+            np.einsum('nij,nik->jk', J, moved),
+            np.einsum('nij,nik->jk', moved, moved),
+            np.einsum('nij,ni->j', moved, rho * weight[:, None]),
+        )
+
+
+@dataclass(frozen=True)
+class SolvedFrame:
+    """Corners with the pose of the camera that fits them best, and their moments about it."""
+
+    corners: FrameCorners
+    pose: CameraPose
+    rows: RowMoments
