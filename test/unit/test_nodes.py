@@ -1,5 +1,7 @@
 """The four nodes one by one: what they publish, say and survive."""
 
+from dataclasses import replace
+
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
@@ -77,6 +79,18 @@ def test_clean_frames_go_out_with_their_stamp_and_frozen_ones_do_not(graph):
     ]
     assert graph.heard['thermal/image'][0].header.frame_id == 'thermal_camera_optical'
     assert graph.diagnose(node)[:2] == (OK, 'ok')
+
+
+def test_a_late_frame_goes_out_and_is_counted(graph):
+    node = graph.add(Tau2Camera)
+    graph.listen(Image, 'thermal/image')
+    first, second, third = frames(3)
+    graph.send('thermal/image_raw', first, third, second)
+    graph.spin_until(lambda: len(graph.heard['thermal/image']) == 3)
+    sent = [message.header.stamp for message in graph.heard['thermal/image']]
+    assert sent == [message.header.stamp for message in (first, third, second)]
+    level, reason, figures = graph.diagnose(node)
+    assert (level, reason, figures['late']) == (OK, 'ok', '1')
 
 
 def test_the_8_bit_view_is_made_only_for_somebody(graph):
@@ -448,6 +462,38 @@ def test_the_estimate_moves_with_the_map(graph):
     fly(graph, [pose(56), imu(60), pose(59, T_new_old @ small_bag.T_BODY_CAMERA), imu(61)])
     np.testing.assert_allclose(node.filter.state.T_map_body, T_new_old, atol=0.01)
     assert graph.diagnose(node)[:2] == (OK, 'tracking')
+
+
+def test_a_late_frame_from_before_a_correction_is_told_in_the_map_of_its_stamp(graph, tmp_path):
+    """The filter takes every pose that is stamped before the correction for one of the old map, and moves it."""
+    whole = small_bag.side_files(tmp_path, ids=(0, 1, 2, 3))[0]
+    graph.listen(PoseWithCovarianceStamped, 'camera_pose')
+    node = graph.add(MarkerMapperNode, map_file=str(whole))
+    with ros_graph('-r', '__ns:=/aside') as other:
+        other.add(ArucoDetector, marker_size=small_bag.SIZE)
+        other.listen(PointCloud2, 'markers')
+        other.send('thermal/camera_info', info())
+        other.send('thermal/image', *frames(4))
+        other.spin_until(lambda: len(other.heard['markers']) == 4)
+    first, late, newest, after = other.heard['markers']
+    T_new_old = transform(np.eye(3), [1.0, 2.0, 0.0])
+    graph.send('thermal/camera_info', info())
+    graph.send('markers', first, newest)
+    node._tell(node.mapper.load(_moved(node.mapper.map, T_new_old)))
+    graph.send('markers', late, after)
+    graph.spin_until(lambda: len(graph.heard['camera_pose']) == 4)
+    found = [convert.camera_pose(message).T_map_camera for message in graph.heard['camera_pose']]
+    truth = [small_bag.true_pose(k / 30) @ small_bag.T_BODY_CAMERA for k in (0, 2, 1, 3)]
+    truth[3] = T_new_old @ truth[3]
+    # The flat pictures are good to a centimetre.
+    np.testing.assert_allclose(found, truth, atol=0.05)
+
+
+def _moved(marker_map, T_new_old):
+    copy = marker_map.copy()
+    for key, marker in copy.markers.items():
+        copy.markers[key] = replace(marker, T_map_marker=T_new_old @ marker.T_map_marker)
+    return copy
 
 
 def test_a_live_mapper_refines_in_the_background_and_tells_the_correction(graph, map_file):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import Tau2CameraConfig
-from thermal_fiducial.core.thermal import EightBitView, FrameCleaner, FROZEN, SETTLING, SHUTTER, STALE_STAMP
+from thermal_fiducial.core.thermal import EightBitView, FrameCleaner, FROZEN, REPEATED_STAMP, SETTLING, SHUTTER
 from thermal_fiducial.errors import InputError
 
 PERIOD_NS = 33_333_333
@@ -212,14 +212,70 @@ def test_a_hot_object_that_leaves_does_not_hide_cooler_markers():
 # --- stamps --------------------------------------------------------------------------------------------
 
 
-def test_stamps_that_do_not_increase_are_refused_and_a_restart_is_taken():
+def test_a_late_frame_passes_once_and_a_restart_is_taken():
     rng = np.random.default_rng(13)
     camera = Camera()
+    for _ in range(5):
+        camera(noisy(scene(), rng), periods=2)
+    assert camera(noisy(scene(), rng), periods=0).reason == REPEATED_STAMP
+    late = camera(noisy(scene(), rng), periods=-3)
+    assert (late.reason, late.late) == ('', True)
+    assert camera(noisy(scene(), rng), periods=0).reason == REPEATED_STAMP
+    # The newest one so far, then one after it.
+    assert camera(noisy(scene(), rng), periods=3).reason == REPEATED_STAMP
+    on_time = camera(noisy(scene(), rng), periods=1)
+    assert (on_time.reason, on_time.late) == ('', False)
+    back = camera(noisy(scene(), rng), periods=-900)
+    assert (back.reason, back.late) == ('', False)
+    assert camera(noisy(scene(), rng), periods=1).reason == ''
+
+
+def test_neighbours_that_swap_places_lose_nothing():
+    rng = np.random.default_rng(16)
+    camera = Camera()
+    frames = [camera(noisy(scene(k), rng), periods=3 if k % 2 == 0 else -1) for k in range(20)]
+    assert [frame.reason for frame in frames] == [''] * 20
+    assert sum(frame.late for frame in frames) == 10
+
+
+@pytest.mark.parametrize('late_at', [1, 8, 9, 10])
+def test_a_stop_is_one_whenever_a_frame_from_before_it_arrives(late_at):
+    """Ten repeated frames, then new ones; a frame from before them comes in late."""
+    rng = np.random.default_rng(17)
+    camera = Camera()
     camera(noisy(scene(), rng))
-    assert camera(noisy(scene(), rng), periods=0).reason == STALE_STAMP
-    assert camera(noisy(scene(), rng), periods=-3).reason == STALE_STAMP
-    assert camera(noisy(scene(), rng), periods=4).reason == ''
-    assert camera(noisy(scene(), rng), periods=-900).reason == ''
+    last = noisy(scene(1.0), rng)
+    camera(last, periods=2)
+    reasons, late = [], None
+    for k in range(14):
+        reasons.append(camera(last if k < 10 else noisy(scene(20.0 + k), rng)).reason)
+        if k == late_at:
+            late = camera(noisy(scene(0.5), rng), periods=-(k + 2)).reason
+            camera.stamp_ns += (k + 2) * PERIOD_NS
+    assert late == ''
+    assert reasons == [FROZEN] * 10 + [SETTLING] + [''] * 3
+
+
+def test_the_first_frame_after_a_stop_settles_even_when_the_second_overtakes_it():
+    rng = np.random.default_rng(18)
+    camera = Camera()
+    last = noisy(scene(), rng)
+    camera(last)
+    assert [camera(last).reason for _ in range(8)] == [FROZEN] * 8
+    assert camera(noisy(scene(20.0), rng), periods=2).reason == SETTLING
+    assert camera(noisy(scene(19.0), rng), periods=-1).reason == SETTLING
+    assert camera(noisy(scene(21.0), rng), periods=2).reason == ''
+
+
+def test_late_frames_show_bad_pixels_too():
+    rng = np.random.default_rng(19)
+    camera = Camera()
+    for k in range(60):
+        frame = noisy(scene(k, shape=(256, 320)), rng)
+        frame[40, 100] = 16383
+        result = camera(frame, periods=3 if k % 2 == 0 else -1)
+    assert camera.cleaner.bad_pixels.tolist() == [[100, 40]]
+    assert abs(int(result.counts[40, 100]) - int(result.counts[40, 101])) < 10 * NOISE
 
 
 # --- bad pixels ----------------------------------------------------------------------------------------

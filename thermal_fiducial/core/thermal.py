@@ -18,7 +18,10 @@ from thermal_fiducial.errors import InputError
 FROZEN = 'frozen'
 SHUTTER = 'FFC'
 SETTLING = 'settling after FFC'
-STALE_STAMP = 'stamp not after the last one'
+REPEATED_STAMP = 'stamp seen before'
+
+# Frames that come later than this after newer ones are those of a clock that was set back [ns].
+LATEST_NS = 1_000_000_000
 
 # Rows of an image; a frame with up to MAX_TELEMETRY_ROWS more carries telemetry.
 STANDARD_HEIGHTS = (1024, 512, 480, 256, 240, 128, 120)
@@ -33,6 +36,8 @@ class CleanFrame:
     counts: Counts | None
     #: in words, empty for a frame that is passed on
     reason: str = ''
+    #: whether newer ones came before it
+    late: bool = False
 
 
 class FrameCleaner:
@@ -52,11 +57,12 @@ class FrameCleaner:
 
     def _restart(self, shape: tuple[int, int]) -> None:
         self._shape = shape
-        self._stamp_ns: int | None = None
+        self._stamps: set[int] = set()
+        self._newest_ns = 0
         self._live_ns: int | None = None
         self._freeze = _FreezeDetector()
         self._shutter = _ShutterDetector()
-        self._settling = 0
+        self._settling = _Settling()
         self._finder = BadPixelFinder(shape)
         self._found: IntArray = np.zeros((0, 2), np.int64)
         self._filler = BadPixelFiller(self._known_bad, shape) if shape != (0, 0) else None
@@ -67,7 +73,7 @@ class FrameCleaner:
         return self._known_bad if self._filler is None else self._filler.pixels
 
     def process(self, stamp_ns: int, counts: Counts | Gray) -> CleanFrame:
-        """Clean the next frame.
+        """Clean the next frame; it may come up to a second later than newer ones.
 
         Parameters
         ----------
@@ -80,17 +86,19 @@ class FrameCleaner:
             Not an image of 8 or 16 bit, or one too small to hold a scene; a listed bad pixel outside it.
         """
         image = self._image(counts)
-        if image.shape != self._shape or self._jumped_back(stamp_ns):
+        if image.shape != self._shape or stamp_ns < self._newest_ns - LATEST_NS:
             self._restart(image.shape)
-        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
-            return CleanFrame(None, STALE_STAMP)
-        self._stamp_ns = stamp_ns
+        if stamp_ns in self._stamps:
+            return CleanFrame(None, REPEATED_STAMP)
+        late = stamp_ns < self._newest_ns
+        self._newest_ns = max(stamp_ns, self._newest_ns)
+        self._stamps = {stamp for stamp in self._stamps if stamp >= self._newest_ns - LATEST_NS} | {stamp_ns}
         reason = self._stale(stamp_ns, image, coarse=counts.dtype == np.uint8)
         if reason:
-            return CleanFrame(None, reason)
-        self._live_ns = stamp_ns
+            return CleanFrame(None, reason, late)
+        self._live_ns = stamp_ns if self._live_ns is None else max(stamp_ns, self._live_ns)
         self._replace_bad_pixels(image)
-        return CleanFrame(image)
+        return CleanFrame(image, late=late)
 
     def _image(self, counts: Counts | Gray) -> Counts:
         """A copy of the image rows as counts."""
@@ -101,24 +109,17 @@ class FrameCleaner:
             raise InputError(f'frame of {image.shape[1]}x{image.shape[0]} pixels is too small')
         return image.astype(np.uint16) & np.uint16((1 << self.config.bits) - 1)
 
-    def _jumped_back(self, stamp_ns: int) -> bool:
-        """Whether the clock was set back or a recording starts anew, rather than a frame coming out of order."""
-        return self._stamp_ns is not None and stamp_ns < self._stamp_ns - 1_000_000_000
-
     def _stale(self, stamp_ns: int, image: Counts, *, coarse: bool) -> str:
         if self._freeze.repeats(image, coarse=coarse):
             reason = FROZEN
         elif self._shutter.closed(stamp_ns, image):
             reason = SHUTTER
-        elif self._settling > 0:
-            self._settling -= 1
-            return SETTLING
         else:
-            return ''
+            return SETTLING if self._settling.withholds(stamp_ns) else ''
         # A single repeated frame is a driver that runs faster than the camera. After a longer stop the first new
         # frame may still hold old counts: in the bolometers, which lag, and in the driver's buffers.
         if self._live_ns is not None and stamp_ns - self._live_ns > 90_000_000:
-            self._settling = self.config.settle_frames
+            self._settling.begin(stamp_ns, self.config.settle_frames)
         return reason
 
     def _replace_bad_pixels(self, image: Counts) -> None:
@@ -181,6 +182,28 @@ def _repeated_rows(sample: Counts, earlier: Counts) -> float:
         return 0.0
     clipped = sample.max(axis=1) == sample.min(axis=1)
     return float(np.mean(same if clipped.all() else same[~clipped]))
+
+
+class _Settling:
+    """Counts frames after a stop, by their stamps: late ones from before it have nothing to settle."""
+
+    def __init__(self) -> None:
+        self._left = 0
+        self._stopped_ns = self._settled_ns = 0
+
+    def begin(self, stamp_ns: int, frames: int) -> None:
+        """Withhold ``frames`` after the one of ``stamp_ns``, which showed nothing new."""
+        self._stopped_ns, self._left = max(stamp_ns, self._stopped_ns), frames
+
+    def withholds(self, stamp_ns: int) -> bool:
+        """Whether a new frame may still hold old counts."""
+        if stamp_ns < self._stopped_ns:
+            return False
+        if self._left == 0:
+            return stamp_ns < self._settled_ns
+        self._left -= 1
+        self._settled_ns = max(stamp_ns, self._settled_ns)
+        return True
 
 
 class _ShutterDetector:

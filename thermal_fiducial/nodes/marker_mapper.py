@@ -16,6 +16,9 @@ from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.geometry import apply, inverse
 from thermal_fiducial.core.map_refinement import refine, Refinement, Snapshot
 from thermal_fiducial.core.marker_map import MapJump, MapperResult, MarkerMap, MarkerMapper
+from thermal_fiducial.core.measurements import CameraPose, in_moved_map
+from thermal_fiducial.core.thermal import LATEST_NS
+from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.map_history import save_with_history, undo
 from thermal_fiducial.files.marker_map import load_map
@@ -50,6 +53,8 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._save_path = self._choose_save_path()
         self._refiner = self._make_refiner()
         self._result = MapperResult(0, None, 'no markers yet')
+        self._newest_ns = 0
+        self._correction: tuple[int, FloatArray] = 0, np.eye(4)
         self._drawn: _Drawing | None = None
         self._camera_pose = self.advertise(PoseWithCovarianceStamped, 'camera_pose')
         self._marker_map = self.advertise(PointCloud2, 'marker_map', qos.LATCHED)
@@ -94,10 +99,10 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         stamp = convert.stamp_ns(message.header.stamp)
         result = self.mapper.process(stamp, convert.markers(message), self.camera(), self.odometry())
         self._result = result
+        self._newest_ns = max(stamp, self._newest_ns) if stamp >= self._newest_ns - LATEST_NS else stamp
         if result.pose is not None:
-            head = convert.header(stamp, self.config.map_frame)
-            pose = convert.pose_with_covariance(result.pose.T_map_camera, result.pose.covariance, head)
-            self._camera_pose.send(pose)
+            head, told = convert.header(stamp, self.config.map_frame), self._as_told(result.pose)
+            self._camera_pose.send(convert.pose_with_covariance(told.T_map_camera, told.covariance, head))
         jump = self._refine(stamp)
         if jump is not None:
             self._tell(jump)
@@ -105,11 +110,20 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             self._publish_map()
 
     def _tell(self, jump: MapJump | None) -> None:
-        """Publish a map that has moved, and how, with the stamp of the last frame in the old one."""
+        """Publish a map that has moved, and how, with the stamp of the newest frame in the old one."""
         if jump is not None:
-            frame, stamp = self.config.map_frame, self._result.stamp_ns
-            self._map_correction.send(convert.transform_message(jump.T_new_old, stamp, frame, f'{frame}_before'))
+            frame, self._correction = self.config.map_frame, (self._newest_ns, jump.T_new_old)
+            self._map_correction.send(
+                convert.transform_message(jump.T_new_old, self._newest_ns, frame, f'{frame}_before')
+            )
         self._publish_map()
+
+    def _as_told(self, pose: CameraPose) -> CameraPose:
+        """A pose in the map that its stamp stands for: late frames from before a correction are taken to be older."""
+        corrected_ns, T_new_old = self._correction
+        if 0 <= corrected_ns - pose.stamp_ns <= LATEST_NS:
+            return in_moved_map(pose, inverse(T_new_old))
+        return pose
 
     def _refine(self, stamp: int) -> MapJump | None:
         """Start a joint refinement where one is due, take over one that is done."""

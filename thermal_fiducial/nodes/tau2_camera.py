@@ -35,6 +35,7 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
         self._image = self.advertise(Image, 'thermal/image', qos.IMAGE_OUTPUT)
         self._image_mono8 = self.advertise(Image, 'thermal/image_mono8', qos.IMAGE_OUTPUT)
         self._withheld: Counter[str] = Counter()
+        self._late = 0
         self._reason = ''
         self.subscribe(Image, 'thermal/image_raw', self._on_image, qos.CAMERA_INPUT)
 
@@ -47,6 +48,7 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
         stamp = convert.stamp_ns(message.header.stamp)
         frame = self.cleaner.process(stamp, image_to_array(message))
         self._reason = frame.reason
+        self._late += frame.late
         if frame.counts is None:
             self._withheld[frame.reason] += 1
             return
@@ -62,9 +64,9 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
         return (WARN, self._reason) if self._reason else (OK, 'ok')
 
     def figures(self) -> dict[str, object]:
-        """Withheld frames by reason, and bad pixels."""
+        """Withheld frames by reason, those that came out of order, and bad pixels."""
         withheld: dict[str, object] = {f'withheld: {reason}': count for reason, count in self._withheld.items()}
-        return withheld | {'bad pixels': len(self.cleaner.bad_pixels)}
+        return withheld | {'late': self._late, 'bad pixels': len(self.cleaner.bad_pixels)}
 
 
 def main() -> int:

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from decimal import Decimal
 from functools import partial
 from pathlib import Path
 import shutil
@@ -62,6 +63,7 @@ class RunFiles:
     def __exit__(self, *exception: Any) -> None:
         for file in (self._fused, self._fiducial, self._detections):
             file.close()
+        _sort_by_stamp(self.folder / 'fiducial.tum')
         self._bag.__exit__(*exception)
 
     def add(self, topic: str, time_ns: int, data: bytes) -> None:
@@ -115,6 +117,12 @@ def extrinsics(config: Any) -> FloatArray:
 
 def _opened(path: Path) -> TextIO:
     return path.open('w', encoding='utf-8')
+
+
+def _sort_by_stamp(path: Path) -> None:
+    """Put the lines of late frames where they belong: a trajectory's stamps increase."""
+    lines = path.read_text(encoding='utf-8').splitlines(keepends=True)
+    path.write_text(''.join(sorted(lines, key=lambda line: Decimal(line.split(maxsplit=1)[0]))), encoding='utf-8')
 
 
 def _write_pose(file: TextIO, message: PoseWithCovarianceStamped, pose: Pose) -> None:
