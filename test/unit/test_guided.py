@@ -11,7 +11,7 @@ from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import _common_shift, MarkerDetector
 from thermal_fiducial.core.measurements import corners_px, Odometry
-from thermal_fiducial.core.vision.guided import expected_markers
+from thermal_fiducial.core.vision.guided import KnownMarkers
 from thermal_fiducial.core.vision.search import Found
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.camera import render_frames
@@ -50,11 +50,13 @@ def detector(**changes):
 
 def test_expected_markers_are_those_in_view():
     frame = frames(8.0, 1)[0]
-    ids, corners, depth = expected_markers(MAP, geometry.inverse(frame.T_map_camera), CAMERA, 12.0)
+    ids, corners, x, depth = KnownMarkers(MAP).expected(geometry.inverse(frame.T_map_camera), CAMERA, 12.0)
     assert set(frame.corners_px) >= set(ids.tolist())
     for marker_id, expected in zip(ids.tolist(), corners, strict=True):
         np.testing.assert_allclose(expected, frame.corners_px[marker_id], atol=1e-6)
+    np.testing.assert_allclose(CAMERA.distort(x), corners, atol=1e-9)
     assert np.all(depth > 1.0)
+    assert len(KnownMarkers({}).expected(np.eye(4), CAMERA, 12.0).ids) == 0
 
 
 def test_finds_markers_of_the_noise_s_own_contrast():

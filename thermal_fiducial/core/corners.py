@@ -13,7 +13,7 @@ from thermal_fiducial.core.adjustment import edges
 from thermal_fiducial.core.adjustment.segments import adjust, HOPELESS, measure
 from thermal_fiducial.core.adjustment.sides import sides_of
 from thermal_fiducial.core.camera import Camera, ImagePoints
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 # Factors on the blur, pass by pass: a wide one catches, narrow ones measure, until the corners no longer move.
 _PASSES = (1.4, 1.0, 1.0, 1.0, 1.0)
@@ -43,8 +43,8 @@ class RefinedCorners:
     contrast: FloatArray
     noise: FloatArray
 
-    def only(self, keep: BoolArray) -> 'RefinedCorners':
-        """Those of the markers ``keep`` (N,)."""
+    def only(self, keep: BoolArray | IntArray) -> 'RefinedCorners':
+        """Those of the markers ``keep``."""
         return RefinedCorners(self.corners_px[keep], self.covariances[keep], self.contrast[keep], self.noise[keep])
 
 

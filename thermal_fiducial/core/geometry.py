@@ -199,5 +199,5 @@ def in_quadrilaterals(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray
     H[:2, :, 1] = (c[:, 3] - c[:, 0] + h[:, None] * c[:, 3]).T
     H[:2, :, 2] = c[:, 0].T
     shares = np.stack([a, b, np.ones_like(a)], axis=-2)
-    u, v, depth = H @ shares if a.ndim == 1 else (H[:, :, None] @ shares)[:, :, 0]
-    return np.asarray((u / depth, v / depth))
+    points = H @ shares if a.ndim == 1 else (H[:, :, None] @ shares)[:, :, 0]
+    return np.asarray(points[:2] / points[2])

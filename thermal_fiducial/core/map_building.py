@@ -12,7 +12,7 @@ from thermal_fiducial.core.map_refinement import refine, Refinement, Snapshot
 from thermal_fiducial.core.mapping.candidates import DECISIVE, SAME_FIT
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.marker_map import MarkerMapper
-from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers
+from thermal_fiducial.core.measurements import Markers
 from thermal_fiducial.core.pose import solve_marker_poses
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.core.vision.marker_rows import marker_rows
@@ -83,8 +83,6 @@ def rows_from_corners(
     ids, sizes : (N,), (N,) [m]
     corners, covariances : (N, 4, 2) [px], (N, 4, 2, 2) [px^2]
     """
-    if not len(ids):
-        return np.zeros(0, MARKER_DTYPE)
     return marker_rows(ids, corners, covariances, solve_marker_poses(corners, covariances, sizes, camera))
 
 

@@ -73,7 +73,7 @@ def blurred_step(distance: Float32Array, sharpness: Float32Array) -> tuple[Float
     slope = (1.0 - bent * bent) * (square * (1.5 * _CUBIC) + 0.5 * _LINEAR) * sharpness
     bent *= 0.5
     bent += 0.5
-    return bent, slope
+    return bent, np.asarray(slope, dtype=np.float32)
 
 
 def _seen_along(sides: Sides, blur_along: FloatArray) -> Float32Array:

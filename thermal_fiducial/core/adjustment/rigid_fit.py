@@ -134,14 +134,14 @@ def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = 
     J[..., :3] = d_p
     np.matmul(d_p, (rotated @ _MINUS_SKEW).reshape(*p.shape, 3), out=J[..., 3:])
     squared = np.sum(residual * residual, axis=(-1, -2))
-    J = J.reshape(len(T), -1, 6)
+    J = J.reshape(len(T), 2 * p.shape[1], 6)
     weighted = J
     if inlier < np.inf:
         excess = np.maximum(squared / inlier**2, 1.0)
         squared = np.where(excess > 1.0, inlier**2 * (1.0 + np.log(excess)), squared)
         weighted = J / np.repeat(excess, 2, axis=-1)[..., None]
     weighted = np.swapaxes(weighted, -1, -2)
-    gradient = (weighted @ residual.reshape(len(T), -1, 1))[..., 0]
+    gradient = (weighted @ residual.reshape(len(T), 2 * p.shape[1], 1))[..., 0]
     return np.where(seen, squared.sum(axis=-1), np.inf), gradient, weighted @ J
 
 

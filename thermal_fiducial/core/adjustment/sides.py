@@ -87,7 +87,7 @@ def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], columns: int
 
 def _nodes(x: FloatArray, camera: Camera) -> FloatArray:
     """Pixels (4 N, 5, 2) of five points on every side of quadrilaterals (N, 4, 2), normalised."""
-    points = np.stack(geometry.in_quadrilaterals(x, _A, _B), axis=-1)
+    points = np.moveaxis(geometry.in_quadrilaterals(x, _A, _B), 0, -1)
     return camera.distort(points).reshape(-1, len(_NODES), 2)
 
 

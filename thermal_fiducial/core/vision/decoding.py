@@ -5,6 +5,7 @@ from noise at contrasts where no single bit could be thresholded.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -44,6 +45,18 @@ class Reading:
     surround: FloatArray
 
 
+class Likeness(NamedTuple):
+    """Which patterns Q quadrilaterals look most like."""
+
+    #: (Q, m * m) contrast of the cells, without background
+    values: FloatArray
+    #: (Q,) four times the most similar ID, and the quarter turns
+    best: IntArray
+    #: (Q,) its correlation, and that of the most similar other ID
+    correlation: FloatArray
+    runner_up: FloatArray
+
+
 class Decoder:
     """Patterns of a dictionary, ready for correlation.
 
@@ -74,6 +87,8 @@ class Decoder:
         self.isolation = 1.0 - likeness.max(axis=1)
         share = ((np.arange(self.cells)[:, None] + _SAMPLES) / self.cells).ravel()
         self._a, self._b = (axis.ravel() for axis in np.meshgrid(share, share))
+        mean = np.kron(np.eye(self.cells), np.full((len(_SAMPLES), 1), 1.0 / len(_SAMPLES)))
+        self._cells_of_samples = (np.kron(mean, mean) @ self._detrend).astype(np.float32)
 
     def read(self, image: Float32Array, quads: FloatArray, allowed: BoolArray) -> Reading:
         """Most similar pattern of each quadrilateral (Q, 4, 2) among those ``allowed`` (M,)."""
@@ -81,27 +96,31 @@ class Decoder:
             nothing = np.zeros(0)
             none = nothing.astype(np.int64)
             return Reading(none, none, nothing, nothing, nothing, none, none, nothing)
-        values = self._cell_means(image, quads)
-        values = values @ self._detrend
-        spread = np.linalg.norm(values, axis=1, keepdims=True)
-        similar = (values / np.maximum(spread, 1e-9)) @ self._patterns.T
-        similar = np.where(np.repeat(allowed, 4), similar, 0.0)
-        best = np.abs(similar).argmax(axis=1)
-        rows = np.arange(len(quads))
-        correlation = similar[rows, best]
-        ids = best // 4
-        others = np.abs(similar).reshape(len(quads), -1, 4).max(axis=-1)
-        others[rows, ids] = 0.0
+        values, best, correlation, runner_up = self.likeness(image, quads, allowed)
         steps = np.zeros((len(quads), 4))
         alike = np.flatnonzero(np.abs(correlation) >= _ALIKE)
         if len(alike):
             steps[alike] = self._steps(image, quads[alike])
-        return self._judged(values, best, correlation, others.max(axis=1), steps)
+        return self._judged(values, best, correlation, runner_up, steps)
+
+    def likeness(self, image: Float32Array, quads: FloatArray, allowed: BoolArray | None = None) -> Likeness:
+        """Most similar patterns of quadrilaterals (Q, 4, 2) among those ``allowed`` (M,), or all."""
+        values = self._contrasts(image, quads)
+        spread = np.sqrt(np.sum(values * values, axis=1, keepdims=True))
+        similar = (values / np.maximum(spread, 1e-9)) @ self._patterns.T
+        if allowed is not None:
+            similar = np.where(np.repeat(allowed, 4), similar, 0.0)
+        size = np.abs(similar)
+        best, rows = size.argmax(axis=1), np.arange(len(quads))
+        correlation = similar[rows, best]
+        by_id = size.reshape(len(quads), -1, 4)
+        by_id[rows, best // 4] = 0.0
+        return Likeness(values, best, correlation, by_id.max(axis=(1, 2)))
 
     def match(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
         """Correlation (Q,) of quadrilaterals (Q, 4, 2) with the upright patterns of ``ids`` (Q,)."""
-        values = self._cell_means(image, quads) @ self._detrend
-        spread = np.maximum(np.linalg.norm(values, axis=1), 1e-9)
+        values = self._contrasts(image, quads)
+        spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), 1e-9)
         return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread)
 
     def seen(self, ids: IntArray, turns: IntArray) -> FloatArray:
@@ -141,11 +160,10 @@ class Decoder:
         means = sampled(image, quads, a, b).reshape(len(quads), 2, 4, -1).mean(axis=-1, dtype=np.float64)
         return np.asarray(means[:, 0] - means[:, 1])
 
-    def _cell_means(self, image: Float32Array, quads: FloatArray) -> FloatArray:
-        """Mean counts (Q, m * m) of the cells."""
+    def _contrasts(self, image: Float32Array, quads: FloatArray) -> FloatArray:
+        """Mean counts (Q, m * m) of the cells without the background."""
         values = sampled(image, quads, self._a, self._b)
-        blocks = values.reshape(len(quads), self.cells, len(_SAMPLES), self.cells, len(_SAMPLES))
-        return np.asarray(blocks.mean(axis=(2, 4)).reshape(len(quads), -1), dtype=np.float64)
+        return np.asarray((values - values[:, :1]) @ self._cells_of_samples, dtype=np.float64)
 
 
 def shrunk(quads: FloatArray, cells: int) -> FloatArray:

@@ -31,30 +31,55 @@ class Expected(NamedTuple):
 
     #: (N,)
     ids: IntArray
-    #: (N, 4, 2)
+    #: (N, 4, 2) in pixels, and normalised
     corners_px: FloatArray
+    x: FloatArray
     #: (N, 4) of the corners [m]
     depth: FloatArray
 
+    def only(self, keep: BoolArray) -> 'Expected':
+        """Those of the markers ``keep`` (N,)."""
+        return Expected(self.ids[keep], self.corners_px[keep], self.x[keep], self.depth[keep])
 
-def expected_markers(
-    marker_map: Mapping[int, tuple[FloatArray, float]], T_camera_map: FloatArray, camera: Camera, min_side_px: float
-) -> Expected:
-    """The markers of the map that are wholly in view and show a face."""
-    ids = np.array(sorted(marker_map), dtype=np.int64)
-    if len(ids) == 0:
-        return Expected(ids, np.zeros((0, 4, 2)), np.zeros((0, 4)))
-    T_map_marker = np.stack([marker_map[marker_id][0] for marker_id in ids.tolist()])
-    sizes = np.array([marker_map[marker_id][1] for marker_id in ids.tolist()])
-    T = T_camera_map @ T_map_marker
-    points = geometry.apply(T, sizes[:, None, None] * marker_corners(1.0))
-    corners = camera.project(points)
-    distance = np.maximum(np.linalg.norm(T[:, :3, 3], axis=-1), 1e-6)
-    facing = -np.sum(T[:, :3, 2] * T[:, :3, 3], axis=-1) / distance > _MAX_TILT_COSINE
-    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=-1)
-    inside = camera.contains(corners, 2.0).all(axis=1)
-    seen = inside & facing & (np.min(np.nan_to_num(sides), axis=1) >= min_side_px)
-    return Expected(ids[seen], corners[seen], points[seen][..., 2])
+    def joined(self, others: 'Expected') -> 'Expected':
+        """Those of ``others`` as well."""
+        return Expected(
+            np.concatenate([self.ids, others.ids]),
+            np.concatenate([self.corners_px, others.corners_px]),
+            np.concatenate([self.x, others.x]),
+            np.concatenate([self.depth, others.depth]),
+        )
+
+
+class KnownMarkers:
+    """The markers of a map.
+
+    Parameters
+    ----------
+    markers : ID to (T_map_marker, side [m])
+    """
+
+    def __init__(self, markers: Mapping[int, tuple[FloatArray, float]]) -> None:
+        #: (M,)
+        self.ids = np.array(sorted(markers), dtype=np.int64)
+        entries = [markers[marker_id] for marker_id in self.ids.tolist()]
+        self._T_map_marker = np.stack([entry[0] for entry in entries]) if entries else np.zeros((0, 4, 4))
+        sizes = np.array([entry[1] for entry in entries])
+        self._corners = geometry.apply(self._T_map_marker, sizes[:, None, None] * marker_corners(1.0))
+
+    def expected(self, T_camera_map: FloatArray, camera: Camera, min_side_px: float) -> Expected:
+        """Those that are wholly in view and show a face."""
+        points = geometry.apply(T_camera_map, self._corners.reshape(-1, 3)).reshape(-1, 4, 3)
+        corners = camera.project(points)
+        centre = geometry.apply(T_camera_map, self._T_map_marker[:, :3, 3])
+        normal = self._T_map_marker[:, :3, 2] @ T_camera_map[:3, :3].T
+        distance = np.sqrt(np.sum(centre * centre, axis=1))
+        facing = np.sum(normal * centre, axis=1) < -_MAX_TILT_COSINE * distance
+        span = corners[:, [1, 2, 3, 0]] - corners
+        large = (np.sum(span * span, axis=-1) >= min_side_px**2).all(axis=1)
+        seen = np.flatnonzero(camera.contains(corners, 2.0).all(axis=1) & facing & large)
+        points = points[seen]
+        return Expected(self.ids[seen], corners[seen], points[..., :2] / points[..., 2:], points[..., 2])
 
 
 def camera_in_map(stamp_ns: int, odometry: Odometry, T_body_camera: FloatArray, twist: Twist) -> FloatArray:

@@ -22,6 +22,7 @@ from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.vision.ids import pairs
 
 # First derivative, exact up to the sixth order: on images blurred by a pixel's optics the eighth does not matter.
 _DERIVATIVE = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0], dtype=np.float32) / 60.0
@@ -146,9 +147,9 @@ class MotionTracker:
         noise : (N,) standard deviation of a corner in normalised coordinates
         """
         twist = predicted
-        common, now, before = np.intersect1d(ids, self._seen.ids, assume_unique=True, return_indices=True)
+        now, before = pairs(ids, self._seen.ids)
         dt = self._since(stamp_ns)
-        if len(common) and dt is not None:
+        if len(now) and dt is not None:
             middle = 0.5 * (x[now] + self._seen.x[before])
             A = interaction(middle, depth[now]).reshape(-1, 6)
             velocity = (x[now] - self._seen.x[before]).reshape(-1) / dt
@@ -231,10 +232,18 @@ def without_lag(image: Float32Array, smear_u: Float32Array, smear_v: Float32Arra
 
 
 def markers_sharpened(
-    image: Float32Array, corners_px: FloatArray, smear_px: FloatArray, margin_px: int
+    image: Float32Array,
+    corners_px: FloatArray,
+    smear_px: FloatArray,
+    margin_px: int,
+    result: Float32Array | None = None,
 ) -> Float32Array:
-    """``image`` with the windows round N markers (corners (N, 4, 2), smear (N, 4, 2) [px]) freed of old memories."""
-    result = image.copy()
+    """``image`` with the windows round N markers (corners (N, 4, 2), smear (N, 4, 2) [px]) freed of old memories.
+
+    ``result`` is where it is put, if given.
+    """
+    result = np.empty_like(image) if result is None else result
+    np.copyto(result, image)
     height, width = image.shape
     finite = np.isfinite(corners_px).all(axis=(1, 2)) & np.isfinite(smear_px).all(axis=(1, 2))
     corners_px, smear_px = corners_px[finite], smear_px[finite]

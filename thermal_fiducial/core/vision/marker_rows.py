@@ -37,7 +37,7 @@ def marker_rows(
     contrast : (N,) [counts], where it is known
     """
     rows = np.zeros(len(ids), dtype=MARKER_DTYPE)
-    table = rows.view(_NUMBER).reshape(len(ids), -1)
+    table = rows.view(_NUMBER).reshape(-1, len(_COLUMN))
     table[:, _CORNERS] = corners_px.reshape(-1, 8)
     terms = covariances.reshape(-1, 4, 4)[..., [0, 1, 3]]
     table[:, _COVARIANCES] = terms.reshape(-1, 12)

@@ -8,8 +8,9 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.corners import RefinedCorners
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from thermal_fiducial.core.vision.alignment import aligned
-from thermal_fiducial.core.vision.contrast import dark, halved, noise_of, Scale, without_columns
+from thermal_fiducial.core.vision.contrast import dark, halved, Scale, without_columns
 from thermal_fiducial.core.vision.decoding import Decoder, Reading, shrunk
+from thermal_fiducial.core.vision.ids import among
 from thermal_fiducial.core.vision.quads import find_quads
 
 # Full resolution sees small and smeared markers; half resolution, without the pattern of columns, faint ones.
@@ -64,6 +65,10 @@ class Found:
     clarity: FloatArray
     expected: BoolArray
 
+    def only(self, keep: BoolArray | IntArray) -> 'Found':
+        """Those of the markers ``keep``."""
+        return Found(self.ids[keep], self.corners_px[keep], self.clarity[keep], self.expected[keep])
+
     @staticmethod
     def none() -> 'Found':
         """No markers."""
@@ -72,6 +77,7 @@ class Found:
 
 def blind_search(
     image: Float32Array,
+    noise: float,
     scene: Float32Array,
     decoder: Decoder,
     allowed: BoolArray,
@@ -83,10 +89,10 @@ def blind_search(
     Parameters
     ----------
     image : (height, width) the frame
+    noise : standard deviation of a pixel in it [counts]
     scene : the same freed of lag, which costs noise: the finest markers are sought there, the faintest in ``image``
     seen : (N, 4, 2) corners of markers that are there [px]: nothing is sought in them and their plates
     """
-    noise = noise_of(image)
     hidden = None if seen is None else _grown(seen, 1.0 + 2.0 * _PLATE_CELLS / decoder.cells)
     half = without_columns(halved(image), 0.5 * noise)
     fine, faint = _outlines(scene, half, noise, config.min_side_px, hidden)
@@ -150,14 +156,16 @@ def _joined(first: Reading, second: Reading) -> Reading:
 
 def merged(first: Found, second: Found) -> Found:
     """All markers of ``first``, and those of ``second`` that it does not have and that lie elsewhere."""
+    if len(second.ids) == 0:
+        return first
     apart = np.linalg.norm(second.corners_px.mean(axis=1)[:, None] - first.corners_px.mean(axis=1), axis=-1)
     extent = np.linalg.norm(first.corners_px[:, 2] - first.corners_px[:, 0], axis=-1)
-    new = ~np.isin(second.ids, first.ids) & (apart > 0.35 * extent).all(axis=1)
+    new = ~among(second.ids, first.ids) & (apart > 0.35 * extent).all(axis=1)
     return Found(
         np.concatenate([first.ids, second.ids[new]]),
         np.concatenate([first.corners_px, second.corners_px[new]]),
         np.concatenate([first.clarity, second.clarity[new]]),
-        np.concatenate([first.expected | np.isin(first.ids, second.ids[second.expected]), second.expected[new]]),
+        np.concatenate([first.expected | among(first.ids, second.ids[second.expected]), second.expected[new]]),
     )
 
 
@@ -220,8 +228,7 @@ def confirmed(
     soft = (softness <= _SOFT) & (similarity >= np.minimum(_CLEARLY_ALIKE, 0.7 + 0.07 * contrast))
     known = (similarity >= config.guided_min_correlation) & (similarity - reading.runner_up >= config.guided_min_margin)
     there = np.abs(refined.corners_px - found.corners_px).max(axis=(1, 2)) < 0.7 * side / decoder.cells
-    seen = same & ((found.expected & known & there) | (alike & (sharp | soft)))
-    return np.asarray(seen & _whole(refined.corners_px, image, 0.5 * _RIM))
+    return np.asarray(same & ((found.expected & known & there) | (alike & (sharp | soft))))
 
 
 def _whole(quads: FloatArray, image: Float32Array, rim: float) -> BoolArray:

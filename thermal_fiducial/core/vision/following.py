@@ -1,0 +1,61 @@
+"""Markers of the last frame followed into this one."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.camera import ImagePoints
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.vision.decoding import Decoder
+from thermal_fiducial.core.vision.frame import Frame, Places
+from thermal_fiducial.core.vision.lag import Tracked, Twist
+from thermal_fiducial.core.vision.search import Found
+
+# Correlation with its pattern of a marker that is still where motion has carried it, seen through the lag.
+_STILL_ALIKE = 0.7
+
+
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """N markers where the motion since the last frame has carried them.
+
+    Parameters
+    ----------
+    ids : (N,)
+    places : at the stamp
+    clarity : (N,) contrast over the noise of a pixel
+    certain : (N,) whether the frame shows them there beyond doubt
+    """
+
+    ids: IntArray
+    places: Places
+    clarity: FloatArray
+    certain: BoolArray
+
+    @staticmethod
+    def of(last: Tracked, frame: Frame) -> 'Followed':
+        """Those of the last frame, carried on; nothing is known yet of whether they are seen."""
+        places = Places.of(ImagePoints.seen_at(last.x, frame.camera), last.depth)
+        return Followed(last.ids, places, last.clarity, np.zeros(len(last.ids), dtype=bool))
+
+    def only(self, keep: BoolArray) -> 'Followed':
+        """Those of the markers ``keep`` (N,)."""
+        return Followed(self.ids[keep], self.places.only(keep), self.clarity[keep], self.certain[keep])
+
+    def found(self) -> Found:
+        """As a search would have found them."""
+        return Found(self.ids, self.places.at.px, self.clarity, np.ones(len(self.ids), dtype=bool))
+
+    def seen(self, frame: Frame, twist: Twist, decoder: Decoder, config: ArucoDetectorConfig) -> 'Followed':
+        """Those that the frame shows: they look like themselves more than like any other marker."""
+        if len(self.ids) == 0:
+            return self
+        shown = self.places.at.px + self.places.smear(twist, config.bolometer_lag)
+        likeness = decoder.likeness(frame.image, shown)
+        similarity = likeness.correlation * np.sign(self.clarity)
+        alike = (likeness.best == 4 * self.ids) & (similarity > _STILL_ALIKE)
+        alike &= frame.camera.contains(shown).all(axis=1)
+        certain = similarity >= config.guided_min_correlation
+        certain &= similarity - likeness.runner_up >= config.guided_min_margin
+        return Followed(self.ids, self.places, self.clarity, certain).only(alike)

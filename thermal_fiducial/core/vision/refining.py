@@ -1,0 +1,157 @@
+"""Corners refined in frames that motion and the bolometers' lag smear.
+
+The smear of each marker follows from the camera's twist. Where it matters it is taken out round the marker, as far as
+that holds whatever the response is like; the edges are fitted with the blur that remains, and what lag has displaced
+them by is taken out of the corners. These correct the twist: where that changes the smear much, it is done once more.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.corners import refine_corners, RefinedCorners
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
+from thermal_fiducial.core.vision.frame import Frame, Places
+from thermal_fiducial.core.vision.lag import markers_sharpened, model_error, MotionTracker, REMAINING, SPREAD, Twist
+from thermal_fiducial.core.vision.search import Found
+
+#: Smear by lag below which the shape of an edge doesn't change [px].
+SMEAR_THAT_MATTERS_PX = 0.4
+#: Pixels round a marker that the refinement may look at.
+WINDOW_MARGIN_PX = 14
+# What both ways to measure smeared corners cost: sharpening adds noise, in pixels times contrast over noise times root
+# of the side; without it the tail of the lag passes for a symmetric blur, which displaces corners by so much of the
+# square of the smear over a cell.
+_NOISE_OF_SHARPENING, _COST_OF_SMEAR = 6.5, 0.22
+# Contrast over noise below which a marker is faint. A clearer one is always sharpened: its corners are so good that
+# even a short tail shows in what they have in common.
+_CLEAR = 20.0
+# Columns of pixels used of a cell; all of a faint marker's count.
+_COLUMNS, _COLUMNS_FAINT = 6, 12
+_ROUNDS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """A frame in which the smear of N markers is short."""
+
+    image: Float32Array
+    #: (N, 4, 2) where the corners appear in it, off their places at the stamp [px]
+    shift: FloatArray
+    #: (N, 4, 2) how much of the smear's shift has been taken out
+    removed: FloatArray
+    #: (N, 2) standard deviation of what is left of the smear, along it
+    spread: FloatArray
+    #: (N,) round which markers it has been sharpened
+    sharpened: BoolArray
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """Refined corners of N markers."""
+
+    #: as the view shows them
+    view: View
+    seen: RefinedCorners
+    #: at the stamp, with what is unknown of the motion
+    corners: RefinedCorners
+    places: Places
+    twist: Twist | None
+
+    def only(self, keep: BoolArray) -> 'Refinement':
+        """That of the markers ``keep`` (N,)."""
+        return replace(self, seen=self.seen.only(keep), corners=self.corners.only(keep), places=self.places.only(keep))
+
+
+class Refiner:
+    """Refines markers of a dictionary in moving frames.
+
+    Parameters
+    ----------
+    behind : (M, 4, m, 2) of :func:`thermal_fiducial.core.adjustment.edges.edges_behind`
+    motion : what corrects the twist by the corners
+    """
+
+    def __init__(self, behind: Float32Array, motion: MotionTracker) -> None:
+        self._behind, self._motion = behind, motion
+        self._sharp = np.zeros((0, 0), dtype=np.float32)
+
+    def refine(
+        self, frame: Frame, found: Found, places: Places, near: BoolArray, config: ArucoDetectorConfig
+    ) -> Refinement:
+        """Corners of N markers.
+
+        Parameters
+        ----------
+        found : the markers
+        places : where they roughly are at the stamp
+        near : (N,) which of them to a pixel
+        """
+        cell = sides_px(found.corners_px) / self._behind.shape[2]
+        columns = _COLUMNS if np.abs(found.clarity).min() > _CLEAR else _COLUMNS_FAINT
+        twist = frame.twist
+        for _ in range(_ROUNDS):
+            view = self._view(frame.image, places, twist, cell, found.clarity, config.bolometer_lag)
+            start = places.at.moved(view.shift, frame.camera)
+            behind = self._behind[found.ids]
+            seen = refine_corners(
+                view.image, start, frame.camera, behind, config.blur_px, view.spread, columns, near=near
+            )
+            refinement = self._at_stamp(frame, found, places, view, seen, cell, config.bolometer_lag)
+            change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)[view.sharpened]
+            if refinement.twist is None or change.max(initial=0.0) < SMEAR_THAT_MATTERS_PX:
+                break
+            twist, places, near = refinement.twist, refinement.places, np.ones(len(near), dtype=bool)
+        return refinement
+
+    def _view(
+        self,
+        image: Float32Array,
+        places: Places,
+        twist: Twist | None,
+        cell: FloatArray,
+        clarity: FloatArray,
+        lag: float,
+    ) -> View:
+        """``image`` with known smear round all markers, sharpened round those for which that is worth its noise."""
+        smear = np.zeros_like(places.at.px) if twist is None else places.smear(twist, lag)
+        mean = smear.mean(axis=1)
+        sharpen = _worth_sharpening(np.sum(mean * mean, axis=1), cell, self._behind.shape[2], clarity)
+        removed = (1.0 - REMAINING) * smear * sharpen[:, None, None]
+        shift = smear - removed
+        if sharpen.any() and twist is not None:
+            if self._sharp.shape != image.shape:
+                self._sharp = np.empty_like(image)
+            corners = places.at.px + shift
+            image = markers_sharpened(image, corners[sharpen], smear[sharpen], WINDOW_MARGIN_PX, self._sharp)
+        return View(image, shift, removed, mean * np.where(sharpen, SPREAD, 1.0)[:, None], sharpen)
+
+    def _at_stamp(
+        self, frame: Frame, found: Found, places: Places, view: View, seen: RefinedCorners, cell: FloatArray, lag: float
+    ) -> Refinement:
+        """The corners without lag, by the twist that they themselves correct."""
+        at = places.at.moved(seen.corners_px - view.shift - places.at.px, frame.camera)
+        variance = seen.covariances[..., 0, 0] + seen.covariances[..., 1, 1]
+        deviation = np.sqrt(0.5 * variance.mean(axis=1)) / frame.camera.focal_px
+        twist = self._motion.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
+        if twist is None:
+            return Refinement(view, seen, seen, replace(places, at=at), None)
+        smear = places.smear(twist, lag)
+        corners = seen.corners_px - smear + view.removed
+        by_twist = lag * places.flow
+        unknown = by_twist @ twist.covariance @ np.swapaxes(by_twist, -1, -2) + model_error(smear, cell)
+        refined = replace(seen, corners_px=corners, covariances=seen.covariances + unknown)
+        return Refinement(view, seen, refined, replace(places, at=at.moved(corners - at.px, frame.camera)), twist)
+
+
+def _worth_sharpening(square: FloatArray, cell: FloatArray, cells: int, clarity: FloatArray) -> BoolArray:
+    """For which markers with squares of the smear (N,) and cells (N,) [px] it costs more than sharpening's noise."""
+    systematic, noise = _COST_OF_SMEAR * square / cell, _NOISE_OF_SHARPENING / np.sqrt(cells * cell)
+    return np.asarray((np.abs(clarity) > _CLEAR) | (systematic * np.abs(clarity) > noise))
+
+
+def sides_px(corners: FloatArray) -> FloatArray:
+    """Mean sides (N,) of quadrilaterals (N, 4, 2)."""
+    span = corners[:, [1, 2, 3, 0]] - corners
+    return np.asarray(np.sqrt(np.sum(span * span, axis=-1)).mean(axis=1))
