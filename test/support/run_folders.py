@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
+from thermal_fiducial.core.filter.gating import PoseUpdate
+from thermal_fiducial.core.filter.innovations import innovations_text
 from thermal_fiducial.core.geometry import quaternion_from_rotation, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.files.bags import BagWriter, TRUTH_TOPIC
@@ -90,10 +92,11 @@ def write_detections(path, frames, rng):
 
 
 def write_output(path, stamps, fused):
-    """``pose`` with the right covariance, and diagnostics."""
+    """``pose`` with the right covariance, and diagnostics, with the innovations of 30 poses in each, one refused."""
     types = get_typestore(Stores.ROS2_JAZZY).types
     header, time = types['std_msgs/msg/Header'], types['builtin_interfaces/msg/Time']
     covariance = np.diag(FUSED_SIGMA**2).ravel()
+    innovations = made_up_innovations()
     q = quaternion_from_rotation(fused[:, :3, :3])
     with BagWriter(path) as bag:
         for k, stamp in enumerate(stamps.tolist()):
@@ -105,11 +108,25 @@ def write_output(path, stamps, fused):
             bag.write('pose', stamp, message)
             if k % 200 == 0:
                 status = types['diagnostic_msgs/msg/DiagnosticStatus']
+                pairs = types['diagnostic_msgs/msg/KeyValue']
+                values = [pairs(key='lost', value='False'), pairs(key='innovations', value=next(innovations))]
+                words = f'running for {k / 200:.1f} s'
                 items = [
-                    status(level=0, name='pose_ekf', message=f'running for {k / 200:.1f} s', hardware_id='', values=[]),
+                    status(level=0, name='pose_ekf', message=words, hardware_id='', values=values),
                     status(level=1, name='tau2_camera', message='FFC', hardware_id='', values=[]),
                 ]
                 bag.write('/diagnostics', stamp, types['diagnostic_msgs/msg/DiagnosticArray'](head, items))
+
+
+def made_up_innovations():
+    """What the filter tells each second."""
+    rng = np.random.default_rng(1)
+    for second in range(1_000_000):
+        stamps = (START_NS + second * 1_000_000_000 + np.arange(30) * 33_333_333).tolist()
+        nis = [*rng.chisquare(6, 29), 99.0]
+        yield innovations_text(
+            PoseUpdate(stamp, value < 50.0, '', value) for stamp, value in zip(stamps, nis, strict=True)
+        )
 
 
 def write_truth_bag(path, seconds=20.0):

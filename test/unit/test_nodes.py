@@ -13,6 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 from support import small_bag
 from support.ros_graph import ros_graph
 
+from thermal_fiducial.core.filter.innovations import innovations_of
 from thermal_fiducial.core.geometry import so3_exp, transform
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
 from thermal_fiducial.errors import InputError
@@ -336,6 +337,11 @@ def test_one_pose_and_one_odometry_for_each_imu_message(graph):
     np.testing.assert_allclose(convert.odometry(message).T_map_body, np.eye(4), atol=0.01)
     level, reason, figures = graph.diagnose(node)
     assert (level, reason, figures['lost']) == (OK, 'tracking', 'False')
+    # Of ten poses three start the filter; each is told once.
+    told = innovations_of(figures['innovations'])
+    assert list(told.stamps_ns) == [START + k * 5_000_000 for k in range(19, 60, 6)]
+    assert told.accepted.all()
+    assert graph.diagnose(node)[2]['innovations'] == ''
 
 
 def test_nan_in_the_imu_is_refused_and_the_next_sample_taken(graph):

@@ -39,6 +39,11 @@ def test_the_measures_are_those_of_the_noise_that_was_put_in(run_folder):
         assert numbers[name]['jitter']['position_mm'] == pytest.approx(1e3 * np.sqrt(6) * sigma[0], rel=1.2 * tolerance)
     # 200 samples of six degrees of freedom: the mean's sigma is sqrt(2 / 1200) = 4 %.
     assert numbers['fused']['consistency']['pose_nees_per_dof'] == pytest.approx(1.0, abs=0.16)
+    innovations = numbers['innovations']
+    assert (innovations['poses'], innovations['refused']) == (600, 20)
+    # 580 samples of six degrees of freedom: sigma sqrt(2 / 3480) = 2.4 %, and sqrt(.95 * .05 / 580) = 0.9 %; four of it
+    assert innovations['nis_per_dof'] == pytest.approx(1.0, abs=0.1)
+    assert innovations['within_95'] == pytest.approx(0.95, abs=0.036)
     assert numbers['latency']['imu_to_pose']['p50_ms'] == pytest.approx(2.0, abs=0.1)
     assert numbers['markers'] == {
         'detections': 2525,
@@ -91,10 +96,10 @@ def test_the_page_is_one_file_of_sound_pictures(run_folder):
         r'http://www\.w3\.org/\S+|http://purl\.org/\S+|http://creativecommons\.org/\S+', '', page
     )
     pictures = re.findall(r'<svg.*?</svg>', page, re.DOTALL)
-    assert len(pictures) == 5
+    assert len(pictures) == 6
     for picture in pictures:
         ET.fromstring(picture)
-    for words in ('Position error', 'markers alone', 'NEES', 'Drop-outs', 'FFC', 'image to camera pose'):
+    for words in ('Position error', 'markers alone', 'NEES', 'NIS', 'Drop-outs', 'FFC', 'image to camera pose'):
         assert words in page
     assert 'nan' not in re.sub(r'<svg.*?</svg>', '', page, flags=re.DOTALL).lower()
 

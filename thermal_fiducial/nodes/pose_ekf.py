@@ -12,6 +12,7 @@ from std_srvs.srv import Trigger
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.ekf import PoseEkf
+from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_text
 from thermal_fiducial.core.geometry import transform_from_quaternion
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, Odometry
 from thermal_fiducial.core.types import FloatArray
@@ -42,6 +43,8 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         #: how often the pose has jumped: fresh starts and corrections of the map
         self._jumps = 0
         self._resets: int | None = None
+        #: stamps of the poses whose innovations were told
+        self._told: set[int] = set()
         self._corrections: deque[tuple[int, FloatArray]] = deque(maxlen=_CORRECTIONS)
         self._pose = self.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
         self._odometry = self.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
@@ -133,7 +136,14 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
     def figures(self) -> dict[str, object]:
         """The filter in numbers."""
         numbers: dict[str, object] = {name: f'{value:.6g}' for name, value in self.filter.diagnostics().items()}
-        return numbers | {'lost': self.filter.lost, 'jumps': self._jumps}
+        return numbers | {'lost': self.filter.lost, 'jumps': self._jumps, INNOVATIONS: self._innovations()}
+
+    def _innovations(self) -> str:
+        """Those of the poses since the last time."""
+        decided = self.filter.decided
+        text = innovations_text(update for stamp, update in decided.items() if stamp not in self._told)
+        self._told = set(decided)
+        return text
 
 
 def main() -> int:

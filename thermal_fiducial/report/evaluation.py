@@ -76,6 +76,8 @@ class Evaluation:
                 result[name]['relative_error'] = metrics.relative_pose_error(e)
         if (known := self.covariances) is not None:
             result['fused']['consistency'] = _consistency(*known)
+        if len(self.run.output.innovations.nis):
+            result['innovations'] = metrics.innovation_consistency(self.run.output.innovations)
         return result
 
     def _markers(self) -> dict[str, Any]:

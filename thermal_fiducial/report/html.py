@@ -79,6 +79,12 @@ def _figures(evaluation: Evaluation) -> list[Figure]:
             plots.errors_over_time(evaluation) or '',
         ),
         Figure(
+            'Innovations',
+            'How far each camera pose lay from what the filter expected, squared, in its standard deviations: 6 on '
+            'average where the covariances are right, less where the parameters allow for more.',
+            plots.innovations_over_time(evaluation) or '',
+        ),
+        Figure(
             'Detections',
             'Bars: a marker in view. Amber: no marker for over 0.3 s.',
             plots.detections_over_time(evaluation),

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermal_fiducial.core.filter.innovations import Innovations
 from thermal_fiducial.core.geometry import inverse, so3_exp, so3_log, transform
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.report.trajectory import Trajectory
@@ -25,8 +26,9 @@ RELATIVE_NS = 1_000_000_000
 GAP_NS = 300_000_000
 #: Truth is not interpolated over holes longer than this [ns].
 TRUTH_HOLE_NS = 200_000_000
-#: 95 % point of chi-square, by degrees of freedom.
+#: 95 % point of chi-square, by degrees of freedom; and where 95 % lie of a pose's, as much below as above.
 CHI2_95 = {3: 7.815, 6: 12.592}
+CHI2_BAND_6 = (1.237, 14.449)
 
 
 def interpolate(truth: Trajectory, stamps_ns: IntArray) -> tuple[FloatArray, BoolArray]:
@@ -177,6 +179,23 @@ def consistency(e: Errors, covariances: FloatArray) -> dict[str, float]:
         nees = np.einsum('ni,ni->n', d, np.linalg.solve(P, d[..., None])[..., 0])
         result[f'{name}_nees_per_dof'] = float(np.mean(nees)) / d.shape[1]
         result[f'{name}_within_95'] = float(np.mean(nees <= CHI2_95[d.shape[1]]))
+    return result
+
+
+def innovation_consistency(innovations: Innovations) -> dict[str, float]:
+    """NIS of the accepted poses: mean (1 a degree of freedom is perfect, less is cautious), share within the band."""
+    result: dict[str, float] = {
+        'poses': len(innovations.nis),
+        'refused': int(np.sum(~innovations.accepted)),
+    }
+    nis = innovations.nis[innovations.accepted]
+    if len(nis):
+        low, high = CHI2_BAND_6
+        result |= {
+            'nis_per_dof': float(np.mean(nis)) / 6.0,
+            'within_95': float(np.mean((low < nis) & (nis < high))),
+            'above_95': float(np.mean(nis >= high)),
+        }
     return result
 
 

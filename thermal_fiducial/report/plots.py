@@ -14,7 +14,7 @@ from thermal_fiducial.core.geometry import apply
 from thermal_fiducial.core.pose import marker_corners
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.report.evaluation import Evaluation
-from thermal_fiducial.report.metrics import GAP_NS
+from thermal_fiducial.report.metrics import CHI2_BAND_6, GAP_NS
 from thermal_fiducial.report.trajectory import Trajectory
 
 FIDUCIAL, FUSED, TRUTH, SEEN, UNSEEN = '#e5484d', '#2563eb', '#64748b', '#e5484d', '#16a34a'
@@ -24,6 +24,8 @@ LATENCY_COLOURS = {'imu_to_pose': FUSED, 'image_to_camera_pose': FIDUCIAL, 'imag
 
 #: A line has no more points than the page has pixels for.
 MOST_POINTS = 1200
+#: Less than this is drawn as this: the axis is logarithmic.
+LEAST_NIS = 0.03
 
 STYLE: Any = {
     'font.family': 'DejaVu Sans',
@@ -263,6 +265,32 @@ def _limit(axis: Axes, fused: FloatArray, three_sigma: FloatArray) -> None:
     typical = np.percentile(three_sigma, 95) if len(three_sigma) else 0.0
     limit = 1.25 * max(float(np.percentile(np.abs(fused), 99.5)), float(typical), 1e-3)
     axis.set_ylim(-limit, limit)
+
+
+def innovations_over_time(evaluation: Evaluation) -> str | None:
+    """Normalised innovation squared of each camera pose; None where the filter told none."""
+    innovations = evaluation.run.output.innovations
+    if not len(innovations.nis):
+        return None
+    with styled():
+        figure = Figure(figsize=(11.5, 2.8))
+        axis = figure.subplots()
+        axis.axhspan(*CHI2_BAND_6, color=FUSED, alpha=0.13, linewidth=0, label='95 % band')
+        t, nis = evaluation.seconds(innovations.stamps_ns), np.maximum(innovations.nis, LEAST_NIS)
+        for chosen, colour, marker, label in (
+            (innovations.accepted, FUSED, '.', 'accepted'),
+            (~innovations.accepted, FIDUCIAL, 'x', 'refused'),
+        ):
+            at = np.flatnonzero(chosen)
+            at = at[thinned(len(at), 2 * MOST_POINTS)]
+            axis.plot(t[at], nis[at], marker, color=colour, markersize=3.5, label=label)
+        axis.set_yscale('log')
+        axis.set_ylabel('NIS')
+        axis.set_title('Normalised innovation squared')
+        _shade_gaps(axis, evaluation)
+        _time_axis(axis, evaluation)
+        _legend(figure, axis)
+        return svg(figure)
 
 
 def detections_over_time(evaluation: Evaluation) -> str:

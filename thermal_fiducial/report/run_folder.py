@@ -1,8 +1,9 @@
 """What a run folder holds, read into arrays."""
 
 from collections import Counter
+from collections.abc import Iterable
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import json
 from pathlib import Path
 import re
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from thermal_fiducial.core.filter.innovations import INNOVATIONS, Innovations, innovations_of
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray, IntArray
@@ -57,11 +59,13 @@ class Output:
     ----------
     stamps_ns, covariances : (N,), (N, 6, 6) of some of the ``pose`` messages
     diagnostics : what the nodes said, most frequent first
+    innovations : how well each camera pose fitted what the filter expected, at the IMU's stamps
     """
 
     stamps_ns: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     covariances: FloatArray = field(default_factory=lambda: np.zeros((0, 6, 6)))
     diagnostics: tuple[Diagnostic, ...] = ()
+    innovations: Innovations = field(default_factory=Innovations)
 
 
 @dataclass(frozen=True)
@@ -104,13 +108,14 @@ def read_run(path: Path, truth: Path | None = None) -> Run:
     own_truth = path / TRUTH
     if truth is None and own_truth.is_file():
         truth = own_truth
+    offset_ns = _camera_time_offset_ns(path / PARAMETERS)
     return Run(
         path=path,
         fused=read_tum(path / FUSED),
-        fiducial=read_tum(path / FIDUCIAL).delayed(_camera_time_offset_ns(path / PARAMETERS)),
+        fiducial=read_tum(path / FIDUCIAL).delayed(offset_ns),
         detections=_detections(path / DETECTIONS),
         latencies=_latencies(path / LATENCY),
-        output=_output(path / OUTPUT),
+        output=_output(path / OUTPUT, offset_ns),
         marker_map=load_map(path / MARKER_MAP) if (path / MARKER_MAP).is_file() else None,
         summary=_summary(path / SUMMARY),
         truth=None if truth is None else read_truth(truth),
@@ -167,11 +172,12 @@ def _latencies(path: Path) -> dict[str, tuple[IntArray, FloatArray]]:
     return {kind: (stamp[kind_of == kind], value[kind_of == kind]) for kind in dict.fromkeys(kinds)}
 
 
-def _output(path: Path) -> Output:
+def _output(path: Path, offset_ns: int) -> Output:
     if not path.is_dir():
         return Output()
     with BagReader(path) as bag:
-        return Output(*_covariances(bag), _diagnostics(bag))
+        statuses = [status for item in bag.messages(['diagnostics']) for status in item.message.status]
+        return Output(*_covariances(bag), _diagnostics(statuses), _innovations(statuses, offset_ns))
 
 
 def _covariances(bag: BagReader) -> tuple[IntArray, FloatArray]:
@@ -182,10 +188,16 @@ def _covariances(bag: BagReader) -> tuple[IntArray, FloatArray]:
     return np.array(stamps, np.int64), np.array(covariances, np.float64).reshape(-1, 6, 6)
 
 
-def _diagnostics(bag: BagReader) -> tuple[Diagnostic, ...]:
+def _diagnostics(statuses: Iterable[Any]) -> tuple[Diagnostic, ...]:
     said: Counter[tuple[str, str, str]] = Counter()
-    for item in bag.messages(['diagnostics']):
-        for status in item.message.status:
-            level = status.level[0] if isinstance(status.level, (bytes, np.ndarray)) else status.level
-            said[status.name, _LEVELS[min(int(level), 3)], _NUMBER.sub('…', status.message)] += 1
+    for status in statuses:
+        level = status.level[0] if isinstance(status.level, (bytes, np.ndarray)) else status.level
+        said[status.name, _LEVELS[min(int(level), 3)], _NUMBER.sub('…', status.message)] += 1
     return tuple(Diagnostic(*key, count) for key, count in said.most_common())
+
+
+def _innovations(statuses: Iterable[Any], offset_ns: int) -> Innovations:
+    told = innovations_of(
+        ' '.join(item.value for status in statuses for item in status.values if item.key == INNOVATIONS)
+    )
+    return replace(told, stamps_ns=told.stamps_ns + offset_ns)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from thermal_fiducial.core.filter.innovations import INNOVATIONS
 from thermal_fiducial.report.evaluation import Evaluation
 
 
@@ -78,6 +79,7 @@ def tables(evaluation: Evaluation, numbers: dict[str, Any]) -> list[Table]:
     made = [
         _accuracy(numbers),
         _consistency(numbers),
+        _innovations(numbers),
         Table('Output', ('', 'fused'), _pick(numbers['fused'], _OUTPUT)),
         _latency(numbers),
         Table('Markers', ('', ''), _pick(numbers['markers'], _MARKERS)),
@@ -110,6 +112,18 @@ def _consistency(numbers: dict[str, Any]) -> Table:
         if f'{name}_nees_per_dof' in values
     ]
     return Table('Consistency of the covariance', ('', 'NEES per degree of freedom', 'within the 95 % region'), rows)
+
+
+def _innovations(numbers: dict[str, Any]) -> Table:
+    values = numbers.get('innovations', {})
+    rows = [('camera poses compared', str(values['poses'])), ('refused', str(values['refused']))] if values else []
+    if 'nis_per_dof' in values:
+        rows += [
+            ('NIS per degree of freedom', number(values['nis_per_dof'])),
+            ('within the 95 % band', f'{100 * values["within_95"]:.1f} %'),
+            ('above it', f'{100 * values["above_95"]:.1f} %'),
+        ]
+    return Table('Innovations of the filter', ('', ''), rows)
 
 
 def _latency(numbers: dict[str, Any]) -> Table:
@@ -160,7 +174,7 @@ def _figures(evaluation: Evaluation) -> Table:
         (node, name, str(value))
         for node, figures in said.items()
         for name, value in figures.items()
-        if value not in ('', '0') and not name.startswith(('received ', 'published '))
+        if value not in ('', '0') and not name.startswith(('received ', 'published ', INNOVATIONS))
     ]
     return Table('What the nodes counted, at the end', ('node', 'figure', 'value'), rows, textual=True)
 
