@@ -75,8 +75,8 @@ def test_seen_markers_are_followed(searches):
         top_left = corners_px(rows)[:, 0]
         # Noise of a tenth of the contrast's half leaves some hundredths of a pixel; refined is refined.
         np.testing.assert_allclose(top_left, [[99.5 + SPEED * k, 79.5], [99.5 + SPEED * k, 279.5]], atol=0.2)
-    # Three frames until the motion is known well enough, then every second.
-    assert len(searches) == 7
+    # Two frames until the motion is known, then every second.
+    assert len(searches) == 6
 
 
 def test_a_marker_that_is_gone_is_not_followed(searches):

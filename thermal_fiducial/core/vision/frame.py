@@ -6,7 +6,7 @@ import numpy as np
 
 from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
-from thermal_fiducial.core.vision.lag import interaction, Twist
+from thermal_fiducial.core.vision.lag import interaction, MEMORY_AGE, Twist
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,4 +46,8 @@ class Places:
 
     def smear(self, twist: Twist, lag: float) -> FloatArray:
         """Mean displacement (N, 4, 2) [px] by a lag [s]."""
-        return -lag * self.velocity(twist)
+        return np.asarray(-lag * (self.flow @ twist.ago(lag)))
+
+    def memory(self, twist: Twist, lag: float) -> FloatArray:
+        """Displacement (N, 4, 2) [px] in so long a time as the lag, as it places the image's memory of the past."""
+        return np.asarray(-lag * (self.flow @ twist.ago(MEMORY_AGE * lag)))

@@ -85,7 +85,8 @@ class KnownMarkers:
 def camera_in_map(stamp_ns: int, odometry: Odometry, T_body_camera: FloatArray, twist: Twist) -> FloatArray:
     """T_map_camera (4, 4) at a frame, from the odometry before it carried on with the camera's twist."""
     dt = (stamp_ns - odometry.stamp_ns) * 1e-9
-    moved = geometry.transform(geometry.so3_exp(twist.value[3:] * dt), twist.value[:3] * dt)
+    mean = twist.ago(0.5 * dt)
+    moved = geometry.transform(geometry.so3_exp(mean[3:] * dt), mean[:3] * dt)
     return np.asarray(odometry.T_map_body @ T_body_camera @ moved)
 
 

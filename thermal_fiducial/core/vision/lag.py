@@ -8,11 +8,14 @@ time m is taken out, ``(y(t) - b y(t - m)) / (1 - b)`` with ``b = exp(-m / tau)`
 one, shifted. What is left is a short blur along the motion, that the model of an edge knows, and its mean delay.
 
 The motion is that of a rigid scene seen from a camera with twist (v, omega) (F. Chaumette, S. Hutchinson, "Visual
-servo control I", 2006, eq. 11). A Kalman filter holds the twist: predicted from the filter's odometry or the last
-frame, corrected by how the markers' corners moved since.
+servo control I", 2006, eq. 11). While it changes, every age has a velocity of its own: what was seen s ago lies
+s w - s^2 a / 2 behind. So the mean delay of an exponential, -tau w + tau^2 a, is that of the velocity one time constant
+ago, and the memory is as far from the image as the velocity of tau + m / 2 ago has carried it. A Kalman filter holds
+the twist and its change (R. Singer, "Estimating optimal tracking filter performance for manned maneuvering targets",
+1970): predicted from the last frame, corrected by the filter's odometry and by how the markers' corners moved since.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import math
 
 import cv2
@@ -26,12 +29,14 @@ from thermal_fiducial.core.vision.ids import pairs
 
 # First derivative, exact up to the sixth order: on images blurred by a pixel's optics the eighth does not matter.
 _DERIVATIVE = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0], dtype=np.float32) / 60.0
-_WARP = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+# Linear interpolation blurs the memory more than the image that it is taken from, and would displace the difference.
+_WARP = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP
 # Twist of which nothing is known: m/s and rad/s of a brisk flight.
-_UNKNOWN = np.diag([1.5, 1.5, 1.5, 1.5, 1.5, 1.5]) ** 2
-# How much it changes within a second: 5 m/s^2 and 10 rad/s^2 sustained for a frame.
-_CHANGE_PER_S = np.diag([5.0, 5.0, 5.0, 10.0, 10.0, 10.0]) ** 2
+_UNKNOWN = np.full(6, 1.5**2)
+# Variance of an acceleration of which nothing is known [m/s^2, rad/s^2], and how long it lasts [s].
+_ACCELERATION, _LASTS_S = np.array([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2, 0.4
 _STALE_S = 0.15
+_VALUE, _CHANGE = np.arange(6), np.arange(6, 12)
 # How much of the past is taken out of the image, in time constants, and its weight.
 _MEMORY = 0.75
 _FORGOTTEN = math.exp(-_MEMORY)
@@ -39,6 +44,8 @@ _GAIN = 1.0 / (1.0 - _FORGOTTEN)
 #: What is left of the smear: its mean, and its standard deviation about that, as shares of the whole.
 REMAINING = 1.0 - _MEMORY * _FORGOTTEN * _GAIN
 SPREAD = math.sqrt(1.0 - _MEMORY**2 * _FORGOTTEN * _GAIN**2)
+#: Age, in time constants, of the velocity that has carried the memory as far as it is from the image.
+MEMORY_AGE = 1.0 + 0.5 * _MEMORY
 # How far the time constant may be off, and the displacement of an edge by a response that is no exponential: a share of
 # the smear, and one that grows with the cells that the smear covers.
 _LAG_UNSURE = 0.35
@@ -49,10 +56,27 @@ _FASTEST, _FASTEST_TURN = 20.0, 30.0
 
 @dataclass(frozen=True, slots=True)
 class Twist:
-    """Velocity of the camera in its own frame: (6,) v [m/s], omega [rad/s], and its covariance."""
+    """Velocity of the camera in its own frame, and how it changes.
+
+    Parameters
+    ----------
+    value : (6,) v [m/s], omega [rad/s] at a frame's stamp
+    covariance : (6, 6) of the value, or (12, 12) of value and acceleration
+    acceleration : (6,) of the value
+    """
 
     value: FloatArray
     covariance: FloatArray
+    acceleration: FloatArray = field(default_factory=lambda: np.zeros(6))
+
+    def ago(self, seconds: float) -> FloatArray:
+        """Value (6,) so many seconds before the stamp."""
+        return self.value - seconds * self.acceleration
+
+    def covariance_ago(self, seconds: float) -> FloatArray:
+        """Covariance (6, 6) of :meth:`ago`."""
+        P = self.covariance
+        return P[:6, :6] - seconds * (P[:6, 6:] + P[6:, :6]) + seconds**2 * P[6:, 6:]
 
 
 def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
@@ -110,22 +134,21 @@ class MotionTracker:
         self._stamp_ns: int | None = None
         self._twist: Twist | None = None
         self._seen = Tracked.none()
-        # The first twist comes from corners whose own lag nobody knew: it tells little of where they will be.
-        self._settled = False
 
     def predict(self, stamp_ns: int, odometry: Odometry | None) -> Twist | None:
         """Twist expected at a frame; None when nothing is known."""
-        if odometry is not None and 0.0 <= abs(stamp_ns - odometry.stamp_ns) * 1e-9 < _STALE_S:
-            twist = camera_twist(odometry, self._T_body_camera)
-            return Twist(twist.value, twist.covariance + self._drift(stamp_ns, odometry.stamp_ns))
-        if self._twist is None or self._stamp_ns is None or self._since(stamp_ns) is None:
-            return None
-        return Twist(self._twist.value, self._twist.covariance + self._drift(stamp_ns, self._stamp_ns))
+        dt = self._since(stamp_ns)
+        carried = _carried(self._twist, dt) if self._twist is not None and dt is not None else None
+        if odometry is None or abs(stamp_ns - odometry.stamp_ns) * 1e-9 >= _STALE_S:
+            return carried
+        seen, later = camera_twist(odometry, self._T_body_camera), (odometry.stamp_ns - stamp_ns) * 1e-9
+        information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + np.diag(_growth(abs(later))[0])))
+        return _corrected(carried or _unknown(), information, information @ seen.value, later)
 
     def expected(self, stamp_ns: int, twist: Twist) -> Tracked:
         """The last frame's markers where the camera's motion since has carried them."""
         dt = self._since(stamp_ns)
-        if dt is None or self._twist is None or not self._settled or len(self._seen.ids) == 0:
+        if dt is None or self._twist is None or len(self._seen.ids) == 0:
             return Tracked.none()
         step = (0.5 * dt) * (twist.value + self._twist.value)
         moved = geometry.inverse(geometry.transform(geometry.so3_exp(step[3:]), step[:3]))
@@ -135,36 +158,36 @@ class MotionTracker:
         return replace(self._seen, x=points[..., :2] / depth[..., None], depth=depth)
 
     def correct(
-        self, stamp_ns: int, predicted: Twist | None, ids: IntArray, x: FloatArray, depth: FloatArray, noise: FloatArray
+        self,
+        stamp_ns: int,
+        predicted: Twist | None,
+        ids: IntArray,
+        x: FloatArray,
+        depth: FloatArray,
+        noise: FloatArray,
+        *,
+        freed: bool = True,
     ) -> Twist | None:
         """Twist from how the corners moved since the last frame.
 
         Parameters
         ----------
         ids : (N,)
-        x : (N, 4, 2) normalised corners, as they are without lag
+        x : (N, 4, 2) normalised corners
         depth : (N, 4) [m]
         noise : (N,) standard deviation of a corner in normalised coordinates
+        freed : whether the corners are where they would be without lag; they lie one time constant back otherwise
         """
-        twist = predicted
         now, before = pairs(ids, self._seen.ids)
         dt = self._since(stamp_ns)
-        if len(now) and dt is not None:
-            middle = 0.5 * (x[now] + self._seen.x[before])
-            A = interaction(middle, depth[now]).reshape(-1, 6)
-            velocity = (x[now] - self._seen.x[before]).reshape(-1) / dt
-            weight = np.repeat((dt / (1.5 * noise[now])) ** 2, 8)
-            prior = predicted or Twist(np.zeros(6), _UNKNOWN)
-            information = np.linalg.inv(prior.covariance)
-            posterior: FloatArray = np.asarray(np.linalg.inv(information + (A.T * weight) @ A))
-            value = posterior @ (information @ prior.value + (A.T * weight) @ velocity)
-            if self._twist is not None and self._settled:
-                # That was half a frame ago; what smears this one is the motion of one time constant ago.
-                apart = 0.5 * dt + self._lag
-                limit = apart * np.sqrt(np.diag(_CHANGE_PER_S))
-                value = value + (0.5 * dt - self._lag) / apart * np.clip(value - self._twist.value, -limit, limit)
-            twist = Twist(np.asarray(value), np.asarray(posterior))
-        return twist
+        if len(now) == 0 or dt is None:
+            return predicted
+        begin, end = dt + (self._lag if self._twist is None else 0.0), 0.0 if freed else self._lag
+        seconds = begin - end
+        A = interaction(0.5 * (x[now] + self._seen.x[before]), depth[now]).reshape(-1, 6)
+        velocity = (x[now] - self._seen.x[before]).reshape(-1) / seconds
+        weighted = A.T * np.repeat((seconds / (1.5 * noise[now])) ** 2, 8)
+        return _corrected(predicted or _unknown(), weighted @ A, weighted @ velocity, -0.5 * (begin + end))
 
     def all_clearer_than(self, clarity: float) -> bool:
         """Whether there were markers, all of more contrast over noise."""
@@ -172,7 +195,6 @@ class MotionTracker:
 
     def remember(self, stamp_ns: int, twist: Twist | None, seen: Tracked) -> None:
         """Keep a frame's twist and markers for the next one."""
-        self._settled = self._twist is not None and self._since(stamp_ns) is not None
         self._stamp_ns, self._twist, self._seen = stamp_ns, twist, seen
 
     def _since(self, stamp_ns: int) -> float | None:
@@ -181,9 +203,39 @@ class MotionTracker:
             return None
         return (stamp_ns - self._stamp_ns) * 1e-9
 
-    @staticmethod
-    def _drift(stamp_ns: int, since_ns: int) -> FloatArray:
-        return _CHANGE_PER_S * ((stamp_ns - since_ns) * 1e-9) ** 2
+
+def _unknown() -> Twist:
+    return Twist(np.zeros(6), np.diag(np.concatenate([_UNKNOWN, _ACCELERATION])))
+
+
+def _carried(twist: Twist, seconds: float) -> Twist:
+    """Twist so much later, its acceleration having died down a little and changed at random."""
+    left = math.exp(-seconds / _LASTS_S)
+    F = np.eye(12)
+    F[_VALUE, _CHANGE] = _LASTS_S * (1.0 - left)
+    F[_CHANGE, _CHANGE] = left
+    covariance = F @ twist.covariance @ F.T
+    covariance[_VALUE, _VALUE] += (growth := _growth(seconds))[0]
+    covariance[_VALUE, _CHANGE] += growth[1]
+    covariance[_CHANGE, _VALUE] += growth[1]
+    covariance[_CHANGE, _CHANGE] += growth[2]
+    return Twist(twist.value + _LASTS_S * (1.0 - left) * twist.acceleration, covariance, left * twist.acceleration)
+
+
+def _growth(seconds: float) -> FloatArray:
+    """Variances (3, 6) that a time adds to the twist, to it with its acceleration, and to that (Singer, eq. 7)."""
+    t, left = seconds / _LASTS_S, math.exp(-seconds / _LASTS_S)
+    twist, both = _LASTS_S**2 * (2.0 * t - 3.0 + 4.0 * left - left**2), _LASTS_S * (1.0 - left) ** 2
+    return np.asarray(np.multiply.outer([twist, both, 1.0 - left**2], _ACCELERATION))
+
+
+def _corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later: float) -> Twist:
+    """Twist when its value so much later is known by ``information`` (6, 6), times the value ``weighted`` (6,)."""
+    H = np.concatenate([np.eye(6), later * np.eye(6)], axis=1)
+    prior = np.linalg.inv(twist.covariance)
+    covariance: FloatArray = np.asarray(np.linalg.inv(prior + H.T @ information @ H))
+    mean = covariance @ (prior @ np.concatenate([twist.value, twist.acceleration]) + H.T @ weighted)
+    return Twist(mean[:6], covariance, mean[6:])
 
 
 def plausible(odometry: Odometry) -> bool:
@@ -200,7 +252,7 @@ def smear_by_twist(x: FloatArray, J: FloatArray, depth: FloatArray, tau: float) 
 
 def smear(camera: Camera, x: FloatArray, depth: FloatArray, twist: Twist, tau: float) -> FloatArray:
     """Mean displacement by lag (..., 2) [px] at normalised points (..., 2)."""
-    return np.asarray(smear_by_twist(x, camera.distort_jacobian(x), depth, tau) @ twist.value)
+    return np.asarray(smear_by_twist(x, camera.distort_jacobian(x), depth, tau) @ twist.ago(tau))
 
 
 def image_velocity(camera: Camera, x: FloatArray, depth: FloatArray, twist: Twist) -> FloatArray:
@@ -288,7 +340,7 @@ class SmearField:
 
     def at(self, twist: Twist, depth: float, tau: float) -> FloatArray:
         """Coarse field (rows, columns, 2) [px]."""
-        velocity = interaction(self._x, np.full(self._x.shape[:-1], depth)) @ twist.value
+        velocity = interaction(self._x, np.full(self._x.shape[:-1], depth)) @ twist.ago(tau)
         return np.asarray(-tau * (self._J @ velocity[..., None])[..., 0])
 
     def full(self, coarse: FloatArray) -> Float32Array:

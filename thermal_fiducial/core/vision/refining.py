@@ -24,9 +24,9 @@ WINDOW_MARGIN_PX = 14
 # of the side; without it the tail of the lag passes for a symmetric blur, which displaces corners by so much of the
 # square of the smear over a cell.
 _NOISE_OF_SHARPENING, _COST_OF_SMEAR = 6.5, 0.22
-# Contrast over noise below which a marker is faint. A clearer one is always sharpened: its corners are so good that
-# even a short tail shows in what they have in common.
-_CLEAR = 20.0
+# Contrast over noise below which a marker is faint. A clearer one is sharpened whatever the smear, as its corners are
+# so good that even a short tail shows in what they have in common; but not where there is hardly any [px].
+_CLEAR, _HARDLY_SMEARED_PX = 20.0, 0.2
 # Columns of pixels used of a cell; all of a faint marker's count.
 _COLUMNS, _COLUMNS_FAINT = 6, 12
 _ROUNDS = 2
@@ -98,7 +98,8 @@ class Refiner:
             seen = refine_corners(
                 view.image, start, frame.camera, behind, config.blur_px, view.spread, columns, near=near
             )
-            refinement = self._at_stamp(frame, found, places, view, seen, cell, config.bolometer_lag)
+            freed = twist is not None
+            refinement = self._at_stamp(frame, found, places, view, seen, cell, config.bolometer_lag, freed=freed)
             change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)[view.sharpened]
             if refinement.twist is None or change.max(initial=0.0) < SMEAR_THAT_MATTERS_PX:
                 break
@@ -115,32 +116,45 @@ class Refiner:
         lag: float,
     ) -> View:
         """``image`` with known smear round all markers, sharpened round those for which that is worth its noise."""
-        smear = np.zeros_like(places.at.px) if twist is None else places.smear(twist, lag)
+        smear = memory = np.zeros_like(places.at.px)
+        if twist is not None:
+            smear, memory = places.smear(twist, lag), places.memory(twist, lag)
         mean = smear.mean(axis=1)
         sharpen = _worth_sharpening(np.sum(mean * mean, axis=1), cell, self._behind.shape[2], clarity)
-        removed = (1.0 - REMAINING) * smear * sharpen[:, None, None]
+        removed = (1.0 - REMAINING) * memory * sharpen[:, None, None]
         shift = smear - removed
-        if sharpen.any() and twist is not None:
+        if sharpen.any():
             if self._sharp.shape != image.shape:
                 self._sharp = np.empty_like(image)
             corners = places.at.px + shift
-            image = markers_sharpened(image, corners[sharpen], smear[sharpen], WINDOW_MARGIN_PX, self._sharp)
+            image = markers_sharpened(image, corners[sharpen], memory[sharpen], WINDOW_MARGIN_PX, self._sharp)
         return View(image, shift, removed, mean * np.where(sharpen, SPREAD, 1.0)[:, None], sharpen)
 
     def _at_stamp(
-        self, frame: Frame, found: Found, places: Places, view: View, seen: RefinedCorners, cell: FloatArray, lag: float
+        self,
+        frame: Frame,
+        found: Found,
+        places: Places,
+        view: View,
+        seen: RefinedCorners,
+        cell: FloatArray,
+        lag: float,
+        *,
+        freed: bool,
     ) -> Refinement:
         """The corners without lag, by the twist that they themselves correct."""
         at = places.at.moved(seen.corners_px - view.shift - places.at.px, frame.camera)
         variance = seen.covariances[..., 0, 0] + seen.covariances[..., 1, 1]
         deviation = np.sqrt(0.5 * variance.mean(axis=1)) / frame.camera.focal_px
-        twist = self._motion.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
+        ids, depth = found.ids, places.depth
+        twist = self._motion.correct(frame.stamp_ns, frame.twist, ids, at.x, depth, deviation, freed=freed)
         if twist is None:
             return Refinement(view, seen, seen, replace(places, at=at), None)
         smear = places.smear(twist, lag)
         corners = seen.corners_px - smear + view.removed
-        by_twist = lag * places.flow
-        unknown = by_twist @ twist.covariance @ np.swapaxes(by_twist, -1, -2) + model_error(smear, cell)
+        # What the corners of a marker have in common is no error of its shape.
+        by_twist = lag * (places.flow - places.flow.mean(axis=1, keepdims=True))
+        unknown = by_twist @ twist.covariance_ago(lag) @ np.swapaxes(by_twist, -1, -2) + model_error(smear, cell)
         refined = replace(seen, corners_px=corners, covariances=seen.covariances + unknown)
         return Refinement(view, seen, refined, replace(places, at=at.moved(corners - at.px, frame.camera)), twist)
 
@@ -148,7 +162,8 @@ class Refiner:
 def _worth_sharpening(square: FloatArray, cell: FloatArray, cells: int, clarity: FloatArray) -> BoolArray:
     """For which markers with squares of the smear (N,) and cells (N,) [px] it costs more than sharpening's noise."""
     systematic, noise = _COST_OF_SMEAR * square / cell, _NOISE_OF_SHARPENING / np.sqrt(cells * cell)
-    return np.asarray((np.abs(clarity) > _CLEAR) | (systematic * np.abs(clarity) > noise))
+    worth = (np.abs(clarity) > _CLEAR) | (systematic * np.abs(clarity) > noise)
+    return np.asarray(worth & (square > _HARDLY_SMEARED_PX**2))
 
 
 def sides_px(corners: FloatArray) -> FloatArray:
