@@ -186,8 +186,8 @@ def test_sharpened_edges_are_those_of_a_response_that_forgets(smear):
     slope = np.gradient(young)
     side = slice(59, 70)
     displaced = slope[side] @ (sharp - young)[side] / (slope[side] @ slope[side])
-    # Linear interpolation displaces it by up to 0.044 px, Lanczos by 0.011 px.
-    assert abs(displaced) < 0.012
+    # Linear interpolation displaces it by 0.019, 0.044 and 0.028 px, Lanczos's by at most 0.0144 px.
+    assert abs(displaced) < 0.015
 
 
 def test_model_error_leaves_the_common_shift_out():
