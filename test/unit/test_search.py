@@ -7,11 +7,13 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.vision.contrast import noise_of
 from thermal_fiducial.core.vision.decoding import Decoder, Reading, shrunk
 from thermal_fiducial.core.vision.patterns import marker_bits
-from thermal_fiducial.core.vision.search import _inside_out, blind_search
+from thermal_fiducial.core.vision.scratch import Scratch
+from thermal_fiducial.core.vision.search import _inside_out, BlindSearch
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))
 DECODER = Decoder(BITS)
+SEARCH = BlindSearch(DECODER, Scratch())
 EVERY = np.ones(len(BITS), dtype=bool)
 
 
@@ -29,7 +31,7 @@ CORNERS = np.array([[199.5, 149.5], [271.5, 149.5], [271.5, 221.5], [199.5, 221.
 
 
 def search(image, config=None, allowed=EVERY):
-    return blind_search(image, noise_of(image), image, DECODER, allowed, config or ArucoDetectorConfig())
+    return SEARCH.search(image, noise_of(image), image, allowed, config or ArucoDetectorConfig())
 
 
 @pytest.mark.parametrize('turn', range(4))
@@ -84,7 +86,7 @@ def test_rim_of_a_plate_is_no_marker_inside_out(sign):
 def test_what_is_seen_already_is_not_sought():
     image = scene(21, 100.0, 2.0)
     image[300:396, 400:496] = scene(8, 100.0, 2.0)[138:234, 188:284]
-    found = blind_search(image, noise_of(image), image, DECODER, EVERY, ArucoDetectorConfig(), CORNERS[None])
+    found = SEARCH.search(image, noise_of(image), image, EVERY, ArucoDetectorConfig(), CORNERS[None])
     assert found.ids.tolist() == [8]
 
 

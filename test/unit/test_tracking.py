@@ -61,8 +61,8 @@ def test_fast_faint_markers_keep_their_shape():
 def searches(monkeypatch):
     """How often a frame was searched blindly."""
     count = []
-    search = detection.blind_search
-    monkeypatch.setattr(detection, 'blind_search', lambda *args: count.append(1) or search(*args))
+    search = detection.BlindSearch.search
+    monkeypatch.setattr(detection.BlindSearch, 'search', lambda *args: count.append(1) or search(*args))
     return count
 
 

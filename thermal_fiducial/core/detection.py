@@ -37,7 +37,8 @@ from thermal_fiducial.core.vision.local_corners import local_corners
 from thermal_fiducial.core.vision.marker_rows import marker_rows
 from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.core.vision.refining import Refinement, Refiner, sides_px, SMEAR_THAT_MATTERS_PX, WINDOW_MARGIN_PX
-from thermal_fiducial.core.vision.search import blind_search, confirmed, Found, merged
+from thermal_fiducial.core.vision.scratch import Scratch
+from thermal_fiducial.core.vision.search import BlindSearch, confirmed, Found, merged
 
 # Smear by lag below which the search misses nothing [px].
 _SMEAR_THAT_HIDES_PX = 2.0
@@ -84,14 +85,15 @@ class MarkerDetector:
             geometry.rotation_from_quaternion(config.camera_orientation), config.camera_position
         )
         self._motion = MotionTracker(self._T_body_camera, config.bolometer_lag)
-        self._refiner = Refiner(edges_behind(bits), self._motion)
+        self._scratch = Scratch()
+        self._refiner = Refiner(edges_behind(bits), self._motion, self._scratch)
+        self._search = BlindSearch(self._decoder, self._scratch)
         self._clock_offset = ClockOffset()
         self._field: SmearField | None = None
         self._depth = _TYPICAL_DEPTH
         self._map: dict[int, tuple[FloatArray, float]] = {}
         self._known = KnownMarkers(self._map)
         self._since_blind = 0
-        self._image = np.zeros((0, 0), dtype=np.float32)
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
         """Markers that are known: ID to (T_map_marker, side [m])."""
@@ -146,13 +148,11 @@ class MarkerDetector:
 
     def _frame(self, stamp_ns: int, counts: Counts | Gray, camera: Camera, twist: Twist | None) -> Frame:
         """The frame, without the pattern of columns where that matters."""
-        if self._image.shape != counts.shape:
-            self._image = np.empty(counts.shape, dtype=np.float32)
-        image = self._image
+        image = self._scratch.floats('image', counts.shape)
         np.copyto(image, counts)
         noise = noise_of(image)
         if counts.dtype != np.uint8 and not self._motion.all_clearer_than(_CLEARER_THAN_COLUMNS):
-            image = without_columns(image, noise)
+            image = without_columns(image, noise, self._scratch)
         return Frame(stamp_ns, image, noise, camera, twist)
 
     def _learn_offset(self, frame: Frame, in_map: Expected | None, ids: IntArray, places: Places) -> None:
@@ -173,7 +173,7 @@ class MarkerDetector:
 
     def _find(self, frame: Frame, in_map: Expected | None) -> tuple[Found, Followed]:
         """Markers where they should be, and whatever a blind search shows, when that is due; and which are followed."""
-        expected, followed, complete, holds = Found.none(), Followed.of(Tracked.none(), frame), False, False
+        expected, followed, complete, holds = Found.none(), Followed.none(), False, False
         if frame.twist is not None and self.config.guided:
             last = Followed.of(self._motion.expected(frame.stamp_ns, frame.twist), frame)
             ids, corners, _, depth = self._expected(frame.camera, last, in_map)
@@ -194,7 +194,7 @@ class MarkerDetector:
         self._since_blind = 0
         scene = self._scene(frame.image, frame.camera, frame.twist)
         allowed = self._allowed()
-        blind = blind_search(frame.image, frame.noise, scene, self._decoder, allowed, self.config, expected.corners_px)
+        blind = self._search.search(frame.image, frame.noise, scene, allowed, self.config, expected.corners_px)
         return merged(expected, blind), followed
 
     def _expected(self, camera: Camera, last: Followed, in_map: Expected | None) -> Expected:
@@ -214,13 +214,15 @@ class MarkerDetector:
         blurred = np.abs(shift).max(axis=(1, 2)) > SMEAR_THAT_MATTERS_PX
         scene = markers_sharpened(image, corners[blurred], shift[blurred], WINDOW_MARGIN_PX)
         still = np.where(blurred[:, None, None], REMAINING * shift, shift)
-        found, seen = look(scene, ids, corners + still, self._decoder, noise, self.config)
+        found, seen = look(scene, self._scratch, ids, corners + still, self._decoder, noise, self.config)
         found = replace(found, corners_px=found.corners_px - still[seen])
         faint = np.flatnonzero(blurred & ~seen)
         if len(faint) == 0:
             return found
         # Freeing a faint marker of its lag may have drowned it in noise.
-        also, there = look(image, ids[faint], (corners + shift)[faint], self._decoder, noise, self.config)
+        also, there = look(
+            image, self._scratch, ids[faint], (corners + shift)[faint], self._decoder, noise, self.config
+        )
         return merged(found, replace(also, corners_px=also.corners_px - shift[faint[there]]))
 
     def _allowed(self) -> BoolArray:
@@ -266,7 +268,9 @@ class MarkerDetector:
         keep = read & among(found.ids, followed.ids[followed.certain])
         others = np.flatnonzero(~keep)
         if len(others):
-            keep[others] = confirmed(view.image, there.only(others), seen.only(others), self._decoder, self.config)
+            keep[others] = confirmed(
+                view.image, self._scratch, there.only(others), seen.only(others), self._decoder, self.config
+            )
         return np.asarray(keep & frame.camera.contains(seen.corners_px, 0.5 * _RIM_PX).all(axis=1))
 
     def _poses(

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.types import Float32Array, Gray
+from thermal_fiducial.core.vision.scratch import Scratch
 
 # The spread is taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
 _LOCAL = 17
@@ -35,20 +36,24 @@ def noise_of(counts: Float32Array) -> float:
     return max(float(np.partition(difference, middle)[middle]) * _MAD_OF_DIFFERENCE, 0.3)
 
 
-def halved(counts: Float32Array) -> Float32Array:
+def halved(counts: Float32Array, scratch: Scratch) -> Float32Array:
     """Half the resolution: means of 2 x 2 pixels, with half the noise."""
-    height, width = counts.shape
-    return np.asarray(cv2.resize(counts, (width // 2, height // 2), interpolation=cv2.INTER_AREA))
+    height, width = counts.shape[0] // 2, counts.shape[1] // 2
+    half = scratch.floats('halved', (height, width))
+    return np.asarray(cv2.resize(counts, (width, height), dst=half, interpolation=cv2.INTER_AREA))
 
 
-def without_columns(counts: Float32Array, noise: float) -> Float32Array:
-    """``counts`` without the offsets of its columns, as they show in the typical pixel of each against its neighbours.
+def without_columns(counts: Float32Array, noise: float, scratch: Scratch) -> Float32Array:
+    """``counts``, changed in place, without the offsets of its columns.
 
-    What the scene does to a column is bounded by the noise: no pixel counts for more than that.
+    They show in the typical pixel of each column against its neighbours. What the scene does to a column is bounded by
+    the noise: no pixel counts for more than that.
     """
-    deviation = counts - cv2.blur(counts, (_COLUMNS, 1))
+    deviation = cv2.blur(counts, (_COLUMNS, 1), dst=scratch.floats('deviation', counts.shape))
+    np.subtract(counts, deviation, out=deviation)
     np.clip(deviation, -noise, noise, out=deviation)
-    return np.asarray(counts - _CLIPPED * cv2.reduce(deviation, 0, cv2.REDUCE_AVG))
+    counts -= _CLIPPED * cv2.reduce(deviation, 0, cv2.REDUCE_AVG)
+    return counts
 
 
 class Scale(NamedTuple):
@@ -56,19 +61,18 @@ class Scale(NamedTuple):
 
     #: standard deviation of the Gaussian before the search [px]
     smoothing_px: float
-    #: odd width of the surroundings
+    #: odd width of the surroundings, and by how much lower the resolution is at which their mean is taken
     window_px: int
+    window_shrink: int
     #: how much darker than the mean of the surroundings, in local standard deviations
     depth: float
     #: spread below which it shows less and less, in standard deviations of the noise of a pixel
     floor: float
-    #: by how much lower the resolution is at which the spread is taken
-    shrink: int
     #: odd width of the median that takes out specks, 1 for none [px]
     specks_px: int = 1
 
 
-def dark(counts: Float32Array, noise: float, scale: Scale) -> Gray:
+def dark(counts: Float32Array, noise: float, scale: Scale, scratch: Scratch) -> Gray:
     """Mask (height, width) of what is darker than its surroundings, 255 where it is.
 
     Parameters
@@ -76,14 +80,18 @@ def dark(counts: Float32Array, noise: float, scale: Scale) -> Gray:
     counts : (height, width) counts or gray levels
     noise : standard deviation of the noise of a pixel [counts]
     """
+    shape = counts.shape
     reach = 2 * round(2.5 * scale.smoothing_px) + 1
-    smooth = cv2.GaussianBlur(counts, (reach, reach), scale.smoothing_px)
-    around = cv2.blur(smooth, (scale.window_px, scale.window_px))
-    height, width = counts.shape
-    small = cv2.resize(counts, (width // scale.shrink, height // scale.shrink), interpolation=cv2.INTER_AREA)
+    smooth = scratch.floats('smooth', shape)
+    cv2.GaussianBlur(counts, (reach, reach), scale.smoothing_px, dst=smooth)
+    coarse = counts if scale.window_shrink == 1 else halved(counts, scratch)
+    limit = cv2.blur(smooth if scale.window_shrink == 1 else coarse, (scale.window_px, scale.window_px))
+    small = halved(coarse, scratch)
     deviation = small - cv2.blur(small, (_LOCAL, _LOCAL))
     variance = np.maximum(cv2.blur(deviation * deviation, (_LOCAL, _LOCAL)), 1e-6)
-    step = (scale.depth / np.sqrt(variance)) * (variance + (scale.floor * noise) ** 2)
-    asked = cv2.resize(step, (width, height), interpolation=cv2.INTER_LINEAR)
-    mask = cv2.compare(cv2.subtract(around, smooth, dst=around), asked, cv2.CMP_GT)
+    asked = (scale.depth / np.sqrt(variance)) * (variance + (scale.floor * noise) ** 2)
+    cv2.subtract(limit, cv2.resize(asked, limit.shape[::-1], interpolation=cv2.INTER_LINEAR), dst=limit)
+    if limit.shape != shape:
+        limit = cv2.resize(limit, shape[::-1], dst=scratch.floats('limit', shape), interpolation=cv2.INTER_LINEAR)
+    mask = cv2.compare(smooth, limit, cv2.CMP_LT, dst=scratch.bytes('mask', shape))
     return np.asarray(cv2.medianBlur(mask, scale.specks_px) if scale.specks_px > 1 else mask)

@@ -34,6 +34,13 @@ class Followed:
     certain: BoolArray
 
     @staticmethod
+    def none() -> 'Followed':
+        """No markers."""
+        x, J = np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2))
+        places = Places(ImagePoints(x, x, J, J), np.zeros((0, 4)), np.zeros((0, 4, 2, 6)))
+        return Followed(np.zeros(0, dtype=np.int64), places, np.zeros(0), np.zeros(0, dtype=bool))
+
+    @staticmethod
     def of(last: Tracked, frame: Frame) -> 'Followed':
         """Those of the last frame, carried on; nothing is known yet of whether they are seen."""
         places = Places.of(ImagePoints.seen_at(last.x, frame.camera), last.depth)

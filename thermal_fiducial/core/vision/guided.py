@@ -17,6 +17,7 @@ from thermal_fiducial.core.pose import marker_corners
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from thermal_fiducial.core.vision.decoding import Decoder, Reading
 from thermal_fiducial.core.vision.lag import Twist
+from thermal_fiducial.core.vision.scratch import Scratch
 from thermal_fiducial.core.vision.search import Found, read_quads
 
 # A marker turned further from the camera than this shows too little to be expected.
@@ -92,6 +93,7 @@ def camera_in_map(stamp_ns: int, odometry: Odometry, T_body_camera: FloatArray, 
 
 def look(
     image: Float32Array,
+    scratch: Scratch,
     ids: IntArray,
     corners: FloatArray,
     decoder: Decoder,
@@ -100,13 +102,13 @@ def look(
 ) -> tuple[Found, BoolArray]:
     """The expected markers (N,), (N, 4, 2) that the image shows, and which (N,) of them these are."""
     corners = _shifted(image, ids, corners, decoder, _NEAR)
-    reading = read_quads(image, corners, decoder)
+    reading = read_quads(image, scratch, corners, decoder)
     good, contrast = _confirmed(reading, ids, noise, config), reading.contrast.copy()
     missing = np.flatnonzero(~good)
     if len(missing):
         far = _shifted(image, ids[missing], corners[missing], decoder, _FAR)
         corners[missing] = _shifted(image, ids[missing], far, decoder, _NEAR)
-        reading = read_quads(image, corners[missing], decoder)
+        reading = read_quads(image, scratch, corners[missing], decoder)
         good[missing], contrast[missing] = _confirmed(reading, ids[missing], noise, config), reading.contrast
     return Found(ids[good], corners[good], contrast[good] / noise, np.ones(int(good.sum()), dtype=bool)), good
 

@@ -14,6 +14,7 @@ from thermal_fiducial.core.corners import refine_corners, RefinedCorners
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 from thermal_fiducial.core.vision.frame import Frame, Places
 from thermal_fiducial.core.vision.lag import markers_sharpened, model_error, MotionTracker, REMAINING, SPREAD, Twist
+from thermal_fiducial.core.vision.scratch import Scratch
 from thermal_fiducial.core.vision.search import Found
 
 #: Smear by lag below which the shape of an edge doesn't change [px].
@@ -71,11 +72,11 @@ class Refiner:
     ----------
     behind : (M, 4, m, 2) of :func:`thermal_fiducial.core.adjustment.edges.edges_behind`
     motion : what corrects the twist by the corners
+    scratch : for its images
     """
 
-    def __init__(self, behind: Float32Array, motion: MotionTracker) -> None:
-        self._behind, self._motion = behind, motion
-        self._sharp = np.zeros((0, 0), dtype=np.float32)
+    def __init__(self, behind: Float32Array, motion: MotionTracker, scratch: Scratch) -> None:
+        self._behind, self._motion, self._scratch = behind, motion, scratch
 
     def refine(
         self, frame: Frame, found: Found, places: Places, near: BoolArray, config: ArucoDetectorConfig
@@ -124,10 +125,8 @@ class Refiner:
         removed = (1.0 - REMAINING) * memory * sharpen[:, None, None]
         shift = smear - removed
         if sharpen.any():
-            if self._sharp.shape != image.shape:
-                self._sharp = np.empty_like(image)
-            corners = places.at.px + shift
-            image = markers_sharpened(image, corners[sharpen], memory[sharpen], WINDOW_MARGIN_PX, self._sharp)
+            corners, sharp = places.at.px + shift, self._scratch.floats('sharp', image.shape)
+            image = markers_sharpened(image, corners[sharpen], memory[sharpen], WINDOW_MARGIN_PX, sharp)
         return View(image, shift, removed, mean * np.where(sharpen, SPREAD, 1.0)[:, None], sharpen)
 
     def _at_stamp(

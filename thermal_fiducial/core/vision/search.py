@@ -12,10 +12,11 @@ from thermal_fiducial.core.vision.contrast import dark, halved, Scale, without_c
 from thermal_fiducial.core.vision.decoding import Decoder, Reading, shrunk
 from thermal_fiducial.core.vision.ids import among
 from thermal_fiducial.core.vision.quads import find_quads
+from thermal_fiducial.core.vision.scratch import Scratch
 
 # Full resolution sees small and smeared markers; half resolution, without the pattern of columns, faint ones.
-_FINE = Scale(smoothing_px=1.0, window_px=15, depth=0.2, floor=1.5, shrink=4)
-_FAINT = Scale(smoothing_px=1.2, window_px=5, depth=0.03, floor=1.0, shrink=2, specks_px=3)
+_FINE = Scale(smoothing_px=1.0, window_px=7, window_shrink=2, depth=0.2, floor=1.5)
+_FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0, specks_px=3)
 # Weight of white surroundings against correlation in choosing among the outlines of a marker.
 _SURROUNDED = 0.2
 # Correlation beyond which an outline needs no alignment, and from which, by such a margin, it is worth one.
@@ -75,54 +76,73 @@ class Found:
         return Found(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros(0), np.zeros(0, dtype=bool))
 
 
-def blind_search(
-    image: Float32Array,
-    noise: float,
-    scene: Float32Array,
-    decoder: Decoder,
-    allowed: BoolArray,
-    config: ArucoDetectorConfig,
-    seen: FloatArray | None = None,
-) -> Found:
-    """Markers with IDs ``allowed`` (M,), each ID once.
+class BlindSearch:
+    """Finds the markers of a dictionary wherever they are.
 
     Parameters
     ----------
-    image : (height, width) the frame
-    noise : standard deviation of a pixel in it [counts]
-    scene : the same freed of lag, which costs noise: the finest markers are sought there, the faintest in ``image``
-    seen : (N, 4, 2) corners of markers that are there [px]: nothing is sought in them and their plates
+    decoder : of the dictionary
+    scratch : for its images
     """
-    hidden = None if seen is None else _grown(seen, 1.0 + 2.0 * _PLATE_CELLS / decoder.cells)
-    half = without_columns(halved(image), 0.5 * noise)
-    fine, faint = _outlines(scene, half, noise, config.min_side_px, hidden)
-    quads = np.concatenate([fine, faint, shrunk(faint, decoder.cells)])
-    if len(quads) == 0:
-        return Found.none()
-    reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, _halfway(quads[len(fine) :]), allowed))
-    rough = _rough(reading, quads)
-    if len(rough):
-        better = aligned(half, _halfway(quads[rough]), reading.ids[rough], reading.turns[rough], decoder)
-        reading = _joined(reading, decoder.read(half, better, allowed))
-        quads = np.concatenate([quads, 2.0 * better + 0.5])
-    sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1).min(axis=1)
-    good = accepted(reading, noise, decoder.correctable, config) & (sides >= config.min_side_px)
-    good &= _whole(quads, image, _RIM)
-    good &= ~_inside_out(reading, quads, good, distinct(reading, noise, config))
-    best = _once(reading, quads, good, config.duplicates == 'drop')
-    turned = (np.arange(4) - reading.turns[best][:, None]) % 4
-    corners = np.take_along_axis(quads[best], turned[..., None], axis=1)
-    return Found(reading.ids[best], corners, reading.contrast[best] / noise, np.zeros(len(best), dtype=bool))
+
+    def __init__(self, decoder: Decoder, scratch: Scratch) -> None:
+        self._decoder, self._scratch = decoder, scratch
+
+    def search(
+        self,
+        image: Float32Array,
+        noise: float,
+        scene: Float32Array,
+        allowed: BoolArray,
+        config: ArucoDetectorConfig,
+        seen: FloatArray | None = None,
+    ) -> Found:
+        """Markers with IDs ``allowed`` (M,), each ID once.
+
+        Parameters
+        ----------
+        image : (height, width) the frame
+        noise : standard deviation of a pixel in it [counts]
+        scene : the same freed of lag, which costs noise: the finest markers are sought there, the faintest in ``image``
+        seen : (N, 4, 2) corners of markers that are there [px]: nothing is sought in them and their plates
+        """
+        decoder = self._decoder
+        hidden = None if seen is None else _grown(seen, 1.0 + 2.0 * _PLATE_CELLS / decoder.cells)
+        fine = find_quads(dark(scene, noise, _FINE, self._scratch), config.min_side_px, hidden)
+        half = without_columns(halved(image, self._scratch), 0.5 * noise, self._scratch)
+        faint = self._faint(half, noise, config.min_side_px, hidden)
+        quads = np.concatenate([fine, faint, shrunk(faint, decoder.cells)])
+        if len(quads) == 0:
+            return Found.none()
+        reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, _halfway(quads[len(fine) :]), allowed))
+        rough = _rough(reading, quads)
+        if len(rough):
+            better = aligned(half, _halfway(quads[rough]), reading.ids[rough], reading.turns[rough], decoder)
+            reading = _joined(reading, decoder.read(half, better, allowed))
+            quads = np.concatenate([quads, 2.0 * better + 0.5])
+        good = accepted(reading, noise, decoder.correctable, config) & _large(quads, config.min_side_px)
+        good &= _whole(quads, image, _RIM)
+        good &= ~_inside_out(reading, quads, good, distinct(reading, noise, config))
+        return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), noise)
+
+    def _faint(self, half: Float32Array, noise: float, min_side_px: float, hidden: FloatArray | None) -> FloatArray:
+        """Quadrilaterals of faint markers (Q, 4, 2) at half the resolution, in pixels of the full one."""
+        hidden = None if hidden is None else _halfway(hidden)
+        mask = dark(half, 0.5 * noise, _FAINT, self._scratch)
+        return 2.0 * find_quads(mask, 0.5 * min_side_px + 2.0, hidden) + 0.5
 
 
-def _outlines(
-    scene: Float32Array, half: Float32Array, noise: float, min_side_px: float, hidden: FloatArray | None
-) -> tuple[FloatArray, FloatArray]:
-    """Quadrilaterals of fine markers (Q, 4, 2) and of faint ones, both in pixels of the full resolution."""
-    fine = find_quads(dark(scene, noise, _FINE), min_side_px, hidden)
-    hidden = None if hidden is None else _halfway(hidden)
-    faint = find_quads(dark(half, 0.5 * noise, _FAINT), 0.5 * min_side_px + 2.0, hidden)
-    return fine, 2.0 * faint + 0.5
+def _large(quads: FloatArray, min_side_px: float) -> BoolArray:
+    """Which quadrilaterals (Q, 4, 2) have no shorter side."""
+    span = quads[:, [1, 2, 3, 0]] - quads
+    return np.asarray((np.sum(span * span, axis=-1) >= min_side_px**2).all(axis=1))
+
+
+def _chosen(reading: Reading, quads: FloatArray, places: IntArray, noise: float) -> Found:
+    """The markers at ``places`` among the quadrilaterals, their corners from the marker's own first one."""
+    turned = (np.arange(4) - reading.turns[places][:, None]) % 4
+    corners = np.take_along_axis(quads[places], turned[..., None], axis=1)
+    return Found(reading.ids[places], corners, reading.contrast[places] / noise, np.zeros(len(places), dtype=bool))
 
 
 def _halfway(quads: FloatArray) -> FloatArray:
@@ -204,7 +224,12 @@ def _inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: 
 
 
 def confirmed(
-    image: Float32Array, found: Found, refined: RefinedCorners, decoder: Decoder, config: ArucoDetectorConfig
+    image: Float32Array,
+    scratch: Scratch,
+    found: Found,
+    refined: RefinedCorners,
+    decoder: Decoder,
+    config: ArucoDetectorConfig,
 ) -> BoolArray:
     """Which markers (N,) still look like themselves at their refined corners, with sides as sharp as their contrast.
 
@@ -213,7 +238,7 @@ def confirmed(
     """
     if len(found.ids) == 0:
         return np.zeros(0, dtype=bool)
-    reading = read_quads(image, refined.corners_px, decoder)
+    reading = read_quads(image, scratch, refined.corners_px, decoder)
     similarity = np.abs(reading.correlation)
     contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
     same = reading.ids == found.ids
@@ -237,12 +262,12 @@ def _whole(quads: FloatArray, image: Float32Array, rim: float) -> BoolArray:
     return np.asarray(((quads >= rim) & (quads <= (width - 1 - rim, height - 1 - rim))).all(axis=(1, 2)))
 
 
-def read_quads(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
+def read_quads(image: Float32Array, scratch: Scratch, quads: FloatArray, decoder: Decoder) -> Reading:
     """Readings of (Q, 4, 2) among all IDs, at half the resolution when all are large enough for it."""
     everything = np.ones(decoder.count, dtype=bool)
     sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
     if sides.min(initial=np.inf) >= _WIDE_CELL_PX * decoder.cells:
-        return decoder.read(halved(image), 0.5 * (quads - 0.5), everything)
+        return decoder.read(halved(image, scratch), 0.5 * (quads - 0.5), everything)
     return decoder.read(image, quads, everything)
 
 
