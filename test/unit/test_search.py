@@ -8,7 +8,7 @@ from thermal_fiducial.core.vision.contrast import noise_of
 from thermal_fiducial.core.vision.decoding import Decoder, Reading, shrunk
 from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.core.vision.scratch import Scratch
-from thermal_fiducial.core.vision.search import _inside_out, BlindSearch
+from thermal_fiducial.core.vision.search import _inside_out, BlindSearch, Found
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))
@@ -86,7 +86,8 @@ def test_rim_of_a_plate_is_no_marker_inside_out(sign):
 def test_what_is_seen_already_is_not_sought():
     image = scene(21, 100.0, 2.0)
     image[300:396, 400:496] = scene(8, 100.0, 2.0)[138:234, 188:284]
-    found = SEARCH.search(image, noise_of(image), image, EVERY, ArucoDetectorConfig(), CORNERS[None])
+    seen = Found(np.array([21]), CORNERS[None], np.ones(1), np.ones(1, dtype=bool))
+    found = SEARCH.search(image, noise_of(image), image, EVERY, ArucoDetectorConfig(), seen)
     assert found.ids.tolist() == [8]
 
 

@@ -194,7 +194,7 @@ class MarkerDetector:
         self._since_blind = 0
         scene = self._scene(frame.image, frame.camera, frame.twist)
         allowed = self._allowed()
-        blind = self._search.search(frame.image, frame.noise, scene, allowed, self.config, expected.corners_px)
+        blind = self._search.search(frame.image, frame.noise, scene, allowed, self.config, expected)
         return merged(expected, blind), followed
 
     def _expected(self, camera: Camera, last: Followed, in_map: Expected | None) -> Expected:

@@ -10,6 +10,7 @@ import math
 import cv2
 import numpy as np
 
+from thermal_fiducial.core.geometry import in_quadrilaterals
 from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
 from thermal_fiducial.core.vision.decoding import Decoder, sampled
 
@@ -45,7 +46,8 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
     planes: list[Float32Array] = [np.asarray(plane) for plane in (picture, slope_u, slope_v)]
     smooth = np.broadcast_to(smooth, (len(ids), *smooth.shape))
     for _ in range(_STEPS):
-        value, du, dv = (sampled(plane, quads, a, b)[..., None] for plane in planes)
+        places = in_quadrilaterals(quads, a, b).astype(np.float32)
+        value, du, dv = (sampled(plane, places)[..., None] for plane in planes)
         J = np.concatenate([du * weights, dv * weights, smooth, pattern], axis=-1)
         information = np.swapaxes(J, -1, -2) @ J
         diagonal = np.einsum('qii->qi', information)

@@ -14,6 +14,8 @@ from thermal_fiducial.core.vision.scratch import Scratch
 
 # The spread is taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
 _LOCAL = 17
+# Odd width of the median that takes out specks.
+_SPECKS = 3
 # Half-resolution pixels along a row over which columns are compared.
 _COLUMNS = 9
 # Mean of Gaussian noise clipped at one standard deviation moves by 0.68 of a small offset.
@@ -68,8 +70,6 @@ class Scale(NamedTuple):
     depth: float
     #: spread below which it shows less and less, in standard deviations of the noise of a pixel
     floor: float
-    #: odd width of the median that takes out specks, 1 for none [px]
-    specks_px: int = 1
 
 
 def dark(counts: Float32Array, noise: float, scale: Scale, scratch: Scratch) -> Gray:
@@ -94,4 +94,5 @@ def dark(counts: Float32Array, noise: float, scale: Scale, scratch: Scratch) -> 
     if limit.shape != shape:
         limit = cv2.resize(limit, shape[::-1], dst=scratch.floats('limit', shape), interpolation=cv2.INTER_LINEAR)
     mask = cv2.compare(smooth, limit, cv2.CMP_LT, dst=scratch.bytes('mask', shape))
-    return np.asarray(cv2.medianBlur(mask, scale.specks_px) if scale.specks_px > 1 else mask)
+    # Specks of noise are many, and each is an outline to follow.
+    return np.asarray(cv2.medianBlur(mask, _SPECKS))

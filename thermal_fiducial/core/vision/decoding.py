@@ -157,12 +157,13 @@ class Decoder:
         inner_low, inner_high = np.broadcast_to(near, t.shape), np.broadcast_to(1.0 - near, t.shape)
         a = np.concatenate([t, t, low, high, t, t, inner_low, inner_high], axis=1)
         b = np.concatenate([low, high, t, t, inner_low, inner_high, t, t], axis=1)
-        means = sampled(image, quads, a, b).reshape(len(quads), 2, 4, -1).mean(axis=-1, dtype=np.float64)
+        places = in_quadrilaterals(quads, a, b).astype(np.float32)
+        means = sampled(image, places).reshape(len(quads), 2, 4, -1).mean(axis=-1, dtype=np.float64)
         return np.asarray(means[:, 0] - means[:, 1])
 
     def _contrasts(self, image: Float32Array, quads: FloatArray) -> FloatArray:
         """Mean counts (Q, m * m) of the cells without the background."""
-        values = sampled(image, quads, self._a, self._b)
+        values = sampled(image, in_quadrilaterals(quads, self._a, self._b).astype(np.float32))
         return np.asarray((values - values[:, :1]) @ self._cells_of_samples, dtype=np.float64)
 
 
@@ -174,7 +175,6 @@ def shrunk(quads: FloatArray, cells: int) -> FloatArray:
     )
 
 
-def sampled(image: Float32Array, quads: FloatArray, a: FloatArray, b: FloatArray) -> Float32Array:
-    """Values (Q, P) of the image at shares a, b of quadrilaterals."""
-    u, v = in_quadrilaterals(quads, a, b).astype(np.float32)
-    return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+def sampled(image: Float32Array, places: Float32Array) -> Float32Array:
+    """Values (Q, P) of the image at columns and rows (2, Q, P)."""
+    return np.asarray(cv2.remap(image, places[0], places[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))

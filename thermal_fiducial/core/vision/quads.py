@@ -9,7 +9,7 @@ from thermal_fiducial.core.types import FloatArray, Gray
 _STRAIGHT = 0.05
 
 
-def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray | None = None) -> FloatArray:
+def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray) -> FloatArray:
     """Convex quadrilaterals (Q, 4, 2) [px], clockwise, among the outlines in a mask, of its spots and of its holes.
 
     Parameters
@@ -18,9 +18,8 @@ def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray | None = None)
     min_side_px : shortest side
     hidden : (N, 4, 2) where not to look [px]
     """
-    if hidden is not None:
-        for quad in np.rint(hidden).astype(np.int32):
-            cv2.fillConvexPoly(mask, quad, 0)
+    for quad in np.rint(hidden).astype(np.int32):
+        cv2.fillConvexPoly(mask, quad, 0)
     outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     shortest, longest = 3.2 * min_side_px, 2.0 * sum(mask.shape)
     quads = []

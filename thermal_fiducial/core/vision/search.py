@@ -16,7 +16,7 @@ from thermal_fiducial.core.vision.scratch import Scratch
 
 # Full resolution sees small and smeared markers; half resolution, without the pattern of columns, faint ones.
 _FINE = Scale(smoothing_px=1.0, window_px=7, window_shrink=2, depth=0.2, floor=1.5)
-_FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0, specks_px=3)
+_FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0)
 # Weight of white surroundings against correlation in choosing among the outlines of a marker.
 _SURROUNDED = 0.2
 # Correlation beyond which an outline needs no alignment, and from which, by such a margin, it is worth one.
@@ -95,7 +95,7 @@ class BlindSearch:
         scene: Float32Array,
         allowed: BoolArray,
         config: ArucoDetectorConfig,
-        seen: FloatArray | None = None,
+        seen: Found | None = None,
     ) -> Found:
         """Markers with IDs ``allowed`` (M,), each ID once.
 
@@ -104,10 +104,11 @@ class BlindSearch:
         image : (height, width) the frame
         noise : standard deviation of a pixel in it [counts]
         scene : the same freed of lag, which costs noise: the finest markers are sought there, the faintest in ``image``
-        seen : (N, 4, 2) corners of markers that are there [px]: nothing is sought in them and their plates
+        seen : markers that are there: nothing is sought in them and their plates
         """
         decoder = self._decoder
-        hidden = None if seen is None else _grown(seen, 1.0 + 2.0 * _PLATE_CELLS / decoder.cells)
+        seen = Found.none() if seen is None else seen
+        hidden = _grown(seen.corners_px, 1.0 + 2.0 * _PLATE_CELLS / decoder.cells)
         fine = find_quads(dark(scene, noise, _FINE, self._scratch), config.min_side_px, hidden)
         half = without_columns(halved(image, self._scratch), 0.5 * noise, self._scratch)
         faint = self._faint(half, noise, config.min_side_px, hidden)
@@ -115,7 +116,7 @@ class BlindSearch:
         if len(quads) == 0:
             return Found.none()
         reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, _halfway(quads[len(fine) :]), allowed))
-        rough = _rough(reading, quads)
+        rough = _rough(reading, quads, seen.ids)
         if len(rough):
             better = aligned(half, _halfway(quads[rough]), reading.ids[rough], reading.turns[rough], decoder)
             reading = _joined(reading, decoder.read(half, better, allowed))
@@ -125,11 +126,10 @@ class BlindSearch:
         good &= ~_inside_out(reading, quads, good, distinct(reading, noise, config))
         return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), noise)
 
-    def _faint(self, half: Float32Array, noise: float, min_side_px: float, hidden: FloatArray | None) -> FloatArray:
+    def _faint(self, half: Float32Array, noise: float, min_side_px: float, hidden: FloatArray) -> FloatArray:
         """Quadrilaterals of faint markers (Q, 4, 2) at half the resolution, in pixels of the full one."""
-        hidden = None if hidden is None else _halfway(hidden)
         mask = dark(half, 0.5 * noise, _FAINT, self._scratch)
-        return 2.0 * find_quads(mask, 0.5 * min_side_px + 2.0, hidden) + 0.5
+        return 2.0 * find_quads(mask, 0.5 * min_side_px + 2.0, _halfway(hidden)) + 0.5
 
 
 def _large(quads: FloatArray, min_side_px: float) -> BoolArray:
@@ -156,12 +156,15 @@ def _grown(quads: FloatArray, factor: float) -> FloatArray:
     return np.asarray(middle + factor * (quads - middle))
 
 
-def _rough(reading: Reading, quads: FloatArray) -> IntArray:
-    """Places of the best readings of IDs that show, but not clearly, where none does: their outlines may be off."""
+def _rough(reading: Reading, quads: FloatArray, seen: IntArray) -> IntArray:
+    """Places of the best readings of IDs that show, but not clearly, where none does: their outlines may be off.
+
+    IDs that are ``seen`` already need no other place.
+    """
     similarity = np.abs(reading.correlation)
     clear = similarity >= _CLEAR
     hinted = (similarity >= _HINT) & (similarity - reading.runner_up >= _HINT_MARGIN)
-    hinted &= ~np.isin(reading.ids, reading.ids[clear])
+    hinted &= ~among(reading.ids, np.concatenate([reading.ids[clear], seen]))
     places = np.flatnonzero(hinted)[np.argsort(-similarity[hinted], kind='stable')]
     places = places[np.unique(reading.ids[places], return_index=True)[1]]
     centre, across = quads.mean(axis=1), np.linalg.norm(quads[clear, 2] - quads[clear, 0], axis=-1)
