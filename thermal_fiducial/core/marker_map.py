@@ -23,6 +23,7 @@ from thermal_fiducial.core.mapping.localization import locate, Location, positiv
 from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.map_editing import align
 from thermal_fiducial.core.mapping.map_rows import marker_poses, usable
+from thermal_fiducial.core.mapping.motion import CameraMotion
 from thermal_fiducial.core.mapping.noise_level import NoiseLevel
 from thermal_fiducial.core.mapping.trust import culprits, DISAGREEMENT, Trust
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers, Odometry
@@ -86,6 +87,7 @@ class MarkerMapper:
         self._trust = Trust()
         self._quarantined = {key for key, marker in self.map.markers.items() if not marker.trusted}
         self._last: CameraPose | None = None
+        self._motion = CameraMotion()
         self._cameras: list[Camera] = []
         self._noise = NoiseLevel()
         self._gap: CameraPose | None = None
@@ -116,7 +118,8 @@ class MarkerMapper:
             changed, waiting = self._without_pose(stamp_ns, markers[~is_known], camera, odometry, location)
             return self._result(stamp_ns, None, location.reason, changed, waiting=waiting)
         ids = tuple(marker.id for marker, used in zip(known.markers, trusted, strict=True) if used)
-        self._last = CameraPose(stamp_ns, location.T_map_camera, location.covariance, ids, location.rms_px)
+        covariance = location.covariance + self._motion.unknown(stamp_ns, location.T_map_camera)
+        self._last = CameraPose(stamp_ns, location.T_map_camera, covariance, ids, location.rms_px)
         self._gap = None
         # Step 7: errors updated.
         errors = self._update_errors(stamp_ns, known, location, camera)
@@ -313,6 +316,7 @@ class MarkerMapper:
         if self._last is not None:
             T_new_old = displacement.at(self._last.stamp_ns)
             self._last = replace(self._last, T_map_camera=T_new_old @ self._last.T_map_camera)
+            self._motion = CameraMotion()
             self._last_frame = replace(self._last_frame, T_map_rig=T_new_old @ self._last_frame.T_map_rig)
         self.map.version += 1
         self.resets += 1
