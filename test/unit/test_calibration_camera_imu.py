@@ -232,6 +232,27 @@ def test_readout_time_and_extrinsics_within_their_errors(readout):
     error = error_of(result, SCENARIO)
     # Chi-square of seven degrees of freedom, 99.9 %.
     assert error @ np.linalg.solve(result.covariance, error) < 24.3
+    # These stamps are exact; a tenth of a pixel at 300 px/s is 0.3 ms a corner.
+    assert result.stamp_jitter < 1e-4
+
+
+def test_stamps_that_jitter_and_an_imu_that_shakes_are_allowed_for():
+    rough = replace(
+        SCENARIO, stamp_jitter=0.002, imu=replace(SCENARIO.imu, gyroscope_rattle=0.015, accelerometer_rattle=0.3)
+    )
+    frames, camera, imu = rolling_recording(rough, 15.0, 3, READOUT, sigma_px=0.1)
+    result = calibrate_rolling_camera_imu(frames, camera, imu, START_NS, ImuNoise())
+    # Most exponential stamps are nearer to their mean than normal ones: the median says 0.94 of the deviation; and the
+    # states of an IMU that shakes follow part of what is left.
+    assert 0.0012 < result.stamp_jitter < 0.0022
+    assert abs(result.readout_time - READOUT) < 4.0 * result.readout_sigma
+    error = error_of(result, rough)
+    # Chi-square of seven degrees of freedom, 99.9 %.
+    assert error @ np.linalg.solve(result.covariance, error) < 24.3
+    assert 0.9 < result.scale < 1.5
+    noise = imu.noise(ImuNoise())
+    assert noise.gyroscope_noise_density == pytest.approx(0.015 / np.sqrt(200.0), rel=0.05)
+    assert noise.accelerometer_noise_density == pytest.approx(0.3 / np.sqrt(200.0), rel=0.05)
 
 
 def test_poses_alone_say_nothing_of_the_readout_time():

@@ -58,12 +58,14 @@ class Solution:
     covariance : (10, 10) of the shared ones, scaled by ``scale`` squared
     residuals : (N, 6) of the camera poses, position and rotation, in the map [m, rad]
     scale : factor on the given covariances at which the residuals are what they should be
+    jitter : standard deviation of the frames' stamps [s], as the residuals show it
     """
 
     state: State
     covariance: FloatArray
     residuals: FloatArray
     scale: float
+    jitter: float
 
 
 def root_information(covariance: FloatArray) -> FloatArray:
@@ -114,6 +116,7 @@ class Problem:
     root : (N, 6, 6) of their information, as :func:`root_information` has it
     imu, noise : samples, and what their noise is
     rows, readout : of the frames, and the read-out time that their poses allow for [s]; without rows it is held at zero
+    jitter : standard deviation of the stamps [s]
     """
 
     def __init__(
@@ -125,9 +128,10 @@ class Problem:
         noise: ImuNoise,
         rows: RowMoments | None = None,
         readout: float = 0.0,
+        jitter: float = 0.0,
     ) -> None:
         self._stamps, self._measured, self._root, self._imu, self._noise = stamps, measured, root, imu, noise
-        self._rows, self._about = rows, readout
+        self._rows, self._about, self._jitter = rows, readout, jitter
         if rows is not None:
             covariance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
             # By how much the true pose is off the measured one for a twist and a read-out time of one, and what the
@@ -141,10 +145,11 @@ class Problem:
             state, change, covariance = self.improved(state)
             if change < _CONVERGED:
                 break
-        error, _, _ = self._pose_errors(state)
-        whitened = (self._root @ error[:, :, None])[:, :, 0]
+        error, _, shared = self._pose_errors(state)
+        whitened = (self._whitening(shared[:, :, 6]) @ error[:, :, None])[:, :, 0]
         scale = max(1.0, 1.4826 * float(np.median(np.abs(whitened))))
-        return Solution(state, covariance * scale**2, error, scale)
+        jitter = self._scatter(error, shared[:, :, 6])
+        return Solution(state, covariance * scale**2, error, scale, jitter)
 
     def camera_poses(self, state: State, frames: IntArray, delays: FloatArray) -> FloatArray:
         """T_map_camera (K, 4, 4) by ``delays`` (K,) [s] after ``frames`` (K,)."""
@@ -200,11 +205,31 @@ class Problem:
             error += (state.readout - self._about) * shared[:, :, 9]
         return error, own, shared
 
+    def _whitening(self, twist: FloatArray) -> FloatArray:
+        """Root information (N, 6, 6) of poses whose stamps jitter too, while the camera moves with ``twist`` (N, 6).
+
+        (1 - a u u') W, with u = W twist: a makes its square the inverse of W^-1 W^-T + jitter^2 twist twist'.
+        """
+        u = (self._root @ twist[:, :, None])[:, :, 0]
+        square = np.maximum(np.sum(u**2, axis=1), 1e-12)
+        a = (1.0 - 1.0 / np.sqrt(1.0 + self._jitter**2 * square)) / square
+        return np.asarray(self._root - a[:, None, None] * u[:, :, None] * (u[:, None, :] @ self._root))
+
+    def _scatter(self, error: FloatArray, twist: FloatArray) -> float:
+        """Deviation of the stamps [s]: of the delays that explain errors (N, 6) best, less what poses' noise makes."""
+        u = (self._root @ twist[:, :, None])[:, :, 0]
+        square = np.maximum(np.sum(u**2, axis=1), 1e-12)
+        fast = square >= np.median(square)
+        late = np.sum(u * (self._root @ error[:, :, None])[:, :, 0], axis=1)[fast] / square[fast]
+        spread = 1.4826 * float(np.median(np.abs(late - np.median(late))))
+        return float(np.sqrt(max(0.0, spread**2 - np.median(1.0 / square[fast]))))
+
     def _add_poses(
         self, state: State, H: FloatArray, B: FloatArray, C: FloatArray, g: FloatArray, c: FloatArray
     ) -> None:
         error, own, shared = self._pose_errors(state)
-        e = (self._root @ error[:, :, None])[:, :, 0]
+        root = self._whitening(shared[:, :, 6])
+        e = (root @ error[:, :, None])[:, :, 0]
         distance = np.linalg.norm(e, axis=1)
         weight = np.sqrt(np.minimum(1.0, _INLIER / np.maximum(distance, 1e-12)))[:, None]
         if self._rows is not None:
@@ -212,7 +237,7 @@ class Problem:
             information = np.einsum('ni,nij,nj->', twist, self._beyond, twist)
             C[9, 9] += information
             c[9] += information * (state.readout - self._about) - np.sum(weight * twist * self._rows.residual)
-        e, own, shared = weight * e, weight[:, :, None] * (self._root @ own), weight[:, :, None] * (self._root @ shared)
+        e, own, shared = weight * e, weight[:, :, None] * (root @ own), weight[:, :, None] * (root @ shared)
         H[:, 0] += np.swapaxes(own, 1, 2) @ own
         B += np.swapaxes(own, 1, 2) @ shared
         C += np.einsum('nij,nik->jk', shared, shared)

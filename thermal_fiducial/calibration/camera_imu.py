@@ -9,7 +9,7 @@ that come early or late with the rows that they rest on.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,14 +20,14 @@ from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
 
 _LEAST_POSES = 100
 # Standard deviations from zero beyond which there is a read-out time.
 _SIGNIFICANT = 3.0
-# The corners are brought to the middle row's time, and the poses solved anew, until the read-out time stays [s].
-_ROUNDS, _SETTLED = 6, 1e-5
+# The corners are brought to the middle row's time, and the poses solved anew, until read-out time and jitter stay [s].
+_ROUNDS, _SETTLED = 8, 2e-5
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class CameraImuCalibration:
     covariance : (7, 7) of the rotation about the camera's axes [rad], position [m], offset [s]
     readout_time : from the sampling of the first row to that of the last [s]; 0 unless it is clearly more
     readout_sigma : its standard deviation [s]; inf when the corners were not given
+    stamp_jitter : standard deviation of the camera's stamps about the time offset [s]
     gravity_map : (3,) [m/s^2]
     bias : (6,) mean gyroscope and accelerometer bias
     residuals : (N, 6) of the camera poses, position and rotation, in the map [m, rad]
@@ -53,6 +54,7 @@ class CameraImuCalibration:
     covariance: FloatArray
     readout_time: float
     readout_sigma: float
+    stamp_jitter: float
     gravity_map: FloatArray
     bias: FloatArray
     residuals: FloatArray
@@ -69,6 +71,7 @@ def calibrate_camera_imu(
     ----------
     poses : of the camera in the map, stamped by the camera's clock, in order
     imu : samples; times are seconds of the IMU's clock since ``start_ns``
+    noise : of the IMU at rest; where it shakes, the samples tell how much more there is
     gravity : its magnitude [m/s^2]
 
     Raises
@@ -76,8 +79,11 @@ def calibrate_camera_imu(
     InputError
         Too few poses, no IMU samples around them, or motion that the answer cannot be read from.
     """
-    _, problem, state = _problem(poses, imu, start_ns, noise, gravity)
-    return _answer(problem.solved(state), np.inf)
+    recording = _Recording(imu, start_ns, gravity)
+    poses = [pose for pose, use in zip(poses, recording.covers(poses), strict=True) if use]
+    _, first = recording.solved(poses, noise)
+    _, second = recording.solved(poses, imu.noise(noise), first.jitter, first.state)
+    return _answer(second, np.inf)
 
 
 def calibrate_rolling_camera_imu(
@@ -93,32 +99,47 @@ def calibrate_rolling_camera_imu(
     Parameters
     ----------
     frames : in order, stamped by the camera's clock
-    imu, start_ns, gravity : as for :func:`calibrate_camera_imu`
+    imu, start_ns, noise, gravity : as for :func:`calibrate_camera_imu`
 
     Raises
     ------
     InputError
         As there.
     """
-    solved = at_once = _solved(frames, camera)
-    readout = 0.0
+    recording = _Recording(imu, start_ns, gravity)
+    at_once = _solved(frames, camera)
+    inside = recording.covers([frame.pose for frame in at_once])
+    at_once = [frame for frame, use in zip(at_once, inside, strict=True) if use]
+    solved, first = _rolling(recording, at_once, camera, noise)
+    shaken = imu.noise(noise)
+    _, second = _rolling(recording, solved, camera, shaken, first.jitter, first.state)
+    sigma = float(np.sqrt(second.covariance[9, 9]))
+    if second.state.readout <= _SIGNIFICANT * sigma:
+        _, second = recording.solved([frame.pose for frame in at_once], shaken, first.jitter, first.state)
+    return _answer(second, sigma)
+
+
+def _rolling(
+    recording: '_Recording',
+    solved: list[SolvedFrame],
+    camera: Camera,
+    noise: ImuNoise,
+    jitter: float = 0.0,
+    state: State | None = None,
+) -> tuple[list[SolvedFrame], Solution]:
+    """Frames as they are with all rows read out at once, and the solution."""
+    readout = 0.0 if state is None else state.readout
     for _ in range(_ROUNDS):
-        poses = [frame.pose for frame in solved]
-        rows = [frame.rows for frame in solved]
-        used, problem, state = _problem(poses, imu, start_ns, noise, gravity, rows, readout)
-        solution = problem.solved(state)
-        change, readout = abs(solution.state.readout - readout), max(0.0, solution.state.readout)
-        if change < _SETTLED:
+        poses, rows = [frame.pose for frame in solved], [frame.rows for frame in solved]
+        problem, solution = recording.solved(poses, noise, jitter, state, rows, readout)
+        state = replace(solution.state, readout=max(0.0, solution.state.readout))
+        if abs(state.readout - readout) < _SETTLED:
             break
-        seen = [solved[index] for index in used.tolist()]
-        shifts = _row_shifts([frame.corners for frame in seen], camera, problem, solution.state)
-        initial = [frame.pose.T_map_camera for frame in seen]
-        solved = _solved([frame.corners for frame in seen], camera, shifts, initial)
-    sigma = float(np.sqrt(solution.covariance[9, 9]))
-    if readout > _SIGNIFICANT * sigma:
-        return _answer(solution, sigma)
-    _, problem, state = _problem([frame.pose for frame in at_once], imu, start_ns, noise, gravity)
-    return _answer(problem.solved(state), sigma)
+        readout = state.readout
+        corners = [frame.corners for frame in solved]
+        shifts, initial = _row_shifts(corners, camera, problem, state), [pose.T_map_camera for pose in poses]
+        solved = _solved(corners, camera, shifts, initial)
+    return solved, solution
 
 
 def _solved(
@@ -153,28 +174,56 @@ def _row_shifts(frames: Sequence[FrameCorners], camera: Camera, problem: Problem
     return [part.reshape(-1, 4, 2) for part in np.split(shifts, np.cumsum(counts)[:-1])]
 
 
-def _problem(
-    poses: Sequence[CameraPose],
-    imu: ImuTrack,
-    start_ns: int,
-    noise: ImuNoise,
-    gravity: float,
-    rows: Sequence[RowMoments] | None = None,
-    readout: float = 0.0,
-) -> tuple[IntArray, Problem, State]:
-    """Which poses can be used, the adjustment of them, and a first state; ``rows`` of all poses about ``readout``."""
-    stamps = np.array([(pose.stamp_ns - start_ns) * 1e-9 for pose in poses])
-    margin = LARGEST_OFFSET + 0.05
-    inside = (stamps > imu.seconds[0] + margin) & (stamps < imu.seconds[-1] - margin)
-    inside[1:] &= np.diff(stamps) > 1e-4
-    if inside.sum() < _LEAST_POSES:
-        raise InputError(f'{inside.sum()} camera poses with IMU samples around them: {_LEAST_POSES} or more are needed')
-    used = np.flatnonzero(inside)
-    measured = np.stack([poses[index].T_map_camera for index in used.tolist()])
-    root = np.stack([root_information(poses[index].covariance) for index in used.tolist()])
-    chosen = None if rows is None else RowMoments.stacked([rows[index] for index in used.tolist()])
-    problem = Problem(stamps[used], measured, root, imu, noise, chosen, readout)
-    return used, problem, first_state(stamps[used], measured, imu, gravity)
+@dataclass(frozen=True)
+class _Recording:
+    """What of a recording doesn't change from round to round."""
+
+    imu: ImuTrack
+    start_ns: int
+    gravity: float
+
+    def covers(self, poses: Sequence[CameraPose]) -> BoolArray:
+        """Which poses have IMU samples around them.
+
+        Raises
+        ------
+        InputError
+            Too few.
+        """
+        stamps, margin = self._seconds(poses), LARGEST_OFFSET + 0.05
+        inside = (stamps > self.imu.seconds[0] + margin) & (stamps < self.imu.seconds[-1] - margin)
+        inside[1:] &= np.diff(stamps) > 1e-4
+        if inside.sum() < _LEAST_POSES:
+            count = f'{inside.sum()} camera poses with IMU samples around them'
+            raise InputError(f'{count}: {_LEAST_POSES} or more are needed')
+        return np.asarray(inside)
+
+    def solved(
+        self,
+        poses: Sequence[CameraPose],
+        noise: ImuNoise,
+        jitter: float = 0.0,
+        state: State | None = None,
+        rows: Sequence[RowMoments] | None = None,
+        readout: float = 0.0,
+    ) -> tuple[Problem, Solution]:
+        """The adjustment of all poses, ``rows`` about ``readout``, and its solution, sought from ``state`` on.
+
+        Raises
+        ------
+        InputError
+            Too little motion.
+        """
+        stamps, measured = self._seconds(poses), np.stack([pose.T_map_camera for pose in poses])
+        root = np.stack([root_information(pose.covariance) for pose in poses])
+        moments = None if rows is None else RowMoments.stacked(rows)
+        problem = Problem(stamps, measured, root, self.imu, noise, moments, readout, jitter)
+        if state is None or len(state.p) != len(poses):
+            state = first_state(stamps, measured, self.imu, self.gravity)
+        return problem, problem.solved(state)
+
+    def _seconds(self, poses: Sequence[CameraPose]) -> FloatArray:
+        return np.array([(pose.stamp_ns - self.start_ns) * 1e-9 for pose in poses])
 
 
 def _answer(solution: Solution, readout_sigma: float) -> CameraImuCalibration:
@@ -185,6 +234,7 @@ def _answer(solution: Solution, readout_sigma: float) -> CameraImuCalibration:
         solution.covariance[:7, :7],
         state.readout,
         readout_sigma,
+        solution.jitter,
         state.gravity,
         state.bias.mean(axis=0),
         solution.residuals,

@@ -4,7 +4,7 @@ C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza, "On-manifold preintegration 
 odometry", 2017, section VI, for all intervals at once.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,8 @@ from thermal_fiducial.core.types import FloatArray
 
 # Longest step of the integration [s]: the sampling interval of a 200 Hz IMU.
 _STEP = 0.005
+# Variance of the second difference of white noise of variance one.
+_SECOND_DIFFERENCE = 6.0
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,19 @@ class ImuTrack:
             for signal in (self.rate, self.force)
         )
         return rate.reshape(*t.shape, 3), force.reshape(*t.shape, 3)
+
+    def noise(self, known: ImuNoise) -> ImuNoise:
+        """``known`` with the white noise that the samples show, where vibration makes it more."""
+        root = float(np.median(np.diff(self.seconds))) ** 0.5
+        rate, force = (
+            root * float(np.sqrt(np.mean(np.diff(signal, 2, axis=0) ** 2) / _SECOND_DIFFERENCE))
+            for signal in (self.rate, self.force)
+        )
+        return replace(
+            known,
+            gyroscope_noise_density=max(rate, known.gyroscope_noise_density),
+            accelerometer_noise_density=max(force, known.accelerometer_noise_density),
+        )
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from thermal_fiducial.calibration.sources import (
     recorded_camera,
 )
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Sighting, Target
-from thermal_fiducial.config import ArucoDetectorConfig, ImuNoise
+from thermal_fiducial.config import ArucoDetectorConfig, ImuNoise, PoseEkfConfig
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
@@ -284,7 +284,7 @@ def _camera_imu(args: argparse.Namespace) -> int:
         camera = recorded_camera(bag) if args.calibration is None else load_camera(args.calibration)
         imu, start_ns = imu_track(bag)
         frames = track(clean_frames(bag), 'finding markers', bag.message_count(['thermal/image_raw']), transient=True)
-        seen = list(_mapped_corners(frames, marker_map, camera))
+        seen = sorted(_mapped_corners(frames, marker_map, camera), key=lambda frame: frame.stamp_ns)
     result = calibrate_rolling_camera_imu(seen, camera, imu, start_ns, noise)
     args.out.write_text(_extrinsics_text(result), encoding='utf-8')
     print(_extrinsics_text(result))
@@ -322,6 +322,8 @@ def _extrinsics_text(result: CameraImuCalibration) -> str:
             f'    camera_orientation: {np.round(q, 8).tolist()}  # +- {np.round(rotation, 4).tolist()} deg',
             f'    camera_time_offset: {result.time_offset:.6f}  # +- {1e3 * sigma[6]:.3f} ms',
             f'    readout_time: {result.readout_time:.6f}  # +- {1e3 * result.readout_sigma:.3f} ms',
+            f'    stamp_jitter: {max(result.stamp_jitter, PoseEkfConfig().stamp_jitter):.6f}  # found: '
+            f'{1e3 * result.stamp_jitter:.3f} ms',
             '',
         ]
     )
