@@ -102,6 +102,20 @@ def test_markers_are_expected_where_the_motion_carries_them():
     assert len(tracker.expected(10**9, twist).ids) == 0
 
 
+def test_a_late_frame_disturbs_nothing_and_a_clock_set_back_is_followed():
+    rng = np.random.default_rng(4)
+    points, twist = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3)), Twist(TWIST, np.eye(12))
+    seen = Tracked(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
+    tracker, now = MotionTracker(np.eye(4)), 10**9
+    tracker.remember(now, twist, seen)
+    ahead = tracker.expected(now + 33_000_000, twist)
+    tracker.remember(now - 66_000_000, None, Tracked.none())
+    np.testing.assert_array_equal(tracker.expected(now + 33_000_000, twist).x, ahead.x)
+    assert tracker.predict(now + 33_000_000, None) is not None
+    tracker.remember(now - 10**9, twist, seen)
+    np.testing.assert_array_equal(tracker.expected(now - 10**9 + 33_000_000, twist).x, ahead.x)
+
+
 def test_field_agrees_with_the_points():
     twist = Twist(TWIST, np.eye(6))
     field = SmearField(CAMERA).full(SmearField(CAMERA).at(twist, 3.0, 0.01))

@@ -194,7 +194,9 @@ class MotionTracker:
         return len(self._seen.ids) > 0 and bool(np.abs(self._seen.clarity).min() > clarity)
 
     def remember(self, stamp_ns: int, twist: Twist | None, seen: Tracked) -> None:
-        """Keep a frame's twist and markers for the next one."""
+        """Keep a frame's twist and markers for the next one; of one that comes late there is nothing to keep."""
+        if self._stamp_ns is not None and 0 < self._stamp_ns - stamp_ns < _STALE_S * 1e9:
+            return
         self._stamp_ns, self._twist, self._seen = stamp_ns, twist, seen
 
     def _since(self, stamp_ns: int) -> float | None:
