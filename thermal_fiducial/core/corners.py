@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.adjustment import edges
-from thermal_fiducial.core.adjustment.segments import adjust, HOPELESS, measure
+from thermal_fiducial.core.adjustment.segments import adjust, counts_across, HOPELESS, measure, Memory
 from thermal_fiducial.core.adjustment.sides import sides_of
 from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
@@ -58,6 +58,7 @@ def refine_corners(
     columns: int = 6,
     *,
     near: BoolArray | None = None,
+    memory: Memory | None = None,
 ) -> RefinedCorners:
     """Corners of N markers, refined.
 
@@ -70,6 +71,7 @@ def refine_corners(
     smear_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
     columns : of pixels, in a segment
     near : (N,) which corners are good to a pixel already, so that nothing wide need catch them
+    memory : what to take out of the image; nothing when left out
     """
     count = len(corners.px)
     px, covariances = corners.px.copy(), np.zeros((count, 4, 2, 2))
@@ -84,7 +86,17 @@ def refine_corners(
         part = corners if len(active) == count else corners.only(active)
         start = part.moved(px[active] - part.px, camera)
         prior = _PRIOR_OF_SHAPE if factor > 1.0 else _PRIOR
-        shift, *rest = _pass(image, start.x, camera, behind[active], factor * blur_px, smear[active], prior, columns)
+        shift, *rest = _pass(
+            image,
+            start.x,
+            camera,
+            behind[active],
+            factor * blur_px,
+            smear[active],
+            prior,
+            columns,
+            None if memory is None else memory.only(active),
+        )
         px[active] = start.px + shift
         covariances[active], contrast[active], noise[active] = rest
         away[active] = np.abs(shift).max(axis=(1, 2)) > _SETTLED_PX
@@ -101,6 +113,7 @@ def _pass(
     smear: FloatArray,
     prior: FloatArray,
     columns: int,
+    memory: Memory | None,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """One linearised adjustment: shifts (N, 4, 2), covariances (N, 4, 2, 2), contrasts (N,), noise (N,)."""
     cells = behind.shape[2]
@@ -108,7 +121,8 @@ def _pass(
     half = min(max(math.ceil(2.5 * widest + 1.0), 4), 10)
     sides = sides_of(x, camera, image.shape, cells * columns, half)
     blur = edges.blurs(sides.normal[:, cells * columns // 2], optics, smear)
-    segments = measure(image, sides, edges.model(sides, behind, blur), cells, _REACHED * blur[0])
+    counts = counts_across(image, sides, memory)
+    segments = measure(counts, edges.model(sides, behind, blur), cells, _REACHED * blur[0])
     moved, covariances = adjust(sides, segments, prior)
     good = segments.variance < HOPELESS
     return moved, covariances, _mean_where(segments.contrast, good), np.sqrt(_mean_where(segments.noise, good))

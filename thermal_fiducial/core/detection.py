@@ -86,7 +86,7 @@ class MarkerDetector:
         )
         self._motion = MotionTracker(self._T_body_camera, config.bolometer_lag)
         self._scratch = Scratch()
-        self._refiner = Refiner(edges_behind(bits), self._motion, self._scratch)
+        self._refiner = Refiner(edges_behind(bits), self._motion)
         self._search = BlindSearch(self._decoder, self._scratch)
         self._clock_offset = ClockOffset()
         self._field: SmearField | None = None
@@ -268,8 +268,9 @@ class MarkerDetector:
         keep = read & among(found.ids, followed.ids[followed.certain])
         others = np.flatnonzero(~keep)
         if len(others):
+            sharp = view.sharp(seen.corners_px, others, self._scratch)
             keep[others] = confirmed(
-                view.image, self._scratch, there.only(others), seen.only(others), self._decoder, self.config
+                sharp, self._scratch, there.only(others), seen.only(others), self._decoder, self.config
             )
         return np.asarray(keep & frame.camera.contains(seen.corners_px, 0.5 * _RIM_PX).all(axis=1))
 

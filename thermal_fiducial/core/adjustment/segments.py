@@ -7,10 +7,11 @@ hidden stretches cost the segments that they touch.
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from thermal_fiducial.core.adjustment.sides import ENDS, Sides, STARTS
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Variance of a segment that measures nothing.
 HOPELESS = 1e6
@@ -25,6 +26,23 @@ _FLOOR = 0.010**2 * np.eye(2)
 # contrast of a plate varies.
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
 _SIDES = np.arange(4)
+
+
+class Memory(NamedTuple):
+    """What the image still shows of the past, to be taken out round N markers.
+
+    Parameters
+    ----------
+    maps : (N, 2, 3) of the pixels (u, v, 1) to those that show what they remember
+    gain : (N,) weight of the present, so that 1 takes nothing out
+    """
+
+    maps: FloatArray
+    gain: FloatArray
+
+    def only(self, keep: IntArray) -> 'Memory':
+        """That round the markers ``keep``."""
+        return Memory(self.maps[keep], self.gain[keep])
 
 
 class Segments(NamedTuple):
@@ -54,9 +72,23 @@ class _Fit(NamedTuple):
     number: FloatArray
 
 
+def counts_across(image: Float32Array, sides: Sides, memory: Memory | None = None) -> Float32Array:
+    """Counts (E, K, M) of the pixels across sides, without memory."""
+    counts: Float32Array = image.ravel().take(sides.pixel, mode='clip')
+    if memory is None or not (memory.gain > 1.0).any():
+        return counts
+    pixel, which = sides.pixel.reshape(len(memory.gain), -1), np.flatnonzero(memory.gain > 1.0)
+    v, u = (a.astype(np.float32) for a in np.divmod(pixel[which].astype(np.int32), np.int32(image.shape[1])))
+    maps = memory.maps[which].astype(np.float32)[..., None]
+    to_u, to_v = (maps[:, row, 0] * u + maps[:, row, 1] * v + maps[:, row, 2] for row in (0, 1))
+    past = cv2.remap(image, to_u, to_v, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+    gain, of_marker = memory.gain[which, None].astype(np.float32), counts.reshape(pixel.shape)
+    of_marker[which] = gain * of_marker[which] + (np.float32(1.0) - gain) * past
+    return counts
+
+
 def measure(
-    image: Float32Array,
-    sides: Sides,
+    counts: Float32Array,
     modelled: tuple[Float32Array, Float32Array, Float32Array],
     cells: int,
     reach: FloatArray,
@@ -65,6 +97,7 @@ def measure(
 
     Parameters
     ----------
+    counts : (E, K, M) of :func:`counts_across`
     modelled : value, derivative and weight of each pixel, of :func:`thermal_fiducial.core.adjustment.edges.model`
     reach : (E,) longest displacement for which the model can be linearised [px]
     """
@@ -72,7 +105,7 @@ def measure(
     count = value.shape[0] * cells
     weight = weight.reshape(count, -1)
     X = np.empty((count, 4, weight.shape[1]), dtype=np.float32)
-    counts = image.ravel().take(sides.pixel, mode='clip').reshape(weight.shape)
+    counts = counts.reshape(weight.shape)
     X[:, 0], X[:, 1], X[:, 2] = 1.0, value.reshape(weight.shape), slope.reshape(weight.shape)
     np.subtract(counts, counts[:, weight.shape[1] // 2, None], out=X[:, 3])
     fit = _fit(X, weight)

@@ -40,10 +40,11 @@ _VALUE, _CHANGE = np.arange(6), np.arange(6, 12)
 # How much of the past is taken out of the image, in time constants, and its weight.
 _MEMORY = 0.75
 _FORGOTTEN = math.exp(-_MEMORY)
-_GAIN = 1.0 / (1.0 - _FORGOTTEN)
+#: The present's weight when the memory is taken out.
+GAIN = 1.0 / (1.0 - _FORGOTTEN)
 #: What is left of the smear: its mean, and its standard deviation about that, as shares of the whole.
-REMAINING = 1.0 - _MEMORY * _FORGOTTEN * _GAIN
-SPREAD = math.sqrt(1.0 - _MEMORY**2 * _FORGOTTEN * _GAIN**2)
+REMAINING = 1.0 - _MEMORY * _FORGOTTEN * GAIN
+SPREAD = math.sqrt(1.0 - _MEMORY**2 * _FORGOTTEN * GAIN**2)
 #: Age, in time constants, of the velocity that has carried the memory as far as it is from the image.
 MEMORY_AGE = 1.0 + 0.5 * _MEMORY
 # How far the time constant may be off, and the displacement of an edge by a response that is no exponential: a share of
@@ -301,19 +302,25 @@ def markers_sharpened(
     height, width = image.shape
     finite = np.isfinite(corners_px).all(axis=(1, 2)) & np.isfinite(smear_px).all(axis=(1, 2))
     corners_px, smear_px = corners_px[finite], smear_px[finite]
-    affine = _affine(corners_px, smear_px)
+    maps = memory_maps(corners_px, smear_px)
     low = np.floor(corners_px.min(axis=1)).astype(int) - margin_px
     high = np.ceil(corners_px.max(axis=1)).astype(int) + margin_px + 1
     low, high = np.maximum(low, 0), np.minimum(high, (width, height))
     seen = (low < high).all(axis=1)
-    low, high, affine = low[seen], high[seen], affine[seen]
-    # Where the memory of a pixel lies: what it saw earlier, the scene now has farther on.
-    to_memory = (-_MEMORY * np.swapaxes(affine, -1, -2) + np.eye(2, 3)).astype(np.float32)
+    low, high, to_memory = low[seen], high[seen], maps[seen].astype(np.float32)
     to_memory[:, :, 2:] += to_memory[:, :, :2] @ low[..., None].astype(np.float32)
     for (u0, v0), (u1, v1), inverse in zip(low.tolist(), high.tolist(), to_memory, strict=True):
         memory = cv2.warpAffine(image, inverse, (u1 - u0, v1 - v0), flags=_WARP, borderMode=cv2.BORDER_REPLICATE)
-        cv2.addWeighted(image[v0:v1, u0:u1], _GAIN, memory, 1.0 - _GAIN, 0.0, dst=result[v0:v1, u0:u1])
+        cv2.addWeighted(image[v0:v1, u0:u1], GAIN, memory, 1.0 - GAIN, 0.0, dst=result[v0:v1, u0:u1])
     return result
+
+
+def memory_maps(corners_px: FloatArray, smear_px: FloatArray) -> FloatArray:
+    """Affine maps (N, 2, 3) of the pixels round markers, (N, 4, 2) both, to where their memory lies.
+
+    What a pixel saw earlier, the scene now has farther on.
+    """
+    return np.asarray(np.eye(2, 3) - _MEMORY * np.swapaxes(_affine(corners_px, smear_px), -1, -2))
 
 
 def _affine(points: FloatArray, values: FloatArray) -> FloatArray:

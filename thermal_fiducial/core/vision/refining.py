@@ -10,10 +10,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.adjustment.segments import Memory
 from thermal_fiducial.core.corners import refine_corners, RefinedCorners
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from thermal_fiducial.core.vision.frame import Frame, Places
-from thermal_fiducial.core.vision.lag import markers_sharpened, model_error, MotionTracker, REMAINING, SPREAD, Twist
+from thermal_fiducial.core.vision.lag import (
+    GAIN,
+    markers_sharpened,
+    memory_maps,
+    model_error,
+    MotionTracker,
+    REMAINING,
+    SPREAD,
+    Twist,
+)
 from thermal_fiducial.core.vision.scratch import Scratch
 from thermal_fiducial.core.vision.search import Found
 
@@ -37,15 +47,24 @@ _ROUNDS = 2
 class View:
     """A frame in which the smear of N markers is short."""
 
+    #: the frame as it is
     image: Float32Array
-    #: (N, 4, 2) where the corners appear in it, off their places at the stamp [px]
+    #: (N, 4, 2) where the corners appear in the view, off their places at the stamp [px]
     shift: FloatArray
-    #: (N, 4, 2) how much of the smear's shift has been taken out
+    #: (N, 4, 2) how much of the smear's shift is taken out
     removed: FloatArray
     #: (N, 2) standard deviation of what is left of the smear, along it
     spread: FloatArray
-    #: (N,) round which markers it has been sharpened
+    #: (N,) round which markers old memories are taken out, by what displacement (N, 4, 2) these are off, and how
     sharpened: BoolArray
+    off: FloatArray
+    memory: Memory | None
+
+    def sharp(self, corners_px: FloatArray, which: IntArray, scratch: Scratch) -> Float32Array:
+        """The view as an image, round the markers ``which`` with ``corners_px`` (N, 4, 2) in it."""
+        which = which[self.sharpened[which]]
+        sharp = scratch.floats('sharp', self.image.shape)
+        return markers_sharpened(self.image, corners_px[which], self.off[which], WINDOW_MARGIN_PX, sharp)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,11 +91,10 @@ class Refiner:
     ----------
     behind : (M, 4, m, 2) of :func:`thermal_fiducial.core.adjustment.edges.edges_behind`
     motion : what corrects the twist by the corners
-    scratch : for its images
     """
 
-    def __init__(self, behind: Float32Array, motion: MotionTracker, scratch: Scratch) -> None:
-        self._behind, self._motion, self._scratch = behind, motion, scratch
+    def __init__(self, behind: Float32Array, motion: MotionTracker) -> None:
+        self._behind, self._motion = behind, motion
 
     def refine(
         self, frame: Frame, found: Found, places: Places, near: BoolArray, config: ArucoDetectorConfig
@@ -96,8 +114,9 @@ class Refiner:
             view = self._view(frame.image, places, twist, cell, found.clarity, config.bolometer_lag)
             start = places.at.moved(view.shift, frame.camera)
             behind = self._behind[found.ids]
+            blur = config.blur_px, view.spread
             seen = refine_corners(
-                view.image, start, frame.camera, behind, config.blur_px, view.spread, columns, near=near
+                frame.image, start, frame.camera, behind, *blur, columns, near=near, memory=view.memory
             )
             freed = twist is not None
             refinement = self._at_stamp(frame, found, places, view, seen, cell, config.bolometer_lag, freed=freed)
@@ -124,10 +143,10 @@ class Refiner:
         sharpen = _worth_sharpening(np.sum(mean * mean, axis=1), cell, self._behind.shape[2], clarity)
         removed = (1.0 - REMAINING) * memory * sharpen[:, None, None]
         shift = smear - removed
+        spread, past = mean * np.where(sharpen, SPREAD, 1.0)[:, None], None
         if sharpen.any():
-            corners, sharp = places.at.px + shift, self._scratch.floats('sharp', image.shape)
-            image = markers_sharpened(image, corners[sharpen], memory[sharpen], WINDOW_MARGIN_PX, sharp)
-        return View(image, shift, removed, mean * np.where(sharpen, SPREAD, 1.0)[:, None], sharpen)
+            past = Memory(memory_maps(places.at.px + shift, memory), np.where(sharpen, GAIN, 1.0))
+        return View(image, shift, removed, spread, sharpen, memory, past)
 
     def _at_stamp(
         self,
