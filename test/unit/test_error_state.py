@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from support.flights import CAMERA_POSITION, config
 
-from thermal_fiducial.core.filter.error_state import BodyPose, ErrorStateFilter, pose_innovation
+from thermal_fiducial.core.filter.error_state import BodyPose, ErrorStateFilter, Motion, pose_innovation
 from thermal_fiducial.core.filter.imu import ImuStep
 from thermal_fiducial.core.filter.initialisation import blank_state
-from thermal_fiducial.core.filter.navigation_state import inject, Layout, POSE
+from thermal_fiducial.core.filter.navigation_state import inject, Layout, POSE, VELOCITY
 from thermal_fiducial.core.geometry import so3_exp, so3_left_jacobian, so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose
 
@@ -63,6 +63,11 @@ def intercepted(filter_):
 
     filter_._update = update
     return seen
+
+
+def steady(rate):
+    """Motion of a constant rate (3,) without specific force."""
+    return Motion(np.concatenate((rate, np.zeros(3))), np.zeros(3), 0.1)
 
 
 def test_inject_moves_the_state_by_the_error(state):
@@ -133,16 +138,46 @@ def test_time_offset_and_extrinsics_columns(state):
     """A pose taken earlier, and one through other extrinsics, differ as the columns of H say."""
     filter_ = ErrorStateFilter(FULL)
     seen = intercepted(filter_)
-    imu = np.concatenate((np.array([0.5, -1.0, 0.7]) + state.bias[:3], np.zeros(3)))
+    motion = steady(np.array([0.5, -1.0, 0.7]) + state.bias[:3])
     later = transform(state.R_map_body @ so3_exp([0.5e-6, -1e-6, 0.7e-6]), state.position + 1e-6 * state.velocity)
     pose = CameraPose(0, later @ state.T_body_camera, np.eye(6))
-    filter_.correct(state, filter_.body_pose(pose, state.T_body_camera), imu)
+    filter_.correct(state, filter_.body_pose(pose, state.T_body_camera), motion)
     np.testing.assert_allclose(seen['y'], 1e-6 * seen['H'][:, LAYOUT.time_offset], atol=1e-11)
     for axis, error in enumerate(1e-6 * np.eye(6)):
         T_true = transform(so3_exp(error[:3]), error[3:]) @ state.T_body_camera
         pose = CameraPose(0, state.T_map_body @ T_true, np.eye(6))
-        filter_.correct(state, filter_.body_pose(pose, state.T_body_camera), imu)
+        filter_.correct(state, filter_.body_pose(pose, state.T_body_camera), motion)
         np.testing.assert_allclose(seen['y'], 1e-6 * seen['H'][:, LAYOUT.extrinsics][:, axis], atol=1e-11)
+
+
+def test_motion_is_the_mean_of_a_window_and_the_slope_of_its_rate():
+    t = np.arange(-39, 1) * 0.005
+    samples = np.stack([0.3 + 2.0 * t, -1.0 * t, 0.0 * t, 1.0 + t, 0.0 * t, 9.8 + 0.0 * t], axis=1)
+    motion = Motion.of(samples, 0.2)
+    np.testing.assert_allclose(motion.angular_acceleration, [2.0, -1.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(motion.imu, samples.mean(axis=0))
+    assert motion.age == pytest.approx(0.1)
+    assert not Motion.of(samples[:1], 0.2).angular_acceleration.any()
+
+
+@pytest.mark.parametrize(('turning', 'push'), [(0.0, 0.0), (3.0, 0.0), (0.0, 2.0)])
+def test_an_uncertain_time_offset_costs_what_the_acceleration_makes_of_it(state, turning, push):
+    """Nothing at rest; half of it times the square of the offset, and what a turn's rate changes since the window."""
+    exact = config(
+        attitude_floor=0.0, position_floor=0.0, motion_floor=0.0, stamp_jitter=0.0, pose_noise_scale=1.0,
+    )  # fmt: skip
+    filter_ = ErrorStateFilter(exact)
+    place, std = filter_.layout.time_offset, 0.02
+    P = 1e3 * np.eye(filter_.layout.size)
+    P[VELOCITY, VELOCITY], P[place, place] = 0.0, std**2
+    resting = replace(state, velocity=np.zeros(3), covariance=P)
+    lift = np.concatenate((resting.bias[:3], resting.bias[3:] - resting.gravity @ resting.R_map_body))
+    motion = Motion(lift + np.eye(6)[3] * push, np.array([turning, 0.0, 0.0]), 0.1)
+    corrected, _ = filter_.correct(resting, BodyPose(resting.T_map_body, 1e-12 * np.eye(6)), motion)
+    attitude = 0.75 * (turning * std**2) ** 2 + (0.1 * turning * std) ** 2
+    position = 0.75 * (push * std**2) ** 2
+    expected = [attitude + 1e-12] * 3 + [position + 1e-12] * 3
+    np.testing.assert_allclose(np.diag(corrected.covariance)[POSE], expected, rtol=1e-4, atol=1e-12)
 
 
 def test_before_the_time_offset_is_estimated_the_covariance_counts_it(state):
@@ -193,8 +228,7 @@ def test_motion_adds_to_the_floors_in_all_directions(state):
     wide = replace(state, clock_open=False, covariance=1e3 * np.eye(filter_.layout.size))
     body = BodyPose(state.T_map_body, np.zeros((6, 6)))
     rate = np.array([0.1, -0.2, 0.4])
-    imu = np.concatenate((rate + state.bias[:3], np.zeros(3)))
-    corrected, _ = filter_.correct(wide, body, imu)
+    corrected, _ = filter_.correct(wide, body, steady(rate + state.bias[:3]))
     speed = np.linalg.norm(state.velocity)
     expected = [1e-4**2 + (2e-3 * np.linalg.norm(rate)) ** 2] * 3 + [1e-3**2 + (2e-3 * speed) ** 2] * 3
     np.testing.assert_allclose(np.diag(corrected.covariance)[POSE], expected, rtol=1e-6)

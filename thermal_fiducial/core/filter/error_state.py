@@ -23,9 +23,6 @@ from thermal_fiducial.core.geometry import inverse, skew, so3_log
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
-#: Angular [rad/s^2] and linear [m/s^2] acceleration of ordinary flight. While the time offset is uncertain by s, a pose
-#: is known to second order only: half the acceleration times the square of the offset, of variance 3/4 a^2 s^4.
-_AGILITY_SQUARED = np.repeat((5.0**2, 3.0**2), 3)
 #: Root of the sum of the velocity variances [m/s] from which the time offset is estimated, and by how much the rate
 #: [rad/s] and the velocity [m/s] may have changed until then.
 _KNOWN_VELOCITY, _UNSEEN_CHANGE = 0.2, 0.5
@@ -41,6 +38,29 @@ class BodyPose:
 
     T_map_body: FloatArray
     covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What the IMU shows of the motion at a pose.
+
+    Means over a window, as the noise of one sample would count as motion that shows no clock error.
+    """
+
+    #: (6,) rate [rad/s] and specific force [m/s^2]
+    imu: FloatArray
+    #: (3,) [rad/s^2]
+    angular_acceleration: FloatArray
+    #: how long before the pose the middle of the window is [s]
+    age: float
+
+    @classmethod
+    def of(cls, samples: FloatArray, seconds: float) -> 'Motion':
+        """Motion in samples (N, 6) of so many ``seconds``, the slope of their rate by least squares."""
+        count = len(samples)
+        place = np.arange(count) - 0.5 * (count - 1)
+        slope = place @ samples[:, :3] * (count / seconds) / max(float(place @ place), 1.0)
+        return cls(samples.mean(axis=0), slope, 0.5 * seconds)
 
 
 class ErrorStateFilter:
@@ -101,44 +121,46 @@ class ErrorStateFilter:
         J[3:, 3:] = -R.T @ skew(lever)
         return BodyPose(T_map_body, self._config.pose_noise_scale**2 * (J @ pose.covariance @ J.T))
 
-    def correct(self, state: NavigationState, pose: BodyPose, imu: FloatArray) -> tuple[NavigationState, float]:
-        """State corrected by a pose at its own instant, and the normalised innovation squared.
-
-        ``imu`` (6,): mean of the samples up to that instant.
-        """
-        motion = np.concatenate((imu[:3] - state.bias[:3], state.velocity_body))
+    def correct(self, state: NavigationState, pose: BodyPose, motion: Motion) -> tuple[NavigationState, float]:
+        """State corrected by a pose at its own instant, and the normalised innovation squared."""
+        twist = np.concatenate((motion.imu[:3] - state.bias[:3], state.velocity_body))
         H = self._H_pose
         if state.clock_open:
             H = H.copy()
-            H[:, self.layout.time_offset] = motion
-        noise = pose.covariance + self._clock_noise(state, motion)
-        noise[_SIX, _SIX] += self._floor(motion)
+            H[:, self.layout.time_offset] = twist
+        noise = pose.covariance + self._clock_noise(state, twist, motion)
+        noise[_SIX, _SIX] += self._floor(twist)
         corrected, nis = self._update(state, pose_innovation(state, pose.T_map_body), H, noise)
-        return self._open_clock(corrected, imu), nis
+        return self._open_clock(corrected, motion.imu), nis
 
-    def _floor(self, motion: FloatArray) -> FloatArray:
+    def _floor(self, twist: FloatArray) -> FloatArray:
         """Variances (6,) of what the corner covariances don't know: errors that all corners share, more in motion."""
         share = self._config.motion_floor**2
-        rate, speed = float(motion[:3] @ motion[:3]), float(motion[3:] @ motion[3:])
+        rate, speed = float(twist[:3] @ twist[:3]), float(twist[3:] @ twist[3:])
         attitude = self._config.attitude_floor**2 + share * rate
         position = self._config.position_floor**2 + share * speed
         return np.array((attitude, attitude, attitude, position, position, position))
 
-    def _clock_noise(self, state: NavigationState, motion: FloatArray) -> FloatArray:
+    def _clock_noise(self, state: NavigationState, twist: FloatArray, motion: Motion) -> FloatArray:
         """What a clock error that isn't in the state, or is there to first order only, makes of a pose (6, 6).
 
         A clock error moves a pose along the motion: the jitter of the stamps, and the offset where it isn't estimated,
-        are noise correlated over all axes.
+        are noise correlated over all axes. Where it is, what is uncertain of it times what is uncertain of the motion,
+        and half the acceleration a times its square, of variance 3/4 a^2 s^4, are left.
         """
-        noise = self._clock_variance * np.outer(motion, motion)
+        noise = self._clock_variance * np.outer(twist, twist)
         place = self.layout.time_offset
         if place is None:
             return noise
         if not state.clock_open:
             noise[_SIX, _SIX] += (self._config.time_offset_std * _UNSEEN_CHANGE) ** 2
             return noise
-        variance = state.covariance[place, place]
-        noise[_SIX, _SIX] += 0.75 * variance**2 * _AGILITY_SQUARED
+        variance = float(state.covariance[place, place])
+        turning = float(motion.angular_acceleration @ motion.angular_acceleration)
+        force = motion.imu[3:] - state.bias[3:] + state.gravity @ state.R_map_body - skew(twist[:3]) @ twist[3:]
+        second = 0.75 * variance**2
+        attitude, position = (second + variance * motion.age**2) * turning, second * float(force @ force)
+        noise[_SIX, _SIX] += (attitude, attitude, attitude, position, position, position)
         noise[3:, 3:] += variance * state.covariance[VELOCITY, VELOCITY]
         return noise
 

@@ -10,10 +10,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 
-import numpy as np
-
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.error_state import ErrorStateFilter
+from thermal_fiducial.core.filter.error_state import ErrorStateFilter, Motion
 from thermal_fiducial.core.filter.imu import ImuStep
 from thermal_fiducial.core.filter.initialisation import blank_state, start, WINDOW_SECONDS
 from thermal_fiducial.core.filter.navigation_state import in_moved_map, NavigationState
@@ -90,9 +88,9 @@ class Sighting:
     samples: Callable[[float], FloatArray]
 
     @cached_property
-    def motion(self) -> FloatArray:
-        """(6,) rate and specific force that show a clock error."""
-        return np.asarray(self.samples(_MOTION_SECONDS).mean(axis=0))
+    def motion(self) -> Motion:
+        """The motion that shows a clock error."""
+        return Motion.of(self.samples(_MOTION_SECONDS), _MOTION_SECONDS)
 
 
 class PoseGate:
