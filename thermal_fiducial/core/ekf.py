@@ -90,11 +90,10 @@ class PoseEkf:
         (``status`` says why).
         """
         verdict = self._input.judge(sample)
-        self._imu_fault = verdict.value
         if verdict is Verdict.RESTART:
             self._begin()
-            self._imu_fault = verdict.value
-        elif verdict is not Verdict.USE:
+        self._imu_fault = verdict.value
+        if verdict not in (Verdict.USE, Verdict.RESTART):
             return None
         imu = np.concatenate((sample.angular_velocity, sample.linear_acceleration))
         if not self._nodes:
