@@ -279,13 +279,13 @@ def _radial_slope(r2: FloatArray, factor: FloatArray, model: _Polynomial) -> Flo
 
 
 def _distort_polynomial(x: FloatArray, model: _Polynomial) -> FloatArray:
-    a, b = x[..., 0], x[..., 1]
-    aa, bb, twice = a * a, b * b, 2.0 * a * b
-    r2 = aa + bb
-    distorted = x * _radial_factor(r2, model)[..., None]
-    distorted[..., 0] += model.p1 * twice + model.p2 * (r2 + 2.0 * aa)
-    distorted[..., 1] += model.p1 * (r2 + 2.0 * bb) + model.p2 * twice
-    return distorted
+    r2 = np.sum(x * x, axis=-1)
+    factor = _radial_factor(r2, model)
+    if not (model.p1 or model.p2):
+        return np.asarray(x * factor[..., None])
+    # The tangential part is p r^2 + 2 (p . x) x with p = (p2, p1).
+    p = np.array([model.p2, model.p1])
+    return np.asarray(x * (factor + x @ (2.0 * p))[..., None] + r2[..., None] * p)
 
 
 def _polynomial_derivative(x: FloatArray, model: _Polynomial) -> FloatArray:

@@ -83,8 +83,10 @@ def refine_corners(
         if len(active) == 0:
             away[:] = factor > 1.0
             continue
-        part = corners if len(active) == count else corners.only(active)
-        start = part.moved(px[active] - part.px, camera)
+        start = corners if len(active) == count else corners.only(active)
+        so_far = px[active] - start.px
+        if so_far.any():
+            start = start.moved(so_far, camera)
         prior = _PRIOR_OF_SHAPE if factor > 1.0 else _PRIOR
         shift, *rest = _pass(
             image,

@@ -83,10 +83,13 @@ class Twist:
 def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
     """Derivative (..., 2, 6) of the velocity of normalised points (..., 2) at ``depth`` (...) [m] by the twist."""
     a, b, inverse = x[..., 0], x[..., 1], 1.0 / depth
-    zero = np.zeros_like(a)
-    first = np.stack([-inverse, zero, a * inverse, a * b, -(1.0 + a * a), b], axis=-1)
-    second = np.stack([zero, -inverse, b * inverse, 1.0 + b * b, -a * b, -a], axis=-1)
-    return np.stack([first, second], axis=-2)
+    J = np.zeros((*x.shape, 6))
+    J[..., 0, 0] = J[..., 1, 1] = -inverse
+    J[..., 2] = x * inverse[..., None]
+    J[..., 0, 3], J[..., 1, 3] = a * b, 1.0 + b * b
+    J[..., 0, 4], J[..., 1, 4] = -1.0 - a * a, -J[..., 0, 3]
+    J[..., 0, 5], J[..., 1, 5] = b, -a
+    return J
 
 
 def camera_twist(odometry: Odometry, T_body_camera: FloatArray) -> Twist:
