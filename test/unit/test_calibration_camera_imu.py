@@ -19,6 +19,7 @@ from thermal_fiducial.sim.imu import ImuModel
 from thermal_fiducial.sim.imu import ImuNoise as SimulatedNoise
 from thermal_fiducial.sim.scenario import named
 from thermal_fiducial.sim.trajectory import GRAVITY
+from thermal_fiducial.sim.vibration import Vibration
 
 OFFSET = 0.024
 SCENARIO = replace(named('fast'), camera_time_offset=OFFSET)
@@ -237,9 +238,8 @@ def test_readout_time_and_extrinsics_within_their_errors(readout):
 
 
 def test_stamps_that_jitter_and_an_imu_that_shakes_are_allowed_for():
-    rough = replace(
-        SCENARIO, stamp_jitter=0.002, imu=replace(SCENARIO.imu, gyroscope_rattle=0.015, accelerometer_rattle=0.3)
-    )
+    shaking = replace(SCENARIO.imu, gyroscope_rattle=0.015, accelerometer_rattle=0.3)
+    rough = replace(SCENARIO, stamp_jitter=0.002, imu=shaking, vibration=Vibration())
     frames, camera, imu = rolling_recording(rough, 15.0, 3, READOUT, sigma_px=0.1)
     result = calibrate_rolling_camera_imu(frames, camera, imu, START_NS, ImuNoise())
     # Most exponential stamps are nearer to their mean than normal ones: the median says 0.94 of the deviation; and the
@@ -250,9 +250,17 @@ def test_stamps_that_jitter_and_an_imu_that_shakes_are_allowed_for():
     # Chi-square of seven degrees of freedom, 99.9 %.
     assert error @ np.linalg.solve(result.covariance, error) < 24.3
     assert 0.9 < result.scale < 1.5
-    noise = imu.noise(ImuNoise())
+
+
+def test_white_noise_is_what_the_samples_show():
+    shaking = replace(SCENARIO.imu, gyroscope_rattle=0.015, accelerometer_rattle=0.3)
+    _, imu = recording(replace(SCENARIO, imu=shaking), 20.0, 1)
+    noise = imu.noise(ImuNoise(gyroscope_random_walk=1e-4))
+    # 4000 samples of three axes: 1 % of statistics, and motion adds a little.
     assert noise.gyroscope_noise_density == pytest.approx(0.015 / np.sqrt(200.0), rel=0.05)
     assert noise.accelerometer_noise_density == pytest.approx(0.3 / np.sqrt(200.0), rel=0.05)
+    assert noise.gyroscope_random_walk == 1e-4
+    assert imu.noise(ImuNoise(1.0, 2.0)) == ImuNoise(1.0, 2.0)
 
 
 def test_poses_alone_say_nothing_of_the_readout_time():

@@ -131,6 +131,8 @@ class Problem:
         jitter: float = 0.0,
     ) -> None:
         self._stamps, self._measured, self._root, self._imu, self._noise = stamps, measured, root, imu, noise
+        # What shakes the gyroscope shakes what is predicted from it too: in a derivative it would find itself.
+        self._steady = imu.averaged(float(np.median(np.diff(stamps))))
         self._rows, self._about, self._jitter = rows, readout, jitter
         if rows is not None:
             covariance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
@@ -184,7 +186,7 @@ class Problem:
     def _pose_errors(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Predicted minus measured (N, 6), and its derivatives by state (N, 6, 15) and shared unknowns (N, 6, 10)."""
         count = len(state.p)
-        rate, _ = self._imu.at(self._stamps + state.offset)
+        rate, _ = self._steady.at(self._stamps + state.offset)
         rate = rate - state.bias[:, :3]
         arm = state.p_body_camera
         R = state.R @ state.R_body_camera

@@ -6,6 +6,7 @@ odometry", 2017, section VI, for all intervals at once.
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from thermal_fiducial.config import ImuNoise
@@ -41,6 +42,12 @@ class ImuTrack:
             for signal in (self.rate, self.force)
         )
         return rate.reshape(*t.shape, 3), force.reshape(*t.shape, 3)
+
+    def averaged(self, seconds: float) -> 'ImuTrack':
+        """Samples averaged over so long about each: how the body moves, without how it shakes."""
+        width = 2 * round(0.5 * seconds / float(np.median(np.diff(self.seconds)))) + 1
+        rate, force = (np.asarray(cv2.blur(signal, (1, width)), np.float64) for signal in (self.rate, self.force))
+        return ImuTrack(self.seconds, rate, force)
 
     def noise(self, known: ImuNoise) -> ImuNoise:
         """``known`` with the white noise that the samples show, where vibration makes it more."""
