@@ -5,7 +5,9 @@ pattern with its white surroundings is fitted to the image: Gauss-Newton on the 
 and a background that may bend (B. Lucas, T. Kanade, "An iterative image registration technique", 1981).
 """
 
+from functools import cache
 import math
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -28,27 +30,45 @@ _DAMPING = 0.1
 _LONGEST = 0.6
 
 
-def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArray, decoder: Decoder) -> FloatArray:
-    """Quadrilaterals (Q, 4, 2) moved to where ``image`` looks most like the markers ``ids`` (Q,), turned (Q,)."""
-    share = np.concatenate(
-        [[-_OUTSIDE], (np.arange(decoder.cells)[:, None] + _SAMPLES).ravel(), [decoder.cells + _OUTSIDE]]
-    )
-    blur = _blur(share, decoder.cells)
-    cells = np.pad(decoder.seen(ids, turns), ((0, 0), (1, 1), (1, 1)), constant_values=1.0)
-    pattern = (blur @ cells @ blur.T).reshape(len(ids), -1, 1)
-    a, b = (axis.ravel() / decoder.cells for axis in np.meshgrid(share, share))
+class _Grid(NamedTuple):
+    """The P samples of a marker with m x m cells."""
+
+    #: (P,) shares of the sides
+    a: FloatArray
+    b: FloatArray
+    #: (P, 4) by how much each sample moves with each corner
+    weights: FloatArray
+    #: (P, 6) background: constant, slopes, curvatures
+    smooth: FloatArray
+    #: (sqrt(P), m + 2) of :func:`_blur`
+    blur: FloatArray
+
+
+@cache
+def _grid(cells: int) -> _Grid:
+    share = np.concatenate([[-_OUTSIDE], (np.arange(cells)[:, None] + _SAMPLES).ravel(), [cells + _OUTSIDE]])
+    a, b = (axis.ravel() / cells for axis in np.meshgrid(share, share))
     x, y = a - 0.5, b - 0.5
     smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
     weights = np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), a * b, (1.0 - a) * b], axis=-1)
+    return _Grid(a, b, weights, smooth, _blur(share, cells))
+
+
+def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArray, decoder: Decoder) -> FloatArray:
+    """Quadrilaterals (Q, 4, 2) moved to where ``image`` looks most like the markers ``ids`` (Q,), turned (Q,)."""
+    grid = _grid(decoder.cells)
+    cells = np.pad(decoder.seen(ids, turns), ((0, 0), (1, 1), (1, 1)), constant_values=1.0)
+    J = np.empty((len(ids), len(grid.a), 15))
+    J[..., 8:14] = grid.smooth
+    J[..., 14] = (grid.blur @ cells @ grid.blur.T).reshape(len(ids), -1)
     picture = cv2.GaussianBlur(image - np.float32(image.mean()), (0, 0), _SMOOTHING)
     slope_u = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.125)
     slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.125)
     planes: list[Float32Array] = [np.asarray(plane) for plane in (picture, slope_u, slope_v)]
-    smooth = np.broadcast_to(smooth, (len(ids), *smooth.shape))
     for _ in range(_STEPS):
-        places = in_quadrilaterals(quads, a, b).astype(np.float32)
+        places = in_quadrilaterals(quads, grid.a, grid.b).astype(np.float32)
         value, du, dv = (sampled(plane, places)[..., None] for plane in planes)
-        J = np.concatenate([du * weights, dv * weights, smooth, pattern], axis=-1)
+        J[..., :4], J[..., 4:8] = du * grid.weights, dv * grid.weights
         information = np.swapaxes(J, -1, -2) @ J
         diagonal = np.einsum('qii->qi', information)
         diagonal[:, :8] *= 1.0 + _DAMPING
