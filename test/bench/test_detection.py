@@ -14,7 +14,7 @@ import cv2
 from matplotlib.figure import Figure
 import numpy as np
 import pytest
-from support.scenes import camera_of, detector_of
+from support.scenes import camera_of, detector_of, told
 
 from thermal_fiducial.core import detection
 from thermal_fiducial.core.measurements import corners_px, Odometry
@@ -31,9 +31,9 @@ SETTLING = 3
 SMALLEST_SIDE = 14.0
 #: A detection is a false one if its shape is farther off than this, or its place (the lag moves markers) [px].
 FALSE_SHAPE, FALSE_PLACE = 6.0, 15.0
-#: The odometry that guides: the truth of the last IMU sample with such errors [m], [rad], [m/s], [rad/s].
+#: The odometry that guides: the truth at the last IMU samples with such errors [m], [rad], [m/s], [rad/s].
 ODOMETRY_ERRORS = (0.005, 0.002, 0.02, 0.005)
-ODOMETRY_AGE = 0.004
+ODOMETRY_AGES = 0.005 * np.arange(8)[::-1] + 0.004
 
 
 @dataclass(frozen=True)
@@ -94,21 +94,22 @@ def stretches(case):
 
 
 def odometry(case, frame, rng):
-    """What a filter would have said just before the frame."""
-    position, attitude, speed, rate = (sigma * rng.standard_normal(3) for sigma in ODOMETRY_ERRORS)
-    motion = case.scene.trajectory(SECONDS, SEED)([frame.seconds - ODOMETRY_AGE])
-    T = motion.T_map_body[0].copy()
-    T[:3, 3] += position
-    T[:3, :3] = T[:3, :3] @ cv2.Rodrigues(attitude)[0]
-    velocity = motion.rotation.inv().apply(motion.velocity)[0] + speed
-    return Odometry(
-        frame.stamp_ns - round(ODOMETRY_AGE * 1e9),
-        T,
-        velocity,
-        motion.angular_velocity_body[0] + rate,
-        np.diag([ODOMETRY_ERRORS[0] ** 2] * 3 + [ODOMETRY_ERRORS[1] ** 2] * 3),
-        np.diag([ODOMETRY_ERRORS[2] ** 2] * 3 + [ODOMETRY_ERRORS[3] ** 2] * 3),
+    """What a filter would have said just before the frame: states of 200 Hz, all with the error of the last."""
+    position, attitude, speed = (sigma * rng.standard_normal(3) for sigma in ODOMETRY_ERRORS[:3])
+    pose_covariance, twist_covariance = (
+        np.diag([a**2] * 3 + [b**2] * 3) for a, b in (ODOMETRY_ERRORS[:2], ODOMETRY_ERRORS[2:])
     )
+    states = []
+    for age in ODOMETRY_AGES:
+        motion = case.scene.trajectory(SECONDS, SEED)([frame.seconds - age])
+        T = motion.T_map_body[0].copy()
+        T[:3, 3] += position
+        T[:3, :3] = T[:3, :3] @ cv2.Rodrigues(attitude)[0]
+        velocity = motion.rotation.inv().apply(motion.velocity)[0] + speed
+        rate = motion.angular_velocity_body[0] + ODOMETRY_ERRORS[3] * rng.standard_normal(3)
+        stamp_ns = frame.stamp_ns - round(age * 1e9)
+        states.append(Odometry(stamp_ns, T, velocity, rate, pose_covariance, twist_covariance))
+    return states
 
 
 def our_detector(case, guided):
@@ -117,7 +118,7 @@ def our_detector(case, guided):
     camera, detector = camera_of(case.scene), detector_of(case.scene, with_map=guided)
 
     def prepared(frame):
-        return frame, odometry(case, frame, rng) if guided else None
+        return frame, told(*odometry(case, frame, rng)) if guided else None
 
     def detect(frame, state):
         rows = detector.detect(frame.stamp_ns, frame.counts, camera, state)

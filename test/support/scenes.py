@@ -1,8 +1,9 @@
-"""The camera and the detector of a simulated scenario."""
+"""The camera and the detector of a simulated scenario, and what a filter tells it."""
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.vision.odometry_log import OdometryLog
 
 
 def camera_of(scenario):
@@ -21,3 +22,11 @@ def detector_of(scenario, *, with_map):
     if with_map:
         detector.set_map({marker.id: (marker.T_map_marker, marker.size) for marker in scenario.markers})
     return detector
+
+
+def told(*states):
+    """A log of these states of the filter."""
+    log = OdometryLog()
+    for state in states:
+        log.add(state.stamp_ns, lambda state=state: state)
+    return log

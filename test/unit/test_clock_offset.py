@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.scenes import camera_of, detector_of
+from support.scenes import camera_of, detector_of, told
 
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.vision.clock_offset import ClockOffset, LIMIT_S
@@ -69,6 +69,6 @@ def test_detector_learns_the_clock_of_its_odometry(offset_s):
         stamp_ns = frame.stamp_ns + round(offset_s * 1e9)
         turn = motion.angular_velocity_body[0]
         state = Odometry(stamp_ns, motion.T_map_body[0], velocity, turn, covariance, covariance)
-        detector.detect(frame.stamp_ns, frame.counts, camera, state)
+        detector.detect(frame.stamp_ns, frame.counts, camera, told(state))
     # The lag is known and the odometry is true: what is left is a pixel of 300 px/s, if anything.
     assert 1e-9 * detector._clock_offset.ns == pytest.approx(offset_s, abs=0.003)

@@ -35,6 +35,7 @@ from thermal_fiducial.core.vision.lag import (
 )
 from thermal_fiducial.core.vision.local_corners import local_corners
 from thermal_fiducial.core.vision.marker_rows import marker_rows
+from thermal_fiducial.core.vision.odometry_log import OdometryLog
 from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.core.vision.refining import Refinement, Refiner, sides_px, SMEAR_THAT_MATTERS_PX, WINDOW_MARGIN_PX
 from thermal_fiducial.core.vision.scratch import Scratch
@@ -52,6 +53,9 @@ _RIM_PX = 2.0
 _READ_THERE = 0.1
 # Where not all markers are known, or not all seen that should be, a blind search follows at least every so many frames.
 _INCOMPLETE = 2
+# The filter's states from so many time constants before a frame to one after it, symmetric about the velocity that
+# smears it, tell its motion; so many of them at most. Without lag, those of so long a time.
+_MEMORY_LAGS, _STATES, _SHORTEST_LAG_S = 3, 10, 0.005
 # Depth of the scene while no marker has told it [m].
 _TYPICAL_DEPTH = 3.0
 
@@ -101,7 +105,9 @@ class MarkerDetector:
         self._map = {marker_id: entry for marker_id, entry in marker_map.items() if 0 <= marker_id < count}
         self._known = KnownMarkers(self._map)
 
-    def detect(self, stamp_ns: int, counts: Counts | Gray, camera: Camera, odometry: Odometry | None = None) -> Markers:
+    def detect(
+        self, stamp_ns: int, counts: Counts | Gray, camera: Camera, odometry: OdometryLog | None = None
+    ) -> Markers:
         """Markers of one frame, sorted by ID; an empty array when there are none.
 
         Parameters
@@ -109,13 +115,13 @@ class MarkerDetector:
         stamp_ns : of the frame
         counts : (height, width), clean
         camera : its intrinsics
-        odometry : the filter's latest state, where there is one
+        odometry : the filter's latest states, where there are any
         """
         with one_thread():
-            odometry = self._on_camera_clock(odometry)
-            twist = self._motion.predict(stamp_ns, odometry)
+            states = [] if odometry is None else self._at_frame(stamp_ns, odometry)
+            twist = self._motion.predict(stamp_ns, states)
             frame = self._frame(stamp_ns, counts, camera, twist)
-            T_camera_map = self._predicted_pose(stamp_ns, odometry, twist)
+            T_camera_map = self._predicted_pose(stamp_ns, states, twist)
             in_map = None
             if T_camera_map is not None and self.config.guided:
                 in_map = self._known.expected(T_camera_map, camera, self.config.min_side_px)
@@ -139,12 +145,14 @@ class MarkerDetector:
             return self._map[marker_id][1]
         return self._sizes.get(marker_id, self.config.marker_size)
 
-    def _on_camera_clock(self, odometry: Odometry | None) -> Odometry | None:
-        """The filter's state, where it can be true, with the stamp that the camera would have given it."""
-        if odometry is None or not plausible(odometry):
-            return None
-        offset = round(self.config.camera_time_offset * 1e9) + self._clock_offset.ns
-        return replace(odometry, stamp_ns=odometry.stamp_ns - offset)
+    def _at_frame(self, stamp_ns: int, odometry: OdometryLog) -> list[Odometry]:
+        """The filter's states while a frame came about, or the nearest; in the clock of the camera."""
+        ahead_ns = round(self.config.camera_time_offset * 1e9) + self._clock_offset.ns
+        stamp_ns, lag_ns = stamp_ns + ahead_ns, round(1e9 * max(self.config.bolometer_lag, _SHORTEST_LAG_S))
+        states = odometry.between(stamp_ns - _MEMORY_LAGS * lag_ns, stamp_ns + lag_ns, _STATES)
+        nearest = odometry.nearest(stamp_ns)
+        states = states or ([] if nearest is None else [nearest])
+        return [replace(state, stamp_ns=state.stamp_ns - ahead_ns) for state in states if plausible(state)]
 
     def _frame(self, stamp_ns: int, counts: Counts | Gray, camera: Camera, twist: Twist | None) -> Frame:
         """The frame, without the pattern of columns where that matters."""
@@ -163,13 +171,14 @@ class MarkerDetector:
         off, velocity = places.at.px[seen] - in_map.corners_px[predicted], places.velocity(frame.twist)[seen]
         self._clock_offset.learn(frame.stamp_ns, off, velocity)
 
-    def _predicted_pose(self, stamp_ns: int, odometry: Odometry | None, twist: Twist | None) -> FloatArray | None:
+    def _predicted_pose(self, stamp_ns: int, states: list[Odometry], twist: Twist | None) -> FloatArray | None:
         """T_camera_map at the frame, where odometry that is fresh enough tells it."""
-        if odometry is None or twist is None or not self._map:
+        if not states or twist is None or not self._map:
             return None
-        if abs(stamp_ns - odometry.stamp_ns) * 1e-9 > self.config.max_odometry_age:
+        nearest = min(states, key=lambda state: abs(stamp_ns - state.stamp_ns))
+        if abs(stamp_ns - nearest.stamp_ns) * 1e-9 > self.config.max_odometry_age:
             return None
-        return geometry.inverse(camera_in_map(stamp_ns, odometry, self._T_body_camera, twist))
+        return geometry.inverse(camera_in_map(stamp_ns, nearest, self._T_body_camera, twist))
 
     def _find(self, frame: Frame, in_map: Expected | None) -> tuple[Found, Followed]:
         """Markers where they should be, and whatever a blind search shows, when that is due; and which are followed."""

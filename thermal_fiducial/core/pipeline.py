@@ -28,6 +28,7 @@ from thermal_fiducial.core.marker_map import MapJump, MapperResult, MarkerMap, M
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Markers, Odometry
 from thermal_fiducial.core.thermal import FrameCleaner
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
+from thermal_fiducial.core.vision.odometry_log import OdometryLog
 
 
 @dataclass(frozen=True)
@@ -99,14 +100,15 @@ class Pipeline:
         self.detector = MarkerDetector(config.aruco_detector, dictionary)
         self.mapper = MarkerMapper(config.marker_mapper, marker_map)
         self.filter = PoseEkf(config.pose_ekf)
-        self._odometry: Odometry | None = None
+        self._odometry = OdometryLog()
         self._share_map()
 
     def add_imu(self, sample: ImuSample) -> Odometry | None:
         """Odometry at the stamp of an IMU sample; None before the filter is initialised."""
         odometry = self.filter.add_imu(sample)
         if odometry is not None:
-            self._odometry = replace(odometry, T_map_body=as_published(odometry.T_map_body))
+            published = replace(odometry, T_map_body=as_published(odometry.T_map_body))
+            self._odometry.add(published.stamp_ns, lambda: published)
         return odometry
 
     def add_image(self, stamp_ns: int, counts: Counts | Gray) -> FrameResult:
@@ -115,7 +117,7 @@ class Pipeline:
         if frame.counts is None or self.camera is None:
             return FrameResult(stamp_ns, withheld=frame.reason or 'no camera_info')
         markers = self.detector.detect(stamp_ns, frame.counts, self.camera, self._odometry)
-        mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry)
+        mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry.latest())
         update = None if mapping.pose is None else self.filter.add_pose(_published_pose(mapping.pose))
         jump = self._refine(stamp_ns)
         if jump is not None:

@@ -52,7 +52,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         counts = image_to_array(message)
         camera = self.camera()
         _check_size(counts, camera)
-        markers = self.detector.detect(stamp, counts, camera, self.odometry())
+        markers = self.detector.detect(stamp, counts, camera, self.odometry)
         self._seen = len(markers)
         self._markers.send(convert.cloud(markers, message.header))
         self._marker_poses.send(convert.marker_poses(markers, message.header))

@@ -1,5 +1,7 @@
 """Base of the nodes that look at markers: the camera's calibration, and the filter's odometry as a hint."""
 
+from functools import partial
+import struct
 from typing import Any, TypeVar
 
 from nav_msgs.msg import Odometry as OdometryMessage
@@ -8,11 +10,15 @@ from sensor_msgs.msg import CameraInfo
 
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.vision.odometry_log import OdometryLog
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.node import StageNode
 
 Config = TypeVar('Config')
+
+# A message in CDR begins with four bytes that say so, then, here, the stamp of its header.
+_CDR_HEADER, _STAMP = 4, struct.Struct('<iI')
 
 
 class CameraStageNode(StageNode[Config]):
@@ -22,7 +28,8 @@ class CameraStageNode(StageNode[Config]):
         super().__init__(name, kind, **kwargs)
         self._camera: Camera | None = None
         self._calibrations = 0
-        self._odometry = b''
+        #: the filter's latest states
+        self.odometry = OdometryLog()
 
     def follow_hints(self) -> None:
         """Subscribe to calibration and odometry; after the node's main input."""
@@ -41,16 +48,14 @@ class CameraStageNode(StageNode[Config]):
             raise InputError('no camera_info')
         return self._camera
 
-    def odometry(self) -> Odometry | None:
-        """The filter's last state, if it has one; deserialised only here, at frame rate rather than at IMU rate."""
-        return convert.odometry(deserialize_message(self._odometry, OdometryMessage)) if self._odometry else None
-
     def figures(self) -> dict[str, object]:
         """How many different calibrations came."""
         return {'calibrations': self._calibrations}
 
     def _on_odometry(self, message: bytes) -> None:
-        self._odometry = message
+        """A few of these are wanted at frame rate, and only they are deserialised."""
+        seconds, nanoseconds = _STAMP.unpack_from(message, _CDR_HEADER)
+        self.odometry.add(10**9 * seconds + nanoseconds, partial(_read, message))
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         camera = convert.camera(message)
@@ -60,3 +65,7 @@ class CameraStageNode(StageNode[Config]):
         self._calibrations += 1
         if self._calibrations > 1:
             self.get_logger().warning('camera_info has changed: the new calibration is used from here on')
+
+
+def _read(message: bytes) -> Odometry:
+    return convert.odometry(deserialize_message(message, OdometryMessage))

@@ -15,6 +15,7 @@ the twist and its change (R. Singer, "Estimating optimal tracking filter perform
 1970): predicted from the last frame, corrected by the filter's odometry and by how the markers' corners moved since.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
 
@@ -36,6 +37,12 @@ _UNKNOWN = np.full(6, 1.5**2)
 # Variance of an acceleration of which nothing is known [m/s^2, rad/s^2], and how long it lasts [s].
 _ACCELERATION, _LASTS_S = np.array([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2, 0.4
 _STALE_S = 0.15
+# So many states of the filter tell the acceleration too, as well as the filter knows the vertical and its biases.
+_ENOUGH_STATES, _UNSURE_ACCELERATION = 4, np.array([0.3, 0.3, 0.3, 0.0, 0.0, 0.0]) ** 2
+# Variance of a twist that is said to be without error [m^2/s^2, rad^2/s^2].
+_LEAST_VARIANCE = 1e-6
+# Jitter of the camera's stamps [s].
+_JITTER_S = 0.001
 _VALUE, _CHANGE = np.arange(6), np.arange(6, 12)
 # How much of the past is taken out of the image, in time constants, and its weight.
 _MEMORY = 0.75
@@ -139,13 +146,20 @@ class MotionTracker:
         self._twist: Twist | None = None
         self._seen = Tracked.none()
 
-    def predict(self, stamp_ns: int, odometry: Odometry | None) -> Twist | None:
-        """Twist expected at a frame; None when nothing is known."""
+    def predict(self, stamp_ns: int, odometry: Sequence[Odometry]) -> Twist | None:
+        """Twist expected at a frame; None when nothing is known.
+
+        Parameters
+        ----------
+        odometry : states round the time that smears the frame, or the nearest that there is; in the camera's clock
+        """
         dt = self._since(stamp_ns)
         carried = _carried(self._twist, dt) if self._twist is not None and dt is not None else None
-        if odometry is None or abs(stamp_ns - odometry.stamp_ns) * 1e-9 >= _STALE_S:
+        if len(odometry) >= _ENOUGH_STATES:
+            return _joined(carried or _unknown(), _line_through(stamp_ns, odometry, self._T_body_camera))
+        if len(odometry) == 0 or abs(stamp_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
             return carried
-        seen, later = camera_twist(odometry, self._T_body_camera), (odometry.stamp_ns - stamp_ns) * 1e-9
+        seen, later = camera_twist(odometry[-1], self._T_body_camera), (odometry[-1].stamp_ns - stamp_ns) * 1e-9
         information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + np.diag(_growth(abs(later))[0])))
         return _corrected(carried or _unknown(), information, information @ seen.value, later)
 
@@ -191,7 +205,14 @@ class MotionTracker:
         A = interaction(0.5 * (x[now] + self._seen.x[before]), depth[now]).reshape(-1, 6)
         velocity = (x[now] - self._seen.x[before]).reshape(-1) / seconds
         weighted = A.T * np.repeat((seconds / (1.5 * noise[now])) ** 2, 8)
-        return _corrected(predicted or _unknown(), weighted @ A, weighted @ velocity, -0.5 * (begin + end))
+        information, seen = weighted @ A, weighted @ velocity
+        if predicted is not None:
+            # Stamps that jitter stretch or shrink all velocities of a frame alike.
+            along = math.sqrt(2.0) * _JITTER_S / seconds * predicted.value
+            spread = information @ along
+            share = spread / (1.0 + along @ spread)
+            information, seen = information - np.outer(spread, share), seen - share * (along @ seen)
+        return _corrected(predicted or _unknown(), information, seen, -0.5 * (begin + end))
 
     def all_clearer_than(self, clarity: float) -> bool:
         """Whether there were markers, all of more contrast over noise."""
@@ -235,12 +256,47 @@ def _growth(seconds: float) -> FloatArray:
     return np.asarray(np.multiply.outer([twist, both, 1.0 - left**2], _ACCELERATION))
 
 
+def _line_through(stamp_ns: int, odometry: Sequence[Odometry], T_body_camera: FloatArray) -> Twist:
+    """Twist that changes evenly through those of K states.
+
+    The error of the velocity is the same in all, that of a turn rate, a gyroscope's noise, is new in each.
+    """
+    twists = [camera_twist(state, T_body_camera) for state in odometry]
+    values = np.stack([twist.value for twist in twists])
+    t = np.array([(state.stamp_ns - stamp_ns) * 1e-9 for state in odometry])
+    middle = float(t.mean())
+    square = float(np.sum((t - middle) ** 2))
+    acceleration = (t - middle) @ values / square
+    once, anew = np.diag([1.0] * 3 + [0.0] * 3), np.diag([0.0] * 3 + [1.0] * 3)
+    typical = np.mean([twist.covariance for twist in twists], axis=0)
+    noise = anew @ typical @ anew
+    changes = np.diag(_growth(float(t[-1] - t[0]))[2] + _UNSURE_ACCELERATION)
+    covariance = np.zeros((12, 12))
+    slope = noise / square + changes
+    covariance[:6, :6] = once @ typical @ once + noise / len(t) + middle**2 * slope + _LEAST_VARIANCE * np.eye(6)
+    covariance[:6, 6:] = covariance[6:, :6] = -middle * slope
+    covariance[6:, 6:] = slope
+    return Twist(values.mean(axis=0) - middle * acceleration, covariance, acceleration)
+
+
+def _joined(first: Twist, second: Twist) -> Twist:
+    """What two independent estimates tell together."""
+    information: FloatArray = np.asarray(np.linalg.inv(second.covariance))
+    mean = np.concatenate([second.value, second.acceleration])
+    return _updated(first, information, information @ mean)
+
+
 def _corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later: float) -> Twist:
     """Twist when its value so much later is known by ``information`` (6, 6), times the value ``weighted`` (6,)."""
     H = np.concatenate([np.eye(6), later * np.eye(6)], axis=1)
+    return _updated(twist, H.T @ information @ H, H.T @ weighted)
+
+
+def _updated(twist: Twist, information: FloatArray, weighted: FloatArray) -> Twist:
+    """Twist with information (12, 12) on value and acceleration added, and that times the value (12,)."""
     prior = np.linalg.inv(twist.covariance)
-    covariance: FloatArray = np.asarray(np.linalg.inv(prior + H.T @ information @ H))
-    mean = covariance @ (prior @ np.concatenate([twist.value, twist.acceleration]) + H.T @ weighted)
+    covariance: FloatArray = np.asarray(np.linalg.inv(prior + information))
+    mean = covariance @ (prior @ np.concatenate([twist.value, twist.acceleration]) + weighted)
     return Twist(mean[:6], covariance, mean[6:])
 
 

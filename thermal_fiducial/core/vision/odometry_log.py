@@ -1,0 +1,46 @@
+"""The filter's latest states, to be asked for those at a frame, which comes later than they do."""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable
+
+from thermal_fiducial.core.measurements import Odometry
+
+# Frames come no later than this; nothing older is kept [ns].
+_KEPT_NS = 500_000_000
+# Stamps that go back farther are those of another clock, or of a bag that starts anew.
+_RESTART_NS = 1_000_000_000
+
+
+class OdometryLog:
+    """States in the order of their stamps, each read only when somebody wants it."""
+
+    def __init__(self) -> None:
+        self._stamps_ns: list[int] = []
+        self._readers: list[Callable[[], Odometry]] = []
+
+    def add(self, stamp_ns: int, read: Callable[[], Odometry]) -> None:
+        """Keep the state of a stamp, which ``read`` gives."""
+        if self._stamps_ns and stamp_ns < self._stamps_ns[-1] - _RESTART_NS:
+            self._stamps_ns, self._readers = [], []
+        place = bisect_right(self._stamps_ns, stamp_ns)
+        self._stamps_ns.insert(place, stamp_ns)
+        self._readers.insert(place, read)
+        if self._stamps_ns[-1] - self._stamps_ns[0] > 2 * _KEPT_NS:
+            old = bisect_left(self._stamps_ns, self._stamps_ns[-1] - _KEPT_NS)
+            del self._stamps_ns[:old], self._readers[:old]
+
+    def latest(self) -> Odometry | None:
+        """The newest state; None when there is none."""
+        return self._readers[-1]() if self._readers else None
+
+    def nearest(self, stamp_ns: int) -> Odometry | None:
+        """The state whose stamp is nearest."""
+        place = bisect_left(self._stamps_ns, stamp_ns)
+        around = range(max(place - 1, 0), min(place + 1, len(self._stamps_ns)))
+        best = min(around, key=lambda index: abs(self._stamps_ns[index] - stamp_ns), default=None)
+        return None if best is None else self._readers[best]()
+
+    def between(self, first_ns: int, last_ns: int, at_most: int) -> list[Odometry]:
+        """States from the first to the last stamp, evenly thinned out where there are more than ``at_most``."""
+        first, last = bisect_left(self._stamps_ns, first_ns), bisect_right(self._stamps_ns, last_ns)
+        return [read() for read in self._readers[first : last : -(-(last - first) // at_most) or 1]]
