@@ -136,6 +136,20 @@ def test_states_without_any_error_are_no_division_by_zero():
     np.testing.assert_allclose(twist.acceleration, np.zeros(6), atol=0.01)
 
 
+def test_twist_of_a_late_frame_is_carried_back():
+    points = np.random.default_rng(5).uniform([-0.6, -0.5, 2], [0.6, 0.5, 4], (5, 4, 3))
+    seen = Tracked(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
+    acceleration, tracker, now = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]), MotionTracker(np.eye(4)), 10**9
+    tracker.remember(now, Twist(TWIST, 1e-6 * np.eye(12), acceleration), seen)
+    ahead, back = (tracker.predict(now + dt_ns, []) for dt_ns in (30_000_000, -30_000_000))
+    # Accelerations last for 0.15 s: a tenth of them is gone on the way.
+    np.testing.assert_allclose(back.value, TWIST - 0.030 * acceleration, rtol=0.1, atol=0.01)
+    np.testing.assert_allclose(ahead.value + back.value, 2.0 * TWIST, atol=1e-12)
+    np.testing.assert_allclose(np.diag(ahead.covariance), np.diag(back.covariance), atol=1e-12)
+    # What both changes have in common with the acceleration is of the opposite sign.
+    np.testing.assert_allclose(ahead.covariance[:6, 6:], -back.covariance[:6, 6:], atol=1e-12)
+
+
 def test_markers_are_expected_where_the_motion_carries_them():
     rng = np.random.default_rng(4)
     points, dt = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3)), 1 / 30
@@ -156,6 +170,9 @@ def test_a_late_frame_disturbs_nothing_and_a_clock_set_back_is_followed():
     tracker, now = MotionTracker(np.eye(4)), 10**9
     tracker.remember(now, twist, seen)
     ahead = tracker.expected(now + 33_000_000, twist)
+    # Whose own markers are expected where they were then.
+    late, before = tracker.expected(now - 66_000_000, twist), moved(points, -0.066)
+    np.testing.assert_allclose(late.x, before[..., :2] / before[..., 2:], atol=1e-8)
     tracker.remember(now - 66_000_000, None, Tracked.none())
     np.testing.assert_array_equal(tracker.expected(now + 33_000_000, twist).x, ahead.x)
     assert tracker.predict(now + 33_000_000, []) is not None

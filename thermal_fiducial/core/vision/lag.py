@@ -225,8 +225,8 @@ class MotionTracker:
         self._stamp_ns, self._twist, self._seen = stamp_ns, twist, seen
 
     def _since(self, stamp_ns: int) -> float | None:
-        """Time since the last frame [s]; None when that tells nothing of this one."""
-        if self._stamp_ns is None or not 0 < stamp_ns - self._stamp_ns < _STALE_S * 1e9:
+        """Time since the last frame [s], negative for one that comes late; None when that tells nothing of this one."""
+        if self._stamp_ns is None or not 0 < abs(stamp_ns - self._stamp_ns) < _STALE_S * 1e9:
             return None
         return (stamp_ns - self._stamp_ns) * 1e-9
 
@@ -236,17 +236,18 @@ def _unknown() -> Twist:
 
 
 def _carried(twist: Twist, seconds: float) -> Twist:
-    """Twist so much later, its acceleration having died down a little and changed at random."""
-    left = math.exp(-seconds / _LASTS_S)
+    """Twist so much later, its acceleration having died down a little and changed at random; or as much earlier."""
+    left, sign = math.exp(-abs(seconds) / _LASTS_S), math.copysign(1.0, seconds)
+    lasting = sign * _LASTS_S * (1.0 - left)
     F = np.eye(12)
-    F[_VALUE, _CHANGE] = _LASTS_S * (1.0 - left)
+    F[_VALUE, _CHANGE] = lasting
     F[_CHANGE, _CHANGE] = left
     covariance = F @ twist.covariance @ F.T
-    covariance[_VALUE, _VALUE] += (growth := _growth(seconds))[0]
-    covariance[_VALUE, _CHANGE] += growth[1]
-    covariance[_CHANGE, _VALUE] += growth[1]
+    covariance[_VALUE, _VALUE] += (growth := _growth(abs(seconds)))[0]
+    covariance[_VALUE, _CHANGE] += sign * growth[1]
+    covariance[_CHANGE, _VALUE] += sign * growth[1]
     covariance[_CHANGE, _CHANGE] += growth[2]
-    return Twist(twist.value + _LASTS_S * (1.0 - left) * twist.acceleration, covariance, left * twist.acceleration)
+    return Twist(twist.value + lasting * twist.acceleration, covariance, left * twist.acceleration)
 
 
 def _growth(seconds: float) -> FloatArray:
