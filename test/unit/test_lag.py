@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.vision.frame import Places
 from thermal_fiducial.core.vision.lag import (
     camera_twist,
     interaction,
@@ -18,7 +19,6 @@ from thermal_fiducial.core.vision.lag import (
     MotionTracker,
     plausible,
     REMAINING,
-    smear,
     SmearField,
     Tracked,
     Twist,
@@ -186,7 +186,7 @@ def test_field_agrees_with_the_points():
     assert field.shape == (512, 640, 2)
     pixels = np.array([[100, 80], [320, 250], [550, 430]])
     x = CAMERA.normalise(pixels.astype(float))
-    expected = smear(CAMERA, x, np.full(3, 3.0), twist, 0.01)
+    expected = Places.of(ImagePoints.seen_at(x, CAMERA), np.full(3, 3.0)).smear(twist, 0.01)
     # The coarse field is interpolated linearly between nodes 16 px apart.
     np.testing.assert_allclose(field[pixels[:, 1], pixels[:, 0]], expected, atol=0.01)
 

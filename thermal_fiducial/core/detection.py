@@ -27,7 +27,6 @@ from thermal_fiducial.core.vision.lag import (
     MotionTracker,
     plausible,
     REMAINING,
-    smear,
     SmearField,
     Tracked,
     Twist,
@@ -37,6 +36,7 @@ from thermal_fiducial.core.vision.local_corners import local_corners
 from thermal_fiducial.core.vision.marker_rows import marker_rows
 from thermal_fiducial.core.vision.odometry_log import OdometryLog
 from thermal_fiducial.core.vision.patterns import marker_bits
+from thermal_fiducial.core.vision.readout import expected_displacement, seen_displacement
 from thermal_fiducial.core.vision.refining import Refinement, Refiner, sides_px, SMEAR_THAT_MATTERS_PX, WINDOW_MARGIN_PX
 from thermal_fiducial.core.vision.scratch import Scratch
 from thermal_fiducial.core.vision.search import BlindSearch, confirmed, Found, merged
@@ -161,7 +161,7 @@ class MarkerDetector:
         noise = noise_of(image)
         if counts.dtype != np.uint8 and not self._motion.all_clearer_than(_CLEARER_THAN_COLUMNS):
             image = without_columns(image, noise, self._scratch)
-        return Frame(stamp_ns, image, noise, camera, twist)
+        return Frame(stamp_ns, image, noise, camera, twist, self.config.bolometer_lag, self.config.readout_time)
 
     def _learn_offset(self, frame: Frame, in_map: Expected | None, ids: IntArray, places: Places) -> None:
         """How far seen corners are off their places tells what is left of the clocks' offset."""
@@ -204,7 +204,14 @@ class MarkerDetector:
         scene = self._scene(frame.image, frame.camera, frame.twist)
         allowed = self._allowed()
         blind = self._search.search(frame.image, frame.noise, scene, allowed, self.config, expected)
-        return merged(expected, blind), followed
+        return merged(expected, self._unrolled(frame, blind)), followed
+
+    def _unrolled(self, frame: Frame, found: Found) -> Found:
+        """Markers where they would be if all rows were seen at once."""
+        if frame.readout == 0.0 or len(found.ids) == 0:
+            return found
+        rolled = seen_displacement(self._places(frame, found), frame.twist, frame, found.corners_px[..., 1])
+        return replace(found, corners_px=found.corners_px - rolled)
 
     def _expected(self, camera: Camera, last: Followed, in_map: Expected | None) -> Expected:
         """The map's markers and the last frame's others."""
@@ -219,12 +226,14 @@ class MarkerDetector:
     def _guided(self, frame: Frame, twist: Twist, ids: IntArray, corners: FloatArray, depth: FloatArray) -> Found:
         """Known markers that are seen near where the map and the filter say."""
         camera, image, noise = frame.camera, frame.image, frame.noise
-        shift = smear(camera, camera.normalise(corners), depth, twist, self.config.bolometer_lag)
+        places = Places.of(ImagePoints.at(corners, camera), depth)
+        shift, rolled = places.smear(twist, frame.lag), expected_displacement(places, twist, frame)
+        corners = corners + rolled
         blurred = np.abs(shift).max(axis=(1, 2)) > SMEAR_THAT_MATTERS_PX
         scene = markers_sharpened(image, corners[blurred], shift[blurred], WINDOW_MARGIN_PX)
         still = np.where(blurred[:, None, None], REMAINING * shift, shift)
         found, seen = look(scene, self._scratch, ids, corners + still, self._decoder, noise, self.config)
-        found = replace(found, corners_px=found.corners_px - still[seen])
+        found = replace(found, corners_px=found.corners_px - (still + rolled)[seen])
         faint = np.flatnonzero(blurred & ~seen)
         if len(faint) == 0:
             return found
@@ -232,7 +241,7 @@ class MarkerDetector:
         also, there = look(
             image, self._scratch, ids[faint], (corners + shift)[faint], self._decoder, noise, self.config
         )
-        return merged(found, replace(also, corners_px=also.corners_px - shift[faint[there]]))
+        return merged(found, replace(also, corners_px=also.corners_px - (shift + rolled)[faint[there]]))
 
     def _allowed(self) -> BoolArray:
         """Which IDs of the dictionary may be found."""

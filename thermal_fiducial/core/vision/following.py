@@ -10,6 +10,7 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.core.vision.decoding import Decoder
 from thermal_fiducial.core.vision.frame import Frame, Places
 from thermal_fiducial.core.vision.lag import Tracked, Twist
+from thermal_fiducial.core.vision.readout import expected_displacement
 from thermal_fiducial.core.vision.search import Found
 
 # Correlation with its pattern of a marker that is still where motion has carried it, seen through the lag.
@@ -58,7 +59,8 @@ class Followed:
         """Those that the frame shows: they look like themselves more than like any other marker."""
         if len(self.ids) == 0:
             return self
-        shown = self.places.at.px + self.places.smear(twist, config.bolometer_lag)
+        shown = self.places.at.px + self.places.smear(twist, frame.lag)
+        shown += expected_displacement(self.places, twist, frame)
         likeness = decoder.likeness(frame.image, shown)
         similarity = likeness.correlation * np.sign(self.clarity)
         alike = (likeness.best == 4 * self.ids) & (similarity > _STILL_ALIKE)

@@ -19,6 +19,9 @@ class Frame:
     noise: float
     camera: Camera
     twist: Twist | None
+    #: time constant of the bolometers, and time from the first row's sampling to the last's [s]
+    lag: float
+    readout: float
 
 
 @dataclass(frozen=True, slots=True)

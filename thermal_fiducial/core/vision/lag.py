@@ -308,21 +308,6 @@ def plausible(odometry: Odometry) -> bool:
     return bool(speed <= _FASTEST and turn <= _FASTEST_TURN and finite)
 
 
-def smear_by_twist(x: FloatArray, J: FloatArray, depth: FloatArray, tau: float) -> FloatArray:
-    """Derivative (..., 2, 6) of :func:`smear` by the twist, where distortion has the derivative J (..., 2, 2) [px]."""
-    return np.asarray(-tau * J @ interaction(x, depth))
-
-
-def smear(camera: Camera, x: FloatArray, depth: FloatArray, twist: Twist, tau: float) -> FloatArray:
-    """Mean displacement by lag (..., 2) [px] at normalised points (..., 2)."""
-    return np.asarray(smear_by_twist(x, camera.distort_jacobian(x), depth, tau) @ twist.ago(tau))
-
-
-def image_velocity(camera: Camera, x: FloatArray, depth: FloatArray, twist: Twist) -> FloatArray:
-    """Velocity (..., 2) [px/s] of normalised points (..., 2)."""
-    return np.asarray(camera.distort_jacobian(x) @ (interaction(x, depth) @ twist.value)[..., None])[..., 0]
-
-
 def model_error(smear_px: FloatArray, cell_px: FloatArray) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] of what is wrong with an exponential lag of this time constant.
 

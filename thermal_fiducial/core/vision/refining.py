@@ -24,6 +24,7 @@ from thermal_fiducial.core.vision.lag import (
     SPREAD,
     Twist,
 )
+from thermal_fiducial.core.vision.readout import expected_displacement, seen_displacement, stretch
 from thermal_fiducial.core.vision.scratch import Scratch
 from thermal_fiducial.core.vision.search import Found
 
@@ -111,7 +112,7 @@ class Refiner:
         columns = _COLUMNS if np.abs(found.clarity).min() > _CLEAR else _COLUMNS_FAINT
         twist = frame.twist
         for _ in range(_ROUNDS):
-            view = self._view(frame.image, places, twist, cell, found.clarity, config.bolometer_lag)
+            view = self._view(frame, places, twist, cell, found.clarity)
             start = places.at.moved(view.shift, frame.camera)
             behind = self._behind[found.ids]
             blur = config.blur_px, view.spread
@@ -119,34 +120,28 @@ class Refiner:
                 frame.image, start, frame.camera, behind, *blur, columns, near=near, memory=view.memory
             )
             freed = twist is not None
-            refinement = self._at_stamp(frame, found, places, view, seen, cell, config.bolometer_lag, freed=freed)
+            refinement = self._at_stamp(frame, found, places, view, seen, cell, freed=freed)
             change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)[view.sharpened]
             if refinement.twist is None or change.max(initial=0.0) < SMEAR_THAT_MATTERS_PX:
                 break
             twist, places, near = refinement.twist, refinement.places, np.ones(len(near), dtype=bool)
         return refinement
 
-    def _view(
-        self,
-        image: Float32Array,
-        places: Places,
-        twist: Twist | None,
-        cell: FloatArray,
-        clarity: FloatArray,
-        lag: float,
-    ) -> View:
-        """``image`` with known smear round all markers, sharpened round those for which that is worth its noise."""
+    def _view(self, frame: Frame, places: Places, twist: Twist | None, cell: FloatArray, clarity: FloatArray) -> View:
+        """The frame with known smear round all markers, sharpened round those for which that is worth its noise."""
         smear = memory = np.zeros_like(places.at.px)
         if twist is not None:
-            smear, memory = places.smear(twist, lag), places.memory(twist, lag)
+            smear, memory = places.smear(twist, frame.lag), places.memory(twist, frame.lag)
+            if frame.readout > 0.0:
+                memory = memory * stretch(places, twist, frame)[..., None]
         mean = smear.mean(axis=1)
         sharpen = _worth_sharpening(np.sum(mean * mean, axis=1), cell, self._behind.shape[2], clarity)
         removed = (1.0 - REMAINING) * memory * sharpen[:, None, None]
-        shift = smear - removed
+        shift = smear - removed + expected_displacement(places, twist, frame)
         spread, past = mean * np.where(sharpen, SPREAD, 1.0)[:, None], None
         if sharpen.any():
             past = Memory(memory_maps(places.at.px + shift, memory), np.where(sharpen, GAIN, 1.0))
-        return View(image, shift, removed, spread, sharpen, memory, past)
+        return View(frame.image, shift, removed, spread, sharpen, memory, past)
 
     def _at_stamp(
         self,
@@ -156,11 +151,10 @@ class Refiner:
         view: View,
         seen: RefinedCorners,
         cell: FloatArray,
-        lag: float,
         *,
         freed: bool,
     ) -> Refinement:
-        """The corners without lag, by the twist that they themselves correct."""
+        """The corners without lag and as if all rows were seen at once, by the twist that they themselves correct."""
         at = places.at.moved(seen.corners_px - view.shift - places.at.px, frame.camera)
         variance = seen.covariances[..., 0, 0] + seen.covariances[..., 1, 1]
         deviation = np.sqrt(0.5 * variance.mean(axis=1)) / frame.camera.focal_px
@@ -168,11 +162,12 @@ class Refiner:
         twist = self._motion.correct(frame.stamp_ns, frame.twist, ids, at.x, depth, deviation, freed=freed)
         if twist is None:
             return Refinement(view, seen, seen, replace(places, at=at), None)
-        smear = places.smear(twist, lag)
-        corners = seen.corners_px - smear + view.removed
+        smear = places.smear(twist, frame.lag)
+        rolled = seen_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
+        corners = seen.corners_px - smear + view.removed - rolled
         # What the corners of a marker have in common is no error of its shape.
-        by_twist = lag * (places.flow - places.flow.mean(axis=1, keepdims=True))
-        unknown = by_twist @ twist.covariance_ago(lag) @ np.swapaxes(by_twist, -1, -2) + model_error(smear, cell)
+        by_twist = frame.lag * (places.flow - places.flow.mean(axis=1, keepdims=True))
+        unknown = by_twist @ twist.covariance_ago(frame.lag) @ np.swapaxes(by_twist, -1, -2) + model_error(smear, cell)
         refined = replace(seen, corners_px=corners, covariances=seen.covariances + unknown)
         return Refinement(view, seen, refined, replace(places, at=at.moved(corners - at.px, frame.camera)), twist)
 
