@@ -417,8 +417,8 @@ class PoseEkfConfig:
     initial_accelerometer_bias_std: float = param(0.2, 'Accelerometer bias at the start.', unit='m/s^2', minimum=0.0)
     initial_poses: int = param(3, 'Poses that must agree before the filter starts.', minimum=1, maximum=100)
     pose_noise_scale: float = param(
-        3.0,
-        'Factor on the standard deviation of the camera poses: their errors last for about ten frames, not one.',
+        2.0,
+        'Factor on the standard deviation of the camera poses: their errors last for about four frames, not one.',
         minimum=0.1,
         live=True,
     )
@@ -429,7 +429,7 @@ class PoseEkfConfig:
         0.0001, 'Least standard deviation of a camera pose, attitude.', unit='rad', minimum=0.0, live=True
     )
     motion_floor: float = param(
-        0.001,
+        0.0005,
         'What motion adds to these in all directions: so much of the speed and of the turn rate (smear, lag).',
         unit='s',
         minimum=0.0,
