@@ -274,7 +274,7 @@ def test_table(benchmark, write_table):
         without = {method: TIMES[scene, method] - POSE_TIMES[scene, method] for method in METHODS}
         rows.append([f'time of a frame, {scene} (ratio to SUBPIX)', *time_cells(whole)])
         rows.append(
-            [f'the same without poses and rows, which detectMarkers does not give, {scene}', *time_cells(without)]
+            [f'of it detection and refinement, which is all that detectMarkers does, {scene}', *time_cells(without)]
         )
     write_table('detection', rows)
     plot(results)
