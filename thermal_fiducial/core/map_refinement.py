@@ -26,6 +26,8 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 #: Chi square of a view (8 residuals) up to which it counts in full: 99.9 % of honest ones.
 ROBUST_CHI2 = 26.1
+#: Chi square of a pose from odometry (6 residuals) up to which it counts in full.
+ROBUST_ODOMETRY = 22.5
 MAX_ITERATIONS = 25
 # Relative decrease of the cost that ends the iteration.
 _CONVERGED = 1e-7
@@ -164,6 +166,9 @@ class _Problem:
     W: FloatArray
     links: list[tuple[int, int, FloatArray, FloatArray]]
     priors: list[tuple[int, FloatArray, FloatArray]]
+    #: (F, 4, 4), (F, 6, 6) what odometry knows of the keyframes
+    T_odometry: FloatArray
+    information: FloatArray
     equations: NormalEquations
 
     @classmethod
@@ -202,6 +207,8 @@ class _Problem:
                 for key, (T, covariance) in snapshot.priors.items()
                 if key in index and not held[index[key]]
             ],
+            T_odometry=np.stack([f.T_odometry for f in frames]),
+            information=np.stack([f.information for f in frames]),
             equations=NormalEquations(frame, marker, tied, held),
         )
 
@@ -222,11 +229,11 @@ class _Problem:
         r = (self.W @ residuals[..., None]).reshape(n, 8)
         chi2 = np.sum(r * r, axis=-1)
         limit = ROBUST_CHI2 * scale
-        weights = np.minimum(1.0, limit / np.maximum(chi2, 1e-300))
-        # The cost whose derivative has these weights: quadratic, then logarithmic.
-        cost = float(np.sum(np.where(chi2 <= limit, chi2, limit * (1.0 - np.log(weights)))))
+        weights = _robust_weights(chi2, limit)
+        cost = float(np.sum(_robust_cost(chi2, limit)))
         cost += sum(float(e @ e) for _, _, e, _, _ in self._linked(state))
         cost += sum(float(e @ e) for _, e, _ in self._prior_terms(state))
+        cost += float(np.sum(_robust_cost(self._odometry_chi2(state)[1], ROBUST_ODOMETRY)))
         whitened = [(self.W @ J.reshape(n, 4, 2, 6)).reshape(n, 8, 6) for J in (J_camera, J_marker)]
         return _Evaluation(cost, r, whitened[0], whitened[1], weights, chi2, np.sum(residuals**2, axis=(1, 2)))
 
@@ -278,6 +285,8 @@ class _Problem:
     def _blocks(self, state: _State, e: _Evaluation) -> Blocks:
         weighted_rig = np.swapaxes(e.J_rig, -1, -2) * e.weights[:, None, None]
         weighted_marker = np.swapaxes(e.J_marker, -1, -2) * e.weights[:, None, None]
+        apart, chi2 = self._odometry_chi2(state)
+        known = self.information * _robust_weights(chi2, ROBUST_ODOMETRY)[:, None, None]
         return Blocks(
             rig=weighted_rig @ e.J_rig,
             marker=weighted_marker @ e.J_marker,
@@ -286,7 +295,14 @@ class _Problem:
             marker_gradient=(weighted_marker @ e.r[..., None])[..., 0],
             links=self._linked(state),
             priors=self._prior_terms(state),
+            known=known,
+            known_gradient=(known @ apart[..., None])[..., 0],
         )
+
+    def _odometry_chi2(self, state: _State) -> tuple[FloatArray, FloatArray]:
+        """How far each keyframe is from where odometry has it (F, 6), and the chi square of that (F,)."""
+        apart = difference(self.T_odometry, state.T_map_rig)
+        return apart, np.einsum('fi,fij,fj->f', apart, self.information, apart)
 
     def _linked(self, state: _State) -> list[tuple[int, int, FloatArray, FloatArray, FloatArray]]:
         """Frames a and b, whitened residual (6,) of each link, and the derivatives of its prediction."""
@@ -350,6 +366,15 @@ def _gauge(markers: list[MapMarker]) -> BoolArray:
     if markers and not np.any(held):
         held[int(np.argmin([np.trace(m.covariance) for m in markers]))] = True
     return held
+
+
+def _robust_weights(chi2: FloatArray, limit: float) -> FloatArray:
+    return np.asarray(np.minimum(1.0, limit / np.maximum(chi2, 1e-300)))
+
+
+def _robust_cost(chi2: FloatArray, limit: float) -> FloatArray:
+    """The cost whose derivative has the robust weights: quadratic, then logarithmic."""
+    return np.where(chi2 <= limit, chi2, limit * (1.0 - np.log(_robust_weights(chi2, limit))))
 
 
 def _root(covariance: npt.ArrayLike) -> FloatArray:

@@ -7,6 +7,7 @@ markers that are seen together with known ones. Beyond the paper: planar ambigui
 on them, covariances carry the map's own uncertainty, and markers that stop agreeing are put in quarantine.
 """
 
+from collections import deque
 from dataclasses import replace
 
 import numpy as np
@@ -16,15 +17,17 @@ from thermal_fiducial.core.adjustment.reprojection import corners_in_map, linear
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.geometry import transform_from_quaternion
 from thermal_fiducial.core.map_refinement import prior_poses, refine, Refinement, Snapshot
-from thermal_fiducial.core.mapping.bridging import camera_pose, growth, link, predict
+from thermal_fiducial.core.mapping.bridging import link
 from thermal_fiducial.core.mapping.candidates import Candidate, View, Viewpoint
-from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore, Rig
+from thermal_fiducial.core.mapping.correction import correction
+from thermal_fiducial.core.mapping.keyframes import in_moved_map, Keyframe, KeyframeStore, Rig
 from thermal_fiducial.core.mapping.localization import locate, Location, positive, Refusal, Sight
 from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.map_editing import align
 from thermal_fiducial.core.mapping.map_rows import marker_poses, usable
 from thermal_fiducial.core.mapping.motion import CameraMotion
 from thermal_fiducial.core.mapping.noise_level import NoiseLevel
+from thermal_fiducial.core.mapping.odometry_prior import ClockDifference, Expected, Fused, growth, together
 from thermal_fiducial.core.mapping.trust import culprits, DISAGREEMENT, Trust
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers, Odometry
 from thermal_fiducial.core.types import BoolArray, FloatArray
@@ -34,10 +37,17 @@ __all__ = ['MapJump', 'MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
 
 #: A pose of the past tells rival poses apart for this long [ns].
 CONTINUITY_NS = 300_000_000
+#: Keyframes whose poses by the odometry are off alike: together they tell no more than one.
+ALIKE = 30.0
+#: Factor on the variance of what a camera pose owes to the map: of all frames of the same markers that error is the
+#: same, while whoever takes in the poses lets their errors average out.
+LASTING = 3.0
 #: Corner errors to allow for before a marker is said to disagree with the others [px].
 TOLERANCE_PX = 0.3
 #: Candidates that are judged in one frame: bounds its time when many are new.
 TRIALS = 3
+# Last frames that tell how the map has moved where the robot is.
+_RECENT = 10
 # A candidate is judged again when its views have grown by one in so many.
 _PATIENCE = 6
 # A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
@@ -88,6 +98,9 @@ class MarkerMapper:
         self._quarantined = {key for key, marker in self.map.markers.items() if not marker.trusted}
         self._last: CameraPose | None = None
         self._motion = CameraMotion()
+        self._clocks = ClockDifference()
+        self._recent: deque[Keyframe] = deque(maxlen=_RECENT)
+        self._belief: FloatArray | None = None
         self._cameras: list[Camera] = []
         self._noise = NoiseLevel()
         self._gap: CameraPose | None = None
@@ -113,12 +126,16 @@ class MarkerMapper:
         known = self._sight(markers[is_known])
         trusted = np.array([marker.trusted for marker in known.markers], dtype=bool)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
-        location = self._locate(stamp_ns, known.select(trusted), camera, odometry)
+        expected = self._expected(stamp_ns, odometry)
+        location = self._locate(stamp_ns, known.select(trusted), camera, expected)
         if isinstance(location, Refusal):
-            changed, waiting = self._without_pose(stamp_ns, markers[~is_known], camera, odometry, location)
+            changed, waiting = self._without_pose(stamp_ns, markers[~is_known], camera, expected, location)
             return self._result(stamp_ns, None, location.reason, changed, waiting=waiting)
         ids = tuple(marker.id for marker, used in zip(known.markers, trusted, strict=True) if used)
         covariance = location.covariance + self._motion.unknown(stamp_ns, location.T_map_camera)
+        covariance = covariance + (LASTING - 1.0) * location.map_covariance
+        if expected is not None:
+            self._clocks.learn(expected, location.T_map_camera, covariance)
         self._last = CameraPose(stamp_ns, location.T_map_camera, covariance, ids, location.rms_px)
         self._gap = None
         # Step 7: errors updated.
@@ -127,28 +144,34 @@ class MarkerMapper:
         # Step 8: new markers placed relative to the camera.
         waiting = {}
         if not self.frozen:
-            self._keep(markers, camera, self._last)
-            viewpoint = _viewpoint(location)
+            fused = _fused(location, expected)
+            self._keep(markers, camera, self._last, fused, expected)
+            viewpoint = _viewpoint(fused)
             placed, waiting = self._place_new(stamp_ns, markers[~is_known], camera, viewpoint)
             changed |= placed
         residuals = {marker.id: float(error) for marker, error in zip(known.markers, errors, strict=True)}
         return self._result(stamp_ns, self._last, '', changed, residuals, waiting)
 
-    def _locate(self, stamp_ns: int, sight: Sight, camera: Camera, odometry: Odometry | None) -> Location | Refusal:
+    def _expected(self, stamp_ns: int, odometry: Odometry | None) -> Expected | None:
+        if odometry is None or abs(stamp_ns - odometry.stamp_ns) >= CONTINUITY_NS:
+            return None
+        return self._clocks.expected(odometry, stamp_ns, self._T_body_camera)
+
+    def _locate(self, stamp_ns: int, sight: Sight, camera: Camera, expected: Expected | None) -> Location | Refusal:
         if not sight.markers:
             return Refusal(self._nothing_known())
         errors = self._trust.running_errors(sight.markers)
-        return locate(sight, errors, camera, self._prior(stamp_ns, odometry))
+        return locate(sight, errors, camera, self._prior(stamp_ns, expected))
 
     def _nothing_known(self) -> str:
         if not self.map.markers:
             return 'the map has no marker: give a map file with at least one'
         return 'no known marker in view'
 
-    def _prior(self, stamp_ns: int, odometry: Odometry | None) -> FloatArray | None:
+    def _prior(self, stamp_ns: int, expected: Expected | None) -> FloatArray | None:
         """T_map_camera that is expected from the filter or, for a short while, from the last pose."""
-        if odometry is not None and abs(stamp_ns - odometry.stamp_ns) < CONTINUITY_NS:
-            return predict(odometry, stamp_ns) @ self._T_body_camera
+        if expected is not None:
+            return expected.pose.T_map_camera
         if self._last is not None and 0 < stamp_ns - self._last.stamp_ns < CONTINUITY_NS:
             return self._last.T_map_camera
         return None
@@ -209,9 +232,12 @@ class MarkerMapper:
         self.map.version += placed
         return placed, {candidate.id: candidate.reason for candidate in shown if candidate.id in self._candidates}
 
-    def _keep(self, rows: Markers, camera: Camera, pose: CameraPose) -> None:
+    def _keep(self, rows: Markers, camera: Camera, pose: CameraPose, fused: Fused, expected: Expected | None) -> None:
         """Keep the frame for the refinement; of one marker alone nothing can be learned."""
-        self._last_frame = _keyframe(rows, pose, self._camera_index(camera))
+        pose = replace(pose, T_map_camera=fused.T_map_camera)
+        self._last_frame = _keyframe(rows, pose, self._camera_index(camera), expected)
+        self._belief = None if expected is None else expected.pose.covariance
+        self._recent.append(self._last_frame)
         if len(rows) >= 2:
             self._keyframes.add(self._last_frame)
 
@@ -224,23 +250,23 @@ class MarkerMapper:
         return len(self._cameras) - 1
 
     def _without_pose(
-        self, stamp_ns: int, rows: Markers, camera: Camera, odometry: Odometry | None, refusal: Refusal
+        self, stamp_ns: int, rows: Markers, camera: Camera, expected: Expected | None, refusal: Refusal
     ) -> tuple[bool, dict[int, str]]:
         """What a frame without a pose may still teach of new markers."""
         if self.frozen or not len(rows):
             return False, {}
         if refusal.rivals is not None and refusal.covariances is not None:
             return self._place_new(stamp_ns, rows, camera, Viewpoint(refusal.rivals, refusal.covariances))
-        if odometry is None or self._last is None:
+        if expected is None or self._last is None:
             return False, {}
         if not 0 <= stamp_ns - self._last.stamp_ns <= self.config.bridge_duration * 1e9:
             return False, {}
-        return self._bridge(stamp_ns, rows, camera, odometry)
+        return self._bridge(stamp_ns, rows, camera, expected)
 
-    def _bridge(self, stamp_ns: int, rows: Markers, camera: Camera, odometry: Odometry) -> tuple[bool, dict[int, str]]:
+    def _bridge(self, stamp_ns: int, rows: Markers, camera: Camera, expected: Expected) -> tuple[bool, dict[int, str]]:
         """Place new markers from the odometry while no known one is in view."""
-        pose = camera_pose(odometry, stamp_ns, self._T_body_camera)
-        frame = _keyframe(rows, pose, self._camera_index(camera))
+        pose = expected.pose
+        frame = _keyframe(rows, pose, self._camera_index(camera), expected)
         if not any(int(key) in self._candidates for key in rows['id']):
             # Nothing but the odometry joins these markers to the map. Once is enough: its error is the same for all
             # that follow, which hang together through the markers themselves.
@@ -252,7 +278,7 @@ class MarkerMapper:
         if self._gap is None:
             self._gap = pose
         # What the odometry had gathered when the gap's first marker came is the same for all its views.
-        viewpoint = Viewpoint.known(pose.T_map_camera, growth(self._gap, pose, odometry))
+        viewpoint = Viewpoint.known(pose.T_map_camera, growth(self._gap, expected))
         return self._place_new(stamp_ns, rows, camera, replace(viewpoint, common=self._gap.covariance))
 
     def refinement_due(self, stamp_ns: int) -> bool:
@@ -300,6 +326,7 @@ class MarkerMapper:
         """
         if self.frozen or refinement.map_version < self._initial.version:
             return None
+        before = dict(self.map.markers)
         for marker_id, adjusted in refinement.markers.items():
             marker = self.map.markers.get(marker_id)
             if marker is not None and marker.trusted:
@@ -314,10 +341,11 @@ class MarkerMapper:
             candidate.move(displacement)
         T_new_old = np.eye(4)
         if self._last is not None:
-            T_new_old = displacement.at(self._last.stamp_ns)
+            T_new_old = correction(tuple(self._recent), self._cameras, before, self.map.markers, self._belief)
+            self._recent = deque((in_moved_map(frame, T_new_old) for frame in self._recent), maxlen=_RECENT)
             self._last = replace(self._last, T_map_camera=T_new_old @ self._last.T_map_camera)
             self._motion = CameraMotion()
-            self._last_frame = replace(self._last_frame, T_map_rig=T_new_old @ self._last_frame.T_map_rig)
+            self._last_frame = in_moved_map(self._last_frame, T_new_old)
         self.map.version += 1
         self.resets += 1
         return MapJump(self.map.version, self.resets, T_new_old)
@@ -350,13 +378,19 @@ class MarkerMapper:
         )
 
 
-def _viewpoint(location: Location) -> Viewpoint:
-    known = Viewpoint.known(location.T_map_camera, location.relative_covariance)
-    return replace(known, common=positive(location.covariance - location.relative_covariance))
+def _fused(location: Location, expected: Expected | None) -> Fused:
+    lasting = positive(location.covariance - location.relative_covariance)
+    if expected is None:
+        return Fused(location.T_map_camera, location.relative_covariance, lasting)
+    return together(location.T_map_camera, location.relative_covariance, lasting, expected.pose)
 
 
-def _keyframe(rows: Markers, pose: CameraPose, camera: int) -> Keyframe:
-    return Keyframe(
+def _viewpoint(fused: Fused) -> Viewpoint:
+    return replace(Viewpoint.known(fused.T_map_camera, fused.changing), common=fused.lasting)
+
+
+def _keyframe(rows: Markers, pose: CameraPose, camera: int, expected: Expected | None) -> Keyframe:
+    frame = Keyframe(
         pose.stamp_ns,
         pose.T_map_camera,
         rows['id'].astype(np.int64),
@@ -364,6 +398,10 @@ def _keyframe(rows: Markers, pose: CameraPose, camera: int) -> Keyframe:
         corner_covariances(rows),
         np.full(len(rows), camera),
     )
+    if expected is None:
+        return frame
+    information = np.asarray(np.linalg.inv(ALIKE * expected.pose.covariance), dtype=np.float64)
+    return replace(frame, T_odometry=expected.pose.T_map_camera, information=information)
 
 
 def _expected_errors(known: Sight, location: Location, camera: Camera) -> FloatArray:

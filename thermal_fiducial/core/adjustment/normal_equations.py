@@ -29,6 +29,9 @@ class Blocks:
     links: list[tuple[int, int, FloatArray, FloatArray, FloatArray]]
     #: marker, whitened residual (6,), derivative (6, 6)
     priors: list[tuple[int, FloatArray, FloatArray]]
+    #: (F, 6, 6) and (F, 6), J' J and J' r of what is known of the keyframes' poses beside the views
+    known: FloatArray
+    known_gradient: FloatArray
 
 
 class NormalEquations:
@@ -91,8 +94,8 @@ class NormalEquations:
 
     def _frame_terms(self, blocks: Blocks, damping: float) -> tuple[FloatArray, FloatArray]:
         starts = np.flatnonzero(np.diff(self.frame, prepend=-1))
-        H = np.add.reduceat(blocks.rig, starts, axis=0)
-        return _damped(H, damping), np.add.reduceat(blocks.rig_gradient, starts, axis=0)
+        H = np.add.reduceat(blocks.rig, starts, axis=0) + blocks.known
+        return _damped(H, damping), np.add.reduceat(blocks.rig_gradient, starts, axis=0) + blocks.known_gradient
 
     def _reduced(
         self, blocks: Blocks, H_inverse: FloatArray, g_f: FloatArray, damping: float

@@ -4,7 +4,6 @@ import numpy as np
 
 from thermal_fiducial.core.geometry import inverse, skew, so3_exp, transform
 from thermal_fiducial.core.mapping.keyframes import Keyframe, Link
-from thermal_fiducial.core.mapping.localization import positive
 from thermal_fiducial.core.measurements import CameraPose, Odometry
 from thermal_fiducial.core.types import FloatArray
 
@@ -22,18 +21,6 @@ def camera_pose(odometry: Odometry, stamp_ns: int, T_body_camera: FloatArray) ->
     A = np.eye(6)
     A[:3, 3:] = -skew(T_map_body[:3, :3] @ T_body_camera[:3, 3])
     return CameraPose(stamp_ns, T_map_body @ T_body_camera, A @ odometry.pose_covariance @ A.T)
-
-
-def growth(first: CameraPose, pose: CameraPose, odometry: Odometry) -> FloatArray:
-    """Covariance (6, 6) of the odometry from ``first`` to ``pose``, from either of two bounds, whichever is closer.
-
-    Errors of odometry that grow add up like independent ones at most as the difference of the covariances says; and a
-    displacement is off by no more than the speed is, all the time.
-    """
-    seconds = (pose.stamp_ns - first.stamp_ns) * 1e-9
-    turn = np.kron(np.eye(2), odometry.T_map_body[:3, :3]) * seconds
-    bounds = positive(pose.covariance - first.covariance), turn @ odometry.twist_covariance @ turn.T
-    return min(bounds, key=lambda covariance: float(np.trace(covariance)))
 
 
 def link(a: Keyframe, b: Keyframe, covariance: FloatArray) -> Link:

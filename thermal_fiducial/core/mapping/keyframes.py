@@ -45,6 +45,14 @@ class Keyframe:
     covariances: FloatArray
     #: (k,) index of the camera of the rig that saw each
     cameras: IntArray
+    #: (4, 4) where the odometry has the rig, and (6, 6) how well it knows: information, zero without any
+    T_odometry: FloatArray = field(default_factory=lambda: np.eye(4))
+    information: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+
+
+def in_moved_map(frame: Keyframe, T_new_old: FloatArray) -> Keyframe:
+    """``frame`` in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
+    return replace(frame, T_map_rig=T_new_old @ frame.T_map_rig, T_odometry=T_new_old @ frame.T_odometry)
 
 
 @dataclass(frozen=True)
@@ -64,6 +72,8 @@ def packed(frames: Sequence[Keyframe]) -> tuple[FloatArray | IntArray, ...]:
     return (
         np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
         np.array([frame.T_map_rig for frame in frames]).reshape(-1, 4, 4),
+        np.array([frame.T_odometry for frame in frames]).reshape(-1, 4, 4),
+        np.array([frame.information for frame in frames]).reshape(-1, 6, 6),
         np.array([len(frame.ids) for frame in frames], dtype=np.int64),
         *(
             np.concatenate([getattr(frame, name) for frame in frames]) if frames else np.zeros(0)
@@ -73,13 +83,21 @@ def packed(frames: Sequence[Keyframe]) -> tuple[FloatArray | IntArray, ...]:
 
 
 def unpacked(
-    stamps: IntArray, T_map_rig: FloatArray, counts: IntArray, *views: FloatArray | IntArray
+    stamps: IntArray,
+    T_map_rig: FloatArray,
+    T_odometry: FloatArray,
+    information: FloatArray,
+    counts: IntArray,
+    *views: FloatArray | IntArray,
 ) -> tuple[Keyframe, ...]:
     """The keyframes again."""
     ends = np.cumsum(counts)[:-1]
     parts = [np.split(array, ends) for array in views]
     return (
-        tuple(Keyframe(*fields) for fields in zip(stamps.tolist(), T_map_rig, *parts, strict=True))
+        tuple(
+            Keyframe(*fields)
+            for fields in zip(stamps.tolist(), T_map_rig, *parts, T_odometry, information, strict=True)
+        )
         if len(stamps)
         else ()
     )

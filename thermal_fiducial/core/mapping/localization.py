@@ -90,6 +90,8 @@ class Location:
     covariance: FloatArray
     #: (6, 6) the same without the error that all markers in view share: how well it is placed among them
     relative_covariance: FloatArray
+    #: (6, 6) the share of the map: an error that lasts as long as the same markers are in view
+    map_covariance: FloatArray
     #: (N,) weights of the markers, 1 for one as good as the rest
     weights: FloatArray
     rms_px: float
@@ -146,13 +148,12 @@ def locate(sight: Sight, running_errors: FloatArray, camera: Camera, prior: Floa
             return Refusal(f'planar ambiguity of {_names(sight)} unsettled', rivals, spreads)
         elif _distance(rival, prior) < _distance(T, prior):
             T = rival
-    covariance, relative = pose_covariances(sight, covariances, weights, camera, T)
+    covariance, relative, from_map = pose_covariances(sight, covariances, weights, camera, T)
     if not np.all(np.isfinite(covariance)):
         return Refusal(f'the pose from {_names(sight)} is not determined')
     residuals = sight.corners - reproject(camera, T, points)
-    return Location(
-        T, covariance + spread, relative + spread, weights, float(np.sqrt(np.mean(np.sum(residuals**2, axis=-1))))
-    )
+    rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=-1))))
+    return Location(T, covariance + spread, relative + spread, from_map, weights, rms)
 
 
 def marker_weights(errors: FloatArray, running_errors: FloatArray) -> FloatArray:
@@ -168,7 +169,7 @@ def marker_weights(errors: FloatArray, running_errors: FloatArray) -> FloatArray
 
 def pose_covariances(
     sight: Sight, covariances: FloatArray, weights: FloatArray, camera: Camera, T_map_camera: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Covariance (6, 6) of a camera pose that was estimated with ``weights`` and corner ``covariances`` (N, 4, 2, 2).
 
     The estimate is linear in the corners and in the map near its optimum: noise of the corners goes in as white, at
@@ -185,7 +186,7 @@ def pose_covariances(
     try:
         A_inverse = np.linalg.inv(A)
     except np.linalg.LinAlgError:
-        return np.full((6, 6), np.nan), np.full((6, 6), np.nan)
+        return np.full((6, 6), np.nan), np.full((6, 6), np.nan), np.full((6, 6), np.nan)
     gains = A_inverse @ np.moveaxis(weighted, -1, -2)
     noise = np.sum(gains @ sight.covariances @ np.moveaxis(gains, -1, -2), axis=(0, 1))
     residuals = (sight.corners - uv)[..., None]
@@ -193,7 +194,8 @@ def pose_covariances(
     noise *= max(1.0, chi2 / max(8 * n - 6, 1))
     map_gains = -np.sum(gains @ J_marker.reshape(n, 4, 2, 6), axis=1)
     whole, relative = sight.map_covariances, sight.relative_covariances
-    return noise + correlated_sum(map_gains, whole), noise + correlated_sum(map_gains, relative)
+    from_map = correlated_sum(map_gains, whole)
+    return noise + from_map, noise + correlated_sum(map_gains, relative), from_map
 
 
 def positive(covariances: FloatArray) -> FloatArray:
