@@ -63,7 +63,9 @@ def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], columns: int
     whole = np.rint(along @ _weights(columns))
     t, centre, slope = _curve(along, across, whole)
     opposite = middle.reshape(-1, 4, 2)[:, _OPPOSITE].reshape(-1, 2) - middle
-    inward = np.sign(np.where(steep, opposite[:, 0], opposite[:, 1]))
+    # On which side of the line the opposite one lies: of a steeply tilted square it may lie mostly further along.
+    turn = span[:, 0] * opposite[:, 1] - span[:, 1] * opposite[:, 0]
+    inward = np.sign(turn * np.where(steep, -span[:, 1], span[:, 0]))
     pitch = inward[:, None] / np.sqrt(1.0 + slope * slope)
     leaning = -slope * pitch
     normal = np.empty((*pitch.shape, 2))
