@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
-from thermal_fiducial.core.filter.gating import PoseUpdate
-from thermal_fiducial.core.filter.innovations import innovations_text
+from thermal_fiducial.core.filter.innovations import innovations_text, PoseUpdate
 from thermal_fiducial.core.geometry import quaternion_from_rotation, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.files.bags import BagWriter, TRUTH_TOPIC

@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.filter.gating import PoseUpdate
-from thermal_fiducial.core.filter.innovations import innovations_of, innovations_text
+from thermal_fiducial.core.filter.innovations import innovations_of, innovations_text, PoseUpdate
 
 STAMP = 1_700_000_000_123_456_789
 

@@ -1,6 +1,6 @@
 """What may be missing on a robot: the core runs without ROS, the commands without the tools they don't need."""
 
-from pathlib import Path
+import pkgutil
 import subprocess
 import sys
 
@@ -33,8 +33,8 @@ def python(code, hidden, *arguments):
 
 
 def test_the_core_imports_without_ros_and_files():
-    folder = Path(thermal_fiducial.core.__file__).parent
-    names = [f'thermal_fiducial.core.{path.stem}' for path in folder.glob('*.py') if path.stem != '__init__']
+    core = thermal_fiducial.core
+    names = [module.name for module in pkgutil.walk_packages(core.__path__, f'{core.__name__}.')]
     result = python('import importlib\nfor name in sys.argv[1:]: importlib.import_module(name)', WITHOUT_ROS, *names)
     assert result.returncode == 0, result.stderr
 

@@ -14,10 +14,11 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.coasting import usable_seconds
-from thermal_fiducial.core.filter.gating import Belief, PoseGate, PoseUpdate, position_std, Sighting, Track
+from thermal_fiducial.core.filter.gating import Belief, PoseGate, position_std, Sighting, Track
 from thermal_fiducial.core.filter.imu import ImuStep, NoiseMonitor
 from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
 from thermal_fiducial.core.filter.initialisation import WINDOW_SECONDS
+from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.navigation_state import NavigationState
 from thermal_fiducial.core.filter.smoothing import SmoothOutput
 from thermal_fiducial.core.filter.state_output import odometry

@@ -21,7 +21,7 @@ from thermal_fiducial.config import (
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.ekf import PoseEkf
-from thermal_fiducial.core.filter.gating import PoseUpdate
+from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.geometry import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.map_refinement import refine
 from thermal_fiducial.core.marker_map import MapJump, MapperResult, MarkerMap, MarkerMapper

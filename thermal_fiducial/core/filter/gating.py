@@ -14,6 +14,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.error_state import ErrorStateFilter, Motion
 from thermal_fiducial.core.filter.imu import ImuStep
 from thermal_fiducial.core.filter.initialisation import blank_state, start, WINDOW_SECONDS
+from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.navigation_state import in_moved_map, NavigationState
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
@@ -25,24 +26,6 @@ _MOTION_SECONDS = 0.2
 #: Poses are linearised anew when the time offset has become known so many times better, and well enough when it is
 #: known to this [s]: half an angular acceleration of 5 rad/s^2 times its square is 0.01 mrad.
 _BETTER, _WELL_KNOWN = 2.0, 0.002
-
-
-@dataclass(frozen=True, slots=True)
-class PoseUpdate:
-    """What became of a camera pose."""
-
-    #: stamp of the camera, as it came
-    stamp_ns: int
-    #: whether it moved the estimate
-    accepted: bool
-    #: in words; empty when accepted
-    reason: str
-    #: squared Mahalanobis distance (6 degrees of freedom), NaN where there was nothing to compare with
-    nis: float
-    #: whether the filter started afresh with it
-    reset: bool = False
-    #: whether it waits for the IMU samples of its instant; the final word is in ``PoseEkf.decided``
-    pending: bool = False
 
 
 @dataclass(frozen=True, slots=True)

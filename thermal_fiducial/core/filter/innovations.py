@@ -1,4 +1,4 @@
-"""How well each pose fitted what was expected, as a line of text: the filter says it, the report reads it."""
+"""What became of each pose, and how well it fitted what was expected: the filter says it, the report reads it."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -7,13 +7,30 @@ import re
 
 import numpy as np
 
-from thermal_fiducial.core.filter.gating import PoseUpdate
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 #: Name of that line among the filter's figures.
 INNOVATIONS = 'innovations'
 _REFUSED = '!'
 _ONE = re.compile(rf'(\d+):([\d.e+-]+)({_REFUSED}?)')
+
+
+@dataclass(frozen=True, slots=True)
+class PoseUpdate:
+    """What became of a camera pose."""
+
+    #: stamp of the camera, as it came
+    stamp_ns: int
+    #: whether it moved the estimate
+    accepted: bool
+    #: in words; empty when accepted
+    reason: str
+    #: squared Mahalanobis distance (6 degrees of freedom), NaN where there was nothing to compare with
+    nis: float
+    #: whether the filter started afresh with it
+    reset: bool = False
+    #: whether it waits for the IMU samples of its instant; the final word is in ``PoseEkf.decided``
+    pending: bool = False
 
 
 @dataclass(frozen=True)
