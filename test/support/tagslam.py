@@ -106,7 +106,7 @@ def load(folder):
 
 
 class _Filter:
-    """Stands in for the pose filter: carries the last pose on by the recorded odometry."""
+    """Stands in for the pose filter: carries the last pose on by the recorded odometry, and what it is known to."""
 
     def __init__(self, recording):
         self._stamps = np.array([stamp for stamp, _ in recording.odometry], dtype=np.int64)
@@ -123,20 +123,20 @@ class _Filter:
     def add(self, pose):
         T = self._at(pose.stamp_ns)
         if T is not None:
-            self._anchor = (pose.stamp_ns, pose.T_map_camera, T)
+            self._anchor = (pose.stamp_ns, pose.T_map_camera, pose.covariance, T)
 
     def odometry(self, stamp):
         T = self._at(stamp)
         if T is None or self._anchor is None:
             return None
-        since, T_map_camera, T_then = self._anchor
+        since, T_map_camera, known, T_then = self._anchor
         moved = self._T_camera_odometry @ inverse(T_then) @ T @ inverse(self._T_camera_odometry)
         walk = np.sqrt(abs(stamp - since) * 1e-9)
         sigma_m = 0.005 + _DRIFT * np.linalg.norm(moved[:3, 3]) + _WALK_M * walk
         covariance = np.diag([sigma_m**2] * 3 + [(0.002 + _WALK_RAD * walk) ** 2] * 3)
         zero = np.zeros(3)
         twist = np.diag([_SPEED_SIGMA**2] * 3 + [_TURN_SIGMA**2] * 3)
-        return Odometry(stamp, T_map_camera @ moved, zero, zero, covariance, twist)
+        return Odometry(stamp, T_map_camera @ moved, zero, zero, known + covariance, twist)
 
 
 def solve(recording, passes=1):

@@ -42,6 +42,8 @@ ALIKE = 30.0
 #: Factor on the variance of what a camera pose owes to the map: of all frames of the same markers that error is the
 #: same, while whoever takes in the poses lets their errors average out.
 LASTING = 3.0
+#: Attitudes known no better than this [rad] are not told: their covariances, of first order, mean nothing.
+VAGUE = 0.2
 #: Corner errors to allow for before a marker is said to disagree with the others [px].
 TOLERANCE_PX = 0.3
 #: Candidates that are judged in one frame: bounds its time when many are new.
@@ -150,7 +152,8 @@ class MarkerMapper:
             placed, waiting = self._place_new(stamp_ns, markers[~is_known], camera, viewpoint)
             changed |= placed
         residuals = {marker.id: float(error) for marker, error in zip(known.markers, errors, strict=True)}
-        return self._result(stamp_ns, self._last, '', changed, residuals, waiting)
+        vague = _vague(location, ids)
+        return self._result(stamp_ns, None if vague else self._last, vague, changed, residuals, waiting)
 
     def _expected(self, stamp_ns: int, odometry: Odometry | None) -> Expected | None:
         if odometry is None or abs(stamp_ns - odometry.stamp_ns) >= CONTINUITY_NS:
@@ -376,6 +379,13 @@ class MarkerMapper:
         return MapperResult(
             stamp_ns, pose, reason, changed, residuals or {}, waiting or {}, quarantined, self.map.version, self.resets
         )
+
+
+def _vague(location: Location, ids: tuple[int, ...]) -> str:
+    """Why a pose that is known by its order of magnitude only is not told; empty for others."""
+    std = float(np.sqrt(np.trace(location.covariance[3:, 3:])))
+    listed = ', '.join(str(key) for key in ids)
+    return f'known to {np.rad2deg(std):.0f} degrees only, by marker {listed}' if std > VAGUE else ''
 
 
 def _fused(location: Location, expected: Expected | None) -> Fused:

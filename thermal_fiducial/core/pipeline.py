@@ -117,7 +117,7 @@ class Pipeline:
         if frame.counts is None or self.camera is None:
             return FrameResult(stamp_ns, withheld=frame.reason or 'no camera_info')
         markers = self.detector.detect(stamp_ns, frame.counts, self.camera, self._odometry)
-        mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry.latest())
+        mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry.nearest(stamp_ns))
         update = None if mapping.pose is None else self.filter.add_pose(_published_pose(mapping.pose))
         jump = self._refine(stamp_ns)
         if jump is not None:

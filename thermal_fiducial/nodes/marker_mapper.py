@@ -97,7 +97,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
 
     def _on_markers(self, message: PointCloud2) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
-        result = self.mapper.process(stamp, convert.markers(message), self.camera(), self.odometry.latest())
+        result = self.mapper.process(stamp, convert.markers(message), self.camera(), self.odometry.nearest(stamp))
         self._result = result
         self._newest_ns = max(stamp, self._newest_ns) if stamp >= self._newest_ns - LATEST_NS else stamp
         if result.pose is not None:
