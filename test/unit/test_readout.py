@@ -8,7 +8,7 @@ import pytest
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.vision.frame import Frame, Places
-from thermal_fiducial.core.vision.lag import Twist
+from thermal_fiducial.core.vision.motion import Twist
 from thermal_fiducial.core.vision.readout import delays, expected_displacement, seen_displacement, stretch
 
 CAMERA = Camera(640, 512, [[440.0, 0, 319.5], [0, 440.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])

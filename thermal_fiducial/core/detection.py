@@ -22,18 +22,10 @@ from thermal_fiducial.core.vision.following import Followed
 from thermal_fiducial.core.vision.frame import Frame, Places
 from thermal_fiducial.core.vision.guided import camera_in_map, Expected, KnownMarkers, look
 from thermal_fiducial.core.vision.ids import among, pairs
-from thermal_fiducial.core.vision.lag import (
-    markers_sharpened,
-    MotionTracker,
-    plausible,
-    REMAINING,
-    SmearField,
-    Tracked,
-    Twist,
-    without_lag,
-)
+from thermal_fiducial.core.vision.lag import markers_sharpened, REMAINING, SmearField, without_lag
 from thermal_fiducial.core.vision.local_corners import local_corners
 from thermal_fiducial.core.vision.marker_rows import marker_rows
+from thermal_fiducial.core.vision.motion import MotionTracker, plausible, Tracked, Twist
 from thermal_fiducial.core.vision.odometry_log import OdometryLog
 from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.core.vision.readout import expected_displacement, seen_displacement

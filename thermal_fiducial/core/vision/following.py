@@ -9,7 +9,7 @@ from thermal_fiducial.core.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.core.vision.decoding import Decoder
 from thermal_fiducial.core.vision.frame import Frame, Places
-from thermal_fiducial.core.vision.lag import Tracked, Twist
+from thermal_fiducial.core.vision.motion import Tracked, Twist
 from thermal_fiducial.core.vision.readout import expected_displacement
 from thermal_fiducial.core.vision.search import Found
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
-from thermal_fiducial.core.vision.lag import interaction, MEMORY_AGE, Twist
+from thermal_fiducial.core.vision.lag import MEMORY_AGE
+from thermal_fiducial.core.vision.motion import interaction, Twist
 
 
 @dataclass(frozen=True, slots=True)

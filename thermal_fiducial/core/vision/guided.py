@@ -16,7 +16,7 @@ from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.pose import marker_corners
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from thermal_fiducial.core.vision.decoding import Decoder, Reading
-from thermal_fiducial.core.vision.lag import Twist
+from thermal_fiducial.core.vision.motion import Twist
 from thermal_fiducial.core.vision.scratch import Scratch
 from thermal_fiducial.core.vision.search import Found, read_quads
 

@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.core.camera import ImagePoints
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.core.vision.frame import Frame, Places
-from thermal_fiducial.core.vision.lag import interaction, Twist
+from thermal_fiducial.core.vision.motion import interaction, Twist
 
 
 def delays(rows: FloatArray, frame: Frame) -> FloatArray:

@@ -14,16 +14,8 @@ from thermal_fiducial.core.adjustment.segments import Memory
 from thermal_fiducial.core.corners import refine_corners, RefinedCorners
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from thermal_fiducial.core.vision.frame import Frame, Places
-from thermal_fiducial.core.vision.lag import (
-    GAIN,
-    markers_sharpened,
-    memory_maps,
-    model_error,
-    MotionTracker,
-    REMAINING,
-    SPREAD,
-    Twist,
-)
+from thermal_fiducial.core.vision.lag import GAIN, markers_sharpened, memory_maps, model_error, REMAINING, SPREAD
+from thermal_fiducial.core.vision.motion import MotionTracker, Twist
 from thermal_fiducial.core.vision.readout import expected_displacement, seen_displacement, stretch
 from thermal_fiducial.core.vision.scratch import Scratch
 from thermal_fiducial.core.vision.search import Found

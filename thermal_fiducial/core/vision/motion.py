@@ -1,0 +1,279 @@
+"""Motion of the camera from frame to frame, as markers and the filter tell it.
+
+The motion is that of a rigid scene seen from a camera with twist (v, omega) (F. Chaumette, S. Hutchinson, "Visual
+servo control I", 2006, eq. 11). A Kalman filter holds the twist and its change (R. Singer, "Estimating optimal tracking
+filter performance for manned maneuvering targets", 1970): predicted from the last frame, corrected by the filter's
+states round the frame and by how the markers' corners moved since.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+import math
+
+import numpy as np
+
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.vision.ids import pairs
+
+# Twist of which nothing is known: m/s and rad/s of a brisk flight.
+_UNKNOWN = np.full(6, 1.5**2)
+# Variance of an acceleration of which nothing is known [m/s^2, rad/s^2], and how long it lasts [s].
+_ACCELERATION, _LASTS_S = np.array([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2, 0.4
+_STALE_S = 0.15
+# So many states of the filter tell the acceleration too, as well as the filter knows the vertical and its biases.
+_ENOUGH_STATES, _UNSURE_ACCELERATION = 4, np.array([0.3, 0.3, 0.3, 0.0, 0.0, 0.0]) ** 2
+# Variance of a twist that is said to be without error [m^2/s^2, rad^2/s^2].
+_LEAST_VARIANCE = 1e-6
+# Jitter of the camera's stamps [s].
+_JITTER_S = 0.001
+_VALUE, _CHANGE = np.arange(6), np.arange(6, 12)
+# No camera that sees markers moves faster: such odometry tells nothing [m/s, rad/s].
+_FASTEST, _FASTEST_TURN = 20.0, 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Twist:
+    """Velocity of the camera in its own frame, and how it changes.
+
+    Parameters
+    ----------
+    value : (6,) v [m/s], omega [rad/s] at a frame's stamp
+    covariance : (6, 6) of the value, or (12, 12) of value and acceleration
+    acceleration : (6,) of the value
+    """
+
+    value: FloatArray
+    covariance: FloatArray
+    acceleration: FloatArray = field(default_factory=lambda: np.zeros(6))
+
+    def ago(self, seconds: float) -> FloatArray:
+        """Value (6,) so many seconds before the stamp."""
+        return self.value - seconds * self.acceleration
+
+    def covariance_ago(self, seconds: float) -> FloatArray:
+        """Covariance (6, 6) of :meth:`ago`."""
+        P = self.covariance
+        return P[:6, :6] - seconds * (P[:6, 6:] + P[6:, :6]) + seconds**2 * P[6:, 6:]
+
+
+def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
+    """Derivative (..., 2, 6) of the velocity of normalised points (..., 2) at ``depth`` (...) [m] by the twist."""
+    a, b, inverse = x[..., 0], x[..., 1], 1.0 / depth
+    J = np.zeros((*x.shape, 6))
+    J[..., 0, 0] = J[..., 1, 1] = -inverse
+    J[..., 2] = x * inverse[..., None]
+    J[..., 0, 3], J[..., 1, 3] = a * b, 1.0 + b * b
+    J[..., 0, 4], J[..., 1, 4] = -1.0 - a * a, -J[..., 0, 3]
+    J[..., 0, 5], J[..., 1, 5] = b, -a
+    return J
+
+
+def camera_twist(odometry: Odometry, T_body_camera: FloatArray) -> Twist:
+    """Twist of the camera from that of the body."""
+    R = T_body_camera[:3, :3].T
+    transfer = np.zeros((6, 6))
+    transfer[:3, :3] = transfer[3:, 3:] = R
+    transfer[:3, 3:] = -R @ geometry.skew(T_body_camera[:3, 3])
+    body = np.concatenate([odometry.velocity_body, odometry.angular_velocity_body])
+    covariance = transfer @ odometry.twist_covariance @ transfer.T
+    return Twist(transfer @ body, covariance)
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """Markers of a frame that the next one should show.
+
+    Parameters
+    ----------
+    ids : (N,)
+    x : (N, 4, 2) normalised corners
+    depth : (N, 4) [m]
+    clarity : (N,) contrast over the noise of a pixel
+    """
+
+    ids: IntArray
+    x: FloatArray
+    depth: FloatArray
+    clarity: FloatArray
+
+    def only(self, keep: BoolArray) -> 'Tracked':
+        """Those of the markers ``keep`` (N,)."""
+        return Tracked(self.ids[keep], self.x[keep], self.depth[keep], self.clarity[keep])
+
+    @staticmethod
+    def none() -> 'Tracked':
+        """No markers."""
+        return Tracked(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4)), np.zeros(0))
+
+
+class MotionTracker:
+    """The camera's twist over the frames, and the markers that it saw."""
+
+    def __init__(self, T_body_camera: FloatArray, lag: float = 0.0) -> None:
+        self._T_body_camera, self._lag = T_body_camera, lag
+        self._stamp_ns: int | None = None
+        self._twist: Twist | None = None
+        self._seen = Tracked.none()
+
+    def predict(self, stamp_ns: int, odometry: Sequence[Odometry]) -> Twist | None:
+        """Twist expected at a frame; None when nothing is known.
+
+        Parameters
+        ----------
+        odometry : states round the time that smears the frame, or the nearest that there is; in the camera's clock
+        """
+        dt = self._since(stamp_ns)
+        carried = _carried(self._twist, dt) if self._twist is not None and dt is not None else None
+        if len(odometry) >= _ENOUGH_STATES:
+            return _joined(carried or _unknown(), _line_through(stamp_ns, odometry, self._T_body_camera))
+        if len(odometry) == 0 or abs(stamp_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
+            return carried
+        seen, later = camera_twist(odometry[-1], self._T_body_camera), (odometry[-1].stamp_ns - stamp_ns) * 1e-9
+        information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + np.diag(_growth(abs(later))[0])))
+        return _corrected(carried or _unknown(), information, information @ seen.value, later)
+
+    def expected(self, stamp_ns: int, twist: Twist) -> Tracked:
+        """The last frame's markers where the camera's motion since has carried them."""
+        dt = self._since(stamp_ns)
+        if dt is None or self._twist is None or len(self._seen.ids) == 0:
+            return Tracked.none()
+        step = (0.5 * dt) * (twist.value + self._twist.value)
+        moved = geometry.inverse(geometry.transform(geometry.so3_exp(step[3:]), step[:3]))
+        rays = np.concatenate([self._seen.x, np.ones((*self._seen.x.shape[:-1], 1))], axis=-1)
+        points = (rays * self._seen.depth[..., None]) @ moved[:3, :3].T + moved[:3, 3]
+        depth = np.maximum(points[..., 2], 1e-3)
+        return replace(self._seen, x=points[..., :2] / depth[..., None], depth=depth)
+
+    def correct(
+        self,
+        stamp_ns: int,
+        predicted: Twist | None,
+        ids: IntArray,
+        x: FloatArray,
+        depth: FloatArray,
+        noise: FloatArray,
+        *,
+        freed: bool = True,
+    ) -> Twist | None:
+        """Twist from how the corners moved since the last frame.
+
+        Parameters
+        ----------
+        ids : (N,)
+        x : (N, 4, 2) normalised corners
+        depth : (N, 4) [m]
+        noise : (N,) standard deviation of a corner in normalised coordinates
+        freed : whether the corners are where they would be without lag; they lie one time constant back otherwise
+        """
+        now, before = pairs(ids, self._seen.ids)
+        dt = self._since(stamp_ns)
+        if len(now) == 0 or dt is None:
+            return predicted
+        begin, end = dt + (self._lag if self._twist is None else 0.0), 0.0 if freed else self._lag
+        seconds = begin - end
+        A = interaction(0.5 * (x[now] + self._seen.x[before]), depth[now]).reshape(-1, 6)
+        velocity = (x[now] - self._seen.x[before]).reshape(-1) / seconds
+        weighted = A.T * np.repeat((seconds / (1.5 * noise[now])) ** 2, 8)
+        information, seen = weighted @ A, weighted @ velocity
+        if predicted is not None:
+            # Stamps that jitter stretch or shrink all velocities of a frame alike.
+            along = math.sqrt(2.0) * _JITTER_S / seconds * predicted.value
+            spread = information @ along
+            share = spread / (1.0 + along @ spread)
+            information, seen = information - np.outer(spread, share), seen - share * (along @ seen)
+        return _corrected(predicted or _unknown(), information, seen, -0.5 * (begin + end))
+
+    def all_clearer_than(self, clarity: float) -> bool:
+        """Whether there were markers, all of more contrast over noise."""
+        return len(self._seen.ids) > 0 and bool(np.abs(self._seen.clarity).min() > clarity)
+
+    def remember(self, stamp_ns: int, twist: Twist | None, seen: Tracked) -> None:
+        """Keep a frame's twist and markers for the next one; of one that comes late there is nothing to keep."""
+        if self._stamp_ns is not None and 0 < self._stamp_ns - stamp_ns < _STALE_S * 1e9:
+            return
+        self._stamp_ns, self._twist, self._seen = stamp_ns, twist, seen
+
+    def _since(self, stamp_ns: int) -> float | None:
+        """Time since the last frame [s], negative for one that comes late; None when that tells nothing of this one."""
+        if self._stamp_ns is None or not 0 < abs(stamp_ns - self._stamp_ns) < _STALE_S * 1e9:
+            return None
+        return (stamp_ns - self._stamp_ns) * 1e-9
+
+
+def _unknown() -> Twist:
+    return Twist(np.zeros(6), np.diag(np.concatenate([_UNKNOWN, _ACCELERATION])))
+
+
+def _carried(twist: Twist, seconds: float) -> Twist:
+    """Twist so much later, its acceleration having died down a little and changed at random; or as much earlier."""
+    left, sign = math.exp(-abs(seconds) / _LASTS_S), math.copysign(1.0, seconds)
+    lasting = sign * _LASTS_S * (1.0 - left)
+    F = np.eye(12)
+    F[_VALUE, _CHANGE] = lasting
+    F[_CHANGE, _CHANGE] = left
+    covariance = F @ twist.covariance @ F.T
+    covariance[_VALUE, _VALUE] += (growth := _growth(abs(seconds)))[0]
+    covariance[_VALUE, _CHANGE] += sign * growth[1]
+    covariance[_CHANGE, _VALUE] += sign * growth[1]
+    covariance[_CHANGE, _CHANGE] += growth[2]
+    return Twist(twist.value + lasting * twist.acceleration, covariance, left * twist.acceleration)
+
+
+def _growth(seconds: float) -> FloatArray:
+    """Variances (3, 6) that a time adds to the twist, to it with its acceleration, and to that (Singer, eq. 7)."""
+    t, left = seconds / _LASTS_S, math.exp(-seconds / _LASTS_S)
+    twist, both = _LASTS_S**2 * (2.0 * t - 3.0 + 4.0 * left - left**2), _LASTS_S * (1.0 - left) ** 2
+    return np.asarray(np.multiply.outer([twist, both, 1.0 - left**2], _ACCELERATION))
+
+
+def _line_through(stamp_ns: int, odometry: Sequence[Odometry], T_body_camera: FloatArray) -> Twist:
+    """Twist that changes evenly through those of K states.
+
+    The error of the velocity is the same in all, that of a turn rate, a gyroscope's noise, is new in each.
+    """
+    twists = [camera_twist(state, T_body_camera) for state in odometry]
+    values = np.stack([twist.value for twist in twists])
+    t = np.array([(state.stamp_ns - stamp_ns) * 1e-9 for state in odometry])
+    middle = float(t.mean())
+    square = float(np.sum((t - middle) ** 2))
+    acceleration = (t - middle) @ values / square
+    once, anew = np.diag([1.0] * 3 + [0.0] * 3), np.diag([0.0] * 3 + [1.0] * 3)
+    typical = np.mean([twist.covariance for twist in twists], axis=0)
+    noise = anew @ typical @ anew
+    changes = np.diag(_growth(float(t[-1] - t[0]))[2] + _UNSURE_ACCELERATION)
+    covariance = np.zeros((12, 12))
+    slope = noise / square + changes
+    covariance[:6, :6] = once @ typical @ once + noise / len(t) + middle**2 * slope + _LEAST_VARIANCE * np.eye(6)
+    covariance[:6, 6:] = covariance[6:, :6] = -middle * slope
+    covariance[6:, 6:] = slope
+    return Twist(values.mean(axis=0) - middle * acceleration, covariance, acceleration)
+
+
+def _joined(first: Twist, second: Twist) -> Twist:
+    """What two independent estimates tell together."""
+    information: FloatArray = np.asarray(np.linalg.inv(second.covariance))
+    mean = np.concatenate([second.value, second.acceleration])
+    return _updated(first, information, information @ mean)
+
+
+def _corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later: float) -> Twist:
+    """Twist when its value so much later is known by ``information`` (6, 6), times the value ``weighted`` (6,)."""
+    H = np.concatenate([np.eye(6), later * np.eye(6)], axis=1)
+    return _updated(twist, H.T @ information @ H, H.T @ weighted)
+
+
+def _updated(twist: Twist, information: FloatArray, weighted: FloatArray) -> Twist:
+    """Twist with information (12, 12) on value and acceleration added, and that times the value (12,)."""
+    prior = np.linalg.inv(twist.covariance)
+    covariance: FloatArray = np.asarray(np.linalg.inv(prior + information))
+    mean = covariance @ (prior @ np.concatenate([twist.value, twist.acceleration]) + weighted)
+    return Twist(mean[:6], covariance, mean[6:])
+
+
+def plausible(odometry: Odometry) -> bool:
+    """Whether a camera that sees markers may move so: anything else tells nothing."""
+    speed, turn = np.linalg.norm(odometry.velocity_body), np.linalg.norm(odometry.angular_velocity_body)
+    finite = np.isfinite(odometry.T_map_body).all() and np.isfinite(odometry.twist_covariance).all()
+    return bool(speed <= _FASTEST and turn <= _FASTEST_TURN and finite)
