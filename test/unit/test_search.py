@@ -8,7 +8,7 @@ from thermal_fiducial.core.vision.contrast import noise_of
 from thermal_fiducial.core.vision.decoding import Decoder, Reading, shrunk
 from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.core.vision.scratch import Scratch
-from thermal_fiducial.core.vision.search import _inside_out, BlindSearch, Found
+from thermal_fiducial.core.vision.search import _inside_out, BlindSearch, Found, Sought
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))
@@ -89,6 +89,14 @@ def test_what_is_seen_already_is_not_sought():
     seen = Found(np.array([21]), CORNERS[None], np.ones(1), np.ones(1, dtype=bool))
     found = SEARCH.search(image, noise_of(image), image, EVERY, ArucoDetectorConfig(), seen)
     assert found.ids.tolist() == [8]
+
+
+@pytest.mark.parametrize('sought', [Sought.FINE, Sought.FAINT])
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_either_resolution_shows_a_clear_marker(sought, sign):
+    image = scene(21, 50.0 * sign, 2.0)
+    found = SEARCH.search(image, noise_of(image), image, EVERY, ArucoDetectorConfig(), sought=sought)
+    assert found.ids.tolist() == [21]
 
 
 def test_rules():

@@ -31,7 +31,7 @@ from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.core.vision.readout import expected_displacement, seen_displacement
 from thermal_fiducial.core.vision.refining import Refinement, Refiner, sides_px, SMEAR_THAT_MATTERS_PX, WINDOW_MARGIN_PX
 from thermal_fiducial.core.vision.scratch import Scratch
-from thermal_fiducial.core.vision.search import BlindSearch, confirmed, Found, merged
+from thermal_fiducial.core.vision.search import BlindSearch, confirmed, Found, merged, Sought
 
 # Smear by lag below which the search misses nothing [px].
 _SMEAR_THAT_HIDES_PX = 2.0
@@ -39,6 +39,8 @@ _SMEAR_THAT_HIDES_PX = 2.0
 _ENOUGH = 0.5
 # Contrast over noise beyond which the column pattern of the array displaces no side.
 _CLEARER_THAN_COLUMNS = 100.0
+# Contrast over noise beyond which a marker shows at full and at half the resolution.
+_CLEAR = 20.0
 # Nearer to the rim of the image than this a marker is not expected to be seen, or may be cut off [px].
 _RIM_PX = 2.0
 # A marker that was read off its corners by less than this need not be read again [cells].
@@ -90,6 +92,7 @@ class MarkerDetector:
         self._map: dict[int, tuple[FloatArray, float]] = {}
         self._known = KnownMarkers(self._map)
         self._since_blind = 0
+        self._sought = Sought.ALL
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
         """Markers that are known: ID to (T_map_marker, side [m])."""
@@ -193,10 +196,17 @@ class MarkerDetector:
         if (complete or (holds and in_map is not None)) and self._since_blind < interval:
             return expected, followed
         self._since_blind = 0
+        self._sought = self._sought_next(complete=complete)
         scene = self._scene(frame.image, frame.camera, frame.twist)
         allowed = self._allowed()
-        blind = self._search.search(frame.image, frame.noise, scene, allowed, self.config, expected)
+        blind = self._search.search(frame.image, frame.noise, scene, allowed, self.config, expected, self._sought)
         return merged(expected, self._unrolled(frame, blind)), followed
+
+    def _sought_next(self, *, complete: bool) -> Sought:
+        """Both resolutions; where all that is expected is seen, so clearly that either shows it, only one, in turn."""
+        if not (complete and self._motion.all_clearer_than(_CLEAR)):
+            return Sought.ALL
+        return Sought.FAINT if self._sought == Sought.FINE else Sought.FINE
 
     def _unrolled(self, frame: Frame, found: Found) -> Found:
         """Markers where they would be if all rows were seen at once."""

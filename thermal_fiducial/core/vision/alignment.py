@@ -61,6 +61,8 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
     J = np.empty((len(ids), len(grid.a), 15))
     J[..., 8:14] = grid.smooth
     J[..., 14] = (grid.blur @ cells @ grid.blur.T).reshape(len(ids), -1)
+    image, origin = _window(image, quads, decoder.cells)
+    quads = quads - origin
     picture = cv2.GaussianBlur(image - np.float32(image.mean()), (0, 0), _SMOOTHING)
     slope_u = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.125)
     slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.125)
@@ -76,7 +78,17 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
         step = -np.linalg.solve(information, np.swapaxes(J, -1, -2) @ value)[:, :8, 0]
         longest = _LONGEST / decoder.cells * np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)[:, None] / np.sqrt(2.0)
         quads = quads + np.swapaxes(np.clip(step, -longest, longest).reshape(-1, 2, 4), -1, -2)
-    return quads
+    return quads + origin
+
+
+def _window(image: Float32Array, quads: FloatArray, cells: int) -> tuple[Float32Array, FloatArray]:
+    """The part of the image that quadrilaterals (Q, 4, 2) can come to see, and its first pixel (2,)."""
+    extent = np.ptp(quads, axis=1).max()
+    reach = (_STEPS * _LONGEST + _OUTSIDE) / cells * extent + 4.0 * _SMOOTHING + 2.0
+    height, width = image.shape
+    first = np.clip(quads.min(axis=(0, 1)) - reach, 0, (width - 1, height - 1)).astype(int)
+    last = np.clip(quads.max(axis=(0, 1)) + reach, first, (width - 1, height - 1)).astype(int)
+    return image[first[1] : last[1] + 1, first[0] : last[0] + 1], first.astype(np.float64)
 
 
 def _blur(places: FloatArray, cells: int) -> FloatArray:

@@ -1,6 +1,7 @@
 """Blind search for markers in a frame."""
 
 from dataclasses import dataclass, fields
+from enum import auto, Flag
 
 import numpy as np
 
@@ -47,6 +48,14 @@ _PLATE_CELLS = 1.6
 _RIM = 2.0
 # Pixels along a side that the refinement uses of a long one.
 _SEEN_PX = 60.0
+
+
+class Sought(Flag):
+    """At which resolutions markers are sought."""
+
+    FINE = auto()
+    FAINT = auto()
+    ALL = FINE | FAINT
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +105,7 @@ class BlindSearch:
         allowed: BoolArray,
         config: ArucoDetectorConfig,
         seen: Found | None = None,
+        sought: Sought = Sought.ALL,
     ) -> Found:
         """Markers with IDs ``allowed`` (M,), each ID once.
 
@@ -105,13 +115,17 @@ class BlindSearch:
         noise : standard deviation of a pixel in it [counts]
         scene : the same freed of lag, which costs noise: the finest markers are sought there, the faintest in ``image``
         seen : markers that are there: nothing is sought in them and their plates
+        sought : at which resolutions
         """
         decoder = self._decoder
         seen = Found.none() if seen is None else seen
         hidden = _grown(seen.corners_px, 1.0 + 2.0 * _PLATE_CELLS / decoder.cells)
-        fine = find_quads(dark(scene, noise, _FINE, self._scratch), config.min_side_px, hidden)
+        fine = faint = np.zeros((0, 4, 2))
+        if Sought.FINE in sought:
+            fine = find_quads(dark(scene, noise, _FINE, self._scratch), config.min_side_px, hidden)
         half = without_columns(halved(image, self._scratch), 0.5 * noise, self._scratch)
-        faint = self._faint(half, noise, config.min_side_px, hidden)
+        if Sought.FAINT in sought:
+            faint = self._faint(half, noise, config.min_side_px, hidden)
         quads = np.concatenate([fine, faint, shrunk(faint, decoder.cells)])
         if len(quads) == 0:
             return Found.none()
