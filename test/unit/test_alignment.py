@@ -43,10 +43,10 @@ def test_what_else_is_in_the_image_does_not_matter():
     larger = cv2.copyMakeBorder(image, 60, 50, 70, 80, cv2.BORDER_REPLICATE)
     here, there = (
         aligned(view, quads, np.array([13]), np.zeros(1, dtype=np.int64), DECODER)
-        for view, quads in ((image, rough), (larger, rough + (70.0, 60.0)))
+        for view, quads in ((image, rough), (larger, rough + np.array([70.0, 60.0])))
     )
     # single precision of counts about another mean
-    np.testing.assert_allclose(there - (70.0, 60.0), here, atol=1e-3)
+    np.testing.assert_allclose(there - np.array([70.0, 60.0]), here, atol=1e-3)
 
 
 def test_what_shows_nothing_stays_finite():
