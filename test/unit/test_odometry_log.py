@@ -35,8 +35,11 @@ def test_nearest_and_between_whatever_the_order_of_arrival():
 
 
 def test_many_are_thinned_out_evenly():
-    assert stamps(told(*states(20)).between(0, 10**9, 10)) == [2 * k * PERIOD_NS for k in range(10)]
-    assert len(told(*states(21)).between(0, 10**9, 10)) <= 10
+    assert stamps(told(*states(19)).between(0, 10**9, 10)) == [2 * k * PERIOD_NS for k in range(10)]
+    uneven = stamps(told(*states(12)).between(0, 10**9, 10))
+    assert len(uneven) == 10
+    assert (uneven[0], uneven[-1]) == (0, 11 * PERIOD_NS)
+    assert len(told(*states(12)).between(0, 10**9, 1)) == 1
 
 
 def test_only_those_asked_for_are_read():

@@ -72,13 +72,21 @@ def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
 
 def camera_twist(odometry: Odometry, T_body_camera: FloatArray) -> Twist:
     """Twist of the camera from that of the body."""
+    transfer = _from_body(T_body_camera)
+    return Twist(transfer @ _body_twist(odometry), transfer @ odometry.twist_covariance @ transfer.T)
+
+
+def _from_body(T_body_camera: FloatArray) -> FloatArray:
+    """What makes a camera's twist (6,) of the body's."""
     R = T_body_camera[:3, :3].T
     transfer = np.zeros((6, 6))
     transfer[:3, :3] = transfer[3:, 3:] = R
     transfer[:3, 3:] = -R @ geometry.skew(T_body_camera[:3, 3])
-    body = np.concatenate([odometry.velocity_body, odometry.angular_velocity_body])
-    covariance = transfer @ odometry.twist_covariance @ transfer.T
-    return Twist(transfer @ body, covariance)
+    return transfer
+
+
+def _body_twist(odometry: Odometry) -> FloatArray:
+    return np.concatenate([odometry.velocity_body, odometry.angular_velocity_body])
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,47 +241,57 @@ def _line_through(stamp_ns: int, odometry: Sequence[Odometry], T_body_camera: Fl
 
     The error of the velocity is the same in all, that of a turn rate, a gyroscope's noise, is new in each.
     """
-    twists = [camera_twist(state, T_body_camera) for state in odometry]
-    values = np.stack([twist.value for twist in twists])
+    transfer = _from_body(T_body_camera)
+    values = np.stack([_body_twist(state) for state in odometry]) @ transfer.T
     t = np.array([(state.stamp_ns - stamp_ns) * 1e-9 for state in odometry])
     middle = float(t.mean())
-    square = float(np.sum((t - middle) ** 2))
-    acceleration = (t - middle) @ values / square
-    once, anew = np.diag([1.0] * 3 + [0.0] * 3), np.diag([0.0] * 3 + [1.0] * 3)
-    typical = np.mean([twist.covariance for twist in twists], axis=0)
-    noise = anew @ typical @ anew
-    changes = np.diag(_growth(float(t[-1] - t[0]))[2] + _UNSURE_ACCELERATION)
-    covariance = np.zeros((12, 12))
-    slope = noise / square + changes
-    covariance[:6, :6] = once @ typical @ once + noise / len(t) + middle**2 * slope + _LEAST_VARIANCE * np.eye(6)
+    off = t - middle
+    square = float(off @ off)
+    acceleration = off @ values / square
+    typical = transfer @ (sum(state.twist_covariance for state in odometry) / len(t)) @ transfer.T
+    noise = np.zeros((6, 6))
+    noise[3:, 3:] = typical[3:, 3:]
+    slope = noise / square + np.diag(_growth(float(t[-1] - t[0]))[2] + _UNSURE_ACCELERATION)
+    covariance = np.empty((12, 12))
+    covariance[:6, :6] = noise / len(t) + middle**2 * slope + _LEAST_VARIANCE * np.eye(6)
+    covariance[:3, :3] += typical[:3, :3]
     covariance[:6, 6:] = covariance[6:, :6] = -middle * slope
     covariance[6:, 6:] = slope
     return Twist(values.mean(axis=0) - middle * acceleration, covariance, acceleration)
 
 
 def _joined(first: Twist, second: Twist) -> Twist:
-    """What two independent estimates tell together."""
-    information: FloatArray = np.asarray(np.linalg.inv(second.covariance))
-    mean = np.concatenate([second.value, second.acceleration])
-    return _updated(first, information, information @ mean)
+    """What two independent estimates tell together: of covariances P and R the gain P inv(P + R)."""
+    gain = np.linalg.solve(first.covariance + second.covariance, first.covariance).T
+    change = gain @ np.concatenate([second.value - first.value, second.acceleration - first.acceleration])
+    covariance = _symmetric(gain @ second.covariance)
+    return Twist(first.value + change[:6], covariance, first.acceleration + change[6:])
 
 
 def _corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later: float) -> Twist:
-    """Twist when its value so much later is known by ``information`` (6, 6), times the value ``weighted`` (6,)."""
-    H = np.concatenate([np.eye(6), later * np.eye(6)], axis=1)
-    return _updated(twist, H.T @ information @ H, H.T @ weighted)
+    """Twist when its value so much later is known by ``information`` (6, 6), times the value ``weighted`` (6,).
+
+    The update of a Kalman filter with H = [I, later I], ``P - P H^T inv(I + W H P H^T) W H P`` of an information W that
+    need not be invertible.
+    """
+    P = twist.covariance
+    HP = P[:6] + later * P[6:]
+    S = np.eye(6) + information @ (HP[:, :6] + later * HP[:, 6:])
+    residual = weighted - information @ twist.ago(-later)
+    solved = np.linalg.solve(S, np.concatenate([information @ HP, residual[:, None]], axis=1))
+    change = HP.T @ solved
+    mean = change[:, 12]
+    return Twist(twist.value + mean[:6], _symmetric(P - change[:, :12]), twist.acceleration + mean[6:])
 
 
-def _updated(twist: Twist, information: FloatArray, weighted: FloatArray) -> Twist:
-    """Twist with information (12, 12) on value and acceleration added, and that times the value (12,)."""
-    prior = np.linalg.inv(twist.covariance)
-    covariance: FloatArray = np.asarray(np.linalg.inv(prior + information))
-    mean = covariance @ (prior @ np.concatenate([twist.value, twist.acceleration]) + weighted)
-    return Twist(mean[:6], covariance, mean[6:])
+def _symmetric(P: FloatArray) -> FloatArray:
+    """Without what rounding makes of a covariance."""
+    return np.asarray(0.5 * (P + P.T))
 
 
 def plausible(odometry: Odometry) -> bool:
     """Whether a camera that sees markers may move so: anything else tells nothing."""
-    speed, turn = np.linalg.norm(odometry.velocity_body), np.linalg.norm(odometry.angular_velocity_body)
-    finite = np.isfinite(odometry.T_map_body).all() and np.isfinite(odometry.twist_covariance).all()
-    return bool(speed <= _FASTEST and turn <= _FASTEST_TURN and finite)
+    v, w = odometry.velocity_body, odometry.angular_velocity_body
+    # A sum of finite numbers is finite.
+    finite = math.isfinite(odometry.T_map_body.sum()) and math.isfinite(odometry.twist_covariance.sum())
+    return bool(v @ v <= _FASTEST**2 and w @ w <= _FASTEST_TURN**2 and finite)

@@ -41,6 +41,8 @@ class OdometryLog:
         return None if best is None else self._readers[best]()
 
     def between(self, first_ns: int, last_ns: int, at_most: int) -> list[Odometry]:
-        """States from the first to the last stamp, evenly thinned out where there are more than ``at_most``."""
+        """States from the first to the last stamp, of more than ``at_most`` so many, as evenly apart as can be."""
         first, last = bisect_left(self._stamps_ns, first_ns), bisect_right(self._stamps_ns, last_ns)
-        return [read() for read in self._readers[first : last : -(-(last - first) // at_most) or 1]]
+        count = last - first
+        kept = min(count, at_most)
+        return [self._readers[first + place * (count - 1) // max(kept - 1, 1)]() for place in range(kept)]
