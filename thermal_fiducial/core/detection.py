@@ -145,8 +145,8 @@ class MarkerDetector:
         ahead_ns = round(self.config.camera_time_offset * 1e9) + self._clock_offset.ns
         stamp_ns, lag_ns = stamp_ns + ahead_ns, round(1e9 * max(self.config.bolometer_lag, _SHORTEST_LAG_S))
         states = odometry.between(stamp_ns - _MEMORY_LAGS * lag_ns, stamp_ns + lag_ns, _STATES)
-        nearest = odometry.nearest(stamp_ns)
-        states = states or ([] if nearest is None else [nearest])
+        if not states and (nearest := odometry.nearest(stamp_ns)) is not None:
+            states = [nearest]
         return [replace(state, stamp_ns=state.stamp_ns - ahead_ns) for state in states if plausible(state)]
 
     def _frame(self, stamp_ns: int, counts: Counts | Gray, camera: Camera, twist: Twist | None) -> Frame:

@@ -1,24 +1,18 @@
 """Base of the nodes that look at markers: the camera's calibration, and the filter's odometry as a hint."""
 
 from functools import partial
-import struct
 from typing import Any, TypeVar
 
 from nav_msgs.msg import Odometry as OdometryMessage
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
 from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.vision.odometry_log import OdometryLog
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros import convert, odometry_bytes, qos
 from thermal_fiducial.ros.node import StageNode
 
 Config = TypeVar('Config')
-
-# A message in CDR begins with four bytes that say so, then, here, the stamp of its header.
-_CDR_HEADER, _STAMP = 4, struct.Struct('<iI')
 
 
 class CameraStageNode(StageNode[Config]):
@@ -53,9 +47,8 @@ class CameraStageNode(StageNode[Config]):
         return {'calibrations': self._calibrations}
 
     def _on_odometry(self, message: bytes) -> None:
-        """A few of these are wanted at frame rate, and only they are deserialised."""
-        seconds, nanoseconds = _STAMP.unpack_from(message, _CDR_HEADER)
-        self.odometry.add(10**9 * seconds + nanoseconds, partial(_read, message))
+        """A few of these are wanted at frame rate, and only they are read."""
+        self.odometry.add(odometry_bytes.stamp_ns(message), partial(odometry_bytes.odometry, message))
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         camera = convert.camera(message)
@@ -65,7 +58,3 @@ class CameraStageNode(StageNode[Config]):
         self._calibrations += 1
         if self._calibrations > 1:
             self.get_logger().warning('camera_info has changed: the new calibration is used from here on')
-
-
-def _read(message: bytes) -> Odometry:
-    return convert.odometry(deserialize_message(message, OdometryMessage))

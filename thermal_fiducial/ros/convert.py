@@ -85,7 +85,11 @@ def transform_of(message: Pose) -> FloatArray:
         A value that is not finite, or a quaternion that is none.
     """
     p, q = message.position, message.orientation
-    values = np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
+    return transform_of_values(np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w]))
+
+
+def transform_of_values(values: FloatArray) -> FloatArray:
+    """:func:`transform_of` of position and quaternion x y z w (7,)."""
     if not (np.all(np.isfinite(values)) and 0.9 < np.linalg.norm(values[3:]) < 1.1):
         raise InputError('pose that is not finite or has no unit quaternion')
     return transform_from_quaternion(values[:3], values[3:])

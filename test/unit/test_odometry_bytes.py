@@ -1,0 +1,51 @@
+"""Odometry from the bytes of its message."""
+
+import numpy as np
+import pytest
+from rclpy.serialization import serialize_message
+
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros import convert, odometry_bytes
+
+
+def state(**other):
+    rng = np.random.default_rng(3)
+    T_map_body = geometry.transform(geometry.so3_exp(rng.standard_normal(3)), rng.standard_normal(3))
+    values = dict(zip(('velocity_body', 'angular_velocity_body'), rng.standard_normal((2, 3)), strict=True))
+    covariances = dict(zip(('pose_covariance', 'twist_covariance'), rng.standard_normal((2, 6, 6)), strict=True))
+    return Odometry(
+        **{'stamp_ns': 1_700_000_000_123_456_789, 'T_map_body': T_map_body, **values, **covariances, **other}
+    )
+
+
+def sent(odometry, frame_id='map', child_frame_id='base_link'):
+    message = convert.odometry_frames(frame_id, child_frame_id)
+    convert.fill_odometry(message, odometry)
+    return message
+
+
+@pytest.mark.parametrize('length', range(9))
+def test_is_what_the_message_says(length):
+    """Names of any length, as what follows them is aligned."""
+    for names in (('m' * length, 'base_link'), ('map', 'b' * length)):
+        message = sent(state(), *names)
+        read, said = odometry_bytes.odometry(serialize_message(message)), convert.odometry(message)
+        assert read.stamp_ns == said.stamp_ns == odometry_bytes.stamp_ns(serialize_message(message))
+        for name in ('T_map_body', 'velocity_body', 'angular_velocity_body', 'pose_covariance', 'twist_covariance'):
+            np.testing.assert_array_equal(getattr(read, name), getattr(said, name))
+
+
+@pytest.mark.parametrize('name', ['velocity_body', 'pose_covariance', 'twist_covariance'])
+def test_what_is_not_finite_is_refused(name):
+    broken = np.full_like(getattr(state(), name), np.nan)
+    with pytest.raises(InputError, match='finite'):
+        odometry_bytes.odometry(serialize_message(sent(state(**{name: broken}))))
+
+
+def test_what_is_no_quaternion_is_refused():
+    message = sent(state())
+    message.pose.pose.orientation.w += 0.7
+    with pytest.raises(InputError, match='quaternion'):
+        odometry_bytes.odometry(serialize_message(message))
