@@ -268,3 +268,67 @@ def test_known_markers_hold_on_to_what_was_known_of_them():
     assert held is not None
     # Two markers are known from before: each counts half.
     assert np.max(np.abs(difference(held.markers[1].T_map_marker, poses[1]))) < 5 * np.sqrt(2e-8)
+
+
+def test_odometry_holds_keyframes_that_a_marker_leaves_loose():
+    """A chain of pairs: each frame sees two markers, and noise turns the chain at every link."""
+    rng = np.random.default_rng(11)
+    poses = dict(list(wall(rng).items())[:4])
+    pairs = [{key: poses[key] for key in (k, k + 1)} for k in range(3)]
+    frames = []
+    for k in range(60):
+        T = flight(0.1 * k)
+        rows = see(T, pairs[k // 20], 0.2, rng)
+        if len(rows) == 2:
+            frames.append(keyframe(k + 1, T, rows))
+    markers = {
+        i: MapMarker(i, SIZE, i == 0, T if i == 0 else retract(T, 0.02 * rng.normal(size=6)), (i > 0) * np.eye(6))
+        for i, T in poses.items()
+    }
+    loose = Snapshot(markers, tuple(frames), Rig.single(CAMERA))
+    sigma = np.diag([5e-3] * 3 + [1e-3] * 3)
+    known = [
+        replace(
+            frame,
+            T_odometry=retract(frame.T_map_rig, sigma @ rng.normal(size=6)),
+            information=np.linalg.inv(sigma @ sigma),
+        )
+        for frame in frames
+    ]
+    held = replace(loose, keyframes=tuple(known))
+    off = {name: errors(refine(s), poses)[:, :3] for name, s in (('loose', loose), ('held', held))}
+    assert np.sqrt(np.mean(off['held'] ** 2)) < 0.5 * np.sqrt(np.mean(off['loose'] ** 2))
+    # What is far off counts less: of a filter that is lost by half a metre less than a tenth gets into the map.
+    lost = [replace(frame, T_odometry=retract(frame.T_odometry, np.full(6, 0.5))) for frame in known]
+    astray = errors(refine(replace(loose, keyframes=tuple(lost))), poses)[:, :3]
+    assert np.sqrt(np.mean(astray**2)) < 0.1 * 0.5
+
+
+def test_errors_that_last_are_in_the_covariances():
+    """Corners that are off by the same in all views of a marker, and by nothing else."""
+    poses, nees = wall(np.random.default_rng(0)), []
+    exact = snapshot(np.random.default_rng(1), poses, sigma=0.0, disturbance=0.0)
+    problem = map_refinement._Problem.build(exact)
+    evaluation = problem.evaluate(problem.start, 1.0)
+    P = problem._lasting(problem._blocks(problem.start, evaluation), evaluation, 1.0)[1:]
+    for seed in range(20):
+        # Corners of noiseless rows declare 1e-3 px.
+        off = 1e-3 * np.random.default_rng(seed).normal(size=(8, 4, 2))
+        frames = tuple(replace(frame, corners=frame.corners + off[frame.ids]) for frame in exact.keyframes)
+        d = errors(refine(replace(exact, keyframes=frames)), poses)
+        nees.append(np.mean(np.einsum('ni,nij,nj->n', d, np.linalg.inv(P), d)))
+    # Six, or 32 / 25 times that (the mean of an inverted Wishart matrix of 32 samples). A map's markers share most
+    # of their error: the mean of twenty has a standard deviation of 0.9.
+    assert 6.0 - 2.7 < np.mean(nees) < 6.0 * 32 / 25 + 2.7
+
+
+def test_responses_are_what_the_steps_are():
+    rng = np.random.default_rng(13)
+    start = snapshot(rng, wall(rng), count=8)
+    problem = map_refinement._Problem.build(start)
+    evaluation = problem.evaluate(problem.start, 1.0)
+    blocks = problem._blocks(problem.start, evaluation)
+    _, markers = problem.equations.solve(blocks, 0.0)
+    sides = [np.stack([side, 2.0 * side]) for side in (blocks.rig_gradient, blocks.marker_gradient)]
+    responses = problem.equations.responses(blocks, *sides)
+    np.testing.assert_allclose(responses, np.stack([markers, 2.0 * markers]), atol=1e-10)

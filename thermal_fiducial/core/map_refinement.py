@@ -33,6 +33,8 @@ MAX_ITERATIONS = 25
 _CONVERGED = 1e-7
 # Median of chi square of eight degrees of freedom.
 _MEDIAN_CHI2 = 7.34
+# Samples of errors that last: the covariance of six numbers from so many is good to a fifth.
+_SAMPLES = 32
 # Each round takes the corners' variance anew from the residuals.
 _ROUNDS = 4
 
@@ -49,9 +51,11 @@ class Snapshot:
     #: pose and covariance (6, 6) by ID of markers that were known beforehand; see :func:`prior_poses`
     priors: Mapping[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     map_version: int = 0
+    #: standard deviation of what each marker's corners are off by in all its views alike, as a share of their noise
+    lasting_share: float = 0.0
 
     def __reduce__(self) -> tuple[Any, ...]:
-        rest = (self.rig, self.links, self.priors, self.map_version)
+        rest = (self.rig, self.links, self.priors, self.map_version, self.lasting_share)
         return _snapshot, (self.markers, packed(self.keyframes), *rest)
 
 
@@ -256,9 +260,12 @@ class _Problem:
         factor = float(np.sum(after.chi2[full]) / freedom)
         held_covariances = np.stack([snapshot.markers[key].covariance for key in self.ids])
         noise = max(factor, 1.0) * correlation_time(after.r[full], self.marker[full])
-        covariances = self.equations.covariances(self._blocks(state, after), noise, held_covariances)
-        if covariances is None:
+        blocks = self._blocks(state, after)
+        covariances = self.equations.covariances(blocks, noise, held_covariances)
+        lasting = self._lasting(blocks, after, snapshot.lasting_share)
+        if covariances is None or lasting is None:
             return None
+        covariances += lasting
         adjusted = {
             key: replace(snapshot.markers[key], T_map_marker=state.T_map_marker[i], covariance=covariances[i])
             for i, key in enumerate(self.ids)
@@ -277,6 +284,23 @@ class _Problem:
             iterations,
             snapshot.map_version,
         )
+
+    def _lasting(self, blocks: Blocks, e: _Evaluation, share: float) -> FloatArray | None:
+        """Covariances (M, 6, 6) of what corners make of the map that are off alike in all views of a marker.
+
+        Nothing averages that out, and no residual shows it: the shape of a fixed marker turns the whole map. It is
+        sampled, as every corner of every marker has a direction of its own.
+        """
+        if share == 0.0:
+            return np.zeros((len(self.ids), 6, 6))
+        precision = np.bincount(self.marker, 0.5 * np.mean(np.sum(self.W**2, axis=(2, 3)), axis=1))
+        std = share * np.sqrt(np.bincount(self.marker) / precision)
+        samples = np.random.default_rng(0).standard_normal((_SAMPLES, len(self.ids), 4, 2, 1))
+        off = std[:, None, None, None] * samples
+        r = (self.W @ off[:, self.marker]).reshape(_SAMPLES, -1, 8, 1) * e.weights[:, None, None]
+        rig, marker = ((np.swapaxes(J, -1, -2) @ r)[..., 0] for J in (e.J_rig, e.J_marker))
+        steps = self.equations.responses(blocks, rig, marker)
+        return None if steps is None else np.asarray(np.einsum('kmi,kmj->mij', steps, steps) / _SAMPLES)
 
     def _hangs_twice(self, marker: int, after: _Evaluation) -> bool:
         own = self.marker == marker

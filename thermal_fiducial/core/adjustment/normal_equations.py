@@ -74,6 +74,30 @@ class NormalEquations:
             return None
         return frames, nodes[: self._markers]
 
+    def responses(self, blocks: Blocks, rig: FloatArray, marker: FloatArray) -> FloatArray | None:
+        """How far the markers go (K, M, 6) for each of K other right sides; None where the system is singular.
+
+        Parameters
+        ----------
+        rig, marker : (K, n, 6) J' r of each view, in place of those of ``blocks``
+        """
+        H_ff, g_f = self._frame_terms(blocks, 0.0)
+        H_inverse = _inverse(H_ff)
+        S, _ = self._reduced(blocks, H_inverse, g_f, 0.0)
+        lu = _factorise(self._select(S, self._free, self._free))
+        if lu is None:
+            return None
+        eliminated = self._eliminated(blocks, H_inverse)
+        starts = np.flatnonzero(np.diff(self.frame, prepend=-1))
+        of_frames = np.add.reduceat(rig, starts, axis=1)
+        g = np.zeros((self._nodes, 6, len(rig)))
+        each = marker - np.einsum('nij,knj->kni', eliminated, of_frames[:, self.frame])
+        np.add.at(g, self.marker, np.moveaxis(each, 0, -1))
+        g[self._tied_node[self.tied]] = np.moveaxis(of_frames[:, self.tied], 0, -1)
+        nodes = np.zeros_like(g)
+        nodes[self._free] = lu.solve(g[self._free].reshape(-1, len(rig))).reshape(-1, 6, len(rig))
+        return np.asarray(np.moveaxis(nodes[: self._markers], -1, 0))
+
     def covariances(self, blocks: Blocks, factor: float, held_covariances: FloatArray) -> FloatArray | None:
         """Covariances (M, 6, 6) of the markers: noise times ``factor``, and what the held markers (M, 6, 6) pass on."""
         H_ff, g_f = self._frame_terms(blocks, 0.0)
@@ -102,7 +126,7 @@ class NormalEquations:
     ) -> tuple[Any, FloatArray]:
         """Schur complement, sparse, over all nodes, and its right side (nodes, 6)."""
         loose = ~self.tied[self.frame]
-        eliminated = np.where(loose[:, None, None], np.swapaxes(blocks.cross, -1, -2) @ H_inverse[self.frame], 0.0)
+        eliminated = self._eliminated(blocks, H_inverse)
         g = np.zeros((self._nodes, 6))
         np.add.at(g, self.marker, blocks.marker_gradient - (eliminated @ g_f[self.frame][..., None])[..., 0])
         H_mm = np.zeros((self._nodes, 6, 6))
@@ -123,6 +147,11 @@ class NormalEquations:
             terms += [(np.array([i]), np.array([j]), (J_i.T @ J_j)[None]) for i, J_i in ends for j, J_j in ends]
         S = self._eliminated_pairs(blocks, eliminated)
         return S + self._assemble(terms), g
+
+    def _eliminated(self, blocks: Blocks, H_inverse: FloatArray) -> FloatArray:
+        """What each view of a loose keyframe takes (n, 6, 6) of that one's right side."""
+        loose = ~self.tied[self.frame][:, None, None]
+        return np.where(loose, np.swapaxes(blocks.cross, -1, -2) @ H_inverse[self.frame], 0.0)
 
     def _tied_terms(self, blocks: Blocks, loose: BoolArray) -> list[tuple[IntArray, IntArray, FloatArray]]:
         if np.all(loose):
