@@ -14,10 +14,10 @@ from thermal_fiducial.core.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
 _MAX_STEPS = 20
-# Costs are chi-squares: a step that lowers one by less is a thousandth of a standard deviation, and the last. Of a pose
+# Costs are chi-squares: a step that lowers one by less is a hundredth of a standard deviation, and the last. Of a pose
 # that the image refutes anyway a share of the cost is enough, lest it creep along its valley; of one that is worse than
 # a rival, a share of what it is worse by. One that costs so many times more even after a step is given up.
-_LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-6, 50.0, 1e-2, 10.0
+_LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-4, 50.0, 1e-2, 10.0
 # Damping at which Levenberg-Marquardt finds no better pose at all.
 _HOPELESS = 1e6
 # Depth [m] from which a point is in front of the camera.
