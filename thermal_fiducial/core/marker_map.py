@@ -51,8 +51,8 @@ VAGUE = 0.2
 TOLERANCE_PX = 0.3
 #: Candidates that are judged in one frame: bounds its time when many are new.
 TRIALS = 3
-# Last frames that tell how the map has moved where the robot is.
-_RECENT = 10
+# Last frames that tell how the map has moved where the robot is, each so many-th of them: neighbours tell the same.
+_RECENT, _EVERY = 10, 3
 # A candidate is judged again when its views have grown by one in so many.
 _PATIENCE = 6
 # A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
@@ -348,7 +348,7 @@ class MarkerMapper:
             candidate.move(displacement)
         T_new_old = np.eye(4)
         if self._last is not None:
-            T_new_old = correction(tuple(self._recent), self._cameras, before, self.map.markers, self._belief)
+            T_new_old = correction(tuple(self._recent)[::_EVERY], self._cameras, before, self.map.markers, self._belief)
             self._recent = deque((in_moved_map(frame, T_new_old) for frame in self._recent), maxlen=_RECENT)
             self._last = replace(self._last, T_map_camera=T_new_old @ self._last.T_map_camera)
             self._motion = CameraMotion()
