@@ -125,6 +125,33 @@ def test_the_edge_of_something_hotter_is_not_taken_for_a_side():
     assert np.sqrt(found.covariances[0, [0, 3], 0, 0]).max() < 0.2
 
 
+def test_a_side_that_is_not_seen_lies_where_it_makes_a_square():
+    camera, T = CAMERAS['plumb_bob'], marker_pose(2.6, (0.1, 0.2, 0.1))
+    image, corners = draw(camera, 3, T, 0.3, contrast=100.0)
+    right = int(corners[:, 0].max())
+    image[:, right + 2 :] += 3000.0
+    start = corners.copy()
+    start[1:3, 0] += 1.5
+    found = refine(image + np.random.default_rng(5).normal(0.0, 1.25, image.shape), start, camera, 3)
+    error = found.corners_px[0] - corners
+    # Three standard deviations of a square's sides, 0.3 % of 57 px.
+    assert np.abs(error).max() < 0.5
+    assert np.sqrt(found.covariances[0, [1, 2], 0, 0]).max() < 0.5
+
+
+@pytest.mark.parametrize('covered_px', [1, 2, 3])
+def test_a_side_that_something_covers_is_no_side_of_a_square(covered_px):
+    camera, T = CAMERAS['plumb_bob'], marker_pose(2.6, (0.1, 0.2, 0.0))
+    image, corners = draw(camera, 3, T, 0.3, contrast=100.0)
+    right = int(corners[1:3, 0].mean())
+    image[:, right - covered_px :] = 7100.0
+    found = refine(image + np.random.default_rng(5).normal(0.0, 1.25, image.shape), corners, camera, 3)
+    error = found.corners_px[0] - corners
+    squared = np.einsum('ki,kij,kj->k', error, np.linalg.inv(found.covariances[0]), error)
+    # Three standard deviations of both coordinates.
+    assert squared.max() < 9.0
+
+
 @pytest.mark.parametrize('contrast', [12.0, 50.0])
 def test_covariance_is_honest(contrast):
     rng = np.random.default_rng(3)

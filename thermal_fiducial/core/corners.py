@@ -12,6 +12,7 @@ import numpy as np
 from thermal_fiducial.core.adjustment import edges
 from thermal_fiducial.core.adjustment.segments import adjust, counts_across, HOPELESS, measure, Memory
 from thermal_fiducial.core.adjustment.sides import sides_of
+from thermal_fiducial.core.adjustment.squares import squareness
 from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -90,7 +91,7 @@ def refine_corners(
         prior = _PRIOR_OF_SHAPE if factor > 1.0 else _PRIOR
         shift, *rest = _pass(
             image,
-            start.x,
+            start,
             camera,
             behind[active],
             factor * blur_px,
@@ -108,7 +109,7 @@ def refine_corners(
 
 def _pass(
     image: Float32Array,
-    x: FloatArray,
+    start: ImagePoints,
     camera: Camera,
     behind: Float32Array,
     optics: float,
@@ -121,11 +122,11 @@ def _pass(
     cells = behind.shape[2]
     widest = math.hypot(optics, math.sqrt(float(np.sum(smear * smear, axis=1).max())))
     half = min(max(math.ceil(2.5 * widest + 1.0), 4), 10)
-    sides = sides_of(x, camera, image.shape, cells * columns, half)
+    sides = sides_of(start.x, camera, image.shape, cells * columns, half)
     blur = edges.blurs(sides.normal[:, cells * columns // 2], optics, smear)
     counts = counts_across(image, sides, memory)
     segments = measure(counts, edges.model(sides, behind, blur), cells, _REACHED * blur[0])
-    moved, covariances = adjust(sides, segments, prior)
+    moved, covariances = adjust(sides, segments, prior, squareness(start.x, start.inverse))
     good = segments.variance < HOPELESS
     return moved, covariances, _mean_where(segments.contrast, good), np.sqrt(_mean_where(segments.noise, good))
 

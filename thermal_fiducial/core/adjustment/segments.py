@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.adjustment.sides import ENDS, Sides, STARTS
+from thermal_fiducial.core.adjustment.squares import SQUARE_STD, Squareness
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Variance of a segment that measures nothing.
@@ -25,6 +26,8 @@ _FLOOR = 0.010**2 * np.eye(2)
 # Contrast of a segment over that of the marker: less is hidden, more is the edge of something else; and by how much the
 # contrast of a plate varies.
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
+# Outlines farther from a square than so many standard deviations are not those of the marker alone.
+_TOO_FAR = 2.0
 _SIDES = np.arange(4)
 
 
@@ -180,13 +183,20 @@ def _median_where(values: FloatArray, good: BoolArray) -> FloatArray:
     return np.where(np.isfinite(median), median, 0.0)
 
 
-def adjust(sides: Sides, segments: Segments, prior: FloatArray) -> tuple[FloatArray, FloatArray]:
+def adjust(
+    sides: Sides, segments: Segments, prior: FloatArray, square: Squareness | None = None
+) -> tuple[FloatArray, FloatArray]:
     """How corners move (N, 4, 2) to explain the shifts of all segments, and their covariances (N, 4, 2, 2).
 
     Parameters
     ----------
     prior : (8, 8) information on the eight numbers beforehand
+    square : of the outlines so far; not used when left out
     """
+    known: FloatArray | float = 0.0
+    if square is not None:
+        by_square = np.swapaxes(square.derivative, 1, 2) / SQUARE_STD**2
+        prior, known = prior + by_square @ square.derivative, by_square @ square.value[..., None]
     used = segments.variance < HOPELESS
     deviation = np.sqrt(segments.variance)
     A = _design(sides, deviation.shape) / deviation[..., None]
@@ -195,7 +205,7 @@ def adjust(sides: Sides, segments: Segments, prior: FloatArray) -> tuple[FloatAr
     for _ in range(3):
         weighted = np.swapaxes(A * robust[..., None], 1, 2)
         covariance = np.linalg.inv(weighted @ A + prior)
-        moved = covariance @ (weighted @ shift[..., None])
+        moved = covariance @ (weighted @ shift[..., None] - known)
         left = np.abs(shift - (A @ moved)[..., 0])
         scale = np.maximum(1.4826 * _median_where(left, used), 1.0)
         robust = 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
@@ -205,7 +215,16 @@ def adjust(sides: Sides, segments: Segments, prior: FloatArray) -> tuple[FloatAr
     # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
     covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None]
     blocks = np.einsum('nikil->nikl', covariance.reshape(-1, 4, 2, 4, 2))
+    if square is not None:
+        blocks = blocks + _no_square(square, moved, sides)[:, None, None, None] * np.eye(2)
     return moved.reshape(-1, 4, 2), blocks + _FLOOR
+
+
+def _no_square(square: Squareness, moved: FloatArray, sides: Sides) -> FloatArray:
+    """Variances (N,) [px^2] of corners whose outline is no square: a side of it is that of something else."""
+    error = square.error(moved)
+    side = sides.along.reshape(-1, 4).mean(axis=1)
+    return np.where(error > (_TOO_FAR * SQUARE_STD) ** 2, side**2 * error, 0.0)
 
 
 def _design(sides: Sides, shape: tuple[int, ...]) -> FloatArray:
