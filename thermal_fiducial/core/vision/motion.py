@@ -28,6 +28,8 @@ _ENOUGH_STATES, _UNSURE_ACCELERATION = 4, np.array([0.3, 0.3, 0.3, 0.0, 0.0, 0.0
 _LEAST_VARIANCE = 1e-6
 # Jitter of the camera's stamps [s].
 _JITTER_S = 0.001
+# How far corners that lag displaces may be off their mean delay, where the form of smeared edges is unknown [lag].
+_DELAY_UNSURE = 0.5
 _VALUE, _CHANGE = np.arange(6), np.arange(6, 12)
 # No camera that sees markers moves faster: such odometry tells nothing [m/s, rad/s].
 _FASTEST, _FASTEST_TURN = 20.0, 30.0
@@ -162,24 +164,21 @@ class MotionTracker:
         x: FloatArray,
         depth: FloatArray,
         noise: FloatArray,
-        *,
-        freed: bool = True,
     ) -> Twist | None:
         """Twist from how the corners moved since the last frame.
 
         Parameters
         ----------
         ids : (N,)
-        x : (N, 4, 2) normalised corners
+        x : (N, 4, 2) normalised corners, where they would be without lag if the twist is predicted, and else as seen
         depth : (N, 4) [m]
         noise : (N,) standard deviation of a corner in normalised coordinates
-        freed : whether the corners are where they would be without lag; they lie one time constant back otherwise
         """
         now, before = pairs(ids, self._seen.ids)
         dt = self._since(stamp_ns)
         if len(now) == 0 or dt is None:
             return predicted
-        begin, end = dt + (self._lag if self._twist is None else 0.0), 0.0 if freed else self._lag
+        begin, end = dt + (self._lag if self._twist is None else 0.0), self._lag if predicted is None else 0.0
         seconds = begin - end
         A = interaction(0.5 * (x[now] + self._seen.x[before]), depth[now]).reshape(-1, 6)
         velocity = (x[now] - self._seen.x[before]).reshape(-1) / seconds
@@ -187,7 +186,8 @@ class MotionTracker:
         information, seen = weighted @ A, weighted @ velocity
         if predicted is not None:
             # Stamps that jitter stretch or shrink all velocities of a frame alike.
-            along = math.sqrt(2.0) * _JITTER_S / seconds * predicted.value
+            unsure = 2.0 * _JITTER_S**2 + (0.0 if self._twist is not None else (_DELAY_UNSURE * self._lag) ** 2)
+            along = math.sqrt(unsure) / seconds * predicted.value
             spread = information @ along
             share = spread / (1.0 + along @ spread)
             information, seen = information - np.outer(spread, share), seen - share * (along @ seen)

@@ -111,9 +111,8 @@ class Refiner:
             seen = refine_corners(
                 frame.image, start, frame.camera, behind, *blur, columns, near=near, memory=view.memory
             )
-            freed = twist is not None
-            refinement = self._at_stamp(frame, found, places, view, seen, cell, freed=freed)
-            change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)[view.sharpened]
+            refinement = self._at_stamp(frame, found, places, view, seen, cell, twist)
+            change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)
             if refinement.twist is None or change.max(initial=0.0) < SMEAR_THAT_MATTERS_PX:
                 break
             twist, places, near = refinement.twist, refinement.places, np.ones(len(near), dtype=bool)
@@ -143,15 +142,16 @@ class Refiner:
         view: View,
         seen: RefinedCorners,
         cell: FloatArray,
-        *,
-        freed: bool,
+        known: Twist | None,
     ) -> Refinement:
         """The corners without lag and as if all rows were seen at once, by the twist that they themselves correct."""
         at = places.at.moved(seen.corners_px - view.shift - places.at.px, frame.camera)
         variance = seen.covariances[..., 0, 0] + seen.covariances[..., 1, 1]
         deviation = np.sqrt(0.5 * variance.mean(axis=1)) / frame.camera.focal_px
-        ids, depth = found.ids, places.depth
-        twist = self._motion.correct(frame.stamp_ns, frame.twist, ids, at.x, depth, deviation, freed=freed)
+        # The same displacement in two frames in a row hides from the first twist; once freed, they are not alike.
+        twist = known
+        if frame.twist is not None or known is None:
+            twist = self._motion.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
         if twist is None:
             return Refinement(view, seen, seen, replace(places, at=at), None)
         smear = places.smear(twist, frame.lag)
