@@ -29,7 +29,7 @@ def frame(index, rng, shown=(4, 7)):
 
 
 def lagging_frame(index, rng, speed_px, tau, contrast=20.0):
-    """Three markers of 36 px, faint ones as a rule, in white plates, moving to the right [px/s], seen through a lag [s]."""
+    """Three markers of 36 px in white plates, faint as a rule, moving right [px/s], seen through a lag [s]."""
     image = np.full((512, 640), 7000.0)
     for k, marker_id in enumerate((4, 7, 9)):
         v, u = 60 + 150 * k, 60
