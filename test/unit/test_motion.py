@@ -173,3 +173,18 @@ def test_implausible_odometry_is_known(velocity, turn):
     odometry = Odometry(0, np.eye(4), np.array([velocity, 0, 0]), np.array([0, turn, 0]), np.eye(6), np.eye(6))
     assert not plausible(odometry)
     assert plausible(replace(odometry, velocity_body=np.zeros(3), angular_velocity_body=np.zeros(3)))
+
+
+def test_motion_that_shows_no_markers_is_forgotten():
+    """A wrong one would blur them away in frame after frame; the filter's states are heard all the same."""
+    tracker, period_ns = MotionTracker(np.eye(4)), 33_333_333
+    tracker.remember(
+        0, Twist(np.full(6, 9.0), np.eye(12)), Tracked(np.arange(1), *(np.ones(s) for s in ((1, 4, 2), (1, 4), 1)))
+    )
+    for frame in range(1, 8):
+        twist = tracker.predict(frame * period_ns, [])
+        assert (twist is None) == (frame * period_ns > 150_000_000)
+        tracker.remember(frame * period_ns, twist, Tracked.none())
+    state = Odometry(8 * period_ns, np.eye(4), TWIST[:3], TWIST[3:], 1e-6 * np.eye(6), 1e-6 * np.eye(6))
+    # The twist of which nothing is known pulls by its share of the variance.
+    np.testing.assert_allclose(tracker.predict(8 * period_ns, [state]).value, TWIST, atol=1e-5)

@@ -306,7 +306,9 @@ class MarkerDetector:
         """What the next frame starts from."""
         clarity = refinement.corners.contrast / frame.noise
         depth = _depths(poses.T_camera_marker[:, 0], self._sizes_of(ids))
-        self._motion.remember(frame.stamp_ns, refinement.twist, Tracked(ids, refinement.places.at.x, depth, clarity))
+        # Motion that was told by what turned out to be no markers is none.
+        twist = refinement.twist if len(ids) else frame.twist
+        self._motion.remember(frame.stamp_ns, twist, Tracked(ids, refinement.places.at.x, depth, clarity))
 
     def _sizes_of(self, ids: IntArray) -> FloatArray:
         return np.array([self.size(marker_id) for marker_id in ids.tolist()])

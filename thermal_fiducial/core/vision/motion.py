@@ -126,6 +126,7 @@ class MotionTracker:
         self._stamp_ns: int | None = None
         self._twist: Twist | None = None
         self._seen = Tracked.none()
+        self._last_seen_ns: int | None = None
 
     def predict(self, stamp_ns: int, odometry: Sequence[Odometry]) -> Twist | None:
         """Twist expected at a frame; None when nothing is known.
@@ -135,7 +136,9 @@ class MotionTracker:
         odometry : states round the time that smears the frame, or the nearest that there is; in the camera's clock
         """
         dt = self._since(stamp_ns)
-        carried = _carried(self._twist, dt) if self._twist is not None and dt is not None else None
+        carried = None
+        if self._twist is not None and dt is not None and self._saw_lately(stamp_ns):
+            carried = _carried(self._twist, dt)
         if len(odometry) >= _ENOUGH_STATES:
             return _joined(carried or _unknown(), _line_through(stamp_ns, odometry, self._T_body_camera))
         if len(odometry) == 0 or abs(stamp_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
@@ -202,6 +205,12 @@ class MotionTracker:
         if self._stamp_ns is not None and 0 < self._stamp_ns - stamp_ns < _STALE_S * 1e9:
             return
         self._stamp_ns, self._twist, self._seen = stamp_ns, twist, seen
+        if len(seen.ids):
+            self._last_seen_ns = stamp_ns
+
+    def _saw_lately(self, stamp_ns: int) -> bool:
+        """Whether markers tell that the twist holds: one that went wrong would hide them from then on."""
+        return self._last_seen_ns is not None and abs(stamp_ns - self._last_seen_ns) < _STALE_S * 1e9
 
     def _since(self, stamp_ns: int) -> float | None:
         """Time since the last frame [s], negative for one that comes late; None when that tells nothing of this one."""

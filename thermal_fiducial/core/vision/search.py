@@ -123,6 +123,8 @@ class BlindSearch:
         fine = faint = np.zeros((0, 4, 2))
         if Sought.FINE in sought:
             fine = find_quads(dark(scene, noise, _FINE, self._scratch), config.min_side_px, hidden)
+        if Sought.FAINT not in sought and len(fine) == 0:
+            return Found.none()
         half = without_columns(halved(image, self._scratch), 0.5 * noise, self._scratch)
         if Sought.FAINT in sought:
             faint = self._faint(half, noise, config.min_side_px, hidden)
