@@ -115,3 +115,11 @@ def test_the_better_of_two_poses_prevails(place, own, sigma):
     # Neither is counted for more than it is worth.
     assert np.all(np.diagonal(fused.changing + fused.lasting) <= 1.01 * min(own, sigma) ** 2)
     assert np.all(np.diagonal(fused.changing + fused.lasting) >= 0.99 * min(own, sigma) ** 2)
+
+
+def test_odometry_that_contradicts_the_markers_is_left_out():
+    markers, other = flight(0.0), retract(flight(0.0), np.full(6, 0.3))
+    own = 1e-4 * np.eye(6)
+    fused = together(markers, own, np.zeros((6, 6)), CameraPose(0, other, 1e-6 * np.eye(6)))
+    np.testing.assert_array_equal(fused.T_map_camera, markers)
+    np.testing.assert_array_equal(fused.changing, own)

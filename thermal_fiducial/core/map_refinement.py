@@ -35,6 +35,8 @@ _CONVERGED = 1e-7
 _MEDIAN_CHI2 = 7.34
 # Samples of errors that last: the covariance of six numbers from so many is good to a fifth.
 _SAMPLES = 32
+# Chi square of a view that no pose near the present one explains.
+_BEHIND_CHI2 = 1e8
 # Each round takes the corners' variance anew from the residuals.
 _ROUNDS = 4
 
@@ -229,9 +231,12 @@ class _Problem:
             )
         arms = T_map_camera[:, :3, 3] - T_map_rig[:, :3, 3]
         J_camera[..., 3:] -= J_camera[..., :3] @ skew(arms)
-        residuals = self.corners - uv
+        # Markers that the state has behind the camera say nothing of where to go, and cost as much as any outlier.
+        behind = ~np.all(np.isfinite(uv), axis=(1, 2))
+        J_camera[behind], J_marker[behind] = 0.0, 0.0
+        residuals = np.where(behind[:, None, None], 0.0, self.corners - uv)
         r = (self.W @ residuals[..., None]).reshape(n, 8)
-        chi2 = np.sum(r * r, axis=-1)
+        chi2 = np.where(behind, _BEHIND_CHI2, np.sum(r * r, axis=-1))
         limit = ROBUST_CHI2 * scale
         weights = _robust_weights(chi2, limit)
         cost = float(np.sum(_robust_cost(chi2, limit)))

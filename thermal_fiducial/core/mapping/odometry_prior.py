@@ -23,6 +23,8 @@ _ALIKE = 10.0
 _OUTLIER = 3.0
 # Share of the variance of odometry's errors that changes between the views of a new marker.
 CHANGING = 0.25
+#: Squared distance (6 degrees of freedom) beyond which markers and odometry contradict each other: ten sigma.
+CONTRADICTION = 100.0
 #: Larger differences are for the filter's parameter [s].
 LIMIT_S = 0.1
 
@@ -84,13 +86,19 @@ class Fused:
 
 
 def together(T_map_camera: FloatArray, changing: FloatArray, lasting: FloatArray, odometry: CameraPose) -> Fused:
-    """The pose (4, 4) from the markers of a frame and that from the odometry, each by what it is worth."""
+    """The pose (4, 4) from the markers of a frame and that from the odometry, each by what it is worth.
+
+    Markers alone count where the odometry contradicts them: it is lost, or in another map.
+    """
     P = odometry.covariance
+    apart = difference(odometry.T_map_camera, T_map_camera)
+    if apart @ np.linalg.solve(changing + lasting + P, apart) > CONTRADICTION:
+        return Fused(T_map_camera, changing, lasting)
     gain = np.linalg.solve(changing + lasting + P, changing + lasting).T
     rest = np.eye(6) - gain
     inherited = gain @ P @ gain.T
     return Fused(
-        np.asarray(retract(T_map_camera, gain @ difference(odometry.T_map_camera, T_map_camera))),
+        np.asarray(retract(T_map_camera, gain @ apart)),
         rest @ changing @ rest.T + CHANGING * inherited,
         rest @ lasting @ rest.T + (1.0 - CHANGING) * inherited,
     )
