@@ -329,9 +329,9 @@ def test_responses_are_what_the_steps_are():
     evaluation = problem.evaluate(problem.start, 1.0)
     blocks = problem._blocks(problem.start, evaluation)
     _, markers = problem.equations.solve(blocks, 0.0)
-    sides = [np.stack([side, 2.0 * side]) for side in (blocks.rig_gradient, blocks.marker_gradient)]
-    responses = problem.equations.responses(blocks, *sides)
-    np.testing.assert_allclose(responses, np.stack([markers, 2.0 * markers]), atol=1e-10)
+    once = blocks.rig_gradient, blocks.marker_gradient
+    responses = problem.equations.responses(blocks, [once, (2.0 * once[0], 2.0 * once[1])])
+    np.testing.assert_allclose(responses, np.stack([markers, 2.0 * markers], axis=-1), atol=1e-10)
 
 
 def test_a_marker_that_starts_behind_the_camera_spoils_nothing():

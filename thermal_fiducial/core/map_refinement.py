@@ -300,12 +300,16 @@ class _Problem:
             return np.zeros((len(self.ids), 6, 6))
         precision = np.bincount(self.marker, 0.5 * np.mean(np.sum(self.W**2, axis=(2, 3)), axis=1))
         std = share * np.sqrt(np.bincount(self.marker) / precision)
-        samples = np.random.default_rng(0).standard_normal((_SAMPLES, len(self.ids), 4, 2, 1))
-        off = std[:, None, None, None] * samples
-        r = (self.W @ off[:, self.marker]).reshape(_SAMPLES, -1, 8, 1) * e.weights[:, None, None]
+        rng = np.random.default_rng(0)
+        sampled = (std[:, None] * rng.standard_normal((len(self.ids), 8)) for _ in range(_SAMPLES))
+        steps = self.equations.responses(blocks, (self._gradients(e, off[self.marker]) for off in sampled))
+        return None if steps is None else steps @ np.swapaxes(steps, -1, -2) / _SAMPLES
+
+    def _gradients(self, e: _Evaluation, off: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """J' r of each view's keyframe and marker, both (n, 6), for corners that are ``off`` (n, 8) [px]."""
+        r = (self.W @ off.reshape(-1, 4, 2, 1)).reshape(-1, 8, 1) * e.weights[:, None, None]
         rig, marker = ((np.swapaxes(J, -1, -2) @ r)[..., 0] for J in (e.J_rig, e.J_marker))
-        steps = self.equations.responses(blocks, rig, marker)
-        return None if steps is None else np.asarray(np.einsum('kmi,kmj->mij', steps, steps) / _SAMPLES)
+        return rig, marker
 
     def _hangs_twice(self, marker: int, after: _Evaluation) -> bool:
         own = self.marker == marker

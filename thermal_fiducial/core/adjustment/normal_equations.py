@@ -1,5 +1,6 @@
 """Normal equations of a bundle adjustment over keyframes and markers: Schur complement, solution, covariances."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -74,12 +75,12 @@ class NormalEquations:
             return None
         return frames, nodes[: self._markers]
 
-    def responses(self, blocks: Blocks, rig: FloatArray, marker: FloatArray) -> FloatArray | None:
-        """How far the markers go (K, M, 6) for each of K other right sides; None where the system is singular.
+    def responses(self, blocks: Blocks, sides: Iterable[tuple[FloatArray, FloatArray]]) -> FloatArray | None:
+        """How far the markers go (M, 6, K) for each of K other right sides; None where the system is singular.
 
         Parameters
         ----------
-        rig, marker : (K, n, 6) J' r of each view, in place of those of ``blocks``
+        sides : J' r of each view's keyframe and marker, both (n, 6), in place of those of ``blocks``
         """
         H_ff, g_f = self._frame_terms(blocks, 0.0)
         H_inverse = _inverse(H_ff)
@@ -88,15 +89,18 @@ class NormalEquations:
         if lu is None:
             return None
         eliminated = self._eliminated(blocks, H_inverse)
-        starts = np.flatnonzero(np.diff(self.frame, prepend=-1))
-        of_frames = np.add.reduceat(rig, starts, axis=1)
-        g = np.zeros((self._nodes, 6, len(rig)))
-        each = marker - np.einsum('nij,knj->kni', eliminated, of_frames[:, self.frame])
-        np.add.at(g, self.marker, np.moveaxis(each, 0, -1))
-        g[self._tied_node[self.tied]] = np.moveaxis(of_frames[:, self.tied], 0, -1)
+        g = np.stack([self._right_side(eliminated, *side) for side in sides], axis=-1)
         nodes = np.zeros_like(g)
-        nodes[self._free] = lu.solve(g[self._free].reshape(-1, len(rig))).reshape(-1, 6, len(rig))
-        return np.asarray(np.moveaxis(nodes[: self._markers], -1, 0))
+        nodes[self._free] = lu.solve(g[self._free].reshape(-1, g.shape[-1])).reshape(-1, *g.shape[1:])
+        return np.asarray(nodes[: self._markers])
+
+    def _right_side(self, eliminated: FloatArray, rig: FloatArray, marker: FloatArray) -> FloatArray:
+        """Right side (nodes, 6) of the reduced system from those of the views."""
+        of_frames = np.add.reduceat(rig, np.flatnonzero(np.diff(self.frame, prepend=-1)), axis=0)
+        g = np.zeros((self._nodes, 6))
+        np.add.at(g, self.marker, marker - (eliminated @ of_frames[self.frame][..., None])[..., 0])
+        g[self._tied_node[self.tied]] = of_frames[self.tied]
+        return g
 
     def covariances(self, blocks: Blocks, factor: float, held_covariances: FloatArray) -> FloatArray | None:
         """Covariances (M, 6, 6) of the markers: noise times ``factor``, and what the held markers (M, 6, 6) pass on."""
