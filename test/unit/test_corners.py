@@ -147,7 +147,8 @@ def test_a_side_that_something_covers_is_no_side_of_a_square(covered_px):
     image[:, right - covered_px :] = 7100.0
     found = refine(image + np.random.default_rng(5).normal(0.0, 1.25, image.shape), corners, camera, 3)
     error = found.corners_px[0] - corners
-    squared = np.einsum('ki,kij,kj->k', error, np.linalg.inv(found.covariances[0]), error)
+    covariances = found.covariances[0] + found.doubt[0] * np.eye(2)
+    squared = np.einsum('ki,kij,kj->k', error, np.linalg.inv(covariances), error)
     # Three standard deviations of both coordinates.
     assert squared.max() < 9.0
 

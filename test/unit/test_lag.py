@@ -6,7 +6,14 @@ import pytest
 
 from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.vision.frame import Places
-from thermal_fiducial.core.vision.lag import markers_sharpened, model_error, REMAINING, SmearField, without_lag
+from thermal_fiducial.core.vision.lag import (
+    common_error,
+    markers_sharpened,
+    model_error,
+    REMAINING,
+    SmearField,
+    without_lag,
+)
 from thermal_fiducial.core.vision.motion import Twist
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
@@ -111,6 +118,15 @@ def test_model_error_leaves_the_common_shift_out():
     # The lag constant may be off by a third, which turns the marker by so much.
     np.testing.assert_allclose(np.trace(shape, axis1=-2, axis2=-1), (0.35 * 0.2) ** 2, rtol=1e-6)
     assert np.all(model_error(common, 0.5 * cell) > model_error(common, cell) - 1e-12)
+
+
+def test_an_unknown_motion_displaces_all_corners_alike_and_sharp_edges_limit_it():
+    displacement = np.tile(0.01 * 500.0 * np.eye(2, 6, k=3), (3, 4, 1, 1))
+    covariances = common_error(displacement, 1.5**2 * np.eye(6), np.array([0.015, 0.05, 0.1]))
+    # Means of the twelve corners are as uncertain as the motion makes each: 7.5 px, but for those sharp enough.
+    deviation = np.sqrt(covariances[..., 0, 0] / 12)
+    np.testing.assert_allclose(deviation, np.broadcast_to([[0.3], [1.0], [7.5]], (3, 4)), rtol=1e-6)
+    np.testing.assert_allclose(common_error(0.0 * displacement, np.eye(6), np.zeros(3)), 0.0)
 
 
 def test_windows_outside_or_without_numbers_are_skipped():

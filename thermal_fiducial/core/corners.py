@@ -12,7 +12,6 @@ import numpy as np
 from thermal_fiducial.core.adjustment import edges
 from thermal_fiducial.core.adjustment.segments import adjust, counts_across, HOPELESS, measure, Memory
 from thermal_fiducial.core.adjustment.sides import sides_of
-from thermal_fiducial.core.adjustment.squares import squareness
 from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -37,16 +36,20 @@ class RefinedCorners:
     covariances : (N, 4, 2, 2) [px^2]
     contrast : (N,) white minus black [counts]
     noise : (N,) standard deviation of a pixel about the model [counts]
+    doubt : (N,) variance of corners that make no square, zero where they do [px^2]; not in the covariances
     """
 
     corners_px: FloatArray
     covariances: FloatArray
     contrast: FloatArray
     noise: FloatArray
+    doubt: FloatArray
 
     def only(self, keep: BoolArray | IntArray) -> 'RefinedCorners':
         """Those of the markers ``keep``."""
-        return RefinedCorners(self.corners_px[keep], self.covariances[keep], self.contrast[keep], self.noise[keep])
+        return RefinedCorners(
+            self.corners_px[keep], self.covariances[keep], self.contrast[keep], self.noise[keep], self.doubt[keep]
+        )
 
 
 def refine_corners(
@@ -76,7 +79,7 @@ def refine_corners(
     """
     count = len(corners.px)
     px, covariances = corners.px.copy(), np.zeros((count, 4, 2, 2))
-    contrast, noise = np.zeros(count), np.zeros(count)
+    contrast, noise, doubt = np.zeros(count), np.zeros(count), np.zeros(count)
     smear = np.zeros((count, 2)) if smear_px is None else smear_px
     away = np.ones(count, dtype=bool) if near is None else ~near
     for factor in _PASSES:
@@ -101,10 +104,10 @@ def refine_corners(
             None if memory is None else memory.only(active),
         )
         px[active] = start.px + shift
-        covariances[active], contrast[active], noise[active] = rest
-        away[active] = np.abs(shift).max(axis=(1, 2)) > _SETTLED_PX
+        covariances[active], contrast[active], noise[active], doubt[active] = rest
+        away[active] = (np.abs(shift).max(axis=(1, 2)) > _SETTLED_PX) | (doubt[active] > 0.0)
         away |= factor > 1.0
-    return RefinedCorners(px, covariances, contrast, noise)
+    return RefinedCorners(px, covariances, contrast, noise, doubt)
 
 
 def _pass(
@@ -117,8 +120,8 @@ def _pass(
     prior: FloatArray,
     columns: int,
     memory: Memory | None,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """One linearised adjustment: shifts (N, 4, 2), covariances (N, 4, 2, 2), contrasts (N,), noise (N,)."""
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """One linearised adjustment: shifts (N, 4, 2), then covariances, contrasts, noise and doubts of RefinedCorners."""
     cells = behind.shape[2]
     widest = math.hypot(optics, math.sqrt(float(np.sum(smear * smear, axis=1).max())))
     half = min(max(math.ceil(2.5 * widest + 1.0), 4), 10)
@@ -126,9 +129,10 @@ def _pass(
     blur = edges.blurs(sides.normal[:, cells * columns // 2], optics, smear)
     counts = counts_across(image, sides, memory)
     segments = measure(counts, edges.model(sides, behind, blur), cells, _REACHED * blur[0])
-    moved, covariances = adjust(sides, segments, prior, squareness(start.x, start.inverse))
+    moved, covariances, doubt = adjust(sides, segments, prior, start)
     good = segments.variance < HOPELESS
-    return moved, covariances, _mean_where(segments.contrast, good), np.sqrt(_mean_where(segments.noise, good))
+    noise = np.sqrt(_mean_where(segments.noise, good))
+    return moved, covariances, _mean_where(segments.contrast, good), noise, doubt
 
 
 def _mean_where(values: FloatArray, good: BoolArray) -> FloatArray:

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.adjustment.sides import ENDS, Sides, STARTS
-from thermal_fiducial.core.adjustment.squares import SQUARE_STD, Squareness
+from thermal_fiducial.core.adjustment.squares import SQUARE_STD, Squareness, squareness
+from thermal_fiducial.core.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Variance of a segment that measures nothing.
@@ -184,28 +185,33 @@ def _median_where(values: FloatArray, good: BoolArray) -> FloatArray:
 
 
 def adjust(
-    sides: Sides, segments: Segments, prior: FloatArray, square: Squareness | None = None
-) -> tuple[FloatArray, FloatArray]:
+    sides: Sides, segments: Segments, prior: FloatArray, at: ImagePoints | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """How corners move (N, 4, 2) to explain the shifts of all segments, and their covariances (N, 4, 2, 2).
+
+    And the variances (N,) [px^2] of corners that make no square, zero where they do.
 
     Parameters
     ----------
     prior : (8, 8) information on the eight numbers beforehand
-    square : of the outlines so far; not used when left out
+    at : (N, 4) corners so far, of squares; nothing is known of the outlines when left out
     """
-    known: FloatArray | float = 0.0
-    if square is not None:
-        by_square = np.swapaxes(square.derivative, 1, 2) / SQUARE_STD**2
-        prior, known = prior + by_square @ square.derivative, by_square @ square.value[..., None]
     used = segments.variance < HOPELESS
     deviation = np.sqrt(segments.variance)
     A = _design(sides, deviation.shape) / deviation[..., None]
     shift = segments.shift / deviation
-    robust = np.ones_like(deviation)
+    robust, moved = np.ones_like(deviation), np.zeros((len(A), 8, 1))
     for _ in range(3):
         weighted = np.swapaxes(A * robust[..., None], 1, 2)
-        covariance = np.linalg.inv(weighted @ A + prior)
-        moved = covariance @ (weighted @ shift[..., None] - known)
+        information, seen = weighted @ A + prior, weighted @ shift[..., None]
+        if at is not None:
+            # Perspective comes into it squared, so it is taken anew where the corners are by now.
+            square = squareness(at.x + (at.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0], at.inverse)
+            by_square = np.swapaxes(square.derivative, 1, 2) / SQUARE_STD**2
+            information = information + by_square @ square.derivative
+            seen = seen + by_square @ (square.derivative @ moved - square.value[..., None])
+        before, covariance = moved, np.linalg.inv(information)
+        moved = covariance @ seen
         left = np.abs(shift - (A @ moved)[..., 0])
         scale = np.maximum(1.4826 * _median_where(left, used), 1.0)
         robust = 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
@@ -215,14 +221,13 @@ def adjust(
     # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
     covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None]
     blocks = np.einsum('nikil->nikl', covariance.reshape(-1, 4, 2, 4, 2))
-    if square is not None:
-        blocks = blocks + _no_square(square, moved, sides)[:, None, None, None] * np.eye(2)
-    return moved.reshape(-1, 4, 2), blocks + _FLOOR
+    doubt = np.zeros(len(A)) if at is None else _no_square(square, moved - before, sides)
+    return moved.reshape(-1, 4, 2), blocks + _FLOOR, doubt
 
 
 def _no_square(square: Squareness, moved: FloatArray, sides: Sides) -> FloatArray:
     """Variances (N,) [px^2] of corners whose outline is no square: a side of it is that of something else."""
-    error = square.error(moved)
+    error = np.sum((square.value + (square.derivative @ moved)[..., 0]) ** 2, axis=1)
     side = sides.along.reshape(-1, 4).mean(axis=1)
     return np.where(error > (_TOO_FAR * SQUARE_STD) ** 2, side**2 * error, 0.0)
 

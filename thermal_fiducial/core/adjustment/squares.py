@@ -23,18 +23,6 @@ class Squareness(NamedTuple):
     value: FloatArray
     #: (N, 2, 8) [1/px]
     derivative: FloatArray
-    x: FloatArray
-    inverse: FloatArray
-
-    def error(self, moved: FloatArray) -> FloatArray:
-        """Squares (N,) of how far they are off when the corners have moved by (N, 8, 1) [px], for certain.
-
-        In small views it is hardly linear: a perspective that noise makes takes its square from it. So only what
-        remains of the linear form as well as of the true one counts.
-        """
-        linear = self.value + (self.derivative @ moved)[..., 0]
-        true = _shear(self.x + (self.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0])
-        return np.asarray(np.minimum(np.sum(linear * linear, axis=-1), np.sum(true * true, axis=-1)))
 
 
 def squareness(x: FloatArray, inverse: FloatArray) -> Squareness:
@@ -44,7 +32,7 @@ def squareness(x: FloatArray, inverse: FloatArray) -> Squareness:
     values = _shear(x[:, None] + size[:, None, None, None] * np.concatenate([np.zeros((1, 4, 2)), steps]))
     by_x = (values[:, 1:] - values[:, :1]) / (_STEP * size)[:, None, None]
     by_corner = np.swapaxes(by_x.reshape(-1, 4, 2, 2), -1, -2) @ inverse
-    return Squareness(values[:, 0], np.moveaxis(by_corner, 2, 1).reshape(-1, 2, 8), x, inverse)
+    return Squareness(values[:, 0], np.moveaxis(by_corner, 2, 1).reshape(-1, 2, 8))
 
 
 def _twice_area(x: FloatArray) -> FloatArray:

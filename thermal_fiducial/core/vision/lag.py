@@ -39,6 +39,9 @@ MEMORY_AGE = 1.0 + 0.5 * _MEMORY
 # the smear, and one that grows with the cells that the smear covers.
 _LAG_UNSURE = 0.35
 _FORM_UNSURE, _FORM_UNSURE_IN_CELLS = 0.008, 0.010
+# Displacement [px] by a smear over the residuals that it leaves of a model without one, in contrasts, and the residuals
+# that hardly grow with it any more: 0.015 where there is no smear, 0.05 where it is 1.5 px, 0.08 where it is 6 px.
+_SMEAR_THAT_SHOWS, _SMEARED_OUT = 20.0, 0.055
 
 
 def model_error(smear_px: FloatArray, cell_px: FloatArray) -> FloatArray:
@@ -55,6 +58,25 @@ def model_error(smear_px: FloatArray, cell_px: FloatArray) -> FloatArray:
     form = (_FORM_UNSURE**2 + (_FORM_UNSURE_IN_CELLS / cell_px) ** 2 * square)[:, None, None]
     along = common[:, :, None] * common[:, None, :] + square[:, None, None] * np.eye(2)
     return np.asarray(change[..., :, None] * change[..., None, :] + 0.5 * (form * along)[:, None])
+
+
+def common_error(displacement: FloatArray, twist_covariance: FloatArray, unsharpness: FloatArray) -> FloatArray:
+    """Covariances (N, 4, 2, 2) [px^2] of corners that a motion displaces of which little is known.
+
+    It displaces all corners of a frame alike, which covariances of single ones cannot say: each has so much that what
+    they tell together is off by as much as any. Edges that are sharp limit it.
+
+    Parameters
+    ----------
+    displacement : (N, 4, 2, 6) derivative of the displacement by the twist [px]
+    twist_covariance : (6, 6)
+    unsharpness : (N,) residuals of pixels across the sides, in contrasts
+    """
+    count = unsharpness.size * 4
+    covariance = displacement @ twist_covariance @ np.swapaxes(displacement, -1, -2)
+    variance = 0.5 * np.trace(covariance, axis1=-2, axis2=-1)
+    shown = np.where(unsharpness < _SMEARED_OUT, (_SMEAR_THAT_SHOWS * unsharpness) ** 2, np.inf)[:, None]
+    return np.asarray(count * covariance * np.minimum(shown / np.maximum(variance, 1e-12), 1.0)[..., None, None])
 
 
 def without_lag(image: Float32Array, smear_u: Float32Array, smear_v: Float32Array) -> Float32Array:

@@ -140,12 +140,12 @@ class MotionTracker:
         if self._twist is not None and dt is not None and self._saw_lately(stamp_ns):
             carried = _carried(self._twist, dt)
         if len(odometry) >= _ENOUGH_STATES:
-            return _joined(carried or _unknown(), _line_through(stamp_ns, odometry, self._T_body_camera))
+            return _joined(carried or unknown_twist(), _line_through(stamp_ns, odometry, self._T_body_camera))
         if len(odometry) == 0 or abs(stamp_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
             return carried
         seen, later = camera_twist(odometry[-1], self._T_body_camera), (odometry[-1].stamp_ns - stamp_ns) * 1e-9
         information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + np.diag(_growth(abs(later))[0])))
-        return _corrected(carried or _unknown(), information, information @ seen.value, later)
+        return _corrected(carried or unknown_twist(), information, information @ seen.value, later)
 
     def expected(self, stamp_ns: int, twist: Twist) -> Tracked:
         """The last frame's markers where the camera's motion since has carried them."""
@@ -194,7 +194,7 @@ class MotionTracker:
             spread = information @ along
             share = spread / (1.0 + along @ spread)
             information, seen = information - np.outer(spread, share), seen - share * (along @ seen)
-        return _corrected(predicted or _unknown(), information, seen, -0.5 * (begin + end))
+        return _corrected(predicted or unknown_twist(), information, seen, -0.5 * (begin + end))
 
     def all_clearer_than(self, clarity: float) -> bool:
         """Whether there were markers, all of more contrast over noise."""
@@ -219,7 +219,8 @@ class MotionTracker:
         return (stamp_ns - self._stamp_ns) * 1e-9
 
 
-def _unknown() -> Twist:
+def unknown_twist() -> Twist:
+    """That of a camera of which nothing is known."""
     return Twist(np.zeros(6), np.diag(np.concatenate([_UNKNOWN, _ACCELERATION])))
 
 

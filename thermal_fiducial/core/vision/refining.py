@@ -14,9 +14,17 @@ from thermal_fiducial.core.adjustment.segments import Memory
 from thermal_fiducial.core.corners import refine_corners, RefinedCorners
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from thermal_fiducial.core.vision.frame import Frame, Places
-from thermal_fiducial.core.vision.lag import GAIN, markers_sharpened, memory_maps, model_error, REMAINING, SPREAD
-from thermal_fiducial.core.vision.motion import MotionTracker, Twist
-from thermal_fiducial.core.vision.readout import expected_displacement, seen_displacement, stretch
+from thermal_fiducial.core.vision.lag import (
+    common_error,
+    GAIN,
+    markers_sharpened,
+    memory_maps,
+    model_error,
+    REMAINING,
+    SPREAD,
+)
+from thermal_fiducial.core.vision.motion import MotionTracker, Twist, unknown_twist
+from thermal_fiducial.core.vision.readout import delays, expected_displacement, seen_displacement, stretch
 from thermal_fiducial.core.vision.scratch import Scratch
 from thermal_fiducial.core.vision.search import Found
 
@@ -153,15 +161,30 @@ class Refiner:
         if frame.twist is not None or known is None:
             twist = self._motion.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
         if twist is None:
-            return Refinement(view, seen, seen, replace(places, at=at), None)
+            unsure = seen.covariances + _doubts(seen) + _never_seen(frame, places, seen, unknown_twist())
+            return Refinement(view, seen, replace(seen, covariances=unsure), replace(places, at=at), None)
         smear = places.smear(twist, frame.lag)
         rolled = seen_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
         corners = seen.corners_px - smear + view.removed - rolled
         # What the corners of a marker have in common is no error of its shape.
         by_twist = frame.lag * (places.flow - places.flow.mean(axis=1, keepdims=True))
         unknown = by_twist @ twist.covariance_ago(frame.lag) @ np.swapaxes(by_twist, -1, -2) + model_error(smear, cell)
-        refined = replace(seen, corners_px=corners, covariances=seen.covariances + unknown)
+        if frame.twist is None:
+            unknown = unknown + _never_seen(frame, places, seen, twist)
+        refined = replace(seen, corners_px=corners, covariances=seen.covariances + _doubts(seen) + unknown)
         return Refinement(view, seen, refined, replace(places, at=at.moved(corners - at.px, frame.camera)), twist)
+
+
+def _doubts(seen: RefinedCorners) -> FloatArray:
+    """Covariances (N, 1, 2, 2) [px^2] of corners that make no square."""
+    return seen.doubt[:, None, None, None] * np.eye(2)
+
+
+def _never_seen(frame: Frame, places: Places, seen: RefinedCorners, twist: Twist) -> FloatArray:
+    """Covariances (N, 4, 2, 2) [px^2] by a motion that the frames before tell nothing of."""
+    since = frame.lag - delays(seen.corners_px[..., 1], frame)
+    unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), 1e-6)
+    return common_error(since[..., None, None] * places.flow, twist.covariance_ago(frame.lag), unsharpness)
 
 
 def _worth_sharpening(square: FloatArray, cell: FloatArray, cells: int, clarity: FloatArray) -> BoolArray:
