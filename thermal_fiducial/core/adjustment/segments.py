@@ -27,6 +27,8 @@ _FLOOR = 0.010**2 * np.eye(2)
 # Contrast of a segment over that of the marker: less is hidden, more is the edge of something else; and by how much the
 # contrast of a plate varies.
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
+# Standard deviation of the linear form of an outline that is far from a square, as a share of how far it is.
+_BENT = 0.1
 # Outlines farther from a square than so many standard deviations are not those of the marker alone.
 _TOO_FAR = 2.0
 _SIDES = np.arange(4)
@@ -207,7 +209,7 @@ def adjust(
         if at is not None:
             # Perspective comes into it squared, so it is taken anew where the corners are by now.
             square = squareness(at.x + (at.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0], at.inverse)
-            by_square = np.swapaxes(square.derivative, 1, 2) / SQUARE_STD**2
+            by_square = np.swapaxes(square.derivative, 1, 2) / (SQUARE_STD**2 + (_BENT * square.value) ** 2)[:, None]
             information = information + by_square @ square.derivative
             seen = seen + by_square @ (square.derivative @ moved - square.value[..., None])
         before, covariance = moved, np.linalg.inv(information)

@@ -63,8 +63,8 @@ def model_error(smear_px: FloatArray, cell_px: FloatArray) -> FloatArray:
 def common_error(displacement: FloatArray, twist_covariance: FloatArray, unsharpness: FloatArray) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] of corners that a motion displaces of which little is known.
 
-    It displaces all corners of a frame alike, which covariances of single ones cannot say: each has so much that what
-    they tell together is off by as much as any. Edges that are sharp limit it.
+    Edges that are sharp limit it. It displaces all corners of a frame alike, which covariances of single ones cannot
+    say: what many of them tell together may be off by more than theirs.
 
     Parameters
     ----------
@@ -72,11 +72,10 @@ def common_error(displacement: FloatArray, twist_covariance: FloatArray, unsharp
     twist_covariance : (6, 6)
     unsharpness : (N,) residuals of pixels across the sides, in contrasts
     """
-    count = unsharpness.size * 4
     covariance = displacement @ twist_covariance @ np.swapaxes(displacement, -1, -2)
     variance = 0.5 * np.trace(covariance, axis1=-2, axis2=-1)
     shown = np.where(unsharpness < _SMEARED_OUT, (_SMEAR_THAT_SHOWS * unsharpness) ** 2, np.inf)[:, None]
-    return np.asarray(count * covariance * np.minimum(shown / np.maximum(variance, 1e-12), 1.0)[..., None, None])
+    return np.asarray(covariance * np.minimum(shown / np.maximum(variance, 1e-12), 1.0)[..., None, None])
 
 
 def without_lag(image: Float32Array, smear_u: Float32Array, smear_v: Float32Array) -> Float32Array:
