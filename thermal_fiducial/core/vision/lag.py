@@ -36,9 +36,9 @@ SPREAD = math.sqrt(1.0 - _MEMORY**2 * _FORGOTTEN * GAIN**2)
 #: Age, in time constants, of the velocity that has carried the memory as far as it is from the image.
 MEMORY_AGE = 1.0 + 0.5 * _MEMORY
 # How far the time constant may be off, and the displacement of an edge by a response that is no exponential: a share of
-# the smear, and one that grows with the cells that the smear covers.
+# the smear, and one that grows with the square of the cells that the smear covers.
 _LAG_UNSURE = 0.35
-_FORM_UNSURE, _FORM_UNSURE_IN_CELLS = 0.008, 0.010
+_FORM_UNSURE, _FORM_UNSURE_IN_CELLS = 0.010, 0.011
 # Displacement [px] by a smear over the residuals that it leaves of a model without one, in contrasts, and the residuals
 # that hardly grow with it any more: 0.015 where there is no smear, 0.05 where it is 1.5 px, 0.08 where it is 6 px.
 _SMEAR_THAT_SHOWS, _SMEARED_OUT = 20.0, 0.055
@@ -55,7 +55,7 @@ def model_error(smear_px: FloatArray, cell_px: FloatArray) -> FloatArray:
     common = smear_px.mean(axis=1)
     change = _LAG_UNSURE * (smear_px - common[:, None])
     square = np.sum(common**2, axis=1)
-    form = (_FORM_UNSURE**2 + (_FORM_UNSURE_IN_CELLS / cell_px) ** 2 * square)[:, None, None]
+    form = (_FORM_UNSURE**2 + (_FORM_UNSURE_IN_CELLS * square / cell_px**2) ** 2)[:, None, None]
     along = common[:, :, None] * common[:, None, :] + square[:, None, None] * np.eye(2)
     return np.asarray(change[..., :, None] * change[..., None, :] + 0.5 * (form * along)[:, None])
 
