@@ -81,7 +81,8 @@ def refine_corners(
     px, covariances = corners.px.copy(), np.zeros((count, 4, 2, 2))
     contrast, noise, doubt = np.zeros(count), np.zeros(count), np.zeros(count)
     smear = np.zeros((count, 2)) if smear_px is None else smear_px
-    away = np.ones(count, dtype=bool) if near is None else ~near
+    far = np.ones(count, dtype=bool) if near is None else ~near
+    away = far.copy()
     for factor in _PASSES:
         active = np.flatnonzero(away)
         if len(active) == 0:
@@ -105,7 +106,7 @@ def refine_corners(
         )
         px[active] = start.px + shift
         covariances[active], contrast[active], noise[active], doubt[active] = rest
-        away[active] = (np.abs(shift).max(axis=(1, 2)) > _SETTLED_PX) | (doubt[active] > 0.0)
+        away[active] = (np.abs(shift).max(axis=(1, 2)) > _SETTLED_PX) | (far[active] & (doubt[active] > 0.0))
         away |= factor > 1.0
     return RefinedCorners(px, covariances, contrast, noise, doubt)
 
