@@ -18,6 +18,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 # Factors on the blur, pass by pass: a wide one catches, narrow ones measure, until the corners no longer move.
 _PASSES = (1.4, 1.0, 1.0, 1.0, 1.0)
 _SETTLED_PX = 0.3
+# Outlines that are none of squares stay so when their corners move by no more than this [px].
+_STILL_PX = 0.1
 # A linearised displacement is good for this many blurs.
 _REACHED = 2.0
 # Standard deviation of what is known of the corners beforehand, and of their places among themselves [px].
@@ -81,8 +83,7 @@ def refine_corners(
     px, covariances = corners.px.copy(), np.zeros((count, 4, 2, 2))
     contrast, noise, doubt = np.zeros(count), np.zeros(count), np.zeros(count)
     smear = np.zeros((count, 2)) if smear_px is None else smear_px
-    far = np.ones(count, dtype=bool) if near is None else ~near
-    away = far.copy()
+    away = np.ones(count, dtype=bool) if near is None else ~near
     for factor in _PASSES:
         active = np.flatnonzero(away)
         if len(active) == 0:
@@ -106,7 +107,8 @@ def refine_corners(
         )
         px[active] = start.px + shift
         covariances[active], contrast[active], noise[active], doubt[active] = rest
-        away[active] = (np.abs(shift).max(axis=(1, 2)) > _SETTLED_PX) | (far[active] & (doubt[active] > 0.0))
+        step = np.abs(shift).max(axis=(1, 2))
+        away[active] = (step > _SETTLED_PX) | ((doubt[active] > 0.0) & (step > _STILL_PX))
         away |= factor > 1.0
     return RefinedCorners(px, covariances, contrast, noise, doubt)
 
