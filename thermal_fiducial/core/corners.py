@@ -18,8 +18,6 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 # Factors on the blur, pass by pass: a wide one catches, narrow ones measure, until the corners no longer move.
 _PASSES = (1.4, 1.0, 1.0, 1.0, 1.0)
 _SETTLED_PX = 0.3
-# Outlines that are none of squares stay so when their corners move by no more than this [px].
-_STILL_PX = 0.1
 # A linearised displacement is good for this many blurs.
 _REACHED = 2.0
 # Standard deviation of what is known of the corners beforehand, and of their places among themselves [px].
@@ -107,8 +105,7 @@ def refine_corners(
         )
         px[active] = start.px + shift
         covariances[active], contrast[active], noise[active], doubt[active] = rest
-        step = np.abs(shift).max(axis=(1, 2))
-        away[active] = (step > _SETTLED_PX) | ((doubt[active] > 0.0) & (step > _STILL_PX))
+        away[active] = (np.abs(shift).max(axis=(1, 2)) > _SETTLED_PX) | (doubt[active] > 0.0)
         away |= factor > 1.0
     return RefinedCorners(px, covariances, contrast, noise, doubt)
 

@@ -29,8 +29,6 @@ _FLOOR = 0.010**2 * np.eye(2)
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
 # Standard deviation of the linear form of an outline that is far from a square, as a share of how far it is.
 _BENT = 0.1
-# Movement of corners that bends it [px].
-_BENDS_PX = 0.3
 # Outlines farther from a square than so many standard deviations are not those of the marker alone.
 _TOO_FAR = 2.0
 _SIDES = np.arange(4)
@@ -204,21 +202,17 @@ def adjust(
     deviation = np.sqrt(segments.variance)
     A = _design(sides, deviation.shape) / deviation[..., None]
     shift = segments.shift / deviation
-    robust, moved, square = np.ones_like(deviation), np.zeros((len(A), 8, 1)), None
-    then = moved
+    robust, moved = np.ones_like(deviation), np.zeros((len(A), 8, 1))
     for _ in range(3):
         weighted = np.swapaxes(A * robust[..., None], 1, 2)
         information, seen = weighted @ A + prior, weighted @ shift[..., None]
         if at is not None:
-            if square is None or np.abs(moved - then).max() > _BENDS_PX:
-                # Perspective comes into it squared, so it is taken anew where the corners are by now.
-                square = squareness(at.x + (at.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0], at.inverse)
-                then = moved
-                bent = SQUARE_STD**2 + (_BENT * square.value) ** 2
-                by_square = np.swapaxes(square.derivative, 1, 2) / bent[:, None]
+            # Perspective comes into it squared, so it is taken anew where the corners are by now.
+            square = squareness(at.x + (at.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0], at.inverse)
+            by_square = np.swapaxes(square.derivative, 1, 2) / (SQUARE_STD**2 + (_BENT * square.value) ** 2)[:, None]
             information = information + by_square @ square.derivative
-            seen = seen + by_square @ (square.derivative @ then - square.value[..., None])
-        covariance = np.linalg.inv(information)
+            seen = seen + by_square @ (square.derivative @ moved - square.value[..., None])
+        before, covariance = moved, np.linalg.inv(information)
         moved = covariance @ seen
         left = np.abs(shift - (A @ moved)[..., 0])
         scale = np.maximum(1.4826 * _median_where(left, used), 1.0)
@@ -229,7 +223,7 @@ def adjust(
     # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
     covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None]
     blocks = np.einsum('nikil->nikl', covariance.reshape(-1, 4, 2, 4, 2))
-    doubt = np.zeros(len(A)) if square is None else _no_square(square, moved - then, sides)
+    doubt = np.zeros(len(A)) if at is None else _no_square(square, moved - before, sides)
     return moved.reshape(-1, 4, 2), blocks + _FLOOR, doubt
 
 
