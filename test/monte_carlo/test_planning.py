@@ -10,6 +10,7 @@ from thermal_fiducial.fabrication.planning import expect, load_measurements, pos
 
 NETD = 0.05
 SIZE = 0.30
+SEEDS = (901, 902, 903)
 
 
 @pytest.mark.slow
@@ -18,18 +19,19 @@ def test_planned_pose_errors_are_the_measured_ones():
     tables = load_measurements()
     ratios = []
     for side, tilt, kelvin in product((34.0, 50.0, 80.0), (20.0, 40.0, 58.0), (1.0, 6.0)):
-        tally = show(detector, camera, side, kelvin, tilt, 72, [901, int(side), int(tilt)])
-        measured = pose_errors(tally.best, tally.other, tally.T_true)
+        tallies = [show(detector, camera, side, kelvin, tilt, 72, [seed, int(side), int(tilt)]) for seed in SEEDS]
+        measured = np.mean([pose_errors(tally.best, tally.other, tally.T_true) for tally in tallies], axis=0)
         planned = expect(
             tables, camera, size=SIZE, distance=camera.focal_px * SIZE / side, tilt_deg=tilt, contrast=kelvin / NETD
         )
         if not planned.detected:
             continue
         # 72 markers: a share of 0.8 scatters by 0.05.
-        assert tally.found >= 0.65
+        assert min(tally.found for tally in tallies) >= 0.65
         ratios.append((planned.position / measured[0], planned.rotation_deg / measured[2]))
     assert len(ratios) == 18
-    # Medians of 72 errors scatter by an eighth, and so do those of the tables: the goal holds for each view.
+    # Medians of 72 errors scatter by an eighth, three of them together by a fourteenth; the tables scatter by a tenth.
+    # The goal holds for each view.
     assert np.all(np.abs(np.log(ratios)) < np.log(1.5))
     # Over all views scatter averages out.
     assert np.all(np.abs(np.log(np.median(ratios, axis=0))) < np.log(1.25))
