@@ -120,7 +120,7 @@ class Pipeline:
         mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry.nearest(stamp_ns))
         update = None if mapping.pose is None else self.filter.add_pose(_published_pose(mapping.pose))
         jump = self._refine(stamp_ns)
-        if jump is not None:
+        if jump is not None and jump.moves_poses:
             self.filter.move_map(as_published(jump.T_new_old))
         if mapping.map_changed or jump is not None:
             self._share_map()

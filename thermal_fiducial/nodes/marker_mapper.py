@@ -111,7 +111,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
 
     def _tell(self, jump: MapJump | None) -> None:
         """Publish a map that has moved, and how where poses move with it, with the stamp of the newest frame before."""
-        if jump is not None and np.any(jump.T_new_old != np.eye(4)):
+        if jump is not None and jump.moves_poses:
             frame, self._correction = self.config.map_frame, (self._newest_ns, jump.T_new_old)
             self._map_correction.send(
                 convert.transform_message(jump.T_new_old, self._newest_ns, frame, f'{frame}_before')

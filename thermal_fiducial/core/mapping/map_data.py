@@ -118,6 +118,11 @@ class MapJump:
     #: (4, 4) moves poses near the robot from the old map to the new: T_new = T_new_old @ T_old
     T_new_old: FloatArray
 
+    @property
+    def moves_poses(self) -> bool:
+        """Whether poses near the robot move at all: most refinements leave them where they are."""
+        return bool(np.any(self.T_new_old != np.eye(4)))
+
 
 def _fill(rows: np.ndarray, names: Collection[str], values: FloatArray) -> None:
     for name, column in zip(names, values.T, strict=True):
