@@ -5,6 +5,7 @@ Good enough to run everything that handles bags; no measure of accuracy, which i
 
 import dataclasses
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import cv2
@@ -29,7 +30,9 @@ SIZE = 0.3
 CENTRES = {0: (2.5, 0.32, 0.26), 1: (2.5, -0.28, 0.3), 2: (2.5, 0.28, -0.3), 3: (2.5, -0.32, -0.26)}
 PARAMETERS = {'marker_size': SIZE, 'camera_position': [0.1, 0.0, 0.0], 'camera_orientation': [-0.5, 0.5, -0.5, 0.5]}
 _COLD, _HOT, _NOISE = 7000, 7600, 4.0
-_PIXELS_PER_BIT = 40
+_SHEET_BITS, _PIXELS_PER_BIT = 10, 40
+# Of the sheet [px]: 0.8 pixels of the images, where a bit is about 16 wide.
+_BLUR = 2.0
 
 _TYPES = get_typestore(Stores.ROS2_JAZZY).types
 
@@ -126,20 +129,24 @@ def frame(T_map_body, rng):
     picture = np.full((CAMERA.height, CAMERA.width), _COLD, np.float32)
     for marker_id, centre in CENTRES.items():
         T_camera_marker = T_camera_map @ transform(R_MAP_MARKER, centre)
-        # The plate is one bit wider all round than the black square of six bits.
-        side = marker_corners(SIZE * 8 / 6)
-        uv = CAMERA.project(apply(T_camera_marker, side)).astype(np.float32)
-        plate = np.full((8, 8), 255, np.uint8)
-        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-        plate[1:7, 1:7] = cv2.aruco.generateImageMarker(dictionary, marker_id, 6)
-        texture = np.kron(plate, np.ones((_PIXELS_PER_BIT, _PIXELS_PER_BIT), np.uint8)).astype(np.float32)
-        n = texture.shape[0] - 0.5
+        uv = CAMERA.project(apply(T_camera_marker, marker_corners(_SHEET_BITS * SIZE / 6)))
+        n = _SHEET_BITS * _PIXELS_PER_BIT - 0.5
         corners = np.array([[-0.5, -0.5], [n, -0.5], [n, n], [-0.5, n]], np.float32)
-        H = cv2.getPerspectiveTransform(corners, uv)
-        warped = cv2.warpPerspective(texture, H, (CAMERA.width, CAMERA.height), flags=cv2.INTER_AREA)
-        picture += warped / 255.0 * (_HOT - _COLD)
-    picture = cv2.GaussianBlur(picture, (0, 0), 0.7) + rng.normal(0.0, _NOISE, picture.shape)
-    return np.rint(picture).astype(np.uint16)
+        H = cv2.getPerspectiveTransform(corners, uv.astype(np.float32))
+        picture += cv2.warpPerspective(_sheet(marker_id), H, (CAMERA.width, CAMERA.height))
+    return np.rint(picture + rng.normal(0.0, _NOISE, picture.shape)).astype(np.uint16)
+
+
+@cache
+def _sheet(marker_id):
+    """What a marker adds to the wall; blurred before it is warped, for sharp edges would come out in steps."""
+    # The plate is one bit wider all round than the black square of six bits, the sheet one wider than the plate.
+    sheet = np.zeros((_SHEET_BITS, _SHEET_BITS), np.float32)
+    sheet[1:-1, 1:-1] = 1.0
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    sheet[2:-2, 2:-2] = cv2.aruco.generateImageMarker(dictionary, marker_id, 6) / 255.0
+    sharp = np.kron(sheet, np.ones((_PIXELS_PER_BIT, _PIXELS_PER_BIT), np.float32))
+    return (_HOT - _COLD) * cv2.GaussianBlur(sharp, (0, 0), _BLUR)
 
 
 def header(stamp_ns, frame_id):
