@@ -22,6 +22,7 @@ from thermal_fiducial.core.mapping.candidates import Candidate, View, Viewpoint
 from thermal_fiducial.core.mapping.correction import correction
 from thermal_fiducial.core.mapping.keyframes import in_moved_map, Keyframe, KeyframeStore, Rig
 from thermal_fiducial.core.mapping.localization import locate, Location, positive, Refusal, Sight
+from thermal_fiducial.core.mapping.located import Located, LocatedFrame
 from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.map_editing import align
 from thermal_fiducial.core.mapping.map_rows import marker_poses, usable
@@ -30,7 +31,7 @@ from thermal_fiducial.core.mapping.noise_level import NoiseLevel
 from thermal_fiducial.core.mapping.odometry_prior import ClockDifference, Expected, Fused, growth, together
 from thermal_fiducial.core.mapping.trust import culprits, DISAGREEMENT, Trust
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers, Odometry
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
 __all__ = ['MapJump', 'MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
@@ -45,8 +46,6 @@ LASTING = 3.0
 #: What a marker's corners are off by in all views alike (its shape, the edge's model), as a share of their noise:
 #: as measured on rendered flights with three lenses and 0.5 to 9 K.
 LASTING_SHARE = 0.7
-#: Attitudes known no better than this [rad] are not told: their covariances, of first order, mean nothing.
-VAGUE = 0.2
 #: Corner errors to allow for before a marker is said to disagree with the others [px].
 TOLERANCE_PX = 0.3
 #: Candidates that are judged in one frame: bounds its time when many are new.
@@ -124,6 +123,10 @@ class MarkerMapper:
         camera : its intrinsics
         odometry : the filter's latest output; settles ambiguities, and bridges gaps between known markers
         """
+        return self.learn(self.locate(stamp_ns, markers, camera, odometry))
+
+    def locate(self, stamp_ns: int, markers: Markers, camera: Camera, odometry: Odometry | None = None) -> LocatedFrame:
+        """The first half of :meth:`process`, which ends with the pose: whoever waits for that need wait no longer."""
         markers = usable(markers)
         self._noise.add(markers)
         # Step 2: known and new markers.
@@ -132,42 +135,48 @@ class MarkerMapper:
         trusted = np.array([marker.trusted for marker in known.markers], dtype=bool)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
         expected = self._expected(stamp_ns, odometry)
-        location = self._locate(stamp_ns, known.select(trusted), camera, expected)
-        if isinstance(location, Refusal):
-            changed, waiting = self._without_pose(stamp_ns, markers[~is_known], camera, expected, location)
-            return self._result(stamp_ns, None, location.reason, changed, waiting=waiting)
-        ids = tuple(marker.id for marker, used in zip(known.markers, trusted, strict=True) if used)
-        covariance = location.covariance + self._motion.unknown(stamp_ns, location.T_map_camera)
-        covariance = covariance + (LASTING - 1.0) * location.map_covariance
+        outcome = self._locate(stamp_ns, known.select(trusted), camera, expected)
+        return LocatedFrame(stamp_ns, camera, markers, is_known, known, trusted, expected, outcome)
+
+    def learn(self, frame: LocatedFrame) -> MapperResult:
+        """The second half: errors, standings and new markers, from the frame that was located last."""
+        expected = frame.expected
+        if isinstance(frame.outcome, Refusal):
+            changed, waiting = self._without_pose(frame, frame.outcome)
+            return self._result(frame, changed, waiting=waiting)
+        location, pose = frame.outcome.location, frame.outcome.pose
         if expected is not None:
-            self._clocks.learn(expected, location.T_map_camera, covariance)
-        self._last = CameraPose(stamp_ns, location.T_map_camera, covariance, ids, location.rms_px)
-        self._gap = None
+            self._clocks.learn(expected, pose.T_map_camera, pose.covariance)
+        self._last, self._gap = pose, None
         # Step 7: errors updated.
-        errors = self._update_errors(stamp_ns, known, location, camera)
-        changed = self._judge(known, trusted, errors, location, camera)
+        errors = self._update_errors(frame, location)
+        changed = self._judge(frame, errors, location)
         # Step 8: new markers placed relative to the camera.
         waiting = {}
         if not self.frozen:
             fused = _fused(location, expected)
-            self._keep(markers, camera, self._last, fused, expected)
-            viewpoint = _viewpoint(fused)
-            placed, waiting = self._place_new(stamp_ns, markers[~is_known], camera, viewpoint)
+            self._keep(frame, pose, fused)
+            placed, waiting = self._place_new(frame, _viewpoint(fused))
             changed |= placed
-        residuals = {marker.id: float(error) for marker, error in zip(known.markers, errors, strict=True)}
-        vague = _vague(location, ids)
-        return self._result(stamp_ns, None if vague else self._last, vague, changed, residuals, waiting)
+        residuals = {marker.id: float(error) for marker, error in zip(frame.known.markers, errors, strict=True)}
+        return self._result(frame, changed, residuals, waiting)
 
     def _expected(self, stamp_ns: int, odometry: Odometry | None) -> Expected | None:
         if odometry is None or abs(stamp_ns - odometry.stamp_ns) >= CONTINUITY_NS:
             return None
         return self._clocks.expected(odometry, stamp_ns, self._T_body_camera)
 
-    def _locate(self, stamp_ns: int, sight: Sight, camera: Camera, expected: Expected | None) -> Location | Refusal:
+    def _locate(self, stamp_ns: int, sight: Sight, camera: Camera, expected: Expected | None) -> Located | Refusal:
         if not sight.markers:
             return Refusal(self._nothing_known())
         errors = self._trust.running_errors(sight.markers)
-        return locate(sight, errors, camera, self._prior(stamp_ns, expected))
+        location = locate(sight, errors, camera, self._prior(stamp_ns, expected))
+        if isinstance(location, Refusal):
+            return location
+        covariance = location.covariance + self._motion.unknown(stamp_ns, location.T_map_camera)
+        covariance = covariance + (LASTING - 1.0) * location.map_covariance
+        ids = tuple(marker.id for marker in sight.markers)
+        return Located(location, CameraPose(stamp_ns, location.T_map_camera, covariance, ids, location.rms_px))
 
     def _nothing_known(self) -> str:
         if not self.map.markers:
@@ -187,8 +196,9 @@ class MarkerMapper:
         known = [self.map.markers[int(key)] for key in rows['id'] if int(key) in self.map.markers]
         return Sight(known, corners_px(rows), self._noise.factor * corner_covariances(rows), branches)
 
-    def _update_errors(self, stamp_ns: int, known: Sight, location: Location, camera: Camera) -> FloatArray:
+    def _update_errors(self, frame: LocatedFrame, location: Location) -> FloatArray:
         """Re-projection error (N,) [px] of each known marker, taken into its statistics."""
+        known, camera = frame.known, frame.camera
         points = corners_in_map(known.T_map_marker, known.sizes)
         residuals = known.corners - reproject(camera, location.T_map_camera, points)
         squared = np.mean(np.sum(residuals**2, axis=-1), axis=-1)
@@ -196,15 +206,16 @@ class MarkerMapper:
         self._trust.add_errors(known.markers, errors)
         if not self.frozen:
             for marker in known.markers:
-                self.map.markers[marker.id] = marker.seen(stamp_ns, self._trust.running_error(marker))
+                self.map.markers[marker.id] = marker.seen(frame.stamp_ns, self._trust.running_error(marker))
         return np.asarray(errors)
 
-    def _judge(self, known: Sight, trusted: BoolArray, errors: FloatArray, location: Location, camera: Camera) -> bool:
+    def _judge(self, frame: LocatedFrame, errors: FloatArray, location: Location) -> bool:
         """Quarantine markers that persistently disagree; whether any standing changed."""
+        known = frame.known
         if len(known.markers) < 2:
             return False
-        disagrees = errors > DISAGREEMENT * _expected_errors(known, location, camera)
-        blamed = culprits(disagrees, trusted, known.markers)
+        disagrees = errors > DISAGREEMENT * _expected_errors(known, location, frame.camera)
+        blamed = culprits(disagrees, frame.trusted, known.markers)
         changes = self._trust.judge(known.markers, blamed.tolist())
         for marker_id, trusted_now in changes.items():
             self._set_standing(marker_id, trusted=trusted_now)
@@ -214,37 +225,36 @@ class MarkerMapper:
         self.map.markers[marker_id] = replace(self.map.markers[marker_id], trusted=trusted)
         (self._quarantined.discard if trusted else self._quarantined.add)(marker_id)
 
-    def _place_new(
-        self, stamp_ns: int, rows: Markers, camera: Camera, viewpoint: Viewpoint
-    ) -> tuple[bool, dict[int, str]]:
+    def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, dict[int, str]]:
         """Show new markers to their candidates; whether any entered the map, and what the others wait for."""
+        rows = frame.new
         branches = np.stack([marker_poses(rows, ''), marker_poses(rows, 'a')], axis=1)
         corners, covariances = corners_px(rows), self._noise.factor * corner_covariances(rows)
         shown = []
         for i, marker_id in enumerate(int(key) for key in rows['id']):
             size = self._sizes.get(marker_id, self.config.marker_size)
             candidate = self._candidates.setdefault(marker_id, Candidate(marker_id, size))
-            candidate.add(View(stamp_ns, viewpoint, corners[i], covariances[i], branches[i]))
+            candidate.add(View(frame.stamp_ns, viewpoint, corners[i], covariances[i], branches[i]))
             shown.append(candidate)
         placed = False
         for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:
             if candidate.untried <= len(candidate.views) // _PATIENCE:
                 continue
-            placement = candidate.place(camera)
+            placement = candidate.place(frame.camera)
             candidate.reason = placement.reason
             if placement.T_map_marker is not None:
-                self.enter(stamp_ns, candidate, placement.T_map_marker, placement.covariance)
+                self.enter(frame.stamp_ns, candidate, placement.T_map_marker, placement.covariance)
                 placed = True
         self.map.version += placed
         return placed, {candidate.id: candidate.reason for candidate in shown if candidate.id in self._candidates}
 
-    def _keep(self, rows: Markers, camera: Camera, pose: CameraPose, fused: Fused, expected: Expected | None) -> None:
+    def _keep(self, frame: LocatedFrame, pose: CameraPose, fused: Fused) -> None:
         """Keep the frame for the refinement; of one marker alone nothing can be learned."""
         pose = replace(pose, T_map_camera=fused.T_map_camera)
-        self._last_frame = _keyframe(rows, pose, self._camera_index(camera), expected)
-        self._belief = None if expected is None else expected.pose.covariance
+        self._last_frame = _keyframe(frame.rows, pose, self._camera_index(frame.camera), frame.expected)
+        self._belief = None if frame.expected is None else frame.expected.pose.covariance
         self._recent.append(self._last_frame)
-        if len(rows) >= 2:
+        if len(frame.rows) >= 2:
             self._keyframes.add(self._last_frame)
 
     def _camera_index(self, camera: Camera) -> int:
@@ -255,37 +265,36 @@ class MarkerMapper:
         self._cameras.append(camera)
         return len(self._cameras) - 1
 
-    def _without_pose(
-        self, stamp_ns: int, rows: Markers, camera: Camera, expected: Expected | None, refusal: Refusal
-    ) -> tuple[bool, dict[int, str]]:
+    def _without_pose(self, frame: LocatedFrame, refusal: Refusal) -> tuple[bool, dict[int, str]]:
         """What a frame without a pose may still teach of new markers."""
-        if self.frozen or not len(rows):
+        expected = frame.expected
+        if self.frozen or not len(frame.new):
             return False, {}
         if refusal.rivals is not None and refusal.covariances is not None:
-            return self._place_new(stamp_ns, rows, camera, Viewpoint(refusal.rivals, refusal.covariances))
+            return self._place_new(frame, Viewpoint(refusal.rivals, refusal.covariances))
         if expected is None or self._last is None:
             return False, {}
-        if not 0 <= stamp_ns - self._last.stamp_ns <= self.config.bridge_duration * 1e9:
+        if not 0 <= frame.stamp_ns - self._last.stamp_ns <= self.config.bridge_duration * 1e9:
             return False, {}
-        return self._bridge(stamp_ns, rows, camera, expected)
+        return self._bridge(frame, expected)
 
-    def _bridge(self, stamp_ns: int, rows: Markers, camera: Camera, expected: Expected) -> tuple[bool, dict[int, str]]:
+    def _bridge(self, frame: LocatedFrame, expected: Expected) -> tuple[bool, dict[int, str]]:
         """Place new markers from the odometry while no known one is in view."""
-        pose = expected.pose
-        frame = _keyframe(rows, pose, self._camera_index(camera), expected)
+        pose, rows = expected.pose, frame.new
+        keyframe = _keyframe(rows, pose, self._camera_index(frame.camera), expected)
         if not any(int(key) in self._candidates for key in rows['id']):
             # Nothing but the odometry joins these markers to the map. Once is enough: its error is the same for all
             # that follow, which hang together through the markers themselves.
             self._keyframes.add(self._last_frame)
-            self._keyframes.links.append(link(self._last_frame, frame, pose.covariance))
-            self._keyframes.add(frame)
+            self._keyframes.links.append(link(self._last_frame, keyframe, pose.covariance))
+            self._keyframes.add(keyframe)
         elif len(rows) >= 2:
-            self._keyframes.add(frame)
+            self._keyframes.add(keyframe)
         if self._gap is None:
             self._gap = pose
         # What the odometry had gathered when the gap's first marker came is the same for all its views.
         viewpoint = Viewpoint.known(pose.T_map_camera, growth(self._gap, expected))
-        return self._place_new(stamp_ns, rows, camera, replace(viewpoint, common=self._gap.covariance))
+        return self._place_new(frame, replace(viewpoint, common=self._gap.covariance))
 
     def refinement_due(self, stamp_ns: int) -> bool:
         """Whether enough has been seen since the last joint refinement for another to be worth its time."""
@@ -372,24 +381,22 @@ class MarkerMapper:
 
     def _result(
         self,
-        stamp_ns: int,
-        pose: CameraPose | None,
-        reason: str,
-        changed: bool = False,
+        frame: LocatedFrame,
+        changed: bool,
         residuals: dict[int, float] | None = None,
         waiting: dict[int, str] | None = None,
     ) -> MapperResult:
-        quarantined = tuple(sorted(self._quarantined))
         return MapperResult(
-            stamp_ns, pose, reason, changed, residuals or {}, waiting or {}, quarantined, self.map.version, self.resets
+            frame.stamp_ns,
+            frame.pose,
+            frame.outcome.reason,
+            changed,
+            residuals or {},
+            waiting or {},
+            tuple(sorted(self._quarantined)),
+            self.map.version,
+            self.resets,
         )
-
-
-def _vague(location: Location, ids: tuple[int, ...]) -> str:
-    """Why a pose that is known by its order of magnitude only is not told; empty for others."""
-    std = float(np.sqrt(np.trace(location.covariance[3:, 3:])))
-    listed = ', '.join(str(key) for key in ids)
-    return f'known to {np.rad2deg(std):.0f} degrees only, by marker {listed}' if std > VAGUE else ''
 
 
 def _fused(location: Location, expected: Expected | None) -> Fused:

@@ -97,12 +97,13 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
 
     def _on_markers(self, message: PointCloud2) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
-        result = self.mapper.process(stamp, convert.markers(message), self.camera(), self.odometry.nearest(stamp))
-        self._result = result
+        frame = self.mapper.locate(stamp, convert.markers(message), self.camera(), self.odometry.nearest(stamp))
         self._newest_ns = max(stamp, self._newest_ns) if stamp >= self._newest_ns - LATEST_NS else stamp
-        if result.pose is not None:
-            head, told = convert.header(stamp, self.config.map_frame), self._as_told(result.pose)
+        if frame.pose is not None:
+            head, told = convert.header(stamp, self.config.map_frame), self._as_told(frame.pose)
             self._camera_pose.send(convert.pose_with_covariance(told.T_map_camera, told.covariance, head))
+        # The pose is on its way by now.
+        self._result = result = self.mapper.learn(frame)
         jump = self._refine(stamp)
         if jump is not None:
             self._tell(jump)
