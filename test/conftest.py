@@ -13,10 +13,13 @@ import hypothesis
 import pytest
 
 from thermal_fiducial.replay.domain import own_domain
+from thermal_fiducial.ros.run import use_transport_profile
 
 cv2.setNumThreads(1)
 _domain = own_domain()
 os.environ['ROS_DOMAIN_ID'] = str(_domain.__enter__())
+# Fast DDS reads profiles once a process: whichever test comes first, replays later on need theirs.
+use_transport_profile()
 hypothesis.settings.register_profile('default', derandomize=True, deadline=None, max_examples=50)
 hypothesis.settings.load_profile('default')
 
