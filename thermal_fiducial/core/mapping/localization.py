@@ -20,15 +20,12 @@ from thermal_fiducial.core.adjustment.reprojection import (
 )
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.geometry import inverse, rotation_angle
-from thermal_fiducial.core.mapping.candidates import correlated_sum
+from thermal_fiducial.core.mapping.candidates import correlated_sum, SYSTEMATIC_PX
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.pose import solve_camera_pose
 from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
 
-#: Corner errors that no covariance of white noise speaks of (lens, lag of a moving camera) [px]: the floor below which
-#: the better of two poses isn't better.
-SYSTEMATIC_PX = 0.1
 #: Difference of chi square that refutes the worse of two poses: odds of e^-10.
 DECISIVE = 20.0
 #: Poses nearer to each other than this [rad] are one pose whose covariance covers both.
