@@ -36,10 +36,10 @@ class _Grid(NamedTuple):
     #: (P,) shares of the sides
     a: FloatArray
     b: FloatArray
-    #: (P, 4) by how much each sample moves with each corner
-    weights: FloatArray
-    #: (P, 6) background: constant, slopes, curvatures
-    smooth: FloatArray
+    #: (4, P) by how much each sample moves with each corner
+    weights: Float32Array
+    #: (6, P) background: constant, slopes, curvatures
+    smooth: Float32Array
     #: (sqrt(P), m + 2) of :func:`_blur`
     blur: FloatArray
 
@@ -49,8 +49,8 @@ def _grid(cells: int) -> _Grid:
     share = np.concatenate([[-_OUTSIDE], (np.arange(cells)[:, None] + _SAMPLES).ravel(), [cells + _OUTSIDE]])
     a, b = (axis.ravel() / cells for axis in np.meshgrid(share, share))
     x, y = a - 0.5, b - 0.5
-    smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
-    weights = np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), a * b, (1.0 - a) * b], axis=-1)
+    smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).astype(np.float32)
+    weights = np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), a * b, (1.0 - a) * b]).astype(np.float32)
     return _Grid(a, b, weights, smooth, _blur(share, cells))
 
 
@@ -58,9 +58,9 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
     """Quadrilaterals (Q, 4, 2) moved to where ``image`` looks most like the markers ``ids`` (Q,), turned (Q,)."""
     grid = _grid(decoder.cells)
     cells = np.pad(decoder.seen(ids, turns), ((0, 0), (1, 1), (1, 1)), constant_values=1.0)
-    J = np.empty((len(ids), len(grid.a), 15))
-    J[..., 8:14] = grid.smooth
-    J[..., 14] = (grid.blur @ cells @ grid.blur.T).reshape(len(ids), -1)
+    J = np.empty((len(ids), 15, len(grid.a)), dtype=np.float32)
+    J[:, 8:14] = grid.smooth
+    J[:, 14] = (grid.blur @ cells @ grid.blur.T).reshape(len(ids), -1)
     image, origin = _window(image, quads, decoder.cells)
     quads = quads - origin
     picture = cv2.GaussianBlur(image - np.float32(image.mean()), (0, 0), _SMOOTHING)
@@ -69,13 +69,14 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
     planes: list[Float32Array] = [np.asarray(plane) for plane in (picture, slope_u, slope_v)]
     for _ in range(_STEPS):
         places = in_quadrilaterals(quads, grid.a, grid.b).astype(np.float32)
-        value, du, dv = (sampled(plane, places)[..., None] for plane in planes)
-        J[..., :4], J[..., 4:8] = du * grid.weights, dv * grid.weights
-        information = np.swapaxes(J, -1, -2) @ J
+        value, du, dv = (sampled(plane, places)[:, None] for plane in planes)
+        np.multiply(du, grid.weights, out=J[:, :4])
+        np.multiply(dv, grid.weights, out=J[:, 4:8])
+        information = (J @ np.swapaxes(J, -1, -2)).astype(np.float64)
         diagonal = np.einsum('qii->qi', information)
         diagonal[:, :8] *= 1.0 + _DAMPING
         diagonal += 1e-9 + 1e-9 * diagonal.max(axis=1, keepdims=True)
-        step = -np.linalg.solve(information, np.swapaxes(J, -1, -2) @ value)[:, :8, 0]
+        step = -np.linalg.solve(information, J @ np.swapaxes(value, -1, -2))[:, :8, 0]
         longest = _LONGEST / decoder.cells * np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)[:, None] / np.sqrt(2.0)
         quads = quads + np.swapaxes(np.clip(step, -longest, longest).reshape(-1, 2, 4), -1, -2)
     return quads + origin

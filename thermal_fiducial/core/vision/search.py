@@ -128,10 +128,12 @@ class BlindSearch:
         half = without_columns(halved(image, self._scratch), 0.5 * noise, self._scratch)
         if Sought.FAINT in sought:
             faint = self._faint(half, noise, config.min_side_px, hidden)
-        quads = np.concatenate([fine, faint, shrunk(faint, decoder.cells)])
-        if len(quads) == 0:
+        if len(fine) + len(faint) == 0:
             return Found.none()
-        reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, _halfway(quads[len(fine) :]), allowed))
+        # Blur may leave nothing to be seen of a border between two white ones but the outline of the whole plate.
+        fine, faint = (np.concatenate([outlines, shrunk(outlines, decoder.cells)]) for outlines in (fine, faint))
+        quads = np.concatenate([fine, faint])
+        reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, _halfway(faint), allowed))
         rough = _rough(reading, quads, seen.ids)
         if len(rough):
             better = aligned(half, _halfway(quads[rough]), reading.ids[rough], reading.turns[rough], decoder)
