@@ -82,6 +82,19 @@ def test_clean_frames_go_out_with_their_stamp_and_frozen_ones_do_not(graph):
     assert graph.diagnose(node)[:2] == (OK, 'ok')
 
 
+def test_frames_of_8_bits_are_taken_and_what_they_cost_is_said(graph):
+    node = graph.add(Tau2Camera)
+    graph.listen(Image, 'thermal/image')
+    (raw,) = frames(1)
+    shown = convert.image((image_to_array(raw) // 64).astype(np.uint8), raw.header)
+    graph.send('thermal/image_raw', shown)
+    graph.spin_until(lambda: graph.heard['thermal/image'])
+    assert graph.heard['thermal/image'][0].encoding == 'mono16'
+    level, reason, _ = graph.diagnose(node)
+    assert level == OK
+    assert '8 bits' in reason
+
+
 def test_a_late_frame_goes_out_and_is_counted(graph):
     node = graph.add(Tau2Camera)
     graph.listen(Image, 'thermal/image')

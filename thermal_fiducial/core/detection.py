@@ -23,7 +23,7 @@ from thermal_fiducial.core.vision.frame import Frame, Places
 from thermal_fiducial.core.vision.guided import camera_in_map, Expected, KnownMarkers, look
 from thermal_fiducial.core.vision.ids import among, pairs
 from thermal_fiducial.core.vision.lag import markers_sharpened, REMAINING, SmearField, without_lag
-from thermal_fiducial.core.vision.local_corners import local_corners
+from thermal_fiducial.core.vision.local_corners import as_displayed, local_corners
 from thermal_fiducial.core.vision.marker_rows import marker_rows
 from thermal_fiducial.core.vision.motion import MotionTracker, plausible, Tracked, Twist
 from thermal_fiducial.core.vision.odometry_log import OdometryLog
@@ -43,6 +43,8 @@ _CLEARER_THAN_COLUMNS = 100.0
 _CLEAR = 20.0
 # Nearer to the rim of the image than this a marker is not expected to be seen, or may be cut off [px].
 _RIM_PX = 2.0
+# Raw counts of a bolometer are beyond those of 8 bits, which went through the camera's processing for a display.
+_COUNTS_OF_8_BITS = 256
 # A marker that was read off its corners by less than this need not be read again [cells].
 _READ_THERE = 0.1
 # Where not all markers are known, or not all seen that should be, a blind search follows at least every so many frames.
@@ -130,6 +132,8 @@ class MarkerDetector:
             if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
                 corners = local_corners(frame.image, corners, self._decoder.cells)
                 at = ImagePoints.at(corners.corners_px, camera)
+            elif counts.max() < _COUNTS_OF_8_BITS:
+                corners = as_displayed(corners)
             poses = self._poses(ids, corners, at, T_camera_map)
             self._remember(frame, ids, refinement, poses)
             return marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)
