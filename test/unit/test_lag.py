@@ -108,16 +108,29 @@ def test_sharpened_edges_are_those_of_a_response_that_forgets(smear):
     assert abs(displaced) < 0.015
 
 
+SQUARE = 60.0 * np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
+
+
 def test_model_error_leaves_the_common_shift_out():
     common = np.broadcast_to([3.0, 0.0], (1, 4, 2))
     turning = common + 0.2 * np.array([[[0, -1], [1, 0], [0, 1], [-1, 0]]])
-    cell = np.array([10.0])
-    still = model_error(0.0 * common, cell)
+    still = model_error(0.0 * common, SQUARE, 6)
     np.testing.assert_array_equal(still, 0.0)
-    shape = model_error(turning, cell) - model_error(common, cell)
+    shape = model_error(turning, SQUARE, 6) - model_error(common, SQUARE, 6)
     # The lag constant may be off by a third, which turns the marker by so much.
     np.testing.assert_allclose(np.trace(shape, axis1=-2, axis2=-1), (0.35 * 0.2) ** 2, rtol=1e-6)
-    assert np.all(model_error(common, 0.5 * cell) > model_error(common, cell) - 1e-12)
+    assert np.all(model_error(common, 0.5 * SQUARE, 6) > model_error(common, SQUARE, 6) - 1e-12)
+
+
+@pytest.mark.parametrize('turn', [0.0, 0.7])
+def test_model_error_counts_the_cells_that_the_smear_passes(turn):
+    """Seen from the side, a marker's cells are narrower one way; how it is turned in the image does not matter."""
+    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    across, along = (np.broadcast_to(R @ shift, (1, 4, 2)) for shift in ([6.0, 0.0], [0.0, 6.0]))
+    tilted, narrow = (SQUARE * np.array(shape) @ R.T for shape in ([0.5, 1.0], [0.5, 0.5]))
+    whole = SQUARE @ R.T
+    np.testing.assert_allclose(model_error(across, tilted, 6), model_error(across, narrow, 6))
+    np.testing.assert_allclose(model_error(along, tilted, 6), model_error(along, whole, 6))
 
 
 def test_an_unknown_motion_is_limited_by_sharp_edges():

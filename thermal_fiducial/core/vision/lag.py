@@ -36,7 +36,7 @@ SPREAD = math.sqrt(1.0 - _MEMORY**2 * _FORGOTTEN * GAIN**2)
 #: Age, in time constants, of the velocity that has carried the memory as far as it is from the image.
 MEMORY_AGE = 1.0 + 0.5 * _MEMORY
 # How far the time constant may be off, and the displacement of an edge by a response that is no exponential: a share of
-# the smear, and one that grows with the square of the cells that the smear covers.
+# the smear, and one that grows with the square of the cells that the smear carries it.
 _LAG_UNSURE = 0.35
 _FORM_UNSURE, _FORM_UNSURE_IN_CELLS = 0.010, 0.011
 # Displacement [px] by a smear over the residuals that it leaves of a model without one, in contrasts, and the residuals
@@ -44,20 +44,27 @@ _FORM_UNSURE, _FORM_UNSURE_IN_CELLS = 0.010, 0.011
 _SMEAR_THAT_SHOWS, _SMEARED_OUT = 20.0, 0.055
 
 
-def model_error(smear_px: FloatArray, cell_px: FloatArray) -> FloatArray:
+def model_error(smear_px: FloatArray, corners_px: FloatArray, cells: int) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] of what is wrong with an exponential lag of this time constant.
 
     A wrong time constant displaces the corners along their smear (N, 4, 2). What they have in common no marker can
     tell, and covariances of single corners cannot say; it is a delay, and belongs to the filter's time offset. The
     differences change the marker's shape. So does a response of another form, and the more the farther it carries the
-    neighbouring edges, one cell (N,) away, into one another.
+    neighbouring edges, one cell away, into one another: those of a marker with m ``cells`` and corners (N, 4, 2).
     """
     common = smear_px.mean(axis=1)
     change = _LAG_UNSURE * (smear_px - common[:, None])
     square = np.sum(common**2, axis=1)
-    form = (_FORM_UNSURE**2 + (_FORM_UNSURE_IN_CELLS * square / cell_px**2) ** 2)[:, None, None]
+    carried = cells**2 * np.sum(_shares_of_sides(common, corners_px) ** 2, axis=1)
+    form = (_FORM_UNSURE**2 + (_FORM_UNSURE_IN_CELLS * carried) ** 2)[:, None, None]
     along = common[:, :, None] * common[:, None, :] + square[:, None, None] * np.eye(2)
     return np.asarray(change[..., :, None] * change[..., None, :] + 0.5 * (form * along)[:, None])
+
+
+def _shares_of_sides(shift: FloatArray, corners: FloatArray) -> FloatArray:
+    """Shifts (N, 2) in mean sides of the markers with ``corners`` (N, 4, 2): of a tilted one these are not alike."""
+    a, b = corners[:, 1] - corners[:, 3], corners[:, 2] - corners[:, 0]
+    return np.asarray(2.0 * np.linalg.solve(np.stack([a + b, b - a], axis=-1), shift[..., None])[..., 0])
 
 
 def common_error(displacement: FloatArray, twist_covariance: FloatArray, unsharpness: FloatArray) -> FloatArray:

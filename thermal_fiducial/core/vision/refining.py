@@ -119,7 +119,7 @@ class Refiner:
             seen = refine_corners(
                 frame.image, start, frame.camera, behind, *blur, columns, near=near, memory=view.memory
             )
-            refinement = self._at_stamp(frame, found, places, view, seen, cell, twist)
+            refinement = self._at_stamp(frame, found, places, view, seen, twist)
             change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)
             if refinement.twist is None or change.max(initial=0.0) < SMEAR_THAT_MATTERS_PX:
                 break
@@ -149,7 +149,6 @@ class Refiner:
         places: Places,
         view: View,
         seen: RefinedCorners,
-        cell: FloatArray,
         known: Twist | None,
     ) -> Refinement:
         """The corners without lag and as if all rows were seen at once, by the twist that they themselves correct."""
@@ -168,7 +167,8 @@ class Refiner:
         corners = seen.corners_px - smear + view.removed - rolled
         # What the corners of a marker have in common is no error of its shape.
         by_twist = frame.lag * (places.flow - places.flow.mean(axis=1, keepdims=True))
-        unknown = by_twist @ twist.covariance_ago(frame.lag) @ np.swapaxes(by_twist, -1, -2) + model_error(smear, cell)
+        unknown = by_twist @ twist.covariance_ago(frame.lag) @ np.swapaxes(by_twist, -1, -2)
+        unknown = unknown + model_error(smear, places.at.px, self._behind.shape[2])
         if frame.twist is None:
             unknown = unknown + _never_seen(frame, places, seen, twist)
         refined = replace(seen, corners_px=corners, covariances=seen.covariances + _doubts(seen) + unknown)
