@@ -3,9 +3,9 @@
 import numpy as np
 
 from thermal_fiducial.core import geometry
-from thermal_fiducial.core.adjustment.squares import squareness
+from thermal_fiducial.core.adjustment.squares import as_squares, squareness
 from thermal_fiducial.core.camera import Camera, ImagePoints
-from thermal_fiducial.core.pose import marker_corners
+from thermal_fiducial.core.pose import marker_corners, solve_marker_poses
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
 
@@ -22,12 +22,14 @@ def views(count, outline):
 def test_views_of_squares_are_square_and_those_of_others_as_far_off_as_these():
     square = marker_corners(0.3)
     seen = views(50, square)
-    np.testing.assert_allclose(squareness(seen.x, seen.inverse).value, 0.0, atol=1e-12)
+    np.testing.assert_allclose(squareness(seen.x, seen.inverse).value[..., 0], 0.0, atol=1e-12)
     # Longer by 1 % from left to right: squares of the sides differ by 2 % of their mean. Sheared by 1 %: the cosine of
     # the angle; both to first order.
     longer, sheared = (views(50, square @ A.T) for A in (np.diag([1.01, 1.0, 1.0]), np.eye(3) + 0.01 * np.eye(3, k=1)))
-    np.testing.assert_allclose(squareness(longer.x, longer.inverse).value, np.tile([0.0, 0.01], (50, 1)), atol=1e-4)
-    off = np.abs(squareness(sheared.x, sheared.inverse).value)
+    np.testing.assert_allclose(
+        squareness(longer.x, longer.inverse).value[..., 0], np.tile([0.0, 0.01], (50, 1)), atol=1e-4
+    )
+    off = np.abs(squareness(sheared.x, sheared.inverse).value[..., 0])
     np.testing.assert_allclose(off, np.tile([0.01, 0.0], (50, 1)), atol=1e-4)
 
 
@@ -35,6 +37,39 @@ def test_derivative_by_the_corners_in_pixels():
     seen, step = views(20, marker_corners(0.3)), np.random.default_rng(4).normal(0.0, 1e-3, (20, 4, 2))
     known = squareness(seen.x, seen.inverse)
     later, earlier = (ImagePoints.at(seen.px + sign * step, CAMERA) for sign in (1.0, -1.0))
-    difference = 0.5 * (squareness(later.x, later.inverse).value - squareness(earlier.x, earlier.inverse).value)
+    difference = 0.5 * (squareness(later.x, later.inverse).value - squareness(earlier.x, earlier.inverse).value)[..., 0]
     # Of changes of about 1e-3, what the second derivative of the distortion leaves.
     np.testing.assert_allclose((known.derivative @ step.reshape(20, 8, 1))[..., 0], difference, rtol=1e-4, atol=1e-7)
+
+
+def test_corners_are_those_of_squares_and_as_good_as_they_claim():
+    truth, sigma = views(400, marker_corners(0.3)), 0.03
+    noise = np.random.default_rng(5).normal(0.0, sigma, (400, 8, 1))
+    known = as_squares(truth, noise, np.tile(sigma**2 * np.eye(8), (400, 1, 1)))
+    nees = np.sum(known.moved * np.linalg.solve(known.covariance, known.moved), axis=(1, 2))
+    # The six of a square, and up to two, as these are squares without error; four standard errors of the mean of 400.
+    assert 6.0 - 4.0 * np.sqrt(12.0 / 400) < nees.mean() < 8.0 + 4.0 * np.sqrt(16.0 / 400)
+    assert np.mean(known.moved**2) < 0.9 * sigma**2
+    # Of 400 true squares about one is as far off by chance as an outline that is none.
+    assert np.count_nonzero(known.doubt) <= 4
+
+
+def test_an_outline_that_is_no_square_is_told():
+    seen = views(50, marker_corners(0.3) * [1.1, 1.0, 1.0])
+    known = as_squares(seen, np.zeros((50, 8, 1)), np.tile(0.01**2 * np.eye(8), (50, 1, 1)))
+    assert np.count_nonzero(known.doubt) > 40
+
+
+def test_a_square_of_the_other_tilt_is_left_for_the_true_one():
+    centre, tilt = np.array([0.5, -0.3, 4.0]), np.array([0.4, 0.3, 0.2])
+    T = geometry.transform(geometry.so3_exp(tilt) @ np.diag([1.0, -1.0, -1.0]), centre)
+    true_px = CAMERA.project(geometry.apply(T, marker_corners(0.3)))[None]
+    unit = np.tile(np.eye(2), (1, 4, 1, 1))
+    other = solve_marker_poses(true_px, 0.01**2 * unit, np.array([0.3]), CAMERA).T_camera_marker[0, 1]
+    start = ImagePoints.at(CAMERA.project(geometry.apply(other, marker_corners(0.3)))[None], CAMERA)
+    off = (true_px - start.px).reshape(1, 8, 1)
+    assert np.abs(off).max() > 0.1
+    known = as_squares(start, off, 0.01**2 * np.eye(8)[None])
+    # The corners are seen without noise, so hardly anything moves them off the true square.
+    np.testing.assert_allclose(known.moved, off, atol=0.01)
+    assert known.chi2[0] < 1.0

@@ -17,7 +17,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 
 # Factors on the blur, pass by pass: a wide one catches, narrow ones measure, until the corners no longer move.
 _PASSES = (1.4, 1.0, 1.0, 1.0, 1.0)
-_SETTLED_PX = 0.3
+# Steps below which they are settled, and below which outlines that are no squares stay so.
+_SETTLED_PX, _STILL_PX = 0.3, 0.1
 # A linearised displacement is good for this many blurs.
 _REACHED = 2.0
 # Standard deviation of what is known of the corners beforehand, and of their places among themselves [px].
@@ -105,7 +106,8 @@ def refine_corners(
         )
         px[active] = start.px + shift
         covariances[active], contrast[active], noise[active], doubt[active] = rest
-        away[active] = (np.abs(shift).max(axis=(1, 2)) > _SETTLED_PX) | (doubt[active] > 0.0)
+        step = np.abs(shift).max(axis=(1, 2))
+        away[active] = step > np.where(doubt[active] > 0.0, _STILL_PX, _SETTLED_PX)
         away |= factor > 1.0
     return RefinedCorners(px, covariances, contrast, noise, doubt)
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.adjustment.sides import ENDS, Sides, STARTS
-from thermal_fiducial.core.adjustment.squares import SQUARE_STD, Squareness, squareness
+from thermal_fiducial.core.adjustment.squares import as_squares
 from thermal_fiducial.core.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -22,15 +22,14 @@ _PIXEL_OUTLIER = 4.5
 _SEGMENT_OUTLIER = 2.5
 # Variance of a standard normal variable of which no more than that is kept.
 _KEPT_VARIANCE = 0.911
-# Standard deviation of a corner that no image noise explains: the optics' blur is not quite a Gaussian [px].
-_FLOOR = 0.010**2 * np.eye(2)
+# Standard deviation of a corner that no image noise explains: the optics' blur is not quite a Gaussian [px]; and of
+# what all four sides have in common of it, so that it leaves a square one.
+_FLOOR, _COMMON_FLOOR = 0.010**2 * np.eye(8), 0.005**2 * np.eye(2)
 # Contrast of a segment over that of the marker: less is hidden, more is the edge of something else; and by how much the
 # contrast of a plate varies.
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
-# Standard deviation of the linear form of an outline that is far from a square, as a share of how far it is.
-_BENT = 0.1
-# Outlines farther from a square than so many standard deviations are not those of the marker alone.
-_TOO_FAR = 2.0
+# Weights of segments are found in so many rounds.
+_ROUNDS = 3
 _SIDES = np.arange(4)
 
 
@@ -187,7 +186,7 @@ def _median_where(values: FloatArray, good: BoolArray) -> FloatArray:
 
 
 def adjust(
-    sides: Sides, segments: Segments, prior: FloatArray, at: ImagePoints | None = None
+    sides: Sides, segments: Segments, prior: FloatArray, at: ImagePoints
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """How corners move (N, 4, 2) to explain the shifts of all segments, and their covariances (N, 4, 2, 2).
 
@@ -196,42 +195,30 @@ def adjust(
     Parameters
     ----------
     prior : (8, 8) information on the eight numbers beforehand
-    at : (N, 4) corners so far, of squares; nothing is known of the outlines when left out
+    at : (N, 4) corners so far
     """
     used = segments.variance < HOPELESS
     deviation = np.sqrt(segments.variance)
     A = _design(sides, deviation.shape) / deviation[..., None]
     shift = segments.shift / deviation
-    robust, moved = np.ones_like(deviation), np.zeros((len(A), 8, 1))
-    for _ in range(3):
-        weighted = np.swapaxes(A * robust[..., None], 1, 2)
-        information, seen = weighted @ A + prior, weighted @ shift[..., None]
-        if at is not None:
-            # Perspective comes into it squared, so it is taken anew where the corners are by now.
-            square = squareness(at.x + (at.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0], at.inverse)
-            by_square = np.swapaxes(square.derivative, 1, 2) / (SQUARE_STD**2 + (_BENT * square.value) ** 2)[:, None]
-            information = information + by_square @ square.derivative
-            seen = seen + by_square @ (square.derivative @ moved - square.value[..., None])
-        before, covariance = moved, np.linalg.inv(information)
-        moved = covariance @ seen
+    weighted = np.swapaxes(A, 1, 2)
+    for _ in range(_ROUNDS):
+        covariance = np.linalg.inv(weighted @ A + prior)
+        moved = covariance @ (weighted @ shift[..., None])
         left = np.abs(shift - (A @ moved)[..., 0])
         scale = np.maximum(1.4826 * _median_where(left, used), 1.0)
         robust = 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
+        weighted = np.swapaxes(A * robust[..., None], 1, 2)
     kept = used & (robust > 0.99)
     chi2 = np.sum(left * left * kept, axis=1) / _KEPT_VARIANCE
     free = np.maximum(np.count_nonzero(kept, axis=1) - 8.0, 0.0)
     # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
-    covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None]
-    blocks = np.einsum('nikil->nikl', covariance.reshape(-1, 4, 2, 4, 2))
-    doubt = np.zeros(len(A)) if at is None else _no_square(square, moved - before, sides)
-    return moved.reshape(-1, 4, 2), blocks + _FLOOR, doubt
-
-
-def _no_square(square: Squareness, moved: FloatArray, sides: Sides) -> FloatArray:
-    """Variances (N,) [px^2] of corners whose outline is no square: a side of it is that of something else."""
-    error = np.sum((square.value + (square.derivative @ moved)[..., 0]) ** 2, axis=1)
-    side = sides.along.reshape(-1, 4).mean(axis=1)
-    return np.where(error > (_TOO_FAR * SQUARE_STD) ** 2, side**2 * error, 0.0)
+    covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None] + _FLOOR
+    known = as_squares(at, moved, covariance)
+    blocks = np.einsum('nikil->nikl', known.covariance.reshape(-1, 4, 2, 4, 2))
+    # A side of an outline that is no square's is that of something else.
+    doubt = known.doubt * sides.along.reshape(-1, 4).mean(axis=1) ** 2
+    return known.moved.reshape(-1, 4, 2), blocks + _COMMON_FLOOR, doubt
 
 
 def _design(sides: Sides, shape: tuple[int, ...]) -> FloatArray:
