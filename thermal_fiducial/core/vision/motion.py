@@ -9,6 +9,7 @@ states round the frame and by how the markers' corners moved since.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,6 +31,11 @@ _LEAST_VARIANCE = 1e-6
 _JITTER_S = 0.001
 # How far corners that lag displaces may be off their mean delay, where the form of smeared edges is unknown [lag].
 _DELAY_UNSURE = 0.5
+# Mean square of a marker's residuals over what the noise of its corners makes of it, beyond which not all markers can
+# be of one scene (two in a hundred of brisk flights); how often weights are adapted, and when they have settled.
+_OUTLIER, _ROUNDS, _SETTLED = 12.0, 10, 0.02
+# Of the corners of a marker.
+_COORDINATES = 8
 _VALUE, _CHANGE = np.arange(6), np.arange(6, 12)
 # No camera that sees markers moves faster: such odometry tells nothing [m/s, rad/s].
 _FASTEST, _FASTEST_TURN = 20.0, 30.0
@@ -118,6 +124,64 @@ class Tracked:
         return Tracked(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4)), np.zeros(0))
 
 
+class _Flow(NamedTuple):
+    """Velocities of the M = 8 N coordinates of N markers' corners.
+
+    Parameters
+    ----------
+    A : (M, 6) derivative by the twist
+    velocity : (M,) normalised
+    stretch : (M,) by what all velocities may be off together, one standard deviation
+    weight : (M,) inverse variance of what each may be off by itself
+    """
+
+    A: FloatArray
+    velocity: FloatArray
+    stretch: FloatArray
+    weight: FloatArray
+
+    def robust(self, start: Twist, ago: float) -> Twist:
+        """The twist ``start`` corrected by the velocities so many seconds before.
+
+        A marker that moves by itself, or whose corners went astray, shows by its residuals beside those of the others,
+        and loses weight accordingly.
+        """
+        twist = _corrected(start, *self._told(self.weight), -ago)
+        if self._chi2(twist.ago(ago), self.weight).max() <= _OUTLIER:
+            return twist
+        # Together with the others, those that are wrong hide among them: what was expected tells them apart.
+        trust = _trusted(self._chi2(start.ago(ago), self.weight))
+        for _ in range(_ROUNDS):
+            weight = np.repeat(trust, _COORDINATES) * self.weight
+            twist = _corrected(start, *self._told(weight), -ago)
+            former, trust = trust, _trusted(self._chi2(twist.ago(ago), weight))
+            if np.abs(trust - former).max() < _SETTLED:
+                break
+        return twist
+
+    def _told(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Information on the twist (6, 6), and times the twist (6,)."""
+        weighted, stretched = self.A.T * weight, weight * self.stretch
+        spread = weighted @ self.stretch
+        share = spread / (1.0 + stretched @ self.stretch)
+        return weighted @ self.A - np.outer(spread, share), weighted @ self.velocity - share * (
+            stretched @ self.velocity
+        )
+
+    def _chi2(self, twist: FloatArray, weight: FloatArray) -> FloatArray:
+        """Squared residuals (N,) of markers from a twist (6,), per degree of freedom."""
+        residual, stretched = self.velocity - self.A @ twist, weight * self.stretch
+        residual = residual - (stretched @ residual) / (1.0 + stretched @ self.stretch) * self.stretch
+        return np.asarray((self.weight * residual * residual).reshape(-1, _COORDINATES).mean(axis=1))
+
+
+def _trusted(chi2: FloatArray) -> FloatArray:
+    """Factors (N,) on the weights of markers, 1 for residuals like those of most (S. Geman, D. McClure, 1987)."""
+    half = (len(chi2) - 1) // 2
+    typical = max(float(np.partition(chi2, half)[half]), 1.0)
+    return np.asarray(np.minimum(2.0 * typical / (typical + chi2), 1.0) ** 2)
+
+
 class MotionTracker:
     """The camera's twist over the frames, and the markers that it saw."""
 
@@ -182,19 +246,14 @@ class MotionTracker:
         if len(now) == 0 or dt is None:
             return predicted
         begin, end = dt + (self._lag if self._twist is None else 0.0), self._lag if predicted is None else 0.0
-        seconds = begin - end
+        seconds, start = begin - end, predicted or unknown_twist()
+        # Stamps that jitter stretch or shrink all velocities of a frame alike.
+        unsure = 2.0 * _JITTER_S**2 + (0.0 if self._twist is not None else (_DELAY_UNSURE * self._lag) ** 2)
         A = interaction(0.5 * (x[now] + self._seen.x[before]), depth[now]).reshape(-1, 6)
         velocity = (x[now] - self._seen.x[before]).reshape(-1) / seconds
-        weighted = A.T * np.repeat((seconds / (1.5 * noise[now])) ** 2, 8)
-        information, seen = weighted @ A, weighted @ velocity
-        if predicted is not None:
-            # Stamps that jitter stretch or shrink all velocities of a frame alike.
-            unsure = 2.0 * _JITTER_S**2 + (0.0 if self._twist is not None else (_DELAY_UNSURE * self._lag) ** 2)
-            along = math.sqrt(unsure) / seconds * predicted.value
-            spread = information @ along
-            share = spread / (1.0 + along @ spread)
-            information, seen = information - np.outer(spread, share), seen - share * (along @ seen)
-        return _corrected(predicted or unknown_twist(), information, seen, -0.5 * (begin + end))
+        stretch = A @ (np.zeros(6) if predicted is None else math.sqrt(unsure) / seconds * predicted.value)
+        flow = _Flow(A, velocity, stretch, np.repeat((seconds / (1.5 * noise[now])) ** 2, _COORDINATES))
+        return flow.robust(start, 0.5 * (begin + end))
 
     def all_clearer_than(self, clarity: float) -> bool:
         """Whether there were markers, all of more contrast over noise."""
