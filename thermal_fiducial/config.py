@@ -305,7 +305,8 @@ class ArucoDetectorConfig:
     guided: bool = param(True, 'With a map and odometry: look for known markers where they should be.', live=True)
     blind_interval: int = param(
         10,
-        'A blind search follows every so many frames, and sooner where expected markers are not seen.',
+        'A blind search follows every so many frames, and sooner without a map or where expected markers are not seen. '
+        'Where all are clear, small markers (at full resolution) and faint ones (at half) are sought in turn.',
         minimum=1,
         maximum=1000,
         live=True,
