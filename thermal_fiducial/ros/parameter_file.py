@@ -41,9 +41,7 @@ def parameter_file() -> str:
 
 def _entry(name: str, item: 'Field[Any]', default: Any) -> Iterator[str]:
     limits = item.metadata
-    text = (
-        limits['description'] + ''.join(f' {part}' for part in _limits(limits)) + (' Live.' if limits['live'] else '')
-    )
+    text = ' '.join([limits['description'], *_limits(limits)])
     yield textwrap.indent(textwrap.fill(text, _WIDTH - 6), '    # ') + '\n'
     value = yaml.safe_dump(list(default) if isinstance(default, tuple) else default, default_flow_style=True)
     # Dotted names are as good as nested ones to ROS, and keep each entry whole.
