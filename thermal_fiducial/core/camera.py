@@ -279,7 +279,7 @@ def _radial_slope(r2: FloatArray, factor: FloatArray, model: _Polynomial) -> Flo
 
 
 def _distort_polynomial(x: FloatArray, model: _Polynomial) -> FloatArray:
-    r2 = np.sum(x * x, axis=-1)
+    r2 = np.einsum('...k,...k->...', x, x)
     factor = _radial_factor(r2, model)
     if not (model.p1 or model.p2):
         return np.asarray(x * factor[..., None])

@@ -15,9 +15,9 @@ from thermal_fiducial.core.adjustment.sides import sides_of
 from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# Factors on the blur, pass by pass: a wide one catches, narrow ones measure, until the corners no longer move.
-_PASSES = (1.4, 1.0, 1.0, 1.0, 1.0)
-# Steps below which they are settled, and below which outlines that are no squares stay so.
+# A first pass with so much more blur catches corners from farther away. Those that follow measure, until the last step
+# was short enough; for outlines that are no squares a shorter one, as these may become ones.
+_WIDE, _PASSES = 1.4, 4
 _SETTLED_PX, _STILL_PX = 0.3, 0.1
 # A linearised displacement is good for this many blurs.
 _REACHED = 2.0
@@ -79,63 +79,73 @@ def refine_corners(
     memory : what to take out of the image; nothing when left out
     """
     count = len(corners.px)
-    px, covariances = corners.px.copy(), np.zeros((count, 4, 2, 2))
-    contrast, noise, doubt = np.zeros(count), np.zeros(count), np.zeros(count)
     smear = np.zeros((count, 2)) if smear_px is None else smear_px
-    away = np.ones(count, dtype=bool) if near is None else ~near
-    for factor in _PASSES:
-        active = np.flatnonzero(away)
-        if len(active) == 0:
-            away[:] = factor > 1.0
-            continue
-        start = corners if len(active) == count else corners.only(active)
-        so_far = px[active] - start.px
-        if so_far.any():
-            start = start.moved(so_far, camera)
-        prior = _PRIOR_OF_SHAPE if factor > 1.0 else _PRIOR
-        shift, *rest = _pass(
-            image,
-            start,
-            camera,
-            behind[active],
-            factor * blur_px,
-            smear[active],
-            prior,
-            columns,
-            None if memory is None else memory.only(active),
-        )
-        px[active] = start.px + shift
-        covariances[active], contrast[active], noise[active], doubt[active] = rest
-        step = np.abs(shift).max(axis=(1, 2))
-        away[active] = step > np.where(doubt[active] > 0.0, _STILL_PX, _SETTLED_PX)
-        away |= factor > 1.0
-    return RefinedCorners(px, covariances, contrast, noise, doubt)
+    task = _Task(image, camera, corners, behind, smear, columns, memory)
+    found = RefinedCorners(
+        corners.px.copy(), np.zeros((count, 4, 2, 2)), np.zeros(count), np.zeros(count), np.zeros(count)
+    )
+    far = np.arange(count) if near is None else np.flatnonzero(~near)
+    if len(far):
+        _improve(found, far, task, _WIDE * blur_px, _PRIOR_OF_SHAPE)
+    away = np.arange(count)
+    for _ in range(_PASSES):
+        if len(away) == 0:
+            break
+        step = _improve(found, away, task, blur_px, _PRIOR)
+        away = away[step > np.where(found.doubt[away] > 0.0, _STILL_PX, _SETTLED_PX)]
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """What to refine, as :func:`refine_corners` is told it."""
+
+    image: Float32Array
+    camera: Camera
+    corners: ImagePoints
+    behind: Float32Array
+    smear: FloatArray
+    columns: int
+    memory: Memory | None
+
+    def only(self, which: IntArray) -> '_Task':
+        """For the markers ``which``."""
+        if len(which) == len(self.behind):
+            return self
+        memory = None if self.memory is None else self.memory.only(which)
+        corners, behind, smear = self.corners.only(which), self.behind[which], self.smear[which]
+        return _Task(self.image, self.camera, corners, behind, smear, self.columns, memory)
+
+    def seen_from(self, corners_px: FloatArray) -> ImagePoints:
+        """The corners where they are by now (N, 4, 2)."""
+        moved = corners_px - self.corners.px
+        return self.corners.moved(moved, self.camera) if moved.any() else self.corners
+
+
+def _improve(found: RefinedCorners, which: IntArray, task: _Task, optics: float, prior: FloatArray) -> FloatArray:
+    """Longest step (n,) of the corners of the markers ``which`` (n,) in one pass; where they get to is put in place."""
+    part = task.only(which)
+    start = part.seen_from(found.corners_px[which])
+    shift, *rest = _pass(part, start, optics, prior)
+    found.corners_px[which] = start.px + shift
+    for array, values in zip((found.covariances, found.contrast, found.noise, found.doubt), rest, strict=True):
+        array[which] = values
+    return np.asarray(np.abs(shift).max(axis=(1, 2)))
 
 
 def _pass(
-    image: Float32Array,
-    start: ImagePoints,
-    camera: Camera,
-    behind: Float32Array,
-    optics: float,
-    smear: FloatArray,
-    prior: FloatArray,
-    columns: int,
-    memory: Memory | None,
+    task: _Task, start: ImagePoints, optics: float, prior: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """One linearised adjustment: shifts (N, 4, 2), then covariances, contrasts, noise and doubts of RefinedCorners."""
-    cells = behind.shape[2]
-    widest = math.hypot(optics, math.sqrt(float(np.sum(smear * smear, axis=1).max())))
+    cells = task.behind.shape[2]
+    widest = math.hypot(optics, math.sqrt(float(np.sum(task.smear * task.smear, axis=1).max())))
     half = min(max(math.ceil(2.5 * widest + 1.0), 4), 10)
-    sides = sides_of(start.x, camera, image.shape, cells * columns, half)
-    blur = edges.blurs(sides.normal[:, cells * columns // 2], optics, smear)
-    counts = counts_across(image, sides, memory)
-    segments = measure(counts, edges.model(sides, behind, blur), cells, _REACHED * blur[0])
+    sides = sides_of(start.x, task.camera, task.image.shape, cells * task.columns, half)
+    blur = edges.blurs(sides.normal[:, cells * task.columns // 2], optics, task.smear)
+    counts = counts_across(task.image, sides, task.memory)
+    segments = measure(counts, edges.model(sides, task.behind, blur), cells, _REACHED * blur[0])
     moved, covariances, doubt = adjust(sides, segments, prior, start)
     good = segments.variance < HOPELESS
-    noise = np.sqrt(_mean_where(segments.noise, good))
-    return moved, covariances, _mean_where(segments.contrast, good), noise, doubt
-
-
-def _mean_where(values: FloatArray, good: BoolArray) -> FloatArray:
-    return np.asarray(np.sum(values * good, axis=1) / np.maximum(np.count_nonzero(good, axis=1), 1))
+    share = good / np.maximum(good.sum(axis=1), 1)[:, None]
+    contrast, noise = np.sum(segments.contrast * share, axis=1), np.sqrt(np.sum(segments.noise * share, axis=1))
+    return moved, covariances, contrast, noise, doubt

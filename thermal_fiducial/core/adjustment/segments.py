@@ -116,8 +116,8 @@ def measure(
     fit = _fit(X, weight)
     shape = (-1, 4 * cells)
     noise = _noise(fit, shape)
-    residual = np.abs(_residuals(fit, X)) * weight
-    outlier = residual > (_PIXEL_OUTLIER * np.sqrt(noise)).astype(np.float32).reshape(-1, 1)
+    residual = np.abs(_residuals(fit, X))
+    outlier = residual * weight > (_PIXEL_OUTLIER * np.sqrt(noise)).astype(np.float32).reshape(-1, 1)
     touched = np.flatnonzero(outlier.any(axis=1))
     if len(touched):
         for all_of, again in zip(fit, _fit(X[touched], weight[touched] * ~outlier[touched]), strict=True):
@@ -133,7 +133,7 @@ def _fit(X: Float32Array, weight: Float32Array) -> _Fit:
     safe = np.maximum(number, 1.0)
     mean = sums[:, 0] / safe[:, None]
     # Without their means the columns leave two unknowns.
-    about = np.moveaxis(sums[:, 1:, 1:] - sums[:, 1:, :1] * mean[:, None, 1:], 0, -1)
+    about = (sums[:, 1:, 1:] - sums[:, 1:, :1] * mean[:, None, 1:]).transpose(1, 2, 0)
     ridge = 1e-6 * number + 1e-6
     a, b, c, p, q = about[0, 0] + ridge, about[0, 1], about[1, 1] + ridge, about[0, 2], about[1, 2]
     determinant = a * c - b * b
@@ -146,15 +146,16 @@ def _fit(X: Float32Array, weight: Float32Array) -> _Fit:
 
 def _residuals(fit: _Fit, X: Float32Array) -> Float32Array:
     """What the model leaves of the pixels (segments, pixels)."""
-    level, contrast, product = (a.astype(np.float32)[:, None] for a in (fit.level, fit.contrast, fit.product))
-    return np.asarray(X[:, 3] - X[:, 1] * contrast - X[:, 2] * product - level)
+    terms = np.ones((len(X), 1, 4), dtype=np.float32)
+    terms[:, 0, 0], terms[:, 0, 1], terms[:, 0, 2] = -fit.level, -fit.contrast, -fit.product
+    return np.asarray((terms @ X)[:, 0])
 
 
 def _noise(fit: _Fit, shape: tuple[int, int]) -> FloatArray:
     """Variances of pixels (N, S): of a marker's typical segment, or a segment's own where that is much larger."""
     free = fit.number.reshape(shape) - 3.0
     own = fit.square.reshape(shape) / np.maximum(free, 1.0)
-    typical = _median_where(own, free > 1.5)
+    typical = _Median(free > 1.5)(own)
     return np.where(own > 2.5 * typical, own, typical) + 1e-3
 
 
@@ -165,7 +166,7 @@ def _judged(fit: _Fit, noise: FloatArray, reach: FloatArray) -> Segments:
         for a in (fit.contrast, fit.product, fit.number, fit.contrast_variance, fit.product_variance)
     )
     usable = number > 4.5
-    typical = _median_where(contrast, usable)
+    typical = _Median(usable)(contrast)
     own = noise * own
     scale = np.sign(typical) / np.maximum(np.abs(typical), 1e-6)
     relative, unsure = contrast * scale, 2.0 * np.sqrt(own) * np.abs(scale)
@@ -177,12 +178,20 @@ def _judged(fit: _Fit, noise: FloatArray, reach: FloatArray) -> Segments:
     return Segments(shift, np.where(usable, noise * unit / (safe * safe), HOPELESS), contrast, noise)
 
 
-def _median_where(values: FloatArray, good: BoolArray) -> FloatArray:
+class _Median:
     """Medians (N, 1) of the good ones of values (N, S), 0 where there is none."""
-    order = np.sort(np.where(good, values, np.inf), axis=1)
-    middle = np.maximum(np.count_nonzero(good, axis=1) - 1, 0) // 2
-    median = order[np.arange(len(order)), middle][:, None]
-    return np.where(np.isfinite(median), median, 0.0)
+
+    def __init__(self, good: BoolArray) -> None:
+        number = good.sum(axis=1)
+        self._good, self._none = good, number == 0
+        self._place = np.arange(len(good)), np.maximum(number - 1, 0) // 2
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        order = np.where(self._good, values, np.inf)
+        order.sort(axis=1)
+        median = order[self._place]
+        median[self._none] = 0.0
+        return np.asarray(median[:, None])
 
 
 def adjust(
@@ -198,20 +207,19 @@ def adjust(
     at : (N, 4) corners so far
     """
     used = segments.variance < HOPELESS
-    deviation = np.sqrt(segments.variance)
-    A = _design(sides, deviation.shape) / deviation[..., None]
-    shift = segments.shift / deviation
-    weighted = np.swapaxes(A, 1, 2)
+    median, sharpness = _Median(used), 1.0 / np.sqrt(segments.variance)
+    A, shift = _design(sides, sharpness.shape) * sharpness[..., None], segments.shift * sharpness
+    weighted = turned = A.swapaxes(1, 2)
     for _ in range(_ROUNDS):
         covariance = np.linalg.inv(weighted @ A + prior)
         moved = covariance @ (weighted @ shift[..., None])
         left = np.abs(shift - (A @ moved)[..., 0])
-        scale = np.maximum(1.4826 * _median_where(left, used), 1.0)
+        scale = np.maximum(1.4826 * median(left), 1.0)
         robust = 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
-        weighted = np.swapaxes(A * robust[..., None], 1, 2)
+        weighted = turned * robust[:, None]
     kept = used & (robust > 0.99)
-    chi2 = np.sum(left * left * kept, axis=1) / _KEPT_VARIANCE
-    free = np.maximum(np.count_nonzero(kept, axis=1) - 8.0, 0.0)
+    chi2 = np.einsum('ns,ns,ns->n', left, left, kept) / _KEPT_VARIANCE
+    free = np.maximum(kept.sum(axis=1) - 8.0, 0.0)
     # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
     covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None] + _FLOOR
     known = as_squares(at, moved, covariance)
@@ -225,7 +233,7 @@ def _design(sides: Sides, shape: tuple[int, ...]) -> FloatArray:
     """Derivative (N, S, 8) of the segments' displacements along their normals by the corners'."""
     cells = shape[1] // 4
     fresh = sides.fresh.reshape(len(sides.t), cells, -1)
-    t = np.sum(sides.t.reshape(fresh.shape) * fresh, axis=-1) / np.maximum(np.count_nonzero(fresh, axis=-1), 1)
+    t = (sides.t.reshape(fresh.shape) * fresh).sum(axis=-1) / np.maximum(fresh.sum(axis=-1), 1)
     normal = sides.normal.reshape(*fresh.shape, 2)[:, :, fresh.shape[-1] // 2].reshape(-1, 4, cells, 2)
     by_end = t.reshape(-1, 4, cells, 1) * normal
     A = np.zeros((len(normal), 4, cells, 4, 2))

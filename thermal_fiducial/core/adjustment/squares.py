@@ -17,8 +17,8 @@ from thermal_fiducial.core.types import FloatArray
 _SQUARE_STD = 0.003
 # Standard deviation of the linear form of an outline that is far from a square, as a share of how far it is.
 _BENT = 0.1
-# Perspective comes into it squared: it is taken again where the corners are by then.
-_STEPS = 2
+# Perspective comes into it squared: it is taken again where the corners are by then, if these are so far away [px].
+_STEPS, _BENDS_PX = 3, 0.05
 # Squared Mahalanobis distances, of two degrees of freedom, from a square near the last corners beyond which one of the
 # other tilt may be nearer, and from any beyond which an outline is not that of the marker alone.
 _OTHER_TILT, _TOO_FAR = 9.0, 12.0
@@ -102,7 +102,9 @@ def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance:
         variance = _SQUARE_STD**2 + (_BENT * value) ** 2
         information = np.linalg.inv(J @ spread + variance * _EYE)
         weighted = information @ error
-        moved = seen - spread @ weighted
+        before, moved = moved, seen - spread @ weighted
+        if np.abs(moved - before).max() < _BENDS_PX:
+            break
     chi2, left = np.sum(error * weighted, axis=(1, 2)), np.sum((variance * weighted) ** 2, axis=(1, 2))
     return Squared(moved, covariance - spread @ information @ np.swapaxes(spread, 1, 2), chi2, left)
 
