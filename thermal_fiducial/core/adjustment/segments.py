@@ -106,29 +106,29 @@ def measure(
     modelled : value, derivative and weight of each pixel, of :func:`thermal_fiducial.core.adjustment.edges.model`
     reach : (E,) longest displacement for which the model can be linearised [px]
     """
-    value, slope, weight = modelled
-    count = value.shape[0] * cells
-    weight = weight.reshape(count, -1)
-    X = np.empty((count, 4, weight.shape[1]), dtype=np.float32)
+    value, slope, weight = (each.reshape(len(reach) * cells, -1) for each in modelled)
     counts = counts.reshape(weight.shape)
-    X[:, 0], X[:, 1], X[:, 2] = 1.0, value.reshape(weight.shape), slope.reshape(weight.shape)
+    X = np.empty((len(weight), 4, weight.shape[1]), dtype=np.float32)
+    X[:, 0], X[:, 1], X[:, 2] = weight, value, slope
     np.subtract(counts, counts[:, weight.shape[1] // 2, None], out=X[:, 3])
-    fit = _fit(X, weight)
-    shape = (-1, 4 * cells)
+    X[:, 1:] *= weight[:, None]
+    fit, shape = _fit(X), (-1, 4 * cells)
     noise = _noise(fit, shape)
-    residual = np.abs(_residuals(fit, X))
-    outlier = residual * weight > (_PIXEL_OUTLIER * np.sqrt(noise)).astype(np.float32).reshape(-1, 1)
+    outlier = np.abs(_residuals(fit, X)) > (_PIXEL_OUTLIER * np.sqrt(noise)).astype(np.float32).reshape(-1, 1)
     touched = np.flatnonzero(outlier.any(axis=1))
     if len(touched):
-        for all_of, again in zip(fit, _fit(X[touched], weight[touched] * ~outlier[touched]), strict=True):
+        for all_of, again in zip(fit, _fit(X[touched] * ~outlier[touched, None]), strict=True):
             all_of[touched] = again
         noise = _noise(fit, shape)
     return _judged(fit, noise, np.repeat(reach, cells).reshape(shape))
 
 
-def _fit(X: Float32Array, weight: Float32Array) -> _Fit:
-    """Least squares of the last of four columns X (segments, 4, pixels) on the others: (1, model, derivative)."""
-    sums = ((X * weight[:, None]) @ np.swapaxes(X, 1, 2)).astype(np.float64)
+def _fit(X: Float32Array) -> _Fit:
+    """Least squares of the last of four columns X (segments, 4, pixels) on the others: (1, model, derivative).
+
+    All are zero of pixels that do not count.
+    """
+    sums = (X @ X.swapaxes(1, 2)).astype(np.float64)
     number = sums[:, 0, 0].copy()
     safe = np.maximum(number, 1.0)
     mean = sums[:, 0] / safe[:, None]

@@ -82,6 +82,8 @@ class Refinement:
 
     def only(self, keep: BoolArray) -> 'Refinement':
         """That of the markers ``keep`` (N,)."""
+        if keep.all():
+            return self
         return replace(self, seen=self.seen.only(keep), corners=self.corners.only(keep), places=self.places.only(keep))
 
 
