@@ -203,28 +203,35 @@ def solve_camera_pose(
     # Turned about their middle, translation and rotation of the points hardly depend on each other.
     middle = geometry.transform(np.eye(3), squares.mean(axis=(0, 1)))
     points = (squares - middle[:3, 3]).reshape(1, -1, 3)
-    starts = np.empty((0, 4, 4)) if initial is None else np.asarray(initial, dtype=np.float64)[None]
-    starts = geometry.inverse(starts) @ middle
-    if compete or initial is None:
-        others = _camera_starts(images.normalised.reshape(corners.shape), squares) @ middle
-        cost = evaluate(others, points, images, _INLIER)[0]
-        starts = np.concatenate([starts, others[np.argsort(cost)[:2]]])
+    starts = _starts(images, squares, points, middle, initial, compete)
     T_camera_middle, chi2, information = fit(starts, points, images, _INLIER, rivals=len(starts))
     best = int(np.argmin(chi2))
     if initial is not None and chi2[0] <= _AMBIGUOUS_RATIO * max(chi2[best], 8.0 * len(corners) - 6.0):
         best = 0
-    T_map_camera = middle @ geometry.inverse(T_camera_middle[best])
     residuals = corners - camera.project(geometry.apply(T_camera_middle[best], points).reshape(squares.shape))
     squared = np.sum(residuals**2, axis=-1)
     if not (np.isfinite(chi2[best]) and np.isfinite(squared).all()):
         raise InputError(f'no camera pose explains the {len(corners)} markers')
-    return JointPose(
-        T_map_camera,
-        _of_camera(covariances(information[best]), T_camera_middle[best]),
-        residuals,
-        float(np.sqrt(squared.mean())),
-        float(chi2[best]),
-    )
+    covariance = _of_camera(covariances(information[best]), T_camera_middle[best])
+    T_map_camera = middle @ geometry.inverse(T_camera_middle[best])
+    return JointPose(T_map_camera, covariance, residuals, float(np.sqrt(squared.mean())), float(chi2[best]))
+
+
+def _starts(
+    images: Images,
+    squares: FloatArray,
+    points: FloatArray,
+    middle: FloatArray,
+    initial: FloatArray | None,
+    compete: bool,
+) -> FloatArray:
+    """T_camera_middle (B, 4, 4): ``initial``, if given, then the two of the markers' poses that explain all best."""
+    known = [] if initial is None else [geometry.inverse(initial) @ middle]
+    if initial is not None and not compete:
+        return np.stack(known)
+    others = _camera_starts(images.normalised.reshape(-1, 4, 2), squares) @ middle
+    cost = evaluate(others, points, images, _INLIER)[0]
+    return np.stack([*known, *others[np.argsort(cost)[:2]]])
 
 
 def _camera_starts(normalised: FloatArray, squares: FloatArray) -> FloatArray:
