@@ -76,14 +76,16 @@ class Squared(NamedTuple):
 def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squared:
     """Corners corrected by what is known of squares.
 
-    Two tilts of a small square look almost alike. That of the last corners is taken unless the image refutes it.
+    Two tilts of a small square look almost alike. That of the corners so far, which are seen to have moved together
+    first of all, is taken unless the image refutes it.
 
     Parameters
     ----------
     at : (N, 4) corners
     seen, covariance : (N, 8, 1), (N, 8, 8) how far they are off, as the image tells [px]
     """
-    nearest = _corrected(at, np.zeros_like(seen), seen, covariance)
+    together = np.tile(seen.reshape(-1, 4, 2).mean(axis=1), 4)[..., None]
+    nearest = _corrected(at, together, seen, covariance)
     refuted = np.flatnonzero(nearest.chi2 > _OTHER_TILT)
     if len(refuted):
         other = _corrected(at.only(refuted), seen[refuted], seen[refuted], covariance[refuted])
