@@ -223,7 +223,9 @@ def adjust(
     # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
     covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None] + _FLOOR
     known = as_squares(at, moved, covariance)
-    blocks = np.einsum('nikil->nikl', known.covariance.reshape(-1, 4, 2, 4, 2))
+    # Corners told by one another err together. Taken for independent, they would tell a pose so much too well.
+    together = (8.0 / (8.0 - known.told))[:, None, None, None]
+    blocks = together * np.einsum('nikil->nikl', known.covariance.reshape(-1, 4, 2, 4, 2))
     # A side of an outline that is no square's is that of something else.
     doubt = known.doubt * sides.along.reshape(-1, 4).mean(axis=1) ** 2
     return known.moved.reshape(-1, 4, 2), blocks + _COMMON_FLOOR, doubt

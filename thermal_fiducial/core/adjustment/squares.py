@@ -66,6 +66,8 @@ class Squared(NamedTuple):
     #: (N,) squared Mahalanobis distance from the nearest square, and square of what is left of it in the corners
     chi2: FloatArray
     left: FloatArray
+    #: (N,) how many of the two conditions it is that told the corners, rather than the image
+    told: FloatArray
 
     @property
     def doubt(self) -> FloatArray:
@@ -108,7 +110,8 @@ def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance:
         if np.abs(moved - before).max() < _BENDS_PX:
             break
     chi2, left = np.sum(error * weighted, axis=(1, 2)), np.sum((variance * weighted) ** 2, axis=(1, 2))
-    return Squared(moved, covariance - spread @ information @ np.swapaxes(spread, 1, 2), chi2, left)
+    told = 2.0 - np.sum(variance * information * _EYE, axis=(1, 2))
+    return Squared(moved, covariance - spread @ information @ np.swapaxes(spread, 1, 2), chi2, left, told)
 
 
 def squareness(x: FloatArray, inverse: FloatArray) -> Squareness:
