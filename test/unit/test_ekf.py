@@ -60,7 +60,7 @@ def test_live_parameters_hold_from_then_on(flight):
     ekf.configure(config(gate=1e-3))
     _, after = run(ekf, arrivals[half:])
     assert all(update.accepted for update in before[3:])
-    assert not any(update.accepted and not update.reset for update in after)
+    assert not any(update.accepted and not update.reason for update in after)
 
 
 def test_innovations_are_told_in_the_diagnostics(flight):

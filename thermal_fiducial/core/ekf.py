@@ -14,6 +14,7 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.coasting import usable_seconds
+from thermal_fiducial.core.filter.error_state import doubted
 from thermal_fiducial.core.filter.gating import Belief, PoseGate, position_std, Sighting, Track
 from thermal_fiducial.core.filter.imu import ImuStep, NoiseMonitor
 from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
@@ -156,8 +157,7 @@ class PoseEkf:
 
     def _due_ns(self, belief: Belief, pose: CameraPose) -> int:
         """Instant of a pose in the clock of the IMU, as a belief sees it."""
-        estimated = belief.main.state.time_offset if belief.main else belief.time_offset
-        return pose.stamp_ns + self._offset_ns + round(estimated * _SECOND_NS)
+        return pose.stamp_ns + self._offset_ns + round(belief.offset * _SECOND_NS)
 
     def _first_node_after(self, pose: CameraPose) -> int:
         """First node with a belief that ``pose`` takes part in."""
@@ -184,14 +184,20 @@ class PoseEkf:
         """
         assert belief.main
         state = belief.main.state
-        first = self._index_at(self._nodes[index].stamp_ns - round(AGAIN_SECONDS * _SECOND_NS))
+        first = self._first_to_linearise(index, belief.main)
         skipped_ns = self._nodes[first].stamp_ns - self._offset_ns - round(state.time_offset * _SECOND_NS)
-        again = self._gate.at_offset(self._nodes[first].belief, state.time_offset, skipped_ns)
+        again = self._gate.at_offset(self._nodes[first].belief, belief.main, skipped_ns)
         # Those that were not due yet are for the nodes that follow, as they will be if they come late.
         poses = self._poses[: _place_after(belief.pose_stamp_ns, self._poses)]
         for i in range(first + 1, index + 1):
             again = self._step(i, again, poses)
-        return self._gate.linearised(again if again.main else belief, self._gate.filter.time_offset_std(state))
+        return self._gate.linearised(again, belief)
+
+    def _first_to_linearise(self, index: int, track: Track) -> int:
+        """Node to go back to: some seconds, but not to another track, whose poses are no more to be trusted now."""
+        first = self._index_at(self._nodes[index].stamp_ns - round(AGAIN_SECONDS * _SECOND_NS))
+        main = self._nodes[first].belief.main
+        return first if main is None or main.started_ns == track.started_ns else self._index_at(track.started_ns)
 
     def _step(self, index: int, belief: Belief, poses: list[CameraPose]) -> Belief:
         """Belief at node ``index`` after ``belief`` at the node before, with those of ``poses`` in between."""
@@ -206,7 +212,8 @@ class PoseEkf:
             imu_there = before.imu + share * (node.imu - before.imu)
             belief = self._propagate(belief, (imu, imu_there), due_ns - time_ns, node.densities)
             time_ns, imu = due_ns, imu_there
-            belief, update = self._gate.weigh(belief, Sighting(pose, due_ns, partial(self._window, index, imu)))
+            sighting = Sighting(pose, due_ns, belief.offset, partial(self._window, index, imu))
+            belief, update = self._gate.weigh(belief, sighting)
             self._decide(update)
         return self._propagate(belief, (imu, node.imu), node.stamp_ns - time_ns, node.densities)
 
@@ -251,6 +258,9 @@ class PoseEkf:
         if node.belief.main is None:
             return None
         state = self._gate.filter.in_clock_of_imu(node.belief.main.state, node.imu)
+        other = self._gate.contradicting(node.belief)
+        if other is not None:
+            state = doubted(state, other)
         return odometry(node.stamp_ns, state, node.imu[:3], self._rate_variance(node))
 
     def _rate_variance(self, node: _Node) -> float:
@@ -281,6 +291,8 @@ class PoseEkf:
         uncertainty = position_std(belief.main.state)
         if uncertainty > self._config.lost_position_std:
             return f'lost: position known to {uncertainty:.2f} m'
+        if self._gate.contradicting(belief) is not None:
+            return 'in doubt: poses agree on another place'
         coasting = self._coasting(belief.main)
         return f'coasting for {coasting:.1f} s' if coasting > 0.5 else 'tracking'
 

@@ -26,6 +26,8 @@ from thermal_fiducial.core.types import FloatArray
 #: Root of the sum of the velocity variances [m/s] from which the time offset is estimated, and by how much the rate
 #: [rad/s] and the velocity [m/s] may have changed until then.
 _KNOWN_VELOCITY, _UNSEEN_CHANGE = 0.2, 0.5
+#: A clock may step by more than was unknown of it at first: by two frames of a camera that lost them.
+_STEP = 2.0
 _SIX = np.arange(6)
 
 
@@ -121,8 +123,13 @@ class ErrorStateFilter:
         J[3:, 3:] = -R.T @ skew(lever)
         return BodyPose(T_map_body, self._config.pose_noise_scale**2 * (J @ pose.covariance @ J.T))
 
-    def correct(self, state: NavigationState, pose: BodyPose, motion: Motion) -> tuple[NavigationState, float]:
-        """State corrected by a pose at its own instant, and the normalised innovation squared."""
+    def correct(
+        self, state: NavigationState, pose: BodyPose, motion: Motion, early: float = 0.0
+    ) -> tuple[NavigationState, float]:
+        """State corrected by a pose at its own instant, and the normalised innovation squared.
+
+        ``early`` [s] is how much later the pose was than the state, by the state's own time offset.
+        """
         twist = np.concatenate((motion.imu[:3] - state.bias[:3], state.velocity_body))
         H = self._H_pose
         if state.clock_open:
@@ -130,8 +137,16 @@ class ErrorStateFilter:
             H[:, self.layout.time_offset] = twist
         noise = pose.covariance + self._clock_noise(state, twist, motion)
         noise[_SIX, _SIX] += self._floor(twist)
-        corrected, nis = self._update(state, pose_innovation(state, pose.T_map_body), H, noise)
+        innovation = pose_innovation(state, pose.T_map_body) - self._travelled(state, twist, motion, early)
+        corrected, nis = self._update(state, innovation, H, noise)
         return self._open_clock(corrected, motion.imu), nis
+
+    def _travelled(self, state: NavigationState, twist: FloatArray, motion: Motion, seconds: float) -> FloatArray:
+        """Rotation and position (6,) that the robot covers in so many ``seconds``, to second order."""
+        if seconds == 0.0:
+            return np.zeros(6)
+        turning = motion.angular_acceleration * (motion.age + 0.5 * seconds)
+        return seconds * (twist + np.concatenate((turning, 0.5 * seconds * _acceleration(state, twist, motion))))
 
     def _floor(self, twist: FloatArray) -> FloatArray:
         """Variances (6,) of what the corner covariances don't know: errors that all corners share, more in motion."""
@@ -157,7 +172,7 @@ class ErrorStateFilter:
             return noise
         variance = float(state.covariance[place, place])
         turning = float(motion.angular_acceleration @ motion.angular_acceleration)
-        force = motion.imu[3:] - state.bias[3:] + state.gravity @ state.R_map_body - skew(twist[:3]) @ twist[3:]
+        force = _acceleration(state, twist, motion)
         second = 0.75 * variance**2
         attitude, position = (second + variance * motion.age**2) * turning, second * float(force @ force)
         noise[_SIX, _SIX] += (attitude, attitude, attitude, position, position, position)
@@ -201,6 +216,14 @@ class ErrorStateFilter:
         error = column / column[place] * (time_offset - state.time_offset)
         return inject(state, error, state.covariance, self.layout)
 
+    def with_unknown_clock(self, state: NavigationState) -> NavigationState:
+        """``state`` as good as it is, whose time offset is as unknown as after a step of the clock."""
+        place, covariance = self.layout.time_offset, state.covariance.copy()
+        assert place is not None
+        covariance[place], covariance[:, place] = 0.0, 0.0
+        covariance[place, place] = (_STEP * self._config.time_offset_std) ** 2
+        return replace(state, covariance=covariance)
+
     def time_offset_std(self, state: NavigationState) -> float:
         """Of the estimate; before it is begun, and where there is none, what the parameter says [s]."""
         place = self.layout.time_offset
@@ -232,6 +255,21 @@ class ErrorStateFilter:
         algebra.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R=noise)
         covariance = 0.5 * (algebra.P + algebra.P.T)
         return inject(state, algebra.x, covariance, self.layout), float(algebra.mahalanobis**2)
+
+
+def doubted(state: NavigationState, other: NavigationState) -> NavigationState:
+    """``state`` with a covariance that allows for ``other`` to be the truth."""
+    error = np.zeros(len(state.covariance))
+    innovation = pose_innovation(state, other.T_map_body)
+    error[ROTATION], error[POSITION] = innovation[:3], innovation[3:]
+    error[VELOCITY] = (other.velocity - state.velocity) @ state.R_map_body
+    return replace(state, covariance=state.covariance + other.covariance + np.outer(error, error))
+
+
+def _acceleration(state: NavigationState, twist: FloatArray, motion: Motion) -> FloatArray:
+    """Change (3,) of the velocity in the robot frame [m/s^2]."""
+    turned = skew(twist[:3]) @ twist[3:]
+    return np.asarray(motion.imu[3:] - state.bias[3:] + state.gravity @ state.R_map_body - turned)
 
 
 def pose_innovation(state: NavigationState, T_map_body: FloatArray) -> FloatArray:

@@ -1,8 +1,8 @@
 """Which poses count: chi-square against the present belief, and recovery by evidence instead of lock-out.
 
 A pose that the belief refuses starts a rival, a second estimate that the following refused poses support or not.
-A rival that many poses agree with, while the belief accepts none, replaces it. The start of the filter is the
-same thing without a belief to replace.
+A rival that many poses agree with, while the belief accepts few, replaces it. The start of the filter is the same
+thing without a belief to replace.
 """
 
 from collections.abc import Callable
@@ -23,6 +23,9 @@ _SECOND_NS = 1_000_000_000
 #: Seconds whose mean motion shows a clock error. The noise of one sample would count as motion that shows none, and it
 #: is in the predicted attitude too: in a slow, shaking flight the two together lead the time offset astray.
 _MOTION_SECONDS = 0.2
+#: A rival must agree with so many times more poses than the belief: when the robot slows down, a belief whose clock is
+#: wrong accepts some.
+_PREFERRED = 4
 #: Poses are linearised anew when the time offset has become known so many times better, and well enough when it is
 #: known to this [s]: half an angular acceleration of 5 rad/s^2 times its square is 0.01 mrad.
 _BETTER, _WELL_KNOWN = 2.0, 0.002
@@ -40,6 +43,8 @@ class Track:
     linearised_std: float
     hits: int = 1
     misses: int = 0
+    #: of a rival: poses since its start that the other estimate accepted
+    against: int = 0
 
     def supported(self, state: NavigationState, time_ns: int) -> 'Track':
         """The track after a pose that it accepts."""
@@ -59,14 +64,20 @@ class Belief:
     #: time offset [s] that holds while there is no estimate
     time_offset: float = 0.0
 
+    @property
+    def offset(self) -> float:
+        """Time offset [s] that holds."""
+        return self.main.state.time_offset if self.main else self.time_offset
+
 
 @dataclass(frozen=True)
 class Sighting:
     """A camera pose at its instant."""
 
     pose: CameraPose
-    #: the instant in the clock of the IMU
+    #: the instant in the clock of the IMU, and the time offset [s] that says so
     time_ns: int
+    time_offset: float
     #: gives the IMU samples (N, 6) of so many seconds up to it
     samples: Callable[[float], FloatArray]
 
@@ -100,7 +111,9 @@ class PoseGate:
         if track is None:
             return None
         state = self.filter.predict(track.state, step)
-        return Track(state, track.started_ns, track.accepted_ns, track.linearised_std, track.hits, track.misses)
+        return Track(
+            state, track.started_ns, track.accepted_ns, track.linearised_std, track.hits, track.misses, track.against
+        )
 
     def in_moved_map(self, belief: Belief, T_new_old: FloatArray) -> Belief:
         """``belief`` in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
@@ -119,13 +132,14 @@ class PoseGate:
         if main:
             state, nis = self._correct(main.state, sighting)
             if nis <= self._config.gate:
-                accepted = Belief(main.supported(state, time_ns), None, stamp_ns, belief.resets)
+                rival = self._outdone(belief.rival, sighting)
+                accepted = Belief(main.supported(state, time_ns), rival, stamp_ns, belief.resets)
                 return accepted, PoseUpdate(stamp_ns, True, '', nis)
         rival = self._challenge(belief, sighting)
         if rival and self._convincing(rival, main, time_ns):
             resets = belief.resets + (belief.main is not None)
             reason = 'started afresh' if belief.main else 'initialised'
-            return Belief(rival, None, stamp_ns, resets), PoseUpdate(stamp_ns, True, reason, nis, True)
+            return Belief(rival, None, stamp_ns, resets), PoseUpdate(stamp_ns, True, reason, nis)
         reason = f'refused: {math.sqrt(nis):.1f} sigma' if main else 'initialising'
         if rival is None:
             reason = 'refused: contradicts gravity'
@@ -133,7 +147,16 @@ class PoseGate:
 
     def _correct(self, state: NavigationState, sighting: Sighting) -> tuple[NavigationState, float]:
         body = self.filter.body_pose(sighting.pose, state.T_body_camera)
-        return self.filter.correct(state, body, sighting.motion)
+        return self.filter.correct(state, body, sighting.motion, state.time_offset - sighting.time_offset)
+
+    def _outdone(self, rival: Track | None, sighting: Sighting) -> Track | None:
+        """The rival after a pose that the main estimate accepts; none unless it has more to show for itself."""
+        if rival is None or rival.against + 1 >= rival.hits:
+            return None
+        state, nis = self._correct(rival.state, sighting)
+        agrees = nis <= self._config.gate
+        tried = rival.supported(state, sighting.time_ns) if agrees else replace(rival, misses=rival.misses + 1)
+        return replace(tried, against=rival.against + 1)
 
     def _challenge(self, belief: Belief, sighting: Sighting) -> Track | None:
         """The rival after a pose that the main estimate refused; one that fails too often gives way to the pose."""
@@ -144,10 +167,21 @@ class PoseGate:
                 return rival.supported(state, time_ns)
             if rival.misses + 1 < rival.hits:
                 return replace(rival, misses=rival.misses + 1)
+        first = self._of_another_clock(belief, sighting) or self._from_nothing(belief, sighting)
+        return Track(first, time_ns, time_ns, self._config.time_offset_std) if first else None
+
+    def _of_another_clock(self, belief: Belief, sighting: Sighting) -> NavigationState | None:
+        """The main estimate, if the pose is right but for a step of the camera's clock."""
+        if belief.main is None or not belief.main.state.clock_open:
+            return None
+        state, nis = self._correct(self.filter.with_unknown_clock(belief.main.state), sighting)
+        return state if nis <= self._config.gate else None
+
+    def _from_nothing(self, belief: Belief, sighting: Sighting) -> NavigationState | None:
+        """An estimate that begins with the pose."""
         prior = belief.main.state if belief.main else replace(self._blank, time_offset=belief.time_offset)
         body = self.filter.body_pose(sighting.pose, prior.T_body_camera)
-        first = start(self._config, self.filter, body, prior, sighting.samples(WINDOW_SECONDS))
-        return Track(first, time_ns, time_ns, self._config.time_offset_std) if first else None
+        return start(self._config, self.filter, body, prior, sighting.samples(WINDOW_SECONDS))
 
     def outgrown(self, belief: Belief) -> bool:
         """Whether the time offset is known so much better by now that its poses should be linearised anew."""
@@ -156,30 +190,46 @@ class PoseGate:
             return False
         return _BETTER * self.filter.time_offset_std(main.state) < main.linearised_std
 
-    def at_offset(self, belief: Belief, time_offset: float, skipped_ns: int) -> Belief:
-        """A past ``belief`` to go on from, as it would be for another ``time_offset`` [s].
+    def at_offset(self, belief: Belief, track: Track, skipped_ns: int) -> Belief:
+        """A past ``belief`` to go on from, as it would be for the time offset that ``track`` has come to know.
 
         What it knew of the offset stays as uncertain as it was, about another value: the poses that follow are what
-        told that value, and are not to count twice. Poses up to the stamp ``skipped_ns`` are left out.
+        told that value, and are not to count twice. Poses up to the stamp ``skipped_ns`` are left out. Of another
+        estimate than the track, or of one that knew nothing of an offset yet, nothing is left.
         """
-        seen_ns = max(belief.pose_stamp_ns, skipped_ns)
-        if belief.main is None or not belief.main.state.clock_open:
-            return Belief(None, None, seen_ns, belief.resets, time_offset)
-        state = self.filter.at_offset(belief.main.state, time_offset)
-        return Belief(replace(belief.main, state=state), None, seen_ns, belief.resets)
+        seen_ns, time_offset = max(belief.pose_stamp_ns, skipped_ns), track.state.time_offset
+        for own in (belief.main, belief.rival):
+            if own and own.started_ns == track.started_ns and own.state.clock_open:
+                state = self.filter.at_offset(own.state, time_offset)
+                return Belief(replace(own, state=state), None, seen_ns, belief.resets)
+        return Belief(None, None, seen_ns, belief.resets, time_offset)
 
-    def linearised(self, belief: Belief, std: float) -> Belief:
-        """``belief``, marked as linearised at a time offset known to ``std`` [s]."""
+    def linearised(self, again: Belief, belief: Belief) -> Belief:
+        """``again``, which is ``belief`` gone through anew, marked as linearised at the time offset of that."""
         assert belief.main
-        return replace(belief, main=replace(belief.main, linearised_std=std))
+        if again.main is None:
+            again = belief
+        assert again.main
+        std = self.filter.time_offset_std(belief.main.state)
+        main = replace(again.main, started_ns=belief.main.started_ns, linearised_std=std)
+        return replace(again, main=main, resets=belief.resets)
+
+    def contradicting(self, belief: Belief) -> NavigationState | None:
+        """What poses agree on that the main estimate refuses, where only time is missing for it to be believed."""
+        agreed = belief.main is not None and belief.rival is not None and self._agreed(belief.rival)
+        return belief.rival.state if agreed and belief.rival else None
 
     def _convincing(self, rival: Track, main: Track | None, time_ns: int) -> bool:
-        if rival.hits < self._config.initial_poses:
+        """Whether a rival that may have accepted a pose at this instant takes over."""
+        if rival.hits < self._config.initial_poses or rival.accepted_ns != time_ns:
             return False
         if main is None or position_std(main.state) > self._config.lost_position_std:
             return True
-        since = max(rival.started_ns, main.accepted_ns)
-        return time_ns - since >= self._config.reset_after * _SECOND_NS and rival.hits >= 2 * rival.misses
+        return self._agreed(rival) and time_ns - rival.started_ns >= self._config.reset_after * _SECOND_NS
+
+    def _agreed(self, rival: Track) -> bool:
+        enough = rival.hits >= self._config.initial_poses
+        return enough and rival.hits >= 2 * rival.misses and rival.hits >= _PREFERRED * rival.against
 
 
 def position_std(state: NavigationState) -> float:

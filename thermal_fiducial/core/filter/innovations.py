@@ -23,12 +23,10 @@ class PoseUpdate:
     stamp_ns: int
     #: whether it moved the estimate
     accepted: bool
-    #: in words; empty when accepted
+    #: in words; empty when accepted, but for a pose with which the filter started
     reason: str
     #: squared Mahalanobis distance (6 degrees of freedom), NaN where there was nothing to compare with
     nis: float
-    #: whether the filter started afresh with it
-    reset: bool = False
     #: whether it waits for the IMU samples of its instant; the final word is in ``PoseEkf.decided``
     pending: bool = False
 
