@@ -7,6 +7,7 @@ import pytest
 from support import small_bag
 
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.camera_info import save_camera
 
@@ -221,3 +222,13 @@ def test_a_map_of_another_dictionary(replay, recording, tmp_path):
     foreign = tmp_path / 'foreign.yaml'
     foreign.write_text((tmp_path / 'map.yaml').read_text().replace('{id: 0,', '{id: 333,'))
     fails(replay(recording.write(tmp_path / 'bag'), map_file=foreign), 'foreign.yaml', '333', 'DICT_4X4_50')
+
+
+def test_an_error_of_a_node_itself_is_said_and_no_success(replay, recording, tmp_path, monkeypatch):
+    def fail(*_):
+        raise ZeroDivisionError('nobody foresaw this')
+
+    monkeypatch.setattr(MarkerDetector, 'detect', fail)
+    status, lines = replay(recording.write(tmp_path / 'bag'))
+    assert status == 1
+    assert lines[-1] == 'aruco_detector: internal error: ZeroDivisionError: nobody foresaw this'

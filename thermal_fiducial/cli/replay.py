@@ -1,14 +1,14 @@
 """Command ``replay``: play a recorded bag through the four nodes."""
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 import importlib
 from pathlib import Path
 import sys
 import time
 
-from thermal_fiducial.errors import InputError
+from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import parse_remaps
 
 
@@ -58,7 +58,16 @@ def run(args: argparse.Namespace) -> int:
     )
     if not args.no_report:
         importlib.import_module('thermal_fiducial.report').write_report(args.out, truth=None)
-    return 0
+    errors = _internal_errors(summary['diagnostics'])
+    for error in errors:
+        print(error, file=sys.stderr)
+    return 1 if errors else 0
+
+
+def _internal_errors(diagnostics: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Errors of the nodes themselves, which they live on through: no replay with one is as it should be."""
+    last = {node: figures.get('last refusal', '') for node, figures in diagnostics.items()}
+    return [f'{node}: {reason}' for node, reason in last.items() if reason.startswith(INTERNAL_ERROR)]
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from thermal_fiducial.errors import InputError
+from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.ros import convert, params, qos
 
 Config = TypeVar('Config')
@@ -160,7 +160,7 @@ class StageNode(CountingNode, Generic[Config]):
             self.refuse(str(error))
         except Exception as error:
             self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
-            self.refuse(f'internal error: {type(error).__name__}: {error}')
+            self.refuse(f'{INTERNAL_ERROR}: {type(error).__name__}: {error}')
 
     def refuse(self, reason: str) -> None:
         """Count a message that could not be used; the first and then one a second is logged."""
