@@ -269,6 +269,13 @@ class ArucoDetectorConfig:
     )
     whitelist: tuple[int, ...] = param((), 'IDs that may be found. Empty: all of the dictionary.')
     whitelist_from_map: bool = param(False, 'Find only the markers of the map, where there is one.')
+    polarity: str = param(
+        'alike',
+        'Which markers a blind search may find: dark ones (colder than their background), bright ones, any, or those '
+        'that are like the ones seen in the last seconds.',
+        choices=('alike', 'any', 'dark', 'bright'),
+        live=True,
+    )
     min_side_px: float = param(12.0, 'Shortest side of a marker.', unit='px', minimum=8.0, maximum=400.0, live=True)
     min_contrast: float = param(
         0.7,

@@ -28,6 +28,7 @@ from thermal_fiducial.core.vision.marker_rows import marker_rows
 from thermal_fiducial.core.vision.motion import MotionTracker, plausible, Tracked, Twist
 from thermal_fiducial.core.vision.odometry_log import OdometryLog
 from thermal_fiducial.core.vision.patterns import marker_bits
+from thermal_fiducial.core.vision.polarity import Polarity
 from thermal_fiducial.core.vision.readout import expected_displacement, seen_displacement
 from thermal_fiducial.core.vision.refining import Refinement, Refiner, sides_px, SMEAR_THAT_MATTERS_PX, WINDOW_MARGIN_PX
 from thermal_fiducial.core.vision.scratch import Scratch
@@ -89,6 +90,7 @@ class MarkerDetector:
         self._refiner = Refiner(edges_behind(bits), self._motion)
         self._search = BlindSearch(self._decoder, self._scratch)
         self._clock_offset = ClockOffset()
+        self._polarity = Polarity()
         self._field: SmearField | None = None
         self._depth = _TYPICAL_DEPTH
         self._map: dict[int, tuple[FloatArray, float]] = {}
@@ -125,6 +127,7 @@ class MarkerDetector:
             found, followed = self._find(frame, in_map)
             if len(found.ids) == 0:
                 self._motion.remember(stamp_ns, twist, Tracked.none())
+                self._polarity.learn(np.zeros(0))
                 return np.zeros(0, dtype=MARKER_DTYPE)
             ids, refinement = self._refined(frame, found, followed)
             self._learn_offset(frame, in_map, ids, refinement.places)
@@ -204,6 +207,7 @@ class MarkerDetector:
         scene = self._scene(frame.image, frame.camera, frame.twist)
         allowed = self._allowed()
         blind = self._search.search(frame.image, frame.noise, scene, allowed, self.config, expected, self._sought)
+        blind = blind.only(self._polarity.possible(blind.clarity, self.config.polarity))
         return merged(expected, self._unrolled(frame, blind)), followed
 
     def _sought_next(self, *, complete: bool) -> Sought:
@@ -308,6 +312,7 @@ class MarkerDetector:
 
     def _remember(self, frame: Frame, ids: IntArray, refinement: Refinement, poses: PlanarPoses) -> None:
         """What the next frame starts from."""
+        self._polarity.learn(refinement.corners.contrast)
         clarity = refinement.corners.contrast / frame.noise
         depth = _depths(poses.T_camera_marker[:, 0], self._sizes_of(ids))
         # Motion that was told by what turned out to be no markers is none.
