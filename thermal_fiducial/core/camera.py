@@ -186,10 +186,9 @@ class Camera:
     def _distorted(self, x: FloatArray) -> FloatArray:
         """Distorted normalised coordinates (..., 2)."""
         if self.model == 'equidistant':
-            r = np.linalg.norm(x, axis=-1)
-            near = r < 1e-6
-            scale = np.where(near, 1.0, _equidistant_radius(np.arctan(r), self.D)[0] / np.where(near, 1.0, r))
-            return np.asarray(x * scale[..., None])
+            # Radius and angle are the same to the last digit where they are as small.
+            r = np.maximum(np.sqrt(np.einsum('...k,...k->...', x, x)), 1e-12)
+            return np.asarray(x * (_equidistant_radius(np.arctan(r), self.D) / r)[..., None])
         return _distort_polynomial(x, self._polynomial)
 
     def _distort(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -302,21 +301,24 @@ def _polynomial_derivative(x: FloatArray, model: _Polynomial) -> FloatArray:
     return J
 
 
-def _equidistant_radius(theta: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distorted radius at angles ``theta`` from the axis, and its derivative."""
+def _equidistant_radius(theta: FloatArray, k: FloatArray) -> FloatArray:
+    """Distorted radius at angles ``theta`` from the axis."""
     t2 = theta * theta
-    return (
-        theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))),
-        1.0 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3]))),
-    )
+    return np.asarray(theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))))
+
+
+def _equidistant_slope(theta: FloatArray, k: FloatArray) -> FloatArray:
+    """Its derivative."""
+    t2 = theta * theta
+    return np.asarray(1.0 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3]))))
 
 
 def _undistort_equidistant(target: FloatArray, k: FloatArray) -> FloatArray:
     radius = np.linalg.norm(target, axis=-1)
     theta = np.minimum(radius, _WIDEST)
     for _ in range(_NEWTON_STEPS):
-        value, slope = _equidistant_radius(theta, k)
-        step = (radius - value) / np.where(np.abs(slope) < 1e-9, 1e-9, slope)
+        slope = _equidistant_slope(theta, k)
+        step = (radius - _equidistant_radius(theta, k)) / np.where(np.abs(slope) < 1e-9, 1e-9, slope)
         theta = np.clip(theta + step, 0.0, _WIDEST)
         if np.all(np.abs(step) < _NEWTON_STEP):
             break
@@ -327,7 +329,8 @@ def _undistort_equidistant(target: FloatArray, k: FloatArray) -> FloatArray:
 def _distort_equidistant(x: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
     r2 = np.sum(x * x, axis=-1)
     r = np.sqrt(r2)
-    theta_d, d_theta_d = _equidistant_radius(np.arctan(r), k)
+    theta = np.arctan(r)
+    theta_d, d_theta_d = _equidistant_radius(theta, k), _equidistant_slope(theta, k)
     near = r < 1e-6
     safe = np.where(near, 1.0, r)
     scale = np.where(near, 1.0, theta_d / safe)
