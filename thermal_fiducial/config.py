@@ -380,8 +380,8 @@ class ImuNoise:
     accelerometer_range: float = param(156.0, 'Readings beyond this are saturated.', unit='m/s^2', minimum=10.0)
     vibration: float = param(
         1.0,
-        'Share of the sample-to-sample noise that counts as white noise (half of it for the accelerometer) where it '
-        'exceeds the densities; 0: none.',
+        'Share of the vibration that may count as white noise where it exceeds the densities: the floor of its '
+        'spectrum always, the rest as far as poses bear it out (half of it for the accelerometer); 0: none.',
         minimum=0.0,
         maximum=1.0,
     )
@@ -405,7 +405,13 @@ class PoseEkfConfig:
     time_offset_random_walk: float = param(
         5.0e-5, 'Drift of the two clocks against each other.', unit='s/sqrt(s)', minimum=0.0
     )
-    stamp_jitter: float = param(0.0005, 'Jitter of the camera stamps.', unit='s', minimum=0.0, maximum=0.05, live=True)
+    stamp_jitter: float = param(
+        0.0005,
+        'Jitter of the camera stamps to begin with; it is learned from the poses. 0: exact, nothing is learned.',
+        unit='s',
+        minimum=0.0,
+        maximum=0.05,
+    )
     estimate_extrinsics: bool = param(False, 'Refine camera_position and camera_orientation while running.')
     extrinsics_position_std: float = param(0.02, 'Standard deviation of camera_position.', unit='m', minimum=0.0)
     extrinsics_orientation_std: float = param(

@@ -9,6 +9,7 @@ from support.flights import CAMERA_POSITION, config
 from thermal_fiducial.core.filter.error_state import BodyPose, ErrorStateFilter, Motion, pose_innovation
 from thermal_fiducial.core.filter.imu import ImuStep
 from thermal_fiducial.core.filter.initialisation import blank_state
+from thermal_fiducial.core.filter.learned_noise import StampJitter
 from thermal_fiducial.core.filter.navigation_state import inject, Layout, POSE, VELOCITY
 from thermal_fiducial.core.geometry import so3_exp, so3_left_jacobian, so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose
@@ -160,6 +161,17 @@ def test_motion_is_the_mean_of_a_window_and_the_slope_of_its_rate():
     assert not Motion.of(samples[:1], 0.2).angular_acceleration.any()
 
 
+def test_rates_are_averaged_as_their_noise_asks_and_the_turning_allows():
+    def turning(rate, acceleration):
+        return Motion(np.array([rate, 0, 0, 0, 0, 9.8]), np.array([0, acceleration, 0]), 0.1)
+
+    swinging = turning(0.1, 0.4)
+    # (density / acceleration)^(2/3), the acceleration 3 times the rate at least: 0.5 rad/s^2 here
+    assert swinging.averaging_seconds(2e-3) == pytest.approx(14.0 * 0.004 ** (2 / 3))
+    assert swinging.averaging_seconds(2e-2) == turning(0.0, 0.0).averaging_seconds(1e-4) == 0.5
+    assert turning(2.0, 5.0).averaging_seconds(5e-4) == 0.05
+
+
 @pytest.mark.parametrize(('turning', 'push'), [(0.0, 0.0), (3.0, 0.0), (0.0, 2.0)])
 def test_an_uncertain_time_offset_costs_what_the_acceleration_makes_of_it(state, turning, push):
     """Nothing at rest; half of it times the square of the offset, and what a turn's rate changes since the window."""
@@ -225,7 +237,8 @@ def test_motion_adds_to_the_floors_in_all_directions(state):
         time_offset_std=0.0,
     )  # fmt: skip
     filter_ = ErrorStateFilter(floors)
-    wide = replace(state, clock_open=False, covariance=1e3 * np.eye(filter_.layout.size))
+    exact = StampJitter.of(floors.stamp_jitter)
+    wide = replace(state, clock_open=False, stamp_jitter=exact, covariance=1e3 * np.eye(filter_.layout.size))
     body = BodyPose(state.T_map_body, np.zeros((6, 6)))
     rate = np.array([0.1, -0.2, 0.4])
     corrected, _ = filter_.correct(wide, body, steady(rate + state.bias[:3]))

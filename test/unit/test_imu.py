@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.filter.imu import GAP, ImuStep, NoiseMonitor, rotation_integrals, Transition
+from thermal_fiducial.core.filter.imu import ImuStep, rotation_integrals, Transition
 from thermal_fiducial.core.geometry import skew, so3_exp
 
 STEP = ImuStep(np.array([0.8, -1.5, 2.0, 3.0, -1.0, 9.0]), 0.005, 1.7e-4, 2.0e-3)
@@ -70,25 +69,3 @@ def test_noise_of_a_step_is_that_of_its_densities():
     np.testing.assert_allclose(np.diag(Q)[9:12], 2e-5**2 * dt)
     np.testing.assert_allclose(np.diag(Q)[12:], 3e-4**2 * dt)
     np.testing.assert_allclose(Q, Q.T, atol=1e-20)
-
-
-def test_white_noise_of_the_data_sheet_leaves_the_densities_alone():
-    noise = ImuNoise()
-    monitor = NoiseMonitor(noise)
-    rng = np.random.default_rng(3)
-    scale = np.repeat((noise.gyroscope_noise_density, noise.accelerometer_noise_density), 3) / np.sqrt(0.005)
-    densities = np.array([monitor.densities(scale * rng.normal(size=6), 0.005) for _ in range(400)])
-    assert densities.mean(axis=0) == pytest.approx((1.7e-4, 2.0e-3), rel=0.1)
-    # 20 % is five standard deviations of a variance over 60 samples x 3 axes, correlated over three
-    assert monitor.vibration == pytest.approx((scale[0], scale[3]), rel=0.2)
-
-
-def test_vibration_gap_and_saturation_raise_the_noise():
-    monitor = NoiseMonitor(ImuNoise())
-    rng = np.random.default_rng(3)
-    shaken = [monitor.densities(rng.normal(size=6), 0.005) for _ in range(400)][-1]
-    # 1 rad/s and 1 m/s^2 rms at 200 Hz, of which half counts; 20 % as above
-    assert shaken == pytest.approx((np.sqrt(0.005), 0.5 * np.sqrt(0.005)), rel=0.2)
-    assert NoiseMonitor(ImuNoise()).densities(np.zeros(6), GAP + 0.01)[1] > 0.5
-    assert NoiseMonitor(ImuNoise()).densities(np.array([0, 0, 0, 0, 0, 157.0]), 0.005)[1] > 1.0
-    assert NoiseMonitor(ImuNoise()).densities(np.array([35.0, 0, 0, 0, 0, 9.8]), 0.005)[0] > 0.03

@@ -16,8 +16,8 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.coasting import usable_seconds
 from thermal_fiducial.core.filter.error_state import doubted
 from thermal_fiducial.core.filter.gating import Belief, PoseGate, position_std, Sighting, Track
-from thermal_fiducial.core.filter.imu import ImuStep, NoiseMonitor
 from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
+from thermal_fiducial.core.filter.imu_noise import NoiseMonitor, NoiseRange
 from thermal_fiducial.core.filter.initialisation import WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.navigation_state import NavigationState
@@ -37,11 +37,11 @@ AGAIN_SECONDS = 2.0
 
 @dataclass(slots=True)
 class _Node:
-    """An IMU sample, the noise densities of the step that ends with it, and the belief there."""
+    """An IMU sample, the noise of the step that ends with it, and the belief there."""
 
     stamp_ns: int
     imu: FloatArray
-    densities: tuple[float, float]
+    noise: NoiseRange
     belief: Belief
 
 
@@ -99,7 +99,7 @@ class PoseEkf:
             return None
         imu = np.concatenate((sample.angular_velocity, sample.linear_acceleration))
         if not self._nodes:
-            self._nodes.append(_Node(sample.stamp_ns, imu, (0.0, 0.0), Belief()))
+            self._nodes.append(_Node(sample.stamp_ns, imu, NoiseRange(), Belief()))
             return None
         last = self._nodes[-1]
         seconds = (sample.stamp_ns - last.stamp_ns) / _SECOND_NS
@@ -210,20 +210,21 @@ class PoseEkf:
             due_ns = max(due_ns, time_ns)
             share = (due_ns - before.stamp_ns) / (node.stamp_ns - before.stamp_ns)
             imu_there = before.imu + share * (node.imu - before.imu)
-            belief = self._propagate(belief, (imu, imu_there), due_ns - time_ns, node.densities)
+            belief = self._propagate(belief, (imu, imu_there), due_ns - time_ns, node.noise)
             time_ns, imu = due_ns, imu_there
-            sighting = Sighting(pose, due_ns, belief.offset, partial(self._window, index, imu))
+            samples = partial(self._window, index, imu)
+            sighting = Sighting(pose, due_ns, belief.offset, samples, node.noise)
             belief, update = self._gate.weigh(belief, sighting)
             self._decide(update)
-        return self._propagate(belief, (imu, node.imu), node.stamp_ns - time_ns, node.densities)
+        return self._propagate(belief, (imu, node.imu), node.stamp_ns - time_ns, node.noise)
 
     def _propagate(
-        self, belief: Belief, ends: tuple[FloatArray, FloatArray], nanoseconds: int, densities: tuple[float, float]
+        self, belief: Belief, ends: tuple[FloatArray, FloatArray], nanoseconds: int, noise: NoiseRange
     ) -> Belief:
         """Trapezoid: the mean of the samples at the ends holds over the step."""
         if nanoseconds <= 0:
             return belief
-        return self._gate.predict(belief, ImuStep(0.5 * (ends[0] + ends[1]), nanoseconds / _SECOND_NS, *densities))
+        return self._gate.predict(belief, 0.5 * (ends[0] + ends[1]), nanoseconds / _SECOND_NS, noise)
 
     def _window(self, index: int, imu: FloatArray, seconds: float) -> FloatArray:
         """Samples (N, 6) of the last ``seconds`` before node ``index``, then ``imu``."""
@@ -264,7 +265,7 @@ class PoseEkf:
         return odometry(node.stamp_ns, state, node.imu[:3], self._rate_variance(node))
 
     def _rate_variance(self, node: _Node) -> float:
-        return node.densities[0] ** 2 * _SECOND_NS / (node.stamp_ns - self._nodes[-2].stamp_ns)
+        return node.noise.shaken[0] ** 2 * _SECOND_NS / (node.stamp_ns - self._nodes[-2].stamp_ns)
 
     @property
     def state(self) -> NavigationState | None:
@@ -336,6 +337,8 @@ class PoseEkf:
                 'usable for': self.usable_for,
                 'time offset': self._config.camera_time_offset + self.state.time_offset,
                 'time offset std': self._gate.filter.time_offset_std(self.state),
+                'stamp jitter': math.sqrt(self.state.stamp_jitter.variance),
+                'vibration share': self.state.aliasing.share,
                 'gyroscope bias': float(np.linalg.norm(self.state.bias[:3])),
                 'accelerometer bias': float(np.linalg.norm(self.state.bias[3:])),
                 'map tilt': math.asin(float(np.hypot(*self.state.gravity[:2])) / self._config.gravity),

@@ -28,6 +28,11 @@ from thermal_fiducial.core.types import FloatArray
 _KNOWN_VELOCITY, _UNSEEN_CHANGE = 0.2, 0.5
 #: A clock may step by more than was unknown of it at first: by two frames of a camera that lost them.
 _STEP = 2.0
+#: A rate is averaged over so many times (its noise density / its change)^(2/3) seconds, between these [s]. The best
+#: single mean has 1.3: noise misleads the time offset always to the same side, what the rate changes does not.
+_AVERAGING, _SHORTEST, _LONGEST = 14.0, 0.05, 0.5
+#: A swing's acceleration is so many times [1/s] its rate, half a period later; squared, the least that counts.
+_SWINGING, _LEAST_TURNING = 3.0, 1e-12
 _SIX = np.arange(6)
 
 
@@ -46,7 +51,8 @@ class BodyPose:
 class Motion:
     """What the IMU shows of the motion at a pose.
 
-    Means over a window, as the noise of one sample would count as motion that shows no clock error.
+    Means over a window: the noise of one sample would count as motion that shows no clock error. As it is in the
+    predicted attitude too, it would even show an error that isn't there.
     """
 
     #: (6,) rate [rad/s] and specific force [m/s^2]
@@ -55,14 +61,29 @@ class Motion:
     angular_acceleration: FloatArray
     #: how long before the pose the middle of the window is [s]
     age: float
+    #: instant of the pose in the clock of the IMU
+    time_ns: int = 0
+    #: how much of the IMU's noise is in doubt, 0 to 1
+    doubt: float = 0.0
 
     @classmethod
-    def of(cls, samples: FloatArray, seconds: float) -> 'Motion':
+    def of(cls, samples: FloatArray, seconds: float, time_ns: int = 0, doubt: float = 0.0) -> 'Motion':
         """Motion in samples (N, 6) of so many ``seconds``, the slope of their rate by least squares."""
         count = len(samples)
         place = np.arange(count) - 0.5 * (count - 1)
         slope = place @ samples[:, :3] * (count / seconds) / max(float(place @ place), 1.0)
-        return cls(samples.mean(axis=0), slope, 0.5 * seconds)
+        return cls(samples.mean(axis=0), slope, 0.5 * seconds, time_ns, doubt)
+
+    def averaging_seconds(self, density: float) -> float:
+        """Seconds over which to average a rate with white noise of ``density`` [rad/s/sqrt(Hz)] in such a motion.
+
+        The noise of the mean falls with the root of them, the change of the rate in them grows: the best is a constant
+        times (density / angular acceleration)^(2/3).
+        """
+        rate = self.imu[:3]
+        turning = float(self.angular_acceleration @ self.angular_acceleration) + _SWINGING**2 * float(rate @ rate)
+        best = _AVERAGING * float(np.cbrt(density**2 / max(turning, _LEAST_TURNING)))
+        return min(max(best, _SHORTEST), _LONGEST)
 
 
 class ErrorStateFilter:
@@ -81,8 +102,7 @@ class ErrorStateFilter:
     def configure(self, config: PoseEkfConfig) -> None:
         """Take over the live parameters of ``config``."""
         self._config = config
-        clock = 0.0 if config.estimate_time_offset else config.time_offset_std
-        self._clock_variance = config.stamp_jitter**2 + clock**2
+        self._clock_variance = 0.0 if config.estimate_time_offset else config.time_offset_std**2
 
     def predict(self, state: NavigationState, step: ImuStep) -> NavigationState:
         """State after an inertial step."""
@@ -108,6 +128,8 @@ class ErrorStateFilter:
             state.time_offset,
             state.clock_open,
             state.T_body_camera,
+            state.stamp_jitter,
+            state.aliasing,
             algebra.P,
         )
 
@@ -139,7 +161,19 @@ class ErrorStateFilter:
         noise[_SIX, _SIX] += self._floor(twist)
         innovation = pose_innovation(state, pose.T_map_body) - self._travelled(state, twist, motion, early)
         corrected, nis = self._update(state, innovation, H, noise)
-        return self._open_clock(corrected, motion.imu), nis
+        return self._open_clock(self._learned(corrected, innovation, twist, motion), motion.imu), nis
+
+    def _learned(
+        self, state: NavigationState, innovation: FloatArray, twist: FloatArray, motion: Motion
+    ) -> NavigationState:
+        """``state`` after the update by ``innovation``, with what that shows of the noise."""
+        weighted, weighted_twist = np.stack((innovation, twist)) @ self._algebra.SI
+        scale = self._config.pose_noise_scale
+        return replace(
+            state,
+            stamp_jitter=state.stamp_jitter.after(twist, weighted_twist, innovation),
+            aliasing=state.aliasing.after(motion.time_ns, innovation, weighted, motion.doubt, scale),
+        )
 
     def _travelled(self, state: NavigationState, twist: FloatArray, motion: Motion, seconds: float) -> FloatArray:
         """Rotation and position (6,) that the robot covers in so many ``seconds``, to second order."""
@@ -163,7 +197,7 @@ class ErrorStateFilter:
         are noise correlated over all axes. Where it is, what is uncertain of it times what is uncertain of the motion,
         and half the acceleration a times its square, of variance 3/4 a^2 s^4, are left.
         """
-        noise = self._clock_variance * np.outer(twist, twist)
+        noise = (self._clock_variance + state.stamp_jitter.variance) * np.outer(twist, twist)
         place = self.layout.time_offset
         if place is None:
             return noise

@@ -13,6 +13,7 @@ import math
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.error_state import ErrorStateFilter, Motion
 from thermal_fiducial.core.filter.imu import ImuStep
+from thermal_fiducial.core.filter.imu_noise import NoiseRange
 from thermal_fiducial.core.filter.initialisation import blank_state, start, WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.navigation_state import in_moved_map, NavigationState
@@ -20,9 +21,8 @@ from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
 _SECOND_NS = 1_000_000_000
-#: Seconds whose mean motion shows a clock error. The noise of one sample would count as motion that shows none, and it
-#: is in the predicted attitude too: in a slow, shaking flight the two together lead the time offset astray.
-_MOTION_SECONDS = 0.2
+#: Seconds of motion that tell over how many it should be averaged.
+_GLANCE_SECONDS = 0.2
 #: A rival must agree with so many times more poses than the belief: when the robot slows down, a belief whose clock is
 #: wrong accepts some.
 _PREFERRED = 4
@@ -80,11 +80,15 @@ class Sighting:
     time_offset: float
     #: gives the IMU samples (N, 6) of so many seconds up to it
     samples: Callable[[float], FloatArray]
+    #: of the IMU at that instant
+    noise: NoiseRange
 
     @cached_property
     def motion(self) -> Motion:
         """The motion that shows a clock error."""
-        return Motion.of(self.samples(_MOTION_SECONDS), _MOTION_SECONDS)
+        glance = Motion.of(self.samples(_GLANCE_SECONDS), _GLANCE_SECONDS)
+        seconds = glance.averaging_seconds(self.noise.shaken[0])
+        return Motion.of(self.samples(seconds), seconds, self.time_ns, self.noise.doubt)
 
 
 class PoseGate:
@@ -100,16 +104,17 @@ class PoseGate:
         self._config = config
         self.filter.configure(config)
 
-    def predict(self, belief: Belief, step: ImuStep) -> Belief:
-        """Belief after an inertial step."""
+    def predict(self, belief: Belief, imu: FloatArray, seconds: float, noise: NoiseRange) -> Belief:
+        """Belief after a step of so many ``seconds`` with the mean sample ``imu`` (6,)."""
         if belief.main is None and belief.rival is None:
             return belief
-        main, rival = self._moved(belief.main, step), self._moved(belief.rival, step)
+        main, rival = (self._moved(track, imu, seconds, noise) for track in (belief.main, belief.rival))
         return Belief(main, rival, belief.pose_stamp_ns, belief.resets, belief.time_offset)
 
-    def _moved(self, track: Track | None, step: ImuStep) -> Track | None:
+    def _moved(self, track: Track | None, imu: FloatArray, seconds: float, noise: NoiseRange) -> Track | None:
         if track is None:
             return None
+        step = ImuStep(imu, seconds, *noise.at(track.state.aliasing.share))
         state = self.filter.predict(track.state, step)
         return Track(
             state, track.started_ns, track.accepted_ns, track.linearised_std, track.hits, track.misses, track.against
@@ -135,6 +140,7 @@ class PoseGate:
                 rival = self._outdone(belief.rival, sighting)
                 accepted = Belief(main.supported(state, time_ns), rival, stamp_ns, belief.resets)
                 return accepted, PoseUpdate(stamp_ns, True, '', nis)
+            belief = replace(belief, main=replace(main, state=replace(main.state, aliasing=state.aliasing)))
         rival = self._challenge(belief, sighting)
         if rival and self._convincing(rival, main, time_ns):
             resets = belief.resets + (belief.main is not None)

@@ -5,20 +5,10 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.types import FloatArray
 
 #: Below this angle [rad] the series are exact to double precision.
 SMALL_ANGLE = 1e-2
-#: A step longer than this [s] is a gap: what happened in it isn't known from the samples at its ends.
-GAP = 0.03
-#: Standard deviation of rate [rad/s] and specific force [m/s^2] in a gap; of a saturated sample, hit or fault.
-UNKNOWN_RATE, UNKNOWN_FORCE, SATURATED_FORCE = 0.5, 3.0, 150.0
-#: How much less the force's shaking counts than the rate's: rotors make tones, not white noise, and the position, its
-#: second integral, hardly feels those above the bandwidth of the filter; the attitude, a first integral, feels more.
-FORCE_SHARE = 0.5
-#: Time constant of the running vibration level [s].
-VIBRATION_TIME = 0.3
 
 
 @dataclass(slots=True)
@@ -145,63 +135,3 @@ def _skews(a: list[float], dv: list[float], dp: list[float]) -> FloatArray:
             (py, -px, 0.0),
         )
     )
-
-
-class NoiseMonitor:
-    """Noise densities that hold now: those of the data sheet, more under vibration, saturation and in gaps.
-
-    Rotors shake an IMU by far more than its noise, and part of that aliases down to low frequencies. The second
-    difference of three samples shows it, as the motion itself hardly has any.
-    """
-
-    def __init__(self, noise: ImuNoise) -> None:
-        self._noise = noise
-        self._recent: list[FloatArray] = []
-        self._variance = np.zeros(2)
-        self._beyond = (False, False)
-
-    @property
-    def vibration(self) -> tuple[float, float]:
-        """Running sample-to-sample standard deviations [rad/s, m/s^2], rms over the axes."""
-        rate, force = self._variance.tolist()
-        return math.sqrt(rate), math.sqrt(force)
-
-    def densities(self, imu: FloatArray, seconds: float) -> tuple[float, float]:
-        """Gyroscope and accelerometer density for the step of ``seconds`` that ends with sample ``imu`` (6,)."""
-        self._watch(imu, seconds)
-        rate, force = self._noise.gyroscope_noise_density, self._noise.accelerometer_noise_density
-        if self._noise.vibration > 0.0:
-            share = self._noise.vibration * math.sqrt(min(seconds, GAP))
-            shaken_rate, shaken_force = self.vibration
-            rate, force = max(rate, share * shaken_rate), max(force, FORCE_SHARE * share * shaken_force)
-        unknown = math.sqrt(seconds)
-        rate_lost, force_lost = self._saturated(imu.tolist())
-        if seconds > GAP or rate_lost:
-            rate = max(rate, UNKNOWN_RATE * unknown)
-        if seconds > GAP:
-            force = max(force, UNKNOWN_FORCE * unknown)
-        if force_lost:
-            force = max(force, SATURATED_FORCE * unknown)
-        return rate, force
-
-    def _saturated(self, imu: list[float]) -> tuple[bool, bool]:
-        """Whether rate and force are beyond their ranges at either end of the step."""
-        before = self._beyond
-        self._beyond = (
-            max(map(abs, imu[:3])) >= self._noise.gyroscope_range,
-            max(map(abs, imu[3:])) >= self._noise.accelerometer_range,
-        )
-        return before[0] or self._beyond[0], before[1] or self._beyond[1]
-
-    def _watch(self, imu: FloatArray, seconds: float) -> None:
-        if seconds > GAP:
-            self._recent.clear()
-        self._recent.append(imu)
-        if len(self._recent) < 3:
-            return
-        first, second, third = self._recent
-        difference = first - 2.0 * second + third
-        # White noise of variance s^2 has second differences of variance 6 s^2.
-        variance = (difference * difference).reshape(2, 3).sum(axis=1) / 18.0
-        self._variance += min(seconds / VIBRATION_TIME, 1.0) * (variance - self._variance)
-        del self._recent[0]

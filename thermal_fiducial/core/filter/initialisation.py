@@ -11,6 +11,7 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.error_state import BodyPose, ErrorStateFilter
+from thermal_fiducial.core.filter.learned_noise import Aliasing, StampJitter
 from thermal_fiducial.core.filter.navigation_state import (
     ACCELEROMETER_BIAS,
     GYROSCOPE_BIAS,
@@ -65,6 +66,8 @@ def blank_state(config: PoseEkfConfig, layout: Layout) -> NavigationState:
         time_offset=0.0,
         clock_open=False,
         T_body_camera=transform_from_quaternion(config.camera_position, config.camera_orientation),
+        stamp_jitter=StampJitter.of(config.stamp_jitter),
+        aliasing=Aliasing(),
         covariance=np.zeros((layout.size, layout.size)),
     )
 

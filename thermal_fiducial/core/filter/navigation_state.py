@@ -16,6 +16,7 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.imu import rotation_integrals
+from thermal_fiducial.core.filter.learned_noise import Aliasing, StampJitter
 from thermal_fiducial.core.geometry import transform
 from thermal_fiducial.core.types import FloatArray
 
@@ -72,6 +73,9 @@ class NavigationState:
     clock_open: bool
     #: (4, 4)
     T_body_camera: FloatArray
+    #: what the innovations have shown of the noise
+    stamp_jitter: StampJitter
+    aliasing: Aliasing
     #: (n, n) of the error coordinates of :class:`Layout`
     covariance: FloatArray
 
