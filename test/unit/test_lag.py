@@ -133,12 +133,14 @@ def test_model_error_counts_the_cells_that_the_smear_passes(turn):
     np.testing.assert_allclose(model_error(along, tilted, 6), model_error(along, whole, 6))
 
 
-def test_an_unknown_motion_is_limited_by_sharp_edges():
-    displacement = np.tile(0.01 * 500.0 * np.eye(2, 6, k=3), (3, 4, 1, 1))
-    covariances = common_error(displacement, 1.5**2 * np.eye(6), np.array([0.015, 0.05, 0.1]))
+def test_an_unknown_motion_is_limited_by_sharp_edges_and_by_cells_that_can_be_read():
+    displacement = np.tile(0.01 * 500.0 * np.eye(2, 6, k=3), (4, 4, 1, 1))
+    cell = np.array([10.0, 10.0, 30.0, 10.0])
+    covariances = common_error(displacement, 1.5**2 * np.eye(6), np.array([0.015, 0.05, 0.1, 0.1]), cell)
     deviation = np.sqrt(covariances[..., 0, 0])
-    np.testing.assert_allclose(deviation, np.broadcast_to([[0.3], [1.0], [7.5]], (3, 4)), rtol=1e-6)
-    np.testing.assert_allclose(common_error(0.0 * displacement, np.eye(6), np.zeros(3)), 0.0)
+    # Of a faint marker, whose residuals tell nothing, as much as the motion does, or 0.4 cells.
+    np.testing.assert_allclose(deviation, np.broadcast_to([[0.3], [1.0], [7.5], [4.0]], (4, 4)), rtol=1e-6)
+    np.testing.assert_allclose(common_error(0.0 * displacement, np.eye(6), np.zeros(4), cell), 0.0)
 
 
 def test_windows_outside_or_without_numbers_are_skipped():

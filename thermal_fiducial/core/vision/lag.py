@@ -42,6 +42,8 @@ _FORM_UNSURE, _FORM_UNSURE_IN_CELLS = 0.010, 0.011
 # Displacement [px] by a smear over the residuals that it leaves of a model without one, in contrasts, and the residuals
 # that hardly grow with it any more: 0.015 where there is no smear, 0.05 where it is 1.5 px, 0.08 where it is 6 px.
 _SMEAR_THAT_SHOWS, _SMEARED_OUT = 20.0, 0.055
+# The same of any marker that can be read, in cells: nine of ten are off by less than 0.65, seen without a motion.
+_READABLE = 0.4
 
 
 def model_error(smear_px: FloatArray, corners_px: FloatArray, cells: int) -> FloatArray:
@@ -67,21 +69,25 @@ def _shares_of_sides(shift: FloatArray, corners: FloatArray) -> FloatArray:
     return np.asarray(2.0 * np.linalg.solve(np.stack([a + b, b - a], axis=-1), shift[..., None])[..., 0])
 
 
-def common_error(displacement: FloatArray, twist_covariance: FloatArray, unsharpness: FloatArray) -> FloatArray:
+def common_error(
+    displacement: FloatArray, twist_covariance: FloatArray, unsharpness: FloatArray, cell_px: FloatArray
+) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] of corners that a motion displaces of which little is known.
 
-    Edges that are sharp limit it. It displaces all corners of a frame alike, which covariances of single ones cannot
-    say: what many of them tell together may be off by more than theirs.
+    Edges that are sharp limit it, and that cells can be told apart. It displaces all corners of a frame alike, which
+    covariances of single ones cannot say: what many of them tell together may be off by more than theirs.
 
     Parameters
     ----------
     displacement : (N, 4, 2, 6) derivative of the displacement by the twist [px]
     twist_covariance : (6, 6)
     unsharpness : (N,) residuals of pixels across the sides, in contrasts
+    cell_px : (N,) width of a cell
     """
     covariance = displacement @ twist_covariance @ np.swapaxes(displacement, -1, -2)
     variance = 0.5 * np.trace(covariance, axis1=-2, axis2=-1)
-    shown = np.where(unsharpness < _SMEARED_OUT, (_SMEAR_THAT_SHOWS * unsharpness) ** 2, np.inf)[:, None]
+    sharp = np.where(unsharpness < _SMEARED_OUT, _SMEAR_THAT_SHOWS * unsharpness, np.inf)
+    shown = np.minimum(sharp, _READABLE * cell_px)[:, None] ** 2
     return np.asarray(covariance * np.minimum(shown / np.maximum(variance, 1e-12), 1.0)[..., None, None])
 
 

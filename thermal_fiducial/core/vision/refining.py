@@ -162,7 +162,7 @@ class Refiner:
         if frame.twist is not None or known is None:
             twist = self._motion.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
         if twist is None:
-            unsure = seen.covariances + _doubts(seen) + _never_seen(frame, places, seen, unknown_twist())
+            unsure = seen.covariances + _doubts(seen) + self._never_seen(frame, places, seen, unknown_twist())
             return Refinement(view, seen, replace(seen, covariances=unsure), replace(places, at=at), None)
         smear = places.smear(twist, frame.lag)
         rolled = seen_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
@@ -172,21 +172,21 @@ class Refiner:
         unknown = by_twist @ twist.covariance_ago(frame.lag) @ np.swapaxes(by_twist, -1, -2)
         unknown = unknown + model_error(smear, places.at.px, self._behind.shape[2])
         if frame.twist is None:
-            unknown = unknown + _never_seen(frame, places, seen, twist)
+            unknown = unknown + self._never_seen(frame, places, seen, twist)
         refined = replace(seen, corners_px=corners, covariances=seen.covariances + _doubts(seen) + unknown)
         return Refinement(view, seen, refined, replace(places, at=at.moved(corners - at.px, frame.camera)), twist)
+
+    def _never_seen(self, frame: Frame, places: Places, seen: RefinedCorners, twist: Twist) -> FloatArray:
+        """Covariances (N, 4, 2, 2) [px^2] by a motion that the frames before tell nothing of."""
+        since = frame.lag - delays(seen.corners_px[..., 1], frame)
+        unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), 1e-6)
+        cell = sides_px(seen.corners_px) / self._behind.shape[2]
+        return common_error(since[..., None, None] * places.flow, twist.covariance_ago(frame.lag), unsharpness, cell)
 
 
 def _doubts(seen: RefinedCorners) -> FloatArray:
     """Covariances (N, 1, 2, 2) [px^2] of corners that make no square."""
     return seen.doubt[:, None, None, None] * np.eye(2)
-
-
-def _never_seen(frame: Frame, places: Places, seen: RefinedCorners, twist: Twist) -> FloatArray:
-    """Covariances (N, 4, 2, 2) [px^2] by a motion that the frames before tell nothing of."""
-    since = frame.lag - delays(seen.corners_px[..., 1], frame)
-    unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), 1e-6)
-    return common_error(since[..., None, None] * places.flow, twist.covariance_ago(frame.lag), unsharpness)
 
 
 def _worth_sharpening(square: FloatArray, cell: FloatArray, cells: int, clarity: FloatArray) -> BoolArray:
