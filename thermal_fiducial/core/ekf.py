@@ -5,7 +5,7 @@ they came: a pose that comes late goes where it belongs, and everything after it
 """
 
 from bisect import bisect_left, bisect_right, insort
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 import math
@@ -33,6 +33,8 @@ _LARGEST_OFFSET_NS = 200_000_000
 _NIS_POSES = 30
 #: The last seconds that are linearised anew when the time offset has become known [s].
 AGAIN_SECONDS = 2.0
+#: Nodes that a second pass goes on for each node that comes.
+STEPS_AGAIN = 6
 
 
 @dataclass(slots=True)
@@ -43,6 +45,18 @@ class _Node:
     imu: FloatArray
     noise: NoiseRange
     belief: Belief
+    #: the last seconds gone through again, if they are just now
+    again: '_Again | None' = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Again:
+    """A second pass: its belief at the node of a stamp, the node it was begun at, and the start of its track [ns]."""
+
+    belief: Belief
+    stamp_ns: int
+    begun_ns: int
+    started_ns: int
 
 
 class PoseEkf:
@@ -121,7 +135,7 @@ class PoseEkf:
             insort(self._poses, pose, key=lambda item: item.stamp_ns)
             first = self._first_node_after(pose)
             for index in range(first, len(self._nodes)):
-                self._advance(index)
+                self._advance(index, self._nodes[first].stamp_ns)
             waiting = PoseUpdate(pose.stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
             update = self.decided.get(pose.stamp_ns, waiting)
         return update
@@ -130,6 +144,8 @@ class PoseEkf:
         """Follow a correction of the map: estimates and buffered poses move with it, T_new = T_new_old @ T_old."""
         for node in self._nodes:
             node.belief = self._gate.in_moved_map(node.belief, T_new_old)
+            if node.again:
+                node.again = replace(node.again, belief=self._gate.in_moved_map(node.again.belief, T_new_old))
         self._poses = [in_moved_map(pose, T_new_old) for pose in self._poses]
 
     def _unusable(self, pose: CameraPose) -> PoseUpdate | None:
@@ -169,29 +185,47 @@ class PoseEkf:
             index += 1
         return index
 
-    def _advance(self, index: int) -> None:
-        """Compute the belief of node ``index`` from the node before."""
+    def _advance(self, index: int, change_ns: int = 0) -> None:
+        """Compute the belief of node ``index`` from the node before; once more if something changed at an instant."""
+        node = self._nodes[index]
         belief = self._step(index, self._nodes[index - 1].belief, self._poses)
-        if self._gate.outgrown(belief):
-            belief = self._linearised_anew(index, belief)
-        self._nodes[index].belief = belief
+        again = self._nodes[index - 1].again
+        if again is None and self._gate.outgrown(belief):
+            again = self._begin_again(index, belief)
+        if again and belief.main and belief.main.started_ns == again.started_ns:
+            done = node.again
+            # What was begun before the change, and has come nowhere near it by then, is what it would be now.
+            holds = done and max(done.begun_ns, done.stamp_ns + _LARGEST_OFFSET_NS) < change_ns
+            again = done if holds else self._go_on(again, index, belief)
+        else:
+            again = None
+        if again and again.stamp_ns == node.stamp_ns:
+            belief, again = self._gate.linearised(again.belief, belief), None
+        node.belief, node.again = belief, again
 
-    def _linearised_anew(self, index: int, belief: Belief) -> Belief:
-        """``belief`` of node ``index``, its last seconds gone through again with the time offset that they have shown.
+    def _begin_again(self, index: int, belief: Belief) -> '_Again':
+        """Begin to go through the last seconds of ``belief`` at node ``index`` with the time offset they have shown.
 
         An offset that is wrong by tens of milliseconds is more than the filter's first order can bear: in a turn it
-        would leave errors in the biases that last.
+        would leave errors in the biases that last. That is work for tens of milliseconds, and spread over the nodes
+        that follow, a few steps each, until the second pass has caught up.
         """
         assert belief.main
-        state = belief.main.state
-        first = self._first_to_linearise(index, belief.main)
-        skipped_ns = self._nodes[first].stamp_ns - self._offset_ns - round(state.time_offset * _SECOND_NS)
-        again = self._gate.at_offset(self._nodes[first].belief, belief.main, skipped_ns)
+        first = self._nodes[self._first_to_linearise(index, belief.main)]
+        skipped_ns = first.stamp_ns - self._offset_ns - round(belief.main.state.time_offset * _SECOND_NS)
+        again = self._gate.at_offset(first.belief, belief.main, skipped_ns)
+        return _Again(again, first.stamp_ns, self._nodes[index].stamp_ns, belief.main.started_ns)
+
+    def _go_on(self, again: '_Again', index: int, belief: Belief) -> '_Again':
+        """A few more steps, with the poses that ``belief`` of node ``index`` has, as far as that."""
         # Those that were not due yet are for the nodes that follow, as they will be if they come late.
         poses = self._poses[: _place_after(belief.pose_stamp_ns, self._poses)]
-        for i in range(first + 1, index + 1):
-            again = self._step(i, again, poses)
-        return self._gate.linearised(again, belief)
+        begin = self._index_at(again.stamp_ns) + 1
+        end = min(begin + STEPS_AGAIN, index + 1)
+        state = again.belief
+        for i in range(begin, end):
+            state = self._step(i, state, poses)
+        return replace(again, belief=state, stamp_ns=self._nodes[end - 1].stamp_ns)
 
     def _first_to_linearise(self, index: int, track: Track) -> int:
         """Node to go back to: some seconds, but not to another track, whose poses are no more to be trusted now."""
