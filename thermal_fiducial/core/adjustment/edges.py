@@ -12,6 +12,9 @@ _NARROW = 5.0
 # Approximation of the normal distribution by a hyperbolic tangent, good to 2e-4 (E. Page, "Approximations to the
 # cumulative normal function and its inverse for use on a pocket calculator", 1977).
 _LINEAR, _CUBIC = 0.7988, 0.7988 * 0.04417
+# The plate ends one cell outside, at an edge that the model does not know: so many blurs from it nothing of it shows;
+# and what must be seen of the plate all the same [px].
+_RIM_SHOWS, _LEAST_QUIET_PX = 1.5, 0.8
 # Share of the side that a column must see: beyond its ends there is none.
 _MOSTLY = 0.7
 
@@ -56,8 +59,8 @@ def model(
     narrow = cell < _NARROW * blur[0]
     if narrow.any():
         _add_neighbours(value, slope, sides, np.flatnonzero(narrow), behind.reshape(-1, cells, len(NEIGHBOURS)), blur)
-    reach = np.where(narrow, 1.6 * cell, cell - 2.0 * blur[0])
-    quiet = np.minimum(reach, np.maximum(cell - blur[0], 2.5))
+    reach = np.where(narrow, cell, cell - 2.0 * blur[0])
+    quiet = np.minimum(reach, np.maximum(cell - _RIM_SHOWS * blur[0], _LEAST_QUIET_PX))
     weight = (sides.distance >= -quiet[:, None, None]) & (sides.distance <= reach[:, None, None])
     weight &= (sides.fresh & (own > _MOSTLY))[..., None]
     if sides.inside is not None:
