@@ -17,12 +17,14 @@ def seen(*frames):
 
 def test_nothing_is_excluded_before_a_kind_is_sure():
     assert seen([3.0, 4.0]).possible(BOTH, 'alike').all()
+    assert seen([3.0, 4.0]).kinds('alike') == (1.0, -1.0)
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 def test_markers_are_like_those_before(sign):
     polarity = seen(*[[sign * 3.0, sign * 0.1]] * 10)
     np.testing.assert_array_equal(polarity.possible(sign * BOTH, 'alike'), [True, False])
+    assert polarity.kinds('alike') == (sign,)
 
 
 def test_a_single_other_one_changes_nothing():

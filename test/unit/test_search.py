@@ -61,6 +61,18 @@ def test_finds_the_marker_at_any_contrast(contrast):
     assert np.abs(found.corners_px[0] - CORNERS).max() < 4.0  # a third of a cell, which the refinement catches
 
 
+def test_faint_markers_brighter_than_all_round_are_found():
+    """Twice the noise of a pixel; their white is the wall's, so that no plate shows."""
+    found = []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        image = np.full((512, 640), 7000.0)
+        image[150:222, 200:272] += 2.0 * (1.0 - np.kron(np.pad(BITS[21], 1), np.ones((12, 12))))
+        found += search((image + rng.normal(0.0, 1.0, image.shape)).astype(np.float32)).ids.tolist()
+    # All when written, none when only what is darker than its surroundings is followed.
+    assert found.count(21) >= 4
+
+
 @pytest.mark.parametrize('contrast', [2000.0, 100.0])
 def test_bright_markers_far_away_are_found(contrast):
     """Plates on a cold wall, whose white and that of bits swamps the border of less than three pixels between."""

@@ -206,7 +206,10 @@ class MarkerDetector:
         self._sought = self._sought_next(complete=complete)
         scene = self._scene(frame.image, frame.camera, frame.twist)
         allowed = self._allowed()
-        blind = self._search.search(frame.image, frame.noise, scene, allowed, self.config, expected, self._sought)
+        kinds = self._polarity.kinds(self.config.polarity)
+        blind = self._search.search(
+            frame.image, frame.noise, scene, allowed, self.config, expected, self._sought, kinds
+        )
         blind = blind.only(self._polarity.possible(blind.clarity, self.config.polarity))
         return merged(expected, self._unrolled(frame, blind)), followed
 

@@ -22,6 +22,10 @@ class Polarity:
         """Take in the markers (N,) of a frame, by white minus black."""
         self._balance += float(np.sign(contrast).sum()) - self._balance / _MEMORY
 
+    def kinds(self, rule: str) -> tuple[float, ...]:
+        """Which kinds there may be by the parameter ``polarity``: 1 for markers darker than what is behind, -1."""
+        return tuple(kind for kind in (1.0, -1.0) if self.possible(np.array([kind]), rule)[0])
+
     def possible(self, contrast: FloatArray, rule: str) -> BoolArray:
         """Which markers (N,) may be some, by the parameter ``polarity``."""
         if rule == 'any' or (rule == 'alike' and abs(self._balance) < _SURE):

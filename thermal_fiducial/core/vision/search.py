@@ -106,6 +106,7 @@ class BlindSearch:
         config: ArucoDetectorConfig,
         seen: Found | None = None,
         sought: Sought = Sought.ALL,
+        kinds: tuple[float, ...] = (1.0, -1.0),
     ) -> Found:
         """Markers with IDs ``allowed`` (M,), each ID once.
 
@@ -116,6 +117,7 @@ class BlindSearch:
         scene : the same freed of lag, which costs noise: the finest markers are sought there, the faintest in ``image``
         seen : markers that are there: nothing is sought in them and their plates
         sought : at which resolutions
+        kinds : of markers sought among the faintest, 1 for darker than their surroundings, -1 for brighter
         """
         decoder = self._decoder
         seen = Found.none() if seen is None else seen
@@ -127,7 +129,8 @@ class BlindSearch:
             return Found.none()
         half = without_columns(halved(image, self._scratch), 0.5 * noise, self._scratch)
         if Sought.FAINT in sought:
-            faint = self._faint(half, noise, config.min_side_px, hidden)
+            views = [half if kind > 0.0 else -half for kind in kinds]
+            faint = np.concatenate([self._faint(view, noise, config.min_side_px, hidden) for view in views])
         if len(fine) + len(faint) == 0:
             return Found.none()
         # Blur may leave nothing to be seen of a border between two white ones but the outline of the whole plate.
