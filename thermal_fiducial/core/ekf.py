@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -57,6 +58,14 @@ class _Again:
     stamp_ns: int
     begun_ns: int
     started_ns: int
+
+
+class _Due(NamedTuple):
+    """A pose, its instant in the clock of the IMU by one of the estimates, and by which."""
+
+    time_ns: int
+    pose: CameraPose
+    by_rival: bool
 
 
 class PoseEkf:
@@ -167,20 +176,25 @@ class PoseEkf:
     def _is_too_late(self, pose: CameraPose) -> bool:
         first, last = self._nodes[0], self._nodes[-1]
         oldest_ns = max(first.stamp_ns, last.stamp_ns - round(self._config.max_delay * _SECOND_NS))
-        return self._due_ns(last.belief, pose) <= oldest_ns or self._due_ns(first.belief, pose) <= first.stamp_ns
+        return (
+            self._due_ns(last.belief.offset, pose) <= oldest_ns
+            or self._due_ns(first.belief.offset, pose) <= first.stamp_ns
+        )
 
     # --- the history ----------------------------------------------------------------------------------
 
-    def _due_ns(self, belief: Belief, pose: CameraPose) -> int:
-        """Instant of a pose in the clock of the IMU, as a belief sees it."""
-        return pose.stamp_ns + self._offset_ns + round(belief.offset * _SECOND_NS)
+    def _due_ns(self, time_offset: float, pose: CameraPose) -> int:
+        """Instant of a pose in the clock of the IMU, for what is left of the time offset [s]."""
+        return pose.stamp_ns + self._offset_ns + round(time_offset * _SECOND_NS)
 
     def _first_node_after(self, pose: CameraPose) -> int:
         """First node with a belief that ``pose`` takes part in."""
         earliest = pose.stamp_ns + self._offset_ns - _LARGEST_OFFSET_NS
         index = max(self._index_at(earliest), 1)
         while index < len(self._nodes):
-            if self._due_ns(self._nodes[index - 1].belief, pose) <= self._nodes[index].stamp_ns:
+            belief = self._nodes[index - 1].belief
+            offset = min(belief.offset, belief.rival.state.time_offset) if belief.rival else belief.offset
+            if self._due_ns(offset, pose) <= self._nodes[index].stamp_ns:
                 break
             index += 1
         return index
@@ -234,23 +248,38 @@ class PoseEkf:
         return first if main is None or main.started_ns == track.started_ns else self._index_at(track.started_ns)
 
     def _step(self, index: int, belief: Belief, poses: list[CameraPose]) -> Belief:
-        """Belief at node ``index`` after ``belief`` at the node before, with those of ``poses`` in between."""
+        """Belief at node ``index`` after ``belief`` at the node before, with those of ``poses`` in between.
+
+        A pose is due at one instant by the main estimate's clock, and at another by the rival's.
+        """
         before, node = self._nodes[index - 1], self._nodes[index]
         time_ns, imu = before.stamp_ns, before.imu
-        for pose in poses[_place_after(belief.pose_stamp_ns, poses) :]:
-            due_ns = self._due_ns(belief, pose)
-            if due_ns > node.stamp_ns:
-                break
-            due_ns = max(due_ns, time_ns)
+        while (due := self._next_due(belief, poses)) is not None and due.time_ns <= node.stamp_ns:
+            due_ns = max(due.time_ns, time_ns)
             share = (due_ns - before.stamp_ns) / (node.stamp_ns - before.stamp_ns)
             imu_there = before.imu + share * (node.imu - before.imu)
             belief = self._propagate(belief, (imu, imu_there), due_ns - time_ns, node.noise)
             time_ns, imu = due_ns, imu_there
-            samples = partial(self._window, index, imu)
-            sighting = Sighting(pose, due_ns, belief.offset, samples, node.noise)
-            belief, update = self._gate.weigh(belief, sighting)
-            self._decide(update)
+            late = (due_ns - due.time_ns) / _SECOND_NS
+            sighting = Sighting(due.pose, due_ns, late, partial(self._window, index, imu), node.noise)
+            weigh = self._gate.weigh_rival if due.by_rival else self._gate.weigh
+            belief, update = weigh(belief, sighting)
+            if update:
+                self._decide(update)
         return self._propagate(belief, (imu, node.imu), node.stamp_ns - time_ns, node.noise)
+
+    def _next_due(self, belief: Belief, poses: list[CameraPose]) -> _Due | None:
+        """The first pose that either estimate has to weigh."""
+        due = []
+        if belief.main or not belief.rival:
+            due += self._due(belief.pose_stamp_ns, belief.offset, poses, by_rival=False)
+        if belief.rival:
+            due += self._due(belief.rival.pose_stamp_ns, belief.rival.state.time_offset, poses, by_rival=True)
+        return min(due, key=lambda item: item.time_ns, default=None)
+
+    def _due(self, seen_ns: int, time_offset: float, poses: list[CameraPose], *, by_rival: bool) -> list[_Due]:
+        place = _place_after(seen_ns, poses)
+        return [_Due(self._due_ns(time_offset, pose), pose, by_rival) for pose in poses[place : place + 1]]
 
     def _propagate(
         self, belief: Belief, ends: tuple[FloatArray, FloatArray], nanoseconds: int, noise: NoiseRange

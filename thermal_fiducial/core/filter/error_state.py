@@ -146,11 +146,11 @@ class ErrorStateFilter:
         return BodyPose(T_map_body, self._config.pose_noise_scale**2 * (J @ pose.covariance @ J.T))
 
     def correct(
-        self, state: NavigationState, pose: BodyPose, motion: Motion, early: float = 0.0
+        self, state: NavigationState, pose: BodyPose, motion: Motion, late: float = 0.0
     ) -> tuple[NavigationState, float]:
         """State corrected by a pose at its own instant, and the normalised innovation squared.
 
-        ``early`` [s] is how much later the pose was than the state, by the state's own time offset.
+        ``late`` [s] is how much later the state is than the pose.
         """
         twist = np.concatenate((motion.imu[:3] - state.bias[:3], state.velocity_body))
         H = self._H_pose
@@ -159,7 +159,7 @@ class ErrorStateFilter:
             H[:, self.layout.time_offset] = twist
         noise = pose.covariance + self._clock_noise(state, twist, motion)
         noise[_SIX, _SIX] += self._floor(twist)
-        innovation = pose_innovation(state, pose.T_map_body) - self._travelled(state, twist, motion, early)
+        innovation = pose_innovation(state, pose.T_map_body) - _travelled(state, twist, motion, -late)
         corrected, nis = self._update(state, innovation, H, noise)
         return self._open_clock(self._learned(corrected, innovation, twist, motion), motion.imu), nis
 
@@ -174,13 +174,6 @@ class ErrorStateFilter:
             stamp_jitter=state.stamp_jitter.after(twist, weighted_twist, innovation),
             aliasing=state.aliasing.after(motion.time_ns, innovation, weighted, motion.doubt, scale),
         )
-
-    def _travelled(self, state: NavigationState, twist: FloatArray, motion: Motion, seconds: float) -> FloatArray:
-        """Rotation and position (6,) that the robot covers in so many ``seconds``, to second order."""
-        if seconds == 0.0:
-            return np.zeros(6)
-        turning = motion.angular_acceleration * (motion.age + 0.5 * seconds)
-        return seconds * (twist + np.concatenate((turning, 0.5 * seconds * _acceleration(state, twist, motion))))
 
     def _floor(self, twist: FloatArray) -> FloatArray:
         """Variances (6,) of what the corner covariances don't know: errors that all corners share, more in motion."""
@@ -298,6 +291,14 @@ def doubted(state: NavigationState, other: NavigationState) -> NavigationState:
     error[ROTATION], error[POSITION] = innovation[:3], innovation[3:]
     error[VELOCITY] = (other.velocity - state.velocity) @ state.R_map_body
     return replace(state, covariance=state.covariance + other.covariance + np.outer(error, error))
+
+
+def _travelled(state: NavigationState, twist: FloatArray, motion: Motion, seconds: float) -> FloatArray:
+    """Rotation and position (6,) that the robot covers in so many ``seconds``, to second order."""
+    if seconds == 0.0:
+        return np.zeros(6)
+    turning = motion.angular_acceleration * (motion.age + 0.5 * seconds)
+    return seconds * (twist + np.concatenate((turning, 0.5 * seconds * _acceleration(state, twist, motion))))
 
 
 def _acceleration(state: NavigationState, twist: FloatArray, motion: Motion) -> FloatArray:

@@ -31,6 +31,9 @@ _PREFERRED = 4
 _BETTER, _WELL_KNOWN = 2.0, 0.002
 
 
+_NEVER = -(1 << 62)
+
+
 @dataclass(frozen=True, slots=True)
 class Track:
     """An estimate and the poses that speak for it."""
@@ -43,8 +46,9 @@ class Track:
     linearised_std: float
     hits: int = 1
     misses: int = 0
-    #: of a rival: poses since its start that the other estimate accepted
+    #: of a rival: poses since its start that the other estimate accepted, and stamp of the last pose that it has seen
     against: int = 0
+    pose_stamp_ns: int = _NEVER
 
     def supported(self, state: NavigationState, time_ns: int) -> 'Track':
         """The track after a pose that it accepts."""
@@ -58,7 +62,7 @@ class Belief:
     main: Track | None = None
     rival: Track | None = None
     #: stamp of the last camera pose in it
-    pose_stamp_ns: int = -(1 << 62)
+    pose_stamp_ns: int = _NEVER
     #: times that it started afresh
     resets: int = 0
     #: time offset [s] that holds while there is no estimate
@@ -69,15 +73,20 @@ class Belief:
         """Time offset [s] that holds."""
         return self.main.state.time_offset if self.main else self.time_offset
 
+    @property
+    def rival_stamp_ns(self) -> int:
+        """Stamp of the last pose that the rival has seen."""
+        return self.rival.pose_stamp_ns if self.rival else _NEVER
+
 
 @dataclass(frozen=True)
 class Sighting:
     """A camera pose at its instant."""
 
     pose: CameraPose
-    #: the instant in the clock of the IMU, and the time offset [s] that says so
+    #: the instant in the clock of the IMU, and by how much it is too late [s]: the estimate had gone on by then
     time_ns: int
-    time_offset: float
+    late: float
     #: gives the IMU samples (N, 6) of so many seconds up to it
     samples: Callable[[float], FloatArray]
     #: of the IMU at that instant
@@ -117,7 +126,14 @@ class PoseGate:
         step = ImuStep(imu, seconds, *noise.at(track.state.aliasing.share))
         state = self.filter.predict(track.state, step)
         return Track(
-            state, track.started_ns, track.accepted_ns, track.linearised_std, track.hits, track.misses, track.against
+            state,
+            track.started_ns,
+            track.accepted_ns,
+            track.linearised_std,
+            track.hits,
+            track.misses,
+            track.against,
+            track.pose_stamp_ns,
         )
 
     def in_moved_map(self, belief: Belief, T_new_old: FloatArray) -> Belief:
@@ -129,52 +145,58 @@ class PoseGate:
         return replace(belief, main=move(belief.main), rival=move(belief.rival))
 
     def weigh(self, belief: Belief, sighting: Sighting) -> tuple[Belief, PoseUpdate]:
-        """Belief after a pose."""
+        """Belief after a pose at its instant by the main estimate's clock, or at its first where there is none."""
         stamp_ns, time_ns, main = sighting.pose.stamp_ns, sighting.time_ns, belief.main
-        if main and time_ns - main.accepted_ns > self._config.reinitialise_after * _SECOND_NS:
-            main = None
         nis = math.nan
         if main:
             state, nis = self._correct(main.state, sighting)
             if nis <= self._config.gate:
-                rival = self._outdone(belief.rival, sighting)
-                accepted = Belief(main.supported(state, time_ns), rival, stamp_ns, belief.resets)
+                accepted = Belief(main.supported(state, time_ns), _outdone(belief.rival), stamp_ns, belief.resets)
                 return accepted, PoseUpdate(stamp_ns, True, '', nis)
             belief = replace(belief, main=replace(main, state=replace(main.state, aliasing=state.aliasing)))
-        rival = self._challenge(belief, sighting)
-        if rival and self._convincing(rival, main, time_ns):
-            resets = belief.resets + (belief.main is not None)
-            reason = 'started afresh' if belief.main else 'initialised'
-            return Belief(rival, None, stamp_ns, resets), PoseUpdate(stamp_ns, True, reason, nis)
+        rival = belief.rival or self._rival(belief, sighting)
         reason = f'refused: {math.sqrt(nis):.1f} sigma' if main else 'initialising'
         if rival is None:
             reason = 'refused: contradicts gravity'
         return replace(belief, rival=rival, pose_stamp_ns=stamp_ns), PoseUpdate(stamp_ns, False, reason, nis)
 
+    def weigh_rival(self, belief: Belief, sighting: Sighting) -> tuple[Belief, PoseUpdate | None]:
+        """Belief after a pose at its instant by the rival's clock; with a word on it where that ends another estimate.
+
+        A rival that fails too often is none.
+        """
+        rival, main, stamp_ns, time_ns = belief.rival, belief.main, sighting.pose.stamp_ns, sighting.time_ns
+        assert rival
+        state, nis = self._correct(rival.state, sighting)
+        if nis <= self._config.gate:
+            rival = replace(rival.supported(state, time_ns), pose_stamp_ns=stamp_ns)
+            if main and time_ns - main.accepted_ns > self._config.reinitialise_after * _SECOND_NS:
+                main = None
+            if self._convincing(rival, main, time_ns):
+                resets = belief.resets + (belief.main is not None)
+                reason = 'started afresh' if belief.main else 'initialised'
+                return Belief(rival, None, stamp_ns, resets), PoseUpdate(stamp_ns, True, reason, math.nan)
+        elif rival.misses + 1 < rival.hits:
+            rival = replace(rival, misses=rival.misses + 1, pose_stamp_ns=stamp_ns)
+        elif belief.main is None:
+            rival = self._rival(belief, sighting)
+        else:
+            rival = None
+        told = None if belief.main else PoseUpdate(stamp_ns, False, 'initialising', math.nan)
+        seen_ns = belief.pose_stamp_ns if belief.main else stamp_ns
+        return replace(belief, rival=rival, pose_stamp_ns=seen_ns), told
+
     def _correct(self, state: NavigationState, sighting: Sighting) -> tuple[NavigationState, float]:
         body = self.filter.body_pose(sighting.pose, state.T_body_camera)
-        return self.filter.correct(state, body, sighting.motion, state.time_offset - sighting.time_offset)
+        return self.filter.correct(state, body, sighting.motion, sighting.late)
 
-    def _outdone(self, rival: Track | None, sighting: Sighting) -> Track | None:
-        """The rival after a pose that the main estimate accepts; none unless it has more to show for itself."""
-        if rival is None or rival.against + 1 >= rival.hits:
-            return None
-        state, nis = self._correct(rival.state, sighting)
-        agrees = nis <= self._config.gate
-        tried = rival.supported(state, sighting.time_ns) if agrees else replace(rival, misses=rival.misses + 1)
-        return replace(tried, against=rival.against + 1)
-
-    def _challenge(self, belief: Belief, sighting: Sighting) -> Track | None:
-        """The rival after a pose that the main estimate refused; one that fails too often gives way to the pose."""
-        rival, time_ns = belief.rival, sighting.time_ns
-        if rival:
-            state, nis = self._correct(rival.state, sighting)
-            if nis <= self._config.gate:
-                return rival.supported(state, time_ns)
-            if rival.misses + 1 < rival.hits:
-                return replace(rival, misses=rival.misses + 1)
+    def _rival(self, belief: Belief, sighting: Sighting) -> Track | None:
+        """An estimate that begins with a pose."""
+        stamp_ns, time_ns = sighting.pose.stamp_ns, sighting.time_ns
         first = self._of_another_clock(belief, sighting) or self._from_nothing(belief, sighting)
-        return Track(first, time_ns, time_ns, self._config.time_offset_std) if first else None
+        if first is None:
+            return None
+        return Track(first, time_ns, time_ns, self._config.time_offset_std, pose_stamp_ns=stamp_ns)
 
     def _of_another_clock(self, belief: Belief, sighting: Sighting) -> NavigationState | None:
         """The main estimate, if the pose is right but for a step of the camera's clock."""
@@ -203,12 +225,12 @@ class PoseGate:
         told that value, and are not to count twice. Poses up to the stamp ``skipped_ns`` are left out. Of another
         estimate than the track, or of one that knew nothing of an offset yet, nothing is left.
         """
-        seen_ns, time_offset = max(belief.pose_stamp_ns, skipped_ns), track.state.time_offset
-        for own in (belief.main, belief.rival):
+        time_offset = track.state.time_offset
+        for own, seen_ns in (belief.main, belief.pose_stamp_ns), (belief.rival, belief.rival_stamp_ns):
             if own and own.started_ns == track.started_ns and own.state.clock_open:
                 state = self.filter.at_offset(own.state, time_offset)
-                return Belief(replace(own, state=state), None, seen_ns, belief.resets)
-        return Belief(None, None, seen_ns, belief.resets, time_offset)
+                return Belief(replace(own, state=state), None, max(seen_ns, skipped_ns), belief.resets)
+        return Belief(None, None, max(belief.pose_stamp_ns, skipped_ns), belief.resets, time_offset)
 
     def linearised(self, again: Belief, belief: Belief) -> Belief:
         """``again``, which is ``belief`` gone through anew, marked as linearised at the time offset of that."""
@@ -226,8 +248,8 @@ class PoseGate:
         return belief.rival.state if agreed and belief.rival else None
 
     def _convincing(self, rival: Track, main: Track | None, time_ns: int) -> bool:
-        """Whether a rival that may have accepted a pose at this instant takes over."""
-        if rival.hits < self._config.initial_poses or rival.accepted_ns != time_ns:
+        """Whether a rival takes over that has accepted a pose at this instant."""
+        if rival.hits < self._config.initial_poses:
             return False
         if main is None or position_std(main.state) > self._config.lost_position_std:
             return True
@@ -236,6 +258,13 @@ class PoseGate:
     def _agreed(self, rival: Track) -> bool:
         enough = rival.hits >= self._config.initial_poses
         return enough and rival.hits >= 2 * rival.misses and rival.hits >= _PREFERRED * rival.against
+
+
+def _outdone(rival: Track | None) -> Track | None:
+    """The rival after a pose that the main estimate accepts; none unless it has more to show for itself."""
+    if rival is None or rival.against + 1 >= rival.hits:
+        return None
+    return replace(rival, against=rival.against + 1)
 
 
 def position_std(state: NavigationState) -> float:
