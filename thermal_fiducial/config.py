@@ -6,11 +6,14 @@ The nodes declare these as ROS parameters, the offline pipeline takes the same o
 
 from collections.abc import Iterator
 from dataclasses import dataclass, Field, field, fields, MISSING
+import math
 from typing import Any, TypeVar
 
 from thermal_fiducial.errors import InputError
 
 Config = TypeVar('Config')
+#: By how much the norm of a quaternion that somebody typed may be off.
+_NORM_TOLERANCE = 0.01
 
 
 def param(
@@ -22,6 +25,7 @@ def param(
     maximum: float | None = None,
     choices: tuple[str, ...] = (),
     length: int | None = None,
+    normed: bool = False,
     live: bool = False,
 ) -> Any:
     """One parameter: a dataclass field with what ROS wants to know of it.
@@ -34,6 +38,7 @@ def param(
     minimum, maximum : inclusive range of a number or of each number of a tuple
     choices : the allowed values of a string
     length : number of elements of a tuple of floats
+    normed : whether their squares must add up to one, as a rotation's quaternion's do
     live : whether it may be set while the node runs; otherwise it is declared read-only
     """
     metadata = {
@@ -42,6 +47,7 @@ def param(
         'maximum': maximum,
         'choices': choices,
         'length': length,
+        'normed': normed,
         'live': live,
     }
     return field(default=default, metadata=metadata)
@@ -93,7 +99,7 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
     Raises
     ------
     InputError
-        Wrong type, out of range, or not among the choices.
+        Wrong type, out of range, not among the choices, or no unit quaternion.
     """
     limits = item.metadata
     result = _typed(name, item.default, limits['length'], value)
@@ -103,6 +109,8 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
     for element in result if isinstance(result, tuple) else (result,):
         if (low is not None and not element >= low) or (high is not None and not element <= high):
             raise InputError(f'parameter {name}: {element!r} is outside {low} .. {high}')
+    if limits['normed'] and not abs(math.hypot(*result) - 1.0) < _NORM_TOLERANCE:
+        raise InputError(f'parameter {name}: {list(result)} is no unit quaternion')
     return result
 
 
@@ -163,6 +171,7 @@ def _camera_orientation() -> Any:
         (-0.5, 0.5, -0.5, 0.5),
         'Orientation of thermal_camera_optical in base_link, quaternion x y z w. Default: looks forward.',
         length=4,
+        normed=True,
     )
 
 

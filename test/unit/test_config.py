@@ -32,6 +32,7 @@ class Example:
     count: int = param(3, 'Count.', minimum=1)
     flag: bool = param(False, 'Flag.')
     place: tuple[float, ...] = param((0.0, 0.0), 'Place.', unit='m', length=2, minimum=-5.0)
+    turn: tuple[float, ...] = param((0.0, 1.0), 'Turn.', length=2, normed=True)
     words: tuple[str, ...] = param((), 'Words.')
     inner: Inner = group(Inner)  # noqa: RUF009
 
@@ -53,7 +54,15 @@ def test_names_shared_by_nodes_have_one_meaning():
 
 
 def test_parameters_of_a_class_and_of_an_instance():
-    assert [name for name, _, _ in parameters(Example)] == ['name', 'count', 'flag', 'place', 'words', 'inner.gain']
+    assert [name for name, _, _ in parameters(Example)] == [
+        'name',
+        'count',
+        'flag',
+        'place',
+        'turn',
+        'words',
+        'inner.gain',
+    ]
     changed = from_mapping(Example, {'inner.gain': 0.5})
     assert {name: value for name, _, value in parameters(changed)}['inner.gain'] == 0.5
 
@@ -78,6 +87,8 @@ def test_values_take_the_place_of_defaults_and_strangers_are_left_alone():
         ({'place': [1.0, -6.0]}, '-6.0 is outside'),
         ({'place': [1.0, float('nan')]}, 'nan is outside'),
         ({'place': 'ab'}, "'ab' is not a list"),
+        ({'turn': [0.0, 0.0]}, 'no unit quaternion'),
+        ({'turn': [0.6, float('nan')]}, 'no unit quaternion'),
         ({'words': 'ab'}, "'ab' is not a list"),
         ({'words': 7}, '7 is not a list'),
         ({'inner.gain': 2.1}, 'parameter inner.gain: 2.1 is outside 0.0 .. 2.0'),
