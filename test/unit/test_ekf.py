@@ -134,6 +134,16 @@ def test_a_clock_that_jumps_starts_afresh(flight, jump):
     assert error < 0.05
 
 
+@pytest.mark.parametrize(('patience', 'fresh_starts'), [(60.0, 0.0), (2.0, 1.0)])
+def test_after_long_enough_without_markers_it_starts_afresh(flight, patience, fresh_starts):
+    poses = [pose for pose in flight.poses if not 1.0 < (pose.stamp_ns - START_NS) * 1e-9 < 4.0]
+    ekf = PoseEkf(config(reinitialise_after=patience))
+    states, _ = run(ekf, timeline(flight.samples(), poses, 0.03))
+    assert ekf.diagnostics()['starts afresh'] == fresh_starts
+    # Of poses that are good to some centimetres.
+    assert errors(flight, states, 5.0)[0].max() < 0.1
+
+
 def test_unusable_poses_are_refused_in_words(flight):
     ekf = PoseEkf(config())
     pose = flight.poses[0]

@@ -146,7 +146,7 @@ class PoseGate:
 
     def weigh(self, belief: Belief, sighting: Sighting) -> tuple[Belief, PoseUpdate]:
         """Belief after a pose at its instant by the main estimate's clock, or at its first where there is none."""
-        stamp_ns, time_ns, main = sighting.pose.stamp_ns, sighting.time_ns, belief.main
+        stamp_ns, time_ns, main = sighting.pose.stamp_ns, sighting.time_ns, self._fresh(belief.main, sighting)
         nis = math.nan
         if main:
             state, nis = self._correct(main.state, sighting)
@@ -165,14 +165,12 @@ class PoseGate:
 
         A rival that fails too often is none.
         """
-        rival, main, stamp_ns, time_ns = belief.rival, belief.main, sighting.pose.stamp_ns, sighting.time_ns
+        rival, stamp_ns, time_ns = belief.rival, sighting.pose.stamp_ns, sighting.time_ns
         assert rival
         state, nis = self._correct(rival.state, sighting)
         if nis <= self._config.gate:
             rival = replace(rival.supported(state, time_ns), pose_stamp_ns=stamp_ns)
-            if main and time_ns - main.accepted_ns > self._config.reinitialise_after * _SECOND_NS:
-                main = None
-            if self._convincing(rival, main, time_ns):
+            if self._convincing(rival, self._fresh(belief.main, sighting), time_ns):
                 resets = belief.resets + (belief.main is not None)
                 reason = 'started afresh' if belief.main else 'initialised'
                 return Belief(rival, None, stamp_ns, resets), PoseUpdate(stamp_ns, True, reason, math.nan)
@@ -185,6 +183,11 @@ class PoseGate:
         told = None if belief.main else PoseUpdate(stamp_ns, False, 'initialising', math.nan)
         seen_ns = belief.pose_stamp_ns if belief.main else stamp_ns
         return replace(belief, rival=rival, pose_stamp_ns=seen_ns), told
+
+    def _fresh(self, main: Track | None, sighting: Sighting) -> Track | None:
+        """The main estimate, unless it has been without poses for too long."""
+        oldest_ns = sighting.time_ns - self._config.reinitialise_after * _SECOND_NS
+        return main if main and main.accepted_ns >= oldest_ns else None
 
     def _correct(self, state: NavigationState, sighting: Sighting) -> tuple[NavigationState, float]:
         body = self.filter.body_pose(sighting.pose, state.T_body_camera)
@@ -200,9 +203,10 @@ class PoseGate:
 
     def _of_another_clock(self, belief: Belief, sighting: Sighting) -> NavigationState | None:
         """The main estimate, if the pose is right but for a step of the camera's clock."""
-        if belief.main is None or not belief.main.state.clock_open:
+        main = self._fresh(belief.main, sighting)
+        if main is None or not main.state.clock_open:
             return None
-        state, nis = self._correct(self.filter.with_unknown_clock(belief.main.state), sighting)
+        state, nis = self._correct(self.filter.with_unknown_clock(main.state), sighting)
         return state if nis <= self._config.gate else None
 
     def _from_nothing(self, belief: Belief, sighting: Sighting) -> NavigationState | None:
