@@ -248,8 +248,8 @@ class PoseGate:
 
     def contradicting(self, belief: Belief) -> NavigationState | None:
         """What poses agree on that the main estimate refuses, where only time is missing for it to be believed."""
-        agreed = belief.main is not None and belief.rival is not None and self._agreed(belief.rival)
-        return belief.rival.state if agreed and belief.rival else None
+        rival = belief.rival
+        return rival.state if belief.main and rival and self._agreed(rival) else None
 
     def _convincing(self, rival: Track, main: Track | None, time_ns: int) -> bool:
         """Whether a rival takes over that has accepted a pose at this instant."""
