@@ -127,6 +127,13 @@ def test_a_wrong_vertical_is_found(resting, fault):
     assert level_of(fault(resting), 'gravity') is Level.FAULT
 
 
+def test_where_a_flight_turns_back_is_no_rest():
+    """Slow for an instant, at the largest acceleration: 0.9 m/s^2 would be a tilt of 5 degrees."""
+    there_and_back = np.zeros((3, 1, 3))
+    there_and_back[0] = (0.4, 1.5, 0.0)
+    assert level_of(record_of(Motion(there_and_back, np.zeros((3, 1, 3)))), 'gravity') is Level.UNTESTED
+
+
 def test_smaller_flaws_are_warnings(flying):
     gap = np.delete(np.arange(len(flying.stamps_ns)), np.arange(100, 110))
     assert level_of(thinned(flying, gap), 'rate') is Level.WARNING

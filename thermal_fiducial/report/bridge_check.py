@@ -24,8 +24,9 @@ PX4_FLOOR, ARDUPILOT_FLOOR = 0.1, 0.2
 MADE_UP = 1e-5
 #: Turning about the vertical that a yaw check needs [rad/s], and moving that a velocity check needs [m/s].
 TURN, MOVE = 0.15, 0.2
-#: At rest: rate below this [rad/s], and specific force this near to gravity [m/s^2].
-STILL_RATE, STILL_FORCE = 0.05, 0.5
+#: At rest: rate [rad/s] and speed [m/s] below this, and specific force this near to gravity [m/s^2], for so long [ns]:
+#: where a flight turns back a drone is as slow for an instant, while it accelerates most.
+STILL_RATE, STILL_SPEED, STILL_FORCE, STILL_NS = 0.05, 0.05, 0.5, 500_000_000
 #: Farthest that gravity may be off the map's vertical [rad].
 LARGEST_TILT = np.radians(5.0)
 
@@ -163,15 +164,19 @@ def _gravity(record: BridgeRecord) -> list[Finding]:
 
 
 def _specific_force_in_map(record: BridgeRecord) -> FloatArray | None:
+    """Mean over the samples at rest, the first ``STILL_NS`` of each rest left out."""
     if len(record.imu) == 0:
         return None
+    nearest = np.clip(np.searchsorted(record.stamps_ns, record.imu_stamps_ns), 0, len(record.stamps_ns) - 1)
     quiet = np.linalg.norm(record.imu[:, :3], axis=1) < STILL_RATE
     quiet &= np.abs(np.linalg.norm(record.imu[:, 3:], axis=1) - GRAVITY) < STILL_FORCE
-    nearest = np.clip(np.searchsorted(record.stamps_ns, record.imu_stamps_ns), 0, len(record.stamps_ns) - 1)
+    quiet &= np.linalg.norm(record.velocities[nearest], axis=1) < STILL_SPEED
     quiet &= np.abs(record.stamps_ns[nearest] - record.imu_stamps_ns) < 100_000_000
-    if quiet.sum() < 20:
+    last_motion = np.maximum.accumulate(np.where(quiet, record.imu_stamps_ns[0], record.imu_stamps_ns))
+    still = record.imu_stamps_ns - last_motion > STILL_NS
+    if still.sum() < 20:
         return None
-    forces = record.rotations[nearest[quiet]] @ record.imu[quiet, 3:, None]
+    forces = record.rotations[nearest[still]] @ record.imu[still, 3:, None]
     return np.asarray(forces[..., 0].mean(axis=0))
 
 
