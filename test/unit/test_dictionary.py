@@ -7,7 +7,7 @@ import yaml
 
 from thermal_fiducial.core.vision.patterns import correctable_bits, marker_bits
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.dictionary import load_dictionary, save_dictionary
+from thermal_fiducial.files.dictionary import load_dictionary, other_patterns, save_dictionary
 
 NAMES = ['DICT_4X4_50', 'DICT_5X5_1000', 'DICT_6X6_250', 'DICT_7X7_50', 'DICT_APRILTAG_36h11', 'DICT_APRILTAG_16h5']
 
@@ -75,3 +75,18 @@ def test_unreadable_file(content, tmp_path):
 def test_unknown_name(name):
     with pytest.raises(InputError, match='neither'):
         load_dictionary(name)
+
+
+@pytest.mark.parametrize(
+    ('of', 'read_as', 'words'),
+    [
+        ('DICT_4X4_50', 'DICT_4X4_50', ''),
+        ('DICT_4X4_50', 'DICT_4X4_250', ''),  # the first 50 are the same
+        ('DICT_4X4_250', 'DICT_4X4_50', 'marker 60'),
+        ('DICT_5X5_50', 'DICT_4X4_50', 'marker 3'),
+        ('gone.yaml', 'DICT_4X4_50', "dictionary 'gone.yaml'"),
+    ],
+)
+def test_a_map_of_another_dictionary_is_told(of, read_as, words):
+    told = other_patterns([60, 3] if '250' in of else [3], of, read_as)
+    assert words in told if words else told == ''

@@ -18,7 +18,7 @@ from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.files.point_cloud import save_alignment
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.ros import convert, qos
-from thermal_fiducial.ros.node import ERROR
+from thermal_fiducial.ros.node import ERROR, WARN
 
 pytestmark = pytest.mark.ros
 
@@ -53,6 +53,15 @@ def test_edits_of_the_file_are_loaded_and_undone_in_flight(graph, map_file):
     assert (response.success, 'no earlier version' in response.message) == (False, True)
     node.mapper.frozen = True
     assert graph.call(Trigger, 'marker_mapper/load', Trigger.Request()).message == 'the map is frozen'
+
+
+def test_a_map_of_another_dictionary_is_used_and_warned_of(graph, map_file):
+    """Most likely the file's label is wrong: a drone that flies is not left without its map for that."""
+    map_file.write_text(map_file.read_text().replace('DICT_4X4_50', 'DICT_5X5_50'))
+    node = graph.add(MarkerMapperNode, map_file=str(map_file))
+    level, reason = node.state()
+    assert (len(node.mapper.map.markers), level) == (1, WARN)
+    assert 'DICT_5X5_50' in reason
 
 
 def test_saving_keeps_what_was_in_the_file(graph, map_file):

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from support.small_bag import side_files
 import yaml
 
 from thermal_fiducial.config import from_mapping, NODES, parameters
@@ -32,5 +33,12 @@ def test_a_parameter_of_several_nodes_has_one_default():
 
 def test_a_replay_takes_the_file():
     settings = read_settings(FILE, {'mode': 'localization'})
-    assert settings.unknown == ()
+    assert settings.warnings == ()
     assert settings.marker_mapper.mode == 'localization'
+
+
+def test_a_map_of_another_dictionary_is_warned_of(tmp_path):
+    map_file, _ = side_files(tmp_path)
+    map_file.write_text(map_file.read_text().replace('DICT_4X4_50', 'DICT_5X5_50'))
+    (warning,) = read_settings(FILE, {'map_file': str(map_file)}).warnings
+    assert 'DICT_5X5_50' in warning

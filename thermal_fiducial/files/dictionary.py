@@ -11,6 +11,7 @@ A dictionary file is YAML::
       - ['0110', '1011', '0010', '1101']
 """
 
+from collections.abc import Iterable
 import os
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,19 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> cv2.aruco.Dictionar
     except yaml.YAMLError as error:
         raise InputError(f'dictionary file {name}: not YAML: {" ".join(str(error).split())}') from None
     return _from_document(name, document)
+
+
+def other_patterns(markers: Iterable[int], of: str, read_as: str) -> str:
+    """In words, whether a map's ``markers`` of dictionary ``of`` may be others in ``read_as``; empty: they are not."""
+    if of == read_as:
+        return ''
+    try:
+        theirs, ours = marker_bits(load_dictionary(of)), marker_bits(load_dictionary(read_as))
+    except InputError as error:
+        return f'the map is of {of}, looked for is {read_as}: {error}'
+    both = min(len(theirs), len(ours))
+    other = [m for m in sorted(markers) if m >= both or not np.array_equal(theirs[m], ours[m])]
+    return f'the map is of {of}, looked for is {read_as}: marker {other[0]} is another one there' if other else ''
 
 
 def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: cv2.aruco.Dictionary) -> None:

@@ -20,6 +20,7 @@ from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.thermal import LATEST_NS
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.dictionary import other_patterns
 from thermal_fiducial.files.map_history import save_with_history, undo
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.point_cloud import load_alignment, load_cloud, thinned
@@ -48,6 +49,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('marker_mapper', MarkerMapperConfig, **kwargs)
         empty = MarkerMap(frame_id=self.config.map_frame, dictionary=self.config.dictionary)
+        self._other_dictionary = ''
         marker_map = self.attempt(self._load_map, empty)
         self.mapper = MarkerMapper(self.config, marker_map)
         self._save_path = self._choose_save_path()
@@ -75,10 +77,15 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
 
     def _load_map(self) -> MarkerMap:
         config = self.config
-        sizes = size_overrides(config.marker_size_overrides)
         if not config.map_file:
             return MarkerMap(frame_id=config.map_frame, dictionary=config.dictionary)
-        return load_map(config.map_file, config.marker_size, sizes)
+        return self._read_map(Path(config.map_file))
+
+    def _read_map(self, path: Path) -> MarkerMap:
+        config = self.config
+        marker_map = load_map(path, config.marker_size, size_overrides(config.marker_size_overrides))
+        self._other_dictionary = other_patterns(marker_map.markers, marker_map.dictionary, config.dictionary)
+        return marker_map
 
     def _choose_save_path(self) -> Path | None:
         """The map's file; one beside it where that holds something that could not be read."""
@@ -192,7 +199,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     def _load(self) -> str:
         """Take over the map file as it is now: what ``thermal-fiducial map`` has made of it."""
         self._refuse_frozen()
-        loaded = load_map(self._map_file(), self.config.marker_size, size_overrides(self.config.marker_size_overrides))
+        loaded = self._read_map(self._map_file())
         self._tell(self.mapper.load(loaded))
         return f'{len(loaded.markers)} markers loaded from {self._save_path}'
 
@@ -240,9 +247,9 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             self.get_logger().error(str(error))
 
     def state(self) -> tuple[bytes, str]:
-        """Why the last frame gave no pose, and which markers are not trusted."""
-        if self._result.reason:
-            return WARN, self._result.reason
+        """Why the last frame gave no pose, whether the map is meant, and which markers are not trusted."""
+        if self._result.reason or self._other_dictionary:
+            return WARN, '; '.join(filter(None, (self._result.reason, self._other_dictionary)))
         if self._result.quarantined:
             return WARN, f'quarantined: {_listed(self._result.quarantined)}'
         return OK, 'map frozen' if self.mapper.frozen else 'ok'

@@ -57,8 +57,8 @@ def replay(options: Options, progress: Callable[[float], None], warn: Callable[[
         An unusable bag, parameter or file; the message says which and why.
     """
     settings = _settings(options)
-    if settings.unknown:
-        warn(f'no node has parameter {", ".join(settings.unknown)}')
+    for line in settings.warnings:
+        warn(line)
     from_file = bool(settings.tau2_camera.calibration_file)
     with BagReader(options.bag, options.remaps) as bag:
         played = played_topics(calibration_from_file=from_file)

@@ -1,7 +1,7 @@
 """Parameters of a replay: those of the nodes from a ROS parameter file, checked before anything starts."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from thermal_fiducial.config import (
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bad_pixels import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
-from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.dictionary import load_dictionary, other_patterns
 from thermal_fiducial.files.marker_map import load_map
 
 
@@ -32,8 +32,8 @@ class Settings:
     aruco_detector: ArucoDetectorConfig
     marker_mapper: MarkerMapperConfig
     pose_ekf: PoseEkfConfig
-    #: names in the parameter file that no node has
-    unknown: tuple[str, ...] = ()
+    #: what is suspicious but can be used, in words
+    warnings: tuple[str, ...] = ()
 
     def write(self, path: Path) -> None:
         """Write all parameters as a ROS parameter file."""
@@ -61,13 +61,14 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any]) -> Settings
         configs[node] = from_mapping(kind, _values_for(node, document) | dict(overrides))
         known |= names
     given = {name for section in document.values() for name in section}
-    settings = Settings(**configs, unknown=tuple(sorted(given - known - {'use_sim_time'})))
-    _check_files(settings)
-    return settings
+    unknown = sorted(given - known - {'use_sim_time'})
+    settings = Settings(**configs)
+    warnings = [f'no node has parameter {", ".join(unknown)}'] if unknown else []
+    return replace(settings, warnings=(*warnings, *_check_files(settings)))
 
 
-def _check_files(settings: Settings) -> None:
-    """Raise what a node would report as a fault."""
+def _check_files(settings: Settings) -> list[str]:
+    """Raise what a node would report as a fault, return what it would warn of."""
     camera, mapper = settings.tau2_camera, settings.marker_mapper
     dictionary = load_dictionary(settings.aruco_detector.dictionary)
     sizes = size_overrides(mapper.marker_size_overrides)
@@ -80,6 +81,9 @@ def _check_files(settings: Settings) -> None:
         foreign = sorted(set(marker_map.markers) - set(range(len(dictionary.bytesList))))
         if foreign:
             raise InputError(f'{mapper.map_file}: marker {foreign[0]} is not in {settings.aruco_detector.dictionary}')
+        other = other_patterns(marker_map.markers, marker_map.dictionary, settings.aruco_detector.dictionary)
+        return [f'{mapper.map_file}: {other}'] if other else []
+    return []
 
 
 def _document(path: Path) -> dict[str, dict[str, Any]]:
