@@ -25,36 +25,36 @@ def image():
 
 
 def test_pixels_lie_across_the_sides(image):
-    sides = sides_of(CAMERA.normalise(CORNERS), CAMERA, image.shape, columns=36, half=5)
+    sides = sides_of(CAMERA.normalise(CORNERS), CAMERA, image.shape, cells=6, columns=6, half=5)
     v, u = np.divmod(sides.pixel, 640)
     # Moved back along the normal by its distance, every pixel of the top side lies between the two upper corners.
-    place = np.stack([u, v], axis=-1) - sides.distance[..., None] * sides.normal[:, :, None]
+    place = np.stack([u, v], axis=-1) - sides.distance[..., None] * sides.normal
     for marker, corners in enumerate(CAMERA.normalise(CORNERS)):
         side = corners[1] - corners[0]
-        off = (CAMERA.normalise(place[4 * marker]) - corners[0]) @ [-side[1], side[0]] / np.linalg.norm(side)
+        off = (CAMERA.normalise(place[..., 4 * marker, :]) - corners[0]) @ [-side[1], side[0]] / np.linalg.norm(side)
         # Without distortion sides are straight; a hundredth of a pixel is what the lens bends in five.
         assert np.abs(off).max() * CAMERA.focal_px < 0.02
     assert sides.inside is None
-    assert np.all(sides.distance[:, :, -1] * sides.distance[:, :, 0] < 0.0)
+    assert np.all(sides.distance[-1] * sides.distance[0] < 0.0)
 
 
 def test_columns_beyond_the_image_do_not_count(image):
     corners = CORNERS[:1] - [97.0, 60.0]
-    sides = sides_of(CAMERA.normalise(corners), CAMERA, image.shape, columns=36, half=5)
+    sides = sides_of(CAMERA.normalise(corners), CAMERA, image.shape, cells=6, columns=6, half=5)
     # The left side is cut off by the rim of the image: its lower half lies outside, the top side does not.
     assert sides.inside is not None
-    assert sides.fresh[0].any()
-    assert not sides.fresh[2].all()
+    assert sides.fresh[..., 0].any()
+    assert not sides.fresh[..., 2].all()
 
 
 def test_memory_is_taken_out_as_in_a_whole_image(image):
     displacement = np.array([[[3.0, 1.0]] * 4, [[0.0, 0.0]] * 4])
-    sides = sides_of(CAMERA.normalise(CORNERS), CAMERA, image.shape, columns=36, half=5)
+    sides = sides_of(CAMERA.normalise(CORNERS), CAMERA, image.shape, cells=6, columns=6, half=5)
     memory = Memory(memory_maps(CORNERS, displacement), np.array([GAIN, 1.0]))
     counts = counts_across(image, sides, memory)
     sharp = markers_sharpened(image, CORNERS[:1], displacement[:1], 14)
     # OpenCV interpolates between thirty-seconds of a pixel, to which both ways may round differently.
     np.testing.assert_allclose(counts, sharp.ravel()[sides.pixel], atol=2.0)
-    assert np.abs(counts[:4] - image.ravel()[sides.pixel[:4]]).max() > 10.0
-    np.testing.assert_array_equal(counts[4:], image.ravel()[sides.pixel[4:]])
+    assert np.abs(counts - image.ravel()[sides.pixel])[..., :4].max() > 10.0
+    np.testing.assert_array_equal(counts[..., 4:], image.ravel()[sides.pixel[..., 4:]])
     np.testing.assert_array_equal(counts_across(image, sides), image.ravel()[sides.pixel])

@@ -19,14 +19,12 @@ def test_distances_grow_inward_however_the_square_is_turned_and_tilted(tilt_deg)
         T = geometry.transform(R @ geometry.so3_exp([0.0, 0.0, turn]), [0.2, -0.1, 3.0])
         points = geometry.apply(T, marker_corners(0.3))
         x = (points[:, :2] / points[:, 2:])[None]
-        sides = sides_of(x, CAMERA, (512, 640), 36, 4)
+        sides = sides_of(x, CAMERA, (512, 640), 6, 6, 4)
         corners = CAMERA.distort(x)[0]
         middles = 0.5 * (corners[[0, 3, 0, 1]] + corners[[1, 2, 3, 2]])
-        inward = np.sum(sides.normal[:, 18] * (corners.mean(axis=0) - middles), axis=1)
+        inward = np.sum(sides.normal[3] * (corners.mean(axis=0) - middles), axis=1)
         # Half the width of the square across each side, to the fraction of a pixel that distortion bends it by.
         np.testing.assert_allclose(inward, 0.5 * sides.across, atol=0.5)
-        nearest = np.abs(sides.distance[:, 18]).argmin(axis=1)
-        assert np.all(nearest == 4)
-        assert np.all(
-            np.diff(sides.distance[:, 18], axis=1) * np.sign(np.diff(sides.distance[:, 18, :2], axis=1)) > 0.0
-        )
+        distance = sides.distance[:, 0, 3]
+        assert np.all(np.abs(distance).argmin(axis=0) == 4)
+        assert np.all(np.diff(distance, axis=0) * np.sign(np.diff(distance[:2], axis=0)) > 0.0)

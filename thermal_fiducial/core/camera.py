@@ -105,12 +105,10 @@ class Camera:
         """Pixels (..., 2) of normalised image coordinates x/z, y/z (..., 2)."""
         return self._to_pixels(self._distorted(np.asarray(normalised, dtype=np.float64)))
 
-    def distort_jacobian(self, normalised: npt.ArrayLike) -> FloatArray:
-        """Derivative (..., 2, 2) [px] of :meth:`distort`."""
-        x = np.asarray(normalised, dtype=np.float64)
-        if self.model == 'equidistant':
-            return np.asarray(self.K[:2, :2] @ _distort_equidistant(x, self.D)[1])
-        return np.asarray(self.K[:2, :2] @ _polynomial_derivative(x, self._polynomial))
+    def distort_linearised(self, normalised: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """:meth:`distort`, and its derivative (..., 2, 2) [px]."""
+        x, J = self._distort(np.asarray(normalised, dtype=np.float64))
+        return self._to_pixels(x), self.K[:2, :2] @ J
 
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
         """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`.
@@ -138,7 +136,8 @@ class Camera:
         return np.asarray(inside & (v >= margin_px) & (v <= self.height - 1 - margin_px))
 
     def _to_pixels(self, x: FloatArray) -> FloatArray:
-        return np.asarray(x @ self.K[:2, :2].T + self.K[:2, 2])
+        # One product of matrices costs less than one for each row of points.
+        return np.asarray((x.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]).reshape(x.shape))
 
     def _normalised(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         z = points[..., 2]
@@ -189,13 +188,16 @@ class Camera:
             # Radius and angle are the same to the last digit where they are as small.
             r = np.maximum(np.sqrt(np.einsum('...k,...k->...', x, x)), 1e-12)
             return np.asarray(x * (_equidistant_radius(np.arctan(r), self.D) / r)[..., None])
-        return _distort_polynomial(x, self._polynomial)
+        r2, factor = _radial(x, self._polynomial)
+        return _distort_polynomial(x, r2, factor, self._polynomial)
 
     def _distort(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Distorted normalised coordinates (..., 2) and their derivative (..., 2, 2)."""
         if self.model == 'equidistant':
             return _distort_equidistant(x, self.D)
-        return _distort_polynomial(x, self._polynomial), _polynomial_derivative(x, self._polynomial)
+        r2, factor = _radial(x, self._polynomial)
+        derivative = _polynomial_derivative(x, r2, factor, self._polynomial)
+        return _distort_polynomial(x, r2, factor, self._polynomial), derivative
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,8 +225,8 @@ class ImagePoints:
     @staticmethod
     def seen_at(x: FloatArray, camera: Camera) -> 'ImagePoints':
         """Those at normalised coordinates (..., 2)."""
-        J = camera.distort_jacobian(x)
-        return ImagePoints(camera.distort(x), x, J, _inverse(J))
+        px, J = camera.distort_linearised(x)
+        return ImagePoints(px, x, J, _inverse(J))
 
     def moved(self, shift_px: FloatArray, camera: Camera) -> 'ImagePoints':
         """Those some pixels (..., 2) away: undistorting them anew would cost more than it tells."""
@@ -277,22 +279,28 @@ def _radial_slope(r2: FloatArray, factor: FloatArray, model: _Polynomial) -> Flo
     return np.asarray((d_top - factor * d_bottom) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))))
 
 
-def _distort_polynomial(x: FloatArray, model: _Polynomial) -> FloatArray:
+def _radial(x: FloatArray, model: _Polynomial) -> tuple[FloatArray, FloatArray]:
+    """Squared distances (...) from the axis, and their :func:`_radial_factor`."""
     r2 = np.einsum('...k,...k->...', x, x)
-    factor = _radial_factor(r2, model)
+    return r2, _radial_factor(r2, model)
+
+
+def _distort_polynomial(x: FloatArray, r2: FloatArray, factor: FloatArray, model: _Polynomial) -> FloatArray:
     if not (model.p1 or model.p2):
         return np.asarray(x * factor[..., None])
     # The tangential part is p r^2 + 2 (p . x) x with p = (p2, p1).
-    p = np.array([model.p2, model.p1])
-    return np.asarray(x * (factor + x @ (2.0 * p))[..., None] + r2[..., None] * p)
+    p1, p2 = model.p1, model.p2
+    distorted = np.empty_like(x)
+    a, b = x[..., 0], x[..., 1]
+    factor = factor + (2.0 * p2) * a + (2.0 * p1) * b
+    distorted[..., 0], distorted[..., 1] = a * factor + p2 * r2, b * factor + p1 * r2
+    return distorted
 
 
-def _polynomial_derivative(x: FloatArray, model: _Polynomial) -> FloatArray:
+def _polynomial_derivative(x: FloatArray, r2: FloatArray, factor: FloatArray, model: _Polynomial) -> FloatArray:
     """Derivative (..., 2, 2) of :func:`_distort_polynomial`."""
     p1, p2 = model.p1, model.p2
     a, b = x[..., 0], x[..., 1]
-    r2 = a * a + b * b
-    factor = _radial_factor(r2, model)
     slope = 2.0 * _radial_slope(r2, factor, model)
     J = np.empty((*x.shape[:-1], 2, 2))
     J[..., 0, 0] = factor + a * (a * slope + 6.0 * p2) + 2.0 * p1 * b

@@ -140,10 +140,10 @@ def _pass(
     cells = task.behind.shape[2]
     widest = math.hypot(optics, math.sqrt(float(np.sum(task.smear * task.smear, axis=1).max())))
     half = min(max(math.ceil(2.5 * widest + 1.0), 4), 10)
-    sides = sides_of(start.x, task.camera, task.image.shape, cells * task.columns, half)
-    blur = edges.blurs(sides.normal[:, cells * task.columns // 2], optics, task.smear)
+    sides = sides_of(start.x, task.camera, task.image.shape, cells, task.columns, half)
+    blur = edges.blurs(sides.normal[cells // 2], optics, task.smear)
     counts = counts_across(task.image, sides, task.memory)
-    segments = measure(counts, edges.model(sides, task.behind, blur), cells, _REACHED * blur[0])
+    segments = measure(counts, edges.model(sides, task.behind, blur), _REACHED * blur[0])
     moved, covariances, doubt = adjust(sides, segments, prior, start)
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]

@@ -43,26 +43,30 @@ def blurs(normal: FloatArray, optics: float, smear: FloatArray) -> tuple[FloatAr
 def model(
     sides: Sides, behind: Float32Array, blur: tuple[FloatArray, FloatArray]
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """White's share of every pixel but for a constant, its derivative by distance, and the pixel's weight, (E, K, M).
+    """White's share of every pixel but for a constant, its derivative by distance, and the pixel's weight.
 
     Parameters
     ----------
     behind : (N, 4, m, 2) of :func:`edges_behind`
     blur : (E,) across and along the sides
+
+    Returns
+    -------
+    (M, C, m, E) each
     """
     cells = behind.shape[2]
     cell = sides.across / cells
     own = _seen_along(sides, blur[1])
-    value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32)[:, None, None])
-    value *= -own[..., None]
-    slope *= -own[..., None]
+    value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32))
+    value *= -own
+    slope *= -own
     narrow = cell < _NARROW * blur[0]
     if narrow.any():
         _add_neighbours(value, slope, sides, np.flatnonzero(narrow), behind.reshape(-1, cells, len(NEIGHBOURS)), blur)
     reach = np.where(narrow, cell, cell - 2.0 * blur[0])
     quiet = np.minimum(reach, np.maximum(cell - _RIM_SHOWS * blur[0], _LEAST_QUIET_PX))
-    weight = (sides.distance >= -quiet[:, None, None]) & (sides.distance <= reach[:, None, None])
-    weight &= (sides.fresh & (own > _MOSTLY))[..., None]
+    weight = (sides.distance >= -quiet.astype(np.float32)) & (sides.distance <= reach.astype(np.float32))
+    weight &= sides.fresh & (own > _MOSTLY)
     if sides.inside is not None:
         weight &= sides.inside
     return value, slope, weight.astype(np.float32)
@@ -80,8 +84,8 @@ def blurred_step(distance: Float32Array, sharpness: Float32Array) -> tuple[Float
 
 
 def _seen_along(sides: Sides, blur_along: FloatArray) -> Float32Array:
-    """How much of its side a column (E, K) sees, blurred along it: less than 1 near its ends."""
-    length = (sides.along / blur_along).astype(np.float32)[:, None]
+    """How much of its side a column (C, m, E) sees, blurred along it: less than 1 near its ends."""
+    length = (sides.along / blur_along).astype(np.float32)
     t = sides.t.astype(np.float32)
     z = np.stack([t, 1.0 - t]) * length
     ends = np.tanh(z * (z * z * _CUBIC + _LINEAR))
@@ -98,12 +102,13 @@ def _add_neighbours(
 ) -> None:
     """Add to the model of the sides ``which`` what the edges ``behind`` (E, m, 2) contribute, blurred along."""
     cells = behind.shape[1]
-    z = (sides.t[which, :, None] * cells - np.arange(cells + 1)) * (sides.along / (cells * blur[1]))[which, None, None]
+    t = np.moveaxis(sides.t[..., which], -1, 0)[..., None]
+    z = (t * cells - np.arange(cells + 1)) * (sides.along / (cells * blur[1]))[which, None, None, None]
     step = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR))
-    amounts = (step[..., :-1] - step[..., 1:]).astype(np.float32) @ behind[which]
-    width = (sides.across / cells)[which, None, None].astype(np.float32)
-    sharpness = (1.0 / blur[0])[which, None, None].astype(np.float32)
+    amounts = np.moveaxis((step[..., :-1] - step[..., 1:]).astype(np.float32) @ behind[which, None], 0, -1)
+    width = (sides.across / cells)[which].astype(np.float32)
+    sharpness = (1.0 / blur[0])[which].astype(np.float32)
     for index, number in enumerate(NEIGHBOURS):
-        share, rise = blurred_step(sides.distance[which] - number * width, sharpness)
-        value[which] += amounts[..., index : index + 1] * share
-        slope[which] += amounts[..., index : index + 1] * rise
+        share, rise = blurred_step(sides.distance[..., which] - number * width, sharpness)
+        value[..., which] += amounts[:, :, index] * share
+        slope[..., which] += amounts[:, :, index] * rise

@@ -31,6 +31,9 @@ _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
 # Weights of segments are found in so many rounds.
 _ROUNDS = 3
 _SIDES = np.arange(4)
+# Products of the columns of a segment's least squares, and of columns and products together.
+_PRODUCTS = (1, 1), (1, 2), (2, 2), (1, 3), (2, 3), (3, 3)
+_PLANES = 4 + len(_PRODUCTS)
 
 
 class Memory(NamedTuple):
@@ -78,96 +81,107 @@ class _Fit(NamedTuple):
 
 
 def counts_across(image: Float32Array, sides: Sides, memory: Memory | None = None) -> Float32Array:
-    """Counts (E, K, M) of the pixels across sides, without memory."""
+    """Counts (M, C, m, E) of the pixels across sides, without memory."""
     counts: Float32Array = image.ravel().take(sides.pixel, mode='clip')
     if memory is None or not (memory.gain > 1.0).any():
         return counts
-    pixel, which = sides.pixel.reshape(len(memory.gain), -1), np.flatnonzero(memory.gain > 1.0)
-    v, u = (a.astype(np.float32) for a in np.divmod(pixel[which].astype(np.int32), np.int32(image.shape[1])))
+    pixel, which = sides.pixel.reshape(-1, len(memory.gain), 4), np.flatnonzero(memory.gain > 1.0)
+    v, u = (a.astype(np.float32) for a in np.divmod(pixel[:, which].astype(np.int32), np.int32(image.shape[1])))
     maps = memory.maps[which].astype(np.float32)[..., None]
     to_u, to_v = (maps[:, row, 0] * u + maps[:, row, 1] * v + maps[:, row, 2] for row in (0, 1))
-    past = cv2.remap(image, to_u, to_v, cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+    flat = (len(pixel), -1)
+    past = cv2.remap(image, to_u.reshape(flat), to_v.reshape(flat), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
     gain, of_marker = memory.gain[which, None].astype(np.float32), counts.reshape(pixel.shape)
-    of_marker[which] = gain * of_marker[which] + (np.float32(1.0) - gain) * past
+    of_marker[:, which] = gain * of_marker[:, which] + (np.float32(1.0) - gain) * past.reshape(u.shape)
     return counts
 
 
 def measure(
-    counts: Float32Array,
-    modelled: tuple[Float32Array, Float32Array, Float32Array],
-    cells: int,
-    reach: FloatArray,
+    counts: Float32Array, modelled: tuple[Float32Array, Float32Array, Float32Array], reach: FloatArray
 ) -> Segments:
-    """Displacement of each segment, one of ``cells`` on a side.
+    """Displacement of each segment, S = 4 m to a marker: one of m on each side, the sides of the first parts first.
 
     Parameters
     ----------
-    counts : (E, K, M) of :func:`counts_across`
+    counts : (M, C, m, E) of :func:`counts_across`
     modelled : value, derivative and weight of each pixel, of :func:`thermal_fiducial.core.adjustment.edges.model`
     reach : (E,) longest displacement for which the model can be linearised [px]
     """
-    value, slope, weight = (each.reshape(len(reach) * cells, -1) for each in modelled)
-    counts = counts.reshape(weight.shape)
-    X = np.empty((len(weight), 4, weight.shape[1]), dtype=np.float32)
-    X[:, 0], X[:, 1], X[:, 2] = weight, value, slope
-    np.subtract(counts, counts[:, weight.shape[1] // 2, None], out=X[:, 3])
-    X[:, 1:] *= weight[:, None]
-    fit, shape = _fit(X), (-1, 4 * cells)
-    noise = _noise(fit, shape)
-    outlier = np.abs(_residuals(fit, X)) > (_PIXEL_OUTLIER * np.sqrt(noise)).astype(np.float32).reshape(-1, 1)
-    touched = np.flatnonzero(outlier.any(axis=1))
-    if len(touched):
-        for all_of, again in zip(fit, _fit(X[touched] * ~outlier[touched, None]), strict=True):
-            all_of[touched] = again
-        noise = _noise(fit, shape)
-    return _judged(fit, noise, np.repeat(reach, cells).reshape(shape))
+    cells = counts.shape[2]
+    value, slope, weight = modelled
+    X = np.empty((_PLANES, *counts.shape), dtype=np.float32)
+    X[0] = weight
+    np.multiply(value, weight, out=X[1])
+    np.multiply(slope, weight, out=X[2])
+    np.subtract(counts, counts[counts.shape[0] // 2, counts.shape[1] // 2], out=X[3])
+    X[3] *= weight
+    X = X.reshape(_PLANES, -1, cells * len(reach))
+    fit = _fit(_by_marker(_moments(X), cells))
+    noise = _noise(fit)
+    alike = np.abs(_residuals(fit, X, cells)) <= _by_segment(_PIXEL_OUTLIER * np.sqrt(noise), cells)
+    if not alike.all():
+        X[:4] *= alike.astype(np.float32)
+        fit = _fit(_by_marker(_moments(X), cells))
+        noise = _noise(fit)
+    return _judged(fit, noise, np.tile(reach.reshape(-1, 4), cells))
 
 
-def _fit(X: Float32Array) -> _Fit:
-    """Least squares of the last of four columns X (segments, 4, pixels) on the others: (1, model, derivative).
+def _moments(X: Float32Array) -> Float32Array:
+    """Sums (10, segments) over pixels (10, pixels, segments): of the first four, and of their products but the first's.
 
-    All are zero of pixels that do not count.
+    The first four are 1, model, derivative and counts, zero for pixels that do not count; the others are room.
     """
-    sums = (X @ X.swapaxes(1, 2)).astype(np.float64)
-    number = sums[:, 0, 0].copy()
-    safe = np.maximum(number, 1.0)
-    mean = sums[:, 0] / safe[:, None]
+    for plane, (first, second) in enumerate(_PRODUCTS, 4):
+        np.multiply(X[first], X[second], out=X[plane])
+    return np.asarray(np.add.reduce(X, axis=1))
+
+
+def _by_marker(values: Float32Array, cells: int) -> FloatArray:
+    """Of segments (..., m E) as (..., N, 4 m)."""
+    by_side = values.reshape(len(values), cells, -1, 4).swapaxes(1, 2)
+    return np.array(by_side, dtype=np.float64, order='C').reshape(len(values), -1, 4 * cells)
+
+
+def _by_segment(values: FloatArray, cells: int) -> Float32Array:
+    """Of markers (N, 4 m) as (m E,)."""
+    return np.array(values.reshape(-1, cells, 4).swapaxes(0, 1), dtype=np.float32, order='C').ravel()
+
+
+def _fit(moments: FloatArray) -> _Fit:
+    """Least squares of the counts on (1, model, derivative), of segments with :func:`_moments` (10, ...)."""
+    number, x, y, z, xx, xy, yy, xz, yz, zz = moments
+    x_mean, y_mean, z_mean = moments[1:4] / np.maximum(number, 1.0)
     # Without their means the columns leave two unknowns.
-    about = (sums[:, 1:, 1:] - sums[:, 1:, :1] * mean[:, None, 1:]).transpose(1, 2, 0)
     ridge = 1e-6 * number + 1e-6
-    a, b, c, p, q = about[0, 0] + ridge, about[0, 1], about[1, 1] + ridge, about[0, 2], about[1, 2]
+    a, b, c = xx - x * x_mean + ridge, xy - x * y_mean, yy - y * y_mean + ridge
+    p, q = xz - z * x_mean, yz - z * y_mean
     determinant = a * c - b * b
     a, b, c = a / determinant, b / determinant, c / determinant
     contrast, product = c * p - b * q, a * q - b * p
-    square = np.maximum(about[2, 2] - contrast * p - product * q, 0.0)
-    level = mean[:, 3] - contrast * mean[:, 1] - product * mean[:, 2]
+    square = np.maximum(zz - z * z_mean - contrast * p - product * q, 0.0)
+    level = z_mean - contrast * x_mean - product * y_mean
     return _Fit(contrast, product, c, a, level, square, number)
 
 
-def _residuals(fit: _Fit, X: Float32Array) -> Float32Array:
-    """What the model leaves of the pixels (segments, pixels)."""
-    terms = np.ones((len(X), 1, 4), dtype=np.float32)
-    terms[:, 0, 0], terms[:, 0, 1], terms[:, 0, 2] = -fit.level, -fit.contrast, -fit.product
-    return np.asarray((terms @ X)[:, 0])
+def _residuals(fit: _Fit, X: Float32Array, cells: int) -> Float32Array:
+    """What the model leaves of the pixels (pixels, segments)."""
+    level, contrast, product = (_by_segment(each, cells) for each in (fit.level, fit.contrast, fit.product))
+    return np.asarray(X[3] - level * X[0] - contrast * X[1] - product * X[2])
 
 
-def _noise(fit: _Fit, shape: tuple[int, int]) -> FloatArray:
+def _noise(fit: _Fit) -> FloatArray:
     """Variances of pixels (N, S): of a marker's typical segment, or a segment's own where that is much larger."""
-    free = fit.number.reshape(shape) - 3.0
-    own = fit.square.reshape(shape) / np.maximum(free, 1.0)
+    free = fit.number - 3.0
+    own = fit.square / np.maximum(free, 1.0)
     typical = _Median(free > 1.5)(own)
     return np.where(own > 2.5 * typical, own, typical) + 1e-3
 
 
 def _judged(fit: _Fit, noise: FloatArray, reach: FloatArray) -> Segments:
     """Which segments measure anything, within their reach (N, S)."""
-    contrast, product, number, own, unit = (
-        a.reshape(reach.shape)
-        for a in (fit.contrast, fit.product, fit.number, fit.contrast_variance, fit.product_variance)
-    )
-    usable = number > 4.5
+    contrast, product, usable = fit.contrast, fit.product, fit.number > 4.5
     typical = _Median(usable)(contrast)
-    own = noise * own
+    own = noise * fit.contrast_variance
     scale = np.sign(typical) / np.maximum(np.abs(typical), 1e-6)
     relative, unsure = contrast * scale, 2.0 * np.sqrt(own) * np.abs(scale)
     usable &= (relative > _LEAST_CONTRAST - unsure) & (relative < _MOST_CONTRAST + unsure)
@@ -175,7 +189,7 @@ def _judged(fit: _Fit, noise: FloatArray, reach: FloatArray) -> Segments:
     others = (_CONTRAST_VARIES * typical) ** 2 + 1e-9
     safe = np.where(usable, (contrast * others + typical * own) / (others + own), 1.0)
     shift = np.where(usable, np.minimum(np.maximum(-product / safe, -reach), reach), 0.0)
-    return Segments(shift, np.where(usable, noise * unit / (safe * safe), HOPELESS), contrast, noise)
+    return Segments(shift, np.where(usable, noise * fit.product_variance / (safe * safe), HOPELESS), contrast, noise)
 
 
 class _Median:
@@ -208,7 +222,7 @@ def adjust(
     """
     used = segments.variance < HOPELESS
     median, sharpness = _Median(used), 1.0 / np.sqrt(segments.variance)
-    A, shift = _design(sides, sharpness.shape) * sharpness[..., None], segments.shift * sharpness
+    A, shift = _design(sides) * sharpness[..., None], segments.shift * sharpness
     weighted = turned = A.swapaxes(1, 2)
     for _ in range(_ROUNDS):
         covariance = np.linalg.inv(weighted @ A + prior)
@@ -231,15 +245,12 @@ def adjust(
     return known.moved.reshape(-1, 4, 2), blocks + _COMMON_FLOOR, doubt
 
 
-def _design(sides: Sides, shape: tuple[int, ...]) -> FloatArray:
+def _design(sides: Sides) -> FloatArray:
     """Derivative (N, S, 8) of the segments' displacements along their normals by the corners'."""
-    cells = shape[1] // 4
-    fresh = sides.fresh.reshape(len(sides.t), cells, -1)
-    t = (sides.t.reshape(fresh.shape) * fresh).sum(axis=-1) / np.maximum(fresh.sum(axis=-1), 1)
-    normal = sides.normal.reshape(*fresh.shape, 2)[:, :, fresh.shape[-1] // 2].reshape(-1, 4, cells, 2)
-    by_end = t.reshape(-1, 4, cells, 1) * normal
-    A = np.zeros((len(normal), 4, cells, 4, 2))
-    # Separated by a slice, the two indices come first.
-    A[:, _SIDES, :, STARTS] = np.swapaxes(normal - by_end, 0, 1)
-    A[:, _SIDES, :, ENDS] = np.swapaxes(by_end, 0, 1)
-    return A.reshape(-1, 4 * cells, 8)
+    cells = len(sides.normal)
+    t = (sides.t * sides.fresh).sum(axis=0) / np.maximum(sides.fresh.sum(axis=0), 1)
+    by_end = t[..., None] * sides.normal
+    A = np.zeros((cells, len(by_end[0]) // 4, 4, 4, 2))
+    A[:, :, _SIDES, STARTS] = (sides.normal - by_end).reshape(cells, -1, 4, 2)
+    A[:, :, _SIDES, ENDS] = by_end.reshape(cells, -1, 4, 2)
+    return A.swapaxes(0, 1).reshape(-1, 4 * cells, 8)

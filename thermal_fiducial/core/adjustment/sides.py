@@ -9,36 +9,34 @@ from functools import cache
 
 import numpy as np
 
-from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Corners between which the sides lie: top and bottom from left to right, left and right from the top down.
 STARTS, ENDS = np.array([0, 3, 0, 1]), np.array([1, 2, 3, 2])
 _OPPOSITE = np.array([1, 0, 3, 2])
+_NEXT, _AFTER_NEXT = np.array([1, 2, 3, 0]), np.array([2, 3, 0, 1])
 # A curved side is a quartic through five of its points, at these shares of it.
 _NODES = np.linspace(0.0, 1.0, 5)
-_A = np.concatenate([_NODES, _NODES, np.zeros(5), np.ones(5)])
-_B = np.concatenate([np.zeros(5), np.ones(5), _NODES, _NODES])
-# Pixels of the image that a side must have on both sides.
-_BOTH_SIDES = 3
+# Pixels of the image that a side must have on both sides, and by how many a curve may pass the nodes it goes through.
+_BOTH_SIDES, _BEYOND_NODES = 3, 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class Sides:
-    """The 4 sides of each of N markers, E = 4 N, and K columns of M pixels each across every one."""
+    """The E = 4 N sides of N markers in m parts each, and C columns of M pixels across every part."""
 
-    #: (E, K) share of the side at which a column crosses it
+    #: (C, m, E) share of the side at which a column crosses it
     t: FloatArray
-    #: (E, K) which columns lie in the image and repeat no other
+    #: (C, m, E) which columns lie in the image and repeat no other
     fresh: BoolArray
-    #: (E, K, M) distance of each pixel from the side, inward [px]
+    #: (M, C, m, E) distance of each pixel from the side, inward [px]
     distance: Float32Array
-    #: (E, K, M) place of each pixel in the flat image
+    #: (M, C, m, E) place of each pixel in the flat image
     pixel: IntArray
-    #: (E, K, M) whether it lies in the image; None: all do
+    #: (M, C, m, E) whether it lies in the image; None: all do
     inside: BoolArray | None
-    #: (E, K, 2) unit normal inward
+    #: (m, E, 2) unit normal inward, in the middle of each part
     normal: FloatArray
     #: (E,) distance of the opposite side [px]
     across: FloatArray
@@ -46,89 +44,98 @@ class Sides:
     along: FloatArray
 
 
-def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], columns: int, half: int) -> Sides:
+def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, columns: int, half: int) -> Sides:
     """Sides of quadrilaterals (N, 4, 2) in normalised coordinates.
 
     Parameters
     ----------
     shape : height and width of the image
-    columns : K of them on a side
+    cells : m equal parts of a side
+    columns : C in each of them
     half : number of pixels of a column on either side; M = 2 half + 1
     """
     nodes = _nodes(x, camera)
     span, middle = nodes[:, 4] - nodes[:, 0], nodes[:, 2]
     steep = np.abs(span[:, 1]) > np.abs(span[:, 0])
-    by_side = steep[:, None]
-    along, across = np.where(by_side, nodes[..., 1], nodes[..., 0]), np.where(by_side, nodes[..., 0], nodes[..., 1])
-    whole = np.rint(along @ _weights(columns))
-    t, centre, slope = _curve(along, across, whole)
-    opposite = middle.reshape(-1, 4, 2)[:, _OPPOSITE].reshape(-1, 2) - middle
+    share, weights = _parts(cells, columns)
+    by_column = (2, columns, cells, len(nodes))
+    (along, rate), (across, climb) = (
+        (weights @ np.where(upright, nodes[..., 1].T, nodes[..., 0].T)).reshape(by_column)
+        for upright in (steep, ~steep)
+    )
+    # From where the columns should be it is at most half a pixel to a whole one: over that the side is straight.
+    whole, slope = np.rint(along), climb / rate
+    ahead = whole - along
+    centre = across + slope * ahead
+    opposite = middle.reshape(-1, 4, 2).take(_OPPOSITE, axis=1).reshape(-1, 2) - middle
     # On which side of the line the opposite one lies: of a steeply tilted square it may lie mostly further along.
     turn = span[:, 0] * opposite[:, 1] - span[:, 1] * opposite[:, 0]
     inward = np.sign(turn * np.where(steep, -span[:, 1], span[:, 0]))
-    pitch = inward[:, None] / np.sqrt(1.0 + slope * slope)
-    leaning = -slope * pitch
-    normal = np.empty((*pitch.shape, 2))
-    normal[..., 0], normal[..., 1] = np.where(by_side, pitch, leaning), np.where(by_side, leaning, pitch)
-    base, offsets = np.rint(centre), np.arange(-half, half + 1)
-    fresh, inside = _seen(whole, base, steep, shape, half)
+    pitch = inward / np.sqrt(1.0 + slope * slope)
+    normal = _normals(pitch[columns // 2], slope[columns // 2], steep)
+    base, offsets = np.rint(centre), np.arange(-half, half + 1)[:, None, None, None]
+    fresh, inside = _seen(whole, base, steep, nodes, shape, half)
     off, rise = ((base - centre) * pitch).astype(np.float32), pitch.astype(np.float32)
-    across_stride, along_stride = np.where(by_side, 1, shape[1]), np.where(by_side, shape[1], 1)
+    across_stride, along_stride = np.where(steep, 1, shape[1]), np.where(steep, shape[1], 1)
     pixel = (base * across_stride + whole * along_stride).astype(np.int64)
     return Sides(
-        t,
+        share + ahead / rate,
         fresh,
-        rise[..., None] * offsets.astype(np.float32) + off[..., None],
-        pixel[..., None] + (across_stride * offsets)[:, None],
+        rise * offsets.astype(np.float32) + off,
+        pixel + across_stride * offsets,
         inside,
         normal,
-        np.abs(np.sum(opposite * normal[:, columns // 2], axis=-1)),
-        np.sqrt(np.sum(span * span, axis=-1)),
+        np.abs((opposite * normal[cells // 2]).sum(axis=-1)),
+        np.sqrt((span * span).sum(axis=-1)),
     )
 
 
 def _nodes(x: FloatArray, camera: Camera) -> FloatArray:
-    """Pixels (4 N, 5, 2) of five points on every side of quadrilaterals (N, 4, 2), normalised."""
-    points = np.moveaxis(geometry.in_quadrilaterals(x, _A, _B), 0, -1)
+    """Pixels (4 N, 5, 2) of five points on every side of quadrilaterals (N, 4, 2), normalised.
+
+    Four corners are in perspective with those of a square when each has the weight of the triangle of the others.
+    """
+    to_next = x.take(_NEXT, axis=1) - x
+    a, b = to_next.take(_NEXT, axis=1), to_next.take(_AFTER_NEXT, axis=1)
+    weight = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    weight[np.abs(weight) < 1e-12] = 1e-12
+    start, end = x.take(STARTS, axis=1), x.take(ENDS, axis=1)
+    ratio = (weight.take(ENDS, axis=1) / weight.take(STARTS, axis=1))[..., None]
+    share = _NODES * ratio / (1.0 + _NODES * (ratio - 1.0))
+    points = start[:, :, None] + share[..., None] * (end - start)[:, :, None]
     return camera.distort(points).reshape(-1, len(_NODES), 2)
 
 
 @cache
-def _weights(columns: int) -> FloatArray:
-    """Weights (5, K) of the nodes at the middles of equal parts."""
-    at = np.vander((np.arange(columns) + 0.5) / columns, len(_NODES), increasing=True)
-    return np.asarray((at @ np.linalg.inv(np.vander(_NODES, increasing=True))).T)
+def _parts(cells: int, columns: int) -> tuple[FloatArray, FloatArray]:
+    """Shares (C, m, 1) of a side where columns cross it; weights (2 C m, 5) of nodes in the places and derivatives."""
+    share = ((np.arange(columns)[:, None] + 0.5) / columns + np.arange(cells)) / cells
+    powers = np.arange(len(_NODES))
+    at = share.reshape(-1, 1) ** powers
+    rate = np.zeros_like(at)
+    rate[:, 1:] = powers[1:] * at[:, :-1]
+    return share[..., None], np.concatenate([at, rate]) @ np.linalg.inv(np.vander(_NODES, increasing=True))
 
 
-def _curve(along: FloatArray, across: FloatArray, whole: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Shares, places across and their slopes, (E, K) each, where curves through nodes (E, 5) pass ``whole`` (E, K)."""
-    middle, scale = 0.5 * (along[:, :1] + along[:, 4:]), 2.0 / (along[:, 4:] - along[:, :1])
-    values = np.empty((*along.shape, 2))
-    values[..., 0], values[..., 1] = _NODES, across
-    polynomial = np.linalg.solve(_powers((along - middle) * scale), values)
-    at = _powers((whole - middle) * scale)
-    t, centre = np.moveaxis(at @ polynomial, -1, 0)
-    rising = polynomial[:, 1:, 1] * (np.arange(1.0, 5.0) * scale)
-    return t, centre, (at[..., :4] @ rising[..., None])[..., 0]
-
-
-def _powers(s: FloatArray) -> FloatArray:
-    """The powers (..., 5) from the zeroth of values (...)."""
-    powers = np.empty((*s.shape, 5))
-    square = s * s
-    powers[..., 0], powers[..., 1], powers[..., 2] = 1.0, s, square
-    powers[..., 3], powers[..., 4] = square * s, square * square
-    return powers
+def _normals(pitch: FloatArray, slope: FloatArray, steep: BoolArray) -> FloatArray:
+    """Unit normals (m, E, 2) of sides whose part across the way that these run, by rows or columns, is ``pitch``."""
+    leaning = -slope * pitch
+    normal = np.empty((*pitch.shape, 2))
+    normal[..., 0], normal[..., 1] = np.where(steep, pitch, leaning), np.where(steep, leaning, pitch)
+    return normal
 
 
 def _seen(
-    whole: FloatArray, base: FloatArray, steep: BoolArray, shape: tuple[int, ...], half: int
+    whole: FloatArray, base: FloatArray, steep: BoolArray, nodes: FloatArray, shape: tuple[int, ...], half: int
 ) -> tuple[BoolArray, BoolArray | None]:
-    """Which columns (E, K) lie in the image and repeat no other, and which of their pixels (E, K, M) lie in it."""
-    far, end = np.where(steep[:, None], shape[::-1], shape).T[..., None] - 1.0
-    fresh = (whole >= 0.0) & (whole <= end) & (base >= _BOTH_SIDES) & (base <= far - _BOTH_SIDES)
-    fresh[:, 1:] &= whole[:, 1:] != whole[:, :-1]
-    if np.all((base >= half) & (base <= far - half)):
+    """Which columns (C, m, E) are in the image and repeat no other, and which of their pixels (M, C, m, E) are in it."""
+    fresh = np.ones(whole.shape, dtype=bool)
+    np.not_equal(whole[1:], whole[:-1], out=fresh[1:])
+    np.not_equal(whole[0, 1:], whole[-1, :-1], out=fresh[0, 1:])
+    margin = half + _BEYOND_NODES
+    if nodes.min() >= margin and (nodes.max(axis=(0, 1)) <= (shape[1] - 1 - margin, shape[0] - 1 - margin)).all():
         return fresh, None
-    place = base[..., None] + np.arange(-half, half + 1)
-    return fresh, (place >= 0.0) & (place <= far[..., None])
+    far, end = np.where(steep[:, None], shape[::-1], shape).T - 1.0
+    fresh &= (whole >= 0.0) & (whole <= end) & (base >= _BOTH_SIDES) & (base <= far - _BOTH_SIDES)
+    place = base + np.arange(-half, half + 1)[:, None, None, None]
+    return fresh, (place >= 0.0) & (place <= far)

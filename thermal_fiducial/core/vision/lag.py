@@ -157,7 +157,7 @@ class SmearField:
         u = (np.arange(-(-camera.width // self._STEP)) + 0.5) * self._STEP - 0.5
         v = (np.arange(-(-camera.height // self._STEP)) + 0.5) * self._STEP - 0.5
         self._x = camera.normalise(np.stack(np.meshgrid(u, v), axis=-1))
-        self._J = camera.distort_jacobian(self._x)
+        self._J = camera.distort_linearised(self._x)[1]
 
     def at(self, twist: Twist, depth: float, tau: float) -> FloatArray:
         """Coarse field (rows, columns, 2) [px]."""
