@@ -17,9 +17,13 @@ def frames():
     return [frame for frame in render_frames('wall', seconds=20.0, seed=5, start=120, stop=124) if not frame.shutter]
 
 
+def new_detector():
+    return MarkerDetector(ArucoDetectorConfig(), load_dictionary('DICT_4X4_50'))
+
+
 @pytest.fixture
 def detector():
-    return MarkerDetector(ArucoDetectorConfig(), load_dictionary('DICT_4X4_50'))
+    return new_detector()
 
 
 def test_finds_every_marker(frames, detector):
@@ -47,27 +51,28 @@ def displayed(counts, bent):
     return np.rint(255.0 * np.clip((counts - low) / (high - low), 0.0, 1.0) ** bent).astype(np.uint16)
 
 
-def last_rows(frames, detector, process):
+def last_rows(frames, process):
     """Of the last frame, when the motion is known by those before."""
-    return [detector.detect(frame.stamp_ns, process(frame.counts), camera_of(named('wall'))) for frame in frames][-1]
+    detector, camera = new_detector(), camera_of(named('wall'))
+    return [detector.detect(frame.stamp_ns, process(frame.counts), camera) for frame in frames][-1]
 
 
 @pytest.mark.parametrize('bent', [0.5, 2.0])
-def test_what_a_display_bends_is_claimed_no_better_than_it_is(frames, detector, bent):
-    rows = last_rows(frames, detector, lambda counts: displayed(counts, bent))
+def test_what_a_display_displaces_the_border_tells(frames, bent):
+    rows = last_rows(frames, lambda counts: displayed(counts, bent))
     truth = np.stack([frames[-1].corners_px[marker_id] for marker_id in rows['id'].tolist()])
     error = corners_px(rows) - truth
-    # All sides lie off alike, outward or inward: a bent scale moves the middle of black and white.
+    # A bent scale moves the middle of black and white, and with it all sides alike: by -0.34 px and +0.54 px as long as
+    # nothing takes that out, by 0.001 and -0.012 px then.
     outward = np.sum(error * np.sign(truth - truth.mean(axis=1, keepdims=True)), axis=-1).mean()
-    assert np.sign(outward) == np.sign(bent - 1.0)
-    assert abs(outward) > 0.1
+    assert abs(outward) < 0.04
     nees = np.einsum('nki,nkij,nkj->nk', error, np.linalg.inv(corner_covariances(rows)), error).mean()
-    # 2 of an honest corner; the scale may be bent worse than this one.
+    # 2 of an honest corner; a real camera's scale is bent from place to place, not by one curve.
     assert nees < 2.0
 
 
-def test_raw_counts_are_claimed_better_than_a_display(frames, detector):
-    raw = last_rows(frames, detector, lambda counts: counts)
-    bent = last_rows(frames, detector, lambda counts: displayed(counts, 2.0))
-    # Measured: 0.02 px, and 0.3 px of the display.
-    assert np.median(raw['sigma_px']) < 0.1 < 0.3 < np.median(bent['sigma_px'])
+def test_raw_counts_are_claimed_better_than_a_display(frames):
+    raw = last_rows(frames, lambda counts: counts)
+    bent = last_rows(frames, lambda counts: displayed(counts, 2.0))
+    # Measured: 0.016 and 0.13 px.
+    assert np.median(raw['sigma_px']) < 0.05 < 0.1 < np.median(bent['sigma_px'])

@@ -18,12 +18,13 @@ from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatAr
 from thermal_fiducial.core.vision.clock_offset import ClockOffset
 from thermal_fiducial.core.vision.contrast import noise_of, without_columns
 from thermal_fiducial.core.vision.decoding import Decoder
+from thermal_fiducial.core.vision.displayed import DisplayedSides, LEVELS
 from thermal_fiducial.core.vision.following import Followed
 from thermal_fiducial.core.vision.frame import Frame, Places
 from thermal_fiducial.core.vision.guided import camera_in_map, Expected, KnownMarkers, look
 from thermal_fiducial.core.vision.ids import among, pairs
 from thermal_fiducial.core.vision.lag import markers_sharpened, REMAINING, SmearField, without_lag
-from thermal_fiducial.core.vision.local_corners import as_displayed, local_corners
+from thermal_fiducial.core.vision.local_corners import local_corners
 from thermal_fiducial.core.vision.marker_rows import marker_rows
 from thermal_fiducial.core.vision.motion import MotionTracker, plausible, Tracked, Twist
 from thermal_fiducial.core.vision.odometry_log import OdometryLog
@@ -44,8 +45,6 @@ _CLEARER_THAN_COLUMNS = 100.0
 _CLEAR = 20.0
 # Nearer to the rim of the image than this a marker is not expected to be seen, or may be cut off [px].
 _RIM_PX = 2.0
-# Raw counts of a bolometer are beyond those of 8 bits, which went through the camera's processing for a display.
-_COUNTS_OF_8_BITS = 256
 # A marker that was read off its corners by less than this need not be read again [cells].
 _READ_THERE = 0.1
 # Where not all markers are known, or not all seen that should be, a blind search follows at least every so many frames.
@@ -88,6 +87,7 @@ class MarkerDetector:
         self._motion = MotionTracker(self._T_body_camera, config.bolometer_lag)
         self._scratch = Scratch()
         self._refiner = Refiner(edges_behind(bits), self._motion)
+        self._displayed = DisplayedSides(bits)
         self._search = BlindSearch(self._decoder, self._scratch)
         self._clock_offset = ClockOffset()
         self._polarity = Polarity()
@@ -135,8 +135,9 @@ class MarkerDetector:
             if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
                 corners = local_corners(frame.image, corners, self._decoder.cells)
                 at = ImagePoints.at(corners.corners_px, camera)
-            elif counts.max() < _COUNTS_OF_8_BITS:
-                corners = as_displayed(corners)
+            elif counts.max() < LEVELS:
+                corners = self._displayed.corrected(frame, ids, refinement, self.config.blur_px)
+                at = ImagePoints.at(corners.corners_px, camera)
             poses = self._poses(ids, corners, at, T_camera_map)
             self._remember(frame, ids, refinement, poses)
             return marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)

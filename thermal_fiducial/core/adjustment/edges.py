@@ -3,7 +3,7 @@
 import numpy as np
 
 from thermal_fiducial.core.adjustment.sides import Sides
-from thermal_fiducial.core.types import Float32Array, FloatArray, Gray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
 
 #: Neighbouring edges that the model knows: so many cells behind the side.
 NEIGHBOURS = (1, 2)
@@ -26,10 +26,28 @@ def edges_behind(bits: Gray) -> Float32Array:
     -------
     (M, 4, m, 2) for the sides of :mod:`sides`, the m = n + 2 cells along each, and edges one and two cells inward.
     """
-    grid = np.pad(bits.astype(np.float32), ((0, 0), (1, 1), (1, 1)))
+    return _changes(_inward(np.pad(bits.astype(np.float32), ((0, 0), (1, 1), (1, 1)))))
+
+
+def edges_behind_border(bits: Gray) -> tuple[Float32Array, BoolArray]:
+    """The same behind the inner edges of the border, those of n cells a side, as if black lay behind them too.
+
+    Returns
+    -------
+    (M, 4, n, 2), and whether white lies behind them (M, 4, n), so that they are seen: as rises where sides are falls
+    """
+    inward = _inward(bits.astype(np.float32))
+    return -_changes(inward), inward[:, :, 0] > 0.5
+
+
+def _inward(grid: Float32Array) -> Float32Array:
+    """Values (M, 4, n, m) of grids (M, m, m) by side, cells inward and cells along."""
     turned = np.swapaxes(grid, 1, 2)
-    inward = np.stack([grid, grid[:, ::-1], turned, turned[:, ::-1]], axis=1)
-    return np.ascontiguousarray(np.moveaxis(np.diff(inward[:, :, : len(NEIGHBOURS) + 1], axis=2), 2, 3))
+    return np.stack([grid, grid[:, ::-1], turned, turned[:, ::-1]], axis=1)[:, :, : len(NEIGHBOURS) + 1]
+
+
+def _changes(inward: Float32Array) -> Float32Array:
+    return np.ascontiguousarray(np.moveaxis(np.diff(inward, axis=2), 2, 3))
 
 
 def blurs(normal: FloatArray, optics: float, smear: FloatArray) -> tuple[FloatArray, FloatArray]:

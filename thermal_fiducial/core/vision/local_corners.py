@@ -18,9 +18,6 @@ _WINDOW_IN_CELLS = 0.3
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
 # Deviation of such a corner on thermal frames [px], and the step beyond which it has left its corner, in cells.
 _DEVIATION = 0.18
-# Displacement of sides where gain control has bent the scale [px]: if the middle of black and white lies anywhere from
-# a fifth to four fifths of the step as it was, that of a step blurred by 0.66 px is off by up to 0.55, evenly spread.
-_DISPLACED_BY_DISPLAY = 0.3
 _LOST_CELLS = 0.4
 
 
@@ -35,8 +32,3 @@ def local_corners(image: Float32Array, refined: RefinedCorners, cells: int) -> R
         near = np.abs(found - start).max(axis=1) < max(1.0, _LOST_CELLS * cell)
         corners[index, near] = found[near]
     return replace(refined, corners_px=corners, covariances=refined.covariances + _DEVIATION**2 * np.eye(2))
-
-
-def as_displayed(refined: RefinedCorners) -> RefinedCorners:
-    """Corners from the lines of sides in what is meant for a display: no better than its grey levels allow."""
-    return replace(refined, covariances=refined.covariances + _DISPLACED_BY_DISPLAY**2 * np.eye(2))

@@ -61,6 +61,18 @@ class View:
     off: FloatArray
     memory: Memory | None
 
+    def only(self, keep: BoolArray) -> 'View':
+        """That of the markers ``keep`` (N,)."""
+        return View(
+            self.image,
+            self.shift[keep],
+            self.removed[keep],
+            self.spread[keep],
+            self.sharpened[keep],
+            self.off[keep],
+            None if self.memory is None else self.memory.only(np.flatnonzero(keep)),
+        )
+
     def sharp(self, corners_px: FloatArray, which: IntArray, scratch: Scratch) -> Float32Array:
         """The view as an image, round the markers ``which`` with ``corners_px`` (N, 4, 2) in it."""
         which = which[self.sharpened[which]]
@@ -84,7 +96,8 @@ class Refinement:
         """That of the markers ``keep`` (N,)."""
         if keep.all():
             return self
-        return replace(self, seen=self.seen.only(keep), corners=self.corners.only(keep), places=self.places.only(keep))
+        view, places = self.view.only(keep), self.places.only(keep)
+        return replace(self, view=view, seen=self.seen.only(keep), corners=self.corners.only(keep), places=places)
 
 
 class Refiner:
