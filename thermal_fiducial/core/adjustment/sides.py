@@ -128,7 +128,7 @@ def _normals(pitch: FloatArray, slope: FloatArray, steep: BoolArray) -> FloatArr
 def _seen(
     whole: FloatArray, base: FloatArray, steep: BoolArray, nodes: FloatArray, shape: tuple[int, ...], half: int
 ) -> tuple[BoolArray, BoolArray | None]:
-    """Which columns (C, m, E) are in the image and repeat no other, and which of their pixels (M, C, m, E) are in it."""
+    """Which columns (C, m, E) lie in the image, repeating no other, and which of their pixels (M, C, m, E) do."""
     fresh = np.ones(whole.shape, dtype=bool)
     np.not_equal(whole[1:], whole[:-1], out=fresh[1:])
     np.not_equal(whole[0, 1:], whole[-1, :-1], out=fresh[0, 1:])
