@@ -31,6 +31,8 @@ SYSTEMATIC_PX = 0.1
 INCONSISTENT = 200.0
 #: Fits that end nearer to each other than this are one fit [rad].
 SAME_FIT = np.deg2rad(2.0)
+# A corner that moves faster in the image than this is hardly before the camera at all [px/m, px/rad].
+_STEEPEST = 1e6
 # How often a fit may change its mind about the cameras' poses.
 _CHOICES = 4
 
@@ -206,6 +208,8 @@ def _fit_chosen(start: FloatArray, size: float, views: list[View], chosen: IntAr
     sizes = np.full(n, size)
     _, J, _ = linearise(camera, T_map_camera, np.broadcast_to(start, (n, 4, 4)), sizes)
     W, log_determinants = _whitening(views, J, camera_covariances)
+    if not np.isfinite(log_determinants).all():
+        return _Fit(start, np.inf, np.inf, np.zeros((6, 6)), np.zeros((6, 6)))
 
     def evaluate(T: FloatArray) -> tuple[FloatArray, FloatArray]:
         uv, _, J = linearise(camera, T_map_camera, np.broadcast_to(T, (n, 4, 4)), sizes)
@@ -229,15 +233,18 @@ def _whitening(
     """Matrices (n, 8, 8) that make the residuals of n views unit white, and the logarithms of their determinants (n,).
 
     A residual comes of the corners' noise, of the systematic part, and of the camera's own pose, which moves all four
-    corners together.
+    corners together. The determinant is infinite of a view that cannot be: a corner lies in the plane of the camera.
     """
     n = len(views)
-    C = np.nan_to_num(J_camera @ camera_covariances @ np.swapaxes(J_camera, -1, -2))
+    possible = np.all(np.abs(J_camera) < _STEEPEST, axis=(1, 2))
+    J_camera = np.where(possible[:, None, None], J_camera, 0.0)
+    C = J_camera @ camera_covariances @ np.swapaxes(J_camera, -1, -2)
     corner = np.arange(4)
     noise = np.stack([view.corner_covariances for view in views]) + SYSTEMATIC_PX**2 * np.eye(2)
     C.reshape(n, 4, 2, 4, 2)[:, corner, :, corner] += np.swapaxes(noise, 0, 1)
     L = np.linalg.cholesky(C)
-    return np.linalg.inv(L), 2.0 * np.sum(np.log(np.einsum('nii->ni', L)), axis=-1)
+    log_determinants = 2.0 * np.sum(np.log(np.einsum('nii->ni', L)), axis=-1)
+    return np.linalg.inv(L), np.where(possible, log_determinants, np.inf)
 
 
 def correlated_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:
