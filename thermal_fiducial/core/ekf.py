@@ -16,10 +16,10 @@ import numpy as np
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.coasting import usable_seconds
 from thermal_fiducial.core.filter.error_state import doubted
-from thermal_fiducial.core.filter.gating import Belief, PoseGate, position_std, Sighting, Track
+from thermal_fiducial.core.filter.gating import Belief, NO_GRAVITY, PoseGate, position_std, Sighting, Track
 from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import NoiseMonitor, NoiseRange
-from thermal_fiducial.core.filter.initialisation import WINDOW_SECONDS
+from thermal_fiducial.core.filter.initialisation import FEWEST_SAMPLES, WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.navigation_state import NavigationState
 from thermal_fiducial.core.filter.smoothing import SmoothOutput
@@ -351,7 +351,7 @@ class PoseEkf:
         belief = self._nodes[-1].belief
         if belief.main is None:
             hits = belief.rival.hits if belief.rival else 0
-            return f'initialising: {hits} of {self._config.initial_poses} poses' if hits else 'waiting for markers'
+            return f'initialising: {hits} of {self._config.initial_poses} poses' if hits else self._why_waiting()
         uncertainty = position_std(belief.main.state)
         if uncertainty > self._config.lost_position_std:
             return f'lost: position known to {uncertainty:.2f} m'
@@ -359,6 +359,14 @@ class PoseEkf:
             return 'in doubt: poses agree on another place'
         coasting = self._coasting(belief.main)
         return f'coasting for {coasting:.1f} s' if coasting > 0.5 else 'tracking'
+
+    def _why_waiting(self) -> str:
+        latest = next(reversed(self.decided.values()), None)
+        if latest is None or latest.reason != NO_GRAVITY:
+            return 'waiting for markers'
+        force = np.mean([node.imu[3:] for node in self._nodes[-FEWEST_SAMPLES:]], axis=0)
+        words = ' '.join(f'{value:.1f}' for value in force)
+        return f'poses contradict gravity: the IMU says {words} m/s^2; its axes, sign, units? camera_orientation?'
 
     def _coasting(self, track: Track) -> float:
         return (self._nodes[-1].stamp_ns - track.accepted_ns) / _SECOND_NS

@@ -29,9 +29,9 @@ _PREFERRED = 4
 #: Poses are linearised anew when the time offset has become known so many times better, and well enough when it is
 #: known to this [s]: half an angular acceleration of 5 rad/s^2 times its square is 0.01 mrad.
 _BETTER, _WELL_KNOWN = 2.0, 0.002
-
-
 _NEVER = -(1 << 62)
+#: why a pose was refused that no attitude of a robot under gravity explains
+NO_GRAVITY = 'refused: contradicts gravity'
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +157,7 @@ class PoseGate:
         rival = belief.rival or self._rival(belief, sighting)
         reason = f'refused: {math.sqrt(nis):.1f} sigma' if main else 'initialising'
         if rival is None:
-            reason = 'refused: contradicts gravity'
+            reason = NO_GRAVITY
         return replace(belief, rival=rival, pose_stamp_ns=stamp_ns), PoseUpdate(stamp_ns, False, reason, nis)
 
     def weigh_rival(self, belief: Belief, sighting: Sighting) -> tuple[Belief, PoseUpdate | None]:

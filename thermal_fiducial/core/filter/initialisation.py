@@ -31,6 +31,8 @@ WINDOW_SECONDS, FEWEST_SAMPLES = 0.5, 20
 STILL_RATE_STD, STILL_FORCE_STD = 0.02, 0.3
 #: ... and their mean is a plausible gyroscope bias [rad/s] and gravity with accelerometer bias [m/s^2].
 STILL_RATE, STILL_FORCE = 0.1, 0.6
+#: At rest no accelerometer is off gravity by so much [m/s^2]: its units or its axes are others.
+NO_GRAVITY = 2.0
 #: What the mean of such a window is worth: a drone on its legs or in a hand still moves a little [rad/s, m/s^2].
 RATE_STD, FORCE_STD = 0.005, 0.05
 #: A first pose whose vertical is further than this [rad] from the specific force is of the wrong planar branch.
@@ -47,12 +49,18 @@ class Rest:
 
 def rest(imu: FloatArray, gravity: float) -> Rest | None:
     """What an IMU window (N, 6) says if the robot stood still in it."""
+    mean = imu.mean(axis=0)
+    level = abs(np.linalg.norm(mean[3:]) - gravity) < STILL_FORCE
+    return Rest(mean[:3], mean[3:]) if level and _quiet(imu) else None
+
+
+def _quiet(imu: FloatArray) -> bool:
+    """Whether samples (N, 6) hardly scatter, about hardly any rate."""
     if len(imu) < FEWEST_SAMPLES:
-        return None
-    mean, std = imu.mean(axis=0), imu.std(axis=0)
+        return False
+    std = imu.std(axis=0)
     quiet = std[:3].max() < STILL_RATE_STD and std[3:].max() < STILL_FORCE_STD
-    level = np.linalg.norm(mean[:3]) < STILL_RATE and abs(np.linalg.norm(mean[3:]) - gravity) < STILL_FORCE
-    return Rest(mean[:3], mean[3:]) if quiet and level else None
+    return bool(quiet and np.linalg.norm(imu.mean(axis=0)[:3]) < STILL_RATE)
 
 
 def blank_state(config: PoseEkfConfig, layout: Layout) -> NavigationState:
@@ -75,7 +83,7 @@ def blank_state(config: PoseEkfConfig, layout: Layout) -> NavigationState:
 def start(
     config: PoseEkfConfig, filter_: ErrorStateFilter, pose: BodyPose, prior: NavigationState, imu: FloatArray
 ) -> NavigationState | None:
-    """State at a first pose, or None where the pose contradicts gravity.
+    """State at a first pose, or None where the pose contradicts gravity, or there is none in what the IMU measures.
 
     Parameters
     ----------
@@ -85,6 +93,8 @@ def start(
     up = pose.T_map_body[2, :3]
     force = imu.mean(axis=0)[3:]
     if up @ force < math.cos(LARGEST_TILT) * np.linalg.norm(force):
+        return None
+    if abs(np.linalg.norm(force) - config.gravity) > NO_GRAVITY and _quiet(imu):
         return None
     state = _unaligned(config, filter_.layout, pose, prior)
     still = rest(imu, config.gravity)
