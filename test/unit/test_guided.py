@@ -131,7 +131,9 @@ def test_odometry_is_read_on_the_camera_s_clock():
     state = odometry(frame)
     velocity = np.array([0.0, 4.0, 0.0])
     late = replace(state, stamp_ns=frame.stamp_ns - 60_000_000, velocity_body=velocity)
-    in_clock_of_camera = detector(camera_time_offset=-0.060)._at_frame(frame.stamp_ns, told(late))
-    assert [state.stamp_ns for state in in_clock_of_camera] == [frame.stamp_ns]
+    guided = detector(camera_time_offset=-0.060)
+    told_ns = guided._told_ns(frame.stamp_ns)
+    assert told_ns == late.stamp_ns
+    assert guided._at_frame(told_ns, told(late)) == [late]
     impossible = replace(late, angular_velocity_body=np.full(3, 1e3))
-    assert detector()._at_frame(frame.stamp_ns, told(impossible)) == []
+    assert guided._at_frame(told_ns, told(impossible)) == []

@@ -13,7 +13,7 @@ from thermal_fiducial.core.adjustment import edges
 from thermal_fiducial.core.adjustment.segments import adjust, counts_across, HOPELESS, measure, Memory
 from thermal_fiducial.core.adjustment.sides import sides_of
 from thermal_fiducial.core.camera import Camera, ImagePoints
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
 
 # A first pass with so much more blur catches corners from farther away. Those that follow measure, until the last step
 # was short enough; for outlines that are no squares a shorter one, as these may become ones.
@@ -54,7 +54,7 @@ class RefinedCorners:
 
 
 def refine_corners(
-    image: Float32Array,
+    image: Counts | Float32Array,
     corners: ImagePoints,
     camera: Camera,
     behind: Float32Array,
@@ -100,7 +100,7 @@ def refine_corners(
 class _Task:
     """What to refine, as :func:`refine_corners` is told it."""
 
-    image: Float32Array
+    image: Counts | Float32Array
     camera: Camera
     corners: ImagePoints
     behind: Float32Array

@@ -52,6 +52,8 @@ _INCOMPLETE = 2
 # The filter's states from so many time constants before a frame to one after it, symmetric about the velocity that
 # smears it, tell its motion; so many of them at most. Without lag, those of so long a time.
 _MEMORY_LAGS, _STATES, _SHORTEST_LAG_S = 3, 10, 0.005
+# Corners of a marker of side 1 in its plane.
+_FACE = marker_corners(1.0)[:, :2]
 # Depth of the scene while no marker has told it [m].
 _TYPICAL_DEPTH = 3.0
 
@@ -117,10 +119,11 @@ class MarkerDetector:
         odometry : the filter's latest states, where there are any
         """
         with one_thread():
-            states = [] if odometry is None else self._at_frame(stamp_ns, odometry)
-            twist = self._motion.predict(stamp_ns, states)
+            told_ns = self._told_ns(stamp_ns)
+            states = [] if odometry is None else self._at_frame(told_ns, odometry)
+            twist = self._motion.predict(stamp_ns, states, told_ns)
             frame = self._frame(stamp_ns, counts, camera, twist)
-            T_camera_map = self._predicted_pose(stamp_ns, states, twist)
+            T_camera_map = self._predicted_pose(told_ns, states, twist)
             in_map = None
             if T_camera_map is not None and self.config.guided:
                 in_map = self._known.expected(T_camera_map, camera, self.config.min_side_px)
@@ -135,7 +138,7 @@ class MarkerDetector:
             if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
                 corners = local_corners(frame.image, corners, self._decoder.cells)
                 at = ImagePoints.at(corners.corners_px, camera)
-            elif counts.max() < LEVELS:
+            elif counts[::8].max() < LEVELS:
                 corners = self._displayed.corrected(frame, ids, refinement, self.config.blur_px)
                 at = ImagePoints.at(corners.corners_px, camera)
             poses = self._poses(ids, corners, at, T_camera_map)
@@ -148,23 +151,27 @@ class MarkerDetector:
             return self._map[marker_id][1]
         return self._sizes.get(marker_id, self.config.marker_size)
 
-    def _at_frame(self, stamp_ns: int, odometry: OdometryLog) -> list[Odometry]:
-        """The filter's states while a frame came about, or the nearest; in the clock of the camera."""
-        ahead_ns = round(self.config.camera_time_offset * 1e9) + self._clock_offset.ns
-        stamp_ns, lag_ns = stamp_ns + ahead_ns, round(1e9 * max(self.config.bolometer_lag, _SHORTEST_LAG_S))
-        states = odometry.between(stamp_ns - _MEMORY_LAGS * lag_ns, stamp_ns + lag_ns, _STATES)
-        if not states and (nearest := odometry.nearest(stamp_ns)) is not None:
+    def _told_ns(self, stamp_ns: int) -> int:
+        """The stamp of a frame in the clock of the filter's states."""
+        return stamp_ns + round(self.config.camera_time_offset * 1e9) + self._clock_offset.ns
+
+    def _at_frame(self, told_ns: int, odometry: OdometryLog) -> list[Odometry]:
+        """The filter's states while a frame came about, or the nearest; its stamp in their clock."""
+        lag_ns = round(1e9 * max(self.config.bolometer_lag, _SHORTEST_LAG_S))
+        states = odometry.between(told_ns - _MEMORY_LAGS * lag_ns, told_ns + lag_ns, _STATES)
+        if not states and (nearest := odometry.nearest(told_ns)) is not None:
             states = [nearest]
-        return [replace(state, stamp_ns=state.stamp_ns - ahead_ns) for state in states if plausible(state)]
+        return [state for state in states if plausible(state)]
 
     def _frame(self, stamp_ns: int, counts: Counts | Gray, camera: Camera, twist: Twist | None) -> Frame:
         """The frame, without the pattern of columns where that matters."""
-        image = self._scratch.floats('image', counts.shape)
-        np.copyto(image, counts)
-        noise = noise_of(image)
+        noise = noise_of(counts)
+        frame = Frame(
+            stamp_ns, counts, noise, camera, twist, self.config.bolometer_lag, self.config.readout_time, self._scratch
+        )
         if counts.dtype != np.uint8 and not self._motion.all_clearer_than(_CLEARER_THAN_COLUMNS):
-            image = without_columns(image, noise, self._scratch)
-        return Frame(stamp_ns, image, noise, camera, twist, self.config.bolometer_lag, self.config.readout_time)
+            return replace(frame, counts=without_columns(frame.image, noise, self._scratch))
+        return frame
 
     def _learn_offset(self, frame: Frame, in_map: Expected | None, ids: IntArray, places: Places) -> None:
         """How far seen corners are off their places tells what is left of the clocks' offset."""
@@ -174,14 +181,14 @@ class MarkerDetector:
         off, velocity = places.at.px[seen] - in_map.corners_px[predicted], places.velocity(frame.twist)[seen]
         self._clock_offset.learn(frame.stamp_ns, off, velocity)
 
-    def _predicted_pose(self, stamp_ns: int, states: list[Odometry], twist: Twist | None) -> FloatArray | None:
+    def _predicted_pose(self, told_ns: int, states: list[Odometry], twist: Twist | None) -> FloatArray | None:
         """T_camera_map at the frame, where odometry that is fresh enough tells it."""
         if not states or twist is None or not self._map:
             return None
-        nearest = min(states, key=lambda state: abs(stamp_ns - state.stamp_ns))
-        if abs(stamp_ns - nearest.stamp_ns) * 1e-9 > self.config.max_odometry_age:
+        nearest = min(states, key=lambda state: abs(told_ns - state.stamp_ns))
+        if abs(told_ns - nearest.stamp_ns) * 1e-9 > self.config.max_odometry_age:
             return None
-        return geometry.inverse(camera_in_map(stamp_ns, nearest, self._T_body_camera, twist))
+        return geometry.inverse(camera_in_map(told_ns, nearest, self._T_body_camera, twist))
 
     def _find(self, frame: Frame, in_map: Expected | None) -> tuple[Found, Followed]:
         """Markers where they should be, and whatever a blind search shows, when that is due; and which are followed."""
@@ -337,5 +344,5 @@ def _common_shift(ids: IntArray, corners: FloatArray, seen: Found) -> FloatArray
 
 def _depths(T_camera_marker: FloatArray, sizes: FloatArray) -> FloatArray:
     """Depths (N, 4) [m] of the corners of markers."""
-    corners = geometry.apply(T_camera_marker, sizes[:, None, None] * marker_corners(1.0))
-    return np.maximum(np.nan_to_num(corners[..., 2], nan=1.0), 0.1)
+    depth = T_camera_marker[:, 2, 3, None] + sizes[:, None] * (T_camera_marker[:, 2, :2] @ _FACE.T)
+    return np.fmax(np.where(np.isfinite(depth), depth, 1.0), 0.1)

@@ -59,11 +59,28 @@ def _left_jacobian_coefficients(angle: FloatArray) -> tuple[FloatArray, FloatArr
 def so3_exp(phi: npt.ArrayLike) -> FloatArray:
     """Rotation matrix (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     phi = np.asarray(phi, dtype=np.float64)
+    if phi.ndim == 1:
+        return _exp_of_one(phi)
     # sin(h) / h is 1 to the last digit at the smallest half angle that is divided by.
     half = np.maximum(0.5 * np.sqrt(np.sum(phi * phi, axis=-1)), 1e-12)[..., None, None]
     s = np.sin(half) / half
     K = skew(phi)
     return np.asarray(np.eye(3) + (s * np.cos(half)) * K + (0.5 * s * s) * (K @ K))
+
+
+def _exp_of_one(phi: FloatArray) -> FloatArray:
+    """The same for a single vector (3,): many times faster without arrays."""
+    x, y, z = phi.tolist()
+    half = max(0.5 * math.sqrt(x * x + y * y + z * z), 1e-12)
+    s = math.sin(half) / half
+    a, b = s * math.cos(half), 0.5 * s * s
+    return np.array(
+        [
+            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+        ]
+    )
 
 
 def so3_log(R: npt.ArrayLike) -> FloatArray:

@@ -13,7 +13,7 @@ import numpy as np
 from thermal_fiducial.core.adjustment.sides import ENDS, Sides, STARTS
 from thermal_fiducial.core.adjustment.squares import as_squares
 from thermal_fiducial.core.camera import ImagePoints
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
 
 #: Variance of a segment that measures nothing.
 HOPELESS = 1e6
@@ -80,9 +80,9 @@ class _Fit(NamedTuple):
     number: FloatArray
 
 
-def counts_across(image: Float32Array, sides: Sides, memory: Memory | None = None) -> Float32Array:
+def counts_across(image: Counts | Float32Array, sides: Sides, memory: Memory | None = None) -> Float32Array:
     """Counts (M, C, m, E) of the pixels across sides, without memory."""
-    counts: Float32Array = image.ravel().take(sides.pixel, mode='clip')
+    counts = image.ravel().take(sides.pixel, mode='clip').astype(np.float32, copy=False)
     if memory is None or not (memory.gain > 1.0).any():
         return counts
     pixel, which = sides.pixel.reshape(-1, len(memory.gain), 4), np.flatnonzero(memory.gain > 1.0)

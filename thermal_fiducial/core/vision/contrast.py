@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.types import Float32Array, Gray
+from thermal_fiducial.core.types import Counts, Float32Array, Gray
 from thermal_fiducial.core.vision.scratch import Scratch
 
 # The spread is taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
@@ -24,7 +24,7 @@ _CLIPPED = 1.0 / 0.68
 _MAD_OF_DIFFERENCE = 1.0484
 
 
-def noise_of(counts: Float32Array) -> float:
+def noise_of(counts: Counts | Gray | Float32Array) -> float:
     """Standard deviation of pixel noise [counts]: median absolute difference of vertical neighbours, sparsely.
 
     Differences along a column leave the column pattern out.
@@ -32,7 +32,7 @@ def noise_of(counts: Float32Array) -> float:
     rows = counts[4::8, ::3]
     below = counts[5::8, ::3]
     count = min(len(rows), len(below))
-    difference = np.abs(rows[:count] - below[:count]).ravel()
+    difference = cv2.absdiff(np.ascontiguousarray(rows[:count]), np.ascontiguousarray(below[:count])).ravel()
     middle = difference.size // 2
     # Whole counts: half a count of quantisation is what a median of 0 can mean.
     return max(float(np.partition(difference, middle)[middle]) * _MAD_OF_DIFFERENCE, 0.3)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.geometry import in_quadrilaterals
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 
 # How far off a side black and white are compared: in cells, and at most in pixels.
 _OUTSIDE = 0.4
@@ -103,7 +103,7 @@ class Decoder:
             steps[alike] = self._steps(image, quads[alike])
         return self._judged(values, best, correlation, runner_up, steps)
 
-    def likeness(self, image: Float32Array, quads: FloatArray, allowed: BoolArray | None = None) -> Likeness:
+    def likeness(self, image: Counts | Float32Array, quads: FloatArray, allowed: BoolArray | None = None) -> Likeness:
         """Most similar patterns of quadrilaterals (Q, 4, 2) among those ``allowed`` (M,), or all."""
         values = self._contrasts(image, quads)
         spread = np.sqrt(np.sum(values * values, axis=1, keepdims=True))
@@ -161,7 +161,7 @@ class Decoder:
         means = sampled(image, places).reshape(len(quads), 2, 4, -1).mean(axis=-1, dtype=np.float64)
         return np.asarray(means[:, 0] - means[:, 1])
 
-    def _contrasts(self, image: Float32Array, quads: FloatArray) -> FloatArray:
+    def _contrasts(self, image: Counts | Float32Array, quads: FloatArray) -> FloatArray:
         """Mean counts (Q, m * m) of the cells without the background."""
         values = sampled(image, in_quadrilaterals(quads, self._a, self._b).astype(np.float32))
         return np.asarray((values - values[:, :1]) @ self._cells_of_samples, dtype=np.float64)
@@ -175,6 +175,7 @@ def shrunk(quads: FloatArray, cells: int) -> FloatArray:
     )
 
 
-def sampled(image: Float32Array, places: Float32Array) -> Float32Array:
+def sampled(image: Counts | Float32Array, places: Float32Array) -> Float32Array:
     """Values (Q, P) of the image at columns and rows (2, Q, P)."""
-    return np.asarray(cv2.remap(image, places[0], places[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    values = cv2.remap(image, places[0], places[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, dtype=np.float32)

@@ -61,7 +61,7 @@ class Followed:
             return self
         shown = self.places.at.px + self.places.smear(twist, frame.lag)
         shown += expected_displacement(self.places, twist, frame)
-        likeness = decoder.likeness(frame.image, shown)
+        likeness = decoder.likeness(frame.samples, shown)
         similarity = likeness.correlation * np.sign(self.clarity)
         alike = (likeness.best == 4 * self.ids) & (similarity > _STILL_ALIKE)
         alike &= frame.camera.contains(shown).all(axis=1)

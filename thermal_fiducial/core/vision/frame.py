@@ -1,21 +1,23 @@
 """A frame, and what is known of it before anything is found."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
 from thermal_fiducial.core.camera import Camera, ImagePoints
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 from thermal_fiducial.core.vision.lag import MEMORY_AGE
 from thermal_fiducial.core.vision.motion import interaction, Twist
+from thermal_fiducial.core.vision.scratch import Scratch
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Frame:
     """An image, and what is known of the camera's motion at its stamp."""
 
     stamp_ns: int
-    image: Float32Array
+    counts: Counts | Gray | Float32Array
     #: standard deviation of a pixel [counts]
     noise: float
     camera: Camera
@@ -23,6 +25,22 @@ class Frame:
     #: time constant of the bolometers, and time from the first row's sampling to the last's [s]
     lag: float
     readout: float
+    #: for the image
+    scratch: Scratch = field(default_factory=Scratch)
+
+    @cached_property
+    def image(self) -> Float32Array:
+        """As floating-point numbers: a copy that few places of it are not worth."""
+        if self.counts.dtype == np.float32:
+            return np.asarray(self.counts, dtype=np.float32)
+        image = self.scratch.floats('image', self.counts.shape)
+        np.copyto(image, self.counts)
+        return image
+
+    @property
+    def samples(self) -> Counts | Float32Array:
+        """To be looked up in few places, interpolated to whole counts at worst."""
+        return np.asarray(self.counts, dtype=np.uint16) if self.counts.dtype == np.uint16 else self.image
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,6 +33,7 @@ GAIN = 1.0 / (1.0 - _FORGOTTEN)
 #: What is left of the smear: its mean, and its standard deviation about that, as shares of the whole.
 REMAINING = 1.0 - _MEMORY * _FORGOTTEN * GAIN
 SPREAD = math.sqrt(1.0 - _MEMORY**2 * _FORGOTTEN * GAIN**2)
+_EYE = np.eye(2)
 #: Age, in time constants, of the velocity that has carried the memory as far as it is from the image.
 MEMORY_AGE = 1.0 + 0.5 * _MEMORY
 # How far the time constant may be off, and the displacement of an edge by a response that is no exponential: a share of
@@ -56,17 +57,23 @@ def model_error(smear_px: FloatArray, corners_px: FloatArray, cells: int) -> Flo
     """
     common = smear_px.mean(axis=1)
     change = _LAG_UNSURE * (smear_px - common[:, None])
-    square = np.sum(common**2, axis=1)
-    carried = cells**2 * np.sum(_shares_of_sides(common, corners_px) ** 2, axis=1)
-    form = (_FORM_UNSURE**2 + (_FORM_UNSURE_IN_CELLS * carried) ** 2)[:, None, None]
-    along = common[:, :, None] * common[:, None, :] + square[:, None, None] * np.eye(2)
-    return np.asarray(change[..., :, None] * change[..., None, :] + 0.5 * (form * along)[:, None])
+    carried = cells**2 * _square_in_sides(common, corners_px)
+    form = 0.5 * (_FORM_UNSURE**2 + (_FORM_UNSURE_IN_CELLS * carried) ** 2)[:, None, None]
+    common = common[:, :, None]
+    along = common * common.swapaxes(1, 2) + (common * common).sum(axis=1, keepdims=True) * _EYE
+    return np.asarray(change[..., :, None] * change[..., None, :] + (form * along)[:, None])
 
 
-def _shares_of_sides(shift: FloatArray, corners: FloatArray) -> FloatArray:
-    """Shifts (N, 2) in mean sides of the markers with ``corners`` (N, 4, 2): of a tilted one these are not alike."""
+def _square_in_sides(shift: FloatArray, corners: FloatArray) -> FloatArray:
+    """Squares (N,) of shifts (N, 2) in mean sides of markers (N, 4, 2): of a tilted one these are not alike."""
     a, b = corners[:, 1] - corners[:, 3], corners[:, 2] - corners[:, 0]
-    return np.asarray(2.0 * np.linalg.solve(np.stack([a + b, b - a], axis=-1), shift[..., None])[..., 0])
+    # Twice the sides are a + b and b - a.
+    right, down = _cross(shift, b - a), _cross(a + b, shift)
+    return np.asarray((right * right + down * down) / _cross(a, b) ** 2)
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 
 def common_error(

@@ -20,13 +20,13 @@ from thermal_fiducial.core.vision.ids import pairs
 
 # Twist of which nothing is known: m/s and rad/s of a brisk flight.
 _UNKNOWN = np.full(6, 1.5**2)
-# Variance of an acceleration of which nothing is known [m/s^2, rad/s^2], and how long it lasts [s].
-_ACCELERATION, _LASTS_S = np.array([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2, 0.4
+# Covariance of an acceleration of which nothing is known [m/s^2, rad/s^2], and how long it lasts [s].
+_RANDOM, _LASTS_S = np.diag([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2, 0.4
 _STALE_S = 0.15
 # So many states of the filter tell the acceleration too, as well as the filter knows the vertical and its biases.
-_ENOUGH_STATES, _UNSURE_ACCELERATION = 4, np.array([0.3, 0.3, 0.3, 0.0, 0.0, 0.0]) ** 2
-# Variance of a twist that is said to be without error [m^2/s^2, rad^2/s^2].
-_LEAST_VARIANCE = 1e-6
+_ENOUGH_STATES, _UNSURE = 4, np.diag([0.3, 0.3, 0.3, 0.0, 0.0, 0.0]) ** 2
+# Covariance of a twist that is said to be without error [m^2/s^2, rad^2/s^2].
+_LEAST = 1e-6 * np.eye(6)
 # Jitter of the camera's stamps [s].
 _JITTER_S = 0.001
 # How far corners that lag displaces may be off their mean delay, where the form of smeared edges is unknown [lag].
@@ -36,7 +36,7 @@ _DELAY_UNSURE = 0.5
 _OUTLIER, _ROUNDS, _SETTLED = 12.0, 10, 0.02
 # Of the corners of a marker.
 _COORDINATES = 8
-_VALUE, _CHANGE = np.arange(6), np.arange(6, 12)
+_EYE = np.eye(6)
 # No camera that sees markers moves faster: such odometry tells nothing [m/s, rad/s].
 _FASTEST, _FASTEST_TURN = 20.0, 30.0
 
@@ -80,7 +80,10 @@ def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
 
 def camera_twist(odometry: Odometry, T_body_camera: FloatArray) -> Twist:
     """Twist of the camera from that of the body."""
-    transfer = _from_body(T_body_camera)
+    return _transferred(odometry, _from_body(T_body_camera))
+
+
+def _transferred(odometry: Odometry, transfer: FloatArray) -> Twist:
     return Twist(transfer @ _body_twist(odometry), transfer @ odometry.twist_covariance @ transfer.T)
 
 
@@ -186,29 +189,31 @@ class MotionTracker:
     """The camera's twist over the frames, and the markers that it saw."""
 
     def __init__(self, T_body_camera: FloatArray, lag: float = 0.0) -> None:
-        self._T_body_camera, self._lag = T_body_camera, lag
+        self._from_body, self._lag = _from_body(T_body_camera), lag
         self._stamp_ns: int | None = None
         self._twist: Twist | None = None
         self._seen = Tracked.none()
         self._last_seen_ns: int | None = None
 
-    def predict(self, stamp_ns: int, odometry: Sequence[Odometry]) -> Twist | None:
+    def predict(self, stamp_ns: int, odometry: Sequence[Odometry], told_ns: int | None = None) -> Twist | None:
         """Twist expected at a frame; None when nothing is known.
 
         Parameters
         ----------
-        odometry : states round the time that smears the frame, or the nearest that there is; in the camera's clock
+        odometry : states round the time that smears the frame, or the nearest that there is
+        told_ns : the frame's stamp in their clock, if that is not the camera's
         """
         dt = self._since(stamp_ns)
         carried = None
         if self._twist is not None and dt is not None and self._saw_lately(stamp_ns):
             carried = _carried(self._twist, dt)
+        told_ns = stamp_ns if told_ns is None else told_ns
         if len(odometry) >= _ENOUGH_STATES:
-            return _joined(carried or unknown_twist(), _line_through(stamp_ns, odometry, self._T_body_camera))
-        if len(odometry) == 0 or abs(stamp_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
+            return _joined(carried or unknown_twist(), _line_through(told_ns, odometry, self._from_body))
+        if len(odometry) == 0 or abs(told_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
             return carried
-        seen, later = camera_twist(odometry[-1], self._T_body_camera), (odometry[-1].stamp_ns - stamp_ns) * 1e-9
-        information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + np.diag(_growth(abs(later))[0])))
+        seen, later = _transferred(odometry[-1], self._from_body), (odometry[-1].stamp_ns - told_ns) * 1e-9
+        information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + _growth(abs(later))[0] * _RANDOM))
         return _corrected(carried or unknown_twist(), information, information @ seen.value, later)
 
     def expected(self, stamp_ns: int, twist: Twist) -> Tracked:
@@ -218,8 +223,7 @@ class MotionTracker:
             return Tracked.none()
         step = (0.5 * dt) * (twist.value + self._twist.value)
         moved = geometry.inverse(geometry.transform(geometry.so3_exp(step[3:]), step[:3]))
-        rays = np.concatenate([self._seen.x, np.ones((*self._seen.x.shape[:-1], 1))], axis=-1)
-        points = (rays * self._seen.depth[..., None]) @ moved[:3, :3].T + moved[:3, 3]
+        points = self._seen.depth[..., None] * (self._seen.x @ moved[:3, :2].T + moved[:3, 2]) + moved[:3, 3]
         depth = np.maximum(points[..., 2], 1e-3)
         return replace(self._seen, x=points[..., :2] / depth[..., None], depth=depth)
 
@@ -280,49 +284,60 @@ class MotionTracker:
 
 def unknown_twist() -> Twist:
     """That of a camera of which nothing is known."""
-    return Twist(np.zeros(6), np.diag(np.concatenate([_UNKNOWN, _ACCELERATION])))
+    return Twist(np.zeros(6), np.diag(np.concatenate([_UNKNOWN, _RANDOM.diagonal()])))
 
 
 def _carried(twist: Twist, seconds: float) -> Twist:
     """Twist so much later, its acceleration having died down a little and changed at random; or as much earlier."""
     left, sign = math.exp(-abs(seconds) / _LASTS_S), math.copysign(1.0, seconds)
     lasting = sign * _LASTS_S * (1.0 - left)
-    F = np.eye(12)
-    F[_VALUE, _CHANGE] = lasting
-    F[_CHANGE, _CHANGE] = left
-    covariance = F @ twist.covariance @ F.T
-    covariance[_VALUE, _VALUE] += (growth := _growth(abs(seconds)))[0]
-    covariance[_VALUE, _CHANGE] += sign * growth[1]
-    covariance[_CHANGE, _VALUE] += sign * growth[1]
-    covariance[_CHANGE, _CHANGE] += growth[2]
+    F = _of_blocks(1.0, lasting, 0.0, left, _IDENTITIES)
+    own, both, change = _growth(abs(seconds))
+    covariance = F @ twist.covariance @ F.T + _of_blocks(own, sign * both, sign * both, change, _RANDOMS)
     return Twist(twist.value + lasting * twist.acceleration, covariance, left * twist.acceleration)
 
 
-def _growth(seconds: float) -> FloatArray:
-    """Variances (3, 6) that a time adds to the twist, to it with its acceleration, and to that (Singer, eq. 7)."""
+def _growth(seconds: float) -> tuple[float, float, float]:
+    """Times :data:`_RANDOM`: what a time adds to the covariance of the twist, to that with its acceleration, and of it.
+
+    Singer, eq. 7.
+    """
     t, left = seconds / _LASTS_S, math.exp(-seconds / _LASTS_S)
-    twist, both = _LASTS_S**2 * (2.0 * t - 3.0 + 4.0 * left - left**2), _LASTS_S * (1.0 - left) ** 2
-    return np.asarray(np.multiply.outer([twist, both, 1.0 - left**2], _ACCELERATION))
+    own, both = _LASTS_S**2 * (2.0 * t - 3.0 + 4.0 * left - left**2), _LASTS_S * (1.0 - left) ** 2
+    return own, both, 1.0 - left**2
 
 
-def _line_through(stamp_ns: int, odometry: Sequence[Odometry], T_body_camera: FloatArray) -> Twist:
+def _blocks(matrix: FloatArray) -> FloatArray:
+    """Flat matrices (4, 144) that have a ``matrix`` (6, 6) as one of their four blocks."""
+    return np.stack([np.kron(block.reshape(2, 2), matrix).ravel() for block in np.eye(4)])
+
+
+def _of_blocks(a: float, b: float, c: float, d: float, blocks: FloatArray) -> FloatArray:
+    """Matrix (12, 12) of such blocks times a, b; c, d."""
+    return np.asarray((np.array([a, b, c, d]) @ blocks).reshape(12, 12))
+
+
+_IDENTITIES, _RANDOMS = _blocks(np.eye(6)), _blocks(_RANDOM)
+
+
+def _line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatArray) -> Twist:
     """Twist that changes evenly through those of K states.
 
     The error of the velocity is the same in all, that of a turn rate, a gyroscope's noise, is new in each.
     """
-    transfer = _from_body(T_body_camera)
-    values = np.stack([_body_twist(state) for state in odometry]) @ transfer.T
+    parts = [part for state in odometry for part in (state.velocity_body, state.angular_velocity_body)]
+    values = np.concatenate(parts).reshape(-1, 6) @ transfer.T
     t = np.array([(state.stamp_ns - stamp_ns) * 1e-9 for state in odometry])
     middle = float(t.mean())
     off = t - middle
     square = float(off @ off)
-    acceleration = off @ values / square
+    acceleration = (off / square) @ values
     typical = transfer @ (sum(state.twist_covariance for state in odometry) / len(t)) @ transfer.T
     noise = np.zeros((6, 6))
     noise[3:, 3:] = typical[3:, 3:]
-    slope = noise / square + np.diag(_growth(float(t[-1] - t[0]))[2] + _UNSURE_ACCELERATION)
+    slope = noise / square + _growth(float(t[-1] - t[0]))[2] * _RANDOM + _UNSURE
     covariance = np.empty((12, 12))
-    covariance[:6, :6] = noise / len(t) + middle**2 * slope + _LEAST_VARIANCE * np.eye(6)
+    covariance[:6, :6] = noise / len(t) + middle**2 * slope + _LEAST
     covariance[:3, :3] += typical[:3, :3]
     covariance[:6, 6:] = covariance[6:, :6] = -middle * slope
     covariance[6:, 6:] = slope
@@ -345,7 +360,7 @@ def _corrected(twist: Twist, information: FloatArray, weighted: FloatArray, late
     """
     P = twist.covariance
     HP = P[:6] + later * P[6:]
-    S = np.eye(6) + information @ (HP[:, :6] + later * HP[:, 6:])
+    S = _EYE + information @ (HP[:, :6] + later * HP[:, 6:])
     residual = weighted - information @ twist.ago(-later)
     solved = np.linalg.solve(S, np.concatenate([information @ HP, residual[:, None]], axis=1))
     change = HP.T @ solved
@@ -361,6 +376,6 @@ def _symmetric(P: FloatArray) -> FloatArray:
 def plausible(odometry: Odometry) -> bool:
     """Whether a camera that sees markers may move so: anything else tells nothing."""
     v, w = odometry.velocity_body, odometry.angular_velocity_body
-    # A sum of finite numbers is finite.
-    finite = math.isfinite(odometry.T_map_body.sum()) and math.isfinite(odometry.twist_covariance.sum())
+    # A sum of squares is finite when all numbers are.
+    finite = all(math.isfinite(np.vdot(each, each)) for each in (odometry.T_map_body, odometry.twist_covariance))
     return bool(v @ v <= _FASTEST**2 and w @ w <= _FASTEST_TURN**2 and finite)

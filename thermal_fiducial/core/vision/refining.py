@@ -48,8 +48,7 @@ _ROUNDS = 2
 class View:
     """A frame in which the smear of N markers is short."""
 
-    #: the frame as it is
-    image: Float32Array
+    frame: Frame
     #: (N, 4, 2) where the corners appear in the view, off their places at the stamp [px]
     shift: FloatArray
     #: (N, 4, 2) how much of the smear's shift is taken out
@@ -64,7 +63,7 @@ class View:
     def only(self, keep: BoolArray) -> 'View':
         """That of the markers ``keep`` (N,)."""
         return View(
-            self.image,
+            self.frame,
             self.shift[keep],
             self.removed[keep],
             self.spread[keep],
@@ -76,8 +75,8 @@ class View:
     def sharp(self, corners_px: FloatArray, which: IntArray, scratch: Scratch) -> Float32Array:
         """The view as an image, round the markers ``which`` with ``corners_px`` (N, 4, 2) in it."""
         which = which[self.sharpened[which]]
-        sharp = scratch.floats('sharp', self.image.shape)
-        return markers_sharpened(self.image, corners_px[which], self.off[which], WINDOW_MARGIN_PX, sharp)
+        sharp = scratch.floats('sharp', self.frame.counts.shape)
+        return markers_sharpened(self.frame.image, corners_px[which], self.off[which], WINDOW_MARGIN_PX, sharp)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +131,7 @@ class Refiner:
             behind = self._behind[found.ids]
             blur = config.blur_px, view.spread
             seen = refine_corners(
-                frame.image, start, frame.camera, behind, *blur, columns, near=near, memory=view.memory
+                frame.samples, start, frame.camera, behind, *blur, columns, near=near, memory=view.memory
             )
             refinement = self._at_stamp(frame, found, places, view, seen, twist)
             change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)
@@ -155,7 +154,7 @@ class Refiner:
         spread, past = mean * np.where(sharpen, SPREAD, 1.0)[:, None], None
         if sharpen.any():
             past = Memory(memory_maps(places.at.px + shift, memory), np.where(sharpen, GAIN, 1.0))
-        return View(frame.image, shift, removed, spread, sharpen, memory, past)
+        return View(frame, shift, removed, spread, sharpen, memory, past)
 
     def _at_stamp(
         self,

@@ -18,6 +18,9 @@ from thermal_fiducial.core.vision.scratch import Scratch
 # Full resolution sees small and smeared markers; half resolution, without the pattern of columns, faint ones.
 _FINE = Scale(smoothing_px=1.0, window_px=7, window_shrink=2, depth=0.2, floor=1.5)
 _FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0)
+# Among markers that are seen clearly noise is left alone, and with it what it would show of the faintest.
+_FINE_OF_CLEAR = _FINE._replace(floor=4.0)
+_FAINT_OF_CLEAR = _FAINT._replace(floor=4.0)
 # Weight of white surroundings against correlation in choosing among the outlines of a marker.
 _SURROUNDED = 0.2
 # Correlation beyond which an outline needs no alignment, and from which, by such a margin, it is worth one.
@@ -46,6 +49,7 @@ _NOISY = 8.0
 _PLATE_CELLS = 1.6
 # Nearer to the rim of the image than this [px] a marker may be cut off.
 _RIM = 2.0
+_NONE = np.zeros(0, dtype=np.intp)
 # Pixels along a side that the refinement uses of a long one.
 _SEEN_PX = 60.0
 
@@ -124,20 +128,22 @@ class BlindSearch:
         hidden = _grown(seen.corners_px, 1.0 + 2.0 * _PLATE_CELLS / decoder.cells)
         fine = faint = np.zeros((0, 4, 2))
         if Sought.FINE in sought:
-            fine = find_quads(dark(scene, noise, _FINE, self._scratch), config.min_side_px, hidden)
-        if Sought.FAINT not in sought and len(fine) == 0:
-            return Found.none()
-        half = without_columns(halved(image, self._scratch), 0.5 * noise, self._scratch)
+            scale = _FINE if sought == Sought.ALL else _FINE_OF_CLEAR
+            fine = find_quads(dark(scene, noise, scale, self._scratch), config.min_side_px, hidden)
+        half = image
         if Sought.FAINT in sought:
+            half = without_columns(halved(image, self._scratch), 0.5 * noise, self._scratch)
             views = [half if kind > 0.0 else -half for kind in kinds]
-            faint = np.concatenate([self._faint(view, noise, config.min_side_px, hidden) for view in views])
+            scale = _FAINT if sought == Sought.ALL else _FAINT_OF_CLEAR
+            faint = np.concatenate([self._faint(view, noise, scale, config.min_side_px, hidden) for view in views])
         if len(fine) + len(faint) == 0:
             return Found.none()
         # Blur may leave nothing to be seen of a border between two white ones but the outline of the whole plate.
         fine, faint = (np.concatenate([outlines, shrunk(outlines, decoder.cells)]) for outlines in (fine, faint))
         quads = np.concatenate([fine, faint])
         reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, _halfway(faint), allowed))
-        rough = _rough(reading, quads, seen.ids)
+        # At full resolution alone those are sought that show clearly, if not now then in a frame to come.
+        rough = _rough(reading, quads, seen.ids) if Sought.FAINT in sought else _NONE
         if len(rough):
             better = aligned(half, _halfway(quads[rough]), reading.ids[rough], reading.turns[rough], decoder)
             reading = _joined(reading, decoder.read(half, better, allowed))
@@ -147,9 +153,11 @@ class BlindSearch:
         good &= ~_inside_out(reading, quads, good, distinct(reading, noise, config))
         return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), noise)
 
-    def _faint(self, half: Float32Array, noise: float, min_side_px: float, hidden: FloatArray) -> FloatArray:
+    def _faint(
+        self, half: Float32Array, noise: float, scale: Scale, min_side_px: float, hidden: FloatArray
+    ) -> FloatArray:
         """Quadrilaterals of faint markers (Q, 4, 2) at half the resolution, in pixels of the full one."""
-        mask = dark(half, 0.5 * noise, _FAINT, self._scratch)
+        mask = dark(half, 0.5 * noise, scale, self._scratch)
         return 2.0 * find_quads(mask, 0.5 * min_side_px + 2.0, _halfway(hidden)) + 0.5
 
 
