@@ -233,6 +233,10 @@ class ImagePoints:
         x = self.x + (self.inverse @ shift_px[..., None])[..., 0]
         return ImagePoints(camera.distort(x), x, self.J, self.inverse)
 
+    def at_pixels(self, px: FloatArray) -> 'ImagePoints':
+        """Those at pixels (..., 2) that are so near that what is left of the distortion's curvature is nothing."""
+        return ImagePoints(px, self.x + (self.inverse @ (px - self.px)[..., None])[..., 0], self.J, self.inverse)
+
     def only(self, keep: BoolArray | IntArray) -> 'ImagePoints':
         """Those at the places ``keep`` of the first axis."""
         return ImagePoints(self.px[keep], self.x[keep], self.J[keep], self.inverse[keep])

@@ -48,9 +48,16 @@ class RefinedCorners:
 
     def only(self, keep: BoolArray | IntArray) -> 'RefinedCorners':
         """Those of the markers ``keep``."""
-        return RefinedCorners(
-            self.corners_px[keep], self.covariances[keep], self.contrast[keep], self.noise[keep], self.doubt[keep]
-        )
+        return RefinedCorners(*(values[keep] for values in self._arrays))
+
+    def put(self, which: IntArray, others: 'RefinedCorners') -> None:
+        """Replace those of the markers ``which`` by ``others``."""
+        for values, new in zip(self._arrays, others._arrays, strict=True):
+            values[which] = new
+
+    @property
+    def _arrays(self) -> tuple[FloatArray, ...]:
+        return self.corners_px, self.covariances, self.contrast, self.noise, self.doubt
 
 
 def refine_corners(
@@ -78,21 +85,24 @@ def refine_corners(
     near : (N,) which corners are good to a pixel already, so that nothing wide need catch them
     memory : what to take out of the image; nothing when left out
     """
-    count = len(corners.px)
-    smear = np.zeros((count, 2)) if smear_px is None else smear_px
+    smear = np.zeros((len(corners.px), 2)) if smear_px is None else smear_px
     task = _Task(image, camera, corners, behind, smear, columns, memory)
-    found = RefinedCorners(
-        corners.px.copy(), np.zeros((count, 4, 2, 2)), np.zeros(count), np.zeros(count), np.zeros(count)
-    )
-    far = np.arange(count) if near is None else np.flatnonzero(~near)
+    start = corners
+    far = np.arange(len(corners.px)) if near is None else np.flatnonzero(~near)
     if len(far):
-        _improve(found, far, task, _WIDE * blur_px, _PRIOR_OF_SHAPE)
-    away = np.arange(count)
-    for _ in range(_PASSES):
+        caught = corners.px.copy()
+        caught[far] = _pass(task.only(far), corners.only(far), _WIDE * blur_px, _PRIOR_OF_SHAPE)[0].corners_px
+        start = task.seen_from(caught)
+    found, step = _pass(task, start, blur_px, _PRIOR)
+    for _ in range(_PASSES - 1):
+        away = np.flatnonzero(step > np.where(found.doubt > 0.0, _STILL_PX, _SETTLED_PX))
         if len(away) == 0:
             break
-        step = _improve(found, away, task, blur_px, _PRIOR)
-        away = away[step > np.where(found.doubt[away] > 0.0, _STILL_PX, _SETTLED_PX)]
+        part = task.only(away)
+        again, further = _pass(part, part.seen_from(found.corners_px[away]), blur_px, _PRIOR)
+        found.put(away, again)
+        step[:] = 0.0
+        step[away] = further
     return found
 
 
@@ -122,30 +132,17 @@ class _Task:
         return self.corners.moved(moved, self.camera) if moved.any() else self.corners
 
 
-def _improve(found: RefinedCorners, which: IntArray, task: _Task, optics: float, prior: FloatArray) -> FloatArray:
-    """Longest step (n,) of the corners of the markers ``which`` (n,) in one pass; where they get to is put in place."""
-    part = task.only(which)
-    start = part.seen_from(found.corners_px[which])
-    shift, *rest = _pass(part, start, optics, prior)
-    found.corners_px[which] = start.px + shift
-    for array, values in zip((found.covariances, found.contrast, found.noise, found.doubt), rest, strict=True):
-        array[which] = values
-    return np.asarray(np.abs(shift).max(axis=(1, 2)))
-
-
-def _pass(
-    task: _Task, start: ImagePoints, optics: float, prior: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """One linearised adjustment: shifts (N, 4, 2), then covariances, contrasts, noise and doubts of RefinedCorners."""
+def _pass(task: _Task, start: ImagePoints, optics: float, prior: FloatArray) -> tuple[RefinedCorners, FloatArray]:
+    """Where one linearised adjustment moves the corners, and the longest step (N,) of each marker."""
     cells = task.behind.shape[2]
-    widest = math.hypot(optics, math.sqrt(float(np.sum(task.smear * task.smear, axis=1).max())))
+    widest = math.hypot(optics, math.sqrt(float((task.smear * task.smear).sum(axis=1).max())))
     half = min(max(math.ceil(2.5 * widest + 1.0), 4), 10)
     sides = sides_of(start.x, task.camera, task.image.shape, cells, task.columns, half)
     blur = edges.blurs(sides.normal[cells // 2], optics, task.smear)
     counts = counts_across(task.image, sides, task.memory)
     segments = measure(counts, edges.model(sides, task.behind, blur), _REACHED * blur[0])
-    moved, covariances, doubt = adjust(sides, segments, prior, start)
+    shift, covariances, doubt = adjust(sides, segments, prior, start)
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]
-    contrast, noise = np.sum(segments.contrast * share, axis=1), np.sqrt(np.sum(segments.noise * share, axis=1))
-    return moved, covariances, contrast, noise, doubt
+    contrast, noise = (segments.contrast * share).sum(axis=1), np.sqrt((segments.noise * share).sum(axis=1))
+    return RefinedCorners(start.px + shift, covariances, contrast, noise, doubt), np.abs(shift).max(axis=(1, 2))

@@ -16,6 +16,8 @@ from thermal_fiducial.core.types import FloatArray
 
 # Below this angle [rad] the Taylor series is exact to double precision (the next term is angle^6 / 5040).
 SMALL_ANGLE = 1e-2
+# Of a corner of a quadrilateral, the next and the opposite one.
+_NEXT, _OPPOSITE = np.array([1, 2, 3, 0]), np.array([2, 3, 0, 1])
 
 
 def skew(v: npt.ArrayLike) -> FloatArray:
@@ -203,18 +205,35 @@ def rotation_angle(R: npt.ArrayLike) -> FloatArray:
 def in_quadrilaterals(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
     """Points (2, Q, P) at shares a, b, (P,) or (Q, P), of plane quadrilaterals (Q, 4, 2).
 
-    The projective map of the unit square (P. Heckbert, "Fundamentals of texture mapping and image warping", 1989,
-    section 2.2.3): a from the first corner to the second, b from the first to the fourth.
+    a from the first corner to the second, b from the first to the fourth.
     """
-    d1, d2, d3 = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2], c[:, 0] - c[:, 1] + c[:, 2] - c[:, 3]
-    determinant = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-    H = np.ones((3, len(c), 3))
-    H[2, :, 0] = g = (d3[:, 0] * d2[:, 1] - d3[:, 1] * d2[:, 0]) / determinant
-    H[2, :, 1] = h = (d1[:, 0] * d3[:, 1] - d1[:, 1] * d3[:, 0]) / determinant
-    H[:2, :, 0] = (c[:, 1] - c[:, 0] + g[:, None] * c[:, 1]).T
-    H[:2, :, 1] = (c[:, 3] - c[:, 0] + h[:, None] * c[:, 3]).T
-    H[:2, :, 2] = c[:, 0].T
-    shares = np.stack([a, b, np.ones_like(a)], axis=-2)
-    points = H @ shares if a.ndim == 1 else (H[:, :, None] @ shares)[:, :, 0]
+    return seen_between(c, bilinear(a, b))
+
+
+def bilinear(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Weights (..., 4, P) of a square's corners in its points at shares a, b (..., P)."""
+    return np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), a * b, (1.0 - a) * b], axis=-2)
+
+
+def seen_between(c: FloatArray, weights: FloatArray) -> FloatArray:
+    """Points (2, Q, P) that have ``weights`` (4, P) or (Q, 4, P) in a square, of its views with corners (Q, 4, 2).
+
+    In homogeneous coordinates, which leave straight what is straight, they are the same means of the corners.
+    """
+    corners = np.empty((3, *c.shape[:2]))
+    corners[2] = perspective(c)
+    np.multiply(c.transpose(2, 0, 1), corners[2], out=corners[:2])
+    points = corners @ weights if weights.ndim == 2 else (corners[:, :, None] @ weights)[:, :, 0]
     return np.asarray(points[:2] / points[2])
+
+
+def perspective(c: FloatArray) -> FloatArray:
+    """Third homogeneous coordinates (Q, 4) that make views (Q, 4, 2) of the corners of squares: alike from in front.
+
+    The diagonals of a square halve each other. What they do in its view, the triangles of all corners but one tell.
+    """
+    to_next = c.take(_NEXT, axis=1) - c
+    a, b = to_next.take(_NEXT, axis=1), to_next.take(_OPPOSITE, axis=1)
+    triangle = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    triangle[np.abs(triangle) < 1e-12] = 1e-12
+    return np.asarray(triangle)

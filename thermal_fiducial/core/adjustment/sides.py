@@ -9,13 +9,13 @@ from functools import cache
 
 import numpy as np
 
+from thermal_fiducial.core import geometry
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Corners between which the sides lie: top and bottom from left to right, left and right from the top down.
 STARTS, ENDS = np.array([0, 3, 0, 1]), np.array([1, 2, 3, 2])
 _OPPOSITE = np.array([1, 0, 3, 2])
-_NEXT, _AFTER_NEXT = np.array([1, 2, 3, 0]), np.array([2, 3, 0, 1])
 # A curved side is a quartic through five of its points, at these shares of it.
 _NODES = np.linspace(0.0, 1.0, 5)
 # Pixels of the image that a side must have on both sides, and by how many a curve may pass the nodes it goes through.
@@ -91,14 +91,8 @@ def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, 
 
 
 def _nodes(x: FloatArray, camera: Camera) -> FloatArray:
-    """Pixels (4 N, 5, 2) of five points on every side of quadrilaterals (N, 4, 2), normalised.
-
-    Four corners are in perspective with those of a square when each has the weight of the triangle of the others.
-    """
-    to_next = x.take(_NEXT, axis=1) - x
-    a, b = to_next.take(_NEXT, axis=1), to_next.take(_AFTER_NEXT, axis=1)
-    weight = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    weight[np.abs(weight) < 1e-12] = 1e-12
+    """Pixels (4 N, 5, 2) of five points on every side of quadrilaterals (N, 4, 2), normalised."""
+    weight = geometry.perspective(x)
     start, end = x.take(STARTS, axis=1), x.take(ENDS, axis=1)
     ratio = (weight.take(ENDS, axis=1) / weight.take(STARTS, axis=1))[..., None]
     share = _NODES * ratio / (1.0 + _NODES * (ratio - 1.0))

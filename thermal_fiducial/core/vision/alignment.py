@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.geometry import in_quadrilaterals
+from thermal_fiducial.core.geometry import bilinear, seen_between
 from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
 from thermal_fiducial.core.vision.decoding import Decoder, sampled
 
@@ -33,10 +33,8 @@ _LONGEST = 0.6
 class _Grid(NamedTuple):
     """The P samples of a marker with m x m cells."""
 
-    #: (P,) shares of the sides
-    a: FloatArray
-    b: FloatArray
-    #: (4, P) by how much each sample moves with each corner
+    #: (4, P) of :func:`bilinear`, and the same as by how much each sample moves with each corner
+    places: FloatArray
     weights: Float32Array
     #: (6, P) background: constant, slopes, curvatures
     smooth: Float32Array
@@ -50,15 +48,15 @@ def _grid(cells: int) -> _Grid:
     a, b = (axis.ravel() / cells for axis in np.meshgrid(share, share))
     x, y = a - 0.5, b - 0.5
     smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).astype(np.float32)
-    weights = np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), a * b, (1.0 - a) * b]).astype(np.float32)
-    return _Grid(a, b, weights, smooth, _blur(share, cells))
+    places = bilinear(a, b)
+    return _Grid(places, places.astype(np.float32), smooth, _blur(share, cells))
 
 
 def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArray, decoder: Decoder) -> FloatArray:
     """Quadrilaterals (Q, 4, 2) moved to where ``image`` looks most like the markers ``ids`` (Q,), turned (Q,)."""
     grid = _grid(decoder.cells)
     cells = np.pad(decoder.seen(ids, turns), ((0, 0), (1, 1), (1, 1)), constant_values=1.0)
-    J = np.empty((len(ids), 15, len(grid.a)), dtype=np.float32)
+    J = np.empty((len(ids), 15, grid.places.shape[1]), dtype=np.float32)
     J[:, 8:14] = grid.smooth
     J[:, 14] = (grid.blur @ cells @ grid.blur.T).reshape(len(ids), -1)
     image, origin = _window(image, quads, decoder.cells)
@@ -68,7 +66,7 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
     slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.125)
     planes: list[Float32Array] = [np.asarray(plane) for plane in (picture, slope_u, slope_v)]
     for _ in range(_STEPS):
-        places = in_quadrilaterals(quads, grid.a, grid.b).astype(np.float32)
+        places = seen_between(quads, grid.places).astype(np.float32)
         value, du, dv = (sampled(plane, places)[:, None] for plane in planes)
         np.multiply(du, grid.weights, out=J[:, :4])
         np.multiply(dv, grid.weights, out=J[:, 4:8])

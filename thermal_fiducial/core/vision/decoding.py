@@ -10,7 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.geometry import in_quadrilaterals
+from thermal_fiducial.core.geometry import bilinear, in_quadrilaterals, seen_between
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 
 # How far off a side black and white are compared: in cells, and at most in pixels.
@@ -86,7 +86,7 @@ class Decoder:
         #: (M,) by how much a perfect view of each marker correlates better with itself than with any other
         self.isolation = 1.0 - likeness.max(axis=1)
         share = ((np.arange(self.cells)[:, None] + _SAMPLES) / self.cells).ravel()
-        self._a, self._b = (axis.ravel() for axis in np.meshgrid(share, share))
+        self._samples = bilinear(*(axis.ravel() for axis in np.meshgrid(share, share)))
         mean = np.kron(np.eye(self.cells), np.full((len(_SAMPLES), 1), 1.0 / len(_SAMPLES)))
         self._cells_of_samples = (np.kron(mean, mean) @ self._detrend).astype(np.float32)
 
@@ -106,7 +106,7 @@ class Decoder:
     def likeness(self, image: Counts | Float32Array, quads: FloatArray, allowed: BoolArray | None = None) -> Likeness:
         """Most similar patterns of quadrilaterals (Q, 4, 2) among those ``allowed`` (M,), or all."""
         values = self._contrasts(image, quads)
-        spread = np.sqrt(np.sum(values * values, axis=1, keepdims=True))
+        spread = np.sqrt((values * values).sum(axis=1, keepdims=True))
         similar = (values / np.maximum(spread, 1e-9)) @ self._patterns.T
         if allowed is not None:
             similar = np.where(np.repeat(allowed, 4), similar, 0.0)
@@ -163,7 +163,7 @@ class Decoder:
 
     def _contrasts(self, image: Counts | Float32Array, quads: FloatArray) -> FloatArray:
         """Mean counts (Q, m * m) of the cells without the background."""
-        values = sampled(image, in_quadrilaterals(quads, self._a, self._b).astype(np.float32))
+        values = sampled(image, seen_between(quads, self._samples).astype(np.float32))
         return np.asarray((values - values[:, :1]) @ self._cells_of_samples, dtype=np.float64)
 
 

@@ -42,6 +42,7 @@ _CLEAR, _HARDLY_SMEARED_PX = 20.0, 0.2
 # Columns of pixels used of a cell; all of a faint marker's count.
 _COLUMNS, _COLUMNS_FAINT = 6, 12
 _ROUNDS = 2
+_NEXT = np.array([1, 2, 3, 0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +187,7 @@ class Refiner:
         if frame.twist is None:
             unknown = unknown + self._never_seen(frame, places, seen, twist)
         refined = replace(seen, corners_px=corners, covariances=seen.covariances + _doubts(seen) + unknown)
-        return Refinement(view, seen, refined, replace(places, at=at.moved(corners - at.px, frame.camera)), twist)
+        return Refinement(view, seen, refined, replace(places, at=at.at_pixels(corners)), twist)
 
     def _never_seen(self, frame: Frame, places: Places, seen: RefinedCorners, twist: Twist) -> FloatArray:
         """Covariances (N, 4, 2, 2) [px^2] by a motion that the frames before tell nothing of."""
@@ -210,5 +211,5 @@ def _worth_sharpening(square: FloatArray, cell: FloatArray, cells: int, clarity:
 
 def sides_px(corners: FloatArray) -> FloatArray:
     """Mean sides (N,) of quadrilaterals (N, 4, 2)."""
-    span = corners[:, [1, 2, 3, 0]] - corners
-    return np.asarray(np.sqrt(np.sum(span * span, axis=-1)).mean(axis=1))
+    span = corners.take(_NEXT, axis=1) - corners
+    return np.asarray(0.25 * np.sqrt((span * span).sum(axis=-1)).sum(axis=1))
