@@ -385,6 +385,13 @@ class ImuNoise:
     accelerometer_random_walk: float = param(
         3.0e-4, 'Accelerometer bias random walk.', unit='m/s^3/sqrt(Hz)', minimum=0.0
     )
+    gyroscope_scale_std: float = param(
+        0.01,
+        'Scale and cross-axis errors of the gyroscope (standard deviation of each), which are estimated while running; '
+        '0: none.',
+        minimum=0.0,
+        maximum=0.1,
+    )
     gyroscope_range: float = param(34.9, 'Readings beyond this are saturated.', unit='rad/s', minimum=0.1)
     accelerometer_range: float = param(156.0, 'Readings beyond this are saturated.', unit='m/s^2', minimum=10.0)
     vibration: float = param(

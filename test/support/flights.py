@@ -138,7 +138,7 @@ def matched(**changes) -> PoseEkfConfig:
         'pose_noise_scale': 1.0,
         'initial_gyroscope_bias_std': 0.005,
         'initial_accelerometer_bias_std': 0.05,
-        'imu': ImuNoise(vibration=0.0),
+        'imu': ImuNoise(vibration=0.0, gyroscope_scale_std=0.0),
     }
     return config(**(exact | changes))
 

@@ -412,6 +412,7 @@ class PoseEkf:
                 'vibration share': self.state.aliasing.share,
                 'gyroscope bias': float(np.linalg.norm(self.state.bias[:3])),
                 'accelerometer bias': float(np.linalg.norm(self.state.bias[3:])),
+                'gyroscope scale error': float(np.abs(self.state.gyroscope_scale).max()),
                 'map tilt': math.asin(float(np.hypot(*self.state.gravity[:2])) / self._config.gravity),
             }
         return numbers

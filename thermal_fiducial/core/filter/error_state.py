@@ -106,7 +106,8 @@ class ErrorStateFilter:
 
     def predict(self, state: NavigationState, step: ImuStep) -> NavigationState:
         """State after an inertial step."""
-        rotation, dv, dp = self._transition.compute(step, state.bias)
+        rate = step.imu[:3]
+        rotation, dv, dp = self._transition.compute(step, np.concatenate((state.rate_error(rate), state.bias[3:])))
         dt = step.seconds
         R = state.R_map_body
         R_next = R @ rotation
@@ -115,6 +116,9 @@ class ErrorStateFilter:
             horizontal = R_next[:2].T
             F[VELOCITY, self.layout.gravity] = horizontal * dt
             F[POSITION, self.layout.gravity] = horizontal * (0.5 * dt * dt)
+        if self.layout.gyroscope_scale:
+            # The error that a share of the rate makes is that of a bias as large.
+            F[:9, self.layout.gyroscope_scale] = np.multiply.outer(F[:9, GYROSCOPE_BIAS], rate).reshape(9, 9)
         algebra = self._algebra
         algebra.P, algebra.F, algebra.Q = state.covariance, F, self._transition.Q
         algebra.predict()
@@ -124,6 +128,7 @@ class ErrorStateFilter:
             state.velocity + fall + R @ dv,
             state.position + (state.velocity + 0.5 * fall) * dt + R @ dp,
             state.bias,
+            state.gyroscope_scale,
             state.gravity,
             state.time_offset,
             state.clock_open,
@@ -152,7 +157,7 @@ class ErrorStateFilter:
 
         ``late`` [s] is how much later the state is than the pose.
         """
-        twist = np.concatenate((motion.imu[:3] - state.bias[:3], state.velocity_body))
+        twist = np.concatenate((motion.imu[:3] - state.rate_error(motion.imu[:3]), state.velocity_body))
         H = self._H_pose
         if state.clock_open:
             H = H.copy()
@@ -221,7 +226,7 @@ class ErrorStateFilter:
         X(t + s) = X(t) Exp((rate, acceleration, velocity) s).
         """
         slide = np.zeros(self.layout.size)
-        slide[ROTATION] = state.bias[:3] - imu[:3]
+        slide[ROTATION] = state.rate_error(imu[:3]) - imu[:3]
         slide[VELOCITY] = state.bias[3:] - imu[3:] - state.gravity @ state.R_map_body
         slide[POSITION] = -state.velocity_body
         slide[self.layout.time_offset] = 1.0
@@ -272,7 +277,7 @@ class ErrorStateFilter:
         """State corrected by the angular rate (3,) of a robot at rest, known to ``std`` [rad/s]."""
         H = np.zeros((3, self.layout.size))
         H[:, GYROSCOPE_BIAS] = np.eye(3)
-        return self._update(state, rate - state.bias[:3], H, std**2 * np.eye(3))
+        return self._update(state, rate - state.rate_error(rate), H, std**2 * np.eye(3))
 
     def _update(
         self, state: NavigationState, innovation: FloatArray, H: FloatArray, noise: FloatArray

@@ -70,6 +70,7 @@ def blank_state(config: PoseEkfConfig, layout: Layout) -> NavigationState:
         velocity=np.zeros(3),
         position=np.zeros(3),
         bias=np.zeros(6),
+        gyroscope_scale=np.zeros((3, 3)),
         gravity=np.array([0.0, 0.0, -config.gravity]),
         time_offset=0.0,
         clock_open=False,
@@ -117,6 +118,8 @@ def _unaligned(config: PoseEkfConfig, layout: Layout, pose: BodyPose, prior: Nav
     if layout.extrinsics:
         stds = (config.extrinsics_orientation_std, config.extrinsics_position_std)
         variances[layout.extrinsics] = np.repeat(np.square(stds), 3)
+    if layout.gyroscope_scale:
+        variances[layout.gyroscope_scale] = config.imu.gyroscope_scale_std**2
     P = np.diag(variances)
     P[np.ix_(POSE, POSE)] += pose.covariance
     return replace(

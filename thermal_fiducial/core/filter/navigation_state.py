@@ -32,12 +32,14 @@ class Layout:
     """Places of the error coordinates that are estimated on request, after the first 15.
 
     ``gravity``: its two horizontal components in the map [m/s^2]; ``time_offset`` [s]; ``extrinsics``: rotation
-    and position of T_body_camera, perturbed from the left, thus in the robot frame [rad, m].
+    and position of T_body_camera, perturbed from the left, thus in the robot frame [rad, m]; ``gyroscope_scale``: the
+    matrix of scale and cross-axis errors, row by row.
     """
 
     gravity: slice | None
     time_offset: int | None
     extrinsics: slice | None
+    gyroscope_scale: slice | None
     size: int
 
     @classmethod
@@ -50,7 +52,9 @@ class Layout:
         size += 0 if time_offset is None else 1
         extrinsics = slice(size, size + 6) if config.estimate_extrinsics else None
         size += 6 if extrinsics else 0
-        return cls(gravity, time_offset, extrinsics, size)
+        scale = slice(size, size + 9) if config.imu.gyroscope_scale_std > 0.0 else None
+        size += 9 if scale else 0
+        return cls(gravity, time_offset, extrinsics, scale, size)
 
 
 @dataclass(slots=True)
@@ -65,6 +69,8 @@ class NavigationState:
     position: FloatArray
     #: (6,) gyroscope [rad/s], then accelerometer [m/s^2]
     bias: FloatArray
+    #: (3, 3) error of the measured rate, in shares of it
+    gyroscope_scale: FloatArray
     #: (3,) in the map [m/s^2]
     gravity: FloatArray
     #: [s], t_imu = t_camera + camera_time_offset + time_offset
@@ -89,6 +95,10 @@ class NavigationState:
         """(3,) velocity in the robot frame [m/s]."""
         return self.velocity @ self.R_map_body
 
+    def rate_error(self, rate: FloatArray) -> FloatArray:
+        """(3,) of a measured ``rate`` (3,) [rad/s]."""
+        return self.bias[:3] + self.gyroscope_scale @ rate
+
 
 def inject(state: NavigationState, error: FloatArray, covariance: FloatArray, layout: Layout) -> NavigationState:
     """``state`` moved by ``error`` (n,), X Exp(xi) for the group part, with a new covariance (n, n)."""
@@ -108,6 +118,8 @@ def inject(state: NavigationState, error: FloatArray, covariance: FloatArray, la
     if layout.extrinsics:
         rotation, left, _ = rotation_integrals(error[layout.extrinsics][:3])
         moved.T_body_camera = transform(rotation, left @ error[layout.extrinsics][3:]) @ state.T_body_camera
+    if layout.gyroscope_scale:
+        moved.gyroscope_scale = state.gyroscope_scale + error[layout.gyroscope_scale].reshape(3, 3)
     return moved
 
 

@@ -27,7 +27,7 @@ def odometry(stamp_ns: int, state: NavigationState, rate: FloatArray, rate_varia
         stamp_ns,
         state.T_map_body,
         velocity_body,
-        rate - state.bias[:3],
+        rate - state.rate_error(rate),
         covariance[:6, :6],
         twist_covariance,
     )
