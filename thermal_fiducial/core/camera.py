@@ -143,7 +143,7 @@ class Camera:
         z = points[..., 2]
         in_front = z > 1e-9
         x = points[..., :2] / np.where(in_front, z, 1.0)[..., None]
-        return x, np.asarray(in_front & (np.sum(x * x, axis=-1) < self._fold_radius**2))
+        return x, np.asarray(in_front & ((x * x).sum(axis=-1) < self._fold_radius**2))
 
     @cached_property
     def _fold_radius(self) -> float:

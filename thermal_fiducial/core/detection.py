@@ -54,6 +54,7 @@ _INCOMPLETE = 2
 _MEMORY_LAGS, _STATES, _SHORTEST_LAG_S = 3, 10, 0.005
 # Corners of a marker of side 1 in its plane.
 _FACE = marker_corners(1.0)[:, :2]
+_NONE_FOUND, _NONE_FOLLOWED = Found.none(), Followed.none()
 # Depth of the scene while no marker has told it [m].
 _TYPICAL_DEPTH = 3.0
 
@@ -132,13 +133,13 @@ class MarkerDetector:
                 self._motion.remember(stamp_ns, twist, Tracked.none())
                 self._polarity.learn(np.zeros(0))
                 return np.zeros(0, dtype=MARKER_DTYPE)
-            ids, refinement = self._refined(frame, found, followed)
+            ids, refinement = self._refined(frame, found, followed, in_map)
             self._learn_offset(frame, in_map, ids, refinement.places)
             corners, at = refinement.corners, refinement.places.at
             if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
                 corners = local_corners(frame.image, corners, self._decoder.cells)
                 at = ImagePoints.at(corners.corners_px, camera)
-            elif counts[::8].max() < LEVELS:
+            elif counts[::64].max() < LEVELS:
                 corners = self._displayed.corrected(frame, ids, refinement, self.config.blur_px)
                 at = ImagePoints.at(corners.corners_px, camera)
             poses = self._poses(ids, corners, at, T_camera_map)
@@ -192,7 +193,7 @@ class MarkerDetector:
 
     def _find(self, frame: Frame, in_map: Expected | None) -> tuple[Found, Followed]:
         """Markers where they should be, and whatever a blind search shows, when that is due; and which are followed."""
-        expected, followed, complete, holds = Found.none(), Followed.none(), False, False
+        expected, followed, complete, holds = _NONE_FOUND, _NONE_FOLLOWED, False, False
         if frame.twist is not None and self.config.guided:
             last = Followed.of(self._motion.expected(frame.stamp_ns, frame.twist), frame)
             ids, corners, _, depth = self._expected(frame.camera, last, in_map)
@@ -283,20 +284,33 @@ class MarkerDetector:
         field = self._field.full(coarse)
         return without_lag(image, field[..., 0], field[..., 1])
 
-    def _refined(self, frame: Frame, found: Found, followed: Followed) -> tuple[IntArray, Refinement]:
+    def _refined(
+        self, frame: Frame, found: Found, followed: Followed, in_map: Expected | None
+    ) -> tuple[IntArray, Refinement]:
         """IDs and refined corners of the markers that these confirm."""
         near = among(found.ids, followed.ids)
-        places = followed.places if len(followed.ids) == len(found.ids) and near.all() else self._places(frame, found)
+        if len(followed.ids) == len(found.ids) and near.all():
+            places = followed.places
+        else:
+            known = [] if in_map is None else [(in_map.ids, in_map.depth)]
+            places = self._places(frame, found, *known, (followed.ids, followed.places.depth))
         self._depth = float(places.depth.mean())
         refinement = self._refiner.refine(frame, found, places, near, self.config)
         keep = self._confirmed(frame, found, refinement, followed)
         return found.ids[keep], refinement.only(keep)
 
-    def _places(self, frame: Frame, found: Found) -> Places:
-        """Where markers are whose poses are not known yet."""
+    def _places(self, frame: Frame, found: Found, *known: tuple[IntArray, FloatArray]) -> Places:
+        """Where markers are: of those that are ``known``, by ID, the corners' depths; the others may be tilted wrongly.
+
+        Seen obliquely and approached, a marker that is tilted the wrong way would be smeared across instead of along.
+        """
         at = ImagePoints.at(found.corners_px, frame.camera)
         sizes = self._sizes_of(found.ids)
-        return Places.of(at, _depths(ippe_square(at.x, sizes)[:, 0], sizes))
+        depth = _depths(ippe_square(at.x, sizes)[:, 0], sizes)
+        for ids, depth_of_known in known:
+            one, other = pairs(ids, found.ids)
+            depth[other] = depth_of_known[one]
+        return Places.of(at, depth)
 
     def _confirmed(self, frame: Frame, found: Found, refinement: Refinement, followed: Followed) -> BoolArray:
         """Which markers look like themselves at their refined corners: how the motion is known does not matter."""

@@ -52,10 +52,10 @@ def _changes(inward: Float32Array) -> Float32Array:
 
 def blurs(normal: FloatArray, optics: float, smear: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Blur (E,) across and along sides with normals (E, 2), of markers with smear (N, 2) [px]."""
-    vector = np.repeat(smear, len(normal) // len(smear), axis=0)
-    across = np.sum(vector * normal, axis=1)
-    along = vector[:, 1] * normal[:, 0] - vector[:, 0] * normal[:, 1]
-    return np.hypot(optics, across), np.hypot(optics, along)
+    u, v = normal[:, 0].reshape(len(smear), -1), normal[:, 1].reshape(len(smear), -1)
+    across, along = smear[:, :1] * u + smear[:, 1:] * v, smear[:, 1:] * u - smear[:, :1] * v
+    square = optics * optics
+    return np.sqrt(square + across * across).ravel(), np.sqrt(square + along * along).ravel()
 
 
 def model(

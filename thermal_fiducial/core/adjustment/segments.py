@@ -28,8 +28,8 @@ _FLOOR, _COMMON_FLOOR = 0.010**2 * np.eye(8), 0.005**2 * np.eye(2)
 # Contrast of a segment over that of the marker: less is hidden, more is the edge of something else; and by how much the
 # contrast of a plate varies.
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
-# Weights of segments are found in so many rounds.
-_ROUNDS = 3
+# Weights of segments are found in so many rounds, or fewer when they no longer change by more.
+_ROUNDS, _SETTLED = 3, 0.1
 _SIDES = np.arange(4)
 # Products of the columns of a segment's least squares, and of columns and products together.
 _PRODUCTS = (1, 1), (1, 2), (2, 2), (1, 3), (2, 3), (3, 3)
@@ -123,7 +123,9 @@ def measure(
         X[:4] *= alike.astype(np.float32)
         fit = _fit(_by_marker(_moments(X), cells))
         noise = _noise(fit)
-    return _judged(fit, noise, np.tile(reach.reshape(-1, 4), cells))
+    farthest = np.empty((len(reach) // 4, cells, 4))
+    farthest[:] = reach.reshape(-1, 1, 4)
+    return _judged(fit, noise, farthest.reshape(noise.shape))
 
 
 def _moments(X: Float32Array) -> Float32Array:
@@ -224,24 +226,27 @@ def adjust(
     median, sharpness = _Median(used), 1.0 / np.sqrt(segments.variance)
     A, shift = _design(sides) * sharpness[..., None], segments.shift * sharpness
     weighted = turned = A.swapaxes(1, 2)
+    robust = np.ones_like(shift)
     for _ in range(_ROUNDS):
         covariance = np.linalg.inv(weighted @ A + prior)
         moved = covariance @ (weighted @ shift[..., None])
         left = np.abs(shift - (A @ moved)[..., 0])
         scale = np.maximum(1.4826 * median(left), 1.0)
-        robust = 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
+        former, robust = robust, 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
+        if np.abs(robust - former).max() < _SETTLED:
+            break
         weighted = turned * robust[:, None]
     kept = used & (robust > 0.99)
-    chi2 = np.einsum('ns,ns,ns->n', left, left, kept) / _KEPT_VARIANCE
+    chi2 = (left * left * kept).sum(axis=1) / _KEPT_VARIANCE
     free = np.maximum(kept.sum(axis=1) - 8.0, 0.0)
     # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
     covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None] + _FLOOR
     known = as_squares(at, moved, covariance)
     # Corners told by one another err together. Taken for independent, they would tell a pose so much too well.
     together = (8.0 / (8.0 - known.told))[:, None, None, None]
-    blocks = together * np.einsum('nikil->nikl', known.covariance.reshape(-1, 4, 2, 4, 2))
+    blocks = together * known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
     # A side of an outline that is no square's is that of something else.
-    doubt = known.doubt * sides.along.reshape(-1, 4).mean(axis=1) ** 2
+    doubt = known.doubt * (0.25 * sides.along.reshape(-1, 4).sum(axis=1)) ** 2
     return known.moved.reshape(-1, 4, 2), blocks + _COMMON_FLOOR, doubt
 
 

@@ -86,8 +86,9 @@ def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squ
     at : (N, 4) corners
     seen, covariance : (N, 8, 1), (N, 8, 8) how far they are off, as the image tells [px]
     """
-    together = np.tile(seen.reshape(-1, 4, 2).mean(axis=1), 4)[..., None]
-    nearest = _corrected(at, together, seen, covariance)
+    together = np.empty((len(seen), 4, 2))
+    together[:] = 0.25 * seen.reshape(-1, 4, 2).sum(axis=1, keepdims=True)
+    nearest = _corrected(at, together.reshape(-1, 8, 1), seen, covariance)
     refuted = np.flatnonzero(nearest.chi2 > _OTHER_TILT)
     if len(refuted):
         other = _corrected(at.only(refuted), seen[refuted], seen[refuted], covariance[refuted])
@@ -102,16 +103,16 @@ def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance:
     for _ in range(_STEPS):
         value, J = squareness(at.x + (at.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0], at.inverse)
         error = value + J @ (seen - moved)
-        spread = covariance @ np.swapaxes(J, 1, 2)
+        spread = covariance @ J.swapaxes(1, 2)
         variance = _SQUARE_STD**2 + (_BENT * value) ** 2
         information = np.linalg.inv(J @ spread + variance * _EYE)
         weighted = information @ error
         before, moved = moved, seen - spread @ weighted
         if np.abs(moved - before).max() < _BENDS_PX:
             break
-    chi2, left = np.sum(error * weighted, axis=(1, 2)), np.sum((variance * weighted) ** 2, axis=(1, 2))
-    told = 2.0 - np.sum(variance * information * _EYE, axis=(1, 2))
-    return Squared(moved, covariance - spread @ information @ np.swapaxes(spread, 1, 2), chi2, left, told)
+    chi2, left = (error * weighted).sum(axis=(1, 2)), ((variance * weighted) ** 2).sum(axis=(1, 2))
+    told = 2.0 - (variance * information * _EYE).sum(axis=(1, 2))
+    return Squared(moved, covariance - spread @ information @ spread.swapaxes(1, 2), chi2, left, told)
 
 
 def squareness(x: FloatArray, inverse: FloatArray) -> Squareness:
@@ -129,7 +130,7 @@ def squareness(x: FloatArray, inverse: FloatArray) -> Squareness:
     turned = np.empty((count, 2, 2, 3))
     turned[:, 0], turned[:, 1] = h[:, ::-1], _MIRRORED * h
     both, by_both = h.reshape(count, 6, 1), turned.reshape(count, 2, 6)
-    length = np.sum(both * both, axis=1, keepdims=True)
+    length = (both * both).sum(axis=1, keepdims=True)
     value = (by_both @ both) / length
     derivative = (by_both - value * both.reshape(count, 1, 6)) @ d_h * (2.0 / length)
     by_pixel = derivative.reshape(count, 2, 4, 1, 2) @ inverse[:, None]

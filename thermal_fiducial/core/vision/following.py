@@ -49,6 +49,8 @@ class Followed:
 
     def only(self, keep: BoolArray) -> 'Followed':
         """Those of the markers ``keep`` (N,)."""
+        if keep.all():
+            return self
         return Followed(self.ids[keep], self.places.only(keep), self.clarity[keep], self.certain[keep])
 
     def found(self) -> Found:

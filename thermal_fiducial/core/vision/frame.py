@@ -62,6 +62,10 @@ class Places:
         """Those of the markers ``keep``."""
         return Places(self.at.only(keep), self.depth[keep], self.flow[keep])
 
+    def moved(self, at: ImagePoints) -> 'Places':
+        """The same some pixels away."""
+        return Places(at, self.depth, self.flow)
+
     def velocity(self, twist: Twist) -> FloatArray:
         """Of the image (N, 4, 2) [px/s]."""
         return np.asarray(self.flow @ twist.value)

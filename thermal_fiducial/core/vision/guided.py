@@ -22,6 +22,7 @@ from thermal_fiducial.core.vision.search import Found, read_quads
 
 # A marker turned further from the camera than this shows too little to be expected.
 _MAX_TILT_COSINE = 0.2
+_NEXT = np.array([1, 2, 3, 0])
 # Places round the prediction that are tried, in shares of a cell: near first, then far.
 _NEAR = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]), axis=-1).reshape(-1, 2)
 _FAR = np.stack(np.meshgrid([-1.4, -0.7, 0.0, 0.7, 1.4], [-1.4, -0.7, 0.0, 0.7, 1.4]), axis=-1).reshape(-1, 2)
@@ -64,20 +65,20 @@ class KnownMarkers:
         #: (M,)
         self.ids = np.array(sorted(markers), dtype=np.int64)
         entries = [markers[marker_id] for marker_id in self.ids.tolist()]
-        self._T_map_marker = np.stack([entry[0] for entry in entries]) if entries else np.zeros((0, 4, 4))
+        T_map_marker = np.stack([entry[0] for entry in entries]) if entries else np.zeros((0, 4, 4))
         sizes = np.array([entry[1] for entry in entries])
-        self._corners = geometry.apply(self._T_map_marker, sizes[:, None, None] * marker_corners(1.0))
+        corners = geometry.apply(T_map_marker, sizes[:, None, None] * marker_corners(1.0))
+        self._corners_and_normals = np.concatenate([corners, T_map_marker[:, None, :3, 2]], axis=1)
 
     def expected(self, T_camera_map: FloatArray, camera: Camera, min_side_px: float) -> Expected:
         """Those that are wholly in view and show a face."""
-        points = geometry.apply(T_camera_map, self._corners.reshape(-1, 3)).reshape(-1, 4, 3)
+        rotated = self._corners_and_normals @ T_camera_map[:3, :3].T
+        points, normal = rotated[:, :4] + T_camera_map[:3, 3], rotated[:, 4]
         corners = camera.project(points)
-        centre = geometry.apply(T_camera_map, self._T_map_marker[:, :3, 3])
-        normal = self._T_map_marker[:, :3, 2] @ T_camera_map[:3, :3].T
-        distance = np.sqrt(np.sum(centre * centre, axis=1))
-        facing = np.sum(normal * centre, axis=1) < -_MAX_TILT_COSINE * distance
-        span = corners[:, [1, 2, 3, 0]] - corners
-        large = (np.sum(span * span, axis=-1) >= min_side_px**2).all(axis=1)
+        centre = 0.25 * points.sum(axis=1)
+        facing = (normal * centre).sum(axis=1) < -_MAX_TILT_COSINE * np.sqrt((centre * centre).sum(axis=1))
+        span = corners.take(_NEXT, axis=1) - corners
+        large = ((span * span).sum(axis=-1) >= min_side_px**2).all(axis=1)
         seen = np.flatnonzero(camera.contains(corners, 2.0).all(axis=1) & facing & large)
         points = points[seen]
         return Expected(self.ids[seen], corners[seen], points[..., :2] / points[..., 2:], points[..., 2])

@@ -55,7 +55,7 @@ def model_error(smear_px: FloatArray, corners_px: FloatArray, cells: int) -> Flo
     differences change the marker's shape. So does a response of another form, and the more the farther it carries the
     neighbouring edges, one cell away, into one another: those of a marker with m ``cells`` and corners (N, 4, 2).
     """
-    common = smear_px.mean(axis=1)
+    common = 0.25 * smear_px.sum(axis=1)
     change = _LAG_UNSURE * (smear_px - common[:, None])
     carried = cells**2 * _square_in_sides(common, corners_px)
     form = 0.5 * (_FORM_UNSURE**2 + (_FORM_UNSURE_IN_CELLS * carried) ** 2)[:, None, None]

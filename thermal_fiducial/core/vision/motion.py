@@ -7,7 +7,7 @@ states round the frame and by how the markers' corners moved since.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 import math
 from typing import NamedTuple
 
@@ -225,7 +225,7 @@ class MotionTracker:
         moved = geometry.inverse(geometry.transform(geometry.so3_exp(step[3:]), step[:3]))
         points = self._seen.depth[..., None] * (self._seen.x @ moved[:3, :2].T + moved[:3, 2]) + moved[:3, 3]
         depth = np.maximum(points[..., 2], 1e-3)
-        return replace(self._seen, x=points[..., :2] / depth[..., None], depth=depth)
+        return Tracked(self._seen.ids, points[..., :2] / depth[..., None], depth, self._seen.clarity)
 
     def correct(
         self,

@@ -42,7 +42,7 @@ _CLEAR, _HARDLY_SMEARED_PX = 20.0, 0.2
 # Columns of pixels used of a cell; all of a faint marker's count.
 _COLUMNS, _COLUMNS_FAINT = 6, 12
 _ROUNDS = 2
-_NEXT = np.array([1, 2, 3, 0])
+_NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,13 +143,14 @@ class Refiner:
 
     def _view(self, frame: Frame, places: Places, twist: Twist | None, cell: FloatArray, clarity: FloatArray) -> View:
         """The frame with known smear round all markers, sharpened round those for which that is worth its noise."""
-        smear = memory = np.zeros_like(places.at.px)
-        if twist is not None:
+        if twist is None:
+            smear = memory = np.zeros_like(places.at.px)
+        else:
             smear, memory = places.smear(twist, frame.lag), places.memory(twist, frame.lag)
             if frame.readout > 0.0:
                 memory = memory * stretch(places, twist, frame)[..., None]
-        mean = smear.mean(axis=1)
-        sharpen = _worth_sharpening(np.sum(mean * mean, axis=1), cell, self._behind.shape[2], clarity)
+        mean = 0.25 * smear.sum(axis=1)
+        sharpen = _worth_sharpening((mean * mean).sum(axis=1), cell, self._behind.shape[2], clarity)
         removed = (1.0 - REMAINING) * memory * sharpen[:, None, None]
         shift = smear - removed + expected_displacement(places, twist, frame)
         spread, past = mean * np.where(sharpen, SPREAD, 1.0)[:, None], None
@@ -169,25 +170,25 @@ class Refiner:
         """The corners without lag and as if all rows were seen at once, by the twist that they themselves correct."""
         at = places.at.moved(seen.corners_px - view.shift - places.at.px, frame.camera)
         variance = seen.covariances[..., 0, 0] + seen.covariances[..., 1, 1]
-        deviation = np.sqrt(0.5 * variance.mean(axis=1)) / frame.camera.focal_px
+        deviation = np.sqrt(0.125 * variance.sum(axis=1)) / frame.camera.focal_px
         # The same displacement in two frames in a row hides from the first twist; once freed, they are not alike.
         twist = known
         if frame.twist is not None or known is None:
             twist = self._motion.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
         if twist is None:
             unsure = seen.covariances + _doubts(seen) + self._never_seen(frame, places, seen, unknown_twist())
-            return Refinement(view, seen, replace(seen, covariances=unsure), replace(places, at=at), None)
+            return Refinement(view, seen, replace(seen, covariances=unsure), places.moved(at), None)
         smear = places.smear(twist, frame.lag)
         rolled = seen_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
         corners = seen.corners_px - smear + view.removed - rolled
         # What the corners of a marker have in common is no error of its shape.
-        by_twist = frame.lag * (places.flow - places.flow.mean(axis=1, keepdims=True))
-        unknown = by_twist @ twist.covariance_ago(frame.lag) @ np.swapaxes(by_twist, -1, -2)
+        by_twist = frame.lag * (places.flow - 0.25 * places.flow.sum(axis=1, keepdims=True))
+        unknown = by_twist @ twist.covariance_ago(frame.lag) @ by_twist.swapaxes(-1, -2)
         unknown = unknown + model_error(smear, places.at.px, self._behind.shape[2])
         if frame.twist is None:
             unknown = unknown + self._never_seen(frame, places, seen, twist)
         refined = replace(seen, corners_px=corners, covariances=seen.covariances + _doubts(seen) + unknown)
-        return Refinement(view, seen, refined, replace(places, at=at.at_pixels(corners)), twist)
+        return Refinement(view, seen, refined, places.moved(at.at_pixels(corners)), twist)
 
     def _never_seen(self, frame: Frame, places: Places, seen: RefinedCorners, twist: Twist) -> FloatArray:
         """Covariances (N, 4, 2, 2) [px^2] by a motion that the frames before tell nothing of."""
@@ -199,7 +200,7 @@ class Refiner:
 
 def _doubts(seen: RefinedCorners) -> FloatArray:
     """Covariances (N, 1, 2, 2) [px^2] of corners that make no square."""
-    return seen.doubt[:, None, None, None] * np.eye(2)
+    return seen.doubt[:, None, None, None] * _EYE
 
 
 def _worth_sharpening(square: FloatArray, cell: FloatArray, cells: int, clarity: FloatArray) -> BoolArray:
