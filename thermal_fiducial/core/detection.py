@@ -278,10 +278,10 @@ class MarkerDetector:
             return image
         if self._field is None or self._field.camera is not camera:
             self._field = SmearField(camera)
-        coarse = self._field.at(twist, self._depth, self.config.bolometer_lag)
-        if np.abs(coarse).max() < _SMEAR_THAT_HIDES_PX:
+        smear = twist, self._depth, self.config.bolometer_lag
+        if self._field.longest(*smear) < _SMEAR_THAT_HIDES_PX:
             return image
-        field = self._field.full(coarse)
+        field = self._field.full(self._field.at(*smear))
         return without_lag(image, field[..., 0], field[..., 1])
 
     def _refined(

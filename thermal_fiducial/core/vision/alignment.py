@@ -55,7 +55,8 @@ def _grid(cells: int) -> _Grid:
 def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArray, decoder: Decoder) -> FloatArray:
     """Quadrilaterals (Q, 4, 2) moved to where ``image`` looks most like the markers ``ids`` (Q,), turned (Q,)."""
     grid = _grid(decoder.cells)
-    cells = np.pad(decoder.seen(ids, turns), ((0, 0), (1, 1), (1, 1)), constant_values=1.0)
+    cells = np.ones((len(ids), decoder.cells + 2, decoder.cells + 2))
+    cells[:, 1:-1, 1:-1] = decoder.seen(ids, turns)
     J = np.empty((len(ids), 15, grid.places.shape[1]), dtype=np.float32)
     J[:, 8:14] = grid.smooth
     J[:, 14] = (grid.blur @ cells @ grid.blur.T).reshape(len(ids), -1)

@@ -29,8 +29,8 @@ def noise_of(counts: Counts | Gray | Float32Array) -> float:
 
     Differences along a column leave the column pattern out.
     """
-    rows = counts[4::8, ::3]
-    below = counts[5::8, ::3]
+    rows = counts[4::16, ::3]
+    below = counts[5::16, ::3]
     count = min(len(rows), len(below))
     difference = cv2.absdiff(np.ascontiguousarray(rows[:count]), np.ascontiguousarray(below[:count])).ravel()
     middle = difference.size // 2

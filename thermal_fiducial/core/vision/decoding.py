@@ -5,6 +5,7 @@ from noise at contrasts where no single bit could be thresholded.
 """
 
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import cv2
@@ -169,10 +170,14 @@ class Decoder:
 
 def shrunk(quads: FloatArray, cells: int) -> FloatArray:
     """The markers (Q, 4, 2) in plates (Q, 4, 2) that surround them with a white margin of one cell."""
+    return seen_between(quads, _in_plate(cells)).transpose(1, 2, 0)
+
+
+@cache
+def _in_plate(cells: int) -> FloatArray:
+    """Of :func:`bilinear`, (4, 4), for the corners of such a marker."""
     low, high = 1.0 / (cells + 2), (cells + 1.0) / (cells + 2)
-    return np.moveaxis(
-        in_quadrilaterals(quads, np.array([low, high, high, low]), np.array([low, low, high, high])), 0, -1
-    )
+    return bilinear(np.array([low, high, high, low]), np.array([low, low, high, high]))
 
 
 def sampled(image: Counts | Float32Array, places: Float32Array) -> Float32Array:

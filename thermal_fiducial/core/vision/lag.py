@@ -165,11 +165,16 @@ class SmearField:
         v = (np.arange(-(-camera.height // self._STEP)) + 0.5) * self._STEP - 0.5
         self._x = camera.normalise(np.stack(np.meshgrid(u, v), axis=-1))
         self._J = camera.distort_linearised(self._x)[1]
+        some = np.ix_([0, len(v) // 2, -1], [0, len(u) // 2, -1])
+        self._some = self._x[some], self._J[some]
 
     def at(self, twist: Twist, depth: float, tau: float) -> FloatArray:
         """Coarse field (rows, columns, 2) [px]."""
-        velocity = interaction(self._x, np.full(self._x.shape[:-1], depth)) @ twist.ago(tau)
-        return np.asarray(-tau * (self._J @ velocity[..., None])[..., 0])
+        return _displacement(self._x, self._J, twist, depth, tau)
+
+    def longest(self, twist: Twist, depth: float, tau: float) -> float:
+        """Its largest number [px]; of a field that is nearly quadratic, corners, rims and middle tell."""
+        return float(np.abs(_displacement(*self._some, twist, depth, tau)).max())
 
     def full(self, coarse: FloatArray) -> Float32Array:
         """Field (height, width, 2)."""
@@ -177,3 +182,9 @@ class SmearField:
         size = (columns * self._STEP, rows * self._STEP)
         field = cv2.resize(coarse.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
         return np.asarray(field[: self.camera.height, : self.camera.width])
+
+
+def _displacement(x: FloatArray, J: FloatArray, twist: Twist, depth: float, tau: float) -> FloatArray:
+    """By lag, [px] (..., 2), of normalised points (..., 2) where pixels change by J (..., 2, 2)."""
+    velocity = interaction(x, np.full(x.shape[:-1], depth)) @ twist.ago(tau)
+    return np.asarray(-tau * (J @ velocity[..., None])[..., 0])

@@ -7,6 +7,7 @@ from thermal_fiducial.core.types import FloatArray, Gray
 
 # The hull of an outline is simplified to within this share of its length: more than noise bends it, less than a side.
 _STRAIGHT = 0.05
+_NEXT = np.array([1, 2, 3, 0])
 
 
 def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray) -> FloatArray:
@@ -29,13 +30,12 @@ def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray) -> FloatArray
         hull = cv2.convexHull(outline)
         simple = cv2.approxPolyDP(hull, _STRAIGHT * cv2.arcLength(hull, True), True)
         if len(simple) == 4:
-            quads.append(simple[:, 0].astype(np.float64))
+            quads.append(simple[:, 0])
     if not quads:
         return np.zeros((0, 4, 2))
-    found = np.stack(quads)
-    sides = np.linalg.norm(np.roll(found, -1, axis=1) - found, axis=-1)
-    found = found[np.isfinite(sides).all(axis=1) & (sides.min(axis=1) >= min_side_px)]
-    return _clockwise(found)
+    found = np.array(quads, dtype=np.float64)
+    span = found.take(_NEXT, axis=1) - found
+    return _clockwise(found[((span * span).sum(axis=-1) >= min_side_px**2).all(axis=1)])
 
 
 def _clockwise(quads: FloatArray) -> FloatArray:

@@ -139,7 +139,7 @@ class BlindSearch:
         if len(fine) + len(faint) == 0:
             return Found.none()
         # Blur may leave nothing to be seen of a border between two white ones but the outline of the whole plate.
-        fine, faint = (np.concatenate([outlines, shrunk(outlines, decoder.cells)]) for outlines in (fine, faint))
+        fine, faint = (_with_shrunk(outlines, decoder.cells) for outlines in (fine, faint))
         quads = np.concatenate([fine, faint])
         reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, _halfway(faint), allowed))
         # At full resolution alone those are sought that show clearly, if not now then in a frame to come.
@@ -150,6 +150,8 @@ class BlindSearch:
             quads = np.concatenate([quads, 2.0 * better + 0.5])
         good = accepted(reading, noise, decoder.correctable, config) & _large(quads, config.min_side_px)
         good &= _whole(quads, image, _RIM)
+        if not good.any():
+            return Found.none()
         good &= ~_inside_out(reading, quads, good, distinct(reading, noise, config))
         return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), noise)
 
@@ -159,6 +161,11 @@ class BlindSearch:
         """Quadrilaterals of faint markers (Q, 4, 2) at half the resolution, in pixels of the full one."""
         mask = dark(half, 0.5 * noise, scale, self._scratch)
         return 2.0 * find_quads(mask, 0.5 * min_side_px + 2.0, _halfway(hidden)) + 0.5
+
+
+def _with_shrunk(outlines: FloatArray, cells: int) -> FloatArray:
+    """Quadrilaterals (Q, 4, 2), and what would be a marker in each if it were a plate."""
+    return np.concatenate([outlines, shrunk(outlines, cells)]) if len(outlines) else outlines
 
 
 def _large(quads: FloatArray, min_side_px: float) -> BoolArray:
@@ -181,7 +188,7 @@ def _halfway(quads: FloatArray) -> FloatArray:
 
 def _grown(quads: FloatArray, factor: float) -> FloatArray:
     """Quadrilaterals (N, 4, 2) larger by a factor about their middles."""
-    middle = quads.mean(axis=1, keepdims=True)
+    middle = 0.25 * quads.sum(axis=1, keepdims=True)
     return np.asarray(middle + factor * (quads - middle))
 
 
