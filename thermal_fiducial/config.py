@@ -386,9 +386,9 @@ class ImuNoise:
         3.0e-4, 'Accelerometer bias random walk.', unit='m/s^3/sqrt(Hz)', minimum=0.0
     )
     gyroscope_scale_std: float = param(
-        0.01,
-        'Scale and cross-axis errors of the gyroscope (standard deviation of each), which are estimated while running; '
-        '0: none.',
+        0.005,
+        'Scale and cross-axis errors of the gyroscope (standard deviation of each: half the tolerance of the data '
+        'sheet), which are estimated while running; 0: none.',
         minimum=0.0,
         maximum=0.1,
     )
