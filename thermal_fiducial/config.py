@@ -209,7 +209,12 @@ class Tau2CameraConfig:
     calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
     bad_pixel_file: str = param('', 'List of dead pixels: a text file, "column row" a line. Empty: none.')
     find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.', live=True)
-    bits: int = param(14, 'Significant bits of a 16-bit pixel; flags above them are masked.', minimum=8, maximum=16)
+    bits: int = param(
+        14,
+        'Significant bits of a 16-bit pixel; flags above them are masked, counts that are shifted up are shifted back.',
+        minimum=8,
+        maximum=16,
+    )
     settle_frames: int = param(
         1,
         'Frames withheld after a shutter event, while they may still hold old counts.',

@@ -69,6 +69,13 @@ def test_flags_above_14_bits_are_masked():
     assert np.array_equal(Camera(bits=16)(flagged).counts, flagged)
 
 
+@pytest.mark.parametrize(('shift', 'largest'), [(2, 1 << 14), (8, 1 << 8)])
+def test_counts_that_a_driver_shifted_up_are_shifted_back(shift, largest):
+    """14 bits to fill 16, and 8 bits sent as mono16: masked like flags, the upper ones would wrap."""
+    counts = np.random.default_rng(4).integers(0, largest, (512, 640)).astype(np.uint16)
+    assert np.array_equal(Camera()(counts << np.uint16(shift)).counts, counts)
+
+
 @pytest.mark.parametrize('rows', [1, 2])
 @pytest.mark.parametrize('top', [False, True])
 def test_telemetry_rows_are_cut_from_either_side(rows, top):

@@ -23,6 +23,8 @@ REPEATED_STAMP = 'stamp seen before'
 # Frames that come later than this after newer ones are those of a clock that was set back [ns].
 LATEST_NS = 1_000_000_000
 
+# Bits that a driver shifts counts up by at least, to fill 16.
+_SHIFTED = 2
 # Rows of an image; a frame with up to MAX_TELEMETRY_ROWS more carries telemetry.
 STANDARD_HEIGHTS = (1024, 512, 480, 256, 240, 128, 120)
 MAX_TELEMETRY_ROWS = 4
@@ -107,7 +109,7 @@ class FrameCleaner:
         image = self._telemetry.cut(counts)
         if min(image.shape) < 16:
             raise InputError(f'frame of {image.shape[1]}x{image.shape[0]} pixels is too small')
-        return image.astype(np.uint16) & np.uint16((1 << self.config.bits) - 1)
+        return _right_aligned(image.astype(np.uint16), self.config.bits) & np.uint16((1 << self.config.bits) - 1)
 
     def _stale(self, stamp_ns: int, image: Counts, *, coarse: bool) -> str:
         if self._freeze.repeats(image, coarse=coarse):
@@ -130,6 +132,13 @@ class FrameCleaner:
                 self._found = found
                 self._filler = BadPixelFiller(np.concatenate([self._known_bad, found]), self._shape)
         self._filler.fill(image)
+
+
+def _right_aligned(image: Counts, bits: int) -> Counts:
+    """The image, shifted where a driver has shifted it: in no living picture the lowest bits are zero in all pixels."""
+    used = int(np.bitwise_or.reduce(image[:: _FreezeDetector.ROW_STEP], axis=None))
+    shift = (used & -used).bit_length() - 1
+    return image >> np.uint16(shift) if used >> bits and shift >= _SHIFTED else image
 
 
 class _TelemetryRows:
