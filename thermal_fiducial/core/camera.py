@@ -22,6 +22,7 @@ MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 # Newton's iteration doubles the digits: after a step this small nothing is left, and ten are enough at any lens's rim.
 _NEWTON_STEPS = 10
 _NEWTON_STEP = 1e-6
+_EYE = np.eye(2)
 # Widest angle from the axis that x/z can tell [rad].
 _WIDEST = 1.5
 
@@ -131,9 +132,8 @@ class Camera:
     def contains(self, uv: npt.ArrayLike, margin_px: float = 0.0) -> BoolArray:
         """Whether pixels (..., 2) lie in the image, ``margin_px`` away from its rim; False for NaN."""
         uv = np.asarray(uv, dtype=np.float64)
-        u, v = uv[..., 0], uv[..., 1]
-        inside = (u >= margin_px) & (u <= self.width - 1 - margin_px)
-        return np.asarray(inside & (v >= margin_px) & (v <= self.height - 1 - margin_px))
+        last = self._last_pixel - margin_px
+        return np.asarray(((uv >= margin_px) & (uv <= last)).all(axis=-1))
 
     def _to_pixels(self, x: FloatArray) -> FloatArray:
         # One product of matrices costs less than one for each row of points.
@@ -159,6 +159,10 @@ class Camera:
     def _polynomial(self) -> '_Polynomial':
         k1, k2, p1, p2, k3, *rational = self.D.tolist()
         return _Polynomial((k1, k2, k3), tuple(rational) if any(rational) else (), p1, p2)
+
+    @cached_property
+    def _last_pixel(self) -> FloatArray:
+        return np.array([self.width - 1.0, self.height - 1.0])
 
     @cached_property
     def _inverse_focal(self) -> FloatArray:
@@ -226,7 +230,7 @@ class ImagePoints:
     def seen_at(x: FloatArray, camera: Camera) -> 'ImagePoints':
         """Those at normalised coordinates (..., 2)."""
         px, J = camera.distort_linearised(x)
-        return ImagePoints(px, x, J, _inverse(J))
+        return ImagePoints(px, x, J, inverse_2x2(J))
 
     def moved(self, shift_px: FloatArray, camera: Camera) -> 'ImagePoints':
         """Those some pixels (..., 2) away: undistorting them anew would cost more than it tells."""
@@ -242,13 +246,13 @@ class ImagePoints:
         return ImagePoints(self.px[keep], self.x[keep], self.J[keep], self.inverse[keep])
 
 
-def _inverse(J: FloatArray) -> FloatArray:
+def inverse_2x2(J: FloatArray) -> FloatArray:
     """Inverses of matrices (..., 2, 2), not finite where they are singular."""
+    a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
     inverse = np.empty_like(J)
-    inverse[..., 0, 0], inverse[..., 1, 1] = J[..., 1, 1], J[..., 0, 0]
-    inverse[..., 0, 1], inverse[..., 1, 0] = -J[..., 0, 1], -J[..., 1, 0]
-    determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-    return np.asarray(inverse / determinant[..., None, None])
+    inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 1, 0], inverse[..., 1, 1] = d, -b, -c, a
+    inverse /= (a * d - b * c)[..., None, None]
+    return inverse
 
 
 class _Polynomial(NamedTuple):
@@ -339,7 +343,7 @@ def _undistort_equidistant(target: FloatArray, k: FloatArray) -> FloatArray:
 
 
 def _distort_equidistant(x: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
-    r2 = np.sum(x * x, axis=-1)
+    r2 = (x * x).sum(axis=-1)
     r = np.sqrt(r2)
     theta = np.arctan(r)
     theta_d, d_theta_d = _equidistant_radius(theta, k), _equidistant_slope(theta, k)
@@ -348,5 +352,5 @@ def _distort_equidistant(x: FloatArray, k: FloatArray) -> tuple[FloatArray, Floa
     scale = np.where(near, 1.0, theta_d / safe)
     # d(scale)/d(r^2): theta_d / r to second order at the axis is 1 + (k1 - 1/3) r^2.
     d_scale = np.where(near, k[0] - 1 / 3, (d_theta_d / (1.0 + r2) - scale) / (2.0 * safe * safe))
-    J = scale[..., None, None] * np.eye(2) + 2.0 * d_scale[..., None, None] * x[..., :, None] * x[..., None, :]
+    J = scale[..., None, None] * _EYE + 2.0 * d_scale[..., None, None] * x[..., :, None] * x[..., None, :]
     return x * scale[..., None], J

@@ -294,7 +294,7 @@ class MarkerDetector:
         else:
             known = [] if in_map is None else [(in_map.ids, in_map.depth)]
             places = self._places(frame, found, *known, (followed.ids, followed.places.depth))
-        self._depth = float(places.depth.mean())
+        self._depth = float(places.depth.sum()) / places.depth.size
         refinement = self._refiner.refine(frame, found, places, near, self.config)
         keep = self._confirmed(frame, found, refinement, followed)
         return found.ids[keep], refinement.only(keep)
@@ -315,16 +315,15 @@ class MarkerDetector:
     def _confirmed(self, frame: Frame, found: Found, refinement: Refinement, followed: Followed) -> BoolArray:
         """Which markers look like themselves at their refined corners: how the motion is known does not matter."""
         view, seen = refinement.view, refinement.seen
-        there = replace(found, corners_px=found.corners_px + view.shift)
-        off = np.abs(seen.corners_px - there.corners_px).max(axis=(1, 2))
+        there = found.corners_px + view.shift
+        off = np.abs(seen.corners_px - there).max(axis=(1, 2))
         read = off < _READ_THERE / self._decoder.cells * sides_px(found.corners_px)
         keep = read & among(found.ids, followed.ids[followed.certain])
         others = np.flatnonzero(~keep)
         if len(others):
             sharp = view.sharp(seen.corners_px, others, self._scratch)
-            keep[others] = confirmed(
-                sharp, self._scratch, there.only(others), seen.only(others), self._decoder, self.config
-            )
+            sought = replace(found, corners_px=there).only(others)
+            keep[others] = confirmed(sharp, self._scratch, sought, seen.only(others), self._decoder, self.config)
         return np.asarray(keep & frame.camera.contains(seen.corners_px, 0.5 * _RIM_PX).all(axis=1))
 
     def _poses(

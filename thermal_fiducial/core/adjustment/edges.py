@@ -75,9 +75,10 @@ def model(
     cells = behind.shape[2]
     cell = sides.across / cells
     own = _seen_along(sides, blur[1])
+    fall = -own
     value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32))
-    value *= -own
-    slope *= -own
+    value *= fall
+    slope *= fall
     narrow = cell < _NARROW * blur[0]
     if narrow.any():
         _add_neighbours(value, slope, sides, np.flatnonzero(narrow), behind.reshape(-1, cells, len(NEIGHBOURS)), blur)

@@ -127,7 +127,8 @@ def _seen(
     np.not_equal(whole[1:], whole[:-1], out=fresh[1:])
     np.not_equal(whole[0, 1:], whole[-1, :-1], out=fresh[0, 1:])
     margin = half + _BEYOND_NODES
-    if nodes.min() >= margin and (nodes.max(axis=(0, 1)) <= (shape[1] - 1 - margin, shape[0] - 1 - margin)).all():
+    last = nodes[..., 0].max() - shape[1], nodes[..., 1].max() - shape[0]
+    if nodes.min() >= margin and max(last) <= -1.0 - margin:
         return fresh, None
     far, end = np.where(steep[:, None], shape[::-1], shape).T - 1.0
     fresh &= (whole >= 0.0) & (whole <= end) & (base >= _BOTH_SIDES) & (base <= far - _BOTH_SIDES)

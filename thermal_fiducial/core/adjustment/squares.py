@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.camera import ImagePoints
+from thermal_fiducial.core.camera import ImagePoints, inverse_2x2
 from thermal_fiducial.core.types import FloatArray
 
 # Standard deviation of what markers, flat and cut to size, and calibrations of lenses make of that.
@@ -105,7 +105,7 @@ def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance:
         error = value + J @ (seen - moved)
         spread = covariance @ J.swapaxes(1, 2)
         variance = _SQUARE_STD**2 + (_BENT * value) ** 2
-        information = np.linalg.inv(J @ spread + variance * _EYE)
+        information = inverse_2x2(J @ spread + variance * _EYE)
         weighted = information @ error
         before, moved = moved, seen - spread @ weighted
         if np.abs(moved - before).max() < _BENDS_PX:

@@ -167,15 +167,14 @@ class _Flow(NamedTuple):
         weighted, stretched = self.A.T * weight, weight * self.stretch
         spread = weighted @ self.stretch
         share = spread / (1.0 + stretched @ self.stretch)
-        return weighted @ self.A - np.outer(spread, share), weighted @ self.velocity - share * (
-            stretched @ self.velocity
-        )
+        information = weighted @ self.A - spread[:, None] * share
+        return information, weighted @ self.velocity - share * (stretched @ self.velocity)
 
     def _chi2(self, twist: FloatArray, weight: FloatArray) -> FloatArray:
         """Squared residuals (N,) of markers from a twist (6,), per degree of freedom."""
         residual, stretched = self.velocity - self.A @ twist, weight * self.stretch
         residual = residual - (stretched @ residual) / (1.0 + stretched @ self.stretch) * self.stretch
-        return np.asarray((self.weight * residual * residual).reshape(-1, _COORDINATES).mean(axis=1))
+        return np.asarray((self.weight * residual * residual).reshape(-1, _COORDINATES).sum(axis=1) / _COORDINATES)
 
 
 def _trusted(chi2: FloatArray) -> FloatArray:
@@ -328,7 +327,7 @@ def _line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatAr
     parts = [part for state in odometry for part in (state.velocity_body, state.angular_velocity_body)]
     values = np.concatenate(parts).reshape(-1, 6) @ transfer.T
     t = np.array([(state.stamp_ns - stamp_ns) * 1e-9 for state in odometry])
-    middle = float(t.mean())
+    middle = float(t.sum()) / len(t)
     off = t - middle
     square = float(off @ off)
     acceleration = (off / square) @ values
@@ -341,7 +340,7 @@ def _line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatAr
     covariance[:3, :3] += typical[:3, :3]
     covariance[:6, 6:] = covariance[6:, :6] = -middle * slope
     covariance[6:, 6:] = slope
-    return Twist(values.mean(axis=0) - middle * acceleration, covariance, acceleration)
+    return Twist(values.sum(axis=0) / len(t) - middle * acceleration, covariance, acceleration)
 
 
 def _joined(first: Twist, second: Twist) -> Twist:
@@ -370,12 +369,14 @@ def _corrected(twist: Twist, information: FloatArray, weighted: FloatArray, late
 
 def _symmetric(P: FloatArray) -> FloatArray:
     """Without what rounding makes of a covariance."""
-    return np.asarray(0.5 * (P + P.T))
+    return 0.5 * (P + P.T)
 
 
 def plausible(odometry: Odometry) -> bool:
     """Whether a camera that sees markers may move so: anything else tells nothing."""
     v, w = odometry.velocity_body, odometry.angular_velocity_body
+    if not (v @ v <= _FASTEST**2 and w @ w <= _FASTEST_TURN**2):
+        return False
     # A sum of squares is finite when all numbers are.
-    finite = all(math.isfinite(np.vdot(each, each)) for each in (odometry.T_map_body, odometry.twist_covariance))
-    return bool(v @ v <= _FASTEST**2 and w @ w <= _FASTEST_TURN**2 and finite)
+    T, P = odometry.T_map_body, odometry.twist_covariance
+    return math.isfinite(np.vdot(T, T) + np.vdot(P, P))
