@@ -18,7 +18,7 @@ from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatAr
 from thermal_fiducial.core.vision.clock_offset import ClockOffset
 from thermal_fiducial.core.vision.contrast import noise_of, without_columns
 from thermal_fiducial.core.vision.decoding import Decoder
-from thermal_fiducial.core.vision.displayed import DisplayedSides, LEVELS
+from thermal_fiducial.core.vision.displayed import DisplayedSides, for_display
 from thermal_fiducial.core.vision.following import Followed
 from thermal_fiducial.core.vision.frame import Frame, Places
 from thermal_fiducial.core.vision.guided import camera_in_map, Expected, KnownMarkers, look
@@ -28,6 +28,7 @@ from thermal_fiducial.core.vision.local_corners import local_corners
 from thermal_fiducial.core.vision.marker_rows import marker_rows
 from thermal_fiducial.core.vision.motion import MotionTracker, plausible, Tracked, Twist
 from thermal_fiducial.core.vision.odometry_log import OdometryLog
+from thermal_fiducial.core.vision.partial import CutMarkerSearch
 from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.core.vision.polarity import Polarity
 from thermal_fiducial.core.vision.readout import expected_displacement, seen_displacement
@@ -45,6 +46,8 @@ _CLEARER_THAN_COLUMNS = 100.0
 _CLEAR = 20.0
 # Nearer to the rim of the image than this a marker is not expected to be seen, or may be cut off [px].
 _RIM_PX = 2.0
+# So many known markers wholly in view tell the pose so well that those which the rim cuts are not worth a look.
+_ENOUGH_WHOLE = 2
 # A marker that was read off its corners by less than this need not be read again [cells].
 _READ_THERE = 0.1
 # Where not all markers are known, or not all seen that should be, a blind search follows at least every so many frames.
@@ -92,6 +95,7 @@ class MarkerDetector:
         self._refiner = Refiner(edges_behind(bits), self._motion)
         self._displayed = DisplayedSides(bits)
         self._search = BlindSearch(self._decoder, self._scratch)
+        self._cut = CutMarkerSearch(self._decoder, bits)
         self._clock_offset = ClockOffset()
         self._polarity = Polarity()
         self._field: SmearField | None = None
@@ -100,6 +104,7 @@ class MarkerDetector:
         self._known = KnownMarkers(self._map)
         self._since_blind = 0
         self._sought = Sought.ALL
+        self._saw_cut = False
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
         """Markers that are known: ID to (T_map_marker, side [m])."""
@@ -129,22 +134,62 @@ class MarkerDetector:
             if T_camera_map is not None and self.config.guided:
                 in_map = self._known.expected(T_camera_map, camera, self.config.min_side_px)
             found, followed = self._find(frame, in_map)
+            whole = np.zeros(0, dtype=MARKER_DTYPE)
             if len(found.ids) == 0:
                 self._motion.remember(stamp_ns, twist, Tracked.none())
                 self._polarity.learn(np.zeros(0))
-                return np.zeros(0, dtype=MARKER_DTYPE)
-            ids, refinement = self._refined(frame, found, followed, in_map)
-            self._learn_offset(frame, in_map, ids, refinement.places)
-            corners, at = refinement.corners, refinement.places.at
-            if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
-                corners = local_corners(frame.image, corners, self._decoder.cells)
-                at = ImagePoints.at(corners.corners_px, camera)
-            elif counts[::64].max() < LEVELS:
-                corners = self._displayed.corrected(frame, ids, refinement, self.config.blur_px)
-                at = ImagePoints.at(corners.corners_px, camera)
-            poses = self._poses(ids, corners, at, T_camera_map)
-            self._remember(frame, ids, refinement, poses)
-            return marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)
+            else:
+                whole = self._whole(counts, frame, found, followed, in_map, T_camera_map)
+            self._saw_cut = False
+            if in_map is None or T_camera_map is None:
+                return whole
+            return self._with_cut(whole, counts, frame, T_camera_map, states)
+
+    def _whole(
+        self,
+        counts: Counts | Gray,
+        frame: Frame,
+        found: Found,
+        followed: Followed,
+        in_map: Expected | None,
+        T_camera_map: FloatArray | None,
+    ) -> Markers:
+        """Rows of the markers that were found, refined."""
+        ids, refinement = self._refined(frame, found, followed, in_map)
+        self._learn_offset(frame, in_map, ids, refinement.places)
+        corners, at = refinement.corners, refinement.places.at
+        if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
+            corners = local_corners(frame.image, corners, self._decoder.cells)
+            at = ImagePoints.at(corners.corners_px, frame.camera)
+        elif for_display(counts):
+            corners = self._displayed.corrected(frame, ids, refinement, self.config.blur_px)
+            at = ImagePoints.at(corners.corners_px, frame.camera)
+        poses = self._poses(ids, corners, at, T_camera_map)
+        self._remember(frame, ids, refinement, poses)
+        return marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)
+
+    def _with_cut(
+        self,
+        whole: Markers,
+        counts: Counts | Gray,
+        frame: Frame,
+        T_camera_map: FloatArray,
+        states: list[Odometry],
+    ) -> Markers:
+        """The rows of ``whole`` markers; where few of them are known, those of known ones that are cut as well."""
+        seen = whole['id'].astype(np.int64)
+        if among(seen, self._known.ids).sum() >= _ENOUGH_WHOLE:
+            return whole
+        cut = self._known.cut(T_camera_map, frame.camera, seen)
+        unsure = float(np.sqrt(np.trace(states[-1].pose_covariance[:3, :3])))
+        ids, corners = self._cut.look(frame, cut, unsure, self._allowed(), self.config, bent=for_display(counts))
+        self._saw_cut = len(ids) > 0
+        if not self._saw_cut:
+            return whole
+        poses = self._poses(ids, corners, ImagePoints.at(corners.corners_px, frame.camera), T_camera_map)
+        rows = marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)
+        rows = np.concatenate([whole, rows])
+        return np.asarray(rows[np.argsort(rows['id'], kind='stable')])
 
     def size(self, marker_id: int) -> float:
         """Side of a marker [m]: of the map, or of the overrides, or the common one."""
@@ -203,7 +248,7 @@ class MarkerDetector:
             if new.any():
                 corners = corners + _common_shift(ids, corners, expected)
                 expected = merged(expected, self._guided(frame, frame.twist, ids[new], corners[new], depth[new]))
-            complete = len(ids) > 0 and len(expected.ids) >= len(ids)
+            complete = len(expected.ids) >= len(ids) and (len(ids) > 0 or self._saw_cut)
             holds = len(ids) > 0 and len(expected.ids) >= _ENOUGH * len(ids)
         self._since_blind += 1
         interval = self.config.blind_interval

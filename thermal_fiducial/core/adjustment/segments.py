@@ -85,7 +85,8 @@ def counts_across(image: Counts | Float32Array, sides: Sides, memory: Memory | N
     counts = image.ravel().take(sides.pixel, mode='clip').astype(np.float32, copy=False)
     if memory is None or not (memory.gain > 1.0).any():
         return counts
-    pixel, which = sides.pixel.reshape(-1, len(memory.gain), 4), np.flatnonzero(memory.gain > 1.0)
+    of_each = sides.pixel.shape[-1] // len(memory.gain)
+    pixel, which = sides.pixel.reshape(-1, len(memory.gain), of_each), np.flatnonzero(memory.gain > 1.0)
     v, u = (a.astype(np.float32) for a in np.divmod(pixel[:, which].astype(np.int32), np.int32(image.shape[1])))
     maps = memory.maps[which].astype(np.float32)[..., None]
     to_u, to_v = (maps[:, row, 0] * u + maps[:, row, 1] * v + maps[:, row, 2] for row in (0, 1))
@@ -97,7 +98,7 @@ def counts_across(image: Counts | Float32Array, sides: Sides, memory: Memory | N
 
 
 def measure(
-    counts: Float32Array, modelled: tuple[Float32Array, Float32Array, Float32Array], reach: FloatArray
+    counts: Float32Array, modelled: tuple[Float32Array, Float32Array, Float32Array], reach: FloatArray, sides: int = 4
 ) -> Segments:
     """Displacement of each segment, S = 4 m to a marker: one of m on each side, the sides of the first parts first.
 
@@ -106,6 +107,7 @@ def measure(
     counts : (M, C, m, E) of :func:`counts_across`
     modelled : value, derivative and weight of each pixel, of :func:`thermal_fiducial.core.adjustment.edges.model`
     reach : (E,) longest displacement for which the model can be linearised [px]
+    sides : of a marker, if it has not 4
     """
     cells = counts.shape[2]
     value, slope, weight = modelled
@@ -116,15 +118,15 @@ def measure(
     np.subtract(counts, counts[counts.shape[0] // 2, counts.shape[1] // 2], out=X[3])
     X[3] *= weight
     X = X.reshape(_PLANES, -1, cells * len(reach))
-    fit = _fit(_by_marker(_moments(X), cells))
+    fit = _fit(_by_marker(_moments(X), cells, sides))
     noise = _noise(fit)
-    alike = np.abs(_residuals(fit, X, cells)) <= _by_segment(_PIXEL_OUTLIER * np.sqrt(noise), cells)
+    alike = np.abs(_residuals(fit, X, cells, sides)) <= _by_segment(_PIXEL_OUTLIER * np.sqrt(noise), cells, sides)
     if not alike.all():
         X[:4] *= alike.astype(np.float32)
-        fit = _fit(_by_marker(_moments(X), cells))
+        fit = _fit(_by_marker(_moments(X), cells, sides))
         noise = _noise(fit)
-    farthest = np.empty((len(reach) // 4, cells, 4))
-    farthest[:] = reach.reshape(-1, 1, 4)
+    farthest = np.empty((len(reach) // sides, cells, sides))
+    farthest[:] = reach.reshape(-1, 1, sides)
     return _judged(fit, noise, farthest.reshape(noise.shape))
 
 
@@ -138,15 +140,15 @@ def _moments(X: Float32Array) -> Float32Array:
     return np.asarray(np.add.reduce(X, axis=1))
 
 
-def _by_marker(values: Float32Array, cells: int) -> FloatArray:
-    """Of segments (..., m E) as (..., N, 4 m)."""
-    by_side = values.reshape(len(values), cells, -1, 4).swapaxes(1, 2)
-    return np.array(by_side, dtype=np.float64, order='C').reshape(len(values), -1, 4 * cells)
+def _by_marker(values: Float32Array, cells: int, sides: int) -> FloatArray:
+    """Of segments (..., m E) as (..., N, S)."""
+    by_side = values.reshape(len(values), cells, -1, sides).swapaxes(1, 2)
+    return np.array(by_side, dtype=np.float64, order='C').reshape(len(values), -1, sides * cells)
 
 
-def _by_segment(values: FloatArray, cells: int) -> Float32Array:
-    """Of markers (N, 4 m) as (m E,)."""
-    return np.array(values.reshape(-1, cells, 4).swapaxes(0, 1), dtype=np.float32, order='C').ravel()
+def _by_segment(values: FloatArray, cells: int, sides: int) -> Float32Array:
+    """Of markers (N, S) as (m E,)."""
+    return np.array(values.reshape(-1, cells, sides).swapaxes(0, 1), dtype=np.float32, order='C').ravel()
 
 
 def _fit(moments: FloatArray) -> _Fit:
@@ -165,9 +167,9 @@ def _fit(moments: FloatArray) -> _Fit:
     return _Fit(contrast, product, c, a, level, square, number)
 
 
-def _residuals(fit: _Fit, X: Float32Array, cells: int) -> Float32Array:
+def _residuals(fit: _Fit, X: Float32Array, cells: int, sides: int) -> Float32Array:
     """What the model leaves of the pixels (pixels, segments)."""
-    level, contrast, product = (_by_segment(each, cells) for each in (fit.level, fit.contrast, fit.product))
+    level, contrast, product = (_by_segment(each, cells, sides) for each in (fit.level, fit.contrast, fit.product))
     return np.asarray(X[3] - level * X[0] - contrast * X[1] - product * X[2])
 
 

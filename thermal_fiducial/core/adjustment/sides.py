@@ -55,7 +55,23 @@ def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, 
     half : number of pixels of a column on either side; M = 2 half + 1
     """
     nodes = _nodes(x, camera)
-    span, middle = nodes[:, 4] - nodes[:, 0], nodes[:, 2]
+    middle = nodes[:, 2]
+    opposite = middle.reshape(-1, 4, 2).take(_OPPOSITE, axis=1).reshape(-1, 2) - middle
+    return columns_across(nodes, opposite, shape, cells, columns, half)
+
+
+def columns_across(
+    nodes: FloatArray, opposite: FloatArray, shape: tuple[int, ...], cells: int, columns: int, half: int
+) -> Sides:
+    """Columns across E sides, or across other edges.
+
+    Parameters
+    ----------
+    nodes : (E, 5, 2) pixels of five points on each, from end to end
+    opposite : (E, 2) from their middles to the opposite sides, inward [px]
+    shape, cells, columns, half : as of :func:`sides_of`
+    """
+    span = nodes[:, 4] - nodes[:, 0]
     steep = np.abs(span[:, 1]) > np.abs(span[:, 0])
     share, weights = _parts(cells, columns)
     by_column = (2, columns, cells, len(nodes))
@@ -67,7 +83,6 @@ def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, 
     whole, slope = np.rint(along), climb / rate
     ahead = whole - along
     centre = across + slope * ahead
-    opposite = middle.reshape(-1, 4, 2).take(_OPPOSITE, axis=1).reshape(-1, 2) - middle
     # On which side of the line the opposite one lies: of a steeply tilted square it may lie mostly further along.
     turn = span[:, 0] * opposite[:, 1] - span[:, 1] * opposite[:, 0]
     inward = np.sign(turn * np.where(steep, -span[:, 1], span[:, 0]))

@@ -15,15 +15,15 @@ from thermal_fiducial.core.adjustment.segments import counts_across, HOPELESS, m
 from thermal_fiducial.core.adjustment.sides import sides_of
 from thermal_fiducial.core.camera import ImagePoints
 from thermal_fiducial.core.corners import RefinedCorners
-from thermal_fiducial.core.types import FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 from thermal_fiducial.core.vision.frame import Frame
 from thermal_fiducial.core.vision.refining import Refinement
 
-#: Largest number of grey levels of what is meant for a display.
-LEVELS = 256
-# Displacement of sides by a bent scale [px]: if the middle of black and white lies anywhere from a fifth to four fifths
-# of the step as it was, that of a step blurred by 0.66 px is off by up to 0.55, evenly spread.
-_DISPLACED = 0.3
+# Largest number of grey levels of what is meant for a display.
+_LEVELS = 256
+#: Displacement of sides by a bent scale [px]: if the middle of black and white lies anywhere from a fifth to four
+#: fifths of the step as it was, that of a step blurred by 0.66 px is off by up to 0.55, evenly spread.
+DISPLACED = 0.3
 # Deviation of a segment that no noise explains [px], and how much larger the variance of their mean is than if segments
 # erred by themselves: of rendered frames after the Tau 2's plateau equalisation, errors of the displacement found are
 # 3 to 4 of the sigmas that independent segments would have, of markers of 14 to 60 px seen at up to 70 degrees.
@@ -33,6 +33,11 @@ _DEVIATION = 0.1
 # Four corners that err together, each with a covariance of its own, tell what they have in common four times too well.
 _CORNERS = 4.0
 _COLUMNS, _HALF = 6, 6
+
+
+def for_display(counts: Counts | Gray) -> bool:
+    """Whether a frame (height, width) has gone through the camera's processing for a display."""
+    return bool(counts[::64].max() < _LEVELS)
 
 
 class DisplayedSides:
@@ -50,7 +55,7 @@ class DisplayedSides:
         # Where sides are out by one, the inner edges are in by one, of a border that is drawn too large with them.
         gain = 2.0 - 2.0 / (self._bits + 2.0)
         information = gain * gain * weight.sum(axis=1)
-        variance = 1.0 / (information + _DISPLACED**-2)
+        variance = 1.0 / (information + DISPLACED**-2)
         displacement = variance * gain * np.sum(weight * segments.shift, axis=1)
         outward = _outward(refinement.corners.corners_px)
         corners = refinement.corners.corners_px - displacement[:, None, None] * outward

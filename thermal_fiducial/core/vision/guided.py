@@ -16,6 +16,7 @@ from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.pose import marker_corners
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from thermal_fiducial.core.vision.decoding import Decoder, Reading
+from thermal_fiducial.core.vision.ids import among
 from thermal_fiducial.core.vision.motion import Twist
 from thermal_fiducial.core.vision.scratch import Scratch
 from thermal_fiducial.core.vision.search import Found, read_quads
@@ -23,6 +24,8 @@ from thermal_fiducial.core.vision.search import Found, read_quads
 # A marker turned further from the camera than this shows too little to be expected.
 _MAX_TILT_COSINE = 0.2
 _NEXT = np.array([1, 2, 3, 0])
+# A marker predicted as far inside the image as this is not cut by its rim [px].
+_WHOLE_PX = 10.0
 # Places round the prediction that are tried, in shares of a cell: near first, then far.
 _NEAR = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]), axis=-1).reshape(-1, 2)
 _FAR = np.stack(np.meshgrid([-1.4, -0.7, 0.0, 0.7, 1.4], [-1.4, -0.7, 0.0, 0.7, 1.4]), axis=-1).reshape(-1, 2)
@@ -53,6 +56,17 @@ class Expected(NamedTuple):
         )
 
 
+class CutMarkers(NamedTuple):
+    """N markers that show a face and may be in view, but not wholly."""
+
+    #: (N,)
+    ids: IntArray
+    #: (N, 4, 4)
+    T_camera_marker: FloatArray
+    #: (N,) sides [m]
+    sizes: FloatArray
+
+
 class KnownMarkers:
     """The markers of a map.
 
@@ -65,8 +79,10 @@ class KnownMarkers:
         #: (M,)
         self.ids = np.array(sorted(markers), dtype=np.int64)
         entries = [markers[marker_id] for marker_id in self.ids.tolist()]
-        T_map_marker = np.stack([entry[0] for entry in entries]) if entries else np.zeros((0, 4, 4))
-        sizes = np.array([entry[1] for entry in entries])
+        self._T_map_marker = T_map_marker = (
+            np.stack([entry[0] for entry in entries]) if entries else np.zeros((0, 4, 4))
+        )
+        self._sizes = sizes = np.array([entry[1] for entry in entries])
         corners = geometry.apply(T_map_marker, sizes[:, None, None] * marker_corners(1.0))
         self._corners_and_normals = np.concatenate([corners, T_map_marker[:, None, :3, 2]], axis=1)
 
@@ -82,6 +98,23 @@ class KnownMarkers:
         seen = np.flatnonzero(camera.contains(corners, 2.0).all(axis=1) & facing & large)
         points = points[seen]
         return Expected(self.ids[seen], corners[seen], points[..., :2] / points[..., 2:], points[..., 2])
+
+    def cut(self, T_camera_map: FloatArray, camera: Camera, without: IntArray) -> CutMarkers:
+        """Those that show a face and may be partly in view, but for those of the IDs ``without``."""
+        T = T_camera_map @ self._T_map_marker
+        centre, normal = T[:, :3, 3], T[:, :3, 2]
+        distance = np.sqrt(np.sum(centre * centre, axis=1))
+        facing = np.sum(normal * centre, axis=1) < -_MAX_TILT_COSINE * distance
+        corners = camera.project(geometry.apply(T_camera_map, self._corners_and_normals[:, :4].reshape(-1, 3))).reshape(
+            -1, 4, 2
+        )
+        near = np.nan_to_num(corners, nan=-1e9)
+        low, high = near.min(axis=1), near.max(axis=1)
+        inside = camera.contains(corners)
+        overlap = inside.any(axis=1) | ((low < (camera.width, camera.height)) & (high > 0.0)).all(axis=1)
+        whole = camera.contains(corners, _WHOLE_PX).all(axis=1)
+        some = np.flatnonzero(facing & overlap & ~whole & ~among(self.ids, without))
+        return CutMarkers(self.ids[some], T[some], self._sizes[some])
 
 
 def camera_in_map(stamp_ns: int, odometry: Odometry, T_body_camera: FloatArray, twist: Twist) -> FloatArray:

@@ -150,7 +150,7 @@ class Refiner:
             if frame.readout > 0.0:
                 memory = memory * stretch(places, twist, frame)[..., None]
         mean = 0.25 * smear.sum(axis=1)
-        sharpen = _worth_sharpening((mean * mean).sum(axis=1), cell, self._behind.shape[2], clarity)
+        sharpen = worth_sharpening((mean * mean).sum(axis=1), cell, self._behind.shape[2], clarity)
         removed = (1.0 - REMAINING) * memory * sharpen[:, None, None]
         shift = smear - removed + expected_displacement(places, twist, frame)
         spread, past = mean * np.where(sharpen, SPREAD, 1.0)[:, None], None
@@ -203,7 +203,7 @@ def _doubts(seen: RefinedCorners) -> FloatArray:
     return seen.doubt[:, None, None, None] * _EYE
 
 
-def _worth_sharpening(square: FloatArray, cell: FloatArray, cells: int, clarity: FloatArray) -> BoolArray:
+def worth_sharpening(square: FloatArray, cell: FloatArray, cells: int, clarity: FloatArray) -> BoolArray:
     """For which markers with squares of the smear (N,) and cells (N,) [px] it costs more than sharpening's noise."""
     systematic, noise = _COST_OF_SMEAR * square / cell, _NOISE_OF_SHARPENING / np.sqrt(cells * cell)
     worth = (np.abs(clarity) > _CLEAR) | (systematic * np.abs(clarity) > noise)

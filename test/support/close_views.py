@@ -1,0 +1,51 @@
+"""Markers so near that the image cuts them off, drawn from their geometry alone: nothing of the detector is used."""
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.core import geometry
+from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.vision.patterns import marker_bits
+from thermal_fiducial.files.dictionary import load_dictionary
+
+K = [[265.0, 0, 158.5], [0, 264.0, 129.5], [0, 0, 1]]
+CAMERAS = {
+    'plumb_bob': Camera(320, 256, K, 'plumb_bob', [-0.15, 0.03, 1e-4, -2e-4, 0.0]),
+    'rational_polynomial': Camera(320, 256, K, 'rational_polynomial', [0.3, 0.05, 1e-4, -2e-4, 0.01, 0.6, 0.1, 0.02]),
+    'equidistant': Camera(320, 256, K, 'equidistant', [-0.02, -0.006, 0.0055, -0.0019]),
+}
+DICTIONARY = load_dictionary('DICT_4X4_50')
+BITS = marker_bits(DICTIONARY)
+BLUR = 0.6
+#: Optics, and the pixel's own square over which the drawing averages.
+BLUR_WITH_PIXEL = float(np.hypot(BLUR, np.sqrt(1 / 12)))
+
+
+def pose(size_px, u, v, tilt, size=0.3):
+    """T_camera_marker of a marker that looks so large, its middle in the direction (u, v) of normalised coordinates."""
+    R = geometry.so3_exp(tilt) @ np.diag([1.0, -1.0, -1.0])
+    return geometry.transform(R, np.array([u, v, 1.0]) * size * 265.0 / size_px)
+
+
+def draw(camera, grid, T, size=0.3, samples=4, blur=BLUR):
+    """White's share (height, width) of a plate at T_camera_marker; ``grid`` has its cells, a white ring about it."""
+    fine = (np.arange(camera.width * samples) + 0.5) / samples - 0.5
+    rows = (np.arange(camera.height * samples) + 0.5) / samples - 0.5
+    image = np.empty((camera.height, camera.width), dtype=np.float32)
+    # Strips of rows bound the memory.
+    for first in range(0, camera.height, 32):
+        v = rows[first * samples : (first + 32) * samples]
+        x = camera.normalise(np.stack(np.meshgrid(fine, v), axis=-1))
+        rays = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
+        on_plane = geometry.apply(geometry.inverse(T), rays * (T[:3, 2] @ T[:3, 3] / (rays @ T[:3, 2]))[..., None])
+        cells = len(grid) - 2
+        column = np.clip(np.floor((on_plane[..., 0] / size + 0.5) * cells) + 1, 0, cells + 1).astype(int)
+        row = np.clip(np.floor((0.5 - on_plane[..., 1] / size) * cells) + 1, 0, cells + 1).astype(int)
+        shares = grid[row, column].reshape(len(v) // samples, samples, camera.width, samples)
+        image[first : first + 32] = shares.mean(axis=(1, 3))
+    return cv2.GaussianBlur(image, (0, 0), blur) if blur > 0.0 else image
+
+
+def plate(marker_id):
+    """Cells of a marker with its white ring."""
+    return np.pad(np.pad(BITS[marker_id].astype(float), 1), 1, constant_values=1.0)
