@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.flights import CAMERA_POSITION, config
 
+from thermal_fiducial.core.filter.clock_steps import ClockSteps
 from thermal_fiducial.core.filter.error_state import BodyPose, ErrorStateFilter, Motion, pose_innovation
 from thermal_fiducial.core.filter.imu import ImuStep
 from thermal_fiducial.core.filter.initialisation import blank_state
@@ -61,6 +62,7 @@ def intercepted(filter_):
 
     def update(state, innovation, H, noise):
         seen.update(y=innovation, H=H)
+        filter_._algebra.K = np.zeros((LAYOUT.size, 6))
         return state, 0.0
 
     filter_._update = update
@@ -187,7 +189,8 @@ def test_an_uncertain_time_offset_costs_what_the_acceleration_makes_of_it(state,
     place, std = filter_.layout.time_offset, 0.02
     P = 1e3 * np.eye(filter_.layout.size)
     P[VELOCITY, VELOCITY], P[place, place] = 0.0, std**2
-    resting = replace(state, velocity=np.zeros(3), covariance=P)
+    steps = ClockSteps.none(filter_.layout.size)
+    resting = replace(state, velocity=np.zeros(3), covariance=P, clock_steps=steps)
     lift = np.concatenate((resting.bias[:3], resting.bias[3:] - resting.gravity @ resting.R_map_body))
     motion = Motion(lift + np.eye(6)[3] * push, np.array([turning, 0.0, 0.0]), 0.1)
     corrected, _ = filter_.correct(resting, BodyPose(resting.T_map_body, 1e-12 * np.eye(6)), motion)

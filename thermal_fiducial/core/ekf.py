@@ -408,6 +408,7 @@ class PoseEkf:
                 'usable for': self.usable_for,
                 'time offset': self._config.camera_time_offset + self.state.time_offset,
                 'time offset std': self._gate.filter.time_offset_std(self.state),
+                'clock steps': float(self.state.clock_steps.found),
                 'stamp jitter': math.sqrt(self.state.stamp_jitter.variance),
                 'vibration share': self.state.aliasing.share,
                 'gyroscope bias': float(np.linalg.norm(self.state.bias[:3])),

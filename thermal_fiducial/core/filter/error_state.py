@@ -7,7 +7,9 @@ from filterpy.kalman import ExtendedKalmanFilter
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.clock_steps import ClockSteps
 from thermal_fiducial.core.filter.imu import ImuStep, rotation_integrals, Transition
+from thermal_fiducial.core.filter.imu_noise import NoiseRange
 from thermal_fiducial.core.filter.navigation_state import (
     ACCELEROMETER_BIAS,
     GYROSCOPE_BIAS,
@@ -33,6 +35,9 @@ _STEP = 2.0
 _AVERAGING, _SHORTEST, _LONGEST = 14.0, 0.05, 0.5
 #: A swing's acceleration is so many times [1/s] its rate, half a period later; squared, the least that counts.
 _SWINGING, _LEAST_TURNING = 3.0, 1e-12
+#: So much more than James and Stein shrink a rate's change: its noise is in the predicted attitude too, and misleads.
+_SHRINKAGE = 4.0
+_NO_NOISE = NoiseRange()
 _SIX = np.arange(6)
 
 
@@ -63,16 +68,16 @@ class Motion:
     age: float
     #: instant of the pose in the clock of the IMU
     time_ns: int = 0
-    #: how much of the IMU's noise is in doubt, 0 to 1
-    doubt: float = 0.0
+    #: of the IMU then
+    noise: NoiseRange = _NO_NOISE
 
     @classmethod
-    def of(cls, samples: FloatArray, seconds: float, time_ns: int = 0, doubt: float = 0.0) -> 'Motion':
+    def of(cls, samples: FloatArray, seconds: float, time_ns: int = 0, noise: NoiseRange | None = None) -> 'Motion':
         """Motion in samples (N, 6) of so many ``seconds``, the slope of their rate by least squares."""
         count = len(samples)
         place = np.arange(count) - 0.5 * (count - 1)
         slope = place @ samples[:, :3] * (count / seconds) / max(float(place @ place), 1.0)
-        return cls(samples.mean(axis=0), slope, 0.5 * seconds, time_ns, doubt)
+        return cls(samples.mean(axis=0), slope, 0.5 * seconds, time_ns, noise or _NO_NOISE)
 
     def averaging_seconds(self, density: float) -> float:
         """Seconds over which to average a rate with white noise of ``density`` [rad/s/sqrt(Hz)] in such a motion.
@@ -84,6 +89,15 @@ class Motion:
         turning = float(self.angular_acceleration @ self.angular_acceleration) + _SWINGING**2 * float(rate @ rate)
         best = _AVERAGING * float(np.cbrt(density**2 / max(turning, _LEAST_TURNING)))
         return min(max(best, _SHORTEST), _LONGEST)
+
+    @property
+    def turned(self) -> FloatArray:
+        """How much the rate (3,) at the pose differs from the mean [rad/s], shrunk as its noise asks (James, Stein)."""
+        turned = self.age * self.angular_acceleration
+        # The end of a fitted line has three times the variance of the mean, on three axes.
+        variance = 9.0 * self.noise.shaken[0] ** 2 / (2.0 * self.age)
+        square = float(turned @ turned)
+        return np.asarray(max(1.0 - _SHRINKAGE * variance / max(square, _LEAST_TURNING), 0.0) * turned)
 
 
 class ErrorStateFilter:
@@ -135,6 +149,7 @@ class ErrorStateFilter:
             state.T_body_camera,
             state.stamp_jitter,
             state.aliasing,
+            state.clock_steps.propagated(F),
             algebra.P,
         )
 
@@ -166,7 +181,10 @@ class ErrorStateFilter:
         noise[_SIX, _SIX] += self._floor(twist)
         innovation = pose_innovation(state, pose.T_map_body) - _travelled(state, twist, motion, -late)
         corrected, nis = self._update(state, innovation, H, noise)
-        return self._open_clock(self._learned(corrected, innovation, twist, motion), motion.imu), nis
+        corrected = self._learned(corrected, innovation, twist, motion)
+        if state.clock_open:
+            corrected.clock_steps = self._clock_steps(state.clock_steps, innovation, H, motion, nis)
+        return self._open_clock(corrected, motion.imu), nis
 
     def _learned(
         self, state: NavigationState, innovation: FloatArray, twist: FloatArray, motion: Motion
@@ -177,8 +195,28 @@ class ErrorStateFilter:
         return replace(
             state,
             stamp_jitter=state.stamp_jitter.after(twist, weighted_twist, innovation),
-            aliasing=state.aliasing.after(motion.time_ns, innovation, weighted, motion.doubt, scale),
+            aliasing=state.aliasing.after(motion.time_ns, innovation, weighted, motion.noise.doubt, scale),
         )
+
+    def _clock_steps(
+        self, steps: ClockSteps, innovation: FloatArray, H: FloatArray, motion: Motion, nis: float
+    ) -> ClockSteps:
+        """``steps`` after the update by ``innovation``, or after none where that is refused."""
+        place, algebra, gate = self.layout.time_offset, self._algebra, self._config.gate
+        assert place is not None
+        shown = H @ steps.responses
+        # What moves a pose is the rate at its instant: the mean of half a second before may be another.
+        shown[:3] += np.outer(motion.turned, steps.responses[place])
+        steps = steps.seen(innovation, shown, algebra.SI, gate)
+        return steps.corrected(algebra.K, shown, place) if nis <= gate else steps
+
+    def after_clock_step(self, state: NavigationState) -> NavigationState | None:
+        """``state`` if the clock has stepped, as poses show that it has; None where they don't."""
+        step = state.clock_steps.found_step()
+        if step is None:
+            return None
+        moved = inject(state, step.error, state.covariance + step.covariance, self.layout)
+        return replace(moved, clock_steps=ClockSteps.none(self.layout.size, state.clock_steps.found + 1))
 
     def _floor(self, twist: FloatArray) -> FloatArray:
         """Variances (6,) of what the corner covariances don't know: errors that all corners share, more in motion."""
@@ -246,7 +284,8 @@ class ErrorStateFilter:
         assert place is not None
         column = state.covariance[:, place]
         error = column / column[place] * (time_offset - state.time_offset)
-        return inject(state, error, state.covariance, self.layout)
+        moved = inject(state, error, state.covariance, self.layout)
+        return replace(moved, clock_steps=ClockSteps.none(self.layout.size, state.clock_steps.found))
 
     def with_unknown_clock(self, state: NavigationState) -> NavigationState:
         """``state`` as good as it is, whose time offset is as unknown as after a step of the clock."""
@@ -254,7 +293,8 @@ class ErrorStateFilter:
         assert place is not None
         covariance[place], covariance[:, place] = 0.0, 0.0
         covariance[place, place] = (_STEP * self._config.time_offset_std) ** 2
-        return replace(state, covariance=covariance)
+        steps = ClockSteps.none(self.layout.size, state.clock_steps.found)
+        return replace(state, covariance=covariance, clock_steps=steps)
 
     def time_offset_std(self, state: NavigationState) -> float:
         """Of the estimate; before it is begun, and where there is none, what the parameter says [s]."""

@@ -54,6 +54,11 @@ class Track:
         """The track after a pose that it accepts."""
         return replace(self, state=state, accepted_ns=time_ns, hits=self.hits + 1)
 
+    def refusing(self, state: NavigationState) -> 'Track':
+        """The track after a pose that it refuses, of which only what ``state`` has learned of the noise is kept."""
+        learned = replace(self.state, aliasing=state.aliasing, clock_steps=state.clock_steps)
+        return replace(self, state=learned)
+
 
 @dataclass(frozen=True, slots=True)
 class Belief:
@@ -97,7 +102,7 @@ class Sighting:
         """The motion that shows a clock error."""
         glance = Motion.of(self.samples(_GLANCE_SECONDS), _GLANCE_SECONDS)
         seconds = glance.averaging_seconds(self.noise.shaken[0])
-        return Motion.of(self.samples(seconds), seconds, self.time_ns, self.noise.doubt)
+        return Motion.of(self.samples(seconds), seconds, self.time_ns, self.noise)
 
 
 class PoseGate:
@@ -150,10 +155,15 @@ class PoseGate:
         nis = math.nan
         if main:
             state, nis = self._correct(main.state, sighting)
-            if nis <= self._config.gate:
-                accepted = Belief(main.supported(state, time_ns), _outdone(belief.rival), stamp_ns, belief.resets)
-                return accepted, PoseUpdate(stamp_ns, True, '', nis)
-            belief = replace(belief, main=replace(main, state=replace(main.state, aliasing=state.aliasing)))
+            accepted = nis <= self._config.gate
+            main = main.supported(state, time_ns) if accepted else main.refusing(state)
+            stepped = self.filter.after_clock_step(main.state)
+            if stepped:
+                main = replace(main, state=stepped)
+            if accepted:
+                rival = None if stepped else _outdone(belief.rival)
+                return Belief(main, rival, stamp_ns, belief.resets), PoseUpdate(stamp_ns, True, '', nis)
+            belief = replace(belief, main=main, rival=None if stepped else belief.rival)
         rival = belief.rival or self._rival(belief, sighting)
         reason = f'refused: {math.sqrt(nis):.1f} sigma' if main else 'initialising'
         if rival is None:

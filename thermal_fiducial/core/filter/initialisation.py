@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.clock_steps import ClockSteps
 from thermal_fiducial.core.filter.error_state import BodyPose, ErrorStateFilter
 from thermal_fiducial.core.filter.learned_noise import Aliasing, StampJitter
 from thermal_fiducial.core.filter.navigation_state import (
@@ -77,6 +78,7 @@ def blank_state(config: PoseEkfConfig, layout: Layout) -> NavigationState:
         T_body_camera=transform_from_quaternion(config.camera_position, config.camera_orientation),
         stamp_jitter=StampJitter.of(config.stamp_jitter),
         aliasing=Aliasing(),
+        clock_steps=ClockSteps.none(layout.size),
         covariance=np.zeros((layout.size, layout.size)),
     )
 
@@ -128,5 +130,6 @@ def _unaligned(config: PoseEkfConfig, layout: Layout, pose: BodyPose, prior: Nav
         position=pose.T_map_body[:3, 3],
         velocity=np.zeros(3),
         clock_open=False,
+        clock_steps=ClockSteps.none(layout.size, prior.clock_steps.found),
         covariance=P,
     )

@@ -15,6 +15,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.clock_steps import ClockSteps
 from thermal_fiducial.core.filter.imu import rotation_integrals
 from thermal_fiducial.core.filter.learned_noise import Aliasing, StampJitter
 from thermal_fiducial.core.geometry import transform
@@ -82,6 +83,8 @@ class NavigationState:
     #: what the innovations have shown of the noise
     stamp_jitter: StampJitter
     aliasing: Aliasing
+    #: whether the camera's clock has stepped
+    clock_steps: ClockSteps
     #: (n, n) of the error coordinates of :class:`Layout`
     covariance: FloatArray
 
@@ -140,6 +143,7 @@ def in_moved_map(state: NavigationState, T_new_old: FloatArray, layout: Layout) 
         turn = np.eye(layout.size)
         turn[layout.gravity, layout.gravity] = R[:2, :2]
         moved.covariance = turn @ state.covariance @ turn.T
+        moved.clock_steps = state.clock_steps.turned(turn)
     return moved
 
 
