@@ -7,7 +7,7 @@ from thermal_fiducial.core.types import FloatArray, Gray
 
 # The hull of an outline is simplified to within this share of its length: more than noise bends it, less than a side.
 _STRAIGHT = 0.05
-_NEXT = np.array([1, 2, 3, 0])
+_CORNERS, _NEXT = 4, np.array([1, 2, 3, 0])
 
 
 def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray) -> FloatArray:
@@ -21,15 +21,15 @@ def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray) -> FloatArray
     """
     for quad in np.rint(hidden).astype(np.int32):
         cv2.fillConvexPoly(mask, quad, 0)
-    outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
     shortest, longest = 3.2 * min_side_px, 2.0 * sum(mask.shape)
     quads = []
     for outline in outlines:
-        if not shortest <= len(outline) <= longest:
+        if len(outline) < _CORNERS or not shortest <= cv2.arcLength(outline, True) <= longest:
             continue
         hull = cv2.convexHull(outline)
         simple = cv2.approxPolyDP(hull, _STRAIGHT * cv2.arcLength(hull, True), True)
-        if len(simple) == 4:
+        if len(simple) == _CORNERS:
             quads.append(simple[:, 0])
     if not quads:
         return np.zeros((0, 4, 2))
