@@ -125,9 +125,9 @@ def bounds(seed):
     ekf = PoseEkf(exact)
     run(ekf, timeline(data.samples(), data.poses))
     known = replace(ekf.state, covariance=np.zeros_like(ekf.state.covariance))
+    densities = COASTING_IMU.gyroscope_noise_density, COASTING_IMU.accelerometer_noise_density
     variances = [
-        polynomial.polyval(GAPS, coasting_variance(state, Layout.of(exact), COASTING_IMU))
-        for state in (ekf.state, known)
+        polynomial.polyval(GAPS, coasting_variance(state, Layout.of(exact), densities)) for state in (ekf.state, known)
     ]
     return np.sqrt(np.array(variances) / 3.0 * chi2.ppf(0.95, 3))
 

@@ -381,7 +381,8 @@ class PoseEkf:
         """Seconds [s] for which the pose stays as good as ``lost_position_std`` asks, if no marker comes any more."""
         if self.state is None:
             return 0.0
-        return usable_seconds(self.state, self._gate.filter.layout, self._config.imu, self._config.lost_position_std)
+        densities = self._nodes[-1].noise.at(self.state.aliasing.share)
+        return usable_seconds(self.state, self._gate.filter.layout, densities, self._config.lost_position_std)
 
     def _mean_nis(self) -> float:
         """Of the latest poses; 6 where their covariances are the truth, less where the parameters allow for more."""

@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.polynomial import polynomial
 
-from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.filter.navigation_state import (
     ACCELEROMETER_BIAS,
     GYROSCOPE_BIAS,
@@ -20,18 +19,21 @@ from thermal_fiducial.core.types import FloatArray
 HORIZON, STEP = 60.0, 0.05
 
 
-def usable_seconds(state: NavigationState, layout: Layout, noise: ImuNoise, position_std: float) -> float:
+def usable_seconds(
+    state: NavigationState, layout: Layout, densities: tuple[float, float], position_std: float
+) -> float:
     """Seconds [s] on the IMU alone until the position is worse than ``position_std`` [m]; at most ``HORIZON``."""
     times = np.arange(0.0, HORIZON + STEP, STEP)
-    beyond = polynomial.polyval(times, coasting_variance(state, layout, noise)) > position_std**2
+    beyond = polynomial.polyval(times, coasting_variance(state, layout, densities)) > position_std**2
     return float(times[np.argmax(beyond)]) if beyond.any() else HORIZON
 
 
-def coasting_variance(state: NavigationState, layout: Layout, noise: ImuNoise) -> FloatArray:
+def coasting_variance(state: NavigationState, layout: Layout, densities: tuple[float, float]) -> FloatArray:
     """Sum of the position variances [m^2] after t seconds of hover, coefficients of t^0 .. t^6.
 
     The error is rho + nu t + alpha t^2 / 2 + beta t^3 / 6 + noise, with alpha the acceleration that tilt and
-    accelerometer bias feign, and beta its growth by the gyroscope bias that is left.
+    accelerometer bias feign, and beta its growth by the gyroscope bias that is left. ``densities``: of the noise of
+    gyroscope and accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)].
     """
     lift = skew(-state.gravity @ state.R_map_body)
     n = layout.size
@@ -46,6 +48,7 @@ def coasting_variance(state: NavigationState, layout: Layout, noise: ImuNoise) -
         for j, right in enumerate(terms):
             coefficients[i + j] += np.einsum('ik,kl,il', left, state.covariance, right)
     # White accelerations on three axes, each sigma^2 t^3 / 3, and the tilt that white rates make of two.
-    coefficients[3] += noise.accelerometer_noise_density**2
-    coefficients[5] += 2.0 * noise.gyroscope_noise_density**2 * float(state.gravity @ state.gravity) / 20.0
+    rate, force = densities
+    coefficients[3] += force**2
+    coefficients[5] += 2.0 * rate**2 * float(state.gravity @ state.gravity) / 20.0
     return coefficients
