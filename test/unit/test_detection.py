@@ -1,5 +1,7 @@
 """The detector on rendered frames."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from support.scenes import camera_of
@@ -7,6 +9,8 @@ from support.scenes import camera_of
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection import MarkerDetector
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, MARKER_DTYPE
+from thermal_fiducial.core.vision.displayed import DisplayedSides
+from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.scenario import named
@@ -69,6 +73,12 @@ def test_what_a_display_displaces_the_border_tells(frames, bent):
     nees = np.einsum('nki,nkij,nkj->nk', error, np.linalg.inv(corner_covariances(rows)), error).mean()
     # 2 of an honest corner; a real camera's scale is bent from place to place, not by one curve.
     assert nees < 2.0
+
+
+def test_without_markers_a_display_displaces_nothing():
+    untouched = SimpleNamespace(corners='untouched')
+    bits = marker_bits(load_dictionary('DICT_4X4_50'))
+    assert DisplayedSides(bits).corrected(None, np.zeros(0, dtype=np.int64), untouched, 0.66) == 'untouched'
 
 
 def test_raw_counts_are_claimed_better_than_a_display(frames):

@@ -29,6 +29,13 @@ _PREFERRED = 4
 #: Poses are linearised anew when the time offset has become known so many times better, and well enough when it is
 #: known to this [s]: half an angular acceleration of 5 rad/s^2 times its square is 0.01 mrad.
 _BETTER, _WELL_KNOWN = 2.0, 0.002
+#: A pose that is off even for an estimate that claims so many times too little is a marker's fault, unless as many
+#: poses bear it out as have borne out the estimate, or so many.
+_FAR_TOO_SURE, _ENOUGH_POSES = 10.0, 300
+#: So many poses that the estimate accepts refute a rival where the robot could not have gone.
+_REFUTED = 3
+#: What speaks against a rival is forgotten by half when it is so much.
+_REMEMBERED = 16
 _NEVER = -(1 << 62)
 #: why a pose was refused that no attitude of a robot under gravity explains
 NO_GRAVITY = 'refused: contradicts gravity'
@@ -49,6 +56,8 @@ class Track:
     #: of a rival: poses since its start that the other estimate accepted, and stamp of the last pose that it has seen
     against: int = 0
     pose_stamp_ns: int = _NEVER
+    #: of a rival: poses that must agree on it
+    needed: int = 0
 
     def supported(self, state: NavigationState, time_ns: int) -> 'Track':
         """The track after a pose that it accepts."""
@@ -139,6 +148,7 @@ class PoseGate:
             track.misses,
             track.against,
             track.pose_stamp_ns,
+            track.needed,
         )
 
     def in_moved_map(self, belief: Belief, T_new_old: FloatArray) -> Belief:
@@ -206,10 +216,25 @@ class PoseGate:
     def _rival(self, belief: Belief, sighting: Sighting) -> Track | None:
         """An estimate that begins with a pose."""
         stamp_ns, time_ns = sighting.pose.stamp_ns, sighting.time_ns
-        first = self._of_another_clock(belief, sighting) or self._from_nothing(belief, sighting)
+        first, needed = self._of_another_clock(belief, sighting), 0
+        if first is None:
+            first, needed = self._from_nothing(belief, sighting), self._needed(belief.main, sighting)
         if first is None:
             return None
-        return Track(first, time_ns, time_ns, self._config.time_offset_std, pose_stamp_ns=stamp_ns)
+        std = self._config.time_offset_std
+        return Track(first, time_ns, time_ns, std, pose_stamp_ns=stamp_ns, needed=needed)
+
+    def _needed(self, main: Track | None, sighting: Sighting) -> int:
+        """How many poses must contradict an estimate that is said to be elsewhere all of a sudden.
+
+        Where the robot could not have gone, a marker that was moved or that hangs in two places has. But the estimate
+        itself may have begun with such a one.
+        """
+        if main is None:
+            return 0
+        doubtful = replace(main.state, covariance=_FAR_TOO_SURE**2 * main.state.covariance)
+        possible = self._correct(doubtful, sighting)[1] <= self._config.gate
+        return 0 if possible else min(main.hits, _ENOUGH_POSES)
 
     def _of_another_clock(self, belief: Belief, sighting: Sighting) -> NavigationState | None:
         """The main estimate, if the pose is right but for a step of the camera's clock."""
@@ -267,7 +292,8 @@ class PoseGate:
             return False
         if main is None or position_std(main.state) > self._config.lost_position_std:
             return True
-        return self._agreed(rival) and time_ns - rival.started_ns >= self._config.reset_after * _SECOND_NS
+        long_enough = time_ns - rival.started_ns >= self._config.reset_after * _SECOND_NS
+        return self._agreed(rival) and long_enough and rival.hits >= rival.needed
 
     def _agreed(self, rival: Track) -> bool:
         enough = rival.hits >= self._config.initial_poses
@@ -276,9 +302,11 @@ class PoseGate:
 
 def _outdone(rival: Track | None) -> Track | None:
     """The rival after a pose that the main estimate accepts; none unless it has more to show for itself."""
-    if rival is None or rival.against + 1 >= rival.hits:
+    if rival is None or rival.against + 1 >= (_REFUTED if rival.needed else rival.hits):
         return None
-    return replace(rival, against=rival.against + 1)
+    if rival.against + 1 < _REMEMBERED:
+        return replace(rival, against=rival.against + 1)
+    return replace(rival, hits=rival.hits // 2, misses=rival.misses // 2, against=(rival.against + 1) // 2)
 
 
 def position_std(state: NavigationState) -> float:

@@ -51,6 +51,8 @@ def hangs_twice(residuals: FloatArray, J: FloatArray, outlying: BoolArray) -> bo
     residuals, J : (n, 8), (n, 8, 6) of all views of one marker, J with respect to its pose
     outlying : (n,)
     """
+    # A marker in the plane of a camera, of a map that has gone wrong, has no residual.
+    outlying = outlying & np.isfinite(residuals).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
     count = np.count_nonzero(outlying)
     if count < _FEWEST or count < _LEAST * len(residuals):
         return False

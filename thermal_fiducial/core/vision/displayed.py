@@ -49,6 +49,8 @@ class DisplayedSides:
 
     def corrected(self, frame: Frame, ids: IntArray, refinement: Refinement, blur_px: float) -> RefinedCorners:
         """Corners of N markers ``ids`` at the stamp, with what stays unknown of the displacement."""
+        if len(ids) == 0:
+            return refinement.corners
         segments = self._across_border(frame, ids, refinement, blur_px)
         known = segments.variance < HOPELESS
         weight = np.where(known, 1.0 / (_TOGETHER * (segments.variance + _FLOOR**2)), 0.0)
