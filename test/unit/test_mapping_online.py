@@ -11,7 +11,7 @@ from thermal_fiducial.core.adjustment.reprojection import difference, retract
 from thermal_fiducial.core.geometry import so3_exp, transform
 from thermal_fiducial.core.map_refinement import refine
 from thermal_fiducial.core.mapping.map_editing import transformed
-from thermal_fiducial.core.marker_map import MapMarker, MarkerMap, MarkerMapper
+from thermal_fiducial.core.marker_map import ASTRAY, MapMarker, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import Odometry
 
 # The body is the camera: odometry and camera pose are one.
@@ -206,6 +206,31 @@ def test_drift_that_grows_with_the_way_does_not_set_neighbouring_frames_apart():
     # The common error is that of 12 s and more; within the 14 frames since, 1 cm/s is 5 mm, and 2 mrad/s is 1 mrad.
     assert np.all(np.diag(apart.common)[:3] >= (0.05 * 12.0) ** 2)
     assert np.all(np.sqrt(np.diag(apart.covariances[0])) < [0.005] * 3 + [0.001] * 3)
+
+
+def test_a_marker_that_hangs_in_two_places_teaches_nothing():
+    """Markers 0 and 1 are seen again 6 m away, with new ones round them: odometry, right so far, knows better."""
+    rng = np.random.default_rng(12)
+    poses = wall(rng)
+    near = {i: poses[i] for i in (0, 1)}
+    m = from_one_marker(poses, **AS_BODY)
+    covariance = 1e-4 * np.eye(6)
+    for k in range(60):
+        T = flight(k / 30)
+        m.process(stamp(k), see(T, near, 0.02, rng), CAMERA, odometry(k, T, np.eye(4), covariance))
+    away = transform(np.eye(3), [6.0, 0.0, 0.0])
+    for k in range(60, 120):
+        T = flight((k - 60) / 30)
+        result = m.process(stamp(k), see(T, poses, 0.02, rng), CAMERA, odometry(k, away @ T, np.eye(4), covariance))
+        assert result.pose is not None
+    assert sorted(m.map.markers) == [0, 1]
+    assert set(result.candidates.values()) == {ASTRAY}
+    # Odometry that never was in this map, as another estimator's, is no reason.
+    other = from_one_marker(poses, **AS_BODY)
+    for k in range(60):
+        T = flight(k / 30)
+        other.process(stamp(k), see(T, poses, 0.02, rng), CAMERA, odometry(k, away @ T, np.eye(4), covariance))
+    assert len(other.map.markers) > 2
 
 
 def test_a_gap_too_long_is_not_spanned():

@@ -28,7 +28,7 @@ from thermal_fiducial.core.mapping.map_editing import align
 from thermal_fiducial.core.mapping.map_rows import marker_poses, usable
 from thermal_fiducial.core.mapping.motion import CameraMotion
 from thermal_fiducial.core.mapping.noise_level import NoiseLevel
-from thermal_fiducial.core.mapping.odometry_prior import ClockDifference, Expected, Fused, growth, together
+from thermal_fiducial.core.mapping.odometry_prior import ClockDifference, contradicts, Expected, Fused, growth, together
 from thermal_fiducial.core.mapping.trust import culprits, DISAGREEMENT, Trust
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers, Odometry
 from thermal_fiducial.core.types import FloatArray
@@ -43,6 +43,8 @@ ALIKE = 30.0
 #: Factor on the variance of what a camera pose owes to the map: of all frames of the same markers that error is the
 #: same, while whoever takes in the poses lets their errors average out.
 LASTING = 3.0
+#: Why nothing is learned from a frame that has a pose.
+ASTRAY = 'the known markers in view contradict the odometry'
 #: What a marker's corners are off by in all views alike (its shape, the edge's model), as a share of their noise:
 #: as measured on rendered flights with three lenses and 0.5 to 9 K.
 LASTING_SHARE = 0.7
@@ -101,6 +103,8 @@ class MarkerMapper:
         self._trust = Trust()
         self._quarantined = {key for key, marker in self.map.markers.items() if not marker.trusted}
         self._last: CameraPose | None = None
+        #: whether odometry has been in this map
+        self._odometry_agreed = False
         self._motion = CameraMotion()
         self._clocks = ClockDifference()
         self._recent: deque[Keyframe] = deque(maxlen=_RECENT)
@@ -146,6 +150,11 @@ class MarkerMapper:
             return self._result(frame, changed, waiting=waiting)
         location, pose = frame.outcome.location, frame.outcome.pose
         if expected is not None:
+            astray = contradicts(pose.T_map_camera, pose.covariance, expected.pose)
+            if astray and self._odometry_agreed:
+                # A marker that was moved, or that hangs in two places: what it teaches would spoil the map.
+                return self._result(frame, False, waiting=dict.fromkeys(frame.new['id'].tolist(), ASTRAY))
+            self._odometry_agreed |= not astray
             self._clocks.learn(expected, pose.T_map_camera, pose.covariance)
         self._last, self._gap = pose, None
         # Step 7: errors updated.

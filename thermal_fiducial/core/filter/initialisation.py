@@ -32,8 +32,9 @@ WINDOW_SECONDS, FEWEST_SAMPLES = 0.5, 20
 STILL_RATE_STD, STILL_FORCE_STD = 0.02, 0.3
 #: ... and their mean is a plausible gyroscope bias [rad/s] and gravity with accelerometer bias [m/s^2].
 STILL_RATE, STILL_FORCE = 0.1, 0.6
-#: At rest no accelerometer is off gravity by so much [m/s^2]: its units or its axes are others.
-NO_GRAVITY = 2.0
+#: At rest no accelerometer is off gravity by so much [m/s^2], nor by such a share of it over a window of a flight: its
+#: units are others.
+NO_GRAVITY, HARDLY_GRAVITY = 2.0, 0.5
 #: What the mean of such a window is worth: a drone on its legs or in a hand still moves a little [rad/s, m/s^2].
 RATE_STD, FORCE_STD = 0.005, 0.05
 #: A first pose whose vertical is further than this [rad] from the specific force is of the wrong planar branch.
@@ -97,7 +98,8 @@ def start(
     force = imu.mean(axis=0)[3:]
     if up @ force < math.cos(LARGEST_TILT) * np.linalg.norm(force):
         return None
-    if abs(np.linalg.norm(force) - config.gravity) > NO_GRAVITY and _quiet(imu):
+    off = abs(float(np.linalg.norm(force)) - config.gravity)
+    if off > (NO_GRAVITY if _quiet(imu) else HARDLY_GRAVITY * config.gravity):
         return None
     state = _unaligned(config, filter_.layout, pose, prior)
     still = rest(imu, config.gravity)

@@ -25,6 +25,8 @@ _OUTLIER = 3.0
 CHANGING = 0.25
 #: Squared distance (6 degrees of freedom) beyond which markers and odometry contradict each other: ten sigma.
 CONTRADICTION = 100.0
+# However uncertain odometry says it is, it is no worse than this while it has agreed with the markers [m, rad].
+_WORST = np.repeat([0.3, 0.2], 3)
 #: Larger differences are for the filter's parameter [s].
 LIMIT_S = 0.1
 
@@ -83,6 +85,14 @@ class Fused:
     #: (6, 6) ROS convention, of errors that change from frame to frame, and of those that last
     changing: FloatArray
     lasting: FloatArray
+
+
+def contradicts(T_map_camera: FloatArray, covariance: FloatArray, odometry: CameraPose) -> bool:
+    """Whether a camera pose (4, 4) from markers is where odometry cannot be, even odometry that is in doubt itself."""
+    worst = _WORST**2
+    scale = min(1.0, float(np.min(worst / np.maximum(np.diag(odometry.covariance), 1e-12))))
+    apart = difference(odometry.T_map_camera, T_map_camera)
+    return bool(apart @ np.linalg.solve(covariance + scale * odometry.covariance, apart) > CONTRADICTION)
 
 
 def together(T_map_camera: FloatArray, changing: FloatArray, lasting: FloatArray, odometry: CameraPose) -> Fused:
