@@ -218,7 +218,8 @@ def bilinear(a: FloatArray, b: FloatArray) -> FloatArray:
 def seen_between(c: FloatArray, weights: FloatArray) -> FloatArray:
     """Points (2, Q, P) that have ``weights`` (4, P) or (Q, 4, P) in a square, of its views with corners (Q, 4, 2).
 
-    In homogeneous coordinates, which leave straight what is straight, they are the same means of the corners.
+    In homogeneous coordinates, which leave straight what is straight, they are the same means of the corners (the
+    projective map of the unit square: P. Heckbert, "Fundamentals of texture mapping and image warping", 1989).
     """
     corners = np.empty((3, *c.shape[:2]))
     corners[2] = perspective(c)
