@@ -479,8 +479,8 @@ class PoseEkfConfig:
     )
     reset_after: float = param(
         1.0,
-        'Start afresh when refused poses have agreed with each other for so long; where the robot cannot have gone, '
-        'only when they are as many as had borne out the estimate (at most 300), or that is lost.',
+        'Start afresh when refused poses have agreed with each other for so long; a metre off all of a sudden, only '
+        'when they are as many as had borne out the estimate (at most 300), or that is lost.',
         unit='s',
         minimum=0.0,
         live=True,

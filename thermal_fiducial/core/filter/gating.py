@@ -10,13 +10,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 import math
 
+import numpy as np
+
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.error_state import ErrorStateFilter, Motion
 from thermal_fiducial.core.filter.imu import ImuStep
 from thermal_fiducial.core.filter.imu_noise import NoiseRange
 from thermal_fiducial.core.filter.initialisation import blank_state, start, WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseUpdate
-from thermal_fiducial.core.filter.navigation_state import in_moved_map, NavigationState
+from thermal_fiducial.core.filter.navigation_state import in_moved_map, NavigationState, POSE
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
@@ -29,9 +31,10 @@ _PREFERRED = 4
 #: Poses are linearised anew when the time offset has become known so many times better, and well enough when it is
 #: known to this [s]: half an angular acceleration of 5 rad/s^2 times its square is 0.01 mrad.
 _BETTER, _WELL_KNOWN = 2.0, 0.002
-#: A pose that is off even for an estimate that claims so many times too little is a marker's fault, unless as many
-#: poses bear it out as have borne out the estimate, or so many.
-_FAR_TOO_SURE, _ENOUGH_POSES = 10.0, 300
+#: A pose that is off even for an estimate that claims so many times too little, and by more than a few of these
+#: [rad, m], is a marker's fault, unless as many poses bear it out as have borne out the estimate, or so many. Nearer
+#: ones are believed earlier: coasting on for long would do more harm.
+_FAR_TOO_SURE, _FAR, _ENOUGH_POSES = 10.0, np.repeat([0.05, 0.2], 3), 300
 #: So many poses that the estimate accepts refute a rival where the robot could not have gone.
 _REFUTED = 3
 #: What speaks against a rival is forgotten by half when it is so much.
@@ -232,8 +235,9 @@ class PoseGate:
         """
         if main is None:
             return 0
-        doubtful = replace(main.state, covariance=_FAR_TOO_SURE**2 * main.state.covariance)
-        possible = self._correct(doubtful, sighting)[1] <= self._config.gate
+        covariance = _FAR_TOO_SURE**2 * main.state.covariance
+        covariance[POSE, POSE] += _FAR**2
+        possible = self._correct(replace(main.state, covariance=covariance), sighting)[1] <= self._config.gate
         return 0 if possible else min(main.hits, _ENOUGH_POSES)
 
     def _of_another_clock(self, belief: Belief, sighting: Sighting) -> NavigationState | None:
