@@ -119,6 +119,7 @@ def test_a_bad_sample_is_refused_and_the_next_one_goes_on(flight, change, word):
     change = {key: bad.stamp_ns + value if key == 'stamp_ns' else value for key, value in change.items()}
     assert ekf.add_imu(replace(bad, **change)) is None
     assert word in ekf.status
+    assert ekf.diagnostics()['IMU samples refused'] == 1.0
     state = ekf.add_imu(samples[401])
     assert state is not None
     assert ekf.status == 'tracking'

@@ -88,6 +88,7 @@ class PoseEkf:
         """Forget everything."""
         config = self._config
         self._gate = PoseGate(config)
+        self._imu_refused = 0
         self._input = ImuInput(config.max_imu_gap, config.imu.gyroscope_range, config.imu.accelerometer_range)
         self._begin()
 
@@ -119,6 +120,7 @@ class PoseEkf:
             self._begin()
         self._imu_fault = verdict.value
         if verdict not in (Verdict.USE, Verdict.RESTART):
+            self._imu_refused += 1
             return None
         imu = np.concatenate((sample.angular_velocity, sample.linear_acceleration))
         if not self._nodes:
@@ -395,6 +397,7 @@ class PoseEkf:
         numbers = {
             'poses accepted': float(self._accepted),
             'poses refused': float(self._refused),
+            'IMU samples refused': float(self._imu_refused),
             'nis': self._mean_nis(),
             'vibration rad/s': rate,
             'vibration m/s^2': force,
