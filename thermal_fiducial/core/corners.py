@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.adjustment import edges
-from thermal_fiducial.core.adjustment.segments import adjust, counts_across, HOPELESS, measure, Memory
+from thermal_fiducial.core.adjustment.segments import adjust, counts_across, HOPELESS, measure, Memory, REACHED
 from thermal_fiducial.core.adjustment.sides import sides_of
 from thermal_fiducial.core.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
@@ -19,8 +19,6 @@ from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatAr
 # was short enough; for outlines that are no squares a shorter one, as these may become ones.
 _WIDE, _PASSES = 1.4, 4
 _SETTLED_PX, _STILL_PX = 0.3, 0.1
-# A linearised displacement is good for this many blurs.
-_REACHED = 2.0
 # Standard deviation of what is known of the corners beforehand, and of their places among themselves [px].
 _PRIOR_PX, _PRIOR_SHAPE_PX = 3.0, 0.7
 _PRIOR = np.eye(8) / _PRIOR_PX**2
@@ -136,11 +134,11 @@ def _pass(task: _Task, start: ImagePoints, optics: float, prior: FloatArray) -> 
     """Where one linearised adjustment moves the corners, and the longest step (N,) of each marker."""
     cells = task.behind.shape[2]
     widest = math.hypot(optics, math.sqrt(float((task.smear * task.smear).sum(axis=1).max())))
-    half = min(max(math.ceil(2.5 * widest + 1.0), 4), 10)
+    half = edges.half_width(widest)
     sides = sides_of(start.x, task.camera, task.image.shape, cells, task.columns, half)
     blur = edges.blurs(sides.normal[cells // 2], optics, task.smear)
     counts = counts_across(task.image, sides, task.memory)
-    segments = measure(counts, edges.model(sides, task.behind, blur), _REACHED * blur[0])
+    segments = measure(counts, edges.model(sides, task.behind, blur), REACHED * blur[0])
     shift, covariances, doubt = adjust(sides, segments, prior, start)
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]

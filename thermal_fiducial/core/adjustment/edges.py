@@ -1,5 +1,7 @@
 """Model of the pixels across a marker's side: a blurred step from white to black, and the nearest edges behind it."""
 
+import math
+
 import numpy as np
 
 from thermal_fiducial.core.adjustment.sides import Sides
@@ -48,6 +50,11 @@ def _inward(grid: Float32Array) -> Float32Array:
 
 def _changes(inward: Float32Array) -> Float32Array:
     return np.ascontiguousarray(np.moveaxis(np.diff(inward, axis=2), 2, 3))
+
+
+def half_width(blur: float) -> int:
+    """Pixels of a column on either side of an edge with a ``blur`` [px]."""
+    return min(max(math.ceil(2.5 * blur + 1.0), 4), 10)
 
 
 def blurs(normal: FloatArray, optics: float, smear: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -13,22 +13,17 @@ import numpy as np
 
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.adjustment import edges
-from thermal_fiducial.core.adjustment.segments import counts_across, HOPELESS, measure, Memory
-from thermal_fiducial.core.adjustment.sides import columns_across, Sides
+from thermal_fiducial.core.adjustment.segments import counts_across, HOPELESS, KEPT_VARIANCE, measure, Memory, REACHED
+from thermal_fiducial.core.adjustment.sides import columns_across, NODES, Sides
 from thermal_fiducial.core.camera import Camera
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
 
-# Points of an edge that its curve in the image goes through.
-_NODES = np.linspace(0.0, 1.0, 5)
 # Columns of pixels across an edge: every so many pixels, but no fewer and no more than this.
 _EVERY_PX, _FEWEST, _MOST = 3.0, 6, 24
 # So many blurs from its ends, and from its neighbours, an edge is a straight step.
 _QUIET = 2.0
-# A linearised displacement is good for this many blurs.
-_REACHED = 2.0
 # Weight of an edge falls off beyond this many standard deviations, in so many rounds.
 _OUTLIER, _ROUNDS = 2.5, 3
-_KEPT_VARIANCE = 0.911
 # Standard deviation of an edge's place that no image noise explains: its optics and its cut [px].
 _FLOOR_PX = 0.015
 # How far a pose may be off before it is adjusted, as a shift of each edge [px].
@@ -59,7 +54,7 @@ def grid_edges(bits: Gray) -> GridEdges:
         # Lines of one direction as rows; turned, those of the other.
         step = np.diff(grid.T if turned else grid, axis=0)[:, 1:-1]
         line, cell = np.nonzero(step)
-        along = (cell[:, None] + _NODES) / cells
+        along = (cell[:, None] + NODES) / cells
         points = np.stack([along, np.broadcast_to(line[:, None] / cells, along.shape)], axis=-1)
         ahead = np.tile([0.0, 1.0 / cells], (len(line), 1))
         nodes.append(points[..., ::-1] if turned else points)
@@ -127,12 +122,12 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     length = float(np.linalg.norm(nodes[:, 4] - nodes[:, 0], axis=1).max())
     columns = int(np.clip(length / _EVERY_PX, _FEWEST, _MOST))
     widest = math.hypot(layer.blur, float(np.linalg.norm(layer.smear)))
-    half = min(max(math.ceil(2.5 * widest + 1.0), 4), 10)
+    half = edges.half_width(widest)
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, columns, half)
     blur = edges.blurs(sides.normal[0], layer.blur, layer.smear[None])
     counts = counts_across(layer.image, sides, layer.memory)
     modelled = _model(sides, pattern.step, blur)
-    measured = measure(counts, modelled, _REACHED * blur[0], len(nodes))
+    measured = measure(counts, modelled, REACHED * blur[0], len(nodes))
     used = measured.variance[0] < HOPELESS
     if used.sum() < 6:
         return None
@@ -198,7 +193,7 @@ def _solved(
         robust = 1.0 / np.maximum(left / (_OUTLIER * scale), 1.0) ** 2
     kept = used & (robust > 0.99)
     number = int(kept.sum())
-    chi2 = float(np.sum(left[kept] ** 2)) / _KEPT_VARIANCE
+    chi2 = float(np.sum(left[kept] ** 2)) / KEPT_VARIANCE
     free = max(number - 6, 0)
     information = weighted @ A * ((free + 24.0) / (chi2 + 24.0))
     moved = geometry.transform(geometry.so3_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3])

@@ -15,13 +15,15 @@ from thermal_fiducial.core.adjustment.squares import as_squares
 from thermal_fiducial.core.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
 
+#: A linearised displacement is good for this many blurs.
+REACHED = 2.0
 #: Variance of a segment that measures nothing.
 HOPELESS = 1e6
 # Weight of a pixel or segment falls off beyond this many standard deviations.
 _PIXEL_OUTLIER = 4.5
 _SEGMENT_OUTLIER = 2.5
-# Variance of a standard normal variable of which no more than that is kept.
-_KEPT_VARIANCE = 0.911
+#: Variance of a standard normal variable of which no more than that is kept.
+KEPT_VARIANCE = 0.911
 # Standard deviation of a corner that no image noise explains: the optics' blur is not quite a Gaussian [px]; and of
 # what all four sides have in common of it, so that it leaves a square one.
 _FLOOR, _COMMON_FLOOR = 0.010**2 * np.eye(8), 0.005**2 * np.eye(2)
@@ -239,7 +241,7 @@ def adjust(
             break
         weighted = turned * robust[:, None]
     kept = used & (robust > 0.99)
-    chi2 = (left * left * kept).sum(axis=1) / _KEPT_VARIANCE
+    chi2 = (left * left * kept).sum(axis=1) / KEPT_VARIANCE
     free = np.maximum(kept.sum(axis=1) - 8.0, 0.0)
     # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
     covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None] + _FLOOR

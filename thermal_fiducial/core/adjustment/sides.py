@@ -16,8 +16,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 #: Corners between which the sides lie: top and bottom from left to right, left and right from the top down.
 STARTS, ENDS = np.array([0, 3, 0, 1]), np.array([1, 2, 3, 2])
 _OPPOSITE = np.array([1, 0, 3, 2])
-# A curved side is a quartic through five of its points, at these shares of it.
-_NODES = np.linspace(0.0, 1.0, 5)
+#: A curved side is a quartic through five of its points, at these shares of it.
+NODES = np.linspace(0.0, 1.0, 5)
 # Pixels of the image that a side must have on both sides, and by how many a curve may pass the nodes it goes through.
 _BOTH_SIDES, _BEYOND_NODES = 3, 3.0
 
@@ -110,20 +110,20 @@ def _nodes(x: FloatArray, camera: Camera) -> FloatArray:
     weight = geometry.perspective(x)
     start, end = x.take(STARTS, axis=1), x.take(ENDS, axis=1)
     ratio = (weight.take(ENDS, axis=1) / weight.take(STARTS, axis=1))[..., None]
-    share = _NODES * ratio / (1.0 + _NODES * (ratio - 1.0))
+    share = NODES * ratio / (1.0 + NODES * (ratio - 1.0))
     points = start[:, :, None] + share[..., None] * (end - start)[:, :, None]
-    return camera.distort(points).reshape(-1, len(_NODES), 2)
+    return camera.distort(points).reshape(-1, len(NODES), 2)
 
 
 @cache
 def _parts(cells: int, columns: int) -> tuple[FloatArray, FloatArray]:
     """Shares (C, m, 1) of a side where columns cross it; weights (2 C m, 5) of nodes in the places and derivatives."""
     share = ((np.arange(columns)[:, None] + 0.5) / columns + np.arange(cells)) / cells
-    powers = np.arange(len(_NODES))
+    powers = np.arange(len(NODES))
     at = share.reshape(-1, 1) ** powers
     rate = np.zeros_like(at)
     rate[:, 1:] = powers[1:] * at[:, :-1]
-    return share[..., None], np.concatenate([at, rate]) @ np.linalg.inv(np.vander(_NODES, increasing=True))
+    return share[..., None], np.concatenate([at, rate]) @ np.linalg.inv(np.vander(NODES, increasing=True))
 
 
 def _normals(pitch: FloatArray, slope: FloatArray, steep: BoolArray) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from thermal_fiducial.core import geometry
 from thermal_fiducial.core.adjustment.edges import blurs, edges_behind_border, model
-from thermal_fiducial.core.adjustment.segments import counts_across, HOPELESS, measure, Segments
+from thermal_fiducial.core.adjustment.segments import counts_across, HOPELESS, measure, REACHED, Segments
 from thermal_fiducial.core.adjustment.sides import sides_of
 from thermal_fiducial.core.camera import ImagePoints
 from thermal_fiducial.core.corners import RefinedCorners
@@ -76,7 +76,7 @@ class DisplayedSides:
         value, slope, weight = model(sides, self._behind[ids], blur)
         weight *= self._white[ids].reshape(-1, self._bits).T
         counts = counts_across(frame.image, sides, refinement.view.memory)
-        return measure(counts, (value, slope, weight), 2.0 * blur[0])
+        return measure(counts, (value, slope, weight), REACHED * blur[0])
 
 
 def _outward(corners: FloatArray) -> FloatArray:

@@ -77,3 +77,11 @@ class Places:
     def memory(self, twist: Twist, lag: float) -> FloatArray:
         """Displacement (N, 4, 2) [px] in so long a time as the lag, as it places the image's memory of the past."""
         return np.asarray(-lag * (self.flow @ twist.ago(MEMORY_AGE * lag)))
+
+    def unknown(self, twist: Twist, lag: float) -> FloatArray:
+        """Covariances (N, 4, 2, 2) [px^2] of the smear by what is unknown of the twist.
+
+        What the corners of a marker have in common is no error of its shape.
+        """
+        by_twist = lag * (self.flow - 0.25 * self.flow.sum(axis=1, keepdims=True))
+        return np.asarray(by_twist @ twist.covariance_ago(lag) @ by_twist.swapaxes(-1, -2))

@@ -34,7 +34,7 @@ from thermal_fiducial.core.vision.frame import Frame, Places
 from thermal_fiducial.core.vision.guided import CutMarkers
 from thermal_fiducial.core.vision.lag import GAIN, MEMORY_AGE, memory_maps, model_error, REMAINING, SPREAD
 from thermal_fiducial.core.vision.motion import interaction
-from thermal_fiducial.core.vision.readout import expected_displacement, stretch
+from thermal_fiducial.core.vision.readout import expected_displacement, memory
 from thermal_fiducial.core.vision.refining import sides_px, worth_sharpening
 from thermal_fiducial.core.vision.visible_cells import VisibleCells
 
@@ -264,10 +264,7 @@ def _sharpened(frame: Frame, window: FloatArray, contrast: float, blur_px: float
     cell = sides_px(places.at.px) / cells
     if twist is None or not worth_sharpening(np.array([mean @ mean]), cell, cells, clarity)[0]:
         return _plain(frame, window, blur_px, 1)
-    memory = places.memory(twist, frame.lag)
-    if frame.readout > 0.0:
-        memory = memory * stretch(places, twist, frame)[..., None]
-    maps = memory_maps(places.at.px + _displaced(frame, window, 1.0 - REMAINING), memory)
+    maps = memory_maps(places.at.px + _displaced(frame, window, 1.0 - REMAINING), memory(places, twist, frame))
 
     def displacement(points: FloatArray) -> FloatArray:
         return _displaced(frame, points, 1.0 - REMAINING)
@@ -317,7 +314,7 @@ def _corners(frame: Frame, marker: _Marker, fit: PoseFit, cells: int, *, bent: b
 
     None where they are too uncertain, or too far outside the image.
     """
-    T, points = fit.T_camera_marker, marker.size * marker_corners(1.0)
+    T, points = fit.T_camera_marker, marker_corners(marker.size)
     corners = frame.camera.project(geometry.apply(T, points))
     limit = _OUTSIDE * frame.camera.width
     if not frame.camera.contains(corners, -limit).all():
@@ -340,10 +337,8 @@ def _pose_covariance(frame: Frame, marker: _Marker, fit: PoseFit, cells: int, *,
     blocks = np.broadcast_to((DISPLACED if bent else _FLOOR_PX) ** 2 * np.eye(2), (4, 2, 2))
     if frame.twist is not None:
         places = _places(geometry.apply(T, window), frame.camera)
-        by_twist = frame.lag * (places.flow - places.flow.mean(axis=1, keepdims=True))
-        unknown = by_twist @ frame.twist.covariance_ago(frame.lag) @ np.swapaxes(by_twist, -1, -2)
-        smear = places.smear(frame.twist, frame.lag)
-        blocks = blocks + unknown[0] + model_error(smear, places.at.px, cells)[0]
+        unknown = places.unknown(frame.twist, frame.lag)
+        blocks = blocks + unknown[0] + model_error(places.smear(frame.twist, frame.lag), places.at.px, cells)[0]
     gain = np.linalg.pinv(J).reshape(6, 4, 2)
     systematic = np.einsum('ick,ckl,jcl->ij', gain, blocks, gain)
     return np.asarray(np.linalg.inv(fit.information) + systematic)

@@ -22,6 +22,12 @@ def stretch(places: Places, twist: Twist, frame: Frame) -> FloatArray:
     return np.asarray(1.0 / (1.0 - frame.readout / (frame.camera.height - 1) * places.velocity(twist)[..., 1]))
 
 
+def memory(places: Places, twist: Twist, frame: Frame) -> FloatArray:
+    """:meth:`Places.memory` (N, 4, 2) [px] in an image whose rows are seen one after the other."""
+    still = places.memory(twist, frame.lag)
+    return still * stretch(places, twist, frame)[..., None] if frame.readout > 0.0 else still
+
+
 def displacement(places: Places, twist: Twist, frame: Frame, seconds: FloatArray) -> FloatArray:
     """By how much (N, 4, 2) corners appear farther on [px] when they are seen ``seconds`` (N, 4) after the stamp.
 

@@ -24,7 +24,7 @@ from thermal_fiducial.core.vision.lag import (
     SPREAD,
 )
 from thermal_fiducial.core.vision.motion import MotionTracker, Twist, unknown_twist
-from thermal_fiducial.core.vision.readout import delays, expected_displacement, seen_displacement, stretch
+from thermal_fiducial.core.vision.readout import delays, expected_displacement, memory, seen_displacement
 from thermal_fiducial.core.vision.scratch import Scratch
 from thermal_fiducial.core.vision.search import Found
 
@@ -144,19 +144,17 @@ class Refiner:
     def _view(self, frame: Frame, places: Places, twist: Twist | None, cell: FloatArray, clarity: FloatArray) -> View:
         """The frame with known smear round all markers, sharpened round those for which that is worth its noise."""
         if twist is None:
-            smear = memory = np.zeros_like(places.at.px)
+            smear = old = np.zeros_like(places.at.px)
         else:
-            smear, memory = places.smear(twist, frame.lag), places.memory(twist, frame.lag)
-            if frame.readout > 0.0:
-                memory = memory * stretch(places, twist, frame)[..., None]
+            smear, old = places.smear(twist, frame.lag), memory(places, twist, frame)
         mean = 0.25 * smear.sum(axis=1)
         sharpen = worth_sharpening((mean * mean).sum(axis=1), cell, self._behind.shape[2], clarity)
-        removed = (1.0 - REMAINING) * memory * sharpen[:, None, None]
+        removed = (1.0 - REMAINING) * old * sharpen[:, None, None]
         shift = smear - removed + expected_displacement(places, twist, frame)
         spread, past = mean * np.where(sharpen, SPREAD, 1.0)[:, None], None
         if sharpen.any():
-            past = Memory(memory_maps(places.at.px + shift, memory), np.where(sharpen, GAIN, 1.0))
-        return View(frame, shift, removed, spread, sharpen, memory, past)
+            past = Memory(memory_maps(places.at.px + shift, old), np.where(sharpen, GAIN, 1.0))
+        return View(frame, shift, removed, spread, sharpen, old, past)
 
     def _at_stamp(
         self,
@@ -181,10 +179,7 @@ class Refiner:
         smear = places.smear(twist, frame.lag)
         rolled = seen_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
         corners = seen.corners_px - smear + view.removed - rolled
-        # What the corners of a marker have in common is no error of its shape.
-        by_twist = frame.lag * (places.flow - 0.25 * places.flow.sum(axis=1, keepdims=True))
-        unknown = by_twist @ twist.covariance_ago(frame.lag) @ by_twist.swapaxes(-1, -2)
-        unknown = unknown + model_error(smear, places.at.px, self._behind.shape[2])
+        unknown = places.unknown(twist, frame.lag) + model_error(smear, places.at.px, self._behind.shape[2])
         if frame.twist is None:
             unknown = unknown + self._never_seen(frame, places, seen, twist)
         refined = replace(seen, corners_px=corners, covariances=seen.covariances + _doubts(seen) + unknown)
