@@ -366,6 +366,7 @@ class MarkerMapperConfig:
     )
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
+    camera_time_offset: float = _camera_time_offset()
     bridge_duration: float = param(
         3.0,
         'How long after the last known marker new ones may still be placed from the odometry.',

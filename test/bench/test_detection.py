@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from support.scenes import camera_of, detector_of, told
 
-from thermal_fiducial.core import detection
+from thermal_fiducial.core.detection import detector as detection
 from thermal_fiducial.core.measurements import corners_px, Odometry
 from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.render import Quality

@@ -10,10 +10,10 @@ from scipy.stats import chi2
 from support.flights import config, errors, Flight, matched, rms, run, START_NS, timeline
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.ekf import PoseEkf
 from thermal_fiducial.core.filter.coasting import coasting_variance
 from thermal_fiducial.core.filter.navigation_state import Layout
-from thermal_fiducial.core.geometry import rotation_angle
+from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.measurements import ImuSample
 
 SETTLED = 5.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.geometry import inverse, rotation_angle, rotation_from_quaternion, transform
+from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle, rotation_from_quaternion, transform
 from thermal_fiducial.core.pipeline import Pipeline, PipelineConfig
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.dictionary import load_dictionary

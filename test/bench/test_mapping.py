@@ -9,7 +9,7 @@ from support.walls import CAMERA, flight, FRAME_NS, see, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.marker_map import MarkerMapper
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
 
 ROUNDS, FRAMES = 7, 60
 #: Frames of an hour, five a second: memory depends on what is kept, not on how fast it comes.

@@ -11,10 +11,10 @@ import pytest
 from support.flights import config, errors, Flight, matched, Motion, rms, run, START_NS, timeline
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.ekf import PoseEkf
 from thermal_fiducial.core.filter.error_state import Motion as FilterMotion
 from thermal_fiducial.core.filter.gating import PoseGate
-from thermal_fiducial.core.geometry import so3_exp, so3_log, transform
+from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.geometry.se3 import so3_exp, so3_log, transform
 
 pytestmark = pytest.mark.slow
 SEEDS = (11, 12)

@@ -6,7 +6,7 @@ from support.boards import chessboard_levels, plate_pose, random_view, render
 
 from thermal_fiducial.calibration.intrinsics import calibrate
 from thermal_fiducial.calibration.targets import Chessboard
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.sim.scenario import LENSES
 
 SQUARE = 0.05

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from support.flights import config, errors, Flight, Motion, run, START_NS, timeline
 
-from thermal_fiducial.core.ekf import PoseEkf
 from thermal_fiducial.core.filter.error_state import ErrorStateFilter
-from thermal_fiducial.core.geometry import so3_exp, so3_log, transform
+from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.geometry.se3 import so3_exp, so3_log, transform
 
 pytestmark = pytest.mark.slow
 STEPPED = 6.0

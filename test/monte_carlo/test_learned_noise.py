@@ -7,9 +7,9 @@ import pytest
 from support.flights import config, Flight, Motion, rms, run, START_NS, timeline
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.ekf import PoseEkf
 from thermal_fiducial.core.filter.learned_noise import Aliasing
-from thermal_fiducial.core.geometry import so3_log
+from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.geometry.se3 import so3_log
 
 pytestmark = pytest.mark.slow
 SEEDS = (51, 52)

@@ -5,9 +5,9 @@ import pytest
 from support.walls import CAMERA, look, see, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.adjustment.reprojection import difference
+from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.marker_map import MarkerMapper
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
 
 FLIGHTS = range(12, 18)
 #: A wrong branch is tens of degrees off.

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from test.support.walls import CAMERA, flight, see, SIZE, wall
-from thermal_fiducial.core.adjustment.reprojection import difference, retract
-from thermal_fiducial.core.map_refinement import refine, Snapshot
+from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.mapping.bundle_adjustment import refine, Snapshot
 from thermal_fiducial.core.mapping.keyframes import Keyframe, Rig
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.measurements import corner_covariances, corners_px

@@ -4,7 +4,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 import numpy as np
 
-from thermal_fiducial.core.camera import Camera, MODELS
+from thermal_fiducial.core.geometry.camera import Camera, MODELS
 
 focals = st.floats(400.0, 1200.0)  # 7.5 to 20 mm lenses of a 17 um array
 pixels = st.tuples(st.floats(0.0, 639.0), st.floats(0.0, 511.0)).map(np.array)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corners_px
 from thermal_fiducial.files.dictionary import load_dictionary
 

@@ -7,7 +7,7 @@ import pytest
 from support import small_bag
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.camera_info import save_camera
 

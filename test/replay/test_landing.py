@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support import approach
 
-from thermal_fiducial.core.geometry import so3_log
+from thermal_fiducial.core.geometry.se3 import so3_log
 from thermal_fiducial.sim.camera import START_NS
 
 SECONDS, SEED = 6.0, 5

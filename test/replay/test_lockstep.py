@@ -8,7 +8,7 @@ from rclpy.executors import SingleThreadedExecutor
 from support import small_bag
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.geometry import inverse, rotation_angle, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle, transform_from_quaternion
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.pipeline import Pipeline, PipelineConfig
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC

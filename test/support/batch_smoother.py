@@ -13,7 +13,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.error_state import ErrorStateFilter
 from thermal_fiducial.core.filter.initialisation import blank_state
 from thermal_fiducial.core.filter.navigation_state import Layout
-from thermal_fiducial.core.geometry import so3_exp
+from thermal_fiducial.core.geometry.se3 import so3_exp
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 from thermal_fiducial.core.types import FloatArray, IntArray
 

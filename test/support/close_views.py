@@ -3,9 +3,9 @@
 import cv2
 import numpy as np
 
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.vision.patterns import marker_bits
+from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.files.dictionary import load_dictionary
 
 K = [[265.0, 0, 158.5], [0, 264.0, 129.5], [0, 0, 1]]
@@ -23,8 +23,8 @@ BLUR_WITH_PIXEL = float(np.hypot(BLUR, np.sqrt(1 / 12)))
 
 def pose(size_px, u, v, tilt, size=0.3):
     """T_camera_marker of a marker that looks so large, its middle in the direction (u, v) of normalised coordinates."""
-    R = geometry.so3_exp(tilt) @ np.diag([1.0, -1.0, -1.0])
-    return geometry.transform(R, np.array([u, v, 1.0]) * size * 265.0 / size_px)
+    R = se3.so3_exp(tilt) @ np.diag([1.0, -1.0, -1.0])
+    return se3.transform(R, np.array([u, v, 1.0]) * size * 265.0 / size_px)
 
 
 def draw(camera, grid, T, size=0.3, samples=4, blur=BLUR):
@@ -37,7 +37,7 @@ def draw(camera, grid, T, size=0.3, samples=4, blur=BLUR):
         v = rows[first * samples : (first + 32) * samples]
         x = camera.normalise(np.stack(np.meshgrid(fine, v), axis=-1))
         rays = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
-        on_plane = geometry.apply(geometry.inverse(T), rays * (T[:3, 2] @ T[:3, 3] / (rays @ T[:3, 2]))[..., None])
+        on_plane = se3.apply(se3.inverse(T), rays * (T[:3, 2] @ T[:3, 3] / (rays @ T[:3, 2]))[..., None])
         cells = len(grid) - 2
         column = np.clip(np.floor((on_plane[..., 0] / size + 0.5) * cells) + 1, 0, cells + 1).astype(int)
         row = np.clip(np.floor((0.5 - on_plane[..., 1] / size) * cells) + 1, 0, cells + 1).astype(int)

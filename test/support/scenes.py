@@ -1,9 +1,9 @@
 """The camera and the detector of a simulated scenario, and what a filter tells it."""
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.detection import MarkerDetector
-from thermal_fiducial.core.vision.odometry_log import OdometryLog
+from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.motion_prior import MotionPrior
 
 
 def camera_of(scenario):
@@ -26,7 +26,7 @@ def detector_of(scenario, *, with_map):
 
 def told(*states):
     """A log of these states of the filter."""
-    log = OdometryLog()
+    log = MotionPrior()
     for state in states:
         log.add(state.stamp_ns, lambda state=state: state)
     return log

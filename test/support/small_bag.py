@@ -14,10 +14,10 @@ from rosbags.typesys import get_typestore, Stores
 import yaml
 
 from support.flights import Motion
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.geometry import apply, inverse, transform
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.se3 import apply, inverse, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.pose import marker_corners
 from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import save_map
 

@@ -8,14 +8,14 @@ import numpy as np
 import yaml
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.adjustment.reprojection import corners_in_map, reproject
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.geometry import inverse, so3_exp, transform, transform_from_quaternion
-from thermal_fiducial.core.map_building import decide, rows_from_corners
-from thermal_fiducial.core.map_refinement import refine, Snapshot
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
+from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform, transform_from_quaternion
+from thermal_fiducial.core.mapping.bundle_adjustment import refine, Snapshot
 from thermal_fiducial.core.mapping.keyframes import Keyframe, Rig
+from thermal_fiducial.core.mapping.map_building import decide, rows_from_corners
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.marker_map import MarkerMapper
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import Odometry
 
 #: Noise of the recorded corners [px]: the re-projection errors of the reference are about that.

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from thermal_fiducial.core.adjustment.reprojection import corners_in_map, reproject
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.geometry import quaternion_from_rotation, so3_exp, transform
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, so3_exp, transform
 from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE
-from thermal_fiducial.core.pose import solve_marker_poses
 
 SIZE = 0.3
 CAMERA = Camera(640, 512, np.array([[529.0, 0.0, 319.5], [0.0, 529.0, 255.5], [0.0, 0.0, 1.0]]))

@@ -11,7 +11,7 @@ from sensor_msgs.msg import Imu
 from support import small_bag
 from support.ros_graph import ros_graph
 
-from thermal_fiducial.core.geometry import rotation_from_quaternion, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import rotation_from_quaternion, so3_exp, transform
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.ros import convert

@@ -5,11 +5,11 @@ import pytest
 from support.boards import render
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corners_px
-from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.fabrication.bridges import find_bridges
 from thermal_fiducial.fabrication.plate import marker_drawing, pattern_origin, PlateOptions
 from thermal_fiducial.fabrication.verification import acrylic_at
@@ -42,9 +42,9 @@ def test_bits_of_bridged_markers_are_read(name, mount):
     detector = MarkerDetector(ArucoDetectorConfig(dictionary=name), dictionary)
     options = PlateOptions(size=SIZE_MM, mount=mount)
     # Side of 100 px, tilted 15 degrees about two axes.
-    R = np.diag([1.0, -1.0, -1.0]) @ geometry.so3_exp([0.26, -0.26, 0.1])
-    T = geometry.transform(R, [0.01, -0.02, LENS.focal[0] * 1e-3 * SIZE_MM / 100.0])
-    truth = LENS.project(geometry.apply(T, CORNERS))
+    R = np.diag([1.0, -1.0, -1.0]) @ se3.so3_exp([0.26, -0.26, 0.1])
+    T = se3.transform(R, [0.01, -0.02, LENS.focal[0] * 1e-3 * SIZE_MM / 100.0])
+    truth = LENS.project(se3.apply(T, CORNERS))
     marker_id = max(range(30), key=lambda index: len(find_bridges(bits[index]).patches))
     drawing = marker_drawing(bits[marker_id], str(marker_id), options)
     levels, side = raster(drawing, float(pattern_origin(options, bits.shape[1] + 2)[0]))

@@ -9,7 +9,7 @@ import yaml
 
 from thermal_fiducial.calibration.targets import Chessboard
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core import geometry
+from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.sim.scenario import LENSES
@@ -21,9 +21,9 @@ def test_camera_against_imu(tmp_path, capsys):
     out = tmp_path / 'extrinsics.yaml'
     assert main(['calibrate', 'camera-imu', str(bag), '--map', str(marker_map), '--out', str(out)]) == 0
     found = yaml.safe_load(out.read_text())['/**']['ros__parameters']
-    R = geometry.rotation_from_quaternion(found['camera_orientation'])
+    R = se3.rotation_from_quaternion(found['camera_orientation'])
     # Six seconds of gentle motion: enough for the rotation and the clock, hardly for the lever arm.
-    assert np.degrees(geometry.rotation_angle(R.T @ T_BODY_CAMERA[:3, :3])) < 1.0
+    assert np.degrees(se3.rotation_angle(R.T @ T_BODY_CAMERA[:3, :3])) < 1.0
     # These frames have no lag, but the detector undoes the 10 ms that a bolometer has.
     assert 0.0 < found['camera_time_offset'] < 0.02
     assert '+-' in capsys.readouterr().out

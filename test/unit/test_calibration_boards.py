@@ -7,7 +7,7 @@ from support.heated_boards import Heat, picture
 
 from thermal_fiducial.calibration.placement import BoardNodes
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera
 
 GUESS = Camera(640, 512, np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 255.5], [0.0, 0.0, 1.0]]))
 CHESSBOARD = Chessboard(8, 6, 1.0)

@@ -11,7 +11,7 @@ from thermal_fiducial.calibration.camera_imu import calibrate_camera_imu, calibr
 from thermal_fiducial.calibration.preintegration import ImuTrack, preintegrate
 from thermal_fiducial.calibration.rolling import FrameCorners
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core import geometry
+from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.sim.camera import plan, simulate_imu, START_NS
@@ -37,7 +37,7 @@ def recording(scenario, seconds, seed, sigma_m=0.002, sigma_rad=0.0006):
     T = trajectory(np.array([flight.frame_time(k) for k in range(flight.frame_count)])).T_map_body
     T = T @ scenario.T_body_camera
     noise = rng.normal(0.0, 1.0, (len(T), 6)) * sigma
-    T = geometry.transform(geometry.so3_exp(noise[:, 3:]) @ T[:, :3, :3], T[:, :3, 3] + noise[:, :3])
+    T = se3.transform(se3.so3_exp(noise[:, 3:]) @ T[:, :3, :3], T[:, :3, 3] + noise[:, :3])
     poses = [CameraPose(flight.stamp_ns(k), pose, covariance) for k, pose in enumerate(T)]
     imu = ImuTrack((record.stamps_ns - START_NS) * 1e-9, record.angular_velocity, record.linear_acceleration)
     return poses, imu
@@ -83,11 +83,9 @@ def rolling_recording(scenario, seconds, seed, readout, sigma_px):
 
 def error_of(result, scenario):
     """Rotation about the camera's axes, position, offset: in the order of the covariance."""
-    difference = geometry.inverse(result.T_body_camera) @ scenario.T_body_camera
+    difference = se3.inverse(result.T_body_camera) @ scenario.T_body_camera
     position = scenario.T_body_camera[:3, 3] - result.T_body_camera[:3, 3]
-    return np.array(
-        [*geometry.so3_log(difference[:3, :3]), *position, scenario.camera_time_offset - result.time_offset]
-    )
+    return np.array([*se3.so3_log(difference[:3, :3]), *position, scenario.camera_time_offset - result.time_offset])
 
 
 def test_increments_are_those_of_the_flight():
@@ -102,7 +100,7 @@ def test_increments_are_those_of_the_flight():
     dv = np.einsum('nij,nj->ni', R0t, np.diff(motion.velocity, axis=0) - g * dt)
     dp = np.einsum('nij,nj->ni', R0t, np.diff(motion.position, axis=0) - motion.velocity[:-1] * dt - 0.5 * g * dt**2)
     # Samples of 200 Hz interpolated linearly: the error is their second derivative times (5 ms)^2 / 12.
-    assert np.abs(geometry.so3_log(np.swapaxes(found.R, 1, 2) @ R0t @ R[1:])).max() < 2e-5
+    assert np.abs(se3.so3_log(np.swapaxes(found.R, 1, 2) @ R0t @ R[1:])).max() < 2e-5
     assert np.abs(found.v - dv).max() < 2e-4
     assert np.abs(found.p - dp).max() < 5e-6
 
@@ -117,7 +115,7 @@ def test_bias_derivatives_against_differences():
         step = np.zeros(6)
         step[column] = h
         moved = preintegrate(imu, times, zero + step, ImuNoise())
-        turn = geometry.so3_log(np.swapaxes(base.R, 1, 2) @ moved.R)
+        turn = se3.so3_log(np.swapaxes(base.R, 1, 2) @ moved.R)
         difference = np.concatenate([turn, moved.v - base.v, moved.p - base.p], axis=1) / h
         # Second order in the turn of a step, 0.01 rad at most, and in h.
         assert base.by_bias[:, :, column] == pytest.approx(difference, rel=2e-3, abs=2e-6)
@@ -189,7 +187,7 @@ def test_wrong_poses_hardly_matter():
     poses, imu = recording(SCENARIO, 30.0, 4)
     rng = np.random.default_rng(5)
     for index in rng.choice(len(poses), 20, replace=False).tolist():
-        T = poses[index].T_map_camera @ geometry.transform(geometry.so3_exp([0.0, 0.3, 0.0]), [0.3, 0.0, 0.1])
+        T = poses[index].T_map_camera @ se3.transform(se3.so3_exp([0.0, 0.3, 0.0]), [0.3, 0.0, 0.1])
         poses[index] = replace(poses[index], T_map_camera=T)
     error = error_of(calibrate_camera_imu(poses, imu, START_NS, ImuNoise()), SCENARIO)
     assert np.degrees(np.linalg.norm(error[:3])) < 0.1

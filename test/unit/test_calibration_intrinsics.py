@@ -6,8 +6,8 @@ from support.boards import random_view
 
 from thermal_fiducial.calibration.intrinsics import _Fit, calibrate, choose_model
 from thermal_fiducial.calibration.targets import Sighting
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.sim.scenario import LENSES
 
@@ -19,7 +19,7 @@ def sightings(lens, count, sigma, seed):
     rng = np.random.default_rng(seed)
     views = []
     for _ in range(count):
-        pixels = lens.project(geometry.apply(random_view(lens, POINTS, rng), POINTS))
+        pixels = lens.project(se3.apply(random_view(lens, POINTS, rng), POINTS))
         views.append(Sighting(POINTS, pixels + rng.normal(0.0, sigma, pixels.shape)))
     return views
 
@@ -79,7 +79,7 @@ def test_centroids_of_circles_are_not_their_centres():
     views = []
     for _ in range(14):
         T = random_view(lens, POINTS, rng)
-        outlines = lens.project(geometry.apply(T, (POINTS[:, None] + rim).reshape(-1, 3))).reshape(48, 400, 2)
+        outlines = lens.project(se3.apply(T, (POINTS[:, None] + rim).reshape(-1, 3))).reshape(48, 400, 2)
         a, b = outlines - outlines.mean(1, keepdims=True), np.roll(outlines, -1, 1) - outlines.mean(1, keepdims=True)
         cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
         middle = np.sum((a + b) * cross[..., None], axis=1) / (3.0 * cross.sum(1)[:, None])
@@ -97,7 +97,7 @@ def test_derivatives_against_differences(model):
     D = {'plumb_bob': [-0.3, 0.1, 1e-3, -1e-3, 0.01], 'equidistant': [0.01, -0.02, 0.03, -0.01]}
     D['rational_polynomial'] = [0.3, 0.05, 3e-4, -2e-4, 0.01, 0.6, 0.1, 0.02]
     camera = Camera(640, 512, np.array([[600.0, 0, 320], [0, 610.0, 250], [0, 0, 1]]), model, np.array(D[model]))
-    T = geometry.transform(geometry.so3_exp([0.2, -0.3, 0.1]), [-0.15, -0.1, 0.6])[None]
+    T = se3.transform(se3.so3_exp([0.2, -0.3, 0.1]), [-0.15, -0.1, 0.6])[None]
     fit = _Fit([Sighting(POINTS, np.zeros((48, 2)))], camera, 0.0)
     by_intrinsics, by_pose = fit._jacobian(camera, T)
     J = np.concatenate([by_intrinsics, by_pose], axis=2)

@@ -6,11 +6,11 @@ from support.boards import plate_pose, random_view, render
 from thermal_fiducial.calibration.intrinsics import calibrate
 from thermal_fiducial.calibration.targets import MarkerBoard
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.fabrication.boards import marker_grid
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.scenario import LENSES
@@ -26,7 +26,7 @@ def board():
     bits = marker_bits(load_dictionary(NAME))
     centres = marker_grid(COLUMNS, ROWS, SIZE, GAP_CELLS * CELL)
     markers = {
-        index: MapMarker(index, SIZE, True, geometry.transform(np.eye(3), [*centre, 0.0]))
+        index: MapMarker(index, SIZE, True, se3.transform(np.eye(3), [*centre, 0.0]))
         for index, centre in enumerate(centres.tolist())
     }
     pitch = 6 + GAP_CELLS
@@ -56,7 +56,7 @@ def test_marker_board_calibrates():
         sighting = target.find(counts, camera)
         if sighting is None:
             continue
-        truth = lens.project(geometry.apply(T @ flip, sighting.points))
+        truth = lens.project(se3.apply(T @ flip, sighting.points))
         # A few hundredths of a pixel at 8 K; corners of small, oblique markers are the worst.
         assert np.median(np.linalg.norm(sighting.pixels - truth, axis=1)) < 0.06
         sightings.append(sighting)

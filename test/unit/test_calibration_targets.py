@@ -8,8 +8,8 @@ from support.boards import chessboard_levels, circle_levels, plate_pose, random_
 from thermal_fiducial.calibration.keypoints import without_speckles
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.sim.scenario import LENSES
@@ -24,7 +24,7 @@ def chessboard_view(rng, contrast, seed, lens=LENS):
     T = random_view(lens, CHESSBOARD.points, rng)
     plate = plate_pose(T, np.array([3.5, 2.5]) * SQUARE)
     counts = render(lens, plate, chessboard_levels(8, 6), 11 * SQUARE, 9 * SQUARE, contrast, seed)
-    return counts, lens.project(geometry.apply(T, CHESSBOARD.points))
+    return counts, lens.project(se3.apply(T, CHESSBOARD.points))
 
 
 def smallest_error(pixels, truth):
@@ -68,7 +68,7 @@ def test_circles(name):
         # Without those that the rim of the image cuts.
         assert len(sighting.points) >= 38
         # Centroids differ from projected centres by perspective, at these sizes by less than half a pixel.
-        truth = lens.project(geometry.apply(T, sighting.points))
+        truth = lens.project(se3.apply(T, sighting.points))
         assert np.abs(sighting.pixels - truth).max() < 0.6
 
 

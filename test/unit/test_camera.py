@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.errors import InputError
 
 K = np.array([[441.2, 0.0, 322.1], [0.0, 439.8, 251.3], [0.0, 0.0, 1.0]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bad_pixels import load_bad_pixels, save_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera, save_camera

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from thermal_fiducial.core.geometry import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.motion import CameraMotion, DELAY_STD, HALF_SQUARE_STD
 
 PERIOD_NS = 33_333_333

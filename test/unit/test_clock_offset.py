@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.scenes import camera_of, detector_of, told
 
+from thermal_fiducial.core.detection.clock_offset import ClockOffset, LIMIT_S
 from thermal_fiducial.core.measurements import Odometry
-from thermal_fiducial.core.vision.clock_offset import ClockOffset, LIMIT_S
 from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.scenario import named
 

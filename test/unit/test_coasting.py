@@ -5,10 +5,10 @@ import pytest
 from support.flights import config, Flight, Motion, run, timeline
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.ekf import PoseEkf
 from thermal_fiducial.core.filter.coasting import coasting_variance, HORIZON, usable_seconds
 from thermal_fiducial.core.filter.gating import position_std
 from thermal_fiducial.core.filter.navigation_state import Layout
+from thermal_fiducial.core.filter.pose_ekf import PoseEkf
 
 IMU = config().imu
 DENSITIES = IMU.gyroscope_noise_density, IMU.accelerometer_noise_density

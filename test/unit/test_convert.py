@@ -8,8 +8,8 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2, PointField, RegionOfInterest
 
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.geometry import so3_exp, transform
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import CORNER_COVARIANCE_FIELDS, MAP_DTYPE, MARKER_DTYPE, Odometry
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.images import image_to_array

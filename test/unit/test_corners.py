@@ -4,12 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.adjustment.edges import edges_behind
-from thermal_fiducial.core.camera import Camera, ImagePoints
-from thermal_fiducial.core.corners import refine_corners
-from thermal_fiducial.core.pose import marker_corners, solve_marker_poses
-from thermal_fiducial.core.vision.patterns import marker_bits
+from thermal_fiducial.core.detection.corners.edges import edges_behind
+from thermal_fiducial.core.detection.corners.refinement import refine_corners
+from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_marker_poses
 from thermal_fiducial.files.dictionary import load_dictionary
 
 K = [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]]
@@ -31,14 +31,14 @@ def draw(camera, marker_id, T, size, contrast=200.0, around=1.0):
 
     White for a cell all round it; ``around`` that, 0 for black and 1 for white.
     """
-    corners = camera.project(geometry.apply(T, marker_corners(size)))
+    corners = camera.project(se3.apply(T, marker_corners(size)))
     low = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 12, 0)
     high = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 13, (camera.width, camera.height))
     u = low[0] + (np.arange((high[0] - low[0]) * SAMPLES) + 0.5) / SAMPLES - 0.5
     v = low[1] + (np.arange((high[1] - low[1]) * SAMPLES) + 0.5) / SAMPLES - 0.5
     x = camera.normalise(np.stack(np.meshgrid(u, v), axis=-1))
     rays = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
-    on_plane = geometry.apply(geometry.inverse(T), rays * (T[:3, 2] @ T[:3, 3] / (rays @ T[:3, 2]))[..., None])
+    on_plane = se3.apply(se3.inverse(T), rays * (T[:3, 2] @ T[:3, 3] / (rays @ T[:3, 2]))[..., None])
     cells = BITS.shape[1] + 2
     plate = np.pad(np.pad(BITS[marker_id].astype(float), 1), 1, constant_values=1.0)
     grid = np.pad(plate, 1, constant_values=around)
@@ -51,8 +51,8 @@ def draw(camera, marker_id, T, size, contrast=200.0, around=1.0):
 
 
 def marker_pose(distance, tilt, u=0.1, v=-0.1):
-    R = geometry.so3_exp(tilt) @ np.diag([1.0, -1.0, -1.0])
-    return geometry.transform(R, np.array([u, v, 1.0]) * distance)
+    R = se3.so3_exp(tilt) @ np.diag([1.0, -1.0, -1.0])
+    return se3.transform(R, np.array([u, v, 1.0]) * distance)
 
 
 def refine(image, corners, camera, marker_id, **options):
@@ -190,17 +190,17 @@ def test_poses_of_faint_markers_are_as_good_as_their_corners_claim():
     """Corners err together: what the sides and the square tell all of them must not count for each of them anew."""
     rng, camera, squared = np.random.default_rng(10), CAMERAS['plumb_bob'], []
     for turn in rng.uniform(-3.0, 3.0, 8):
-        T = geometry.transform(geometry.so3_exp([0.0, 0.0, turn]), np.zeros(3))
+        T = se3.transform(se3.so3_exp([0.0, 0.0, turn]), np.zeros(3))
         T = marker_pose(3.5, rng.uniform(-0.5, 0.5, 3)) @ T
         image, corners = draw(camera, 11, T, 0.3, contrast=10.0)
         for _ in range(25):
             noise = rng.normal(0.0, 1.25, image.shape)
             found = refine(image + noise, corners + rng.normal(0, 0.3, (4, 2)), camera, 11, columns=12)
             poses = solve_marker_poses(found.corners_px, found.covariances, np.array([0.3]), camera)
-            errors = geometry.inverse(poses.T_camera_marker[0]) @ T
-            branch = int(np.argmin(geometry.rotation_angle(errors[:, :3, :3])))
+            errors = se3.inverse(poses.T_camera_marker[0]) @ T
+            branch = int(np.argmin(se3.rotation_angle(errors[:, :3, :3])))
             estimate = poses.T_camera_marker[0, branch]
-            turned = geometry.so3_log(T[:3, :3] @ estimate[:3, :3].T)
+            turned = se3.so3_log(T[:3, :3] @ estimate[:3, :3].T)
             error = np.concatenate([T[:3, 3] - estimate[:3, 3], turned])
             squared.append(error @ np.linalg.solve(poses.covariances[0, branch], error))
     # Six degrees of freedom: 7.0 to 7.2 by three seeds, each give or take 0.4 (9.2 to 9.6 where they count anew).

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.vision.patterns import marker_bits
+from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.fabrication.bridges import darkest_white, find_bridges
 from thermal_fiducial.fabrication.cuttability import examine
 from thermal_fiducial.fabrication.shape import paint, Rectangle

@@ -7,10 +7,10 @@ import pytest
 from support.scenes import camera_of
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.detection.displayed import DisplayedSides
+from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, MARKER_DTYPE
-from thermal_fiducial.core.vision.displayed import DisplayedSides
-from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.scenario import named

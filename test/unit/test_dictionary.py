@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import yaml
 
-from thermal_fiducial.core.vision.patterns import correctable_bits, marker_bits
+from thermal_fiducial.core.detection.patterns import correctable_bits, marker_bits
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns, save_dictionary
 

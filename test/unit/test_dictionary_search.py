@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.vision.patterns import marker_bits
+from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.cuttability import examine
 from thermal_fiducial.fabrication.dictionary_search import distances, random_code, search

@@ -12,7 +12,7 @@ from shapely.geometry import box, Point, Polygon
 from shapely.ops import unary_union
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.vision.patterns import marker_bits
+from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import circle_board
 from thermal_fiducial.fabrication.drawing import Circle, Contour, Drawing

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.flights import config, errors, Flight, matched, Motion, rms, run, START_NS, timeline
 
-from thermal_fiducial.core.ekf import PoseEkf, STEPS_AGAIN
+from thermal_fiducial.core.filter.pose_ekf import PoseEkf, STEPS_AGAIN
 from thermal_fiducial.core.measurements import ImuSample
 
 

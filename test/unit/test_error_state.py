@@ -12,7 +12,7 @@ from thermal_fiducial.core.filter.imu import ImuStep
 from thermal_fiducial.core.filter.initialisation import blank_state
 from thermal_fiducial.core.filter.learned_noise import StampJitter
 from thermal_fiducial.core.filter.navigation_state import inject, Layout, POSE, VELOCITY
-from thermal_fiducial.core.geometry import so3_exp, so3_left_jacobian, so3_log, transform
+from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian, so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose
 
 FULL = config(estimate_extrinsics=True, pose_noise_scale=1.0)

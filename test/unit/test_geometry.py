@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from thermal_fiducial.core import geometry
+from thermal_fiducial.core.geometry import se3
 
 ANGLES = [0.0, 1e-12, 1e-6, 0.99e-2, 1.01e-2, 0.5, 2.0, np.pi - 1e-7, np.pi]
 AXIS = np.array([0.48, -0.6, 0.64])
@@ -13,16 +13,16 @@ AXIS = np.array([0.48, -0.6, 0.64])
 
 @pytest.mark.parametrize('angle', ANGLES)
 def test_exp_is_the_matrix_exponential(angle):
-    assert np.allclose(geometry.so3_exp(angle * AXIS), expm(geometry.skew(angle * AXIS)), atol=1e-14)
+    assert np.allclose(se3.so3_exp(angle * AXIS), expm(se3.skew(angle * AXIS)), atol=1e-14)
 
 
 @pytest.mark.parametrize('angle', ANGLES)
 def test_exp_and_log_agree_with_scipy(angle):
     R = Rotation.from_rotvec(angle * AXIS)
-    assert np.allclose(geometry.so3_exp(angle * AXIS), R.as_matrix(), atol=1e-15)
+    assert np.allclose(se3.so3_exp(angle * AXIS), R.as_matrix(), atol=1e-15)
     # At half a turn the sign of the axis is free: what counts is that it is the same rotation.
-    assert np.allclose(geometry.so3_exp(geometry.so3_log(R.as_matrix())), R.as_matrix(), atol=1e-14)
-    assert np.linalg.norm(geometry.so3_log(R.as_matrix())) == pytest.approx(angle, abs=2e-8)
+    assert np.allclose(se3.so3_exp(se3.so3_log(R.as_matrix())), R.as_matrix(), atol=1e-14)
+    assert np.linalg.norm(se3.so3_log(R.as_matrix())) == pytest.approx(angle, abs=2e-8)
 
 
 @pytest.mark.parametrize('angle', [0.0, 1e-9, 0.99e-2, 1.01e-2, 0.7, 3.0])
@@ -30,54 +30,54 @@ def test_left_jacobian_is_the_derivative_of_exp(angle):
     phi, h = angle * AXIS, 1e-6
     for k in range(3):
         d = h * np.eye(3)[k]
-        forward, backward = (geometry.so3_exp(phi + s * d) @ geometry.so3_exp(phi).T for s in (1, -1))
-        numeric = (geometry.so3_log(forward) - geometry.so3_log(backward)) / (2 * h)
+        forward, backward = (se3.so3_exp(phi + s * d) @ se3.so3_exp(phi).T for s in (1, -1))
+        numeric = (se3.so3_log(forward) - se3.so3_log(backward)) / (2 * h)
         # Central differences: h^2 / 6 times a third derivative of order one, and 1e-16 / h of rounding.
-        assert np.allclose(geometry.so3_left_jacobian(phi)[:, k], numeric, atol=1e-9)
+        assert np.allclose(se3.so3_left_jacobian(phi)[:, k], numeric, atol=1e-9)
 
 
 @pytest.mark.parametrize('angle', [0.0, 1e-9, 0.99e-2, 1.01e-2, 0.7, 3.0, 5.5])
 def test_left_jacobian_inverse(angle):
-    J = geometry.so3_left_jacobian(angle * AXIS)
-    assert np.allclose(J @ geometry.so3_left_jacobian_inverse(angle * AXIS), np.eye(3), atol=1e-11)
+    J = se3.so3_left_jacobian(angle * AXIS)
+    assert np.allclose(J @ se3.so3_left_jacobian_inverse(angle * AXIS), np.eye(3), atol=1e-11)
 
 
 def test_the_series_meet_the_closed_forms():
     """On both sides of the switch the functions agree to what they change in between."""
-    below, above = np.nextafter(geometry.SMALL_ANGLE, 0.0) * AXIS, np.nextafter(geometry.SMALL_ANGLE, 1.0) * AXIS
-    for function in (geometry.so3_exp, geometry.so3_left_jacobian, geometry.so3_left_jacobian_inverse):
+    below, above = np.nextafter(se3.SMALL_ANGLE, 0.0) * AXIS, np.nextafter(se3.SMALL_ANGLE, 1.0) * AXIS
+    for function in (se3.so3_exp, se3.so3_left_jacobian, se3.so3_left_jacobian_inverse):
         # The closed form of 1/a^2 - 1/(2 a tan) cancels to 1e-16 / a^2 = 1e-12 here, times a^2 in the matrix.
         assert np.allclose(function(below), function(above), atol=1e-14)
 
 
 def test_quaternions_are_those_of_scipy():
     rotations = Rotation.random(500, random_state=1)
-    q = geometry.quaternion_from_rotation(rotations.as_matrix())
+    q = se3.quaternion_from_rotation(rotations.as_matrix())
     assert np.allclose(q, rotations.as_quat(canonical=True), atol=1e-14)
-    assert np.allclose(geometry.rotation_from_quaternion(q), rotations.as_matrix(), atol=1e-14)
-    assert np.allclose(geometry.rotation_from_quaternion(-3.0 * q), rotations.as_matrix(), atol=1e-14)
+    assert np.allclose(se3.rotation_from_quaternion(q), rotations.as_matrix(), atol=1e-14)
+    assert np.allclose(se3.rotation_from_quaternion(-3.0 * q), rotations.as_matrix(), atol=1e-14)
 
 
 @pytest.mark.parametrize('half_turn', [np.diag([1.0, -1, -1]), np.diag([-1.0, 1, -1]), np.diag([-1.0, -1, 1])])
 def test_half_turns(half_turn):
-    q = geometry.quaternion_from_rotation(half_turn)
-    assert np.allclose(geometry.rotation_from_quaternion(q), half_turn, atol=1e-15)
-    assert geometry.rotation_angle(half_turn) == pytest.approx(np.pi)
+    q = se3.quaternion_from_rotation(half_turn)
+    assert np.allclose(se3.rotation_from_quaternion(q), half_turn, atol=1e-15)
+    assert se3.rotation_angle(half_turn) == pytest.approx(np.pi)
 
 
 def test_transforms_chain_as_their_names_do():
-    T_a_b = geometry.transform(geometry.so3_exp([0.1, 0.2, 0.3]), [1.0, 2.0, 3.0])
-    T_b_c = geometry.transform(geometry.so3_exp([-0.4, 0.0, 1.0]), [0.0, -1.0, 0.5])
+    T_a_b = se3.transform(se3.so3_exp([0.1, 0.2, 0.3]), [1.0, 2.0, 3.0])
+    T_b_c = se3.transform(se3.so3_exp([-0.4, 0.0, 1.0]), [0.0, -1.0, 0.5])
     p_c = np.array([[0.3, 0.2, 0.1], [5.0, 0.0, -1.0]])
-    assert np.allclose(geometry.apply(T_a_b @ T_b_c, p_c), geometry.apply(T_a_b, geometry.apply(T_b_c, p_c)))
-    assert np.allclose(geometry.inverse(T_a_b) @ T_a_b, np.eye(4), atol=1e-15)
+    assert np.allclose(se3.apply(T_a_b @ T_b_c, p_c), se3.apply(T_a_b, se3.apply(T_b_c, p_c)))
+    assert np.allclose(se3.inverse(T_a_b) @ T_a_b, np.eye(4), atol=1e-15)
     # The origin of b in a.
-    assert np.allclose(geometry.apply(T_a_b, np.zeros((1, 3))), [[1.0, 2.0, 3.0]])
+    assert np.allclose(se3.apply(T_a_b, np.zeros((1, 3))), [[1.0, 2.0, 3.0]])
 
 
 def test_transform_from_quaternion():
-    T = geometry.transform_from_quaternion([1.0, 2.0, 3.0], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
-    assert np.allclose(geometry.apply(T, np.array([[1.0, 0.0, 0.0]])), [[1.0, 3.0, 3.0]])
+    T = se3.transform_from_quaternion([1.0, 2.0, 3.0], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
+    assert np.allclose(se3.apply(T, np.array([[1.0, 0.0, 0.0]])), [[1.0, 3.0, 3.0]])
 
 
 def test_batches_are_single_calls_side_by_side():
@@ -85,21 +85,21 @@ def test_batches_are_single_calls_side_by_side():
     phi = rng.normal(size=(4, 5, 3))
     phi[1, 2] = 0.0
     p = rng.normal(size=(4, 5, 3))
-    T = geometry.transform(geometry.so3_exp(phi), p)
+    T = se3.transform(se3.so3_exp(phi), p)
     points = rng.normal(size=(4, 5, 7, 3))
-    q = geometry.quaternion_from_rotation(T[..., :3, :3])
+    q = se3.quaternion_from_rotation(T[..., :3, :3])
     for i in np.ndindex(4, 5):
-        assert np.allclose(T[i], geometry.transform(geometry.so3_exp(phi[i]), p[i]))
-        assert np.allclose(geometry.inverse(T)[i], geometry.inverse(T[i]))
-        assert np.allclose(geometry.apply(T, points)[i], geometry.apply(T[i], points[i]))
-        assert np.allclose(geometry.so3_log(T[..., :3, :3])[i], geometry.so3_log(T[i][:3, :3]))
-        assert np.allclose(q[i], geometry.quaternion_from_rotation(T[i][:3, :3]))
-        assert np.allclose(geometry.so3_left_jacobian_inverse(phi)[i], geometry.so3_left_jacobian_inverse(phi[i]))
+        assert np.allclose(T[i], se3.transform(se3.so3_exp(phi[i]), p[i]))
+        assert np.allclose(se3.inverse(T)[i], se3.inverse(T[i]))
+        assert np.allclose(se3.apply(T, points)[i], se3.apply(T[i], points[i]))
+        assert np.allclose(se3.so3_log(T[..., :3, :3])[i], se3.so3_log(T[i][:3, :3]))
+        assert np.allclose(q[i], se3.quaternion_from_rotation(T[i][:3, :3]))
+        assert np.allclose(se3.so3_left_jacobian_inverse(phi)[i], se3.so3_left_jacobian_inverse(phi[i]))
 
 
 def test_skew_is_the_cross_product():
     v, w = np.random.default_rng(3).normal(size=(2, 10, 3))
-    assert np.allclose((geometry.skew(v) @ w[..., None])[..., 0], np.cross(v, w))
+    assert np.allclose((se3.skew(v) @ w[..., None])[..., 0], np.cross(v, w))
 
 
 def test_one_rotation_gives_the_quaternion_that_a_batch_gives():
@@ -107,9 +107,9 @@ def test_one_rotation_gives_the_quaternion_that_a_batch_gives():
     phi = rng.normal(size=(300, 3))
     phi[::3] *= np.pi / np.linalg.norm(phi[::3], axis=1, keepdims=True)
     phi[1::7] *= 1e-9
-    R = geometry.so3_exp(phi)
-    batch = geometry.quaternion_from_rotation(R)
-    single = np.array([geometry.quaternion_from_rotation(one) for one in R])
+    R = se3.so3_exp(phi)
+    batch = se3.quaternion_from_rotation(R)
+    single = np.array([se3.quaternion_from_rotation(one) for one in R])
     assert np.all(single[:, 3] >= 0.0)
     # The same formulas in doubles; at half a turn the sign is free.
     sign = np.where(np.sum(batch * single, axis=1, keepdims=True) < 0.0, -1.0, 1.0)

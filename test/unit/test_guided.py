@@ -8,12 +8,12 @@ from scipy.spatial.transform import Rotation
 from support.scenes import told
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.detection import _common_shift, MarkerDetector
+from thermal_fiducial.core.detection.detector import _common_shift, MarkerDetector
+from thermal_fiducial.core.detection.guided import KnownMarkers
+from thermal_fiducial.core.detection.search import Found
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corners_px, Odometry
-from thermal_fiducial.core.vision.guided import KnownMarkers
-from thermal_fiducial.core.vision.search import Found
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.scenario import named, with_contrast
@@ -38,8 +38,8 @@ def frames(contrast, count=4):
 
 
 def odometry(frame, shift=(0.003, -0.002, 0.002)):
-    T = frame.T_map_camera @ geometry.inverse(SCENARIO.T_body_camera)
-    T = geometry.transform(T[:3, :3], T[:3, 3] + shift)
+    T = frame.T_map_camera @ se3.inverse(SCENARIO.T_body_camera)
+    T = se3.transform(T[:3, :3], T[:3, 3] + shift)
     return Odometry(frame.stamp_ns, T, np.zeros(3), np.zeros(3), 1e-6 * np.eye(6), 1e-2 * np.eye(6))
 
 
@@ -51,7 +51,7 @@ def detector(**changes):
 
 def test_expected_markers_are_those_in_view():
     frame = frames(8.0, 1)[0]
-    ids, corners, x, depth = KnownMarkers(MAP).expected(geometry.inverse(frame.T_map_camera), CAMERA, 12.0)
+    ids, corners, x, depth = KnownMarkers(MAP).expected(se3.inverse(frame.T_map_camera), CAMERA, 12.0)
     assert set(frame.corners_px) >= set(ids.tolist())
     for marker_id, expected in zip(ids.tolist(), corners, strict=True):
         np.testing.assert_allclose(expected, frame.corners_px[marker_id], atol=1e-6)
@@ -120,9 +120,9 @@ def test_branch_follows_the_map():
     frame = frames(8.0, 1)[0]
     rows = detector().detect(frame.stamp_ns, frame.counts, CAMERA, told(odometry(frame)))
     for row in rows:
-        R = geometry.rotation_from_quaternion([row['qx'], row['qy'], row['qz'], row['qw']])
+        R = se3.rotation_from_quaternion([row['qx'], row['qy'], row['qz'], row['qw']])
         expected = frame.T_map_camera[:3, :3].T @ MAP[int(row['id'])][0][:3, :3]
-        assert np.linalg.norm(geometry.so3_log(R @ expected.T)) < np.radians(6.0)
+        assert np.linalg.norm(se3.so3_log(R @ expected.T)) < np.radians(6.0)
 
 
 def test_odometry_is_read_on_the_camera_s_clock():

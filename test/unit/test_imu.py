@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm
 
 from thermal_fiducial.core.filter.imu import ImuStep, rotation_integrals, Transition
-from thermal_fiducial.core.geometry import skew, so3_exp
+from thermal_fiducial.core.geometry.se3 import skew, so3_exp
 
 STEP = ImuStep(np.array([0.8, -1.5, 2.0, 3.0, -1.0, 9.0]), 0.005, 1.7e-4, 2.0e-3)
 BIAS = np.array([0.01, -0.02, 0.03, 0.2, -0.1, 0.1])

@@ -3,7 +3,7 @@
 import numpy as np
 
 from test.support.walls import flight
-from thermal_fiducial.core.geometry import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore, Link
 
 

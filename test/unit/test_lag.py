@@ -4,9 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.camera import Camera, ImagePoints
-from thermal_fiducial.core.vision.frame import Places
-from thermal_fiducial.core.vision.lag import (
+from thermal_fiducial.core.detection.frame import Places
+from thermal_fiducial.core.detection.lag import (
     common_error,
     markers_sharpened,
     model_error,
@@ -14,7 +13,8 @@ from thermal_fiducial.core.vision.lag import (
     SmearField,
     without_lag,
 )
-from thermal_fiducial.core.vision.motion import Twist
+from thermal_fiducial.core.detection.motion import Twist
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
 TWIST = np.array([0.5, -0.3, 0.8, 0.4, -0.6, 0.7])

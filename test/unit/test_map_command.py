@@ -5,8 +5,8 @@ import pytest
 
 from test.support.walls import CAMERA, flight, see, SIZE, stamp, wall
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.adjustment.reprojection import corners_in_map, difference
-from thermal_fiducial.core.geometry import apply, inverse, so3_exp, transform
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference
+from thermal_fiducial.core.geometry.se3 import apply, inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.map_editing import transformed
 from thermal_fiducial.core.measurements import CORNER_FIELDS

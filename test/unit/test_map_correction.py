@@ -7,12 +7,12 @@ import pytest
 
 from test.support.walls import CAMERA, flight, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.adjustment.reprojection import difference, retract
-from thermal_fiducial.core.map_refinement import refine
+from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.correction import correction
 from thermal_fiducial.core.mapping.keyframes import Keyframe
+from thermal_fiducial.core.mapping.mapper import MapMarker, MarkerMap, MarkerMapper
 from thermal_fiducial.core.mapping.odometry_prior import ClockDifference, together
-from thermal_fiducial.core.marker_map import MapMarker, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Odometry
 
 AS_BODY = {'camera_orientation': (0.0, 0.0, 0.0, 1.0)}

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from test.support.walls import CAMERA, flight, see, SIZE, wall
-from thermal_fiducial.core import map_refinement
-from thermal_fiducial.core.adjustment.reprojection import difference, retract
-from thermal_fiducial.core.geometry import inverse, so3_exp, transform
-from thermal_fiducial.core.map_refinement import prior_poses, refine, Snapshot
+from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
+from thermal_fiducial.core.mapping import bundle_adjustment
+from thermal_fiducial.core.mapping.bundle_adjustment import prior_poses, refine, Snapshot
 from thermal_fiducial.core.mapping.keyframes import Keyframe, Link, Rig
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
@@ -60,7 +60,7 @@ def test_the_schur_complement_answers_like_the_whole_system():
     s = snapshot(rng, poses, count=6, disturbance=1e-3)
     s = replace(s, links=(Link(2, 5, inverse(flight(20 / 6)) @ flight(80 / 6), np.diag([1e-4] * 3 + [1e-5] * 3)),))
     s = replace(s, priors=prior_poses({1: s.markers[1]}))
-    problem = map_refinement._Problem.build(s)
+    problem = bundle_adjustment._Problem.build(s)
     assert problem is not None
     e = problem.evaluate(problem.start, 1.0)
     F, M = len(problem.stamps), len(problem.ids)
@@ -100,7 +100,7 @@ def test_derivatives_of_a_link_are_those_of_its_residual():
     s = snapshot(rng, poses, count=4, disturbance=0.0)
     T = [frame.T_map_rig for frame in s.keyframes]
     s = replace(s, links=(Link(1, 3, inverse(T[0]) @ T[2], np.eye(6)),))
-    problem = map_refinement._Problem.build(s)
+    problem = bundle_adjustment._Problem.build(s)
     assert problem is not None
     h = 1e-6
     ((a, b, _, J_a, J_b),) = problem._linked(problem.start)
@@ -308,7 +308,7 @@ def test_errors_that_last_are_in_the_covariances():
     """Corners that are off by the same in all views of a marker, and by nothing else."""
     poses, nees = wall(np.random.default_rng(0)), []
     exact = snapshot(np.random.default_rng(1), poses, sigma=0.0, disturbance=0.0)
-    problem = map_refinement._Problem.build(exact)
+    problem = bundle_adjustment._Problem.build(exact)
     evaluation = problem.evaluate(problem.start, 1.0)
     P = problem._lasting(problem._blocks(problem.start, evaluation), evaluation, 1.0)[1:]
     for seed in range(20):
@@ -325,7 +325,7 @@ def test_errors_that_last_are_in_the_covariances():
 def test_responses_are_what_the_steps_are():
     rng = np.random.default_rng(13)
     start = snapshot(rng, wall(rng), count=8)
-    problem = map_refinement._Problem.build(start)
+    problem = bundle_adjustment._Problem.build(start)
     evaluation = problem.evaluate(problem.start, 1.0)
     blocks = problem._blocks(problem.start, evaluation)
     _, markers = problem.equations.solve(blocks, 0.0)

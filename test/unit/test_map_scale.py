@@ -8,9 +8,9 @@ from support.crowds import crowd, frames, mapped, SIZE
 from support.walls import CAMERA, FRAME_NS, look, see, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.geometry import transform
+from thermal_fiducial.core.geometry.se3 import transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.marker_map import MarkerMapper
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import Odometry
 
 

@@ -11,7 +11,7 @@ from support.ros_graph import ros_graph
 from visualization_msgs.msg import Marker, MarkerArray
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.geometry import apply, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import apply, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.files.map_history import entries
 from thermal_fiducial.files.marker_map import save_map

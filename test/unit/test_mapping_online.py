@@ -7,11 +7,11 @@ import numpy as np
 
 from test.support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.adjustment.reprojection import difference, retract
-from thermal_fiducial.core.geometry import so3_exp, transform
-from thermal_fiducial.core.map_refinement import refine
+from thermal_fiducial.core.geometry.reprojection import difference, retract
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_editing import transformed
-from thermal_fiducial.core.marker_map import ASTRAY, MapMarker, MarkerMap, MarkerMapper
+from thermal_fiducial.core.mapping.mapper import ASTRAY, MapMarker, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import Odometry
 
 # The body is the camera: odometry and camera pose are one.

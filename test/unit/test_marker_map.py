@@ -5,8 +5,8 @@ import pytest
 
 from test.support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.adjustment.reprojection import difference
-from thermal_fiducial.core.marker_map import MapMarker, MarkerMap, MarkerMapper
+from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.mapping.mapper import MapMarker, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import MARKER_DTYPE
 
 

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.geometry import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import dump_map, load_map, save_map

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.run_folders import disturbed, START_NS, true_pose
 
-from thermal_fiducial.core.geometry import inverse, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.report import metrics
 from thermal_fiducial.report.trajectory import Trajectory
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.measurements import Odometry
-from thermal_fiducial.core.vision.lag import (
+from thermal_fiducial.core.detection.lag import (
     MEMORY_AGE,
 )
-from thermal_fiducial.core.vision.motion import camera_twist, interaction, MotionTracker, plausible, Tracked, Twist
+from thermal_fiducial.core.detection.motion import camera_twist, interaction, MotionTracker, plausible, Tracked, Twist
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.measurements import Odometry
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
 TWIST = np.array([0.5, -0.3, 0.8, 0.4, -0.6, 0.7])
@@ -20,8 +20,8 @@ LAG = 0.010
 
 def moved(points, dt):
     """Points in the camera after it has moved with TWIST for ``dt``."""
-    T = geometry.transform(geometry.so3_exp(TWIST[3:] * dt), TWIST[:3] * dt)
-    return geometry.apply(geometry.inverse(T), points)
+    T = se3.transform(se3.so3_exp(TWIST[3:] * dt), TWIST[:3] * dt)
+    return se3.apply(se3.inverse(T), points)
 
 
 def test_interaction_is_the_derivative_of_the_projection():
@@ -35,12 +35,12 @@ def test_interaction_is_the_derivative_of_the_projection():
 
 
 def test_twist_of_the_camera_from_that_of_the_body():
-    T_body_camera = geometry.transform(geometry.so3_exp([0.3, -1.0, 0.5]), [0.1, 0.2, -0.3])
+    T_body_camera = se3.transform(se3.so3_exp([0.3, -1.0, 0.5]), [0.1, 0.2, -0.3])
     body = np.array([0.4, -0.2, 0.3, 0.5, 0.1, -0.7])
     dt = 1e-6
-    T_body = geometry.transform(geometry.so3_exp(body[3:] * dt), body[:3] * dt)
-    T_camera = geometry.inverse(T_body_camera) @ T_body @ T_body_camera
-    numeric = np.concatenate([T_camera[:3, 3], geometry.so3_log(T_camera[:3, :3])]) / dt
+    T_body = se3.transform(se3.so3_exp(body[3:] * dt), body[:3] * dt)
+    T_camera = se3.inverse(T_body_camera) @ T_body @ T_body_camera
+    numeric = np.concatenate([T_camera[:3, 3], se3.so3_log(T_camera[:3, :3])]) / dt
     odometry = Odometry(0, np.eye(4), body[:3], body[3:], np.eye(6), np.eye(6))
     np.testing.assert_allclose(camera_twist(odometry, T_body_camera).value, numeric, atol=1e-5)
 
@@ -94,7 +94,7 @@ def turning(stamp_ns, states, jitter_ns=0, seed=6):
             for age, e in zip(ages_ns, noise, strict=True)
         ]
         seen_ns = int(stamp + jitter_ns * rng.standard_normal())
-        seen = points @ geometry.so3_exp(0.5 * acceleration * (seen_ns * 1e-9) ** 2)
+        seen = points @ se3.so3_exp(0.5 * acceleration * (seen_ns * 1e-9) ** 2)
         x = seen[..., :2] / seen[..., 2:]
         twist = tracker.correct(stamp, tracker.predict(stamp, heard), ids, x, seen[..., 2], np.full(5, 1e-5))
         tracker.remember(stamp, twist, Tracked(ids, x, seen[..., 2], np.full(5, 100.0)))
@@ -107,7 +107,7 @@ def test_twist_is_that_of_the_time_that_smears():
     lag, dt, acceleration = 0.010, 1 / 30, np.array([0.0, 6.0, 2.0])
     tracker, ids, twist = MotionTracker(np.eye(4), lag), np.arange(5), None
     for frame in range(8):
-        turned = geometry.so3_exp(0.5 * acceleration * (frame * dt) ** 2)
+        turned = se3.so3_exp(0.5 * acceleration * (frame * dt) ** 2)
         seen = points @ turned
         stamp = round(frame * dt * 1e9)
         x = seen[..., :2] / seen[..., 2:]

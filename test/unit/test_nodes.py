@@ -14,7 +14,7 @@ from support import small_bag
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.filter.innovations import innovations_of
-from thermal_fiducial.core.geometry import so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import save_camera
@@ -461,7 +461,7 @@ def test_names_are_relative(graph):
         topics = {output.topic for output in node.outputs} | {source.topic for source in node.inputs}
     assert topics == {
         '/diagnostics', '/drone/vision/pose', '/drone/odometry', '/drone/path', '/drone/imu/data', '/drone/camera_pose',
-        '/drone/map_correction',
+        '/drone/camera_clock', '/drone/map_correction',
     }  # fmt: skip
 
 

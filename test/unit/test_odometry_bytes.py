@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rclpy.serialization import serialize_message
 
-from thermal_fiducial.core import geometry
+from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros import convert, odometry_bytes
@@ -12,7 +12,7 @@ from thermal_fiducial.ros import convert, odometry_bytes
 
 def state(**other):
     rng = np.random.default_rng(3)
-    T_map_body = geometry.transform(geometry.so3_exp(rng.standard_normal(3)), rng.standard_normal(3))
+    T_map_body = se3.transform(se3.so3_exp(rng.standard_normal(3)), rng.standard_normal(3))
     values = dict(zip(('velocity_body', 'angular_velocity_body'), rng.standard_normal((2, 3)), strict=True))
     covariances = dict(zip(('pose_covariance', 'twist_covariance'), rng.standard_normal((2, 6, 6)), strict=True))
     return Odometry(

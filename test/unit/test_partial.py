@@ -9,15 +9,15 @@ from support.close_views import BITS, BLUR_WITH_PIXEL, CAMERAS, draw, plate, pos
 from support.scenes import told
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.adjustment.grid import adjusted, grid_edges, Layer
+from thermal_fiducial.core.detection.corners.grid import adjusted, grid_edges, Layer
+from thermal_fiducial.core.detection.decoding import Decoder
+from thermal_fiducial.core.detection.frame import Frame
+from thermal_fiducial.core.detection.guided import KnownMarkers
+from thermal_fiducial.core.detection.motion import Twist
+from thermal_fiducial.core.detection.partial import CutMarkerSearch
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_camera_pose
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, Odometry
-from thermal_fiducial.core.pose import marker_corners, solve_camera_pose
-from thermal_fiducial.core.vision.decoding import Decoder
-from thermal_fiducial.core.vision.frame import Frame
-from thermal_fiducial.core.vision.guided import KnownMarkers
-from thermal_fiducial.core.vision.motion import Twist
-from thermal_fiducial.core.vision.partial import CutMarkerSearch
 from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.trajectory import Trajectory
 
@@ -51,14 +51,14 @@ def look(image, camera, T_expected, noise, marker_id=ID):
 
 
 def disturbed(T, rng, scale=0.005):
-    return geometry.transform(geometry.so3_exp(rng.normal(0, scale, 3)), rng.normal(0, scale, 3)) @ T
+    return se3.transform(se3.so3_exp(rng.normal(0, scale, 3)), rng.normal(0, scale, 3)) @ T
 
 
 @pytest.mark.parametrize('model', CAMERAS)
 @pytest.mark.parametrize('view', VIEWS)
 def test_corners_outside_the_image_are_found_without_noise(model, view):
     camera, T = CAMERAS[model], pose(*VIEWS[view])
-    true = camera.project(geometry.apply(T, marker_corners(SIZE)))
+    true = camera.project(se3.apply(T, marker_corners(SIZE)))
     assert not camera.contains(true, 8.0).all()
     image = 7000.0 + 200.0 * drawn(model, view)
     ids, found = look(image, camera, disturbed(T, np.random.default_rng(1)), 0.5)
@@ -79,7 +79,7 @@ def test_errors_are_those_that_the_covariance_tells(view):
         layer = Layer(image, camera, lambda points: np.zeros((len(points), 2)), BLUR_WITH_PIXEL, np.zeros(2))
         fit = adjusted(adjusted(T, SIZE, pattern, layer).T_camera_marker, SIZE, pattern, layer)
         found = fit.T_camera_marker
-        turn = geometry.so3_log(T[:3, :3] @ found[:3, :3].T)
+        turn = se3.so3_log(T[:3, :3] @ found[:3, :3].T)
         error = np.concatenate([T[:3, 3] - found[:3, 3], turn])
         nees.append(error @ fit.information @ error / 6.0)
     # Three sigma of the mean are 0.22; the floor of an edge's place, which nothing here needs, takes up to 0.15.
@@ -95,10 +95,10 @@ def test_corners_taken_for_independent_claim_no_more_than_is_known():
         if len(found.corners_px) == 0:
             continue
         square = (marker_corners(SIZE))[None]
-        T_marker_camera = geometry.inverse(T)
+        T_marker_camera = se3.inverse(T)
         solved = solve_camera_pose(found.corners_px, found.covariances, square, camera, T_marker_camera, compete=False)
         off = T_marker_camera[:3, 3] - solved.T_map_camera[:3, 3]
-        turn = geometry.so3_log(T_marker_camera[:3, :3] @ solved.T_map_camera[:3, :3].T)
+        turn = se3.so3_log(T_marker_camera[:3, :3] @ solved.T_map_camera[:3, :3].T)
         error = np.concatenate([off, turn])
         nees.append(error @ np.linalg.solve(solved.covariance, error) / 6.0)
     # One in forty may be refused where noise makes the pattern doubtful.
@@ -142,7 +142,7 @@ def test_a_detector_with_odometry_sees_it():
     scenario = approach.scenario()
     frame = next(iter(render_frames(scenario, 7.0, 3, start=150, stop=151)))
     assert frame.corners_px == {}
-    T_map_body = frame.T_map_camera @ geometry.inverse(scenario.T_body_camera)
+    T_map_body = frame.T_map_camera @ se3.inverse(scenario.T_body_camera)
     motion = still(scenario, frame)
     state = Odometry(frame.stamp_ns, T_map_body, *motion, 1e-6 * np.eye(6), 1e-4 * np.eye(6))
     detector, camera = approach.detector_of(scenario, with_map=True), approach.camera_of(scenario)
@@ -150,8 +150,8 @@ def test_a_detector_with_odometry_sees_it():
     row = detector.detect(frame.stamp_ns + 1, frame.counts, camera, told(state))
     assert row['id'].tolist() == [7]
     marker = scenario.markers[0]
-    T = geometry.inverse(frame.T_map_camera) @ marker.T_map_marker
-    error = corners_px(row)[0] - camera.project(geometry.apply(T, marker_corners(marker.size)))
+    T = se3.inverse(frame.T_map_camera) @ marker.T_map_marker
+    error = corners_px(row)[0] - camera.project(se3.apply(T, marker_corners(marker.size)))
     assert np.abs(error).max() < 0.5
     sigma = np.sqrt(np.trace(corner_covariances(row)[0], axis1=1, axis2=2))
     assert np.all(np.linalg.norm(error, axis=1) < 4.0 * sigma)

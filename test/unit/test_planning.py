@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.planning import (
     expect,

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera, ImagePoints
-from thermal_fiducial.core.pose import (
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.planar_pose import (
     choose_branches,
     ippe_square,
     marker_corners,
@@ -25,11 +25,11 @@ ISOTROPIC = np.broadcast_to(0.1**2 * np.eye(2), (4, 2, 2))
 
 
 def pose(tilt_rad, position):
-    return geometry.transform(geometry.so3_exp(tilt_rad) @ FACING, position)
+    return se3.transform(se3.so3_exp(tilt_rad) @ FACING, position)
 
 
 def image(camera, T_camera_marker, size=0.3):
-    return camera.project(geometry.apply(T_camera_marker, marker_corners(size)))
+    return camera.project(se3.apply(T_camera_marker, marker_corners(size)))
 
 
 def solve_one(corners, camera, size=0.3):
@@ -53,13 +53,13 @@ def test_noiseless_is_exact(model, tilt, position):
 def test_front_parallel_branches_are_both_proper():
     poses = ippe_square(np.array([[[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]]]), np.array([0.3]))[0]
     for T in poses:
-        np.testing.assert_allclose(T, geometry.transform(FACING, [0, 0, 1.5]), atol=1e-7)
+        np.testing.assert_allclose(T, se3.transform(FACING, [0, 0, 1.5]), atol=1e-7)
 
 
 def test_alternative_is_the_mirrored_tilt():
     camera, T = CAMERAS['plumb_bob'], pose((0.4, 0.0, 0.0), (0.0, 0.0, 4.0))
     found = solve_one(image(camera, T), camera)
-    tilt = geometry.so3_log(found.T_camera_marker[0, 1, :3, :3] @ FACING.T)
+    tilt = se3.so3_log(found.T_camera_marker[0, 1, :3, :3] @ FACING.T)
     np.testing.assert_allclose(tilt, (-0.4, 0.0, 0.0), atol=0.05)
     assert 0.01 < found.rms_px[0, 1] < 1.0
 
@@ -84,9 +84,9 @@ def test_expectation_chooses_among_branches_that_the_image_allows(distance, allo
 def test_other_known_markers_choose_the_branch():
     """Of three small markers far away each alone is ambiguous; together they are not, whatever was predicted."""
     camera = CAMERAS['plumb_bob']
-    T_camera_map = geometry.transform(geometry.so3_exp([0.2, -0.1, 0.1]), [0.1, 0.0, 5.0])
+    T_camera_map = se3.transform(se3.so3_exp([0.2, -0.1, 0.1]), [0.1, 0.0, 5.0])
     poses_in_map = [
-        geometry.transform(geometry.so3_exp(tilt) @ FACING, p)
+        se3.transform(se3.so3_exp(tilt) @ FACING, p)
         for tilt, p in [
             ((0.3, 0, 0), (-1.0, 0.3, 0.0)),
             ((0, -0.3, 0), (0.9, -0.4, 0.5)),
@@ -99,7 +99,7 @@ def test_other_known_markers_choose_the_branch():
     assert poses.ambiguous().all()
     wrong = poses.swapped(np.array([True, False, True]))
     known, points = [(T, 0.2) for T in poses_in_map], ImagePoints.at(corners, camera)
-    for predicted in (None, T_camera_map, wrong.T_camera_marker[0, 0] @ geometry.inverse(poses_in_map[0])):
+    for predicted in (None, T_camera_map, wrong.T_camera_marker[0, 0] @ se3.inverse(poses_in_map[0])):
         chosen = choose_branches(wrong, points, covs, known, predicted)
         np.testing.assert_allclose(chosen.T_camera_marker[:, 0], T_camera_map @ np.stack(poses_in_map), atol=1e-5)
     # A lone known marker has the prediction alone, one of unknown pose nothing.
@@ -127,12 +127,12 @@ def test_degenerate_marker_leaves_the_others_alone():
 
 def scene(camera):
     rng = np.random.default_rng(3)
-    T_map_camera = geometry.transform(geometry.so3_exp([0.4, -1.0, 0.3]), [1.0, -2.0, 0.5])
+    T_map_camera = se3.transform(se3.so3_exp([0.4, -1.0, 0.3]), [1.0, -2.0, 0.5])
     T_camera_markers = [
         pose(rng.normal(0, 0.4, 3), p) for p in [(-0.5, -0.3, 2.0), (0.5, 0.2, 2.5), (0.0, 0.4, 3.0), (0.4, -0.5, 2.2)]
     ]
-    in_camera = np.stack([geometry.apply(T, marker_corners(0.3)) for T in T_camera_markers])
-    return T_map_camera, geometry.apply(T_map_camera, in_camera), camera.project(in_camera)
+    in_camera = np.stack([se3.apply(T, marker_corners(0.3)) for T in T_camera_markers])
+    return T_map_camera, se3.apply(T_map_camera, in_camera), camera.project(in_camera)
 
 
 @pytest.mark.parametrize('model', CAMERAS)
@@ -149,7 +149,7 @@ def test_joint_pose_survives_a_wrong_prediction_and_a_wrong_marker():
     camera = CAMERAS['plumb_bob']
     T_map_camera, squares, corners = scene(camera)
     covs = np.broadcast_to(ISOTROPIC, (4, 4, 2, 2))
-    wrong = T_map_camera @ geometry.transform(geometry.so3_exp([0.2, 0.3, -0.2]), [0.2, 0.1, 0.3])
+    wrong = T_map_camera @ se3.transform(se3.so3_exp([0.2, 0.3, -0.2]), [0.2, 0.1, 0.3])
     found = solve_camera_pose(corners, covs, squares, camera, initial=wrong)
     np.testing.assert_allclose(found.T_map_camera, T_map_camera, atol=1e-8)
     shifted = corners.copy()
@@ -167,9 +167,9 @@ def test_prediction_decides_between_the_branches_of_a_lone_marker():
     corners, squares = image(camera, T)[None], marker_corners(0.3)[None]
     other = solve_marker_poses(corners, covs, np.array([0.3]), camera).T_camera_marker[0, 1]
     for expected in (T, other):
-        found = solve_camera_pose(corners, covs, squares, camera, initial=geometry.inverse(expected))
+        found = solve_camera_pose(corners, covs, squares, camera, initial=se3.inverse(expected))
         # The branches lie half a radian and a metre apart; the worse one is known to a tenth of its deviation.
-        np.testing.assert_allclose(found.T_map_camera, geometry.inverse(expected), atol=1e-3)
+        np.testing.assert_allclose(found.T_map_camera, se3.inverse(expected), atol=1e-3)
 
 
 def test_no_markers():
@@ -191,7 +191,7 @@ def test_marker_covariance_is_honest():
     poses = solve_marker_poses(image(camera, T) + noise[..., 0], covs, np.full(count, 0.3), camera)
     found = poses.T_camera_marker[:, 0]
     error = np.concatenate(
-        [T[:3, 3] - found[:, :3, 3], geometry.so3_log(T[:3, :3] @ np.swapaxes(found[:, :3, :3], -1, -2))], axis=-1
+        [T[:3, 3] - found[:, :3, 3], se3.so3_log(T[:3, :3] @ np.swapaxes(found[:, :3, :3], -1, -2))], axis=-1
     )
     nees = np.einsum('bi,bij,bj->b', error, np.linalg.inv(poses.covariances[:, 0]), error)
     # Chi-square of 6: standard deviation of the mean over 2000 is 0.08; 4 of them.
@@ -209,7 +209,7 @@ def test_joint_covariance_is_honest():
         noise = np.linalg.cholesky(covs) @ rng.normal(size=(4, 4, 2, 1))
         found = solve_camera_pose(corners + noise[..., 0], covs, squares, camera)
         R = T[:3, :3] @ found.T_map_camera[:3, :3].T
-        error = np.concatenate([T[:3, 3] - found.T_map_camera[:3, 3], geometry.so3_log(R)])
+        error = np.concatenate([T[:3, 3] - found.T_map_camera[:3, 3], se3.so3_log(R)])
         nees.append(error @ np.linalg.solve(found.covariance, error))
     # Standard deviation of the mean over 300: 0.2; Huber clips 1 % of the corners, which costs under 0.1.
     assert np.mean(nees) == pytest.approx(6.0, abs=0.8)

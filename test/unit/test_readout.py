@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera, ImagePoints
-from thermal_fiducial.core.vision.frame import Frame, Places
-from thermal_fiducial.core.vision.motion import Twist
-from thermal_fiducial.core.vision.readout import delays, expected_displacement, seen_displacement, stretch
+from thermal_fiducial.core.detection.frame import Frame, Places
+from thermal_fiducial.core.detection.motion import Twist
+from thermal_fiducial.core.detection.readout import delays, expected_displacement, seen_displacement, stretch
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 
 CAMERA = Camera(640, 512, [[440.0, 0, 319.5], [0, 440.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
 TWIST = Twist(np.array([0.8, -1.5, 0.6, -1.8, 1.5, 0.8]), np.eye(12), np.array([3.0, 0.0, 2.0, 6.0, -4.0, 5.0]))
@@ -30,8 +30,8 @@ def seen_after(corners, seconds):
         dt = seconds[index] / steps
         for k in range(steps):
             twist = TWIST.value + (k + 0.5) * dt * TWIST.acceleration
-            T = T @ geometry.transform(geometry.so3_exp(twist[3:] * dt), twist[:3] * dt)
-        p = geometry.apply(geometry.inverse(T), corners[index][None])[0]
+            T = T @ se3.transform(se3.so3_exp(twist[3:] * dt), twist[:3] * dt)
+        p = se3.apply(se3.inverse(T), corners[index][None])[0]
         result[index] = CAMERA.distort(p[:2] / p[2])
     return result
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.adjustment.reprojection import difference, linearise, retract, shared_covariances, whitening
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.geometry import so3_exp, transform
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, shared_covariances, whitening
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.candidates import correlated_sum
 
 CAMERAS = [

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.vision.contrast import noise_of
-from thermal_fiducial.core.vision.decoding import Decoder, Reading, shrunk
-from thermal_fiducial.core.vision.patterns import marker_bits
-from thermal_fiducial.core.vision.scratch import Scratch
-from thermal_fiducial.core.vision.search import _inside_out, BlindSearch, Found, Sought
+from thermal_fiducial.core.detection.contrast import noise_of
+from thermal_fiducial.core.detection.decoding import Decoder, Reading, shrunk
+from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.detection.scratch import Scratch
+from thermal_fiducial.core.detection.search import _inside_out, BlindSearch, Found, Sought
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))

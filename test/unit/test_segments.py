@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.adjustment.segments import counts_across, Memory
-from thermal_fiducial.core.adjustment.sides import sides_of
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.vision.lag import GAIN, markers_sharpened, memory_maps
+from thermal_fiducial.core.detection.corners.segments import counts_across, Memory
+from thermal_fiducial.core.detection.corners.sides import sides_of
+from thermal_fiducial.core.detection.lag import GAIN, markers_sharpened, memory_maps
+from thermal_fiducial.core.geometry.camera import Camera
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 527.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 1e-4, -2e-4, 0.0])
 CORNERS = np.array(

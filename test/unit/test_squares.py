@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.adjustment.squares import as_squares, squareness
-from thermal_fiducial.core.camera import Camera, ImagePoints
-from thermal_fiducial.core.pose import marker_corners, solve_marker_poses
+from thermal_fiducial.core.detection.corners.squares import as_squares, squareness
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_marker_poses
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
 
@@ -13,7 +13,7 @@ CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'pl
 def views(count, outline):
     """Corners of ``outline`` (4, 3) in poses like those of markers that can be read."""
     rng = np.random.default_rng(3)
-    R = np.stack([geometry.so3_exp(tilt) for tilt in rng.uniform(-0.8, 0.8, (count, 3))]) @ np.diag([1.0, -1.0, -1.0])
+    R = np.stack([se3.so3_exp(tilt) for tilt in rng.uniform(-0.8, 0.8, (count, 3))]) @ np.diag([1.0, -1.0, -1.0])
     centre = rng.uniform([-0.5, -0.4, 1.0], [0.5, 0.4, 1.0], (count, 3)) * rng.uniform(1.0, 6.0, (count, 1))
     points = outline @ np.swapaxes(R, 1, 2) + centre[:, None]
     return ImagePoints.seen_at(points[..., :2] / points[..., 2:], CAMERA)
@@ -72,11 +72,11 @@ def test_an_outline_that_is_no_square_is_told():
 
 def test_a_square_of_the_other_tilt_is_left_for_the_true_one():
     centre, tilt = np.array([0.5, -0.3, 4.0]), np.array([0.4, 0.3, 0.2])
-    T = geometry.transform(geometry.so3_exp(tilt) @ np.diag([1.0, -1.0, -1.0]), centre)
-    true_px = CAMERA.project(geometry.apply(T, marker_corners(0.3)))[None]
+    T = se3.transform(se3.so3_exp(tilt) @ np.diag([1.0, -1.0, -1.0]), centre)
+    true_px = CAMERA.project(se3.apply(T, marker_corners(0.3)))[None]
     unit = np.tile(np.eye(2), (1, 4, 1, 1))
     other = solve_marker_poses(true_px, 0.01**2 * unit, np.array([0.3]), CAMERA).T_camera_marker[0, 1]
-    start = ImagePoints.at(CAMERA.project(geometry.apply(other, marker_corners(0.3)))[None], CAMERA)
+    start = ImagePoints.at(CAMERA.project(se3.apply(other, marker_corners(0.3)))[None], CAMERA)
     off = (true_px - start.px).reshape(1, 8, 1)
     assert np.abs(off).max() > 0.1
     known = as_squares(start, off, 0.01**2 * np.eye(8)[None])

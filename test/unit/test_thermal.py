@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import Tau2CameraConfig
-from thermal_fiducial.core.thermal import EightBitView, FrameCleaner, FROZEN, REPEATED_STAMP, SETTLING, SHUTTER
+from thermal_fiducial.core.imaging.frame_cleaner import (
+    EightBitView,
+    FrameCleaner,
+    FROZEN,
+    REPEATED_STAMP,
+    SETTLING,
+    SHUTTER,
+)
 from thermal_fiducial.errors import InputError
 
 PERIOD_NS = 33_333_333

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core import detection
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.detection import detector as detection
+from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corners_px
-from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.files.dictionary import load_dictionary
 
 DICTIONARY = load_dictionary('DICT_4X4_50')

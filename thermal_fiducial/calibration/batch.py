@@ -12,7 +12,7 @@ from scipy.linalg import solveh_banded
 from thermal_fiducial.calibration.preintegration import ImuTrack, Increments, preintegrate
 from thermal_fiducial.calibration.rolling import RowMoments
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core import geometry
+from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 
@@ -78,7 +78,7 @@ def first_state(stamps: FloatArray, measured: FloatArray, imu: ImuTrack, gravity
     """Offset and rotation from the angular velocities, everything else from these."""
     R, p = measured[:, :3, :3], measured[:, :3, 3]
     dt = np.diff(stamps)
-    turned = geometry.so3_log(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / dt[:, None]
+    turned = se3.so3_log(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / dt[:, None]
     steady = dt < 2.0 * np.median(dt)
     middle = 0.5 * (stamps[:-1] + stamps[1:])[steady]
     turned = turned[steady]
@@ -157,8 +157,8 @@ class Problem:
         """T_map_camera (K, 4, 4) by ``delays`` (K,) [s] after ``frames`` (K,)."""
         chosen = replace(state, R=state.R[frames], p=state.p[frames], v=state.v[frames], bias=state.bias[frames])
         moved = self._shifted(chosen, delays[:, None], self._stamps[frames])
-        T_map_body = geometry.transform(moved.R, moved.p)
-        return np.asarray(T_map_body @ geometry.transform(state.R_body_camera, state.p_body_camera))
+        T_map_body = se3.transform(moved.R, moved.p)
+        return np.asarray(T_map_body @ se3.transform(state.R_body_camera, state.p_body_camera))
 
     def improved(self, state: State) -> tuple[State, float, FloatArray]:
         """The next state, the largest change of a shared unknown, and the covariance (10, 10) of these."""
@@ -192,10 +192,10 @@ class Problem:
         R = state.R @ state.R_body_camera
         error = np.zeros((count, 6))
         error[:, :3] = state.p + state.R @ arm - self._measured[:, :3, 3]
-        error[:, 3:] = geometry.so3_log(R @ np.swapaxes(self._measured[:, :3, :3], 1, 2))
+        error[:, 3:] = se3.so3_log(R @ np.swapaxes(self._measured[:, :3, :3], 1, 2))
         own, shared = np.zeros((count, 6, _STATE)), np.zeros((count, 6, _SHARED))
         own[:, :3, :3] = np.eye(3)
-        own[:, :3, 3:6] = -state.R @ geometry.skew(arm)
+        own[:, :3, 3:6] = -state.R @ se3.skew(arm)
         own[:, 3:, 3:6] = state.R
         shared[:, 3:, :3] = R
         shared[:, :3, 3:6] = state.R
@@ -260,13 +260,13 @@ class Problem:
     def _moved(self, state: State, own: FloatArray, shared: FloatArray) -> State:
         moved = replace(
             state,
-            R=state.R @ geometry.so3_exp(own[:, 3:6]),
+            R=state.R @ se3.so3_exp(own[:, 3:6]),
             p=state.p + own[:, :3],
             v=state.v + own[:, 6:9],
             bias=state.bias + own[:, 9:],
-            R_body_camera=state.R_body_camera @ geometry.so3_exp(shared[:3]),
+            R_body_camera=state.R_body_camera @ se3.so3_exp(shared[:3]),
             p_body_camera=state.p_body_camera + shared[3:6],
-            gravity=geometry.so3_exp(_horizontal(state.gravity) @ shared[7:9]) @ state.gravity,
+            gravity=se3.so3_exp(_horizontal(state.gravity) @ shared[7:9]) @ state.gravity,
             readout=state.readout + shared[9],
         )
         delay = float(np.clip(shared[6], -0.05, 0.05))
@@ -278,7 +278,7 @@ class Problem:
         acceleration = (state.R @ (force - state.bias[:, 3:])[:, :, None])[:, :, 0] + state.gravity
         return replace(
             state,
-            R=state.R @ geometry.so3_exp((rate - state.bias[:, :3]) * delay),
+            R=state.R @ se3.so3_exp((rate - state.bias[:, :3]) * delay),
             p=state.p + state.v * delay + 0.5 * acceleration * delay**2,
             v=state.v + acceleration * delay,
         )
@@ -301,20 +301,20 @@ def imu_errors(
     gravity = state.gravity
     dv = (R0t @ (state.v[1:] - state.v[:-1] - gravity * dt)[:, :, None])[:, :, 0]
     dp = (R0t @ (state.p[1:] - state.p[:-1] - state.v[:-1] * dt - 0.5 * gravity * dt**2)[:, :, None])[:, :, 0]
-    turn = geometry.so3_log(np.swapaxes(increments.R, 1, 2) @ R0t @ R1)
+    turn = se3.so3_log(np.swapaxes(increments.R, 1, 2) @ R0t @ R1)
     error = np.concatenate([turn, dv - increments.v, dp - increments.p, state.bias[1:] - state.bias[:-1]], axis=1)
     first, second = np.zeros((count, _STATE, _STATE)), np.zeros((count, _STATE, _STATE))
     shared = np.zeros((count, _STATE, _SHARED))
     # log(D^T R0^T R1 exp(d)) = turn + Jr^-1 d, and Jr^-1 is the transpose of Jl^-1.
-    by_turn = np.swapaxes(geometry.so3_left_jacobian_inverse(turn), 1, 2)
+    by_turn = np.swapaxes(se3.so3_left_jacobian_inverse(turn), 1, 2)
     first[:, :3, 3:6] = -by_turn @ np.swapaxes(R1, 1, 2) @ R0
     second[:, :3, 3:6] = by_turn
-    first[:, 3:6, 3:6], first[:, 3:6, 6:9], second[:, 3:6, 6:9] = geometry.skew(dv), -R0t, R0t
-    first[:, 6:9, 3:6], first[:, 6:9, :3], second[:, 6:9, :3] = geometry.skew(dp), -R0t, R0t
+    first[:, 3:6, 3:6], first[:, 3:6, 6:9], second[:, 3:6, 6:9] = se3.skew(dv), -R0t, R0t
+    first[:, 6:9, 3:6], first[:, 6:9, :3], second[:, 6:9, :3] = se3.skew(dp), -R0t, R0t
     first[:, 6:9, 6:9] = -R0t * dt[:, :, None]
     first[:, :9, 9:] = -increments.by_bias
     first[:, 9:, 9:], second[:, 9:, 9:] = -np.eye(6), np.eye(6)
-    by_gravity = -geometry.skew(gravity) @ _horizontal(gravity)
+    by_gravity = -se3.skew(gravity) @ _horizontal(gravity)
     shared[:, 3:6, 7:9] = -R0t @ by_gravity * dt[:, :, None]
     shared[:, 6:9, 7:9] = -0.5 * R0t @ by_gravity * dt[:, :, None] ** 2
     root = np.zeros((count, _STATE, _STATE))

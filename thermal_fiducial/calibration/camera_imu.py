@@ -17,8 +17,8 @@ from thermal_fiducial.calibration.batch import first_state, LARGEST_OFFSET, Prob
 from thermal_fiducial.calibration.preintegration import ImuTrack
 from thermal_fiducial.calibration.rolling import FrameCorners, RowMoments, SolvedFrame
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
@@ -167,7 +167,7 @@ def _row_shifts(frames: Sequence[FrameCorners], camera: Camera, problem: Problem
     index = np.repeat(np.arange(len(frames)), counts)
 
     def pixels(after: FloatArray) -> FloatArray:
-        T_camera_map = geometry.inverse(problem.camera_poses(state, index, after))
+        T_camera_map = se3.inverse(problem.camera_poses(state, index, after))
         return camera.project((T_camera_map[:, :3, :3] @ points[:, :, None])[:, :, 0] + T_camera_map[:, :3, 3])
 
     shifts = pixels(np.zeros_like(delays)) - pixels(delays)
@@ -229,7 +229,7 @@ class _Recording:
 def _answer(solution: Solution, readout_sigma: float) -> CameraImuCalibration:
     state = solution.state
     return CameraImuCalibration(
-        geometry.transform(state.R_body_camera, state.p_body_camera),
+        se3.transform(state.R_body_camera, state.p_body_camera),
         state.offset,
         solution.covariance[:7, :7],
         state.readout,

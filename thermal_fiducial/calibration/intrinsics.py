@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.calibration.targets import Sighting
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera, MODELS
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera, MODELS
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 
@@ -156,7 +156,7 @@ def board_pose(sighting: Sighting, camera: Camera) -> FloatArray:
     )
     if not found or not translation[2, 0] > 0.0:
         raise InputError('a view from which no pose of the board follows')
-    return geometry.transform(geometry.so3_exp(rotation.reshape(3)), translation.reshape(3))
+    return se3.transform(se3.so3_exp(rotation.reshape(3)), translation.reshape(3))
 
 
 def _start(sightings: Sequence[Sighting], width: int, height: int, model: str, focal_px: float) -> Camera:
@@ -239,7 +239,7 @@ class _Fit:
         if not self._poses_only:
             camera = _camera(camera, _parameters(camera) + step[: self._intrinsics])
         turn = step[self._intrinsics :].reshape(-1, 6)
-        return camera, geometry.transform(geometry.so3_exp(turn[:, 3:]) @ T[:, :3, :3], T[:, :3, 3] + turn[:, :3])
+        return camera, se3.transform(se3.so3_exp(turn[:, 3:]) @ T[:, :3, :3], T[:, :3, 3] + turn[:, :3])
 
     def _noise(self, camera: Camera, T: FloatArray) -> float:
         """Standard deviation of a coordinate, from the median; at least a hundredth of a pixel."""
@@ -253,7 +253,7 @@ class _Fit:
         if self._radius == 0.0:
             return camera.project(_seen_from(T[self._view], self._points))
         rims = self._points[:, None] + self._radius * _CIRCLE
-        return _area_centroid(camera.project(geometry.apply(T[self._view], rims)))
+        return _area_centroid(camera.project(se3.apply(T[self._view], rims)))
 
     def _jacobian(self, camera: Camera, T: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Of :meth:`_error`, by the intrinsics (N, 2, I) and by the pose of the point's view (N, 2, 6).
@@ -262,7 +262,7 @@ class _Fit:
         """
         seen = _seen_from(T[self._view], self._points)
         uv, by_point = camera.project_jacobian(seen)
-        by_pose = np.concatenate([by_point, -by_point @ geometry.skew(seen - T[self._view, :3, 3])], axis=-1)
+        by_pose = np.concatenate([by_point, -by_point @ se3.skew(seen - T[self._view, :3, 3])], axis=-1)
         by_intrinsics = np.zeros((len(seen), 2, self._intrinsics))
         if not self._poses_only:
             by_intrinsics[:, :, :4] = _by_matrix(camera, uv)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core import geometry
+from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.types import FloatArray
 
 # Longest step of the integration [s]: the sampling interval of a 200 Hz IMU.
@@ -100,7 +100,7 @@ def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: ImuN
     for step in range(steps):
         rate, force = imu.at(times[:-1] + (step + 0.5) * h[:, 0])
         rate, force = rate - bias[:, :3], force - bias[:, 3:]
-        half = geometry.so3_exp(0.5 * rate * h)
+        half = se3.so3_exp(0.5 * rate * h)
         middle = R @ half
         transition, inputs = _linearised(middle, force, half, h[:, :, None])
         # Noise and bias enter in the same way; a bias takes away from the sample.
@@ -123,7 +123,7 @@ def _linearised(
     """
     count = len(middle)
     back = np.swapaxes(half, 1, 2)
-    by_turn = -middle @ geometry.skew(force)
+    by_turn = -middle @ se3.skew(force)
     transition = np.tile(np.eye(9), (count, 1, 1))
     transition[:, :3, :3] = back @ back
     transition[:, 3:6, :3] = by_turn @ back * h

@@ -9,8 +9,8 @@ import numpy as np
 
 from thermal_fiducial.calibration.preintegration import ImuTrack
 from thermal_fiducial.config import Tau2CameraConfig
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.thermal import FrameCleaner
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC

@@ -11,8 +11,8 @@ from thermal_fiducial.calibration.keypoints import blobs, Keypoints, saddles, wi
 from thermal_fiducial.calibration.lattice import find_board
 from thermal_fiducial.calibration.placement import BoardNodes
 from thermal_fiducial.calibration.subpixel import refine
-from thermal_fiducial.core.adjustment.reprojection import corners_in_map
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray

@@ -24,9 +24,9 @@ from thermal_fiducial.calibration.sources import (
 )
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Sighting, Target
 from thermal_fiducial.config import ArucoDetectorConfig, ImuNoise, PoseEkfConfig
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
 from thermal_fiducial.errors import InputError
@@ -307,7 +307,7 @@ def _mapped_corners(frames: Iterable[Frame], marker_map: MarkerMap, camera: Came
 
 def _extrinsics_text(result: CameraImuCalibration) -> str:
     """Parameter file of the nodes, with what is known of the errors as comments."""
-    q = geometry.quaternion_from_rotation(result.T_body_camera[:3, :3])
+    q = se3.quaternion_from_rotation(result.T_body_camera[:3, :3])
     p = result.T_body_camera[:3, 3]
     sigma = np.sqrt(np.diag(result.covariance))
     rotation, position = np.degrees(sigma[:3]), 1e3 * sigma[3:6]

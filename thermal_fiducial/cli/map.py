@@ -12,7 +12,7 @@ from rich.table import Table
 
 from thermal_fiducial.cli import map_cloud, map_sources
 from thermal_fiducial.config import size_overrides
-from thermal_fiducial.core.geometry import transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping import map_editing
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import FloatArray

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from thermal_fiducial.config import size_overrides
-from thermal_fiducial.core.geometry import apply, inverse, quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import apply, inverse, quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.mapping.cloud_alignment import align_to_cloud, CloudAlignment
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import load_map

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 import numpy as np
 
-from thermal_fiducial.core.adjustment.reprojection import corners_in_map
+from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError

@@ -9,9 +9,9 @@ import numpy as np
 from rich.progress import Progress
 
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, size_overrides
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.detection import MarkerDetector
-from thermal_fiducial.core.map_building import build_map, Built, rows_from_corners
+from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.mapping.map_building import build_map, Built, rows_from_corners
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE, Markers
 from thermal_fiducial.core.types import FloatArray, Gray

@@ -7,12 +7,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.detection import MarkerDetector
+from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import columns, corners_px, Markers
 from thermal_fiducial.core.types import Counts, FloatArray
-from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.fabrication.planning import expected_errors, Measurements, pose_errors
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.lens import Lens
@@ -76,7 +76,7 @@ def render_view(side_px: float, contrast: float, tilt_deg: float, rng: np.random
     counts = _SENSOR.counts(renderer.frame(_TIME), _TIME, 0, int(rng.integers(1 << 31)))
     s = 0.5 * _SIZE
     corners = np.array([[-s, s, 0.0], [s, s, 0.0], [s, -s, 0.0], [-s, -s, 0.0]])
-    return View(int(rng.integers(1 << 60)), counts, ids, T, lens.project(geometry.apply(T, corners)))
+    return View(int(rng.integers(1 << 60)), counts, ids, T, lens.project(se3.apply(T, corners)))
 
 
 def _places(lens: Lens, side_px: float, rng: np.random.Generator) -> Iterator[FloatArray]:
@@ -96,10 +96,10 @@ def _place(lens: Lens, pixel: FloatArray, side_px: float, tilt: float, rng: np.r
     towards = np.cross([0.0, 0.0, 1.0], ray)
     turned, own = rng.uniform(0.0, 2.0 * np.pi, 2)
     axis = tilt * np.array([np.cos(turned), np.sin(turned), 0.0])
-    aim = geometry.so3_exp(towards * np.arcsin(np.linalg.norm(towards)) / max(float(np.linalg.norm(towards)), 1e-12))
-    R = aim @ geometry.so3_exp(axis) @ np.diag([1.0, -1.0, -1.0]) @ geometry.so3_exp([0.0, 0.0, own])
+    aim = se3.so3_exp(towards * np.arcsin(np.linalg.norm(towards)) / max(float(np.linalg.norm(towards)), 1e-12))
+    R = aim @ se3.so3_exp(axis) @ np.diag([1.0, -1.0, -1.0]) @ se3.so3_exp([0.0, 0.0, own])
     distance = float(np.sqrt(lens.focal[0] * lens.focal[1])) * _SIZE / side_px
-    return geometry.transform(R, distance * ray)
+    return se3.transform(R, distance * ray)
 
 
 def _plate(T: FloatArray, bits: np.ndarray, contrast: float) -> Plate:
@@ -131,9 +131,9 @@ def camera_and_detector() -> tuple[Camera, MarkerDetector]:
 
 def both_poses(rows: Markers) -> tuple[FloatArray, FloatArray]:
     """T_camera_marker (N, 4, 4) of rows, the chosen branch and the other one."""
-    best = geometry.transform_from_quaternion(columns(rows, ('x', 'y', 'z')), columns(rows, ('qx', 'qy', 'qz', 'qw')))
+    best = se3.transform_from_quaternion(columns(rows, ('x', 'y', 'z')), columns(rows, ('qx', 'qy', 'qz', 'qw')))
     other = columns(rows, ('ax', 'ay', 'az')), columns(rows, ('aqx', 'aqy', 'aqz', 'aqw'))
-    return best, geometry.transform_from_quaternion(*other)
+    return best, se3.transform_from_quaternion(*other)
 
 
 @dataclass

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.contrast import Mounting, remaining_contrast

@@ -12,10 +12,10 @@ from rich.progress import Progress
 from rich.table import Table
 
 from thermal_fiducial.cli import marker_planning
-from thermal_fiducial.core import geometry
+from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray, Gray
-from thermal_fiducial.core.vision.patterns import marker_bits
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import base_plate, circle_board, marker_grid
 from thermal_fiducial.fabrication.bridges import darkest_white, find_bridges
@@ -176,7 +176,7 @@ def _board_map(centres: FloatArray, options: PlateOptions, dictionary: str) -> M
     """Map of a board's markers, the origin in its middle; what ``calibrate intrinsics --board`` takes."""
     metres = 1e-3 * np.column_stack([centres, np.zeros(len(centres))])
     markers = {
-        index: MapMarker(index, 1e-3 * options.size, True, geometry.transform(np.eye(3), centre))
+        index: MapMarker(index, 1e-3 * options.size, True, se3.transform(np.eye(3), centre))
         for index, centre in enumerate(metres)
     }
     return MarkerMap(markers, dictionary=dictionary)

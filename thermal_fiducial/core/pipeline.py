@@ -18,17 +18,17 @@ from thermal_fiducial.config import (
     PoseEkfConfig,
     Tau2CameraConfig,
 )
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.detection import MarkerDetector
-from thermal_fiducial.core.ekf import PoseEkf
+from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.filter.innovations import PoseUpdate
-from thermal_fiducial.core.geometry import quaternion_from_rotation, transform_from_quaternion
-from thermal_fiducial.core.map_refinement import refine
-from thermal_fiducial.core.marker_map import MapJump, MapperResult, MarkerMap, MarkerMapper
+from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
+from thermal_fiducial.core.mapping.bundle_adjustment import refine
+from thermal_fiducial.core.mapping.mapper import MapJump, MapperResult, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Markers, Odometry
-from thermal_fiducial.core.thermal import FrameCleaner
+from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
-from thermal_fiducial.core.vision.odometry_log import OdometryLog
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Pipeline:
         self.detector = MarkerDetector(config.aruco_detector, dictionary)
         self.mapper = MarkerMapper(config.marker_mapper, marker_map)
         self.filter = PoseEkf(config.pose_ekf)
-        self._odometry = OdometryLog()
+        self._odometry = MotionPrior(config.aruco_detector.camera_time_offset)
         self._share_map()
 
     def add_imu(self, sample: ImuSample) -> Odometry | None:
@@ -119,6 +119,8 @@ class Pipeline:
         markers = self.detector.detect(stamp_ns, frame.counts, self.camera, self._odometry)
         mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry.nearest(stamp_ns))
         update = None if mapping.pose is None else self.filter.add_pose(_published_pose(mapping.pose))
+        if (offset := self.filter.camera_time_offset) is not None:
+            self._odometry.set_clock_offset(offset)
         jump = self._refine(stamp_ns)
         if jump is not None and jump.moves_poses:
             self.filter.move_map(as_published(jump.T_new_old))

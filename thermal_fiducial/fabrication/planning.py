@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
-from thermal_fiducial.core import geometry
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.pose import marker_corners, solve_marker_poses
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_marker_poses
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
@@ -212,7 +212,7 @@ def expected_errors(
     rng = np.random.default_rng(seed)
     turned = rng.uniform(0.0, 2.0 * np.pi, _SAMPLES)
     T = viewed_at(distance, np.radians(tilt_deg), turned, camera)
-    corners = camera.project(geometry.apply(T, marker_corners(size)))
+    corners = camera.project(se3.apply(T, marker_corners(size)))
     noisy = corners + rng.normal(0.0, sigma_px, corners.shape)
     covariances = np.broadcast_to(sigma_px**2 * np.eye(2), (*corners.shape, 2))
     poses = solve_marker_poses(noisy, covariances, np.full(_SAMPLES, size), camera)
@@ -231,9 +231,9 @@ def viewed_at(distance: float, tilt: float, turned: npt.ArrayLike, camera: Camer
     middle = camera.rays(np.array([0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]))
     zero = np.zeros_like(turned)
     axis = np.stack([np.cos(turned), np.sin(turned), zero], axis=-1)
-    own = geometry.so3_exp(np.stack([zero, zero, 2.3 * turned], axis=-1))
-    R = geometry.so3_exp(tilt * axis) @ np.diag([1.0, -1.0, -1.0]) @ own
-    return geometry.transform(R, distance * middle)
+    own = se3.so3_exp(np.stack([zero, zero, 2.3 * turned], axis=-1))
+    R = se3.so3_exp(tilt * axis) @ np.diag([1.0, -1.0, -1.0]) @ own
+    return se3.transform(R, distance * middle)
 
 
 def pose_errors(best: FloatArray, other: FloatArray, T_true: FloatArray) -> tuple[float, float, float, float]:
@@ -245,12 +245,12 @@ def pose_errors(best: FloatArray, other: FloatArray, T_true: FloatArray) -> tupl
     T_true : (N, 4, 4)
     """
     R_true = np.swapaxes(T_true[:, :3, :3], 1, 2)
-    angle, other_angle = (geometry.rotation_angle(T[:, :3, :3] @ R_true) for T in (best, other))
+    angle, other_angle = (se3.rotation_angle(T[:, :3, :3] @ R_true) for T in (best, other))
     # Where both branches meet, they are the same pose but for rounding.
     right = angle <= 1.01 * other_angle
     if not np.any(right):
         return np.nan, np.nan, np.nan, 1.0
-    seen_from = geometry.inverse(best)[:, :3, 3] - geometry.inverse(T_true)[:, :3, 3]
+    seen_from = se3.inverse(best)[:, :3, 3] - se3.inverse(T_true)[:, :3, 3]
     along = np.linalg.norm(best[:, :3, 3], axis=1) - np.linalg.norm(T_true[:, :3, 3], axis=1)
     return (
         float(np.median(np.linalg.norm(seen_from, axis=1)[right])),

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 import yaml
 
-from thermal_fiducial.core.vision.patterns import correctable_bits, marker_bits
+from thermal_fiducial.core.detection.patterns import correctable_bits, marker_bits
 from thermal_fiducial.errors import InputError
 
 FORMAT = 'thermal_fiducial/dictionary'

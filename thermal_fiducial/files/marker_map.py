@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from thermal_fiducial.core.geometry import quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError

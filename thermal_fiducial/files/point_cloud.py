@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from thermal_fiducial.core.geometry import quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import write_atomically

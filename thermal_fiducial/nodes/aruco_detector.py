@@ -8,9 +8,9 @@ import numpy as np
 from sensor_msgs.msg import Image, PointCloud2
 
 from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.detection import MarkerDetector
-from thermal_fiducial.core.thermal import EightBitView
+from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.imaging.frame_cleaner import EightBitView
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary

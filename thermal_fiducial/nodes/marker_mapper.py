@@ -13,11 +13,11 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
-from thermal_fiducial.core.geometry import apply, inverse
-from thermal_fiducial.core.map_refinement import refine, Refinement, Snapshot
-from thermal_fiducial.core.marker_map import MapJump, MapperResult, MarkerMap, MarkerMapper
+from thermal_fiducial.core.geometry.se3 import apply, inverse
+from thermal_fiducial.core.imaging.frame_cleaner import LATEST_NS
+from thermal_fiducial.core.mapping.bundle_adjustment import refine, Refinement, Snapshot
+from thermal_fiducial.core.mapping.mapper import MapJump, MapperResult, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
-from thermal_fiducial.core.thermal import LATEST_NS
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import other_patterns

@@ -7,13 +7,13 @@ from typing import Any
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
-from sensor_msgs.msg import Imu
+from sensor_msgs.msg import Imu, TimeReference
 from std_srvs.srv import Trigger
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.ekf import PoseEkf
 from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_text
-from thermal_fiducial.core.geometry import transform_from_quaternion
+from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, Odometry
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros import convert, qos
@@ -48,6 +48,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._corrections: deque[tuple[int, FloatArray]] = deque(maxlen=_CORRECTIONS)
         self._pose = self.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
         self._odometry = self.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
+        self._camera_clock = self.advertise(TimeReference, 'camera_clock', qos.RESULT)
         self._path_output = self.advertise(Path, 'path')
         if self.config.smoothing_time > 0.0:
             self._smooth_odometry = self.advertise(OdometryMessage, 'odometry_smooth', qos.IMU_RATE_RESULT)
@@ -94,6 +95,8 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
     def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
         update = self.filter.add_pose(self._in_present_map(convert.camera_pose(message)))
         self._last_refusal = '' if update.accepted or update.pending else update.reason
+        if (offset := self.filter.camera_time_offset) is not None:
+            self._camera_clock.send(convert.clock_reference(update.stamp_ns, offset))
 
     def _on_map_correction(self, message: TransformStamped) -> None:
         correction = convert.correction_of(message)

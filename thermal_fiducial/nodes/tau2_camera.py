@@ -8,8 +8,8 @@ import numpy as np
 from sensor_msgs.msg import CameraInfo, Image
 
 from thermal_fiducial.config import Tau2CameraConfig
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.thermal import EightBitView, FrameCleaner
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.imaging.frame_cleaner import EightBitView, FrameCleaner
 from thermal_fiducial.files.bad_pixels import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.images import image_to_array

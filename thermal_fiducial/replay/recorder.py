@@ -13,7 +13,7 @@ from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
-from thermal_fiducial.core.geometry import inverse, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagWriter

@@ -9,7 +9,7 @@ import shutil
 from typing import Any
 
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
-from thermal_fiducial.core.geometry import transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC

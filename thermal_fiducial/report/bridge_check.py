@@ -9,7 +9,7 @@ from enum import Enum
 
 import numpy as np
 
-from thermal_fiducial.core.geometry import so3_log
+from thermal_fiducial.core.geometry.se3 import so3_log
 from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.report.bridge_record import BridgeRecord
 

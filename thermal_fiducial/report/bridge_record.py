@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from thermal_fiducial.core.geometry import rotation_from_quaternion
+from thermal_fiducial.core.geometry.se3 import rotation_from_quaternion
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, IMU_TOPIC

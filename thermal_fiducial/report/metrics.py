@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core.filter.innovations import Innovations
-from thermal_fiducial.core.geometry import inverse, so3_exp, so3_log, transform
+from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.report.trajectory import Trajectory
 

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 import numpy as np
 
-from thermal_fiducial.core.geometry import apply
-from thermal_fiducial.core.pose import marker_corners
+from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.se3 import apply
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.metrics import CHI2_BAND_6, GAP_NS

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thermal_fiducial.core.geometry import transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, TRUTH_TOPIC

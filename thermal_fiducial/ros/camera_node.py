@@ -4,15 +4,16 @@ from functools import partial
 from typing import Any, TypeVar
 
 from nav_msgs.msg import Odometry as OdometryMessage
-from sensor_msgs.msg import CameraInfo
+from sensor_msgs.msg import CameraInfo, TimeReference
 
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.vision.odometry_log import OdometryLog
+from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros import convert, odometry_bytes, qos
 from thermal_fiducial.ros.node import StageNode
 
-Config = TypeVar('Config')
+Config = TypeVar('Config', bound=ArucoDetectorConfig | MarkerMapperConfig)
 
 
 class CameraStageNode(StageNode[Config]):
@@ -23,12 +24,13 @@ class CameraStageNode(StageNode[Config]):
         self._camera: Camera | None = None
         self._calibrations = 0
         #: the filter's latest states
-        self.odometry = OdometryLog()
+        self.odometry = MotionPrior(self.config.camera_time_offset)
 
     def follow_hints(self) -> None:
         """Subscribe to calibration and odometry; after the node's main input."""
         self.subscribe(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
         self.subscribe(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT, raw=True)
+        self.subscribe(TimeReference, 'camera_clock', self._on_camera_clock, qos.RESULT)
 
     def camera(self) -> Camera:
         """The calibration.
@@ -49,6 +51,9 @@ class CameraStageNode(StageNode[Config]):
     def _on_odometry(self, message: bytes) -> None:
         """A few of these are wanted at frame rate, and only they are read."""
         self.odometry.add(odometry_bytes.stamp_ns(message), partial(odometry_bytes.odometry, message))
+
+    def _on_camera_clock(self, message: TimeReference) -> None:
+        self.odometry.set_clock_offset(convert.clock_offset(message))
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         camera = convert.camera(message)

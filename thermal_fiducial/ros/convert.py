@@ -24,11 +24,11 @@ from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
 import numpy as np
 import numpy.typing as npt
-from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2, PointField
+from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2, PointField, TimeReference
 from std_msgs.msg import Header
 
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.geometry import quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.measurements import (
     CameraPose,
     CORNER_COVARIANCE_FIELDS,
@@ -61,6 +61,17 @@ _POINT_CODES = {code: datatype for datatype, code in _POINT_TYPES.items()}
 def stamp_ns(stamp: Time) -> int:
     """Integer nanoseconds of a stamp."""
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def clock_reference(camera_stamp_ns: int, offset: float) -> TimeReference:
+    """The instant of a frame in both clocks, for t_imu = t_camera + ``offset`` [s]."""
+    imu_stamp_ns = camera_stamp_ns + round(offset * 1e9)
+    return TimeReference(header=header(imu_stamp_ns, ''), time_ref=header(camera_stamp_ns, '').stamp, source='camera')
+
+
+def clock_offset(message: TimeReference) -> float:
+    """What :func:`clock_reference` says [s]."""
+    return (stamp_ns(message.header.stamp) - stamp_ns(message.time_ref)) * 1e-9
 
 
 def header(stamp: int, frame_id: str) -> Header:

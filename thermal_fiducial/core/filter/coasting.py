@@ -12,7 +12,7 @@ from thermal_fiducial.core.filter.navigation_state import (
     ROTATION,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry import skew
+from thermal_fiducial.core.geometry.se3 import skew
 from thermal_fiducial.core.types import FloatArray
 
 #: Farther than this [s] nobody needs to look ahead, and in this grid.

@@ -21,7 +21,7 @@ from thermal_fiducial.core.filter.navigation_state import (
     ROTATION,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry import inverse, skew, so3_log
+from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_log
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 

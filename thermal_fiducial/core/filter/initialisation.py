@@ -23,7 +23,7 @@ from thermal_fiducial.core.filter.navigation_state import (
     ROTATION,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry import transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 
 #: Seconds of samples that stillness is judged on, and the fewest of them.

@@ -18,7 +18,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.clock_steps import ClockSteps
 from thermal_fiducial.core.filter.imu import rotation_integrals
 from thermal_fiducial.core.filter.learned_noise import Aliasing, StampJitter
-from thermal_fiducial.core.geometry import transform
+from thermal_fiducial.core.geometry.se3 import transform
 from thermal_fiducial.core.types import FloatArray
 
 #: Places of the error coordinates, in the robot frame [rad, m/s, m, rad/s, m/s^2].

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.geometry import inverse, so3_exp, so3_log, transform
+from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from thermal_fiducial.core.filter.navigation_state import GYROSCOPE_BIAS, NavigationState, POSITION, ROTATION, VELOCITY
-from thermal_fiducial.core.geometry import skew
+from thermal_fiducial.core.geometry.se3 import skew
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from thermal_fiducial.core.geometry import inverse, skew, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, transform
 from thermal_fiducial.core.mapping.keyframes import Keyframe, Link
 from thermal_fiducial.core.measurements import CameraPose, Odometry
 from thermal_fiducial.core.types import FloatArray

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.adjustment.fitting import fit_pose
-from thermal_fiducial.core.adjustment.reprojection import linearise
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.geometry import rotation_angle
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.fitting import fit_pose
+from thermal_fiducial.core.geometry.reprojection import linearise
+from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.keyframes import Displacement
 from thermal_fiducial.core.types import FloatArray, IntArray
 

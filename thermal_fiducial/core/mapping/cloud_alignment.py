@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.geometry import apply, skew, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import apply, skew, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError

@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.adjustment.fitting import fit_pose
-from thermal_fiducial.core.adjustment.reprojection import (
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.fitting import fit_pose
+from thermal_fiducial.core.geometry.reprojection import (
     difference,
     linearise,
     retract,
     shared_covariances,
     whitening,
 )
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.geometry import inverse
+from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.keyframes import Keyframe
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import BoolArray, FloatArray

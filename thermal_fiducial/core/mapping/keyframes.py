@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.geometry import inverse
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.types import FloatArray, IntArray
 
 # Side of a cell of camera positions [m] and of viewing directions [components of a unit vector] to begin with.

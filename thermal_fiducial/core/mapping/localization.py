@@ -9,8 +9,10 @@ from functools import cached_property
 
 import numpy as np
 
-from thermal_fiducial.core.adjustment.fitting import fit_pose
-from thermal_fiducial.core.adjustment.reprojection import (
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.fitting import fit_pose
+from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
+from thermal_fiducial.core.geometry.reprojection import (
     corners_in_map,
     difference,
     linearise,
@@ -18,11 +20,9 @@ from thermal_fiducial.core.adjustment.reprojection import (
     shared_covariances,
     whitening,
 )
-from thermal_fiducial.core.camera import Camera
-from thermal_fiducial.core.geometry import inverse, rotation_angle
+from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
 from thermal_fiducial.core.mapping.candidates import correlated_sum, SYSTEMATIC_PX
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.pose import solve_camera_pose
 from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
 

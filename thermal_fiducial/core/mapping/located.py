@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.localization import Location, Refusal, Sight
 from thermal_fiducial.core.mapping.odometry_prior import Expected
 from thermal_fiducial.core.measurements import CameraPose, Markers

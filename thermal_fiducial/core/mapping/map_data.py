@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.geometry import quaternion_from_rotation
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
 from thermal_fiducial.core.measurements import CameraPose, MAP_DTYPE
 from thermal_fiducial.core.types import FloatArray
 

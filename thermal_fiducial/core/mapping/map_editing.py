@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.adjustment.reprojection import corners_in_map
-from thermal_fiducial.core.geometry import apply, rotation_angle, transform
+from thermal_fiducial.core.geometry.reprojection import corners_in_map
+from thermal_fiducial.core.geometry.se3 import apply, rotation_angle, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError

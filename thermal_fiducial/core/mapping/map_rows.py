@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from thermal_fiducial.core.geometry import transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import columns, CORNER_COVARIANCE_FIELDS, corners_px, Markers
 from thermal_fiducial.core.types import FloatArray
 

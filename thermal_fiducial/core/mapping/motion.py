@@ -7,7 +7,7 @@ corners: it is an error of the pose, as large for many markers as for one, and t
 
 import numpy as np
 
-from thermal_fiducial.core.adjustment.reprojection import difference
+from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.types import FloatArray
 
 #: Standard deviation of the delay [s], beside a constant one, which belongs to the clocks, and of half its mean square

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.adjustment.reprojection import difference, retract
+from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.mapping.bridging import camera_pose
 from thermal_fiducial.core.mapping.localization import positive
 from thermal_fiducial.core.measurements import CameraPose, Odometry

@@ -1,1 +1,0 @@
-"""Least squares on re-projection errors: closed forms, robust fits, normal equations."""

@@ -1,0 +1,98 @@
+"""Rough outlines of markers pulled onto the pattern that they show.
+
+An outline of a faint marker has a corner or two off by up to a cell. Once its cells tell which marker it is, the whole
+pattern with its white surroundings is fitted to the image: Gauss-Newton on the four corners, together with contrast
+and a background that may bend (B. Lucas, T. Kanade, "An iterative image registration technique", 1981).
+"""
+
+from functools import cache
+import math
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.core.detection.decoding import Decoder, sampled
+from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
+from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
+
+_STEPS = 3
+# Smoothing of the image [px], so that its slope tells the way from half a cell away.
+_SMOOTHING = 1.0
+# Samples along a cell, and one outside the sides, in cells.
+_SAMPLES = (0.17, 0.5, 0.83)
+_OUTSIDE = 0.35
+# What the smoothing, the optics and the pixels make of an edge [cells].
+_BLUR = 0.25
+# Share of its own information that each coordinate is held back with.
+_DAMPING = 0.1
+# Longest step of a corner [cells].
+_LONGEST = 0.6
+
+
+class _Grid(NamedTuple):
+    """The P samples of a marker with m x m cells."""
+
+    #: (4, P) of :func:`bilinear`, and the same as by how much each sample moves with each corner
+    places: FloatArray
+    weights: Float32Array
+    #: (6, P) background: constant, slopes, curvatures
+    smooth: Float32Array
+    #: (sqrt(P), m + 2) of :func:`_blur`
+    blur: FloatArray
+
+
+@cache
+def _grid(cells: int) -> _Grid:
+    share = np.concatenate([[-_OUTSIDE], (np.arange(cells)[:, None] + _SAMPLES).ravel(), [cells + _OUTSIDE]])
+    a, b = (axis.ravel() / cells for axis in np.meshgrid(share, share))
+    x, y = a - 0.5, b - 0.5
+    smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).astype(np.float32)
+    places = bilinear(a, b)
+    return _Grid(places, places.astype(np.float32), smooth, _blur(share, cells))
+
+
+def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArray, decoder: Decoder) -> FloatArray:
+    """Quadrilaterals (Q, 4, 2) moved to where ``image`` looks most like the markers ``ids`` (Q,), turned (Q,)."""
+    grid = _grid(decoder.cells)
+    cells = np.ones((len(ids), decoder.cells + 2, decoder.cells + 2))
+    cells[:, 1:-1, 1:-1] = decoder.seen(ids, turns)
+    J = np.empty((len(ids), 15, grid.places.shape[1]), dtype=np.float32)
+    J[:, 8:14] = grid.smooth
+    J[:, 14] = (grid.blur @ cells @ grid.blur.T).reshape(len(ids), -1)
+    image, origin = _window(image, quads, decoder.cells)
+    quads = quads - origin
+    picture = cv2.GaussianBlur(image - np.float32(image.mean()), (0, 0), _SMOOTHING)
+    slope_u = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.125)
+    slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.125)
+    planes: list[Float32Array] = [np.asarray(plane) for plane in (picture, slope_u, slope_v)]
+    for _ in range(_STEPS):
+        places = seen_between(quads, grid.places).astype(np.float32)
+        value, du, dv = (sampled(plane, places)[:, None] for plane in planes)
+        np.multiply(du, grid.weights, out=J[:, :4])
+        np.multiply(dv, grid.weights, out=J[:, 4:8])
+        information = (J @ np.swapaxes(J, -1, -2)).astype(np.float64)
+        diagonal = np.einsum('qii->qi', information)
+        diagonal[:, :8] *= 1.0 + _DAMPING
+        diagonal += 1e-9 + 1e-9 * diagonal.max(axis=1, keepdims=True)
+        step = -np.linalg.solve(information, J @ np.swapaxes(value, -1, -2))[:, :8, 0]
+        longest = _LONGEST / decoder.cells * np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)[:, None] / np.sqrt(2.0)
+        quads = quads + np.swapaxes(np.clip(step, -longest, longest).reshape(-1, 2, 4), -1, -2)
+    return quads + origin
+
+
+def _window(image: Float32Array, quads: FloatArray, cells: int) -> tuple[Float32Array, FloatArray]:
+    """The part of the image that quadrilaterals (Q, 4, 2) can come to see, and its first pixel (2,)."""
+    extent = np.ptp(quads, axis=1).max()
+    reach = (_STEPS * _LONGEST + _OUTSIDE) / cells * extent + 4.0 * _SMOOTHING + 2.0
+    height, width = image.shape
+    first = np.clip(quads.min(axis=(0, 1)) - reach, 0, (width - 1, height - 1)).astype(int)
+    last = np.clip(quads.max(axis=(0, 1)) + reach, first, (width - 1, height - 1)).astype(int)
+    return image[first[1] : last[1] + 1, first[0] : last[0] + 1], first.astype(np.float64)
+
+
+def _blur(places: FloatArray, cells: int) -> FloatArray:
+    """Weights (P, cells + 2) of blurred cells at ``places`` (P,) [cells]; the outermost two reach on without end."""
+    edges = np.concatenate([[-np.inf], np.arange(cells + 1), [np.inf]])
+    below = [[math.erf(z) for z in row] for row in ((edges - places[:, None]) / (_BLUR * math.sqrt(2.0))).tolist()]
+    return np.asarray(0.5 * np.diff(np.array(below), axis=1))

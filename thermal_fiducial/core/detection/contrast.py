@@ -1,0 +1,98 @@
+"""What is darker than its surroundings, by a share of the local contrast: the same of markers of any contrast.
+
+The local spread is the measure, down to a floor of the order of the noise, below which ever more is asked for: next to
+strong structures little shows, of a marker of twice the noise all, of a bare wall nearly nothing.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.core.detection.scratch import Scratch
+from thermal_fiducial.core.types import Counts, Float32Array, Gray
+
+# The spread is taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
+_LOCAL = 17
+# Odd width of the median that takes out specks.
+_SPECKS = 3
+# Half-resolution pixels along a row over which columns are compared.
+_COLUMNS = 9
+# Mean of Gaussian noise clipped at one standard deviation moves by 0.68 of a small offset.
+_CLIPPED = 1.0 / 0.68
+# 1 / (sqrt(2) * 0.6745): standard deviation from the median absolute difference of two pixels.
+_MAD_OF_DIFFERENCE = 1.0484
+
+
+def noise_of(counts: Counts | Gray | Float32Array) -> float:
+    """Standard deviation of pixel noise [counts]: median absolute difference of vertical neighbours, sparsely.
+
+    Differences along a column leave the column pattern out.
+    """
+    rows = counts[4::16, ::3]
+    below = counts[5::16, ::3]
+    count = min(len(rows), len(below))
+    difference = cv2.absdiff(np.ascontiguousarray(rows[:count]), np.ascontiguousarray(below[:count])).ravel()
+    middle = difference.size // 2
+    # Whole counts: half a count of quantisation is what a median of 0 can mean.
+    return max(float(np.partition(difference, middle)[middle]) * _MAD_OF_DIFFERENCE, 0.3)
+
+
+def halved(counts: Float32Array, scratch: Scratch) -> Float32Array:
+    """Half the resolution: means of 2 x 2 pixels, with half the noise."""
+    height, width = counts.shape[0] // 2, counts.shape[1] // 2
+    half = scratch.floats('halved', (height, width))
+    return np.asarray(cv2.resize(counts, (width, height), dst=half, interpolation=cv2.INTER_AREA))
+
+
+def without_columns(counts: Float32Array, noise: float, scratch: Scratch) -> Float32Array:
+    """``counts``, changed in place, without the offsets of its columns.
+
+    They show in the typical pixel of each column against its neighbours. What the scene does to a column is bounded by
+    the noise: no pixel counts for more than that.
+    """
+    deviation = cv2.blur(counts, (_COLUMNS, 1), dst=scratch.floats('deviation', counts.shape))
+    np.subtract(counts, deviation, out=deviation)
+    np.clip(deviation, -noise, noise, out=deviation)
+    counts -= _CLIPPED * cv2.reduce(deviation, 0, cv2.REDUCE_AVG)
+    return counts
+
+
+class Scale(NamedTuple):
+    """How dark places are sought at one resolution."""
+
+    #: standard deviation of the Gaussian before the search [px]
+    smoothing_px: float
+    #: odd width of the surroundings, and by how much lower the resolution is at which their mean is taken
+    window_px: int
+    window_shrink: int
+    #: how much darker than the mean of the surroundings, in local standard deviations
+    depth: float
+    #: spread below which it shows less and less, in standard deviations of the noise of a pixel
+    floor: float
+
+
+def dark(counts: Float32Array, noise: float, scale: Scale, scratch: Scratch) -> Gray:
+    """Mask (height, width) of what is darker than its surroundings, 255 where it is.
+
+    Parameters
+    ----------
+    counts : (height, width) counts or gray levels
+    noise : standard deviation of the noise of a pixel [counts]
+    """
+    shape = counts.shape
+    reach = 2 * round(2.5 * scale.smoothing_px) + 1
+    smooth = scratch.floats('smooth', shape)
+    cv2.GaussianBlur(counts, (reach, reach), scale.smoothing_px, dst=smooth)
+    coarse = counts if scale.window_shrink == 1 else halved(counts, scratch)
+    limit = cv2.blur(smooth if scale.window_shrink == 1 else coarse, (scale.window_px, scale.window_px))
+    small = halved(coarse, scratch)
+    deviation = small - cv2.blur(small, (_LOCAL, _LOCAL))
+    variance = np.maximum(cv2.blur(deviation * deviation, (_LOCAL, _LOCAL)), 1e-6)
+    asked = (scale.depth / np.sqrt(variance)) * (variance + (scale.floor * noise) ** 2)
+    cv2.subtract(limit, cv2.resize(asked, limit.shape[::-1], interpolation=cv2.INTER_LINEAR), dst=limit)
+    if limit.shape != shape:
+        limit = cv2.resize(limit, shape[::-1], dst=scratch.floats('limit', shape), interpolation=cv2.INTER_LINEAR)
+    mask = cv2.compare(smooth, limit, cv2.CMP_LT, dst=scratch.bytes('mask', shape))
+    # Specks of noise are many, and each is an outline to follow.
+    return np.asarray(cv2.medianBlur(mask, _SPECKS))

@@ -1,0 +1,1 @@
+"""Corners from the edges of a marker, adjusted jointly."""

@@ -1,0 +1,222 @@
+"""The edges between the cells of a marker, inside and along its sides, as a camera at a pose sees them.
+
+Each is a straight step between black and white whose place on the marker is known, so all that are in view tell the
+marker's pose, wherever its corners are.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from thermal_fiducial.core.detection.corners import edges
+from thermal_fiducial.core.detection.corners.segments import (
+    counts_across,
+    HOPELESS,
+    KEPT_VARIANCE,
+    measure,
+    Memory,
+    REACHED,
+)
+from thermal_fiducial.core.detection.corners.sides import columns_across, NODES, Sides
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
+
+# Columns of pixels across an edge: every so many pixels, but no fewer and no more than this.
+_EVERY_PX, _FEWEST, _MOST = 3.0, 6, 24
+# So many blurs from its ends, and from its neighbours, an edge is a straight step.
+_QUIET = 2.0
+# Weight of an edge falls off beyond this many standard deviations, in so many rounds.
+_OUTLIER, _ROUNDS = 2.5, 3
+# Standard deviation of an edge's place that no image noise explains: its optics and its cut [px].
+_FLOOR_PX = 0.015
+# How far a pose may be off before it is adjusted, as a shift of each edge [px].
+_PRIOR_PX = 30.0
+
+
+class GridEdges(NamedTuple):
+    """The E edges of a marker, in shares of its sides: a from left to right, b from the top down."""
+
+    #: (E, 5, 2) points of each, equally far apart
+    nodes: FloatArray
+    #: (E, 2) to the next line of cells, to the right of upright edges and below others
+    onward: FloatArray
+    #: (E,) change of value on the way there, 1 from black to white
+    step: FloatArray
+
+    def only(self, keep: BoolArray) -> 'GridEdges':
+        """Those of the edges ``keep`` (E,)."""
+        return GridEdges(self.nodes[keep], self.onward[keep], self.step[keep])
+
+
+def grid_edges(bits: Gray) -> GridEdges:
+    """Edges of the marker with ``bits`` (n, n) in its black border on white."""
+    grid = np.pad(np.pad(bits.astype(np.float64), 1), 1, constant_values=1.0)
+    cells = len(grid) - 2
+    nodes, onward, steps = [], [], []
+    for turned in (False, True):
+        # Lines of one direction as rows; turned, those of the other.
+        step = np.diff(grid.T if turned else grid, axis=0)[:, 1:-1]
+        line, cell = np.nonzero(step)
+        along = (cell[:, None] + NODES) / cells
+        points = np.stack([along, np.broadcast_to(line[:, None] / cells, along.shape)], axis=-1)
+        ahead = np.tile([0.0, 1.0 / cells], (len(line), 1))
+        nodes.append(points[..., ::-1] if turned else points)
+        onward.append(ahead[:, ::-1] if turned else ahead)
+        steps.append(step[line, cell])
+    return GridEdges(np.concatenate(nodes), np.concatenate(onward), np.concatenate(steps))
+
+
+def on_marker(shares: FloatArray, size: float) -> FloatArray:
+    """Points (..., 3) in the marker's frame [m] at shares (..., 2) of its sides."""
+    points = np.zeros((*shares.shape[:-1], 3))
+    points[..., 0], points[..., 1] = (shares[..., 0] - 0.5) * size, (0.5 - shares[..., 1]) * size
+    return points
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """An image at some resolution, and what displaces and blurs the scene in it."""
+
+    image: Float32Array
+    camera: Camera
+    #: points (P, 3) in the camera -> by how much (P, 2) they appear displaced [px]
+    displacement: Callable[[FloatArray], FloatArray]
+    #: standard deviation of optics and pixels [px], and what motion adds to it (2,), along itself
+    blur: float
+    smear: FloatArray
+    #: what to take out of the image; None: nothing
+    memory: Memory | None = None
+
+    def project(self, points: FloatArray) -> FloatArray:
+        """Pixels (..., 2) in which points (..., 3) in the camera appear, NaN where the lens shows none."""
+        flat = points.reshape(-1, 3)
+        return np.asarray((self.camera.project(flat) + self.displacement(flat)).reshape(*points.shape[:-1], 2))
+
+
+class PoseFit(NamedTuple):
+    """A marker's pose by its edges."""
+
+    #: (4, 4)
+    T_camera_marker: FloatArray
+    #: (6, 6) information on translation and rotation in the camera frame, of the edges alone
+    information: FloatArray
+    #: longest move of an edge in this step [px], along its normal
+    moved_px: float
+    #: edges in view, those with a step like the others', and those that agree with the pose
+    visible: int
+    shown: int
+    agreeing: int
+    #: mean square of the residuals of those that agree, over their variances
+    chi2: float
+    contrast: float
+    #: standard deviation of a pixel about the model [counts]
+    noise: float
+
+
+def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> PoseFit | None:
+    """One linearised adjustment of a pose ``T`` (4, 4) of a marker in the camera; None where too little is seen."""
+    nodes = layer.project(se3.apply(T, on_marker(pattern.nodes, size)))
+    inside: BoolArray = np.asarray(layer.camera.contains(nodes).any(axis=1) & np.isfinite(nodes).all(axis=(1, 2)))
+    if inside.sum() < 6:
+        return None
+    pattern, nodes = pattern.only(inside), nodes[inside]
+    middle = pattern.nodes[:, 2]
+    onward = layer.project(se3.apply(T, on_marker(middle + pattern.onward, size))) - nodes[:, 2]
+    length = float(np.linalg.norm(nodes[:, 4] - nodes[:, 0], axis=1).max())
+    columns = int(np.clip(length / _EVERY_PX, _FEWEST, _MOST))
+    widest = math.hypot(layer.blur, float(np.linalg.norm(layer.smear)))
+    half = edges.half_width(widest)
+    sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, columns, half)
+    blur = edges.blurs(sides.normal[0], layer.blur, layer.smear[None])
+    counts = counts_across(layer.image, sides, layer.memory)
+    modelled = _model(sides, pattern.step, blur)
+    measured = measure(counts, modelled, REACHED * blur[0], len(nodes))
+    used = measured.variance[0] < HOPELESS
+    if used.sum() < 6:
+        return None
+    J = _design(T, size, pattern, sides, modelled[2], layer.camera)
+    variance = measured.variance[0] + np.where(used, _FLOOR_PX**2, 0.0)
+    return _solved(T, J, measured.shift[0], variance, used, measured.contrast[0], measured.noise[0])
+
+
+def _model(
+    sides: Sides, step: FloatArray, blur: tuple[FloatArray, FloatArray]
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """White's share of every pixel but for a constant, its derivative by distance, and its weight, (M, C, 1, E)."""
+    value, slope = edges.blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32))
+    sign = step.astype(np.float32)
+    value *= sign
+    slope *= sign
+    ends = _QUIET * blur[1] / sides.along
+    straight = sides.fresh & (sides.t > ends) & (sides.t < 1.0 - ends)
+    weight: BoolArray = np.asarray((np.abs(sides.distance) <= sides.across - _QUIET * blur[0]) & straight)
+    if sides.inside is not None:
+        weight &= sides.inside
+    return value, slope, weight.astype(np.float32)
+
+
+def _design(
+    T: FloatArray, size: float, pattern: GridEdges, sides: Sides, weight: Float32Array, camera: Camera
+) -> FloatArray:
+    """Derivative (E, 6) of displacements along the normals by translation and rotation, where columns count."""
+    counted: BoolArray = np.asarray(weight.any(axis=0))
+    t = (sides.t * counted).sum(axis=(0, 1)) / np.maximum(counted.sum(axis=(0, 1)), 1)
+    shares = pattern.nodes[:, 0] + t[:, None] * (pattern.nodes[:, 4] - pattern.nodes[:, 0])
+    J = pose_jacobian(T, on_marker(shares, size), camera)
+    return np.asarray(np.einsum('ek,ekj->ej', sides.normal[0], J))
+
+
+def pose_jacobian(T: FloatArray, points: FloatArray, camera: Camera) -> FloatArray:
+    """Derivative (P, 2, 6) of the pixels of points (P, 3) in the marker by its pose ``T`` (4, 4)."""
+    _, by_point = camera.project_jacobian(se3.apply(T, points))
+    by_turn = -se3.skew(points @ T[:3, :3].T)
+    return np.concatenate([by_point, by_point @ by_turn], axis=-1)
+
+
+def _solved(
+    T: FloatArray,
+    J: FloatArray,
+    shift: FloatArray,
+    variance: FloatArray,
+    used: BoolArray,
+    contrast: FloatArray,
+    noise: FloatArray,
+) -> PoseFit:
+    """The pose that explains the shifts (E,) of the edges best, outliers aside."""
+    sharpness = np.where(used, 1.0 / np.sqrt(variance), 0.0)
+    A, target = J * sharpness[:, None], shift * sharpness
+    prior = J[used].T @ J[used] / (used.sum() * _PRIOR_PX**2)
+    prior += 1e-9 * np.diag(np.diag(prior))
+    robust = np.ones(len(shift))
+    for _ in range(_ROUNDS):
+        weighted = A.T * robust
+        step = np.linalg.solve(weighted @ A + prior, weighted @ target)
+        left = np.abs(target - A @ step)
+        scale = max(1.4826 * _median(left[used]), 1.0)
+        robust = 1.0 / np.maximum(left / (_OUTLIER * scale), 1.0) ** 2
+    kept = used & (robust > 0.99)
+    number = int(kept.sum())
+    chi2 = float(np.sum(left[kept] ** 2)) / KEPT_VARIANCE
+    free = max(number - 6, 0)
+    information = weighted @ A * ((free + 24.0) / (chi2 + 24.0))
+    moved = se3.transform(se3.so3_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3])
+    return PoseFit(
+        moved,
+        information,
+        float(np.abs(J[used] @ step).max()),
+        len(shift),
+        int(used.sum()),
+        number,
+        chi2 / max(free, 1),
+        _median(contrast[used]),
+        math.sqrt(_median(noise[used])),
+    )
+
+
+def _median(values: FloatArray) -> float:
+    """The upper median of a few values (K,)."""
+    return float(np.sort(values)[len(values) // 2])

@@ -1,0 +1,146 @@
+"""Sub-pixel corners: the sides of the markers located on raw counts.
+
+Columns of whole pixels across the sides are compared with the model of a blurred edge, segment by segment; a robust
+adjustment of the four corners to all segments of the marker follows, until the corners no longer move.
+"""
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from thermal_fiducial.core.detection.corners import edges
+from thermal_fiducial.core.detection.corners.segments import adjust, counts_across, HOPELESS, measure, Memory, REACHED
+from thermal_fiducial.core.detection.corners.sides import sides_of
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
+
+# A first pass with so much more blur catches corners from farther away. Those that follow measure, until the last step
+# was short enough; for outlines that are no squares a shorter one, as these may become ones.
+_WIDE, _PASSES = 1.4, 4
+_SETTLED_PX, _STILL_PX = 0.3, 0.1
+# Standard deviation of what is known of the corners beforehand, and of their places among themselves [px].
+_PRIOR_PX, _PRIOR_SHAPE_PX = 3.0, 0.7
+_PRIOR = np.eye(8) / _PRIOR_PX**2
+_PRIOR_OF_SHAPE = np.linalg.inv(_PRIOR_SHAPE_PX**2 * np.eye(8) + _PRIOR_PX**2 * np.kron(np.ones((4, 4)), np.eye(2)))
+
+
+@dataclass(frozen=True, slots=True)
+class RefinedCorners:
+    """Corners of N markers.
+
+    Parameters
+    ----------
+    corners_px : (N, 4, 2)
+    covariances : (N, 4, 2, 2) [px^2]
+    contrast : (N,) white minus black [counts]
+    noise : (N,) standard deviation of a pixel about the model [counts]
+    doubt : (N,) variance of corners that make no square, zero where they do [px^2]; not in the covariances
+    """
+
+    corners_px: FloatArray
+    covariances: FloatArray
+    contrast: FloatArray
+    noise: FloatArray
+    doubt: FloatArray
+
+    def only(self, keep: BoolArray | IntArray) -> 'RefinedCorners':
+        """Those of the markers ``keep``."""
+        return RefinedCorners(*(values[keep] for values in self._arrays))
+
+    def put(self, which: IntArray, others: 'RefinedCorners') -> None:
+        """Replace those of the markers ``which`` by ``others``."""
+        for values, new in zip(self._arrays, others._arrays, strict=True):
+            values[which] = new
+
+    @property
+    def _arrays(self) -> tuple[FloatArray, ...]:
+        return self.corners_px, self.covariances, self.contrast, self.noise, self.doubt
+
+
+def refine_corners(
+    image: Counts | Float32Array,
+    corners: ImagePoints,
+    camera: Camera,
+    behind: Float32Array,
+    blur_px: float,
+    smear_px: FloatArray | None = None,
+    columns: int = 6,
+    *,
+    near: BoolArray | None = None,
+    memory: Memory | None = None,
+) -> RefinedCorners:
+    """Corners of N markers, refined.
+
+    Parameters
+    ----------
+    image : (height, width) counts
+    corners : (N, 4) to within two pixels, or a third of a cell
+    behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.edges.edges_behind`
+    blur_px : standard deviation of optics and pixel
+    smear_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
+    columns : of pixels, in a segment
+    near : (N,) which corners are good to a pixel already, so that nothing wide need catch them
+    memory : what to take out of the image; nothing when left out
+    """
+    smear = np.zeros((len(corners.px), 2)) if smear_px is None else smear_px
+    task = _Task(image, camera, corners, behind, smear, columns, memory)
+    start = corners
+    far = np.arange(len(corners.px)) if near is None else np.flatnonzero(~near)
+    if len(far):
+        caught = corners.px.copy()
+        caught[far] = _pass(task.only(far), corners.only(far), _WIDE * blur_px, _PRIOR_OF_SHAPE)[0].corners_px
+        start = task.seen_from(caught)
+    found, step = _pass(task, start, blur_px, _PRIOR)
+    for _ in range(_PASSES - 1):
+        away = np.flatnonzero(step > np.where(found.doubt > 0.0, _STILL_PX, _SETTLED_PX))
+        if len(away) == 0:
+            break
+        part = task.only(away)
+        again, further = _pass(part, part.seen_from(found.corners_px[away]), blur_px, _PRIOR)
+        found.put(away, again)
+        step[:] = 0.0
+        step[away] = further
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """What to refine, as :func:`refine_corners` is told it."""
+
+    image: Counts | Float32Array
+    camera: Camera
+    corners: ImagePoints
+    behind: Float32Array
+    smear: FloatArray
+    columns: int
+    memory: Memory | None
+
+    def only(self, which: IntArray) -> '_Task':
+        """For the markers ``which``."""
+        if len(which) == len(self.behind):
+            return self
+        memory = None if self.memory is None else self.memory.only(which)
+        corners, behind, smear = self.corners.only(which), self.behind[which], self.smear[which]
+        return _Task(self.image, self.camera, corners, behind, smear, self.columns, memory)
+
+    def seen_from(self, corners_px: FloatArray) -> ImagePoints:
+        """The corners where they are by now (N, 4, 2)."""
+        moved = corners_px - self.corners.px
+        return self.corners.moved(moved, self.camera) if moved.any() else self.corners
+
+
+def _pass(task: _Task, start: ImagePoints, optics: float, prior: FloatArray) -> tuple[RefinedCorners, FloatArray]:
+    """Where one linearised adjustment moves the corners, and the longest step (N,) of each marker."""
+    cells = task.behind.shape[2]
+    widest = math.hypot(optics, math.sqrt(float((task.smear * task.smear).sum(axis=1).max())))
+    half = edges.half_width(widest)
+    sides = sides_of(start.x, task.camera, task.image.shape, cells, task.columns, half)
+    blur = edges.blurs(sides.normal[cells // 2], optics, task.smear)
+    counts = counts_across(task.image, sides, task.memory)
+    segments = measure(counts, edges.model(sides, task.behind, blur), REACHED * blur[0])
+    shift, covariances, doubt = adjust(sides, segments, prior, start)
+    good = segments.variance < HOPELESS
+    share = good / np.maximum(good.sum(axis=1), 1)[:, None]
+    contrast, noise = (segments.contrast * share).sum(axis=1), np.sqrt((segments.noise * share).sum(axis=1))
+    return RefinedCorners(start.px + shift, covariances, contrast, noise, doubt), np.abs(shift).max(axis=(1, 2))

@@ -1,0 +1,265 @@
+"""Displacements of a marker's sides, segment by segment, and of the corners that explain them.
+
+One segment, a bit long, measures how far its side is off with a level and a contrast of its own and a variance from its
+own residuals; a robust adjustment of the four corners to all segments of the marker follows. Clutter, dead pixels and
+hidden stretches cost the segments that they touch.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.core.detection.corners.sides import ENDS, Sides, STARTS
+from thermal_fiducial.core.detection.corners.squares import as_squares
+from thermal_fiducial.core.geometry.camera import ImagePoints
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
+
+#: A linearised displacement is good for this many blurs.
+REACHED = 2.0
+#: Variance of a segment that measures nothing.
+HOPELESS = 1e6
+# Weight of a pixel or segment falls off beyond this many standard deviations.
+_PIXEL_OUTLIER = 4.5
+_SEGMENT_OUTLIER = 2.5
+#: Variance of a standard normal variable of which no more than that is kept.
+KEPT_VARIANCE = 0.911
+# Standard deviation of a corner that no image noise explains: the optics' blur is not quite a Gaussian [px]; and of
+# what all four sides have in common of it, so that it leaves a square one.
+_FLOOR, _COMMON_FLOOR = 0.010**2 * np.eye(8), 0.005**2 * np.eye(2)
+# Contrast of a segment over that of the marker: less is hidden, more is the edge of something else; and by how much the
+# contrast of a plate varies.
+_LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
+# Weights of segments are found in so many rounds, or fewer when they no longer change by more.
+_ROUNDS, _SETTLED = 3, 0.1
+_SIDES = np.arange(4)
+# Products of the columns of a segment's least squares, and of columns and products together.
+_PRODUCTS = (1, 1), (1, 2), (2, 2), (1, 3), (2, 3), (3, 3)
+_PLANES = 4 + len(_PRODUCTS)
+
+
+class Memory(NamedTuple):
+    """What the image still shows of the past, to be taken out round N markers.
+
+    Parameters
+    ----------
+    maps : (N, 2, 3) of the pixels (u, v, 1) to those that show what they remember
+    gain : (N,) weight of the present, so that 1 takes nothing out
+    """
+
+    maps: FloatArray
+    gain: FloatArray
+
+    def only(self, keep: IntArray) -> 'Memory':
+        """That round the markers ``keep``."""
+        return Memory(self.maps[keep], self.gain[keep])
+
+
+class Segments(NamedTuple):
+    """What the S segments of each of N markers measured, (N, S) each."""
+
+    #: displacement of their sides along the normals, inward [px]
+    shift: FloatArray
+    #: its variance [px^2]
+    variance: FloatArray
+    contrast: FloatArray
+    #: variance of a pixel about the model
+    noise: FloatArray
+
+
+class _Fit(NamedTuple):
+    """Least squares of segments (...) over level, contrast and contrast times displacement."""
+
+    contrast: FloatArray
+    #: contrast times displacement
+    product: FloatArray
+    #: their variances for noise of 1
+    contrast_variance: FloatArray
+    product_variance: FloatArray
+    level: FloatArray
+    #: sum of squared residuals, and number of pixels
+    square: FloatArray
+    number: FloatArray
+
+
+def counts_across(image: Counts | Float32Array, sides: Sides, memory: Memory | None = None) -> Float32Array:
+    """Counts (M, C, m, E) of the pixels across sides, without memory."""
+    counts = image.ravel().take(sides.pixel, mode='clip').astype(np.float32, copy=False)
+    if memory is None or not (memory.gain > 1.0).any():
+        return counts
+    of_each = sides.pixel.shape[-1] // len(memory.gain)
+    pixel, which = sides.pixel.reshape(-1, len(memory.gain), of_each), np.flatnonzero(memory.gain > 1.0)
+    v, u = (a.astype(np.float32) for a in np.divmod(pixel[:, which].astype(np.int32), np.int32(image.shape[1])))
+    maps = memory.maps[which].astype(np.float32)[..., None]
+    to_u, to_v = (maps[:, row, 0] * u + maps[:, row, 1] * v + maps[:, row, 2] for row in (0, 1))
+    flat = (len(pixel), -1)
+    past = cv2.remap(image, to_u.reshape(flat), to_v.reshape(flat), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
+    gain, of_marker = memory.gain[which, None].astype(np.float32), counts.reshape(pixel.shape)
+    of_marker[:, which] = gain * of_marker[:, which] + (np.float32(1.0) - gain) * past.reshape(u.shape)
+    return counts
+
+
+def measure(
+    counts: Float32Array, modelled: tuple[Float32Array, Float32Array, Float32Array], reach: FloatArray, sides: int = 4
+) -> Segments:
+    """Displacement of each segment, S = 4 m to a marker: one of m on each side, the sides of the first parts first.
+
+    Parameters
+    ----------
+    counts : (M, C, m, E) of :func:`counts_across`
+    modelled : value, derivative and weight of each pixel, of ``edges.model``
+    reach : (E,) longest displacement for which the model can be linearised [px]
+    sides : of a marker, if it has not 4
+    """
+    cells = counts.shape[2]
+    value, slope, weight = modelled
+    X = np.empty((_PLANES, *counts.shape), dtype=np.float32)
+    X[0] = weight
+    np.multiply(value, weight, out=X[1])
+    np.multiply(slope, weight, out=X[2])
+    np.subtract(counts, counts[counts.shape[0] // 2, counts.shape[1] // 2], out=X[3])
+    X[3] *= weight
+    X = X.reshape(_PLANES, -1, cells * len(reach))
+    fit = _fit(_by_marker(_moments(X), cells, sides))
+    noise = _noise(fit)
+    alike = np.abs(_residuals(fit, X, cells, sides)) <= _by_segment(_PIXEL_OUTLIER * np.sqrt(noise), cells, sides)
+    if not alike.all():
+        X[:4] *= alike.astype(np.float32)
+        fit = _fit(_by_marker(_moments(X), cells, sides))
+        noise = _noise(fit)
+    farthest = np.empty((len(reach) // sides, cells, sides))
+    farthest[:] = reach.reshape(-1, 1, sides)
+    return _judged(fit, noise, farthest.reshape(noise.shape))
+
+
+def _moments(X: Float32Array) -> Float32Array:
+    """Sums (10, segments) over pixels (10, pixels, segments): of the first four, and of their products but the first's.
+
+    The first four are 1, model, derivative and counts, zero for pixels that do not count; the others are room.
+    """
+    for plane, (first, second) in enumerate(_PRODUCTS, 4):
+        np.multiply(X[first], X[second], out=X[plane])
+    return np.asarray(np.add.reduce(X, axis=1))
+
+
+def _by_marker(values: Float32Array, cells: int, sides: int) -> FloatArray:
+    """Of segments (..., m E) as (..., N, S)."""
+    by_side = values.reshape(len(values), cells, -1, sides).swapaxes(1, 2)
+    return np.array(by_side, dtype=np.float64, order='C').reshape(len(values), -1, sides * cells)
+
+
+def _by_segment(values: FloatArray, cells: int, sides: int) -> Float32Array:
+    """Of markers (N, S) as (m E,)."""
+    return np.array(values.reshape(-1, cells, sides).swapaxes(0, 1), dtype=np.float32, order='C').ravel()
+
+
+def _fit(moments: FloatArray) -> _Fit:
+    """Least squares of the counts on (1, model, derivative), of segments with :func:`_moments` (10, ...)."""
+    number, x, y, z, xx, xy, yy, xz, yz, zz = moments
+    x_mean, y_mean, z_mean = moments[1:4] / np.maximum(number, 1.0)
+    # Without their means the columns leave two unknowns.
+    ridge = 1e-6 * number + 1e-6
+    a, b, c = xx - x * x_mean + ridge, xy - x * y_mean, yy - y * y_mean + ridge
+    p, q = xz - z * x_mean, yz - z * y_mean
+    determinant = a * c - b * b
+    a, b, c = a / determinant, b / determinant, c / determinant
+    contrast, product = c * p - b * q, a * q - b * p
+    square = np.maximum(zz - z * z_mean - contrast * p - product * q, 0.0)
+    level = z_mean - contrast * x_mean - product * y_mean
+    return _Fit(contrast, product, c, a, level, square, number)
+
+
+def _residuals(fit: _Fit, X: Float32Array, cells: int, sides: int) -> Float32Array:
+    """What the model leaves of the pixels (pixels, segments)."""
+    level, contrast, product = (_by_segment(each, cells, sides) for each in (fit.level, fit.contrast, fit.product))
+    return np.asarray(X[3] - level * X[0] - contrast * X[1] - product * X[2])
+
+
+def _noise(fit: _Fit) -> FloatArray:
+    """Variances of pixels (N, S): of a marker's typical segment, or a segment's own where that is much larger."""
+    free = fit.number - 3.0
+    own = fit.square / np.maximum(free, 1.0)
+    typical = _Median(free > 1.5)(own)
+    return np.where(own > 2.5 * typical, own, typical) + 1e-3
+
+
+def _judged(fit: _Fit, noise: FloatArray, reach: FloatArray) -> Segments:
+    """Which segments measure anything, within their reach (N, S)."""
+    contrast, product, usable = fit.contrast, fit.product, fit.number > 4.5
+    typical = _Median(usable)(contrast)
+    own = noise * fit.contrast_variance
+    scale = np.sign(typical) / np.maximum(np.abs(typical), 1e-6)
+    relative, unsure = contrast * scale, 2.0 * np.sqrt(own) * np.abs(scale)
+    usable &= (relative > _LEAST_CONTRAST - unsure) & (relative < _MOST_CONTRAST + unsure)
+    # A faint segment hardly tells its contrast, by which its displacement is divided: the others tell it better.
+    others = (_CONTRAST_VARIES * typical) ** 2 + 1e-9
+    safe = np.where(usable, (contrast * others + typical * own) / (others + own), 1.0)
+    shift = np.where(usable, np.minimum(np.maximum(-product / safe, -reach), reach), 0.0)
+    return Segments(shift, np.where(usable, noise * fit.product_variance / (safe * safe), HOPELESS), contrast, noise)
+
+
+class _Median:
+    """Medians (N, 1) of the good ones of values (N, S), 0 where there is none."""
+
+    def __init__(self, good: BoolArray) -> None:
+        number = good.sum(axis=1)
+        self._good, self._none = good, number == 0
+        self._place = np.arange(len(good)), np.maximum(number - 1, 0) // 2
+
+    def __call__(self, values: FloatArray) -> FloatArray:
+        order = np.where(self._good, values, np.inf)
+        order.sort(axis=1)
+        median = order[self._place]
+        median[self._none] = 0.0
+        return np.asarray(median[:, None])
+
+
+def adjust(
+    sides: Sides, segments: Segments, prior: FloatArray, at: ImagePoints
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """How corners move (N, 4, 2) to explain the shifts of all segments, and their covariances (N, 4, 2, 2).
+
+    And the variances (N,) [px^2] of corners that make no square, zero where they do.
+
+    Parameters
+    ----------
+    prior : (8, 8) information on the eight numbers beforehand
+    at : (N, 4) corners so far
+    """
+    used = segments.variance < HOPELESS
+    median, sharpness = _Median(used), 1.0 / np.sqrt(segments.variance)
+    A, shift = _design(sides) * sharpness[..., None], segments.shift * sharpness
+    weighted = turned = A.swapaxes(1, 2)
+    robust = np.ones_like(shift)
+    for _ in range(_ROUNDS):
+        covariance = np.linalg.inv(weighted @ A + prior)
+        moved = covariance @ (weighted @ shift[..., None])
+        left = np.abs(shift - (A @ moved)[..., 0])
+        scale = np.maximum(1.4826 * median(left), 1.0)
+        former, robust = robust, 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
+        if np.abs(robust - former).max() < _SETTLED:
+            break
+        weighted = turned * robust[:, None]
+    kept = used & (robust > 0.99)
+    chi2 = (left * left * kept).sum(axis=1) / KEPT_VARIANCE
+    free = np.maximum(kept.sum(axis=1) - 8.0, 0.0)
+    # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
+    covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None] + _FLOOR
+    known = as_squares(at, moved, covariance)
+    # Corners told by one another err together. Taken for independent, they would tell a pose so much too well.
+    together = (8.0 / (8.0 - known.told))[:, None, None, None]
+    blocks = together * known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
+    # A side of an outline that is no square's is that of something else.
+    doubt = known.doubt * (0.25 * sides.along.reshape(-1, 4).sum(axis=1)) ** 2
+    return known.moved.reshape(-1, 4, 2), blocks + _COMMON_FLOOR, doubt
+
+
+def _design(sides: Sides) -> FloatArray:
+    """Derivative (N, S, 8) of the segments' displacements along their normals by the corners'."""
+    cells = len(sides.normal)
+    t = (sides.t * sides.fresh).sum(axis=0) / np.maximum(sides.fresh.sum(axis=0), 1)
+    by_end = t[..., None] * sides.normal
+    A = np.zeros((cells, len(by_end[0]) // 4, 4, 4, 2))
+    A[:, :, _SIDES, STARTS] = (sides.normal - by_end).reshape(cells, -1, 4, 2)
+    A[:, :, _SIDES, ENDS] = by_end.reshape(cells, -1, 4, 2)
+    return A.swapaxes(0, 1).reshape(-1, 4 * cells, 8)

@@ -1,0 +1,359 @@
+"""Known markers that the rim of the image cuts, or that fill it.
+
+Where the map and the odometry expect one, its visible cells must look like it and like nothing else there. All edges
+between its cells that are in view, inside and along its sides, then tell its pose, and that tells its corners, those
+outside the image as well.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+import math
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.corners.grid import (
+    adjusted,
+    grid_edges,
+    GridEdges,
+    Layer,
+    on_marker,
+    pose_jacobian,
+    PoseFit,
+)
+from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
+from thermal_fiducial.core.detection.corners.segments import Memory
+from thermal_fiducial.core.detection.decoding import Decoder
+from thermal_fiducial.core.detection.displayed import DISPLACED
+from thermal_fiducial.core.detection.frame import Frame, Places
+from thermal_fiducial.core.detection.guided import CutMarkers
+from thermal_fiducial.core.detection.lag import GAIN, MEMORY_AGE, memory_maps, model_error, REMAINING, SPREAD
+from thermal_fiducial.core.detection.motion import interaction
+from thermal_fiducial.core.detection.readout import expected_displacement, memory
+from thermal_fiducial.core.detection.refining import sides_px, worth_sharpening
+from thermal_fiducial.core.detection.visible_cells import VisibleCells
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.types import BoolArray, FloatArray, Gray, IntArray
+
+# Cells narrower than this show no straight edges apart from each other [px]; those of the coarsest layer are no wider.
+_NARROWEST_PX, _COARSE_PX = 5.0, 8.0
+# So many markers at most, the largest, are looked for in a frame: more tell little more.
+_MOST = 2
+# Places near the prediction that are tried, in cells; others are so far apart, as far as so many standard deviations of
+# the prediction reach, but at least and at most so far.
+_NEAR = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]), axis=-1).reshape(-1, 2)
+_APART, _UNSURE, _LEAST_REACH, _REACH = 0.7, 2.5, 1.4, 4.9
+# Least number of cells in view, and of those by which any other marker differs, lest a stain make it another.
+_CELLS, _DIFFERENT = 16, 2
+# Least correlation, difference to the most similar other pattern as a share of what a perfect view has, and of squares.
+_ALIKE, _MARGIN, _EVIDENCE = 0.8, 0.5, 25.0
+# Correlation of a marker that need not be looked for elsewhere, and of a place that is worth a closer look.
+_THERE, _HINT = 0.95, 0.55
+# Least share of the edges in view that show a step like the others', and agree with the pose.
+_SHOWN, _AGREEING = 0.7, 0.6
+# Steps on the coarse layer, and one along all edges after which there need be no other [px]; those on the fine layer,
+# the first with so much more blur, to catch edges from farther away, and the last step of a pose that has settled [px].
+_COARSE_STEPS, _NEAR_PX = 3, 0.3
+_STEPS, _WIDE, _SETTLED_PX = 8, 1.5, 0.1
+# A corner that is known no better tells nothing, nor one so far outside the image, in image widths [px].
+_KNOWN_PX, _OUTSIDE = 8.0, 1.0
+# Depth of points that are no longer in front of the camera [m].
+_LEAST_DEPTH = 1e-3
+# Standard deviation of what displaces a corner of a marker's window, whatever the edges say [px].
+_FLOOR_PX = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class _Marker:
+    """A marker that is looked for."""
+
+    id: int
+    size: float
+    #: (4, 4) where it is expected
+    T_camera_marker: FloatArray
+    #: (4, 2) shares of the sides between which it is in view
+    window: FloatArray
+    #: width of its cells in view [px], and standard deviation of its place, in cells
+    cell_px: float
+    unsure_cells: float
+
+    def seen(self) -> FloatArray:
+        """The window (4, 3) in the camera [m]."""
+        return se3.apply(self.T_camera_marker, on_marker(self.window, self.size))
+
+
+class CutMarkerSearch:
+    """Looks for known markers that are not wholly in view.
+
+    Parameters
+    ----------
+    decoder, bits : of the dictionary, (M, n, n)
+    """
+
+    def __init__(self, decoder: Decoder, bits: Gray) -> None:
+        self._bits, self._cells = bits, decoder.cells
+        self._visible = VisibleCells(decoder)
+
+    def look(
+        self,
+        frame: Frame,
+        cut: CutMarkers,
+        unsure_m: float,
+        allowed: BoolArray,
+        config: ArucoDetectorConfig,
+        *,
+        bent: bool = False,
+    ) -> tuple[IntArray, RefinedCorners]:
+        """Those of the markers ``cut`` that the frame shows: IDs (N,) and corners.
+
+        Parameters
+        ----------
+        frame : whose twist is known
+        unsure_m : standard deviation of where they are expected
+        allowed : (M,) IDs that there may be
+        bent : whether the frame is for a display, its scale bent by gain control
+        """
+        in_view = (
+            self._expected(frame.camera, marker_id, size, T, unsure_m)
+            for marker_id, T, size in zip(cut.ids.tolist(), cut.T_camera_marker, cut.sizes.tolist(), strict=True)
+        )
+        largest = sorted((marker for marker in in_view if marker is not None), key=lambda marker: -marker.cell_px)
+        seen = []
+        for marker in largest[:_MOST]:
+            corners = self._one(frame, marker, allowed, config, bent=bent)
+            if corners is not None:
+                seen.append((marker.id, corners))
+        if not seen:
+            nothing = np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros(0), np.zeros(0), np.zeros(0)
+            return np.zeros(0, dtype=np.int64), RefinedCorners(*nothing)
+        parts = [(c.corners_px, c.covariances, c.contrast, c.noise, c.doubt) for _, c in seen]
+        ids = np.array([marker_id for marker_id, _ in seen])
+        return ids, RefinedCorners(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+    def _one(
+        self, frame: Frame, marker: _Marker, allowed: BoolArray, config: ArucoDetectorConfig, *, bent: bool
+    ) -> RefinedCorners | None:
+        points = on_marker(self._visible.places, marker.size)
+        factor = int(2 ** np.clip(np.floor(np.log2(marker.cell_px / _COARSE_PX)), 0, 3))
+        coarse = _plain(frame, marker.seen(), config.blur_px, factor)
+        T = self._moved(marker, points, coarse, marker.cell_px / factor)
+        if T is None:
+            return None
+        pattern = grid_edges(self._bits[marker.id])
+        rough = _settled(T, marker.size, pattern, [coarse] * _COARSE_STEPS, _NEAR_PX)
+        if rough is None or not self._recognised(rough, marker, coarse, allowed, frame.noise, config):
+            return None
+        fine = _sharpened(frame, marker.seen(), rough.contrast, config.blur_px, self._cells)
+        layers = [replace(fine, blur=_WIDE * fine.blur), *[fine] * _STEPS]
+        fit = _settled(rough.T_camera_marker, marker.size, pattern, layers, _SETTLED_PX)
+        if fit is None or fit.moved_px > _SETTLED_PX or not _agrees(fit):
+            return None
+        return _corners(frame, marker, fit, self._cells, bent=bent)
+
+    def _expected(
+        self, camera: Camera, marker_id: int, size: float, T_camera_marker: FloatArray, unsure_m: float
+    ) -> _Marker | None:
+        """A marker as far as it should be in view; None where that is too little."""
+        px = camera.project(se3.apply(T_camera_marker, on_marker(self._visible.places, size)))
+        inside = camera.contains(px).reshape(-1, 9).all(axis=1)
+        if inside.sum() < _CELLS:
+            return None
+        samples = px.reshape(-1, 9, 2)[inside]
+        right, down = samples[:, 2] - samples[:, 0], samples[:, 6] - samples[:, 0]
+        area = np.abs(right[:, 0] * down[:, 1] - right[:, 1] * down[:, 0])
+        cell_px = float(np.sqrt(np.median(area)) / 0.4)
+        if cell_px < _NARROWEST_PX:
+            return None
+        shares = np.clip(self._visible.places.reshape(-1, 9, 2)[inside].reshape(-1, 2), 0.0, 1.0)
+        (left, top), (right_end, bottom) = shares.min(axis=0), shares.max(axis=0)
+        window = np.array([[left, top], [right_end, top], [right_end, bottom], [left, bottom]])
+        return _Marker(marker_id, size, T_camera_marker, window, cell_px, unsure_m * self._cells / size)
+
+    def _moved(self, marker: _Marker, points: FloatArray, layer: Layer, cell_px: float) -> FloatArray | None:
+        """The expected pose (4, 4) moved to where the pattern correlates best; None where it does nowhere."""
+        px = layer.project(se3.apply(marker.T_camera_marker, points))
+
+        def similar(places: FloatArray) -> FloatArray:
+            return np.abs(self._visible.match(layer.image, px + places[:, None], marker.id))
+
+        if similar(np.zeros((1, 2)))[0] > _THERE:
+            return marker.T_camera_marker
+        at, near = np.zeros(2), cell_px * _NEAR
+        similarity = similar(near)
+        if similarity.max() < _ALIKE:
+            far = cell_px * _around(marker.unsure_cells)
+            at = far[np.argmax(similar(far))]
+            similarity = similar(at + near)
+        if similarity.max() < _HINT:
+            return None
+        weight = np.maximum(similarity - 0.8 * similarity.max(), 0.0)
+        shift = at + weight @ near / max(float(weight.sum()), 1e-9)
+        seen = np.flatnonzero(layer.camera.contains(px))
+        J = pose_jacobian(marker.T_camera_marker, points[seen], layer.camera)[..., :3].reshape(-1, 3)
+        step = np.linalg.lstsq(J, np.tile(shift, len(seen)), rcond=1e-3)[0]
+        return se3.transform(marker.T_camera_marker[:3, :3], marker.T_camera_marker[:3, 3] + step)
+
+    def _recognised(
+        self,
+        rough: PoseFit,
+        marker: _Marker,
+        layer: Layer,
+        allowed: BoolArray,
+        noise: float,
+        config: ArucoDetectorConfig,
+    ) -> bool:
+        """Whether the cells in view show the marker beyond doubt."""
+        lines = se3.apply(rough.T_camera_marker, on_marker(self._visible.line_places, marker.size))
+        likeness = self._visible.likeness(layer.image, layer.project(lines), marker.id, allowed)
+        correlation, margin = abs(likeness.correlation), _MARGIN * (1.0 - likeness.perfect)
+        return bool(
+            likeness.cells >= _CELLS
+            and correlation >= _ALIKE
+            and correlation - likeness.runner_up >= margin
+            and likeness.distance >= _DIFFERENT
+            and likeness.evidence >= _EVIDENCE
+            and likeness.contrast * np.sign(rough.contrast) >= config.guided_min_contrast * noise
+        )
+
+
+def _settled(T: FloatArray, size: float, pattern: GridEdges, layers: list[Layer], short_px: float) -> PoseFit | None:
+    """A pose adjusted on one layer after the other, until on the last a step is short."""
+    fit = adjusted(T, size, pattern, layers[0])
+    for before, layer in pairwise(layers):
+        if fit is None or (before is layers[-1] and fit.moved_px < short_px):
+            break
+        fit = adjusted(fit.T_camera_marker, size, pattern, layer)
+    return fit
+
+
+def _agrees(fit: PoseFit) -> bool:
+    """Whether most edges in view are there, where the pose has them."""
+    return fit.shown >= _SHOWN * fit.visible and fit.agreeing >= _AGREEING * fit.visible
+
+
+def _around(unsure_cells: float) -> FloatArray:
+    """Places (P, 2) round one that is known so well, in cells."""
+    steps = round(np.clip(_UNSURE * unsure_cells, _LEAST_REACH, _REACH) / _APART)
+    along = _APART * np.arange(-steps, steps + 1)
+    return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+
+
+def _plain(frame: Frame, window: FloatArray, blur_px: float, factor: int) -> Layer:
+    """The frame at one resolution in ``factor``, as smeared as it is round a ``window`` (4, 3) in the camera."""
+    camera = _coarser(frame.camera, factor)
+    image = frame.image
+    if factor > 1:
+        cropped = image[: camera.height * factor, : camera.width * factor]
+        image = np.asarray(cv2.resize(cropped, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
+    blur = math.hypot(blur_px / factor, math.sqrt((1.0 - 1.0 / factor**2) / 12.0))
+
+    def displacement(points: FloatArray) -> FloatArray:
+        return _displaced(frame, points, 0.0) / factor
+
+    return Layer(image, camera, displacement, blur, _smear(frame, window) / factor)
+
+
+def _sharpened(frame: Frame, window: FloatArray, contrast: float, blur_px: float, cells: int) -> Layer:
+    """The frame as it is; without old memories round the window (4, 3), where that is worth its noise."""
+    places, twist = _places(window, frame.camera), frame.twist
+    mean = _smear(frame, window)
+    clarity = np.array([contrast / frame.noise])
+    cell = sides_px(places.at.px) / cells
+    if twist is None or not worth_sharpening(np.array([mean @ mean]), cell, cells, clarity)[0]:
+        return _plain(frame, window, blur_px, 1)
+    maps = memory_maps(places.at.px + _displaced(frame, window, 1.0 - REMAINING), memory(places, twist, frame))
+
+    def displacement(points: FloatArray) -> FloatArray:
+        return _displaced(frame, points, 1.0 - REMAINING)
+
+    return Layer(frame.image, frame.camera, displacement, blur_px, SPREAD * mean, Memory(maps, np.array([GAIN])))
+
+
+def _displaced(frame: Frame, points: FloatArray, removed: float) -> FloatArray:
+    """By how much points (P, 3) in the camera appear displaced (P, 2) [px], such a share of memories taken out."""
+    twist, lag = frame.twist, frame.lag
+    if twist is None:
+        return np.zeros((len(points), 2))
+    depth = np.maximum(points[:, 2], _LEAST_DEPTH)
+    x = points[:, :2] / depth[:, None]
+    back = -lag * (twist.ago(lag) - removed * twist.ago(MEMORY_AGE * lag))
+    shift = (frame.camera.distort_linearised(x)[1] @ (interaction(x, depth) @ back)[..., None])[..., 0]
+    if frame.readout == 0.0:
+        return np.asarray(shift)
+    return np.asarray(shift + expected_displacement(_places(points, frame.camera), twist, frame)[0])
+
+
+def _smear(frame: Frame, window: FloatArray) -> FloatArray:
+    """Mean smear (2,) [px] of what is seen of a marker, whose window is (4, 3) in the camera."""
+    if frame.twist is None:
+        return np.zeros(2)
+    return np.asarray(_places(window, frame.camera).smear(frame.twist, frame.lag)[0].mean(axis=0))
+
+
+def _coarser(camera: Camera, factor: int) -> Camera:
+    """The camera of an image of which each pixel is the mean of so many squared."""
+    if factor == 1:
+        return camera
+    K = camera.K.copy()
+    K[:2, 2] += 0.5 - 0.5 * factor
+    K[:2] /= factor
+    return Camera(camera.width // factor, camera.height // factor, K, camera.model, camera.D)
+
+
+def _places(points: FloatArray, camera: Camera) -> Places:
+    """Places (1, P) of points (P, 3) in the camera."""
+    depth = np.maximum(points[None, :, 2], _LEAST_DEPTH)
+    return Places.of(ImagePoints.seen_at(points[None, :, :2] / depth[..., None], camera), depth)
+
+
+def _corners(frame: Frame, marker: _Marker, fit: PoseFit, cells: int, *, bent: bool) -> RefinedCorners | None:
+    """The corners that follow from a marker's pose, with covariances (2, 2) that claim no more than is known of it.
+
+    None where they are too uncertain, or too far outside the image.
+    """
+    T, points = fit.T_camera_marker, marker_corners(marker.size)
+    corners = frame.camera.project(se3.apply(T, points))
+    limit = _OUTSIDE * frame.camera.width
+    if not frame.camera.contains(corners, -limit).all():
+        return None
+    J = pose_jacobian(T, points, frame.camera)
+    information: FloatArray = np.asarray(np.linalg.inv(_pose_covariance(frame, marker, fit, cells, bent=bent)))
+    blocks = _independent(J, information)
+    deviation = np.sqrt(np.trace(blocks, axis1=1, axis2=2).max())
+    if not deviation < _KNOWN_PX:
+        return None
+    scalars = (np.array([value]) for value in (fit.contrast, fit.noise, 0.0))
+    return RefinedCorners(corners[None], blocks[None], *scalars)
+
+
+def _pose_covariance(frame: Frame, marker: _Marker, fit: PoseFit, cells: int, *, bent: bool) -> FloatArray:
+    """Covariance (6, 6) of a pose by its edges' noise, and by what displaces all of them alike or in some order."""
+    T = fit.T_camera_marker
+    window = on_marker(marker.window, marker.size)
+    J = pose_jacobian(T, window, frame.camera).reshape(8, 6)
+    blocks = np.broadcast_to((DISPLACED if bent else _FLOOR_PX) ** 2 * np.eye(2), (4, 2, 2))
+    if frame.twist is not None:
+        places = _places(se3.apply(T, window), frame.camera)
+        unknown = places.unknown(frame.twist, frame.lag)
+        blocks = blocks + unknown[0] + model_error(places.smear(frame.twist, frame.lag), places.at.px, cells)[0]
+    gain = np.linalg.pinv(J).reshape(6, 4, 2)
+    systematic = np.einsum('ick,ckl,jcl->ij', gain, blocks, gain)
+    return np.asarray(np.linalg.inv(fit.information) + systematic)
+
+
+def _independent(J: FloatArray, information: FloatArray) -> FloatArray:
+    """Covariances (4, 2, 2) of corners that, taken for independent, tell a pose no better than it is known.
+
+    Parameters
+    ----------
+    J : (4, 2, 6) derivative of the corners by the pose
+    information : (6, 6) on it
+    """
+    covariance = np.linalg.inv(information)
+    blocks = J @ covariance @ np.swapaxes(J, 1, 2)
+    told = np.sum(np.swapaxes(J, 1, 2) @ np.linalg.inv(blocks) @ J, axis=0)
+    L = np.linalg.cholesky(covariance)
+    return np.asarray(np.linalg.eigvalsh(L.T @ told @ L)[-1] * blocks)

@@ -1,0 +1,1 @@
+"""Rigid motions, cameras, poses of planar markers and their covariances."""

@@ -1,0 +1,96 @@
+"""Re-projection of map markers into a frame: what the mapper, the candidates and the joint adjustment minimise.
+
+Poses are perturbed in the ROS convention of :mod:`thermal_fiducial.core.measurements`: ``d`` is (x y z, rotation
+about x y z), both in the map frame. With ``p_camera = R' (R_m c + t_m - t)`` for a corner ``c`` of the marker,
+``dp_camera = R' (dt_m - [R_m c]x dr_m - dt + [R_m c + t_m - t]x dr)``.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.se3 import skew, so3_exp, so3_log
+from thermal_fiducial.core.types import FloatArray
+
+#: Corners of a marker of side 2, clockwise from its top-left.
+_UNIT_CORNERS = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
+
+
+def retract(T: npt.ArrayLike, d: npt.ArrayLike) -> FloatArray:
+    """Pose (..., 4, 4) moved by ``d`` (..., 6) in its parent frame: ``p + d[:3]``, ``exp(d[3:]) R``."""
+    d = np.asarray(d, dtype=np.float64)
+    moved = np.array(T, dtype=np.float64)
+    moved[..., :3, :3] = so3_exp(d[..., 3:]) @ moved[..., :3, :3]
+    moved[..., :3, 3] += d[..., :3]
+    return moved
+
+
+def difference(T: npt.ArrayLike, T_reference: npt.ArrayLike) -> FloatArray:
+    """``d`` (..., 6) with ``T == retract(T_reference, d)``."""
+    T, T_reference = np.asarray(T, dtype=np.float64), np.asarray(T_reference, dtype=np.float64)
+    rotation = so3_log(T[..., :3, :3] @ np.swapaxes(T_reference[..., :3, :3], -1, -2))
+    return np.concatenate([T[..., :3, 3] - T_reference[..., :3, 3], rotation], axis=-1)
+
+
+def corners_of(sizes: npt.ArrayLike) -> FloatArray:
+    """Corners (..., 4, 3) [m] of markers of ``sizes`` (...) in their own frames."""
+    return np.asarray(0.5 * np.asarray(sizes, dtype=np.float64)[..., None, None] * _UNIT_CORNERS)
+
+
+def corners_in_map(T_map_marker: FloatArray, sizes: npt.ArrayLike) -> FloatArray:
+    """Corners (..., 4, 3) [m] in the map of markers with poses (..., 4, 4) and ``sizes`` (...)."""
+    corners = corners_of(sizes) @ np.swapaxes(T_map_marker[..., :3, :3], -1, -2)
+    return np.asarray(corners + T_map_marker[..., None, :3, 3])
+
+
+def reproject(camera: Camera, T_map_camera: FloatArray, points: FloatArray) -> FloatArray:
+    """Pixels (..., 4, 2) of corners ``points`` (..., 4, 3) in the map, for cameras (..., 4, 4); NaN: unseen."""
+    relative = points - T_map_camera[..., None, :3, 3]
+    return camera.project(relative @ T_map_camera[..., :3, :3])
+
+
+def linearise(
+    camera: Camera, T_map_camera: FloatArray, T_map_marker: FloatArray, sizes: npt.ArrayLike
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Pixels of the corners of markers, and their derivatives with respect to both poses.
+
+    Parameters
+    ----------
+    T_map_camera, T_map_marker : (n, 4, 4), one pair a view
+    sizes : (n,) [m]
+
+    Returns
+    -------
+    uv (n, 4, 2), J_camera (n, 8, 6), J_marker (n, 8, 6) [px/m, px/rad], rows u0 v0 u1 v1 ...
+    """
+    n = len(T_map_camera)
+    R_camera_map = np.swapaxes(T_map_camera[:, :3, :3], -1, -2)[:, None]
+    arms = corners_of(sizes) @ np.swapaxes(T_map_marker[:, :3, :3], -1, -2)
+    points = arms + (T_map_marker[:, :3, 3] - T_map_camera[:, :3, 3])[:, None]
+    uv, projection = camera.project_jacobian((R_camera_map @ points[..., None])[..., 0])
+    J = projection @ R_camera_map
+    J_marker = np.concatenate([J, -J @ skew(arms)], axis=-1).reshape(n, 8, 6)
+    J_camera = np.concatenate([-J, J @ skew(points)], axis=-1).reshape(n, 8, 6)
+    return uv, J_camera, J_marker
+
+
+def whitening(covariances: FloatArray) -> FloatArray:
+    """Matrices (..., 2, 2) that make residuals of ``covariances`` (..., 2, 2) unit white: inverse Cholesky factors."""
+    a, b, c = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
+    root = np.sqrt(a)
+    rest = np.sqrt(c - b * b / a)
+    W = np.zeros_like(covariances)
+    W[..., 0, 0] = 1.0 / root
+    W[..., 1, 0] = -b / (a * rest)
+    W[..., 1, 1] = 1.0 / rest
+    return W
+
+
+def shared_covariances(J: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Corner covariances (n, 4, 2, 2) [px^2] to weight with, of pose errors (n, 6, 6) seen through J (n, 8, 6).
+
+    The four corners of a view share such an error; taken as independent, each must count four times, lest the four
+    average it away.
+    """
+    blocks = J.reshape(-1, 4, 2, 6)
+    return np.asarray(4.0 * blocks @ covariances[:, None] @ np.swapaxes(blocks, -1, -2))

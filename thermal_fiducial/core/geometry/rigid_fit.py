@@ -1,0 +1,179 @@
+"""Poses of rigid bodies of known points from their noisy images: Levenberg-Marquardt on a batch.
+
+The lens is taken out once: at the measured pixel its distortion is undone, and what a small deviation there means in
+pixels is folded into the whitening. What is left to be minimised is a pinhole projection. The weight of a residual is
+right to the order of residual over focal length, and a residual of zero stays zero.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import ImagePoints
+from thermal_fiducial.core.types import BoolArray, FloatArray
+
+_MAX_STEPS = 20
+# Costs are chi-squares: a step that lowers one by less is a hundredth of a standard deviation, and the last. Of a pose
+# that the image refutes anyway a share of the cost is enough, lest it creep along its valley; of one that is worse than
+# a rival, a share of what it is worse by. One that costs so many times more even after a step is given up.
+_LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-4, 50.0, 1e-2, 10.0
+# Damping at which Levenberg-Marquardt finds no better pose at all.
+_HOPELESS = 1e6
+# Depth [m] from which a point is in front of the camera.
+_NEAR = 1e-6
+# Stands in for a start that does not exist.
+_AHEAD = se3.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.0])
+# Variance of a parameter, over what it would be with the others known, from which it counts as unknown.
+_UNKNOWN = 1e13
+# v @ _SKEW is skew(v), its rows one after the other.
+_SKEW = se3.skew(np.eye(3)).reshape(3, 9)
+_MINUS_SKEW = -_SKEW
+
+#: At poses (B, 4, 4): cost (B,), gradient (B, 6), information (B, 6, 6).
+_Evaluation = tuple[FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Images:
+    """Whitened images of B bodies of K points each: ``whitening @ x - target`` for normalised coordinates x.
+
+    Parameters
+    ----------
+    whitening : (B, K, 2, 2)
+    target : (B, K, 2)
+    normalised : (B, K, 2) the measured points without distortion
+    """
+
+    whitening: FloatArray
+    target: FloatArray
+    normalised: FloatArray
+
+    @staticmethod
+    def of(points: ImagePoints, whitening: FloatArray) -> 'Images':
+        """Of points (B, K) whose noise ``whitening`` (B, K, 2, 2) [1/px] makes unit white."""
+        W = whitening @ points.J
+        return Images(W, (W @ points.x[..., None])[..., 0], points.x)
+
+    def repeated(self, times: int) -> 'Images':
+        """Every body so many times in a row."""
+        return Images(*(np.repeat(a, times, axis=0) for a in (self.whitening, self.target, self.normalised)))
+
+    def joined(self) -> 'Images':
+        """The points of all bodies as those of a single one."""
+        return Images(*(a.reshape(1, -1, *a.shape[2:]) for a in (self.whitening, self.target, self.normalised)))
+
+    def residuals(self, T: FloatArray, points: FloatArray) -> FloatArray:
+        """Measured minus predicted (B, K, 2) in normalised coordinates, NaN behind the camera: see :func:`fit`."""
+        p = se3.apply(T, points)
+        return np.asarray(self.normalised - p[..., :2] / np.where(p[..., 2:] > _NEAR, p[..., 2:], np.nan))
+
+
+def fit(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf, rivals: int = 1) -> _Evaluation:
+    """Poses of bodies in the camera with the least squared errors, from starts ``T`` (B, 4, 4).
+
+    Parameters
+    ----------
+    points : (B or 1, K, 3) [m] in their bodies
+    inlier : Mahalanobis distance up to which errors are squared; beyond, their influence falls to nothing
+    rivals : so many starts in a row are of the same body, and matter only where they may be the best
+
+    Returns
+    -------
+    T_camera_body (B, 4, 4), costs (B,), inf from an unusable start, and information matrices (B, 6, 6) of translation
+    and rotation in the camera frame.
+    """
+    possible: BoolArray = np.asarray(np.isfinite(T).all(axis=(-1, -2)))
+    if not possible.all():
+        T = np.where(possible[:, None, None], T, _AHEAD)
+    cost, gradient, information = evaluate(T, points, images, inlier)
+    possible = possible & np.isfinite(cost)
+    if not possible.all():
+        information = np.where(possible[:, None, None], information, np.eye(6))
+        gradient = np.where(possible[:, None], gradient, 0.0)
+    damping = np.full(len(T), 1e-6)
+    active = possible
+    for steps in range(_MAX_STEPS):
+        step = _solve(information, damping, gradient)
+        gain = np.sum(step * gradient, axis=-1)
+        best = np.repeat(cost.reshape(-1, rivals).min(axis=1), rivals)
+        last = gain < np.maximum(_LAST_GAIN, _LAST_SHARE * (cost - np.minimum(best, _REFUTED)))
+        given_up = (damping > _HOPELESS) | ((cost > _REFUTED + _TIMES_THE_BEST * best) & (steps > 0))
+        trial = _moved(T, -step)
+        T = np.where((active & last & ~given_up)[:, None, None], trial, T)
+        active = active & ~last & ~given_up
+        if not active.any():
+            break
+        new = evaluate(trial, points, images, inlier)
+        better = active & (new[0] <= cost)
+        T = np.where(better[:, None, None], trial, T)
+        cost = np.where(better, new[0], cost)
+        gradient = np.where(better[:, None], new[1], gradient)
+        information = np.where(better[:, None, None], new[2], information)
+        damping *= np.where(better, 0.1, 10.0)
+    return T, np.where(possible, cost, np.inf), information
+
+
+def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> _Evaluation:
+    """Robust squared error at poses (B, 4, 4), inf where a point is behind the camera, and its derivatives.
+
+    Of a whitened error d, the cost is d^2 up to ``inlier`` and ``inlier^2 (1 + 2 log(d / inlier))`` beyond.
+    """
+    rotated = points @ np.swapaxes(T[:, :3, :3], -1, -2)
+    p = rotated + T[:, None, :3, 3]
+    z = p[..., 2:]
+    seen = (z > _NEAR).all(axis=(1, 2))
+    z = np.maximum(z, _NEAR)
+    W = images.whitening
+    seen_at = W @ (p[..., :2] / z)[..., None]
+    residual = seen_at - images.target[..., None]
+    d_p = np.empty((*p.shape[:2], 2, 3))
+    d_p[..., :2], d_p[..., 2:] = W, -seen_at
+    d_p /= z[..., None]
+    J = np.empty((*p.shape[:2], 2, 6))
+    J[..., :3] = d_p
+    np.matmul(d_p, (rotated @ _MINUS_SKEW).reshape(*p.shape, 3), out=J[..., 3:])
+    squared = np.sum(residual * residual, axis=(-1, -2))
+    J = J.reshape(len(T), 2 * p.shape[1], 6)
+    weighted = J
+    if inlier < np.inf:
+        excess = np.maximum(squared / inlier**2, 1.0)
+        squared = np.where(excess > 1.0, inlier**2 * (1.0 + np.log(excess)), squared)
+        weighted = J / np.repeat(excess, 2, axis=-1)[..., None]
+    weighted = np.swapaxes(weighted, -1, -2)
+    gradient = (weighted @ residual.reshape(len(T), 2 * p.shape[1], 1))[..., 0]
+    return np.where(seen, squared.sum(axis=-1), np.inf), gradient, weighted @ J
+
+
+def covariances(information: FloatArray) -> FloatArray:
+    """Covariances (B, 6, 6); where nothing is known of some direction, the pseudo-inverse would hide it: inf."""
+    scale = np.sqrt(np.maximum(np.einsum('...ii->...i', information), 1e-300))
+    scale = scale[..., :, None] * scale[..., None, :]
+    # The ridge is below the rounding of what is known, and keeps what is not from being exactly singular.
+    inflation = np.linalg.inv(information / scale + 1e-14 * np.eye(6))
+    own = np.einsum('...ii->...i', inflation)
+    known = np.all((own > 0.0) & (own < _UNKNOWN), axis=-1)
+    covariance = 0.5 * (inflation + np.swapaxes(inflation, -1, -2)) / scale
+    return np.where(known[..., None, None], covariance, np.inf)
+
+
+def _moved(T: FloatArray, step: FloatArray) -> FloatArray:
+    """Poses (B, 4, 4) after steps (B, 6): translation added, rotation from the left.
+
+    The rotation is that of Cayley's transform, which differs from the exponential in the third order only.
+    """
+    half = 0.5 * step[:, 3:]
+    K = (half @ _SKEW).reshape(-1, 3, 3)
+    moved = T.copy()
+    turn = (2.0 / (1.0 + np.sum(half * half, axis=-1)))[:, None, None] * (K + K @ K)
+    moved[:, :3, :3] += turn @ T[:, :3, :3]
+    moved[:, :3, 3] += step[:, :3]
+    return moved
+
+
+def _solve(information: FloatArray, damping: FloatArray, gradient: FloatArray) -> FloatArray:
+    damped = information.copy()
+    diagonal = np.einsum('bii->bi', damped)
+    floor = 1e-12 * np.maximum(diagonal.max(axis=-1, keepdims=True), 1e-12)
+    diagonal += damping[:, None] * diagonal + floor
+    return np.asarray(np.linalg.solve(damped, gradient[..., None])[..., 0])

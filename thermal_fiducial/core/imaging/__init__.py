@@ -1,0 +1,1 @@
+"""``tau2_camera``: clean counts from raw thermal frames."""

@@ -1,0 +1,139 @@
+"""A map from frames in any order: photos of a place, or the detections of a whole run at once."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.detection.marker_rows import marker_rows
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
+from thermal_fiducial.core.geometry.se3 import rotation_angle
+from thermal_fiducial.core.mapping.bundle_adjustment import refine, Refinement, Snapshot
+from thermal_fiducial.core.mapping.candidates import DECISIVE, SAME_FIT
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.measurements import Markers
+from thermal_fiducial.core.types import FloatArray, IntArray
+
+# Passes over all frames: more than any chain of markers needs of which each is seen with the last alone.
+_MAX_PASSES = 50
+# What a rival pose starts its joint adjustment with: as good as unknown.
+_UNKNOWN = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
+
+
+@dataclass(frozen=True)
+class Built:
+    """A map from frames, and how it came out."""
+
+    map: MarkerMap
+    #: the last joint adjustment; None: there was nothing to adjust
+    refinement: Refinement | None
+    #: markers that were seen but could not be placed, with the reason in words
+    unplaced: dict[int, str]
+    #: frames that gave a camera pose in the end
+    frames_used: int
+
+
+def build_map(
+    frames: Sequence[Markers],
+    camera: Camera,
+    marker_map: MarkerMap,
+    config: MarkerMapperConfig,
+    progress: Callable[[int], None] = lambda markers: None,
+) -> Built:
+    """Grow ``marker_map`` by all markers that hang together with it, and adjust all jointly.
+
+    The frames are shown to the mapper again and again, for as long as any brings a new marker: a frame in which
+    nothing is known yet may be the link to the rest later. Where views alone leave two poses of a marker, the joint
+    adjustment of either decides.
+
+    Parameters
+    ----------
+    frames : rows of MARKER_DTYPE of each frame
+    progress : is told the number of markers in the map after each pass
+    """
+    config = replace(config, mode='mapping', keyframe_budget=max(len(frames), config.keyframe_budget))
+    mapper = MarkerMapper(config, marker_map)
+    used, refinement = 0, None
+    waiting: dict[int, str] = {}
+    for _ in range(_MAX_PASSES):
+        before = len(mapper.map.markers)
+        used = 0
+        for k, rows in enumerate(frames):
+            result = mapper.process(_stamp(k), rows, camera)
+            waiting |= result.candidates
+            used += result.pose is not None
+        refinement = mapper.refine() or refinement
+        progress(len(mapper.map.markers))
+        if len(mapper.map.markers) == before and not _settle(mapper, camera):
+            break
+    unplaced = {key: why for key, why in waiting.items() if key not in mapper.map.markers}
+    return Built(_with_statistics(mapper.map, frames, marker_map), refinement, unplaced, used)
+
+
+def rows_from_corners(
+    ids: IntArray, corners: FloatArray, covariances: FloatArray, sizes: FloatArray, camera: Camera
+) -> Markers:
+    """Rows (N,) of MARKER_DTYPE by rising ID of markers known by their corners alone, as in a file of detections.
+
+    Parameters
+    ----------
+    ids, sizes : (N,), (N,) [m]
+    corners, covariances : (N, 4, 2) [px], (N, 4, 2, 2) [px^2]
+    """
+    return marker_rows(ids, corners, covariances, solve_marker_poses(corners, covariances, sizes, camera))
+
+
+def _stamp(k: int) -> int:
+    """Stamp of frame k, in every pass the same; seconds apart, since unordered frames have no continuity."""
+    return (k + 1) * 1_000_000_000
+
+
+def _settle(mapper: MarkerMapper, camera: Camera) -> bool:
+    """Decide between the rival poses of a candidate by adjusting the map jointly with either; whether one was."""
+    snapshot = mapper.snapshot()
+    if snapshot is None:
+        return False
+    for candidate in mapper.candidates.values():
+        winner = decide(snapshot, candidate.id, candidate.size, candidate.solutions(camera)[:2])
+        if winner is not None:
+            mapper.enter(candidate.views[-1].stamp_ns, candidate, winner.T_map_marker, winner.covariance)
+            mapper.map.version += 1
+            return True
+    return False
+
+
+def decide(snapshot: Snapshot, marker_id: int, size: float, rivals: Sequence[FloatArray]) -> MapMarker | None:
+    """The new marker at that one of the ``rivals``, poses (4, 4), which the joint adjustment prefers decisively."""
+    outcomes = []
+    for T in rivals:
+        trial = MapMarker(marker_id, size, False, T, _UNKNOWN)
+        refinement = refine(replace(snapshot, markers={**snapshot.markers, marker_id: trial}))
+        if refinement is not None and marker_id in refinement.markers:
+            outcomes.append((refinement.cost, refinement.markers[marker_id]))
+    if not outcomes:
+        return None
+    outcomes.sort(key=lambda outcome: outcome[0])
+    cost, best = outcomes[0]
+    for other_cost, other in outcomes[1:]:
+        apart = rotation_angle(best.T_map_marker[:3, :3].T @ other.T_map_marker[:3, :3])
+        if apart > SAME_FIT and other_cost - cost < DECISIVE:
+            return None
+    return best
+
+
+def _with_statistics(built: MarkerMap, frames: Sequence[Markers], start: MarkerMap) -> MarkerMap:
+    """Observations counted once, however often the frames were shown; stamps of made-up times left out."""
+    ids, counts = np.unique(np.concatenate([rows['id'] for rows in frames]), return_counts=True)
+    seen = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+    for key, marker in built.markers.items():
+        earlier = start.markers.get(key)
+        built.markers[key] = replace(
+            marker,
+            observations=seen.get(key, 0) + (earlier.observations if earlier else 0),
+            first_seen_ns=earlier.first_seen_ns if earlier else 0,
+            last_seen_ns=earlier.last_seen_ns if earlier else 0,
+        )
+    return built

@@ -1,0 +1,446 @@
+"""The incremental marker map: Algorithm 1 of the paper.
+
+S. Khattak, C. Papachristos, K. Alexis, "Marker based thermal-inertial localization for aerial robots in obscurant
+filled environments", ISVC 2018. For every frame: split the markers into known and new, find the camera from all known
+ones jointly, weight each by its present and running re-projection error, refine, update the errors, and place new
+markers that are seen together with known ones. Beyond the paper: planar ambiguities are settled before anything rests
+on them, covariances carry the map's own uncertainty, and markers that stop agreeing are put in quarantine.
+"""
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from thermal_fiducial.config import MarkerMapperConfig, size_overrides
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise, reproject
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.mapping.bridging import link
+from thermal_fiducial.core.mapping.bundle_adjustment import prior_poses, refine, Refinement, Snapshot
+from thermal_fiducial.core.mapping.candidates import Candidate, View, Viewpoint
+from thermal_fiducial.core.mapping.correction import correction
+from thermal_fiducial.core.mapping.keyframes import in_moved_map, Keyframe, KeyframeStore, Rig
+from thermal_fiducial.core.mapping.localization import locate, Location, positive, Refusal, Sight
+from thermal_fiducial.core.mapping.located import Located, LocatedFrame
+from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
+from thermal_fiducial.core.mapping.map_editing import align
+from thermal_fiducial.core.mapping.map_rows import marker_poses, usable
+from thermal_fiducial.core.mapping.motion import CameraMotion
+from thermal_fiducial.core.mapping.noise_level import NoiseLevel
+from thermal_fiducial.core.mapping.odometry_prior import ClockDifference, contradicts, Expected, Fused, growth, together
+from thermal_fiducial.core.mapping.trust import culprits, DISAGREEMENT, Trust
+from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers, Odometry
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+
+__all__ = ['MapJump', 'MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
+
+#: A pose of the past tells rival poses apart for this long [ns].
+CONTINUITY_NS = 300_000_000
+#: Keyframes whose poses by the odometry are off alike: together they tell no more than one.
+ALIKE = 30.0
+#: Factor on the variance of what a camera pose owes to the map: of all frames of the same markers that error is the
+#: same, while whoever takes in the poses lets their errors average out.
+LASTING = 3.0
+#: Why nothing is learned from a frame that has a pose.
+ASTRAY = 'the known markers in view contradict the odometry'
+#: What a marker's corners are off by in all views alike (its shape, the edge's model), as a share of their noise:
+#: as measured on rendered flights with three lenses and 0.5 to 9 K.
+LASTING_SHARE = 0.7
+#: Corner errors to allow for before a marker is said to disagree with the others [px].
+TOLERANCE_PX = 0.3
+#: Candidates that are judged in one frame: bounds its time when many are new.
+TRIALS = 3
+# Last frames that tell how the map has moved where the robot is, each so many-th of them: neighbours tell the same.
+_RECENT, _EVERY = 10, 3
+# A candidate is judged again when its views have grown by one in so many.
+_PATIENCE = 6
+# A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
+_GROWTH, _FEW = 0.2, 15
+
+
+class MarkerMapper:
+    """Camera pose from the map, and the map from camera poses.
+
+    Parameters
+    ----------
+    config : sizes, mode, extrinsics
+    marker_map : the map to start from, with at least one marker; it is copied
+    """
+
+    def __init__(self, config: MarkerMapperConfig, marker_map: MarkerMap) -> None:
+        self.config = config
+        self._sizes = size_overrides(config.marker_size_overrides)
+        self._T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
+        #: no new markers, no changes of the map, while True
+        self.frozen = config.mode == 'localization'
+        self.resets = 0
+        self._begin(marker_map)
+
+    def reset(self) -> MapJump | None:
+        """Back to the map that it was started with; see :meth:`load`."""
+        return self.load(self._initial)
+
+    def load(self, marker_map: MarkerMap) -> MapJump | None:
+        """Go on with another map of the place, of the next version; what was seen before is forgotten.
+
+        Returns
+        -------
+        The jump from the old map to the new by the markers that both have; None where they have none.
+        """
+        try:
+            T_new_old = align(marker_map.markers, self.map.markers).T
+        except InputError:
+            T_new_old = None
+        self._begin(replace(marker_map, version=max(self.map.version, marker_map.version) + 1))
+        self.resets += 1
+        return None if T_new_old is None else MapJump(self.map.version, self.resets, T_new_old)
+
+    def _begin(self, marker_map: MarkerMap) -> None:
+        self._initial, self.map = marker_map.copy(), marker_map.copy()
+        self._candidates: dict[int, Candidate] = {}
+        self._trust = Trust()
+        self._quarantined = {key for key, marker in self.map.markers.items() if not marker.trusted}
+        self._last: CameraPose | None = None
+        #: whether odometry has been in this map
+        self._odometry_agreed = False
+        self._motion = CameraMotion()
+        self._clocks = ClockDifference()
+        self._recent: deque[Keyframe] = deque(maxlen=_RECENT)
+        self._belief: FloatArray | None = None
+        self._cameras: list[Camera] = []
+        self._noise = NoiseLevel()
+        self._gap: CameraPose | None = None
+        self._keyframes = KeyframeStore(self.config.keyframe_budget)
+        self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(self.map.markers)
+        self._frames_then = 0
+
+    def process(
+        self, stamp_ns: int, markers: Markers, camera: Camera, odometry: Odometry | None = None
+    ) -> MapperResult:
+        """One frame of Algorithm 1.
+
+        Parameters
+        ----------
+        markers : (N,) of MARKER_DTYPE
+        camera : its intrinsics
+        odometry : the filter's latest output; settles ambiguities, and bridges gaps between known markers
+        """
+        return self.learn(self.locate(stamp_ns, markers, camera, odometry))
+
+    def locate(self, stamp_ns: int, markers: Markers, camera: Camera, odometry: Odometry | None = None) -> LocatedFrame:
+        """The first half of :meth:`process`, which ends with the pose: whoever waits for that need wait no longer."""
+        markers = usable(markers)
+        self._noise.add(markers)
+        # Step 2: known and new markers.
+        is_known = np.array([int(key) in self.map.markers for key in markers['id']], dtype=bool)
+        known = self._sight(markers[is_known])
+        trusted = np.array([marker.trusted for marker in known.markers], dtype=bool)
+        # Steps 3 to 6: the camera from all known ones, weighted by their errors.
+        expected = self._expected(stamp_ns, odometry)
+        outcome = self._locate(stamp_ns, known.select(trusted), camera, expected)
+        return LocatedFrame(stamp_ns, camera, markers, is_known, known, trusted, expected, outcome)
+
+    def learn(self, frame: LocatedFrame) -> MapperResult:
+        """The second half: errors, standings and new markers, from the frame that was located last."""
+        expected = frame.expected
+        if isinstance(frame.outcome, Refusal):
+            changed, waiting = self._without_pose(frame, frame.outcome)
+            return self._result(frame, changed, waiting=waiting)
+        location, pose = frame.outcome.location, frame.outcome.pose
+        if expected is not None:
+            astray = contradicts(pose.T_map_camera, pose.covariance, expected.pose)
+            if astray and self._odometry_agreed:
+                # A marker that was moved, or that hangs in two places: what it teaches would spoil the map.
+                return self._result(frame, False, waiting=dict.fromkeys(frame.new['id'].tolist(), ASTRAY))
+            self._odometry_agreed |= not astray
+            self._clocks.learn(expected, pose.T_map_camera, pose.covariance)
+        self._last, self._gap = pose, None
+        # Step 7: errors updated.
+        errors = self._update_errors(frame, location)
+        changed = self._judge(frame, errors, location)
+        # Step 8: new markers placed relative to the camera.
+        waiting = {}
+        if not self.frozen:
+            fused = _fused(location, expected)
+            self._keep(frame, pose, fused)
+            placed, waiting = self._place_new(frame, _viewpoint(fused))
+            changed |= placed
+        residuals = {marker.id: float(error) for marker, error in zip(frame.known.markers, errors, strict=True)}
+        return self._result(frame, changed, residuals, waiting)
+
+    def _expected(self, stamp_ns: int, odometry: Odometry | None) -> Expected | None:
+        if odometry is None or abs(stamp_ns - odometry.stamp_ns) >= CONTINUITY_NS:
+            return None
+        return self._clocks.expected(odometry, stamp_ns, self._T_body_camera)
+
+    def _locate(self, stamp_ns: int, sight: Sight, camera: Camera, expected: Expected | None) -> Located | Refusal:
+        if not sight.markers:
+            return Refusal(self._nothing_known())
+        errors = self._trust.running_errors(sight.markers)
+        location = locate(sight, errors, camera, self._prior(stamp_ns, expected))
+        if isinstance(location, Refusal):
+            return location
+        covariance = location.covariance + self._motion.unknown(stamp_ns, location.T_map_camera)
+        covariance = covariance + (LASTING - 1.0) * location.map_covariance
+        ids = tuple(marker.id for marker in sight.markers)
+        return Located(location, CameraPose(stamp_ns, location.T_map_camera, covariance, ids, location.rms_px))
+
+    def _nothing_known(self) -> str:
+        if not self.map.markers:
+            return 'the map has no marker: give a map file with at least one'
+        return 'no known marker in view'
+
+    def _prior(self, stamp_ns: int, expected: Expected | None) -> FloatArray | None:
+        """T_map_camera that is expected from the filter or, for a short while, from the last pose."""
+        if expected is not None:
+            return expected.pose.T_map_camera
+        if self._last is not None and 0 < stamp_ns - self._last.stamp_ns < CONTINUITY_NS:
+            return self._last.T_map_camera
+        return None
+
+    def _sight(self, rows: Markers) -> Sight:
+        branches = np.stack([marker_poses(rows, ''), marker_poses(rows, 'a')], axis=1)
+        known = [self.map.markers[int(key)] for key in rows['id'] if int(key) in self.map.markers]
+        return Sight(known, corners_px(rows), self._noise.factor * corner_covariances(rows), branches)
+
+    def _update_errors(self, frame: LocatedFrame, location: Location) -> FloatArray:
+        """Re-projection error (N,) [px] of each known marker, taken into its statistics."""
+        known, camera = frame.known, frame.camera
+        points = corners_in_map(known.T_map_marker, known.sizes)
+        residuals = known.corners - reproject(camera, location.T_map_camera, points)
+        squared = np.mean(np.sum(residuals**2, axis=-1), axis=-1)
+        errors = np.sqrt(np.where(np.isfinite(squared), squared, float(camera.width) ** 2))
+        self._trust.add_errors(known.markers, errors)
+        if not self.frozen:
+            for marker in known.markers:
+                self.map.markers[marker.id] = marker.seen(frame.stamp_ns, self._trust.running_error(marker))
+        return np.asarray(errors)
+
+    def _judge(self, frame: LocatedFrame, errors: FloatArray, location: Location) -> bool:
+        """Quarantine markers that persistently disagree; whether any standing changed."""
+        known = frame.known
+        if len(known.markers) < 2:
+            return False
+        disagrees = errors > DISAGREEMENT * _expected_errors(known, location, frame.camera)
+        blamed = culprits(disagrees, frame.trusted, known.markers)
+        changes = self._trust.judge(known.markers, blamed.tolist())
+        for marker_id, trusted_now in changes.items():
+            self._set_standing(marker_id, trusted=trusted_now)
+        return bool(changes)
+
+    def _set_standing(self, marker_id: int, *, trusted: bool) -> None:
+        self.map.markers[marker_id] = replace(self.map.markers[marker_id], trusted=trusted)
+        (self._quarantined.discard if trusted else self._quarantined.add)(marker_id)
+
+    def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, dict[int, str]]:
+        """Show new markers to their candidates; whether any entered the map, and what the others wait for."""
+        rows = frame.new
+        branches = np.stack([marker_poses(rows, ''), marker_poses(rows, 'a')], axis=1)
+        corners, covariances = corners_px(rows), self._noise.factor * corner_covariances(rows)
+        shown = []
+        for i, marker_id in enumerate(int(key) for key in rows['id']):
+            size = self._sizes.get(marker_id, self.config.marker_size)
+            candidate = self._candidates.setdefault(marker_id, Candidate(marker_id, size))
+            candidate.add(View(frame.stamp_ns, viewpoint, corners[i], covariances[i], branches[i]))
+            shown.append(candidate)
+        placed = False
+        for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:
+            if candidate.untried <= len(candidate.views) // _PATIENCE:
+                continue
+            placement = candidate.place(frame.camera)
+            candidate.reason = placement.reason
+            if placement.T_map_marker is not None:
+                self.enter(frame.stamp_ns, candidate, placement.T_map_marker, placement.covariance)
+                placed = True
+        self.map.version += placed
+        return placed, {candidate.id: candidate.reason for candidate in shown if candidate.id in self._candidates}
+
+    def _keep(self, frame: LocatedFrame, pose: CameraPose, fused: Fused) -> None:
+        """Keep the frame for the refinement; of one marker alone nothing can be learned."""
+        pose = replace(pose, T_map_camera=fused.T_map_camera)
+        self._last_frame = _keyframe(frame.rows, pose, self._camera_index(frame.camera), frame.expected)
+        self._belief = None if frame.expected is None else frame.expected.pose.covariance
+        self._recent.append(self._last_frame)
+        if len(frame.rows) >= 2:
+            self._keyframes.add(self._last_frame)
+
+    def _camera_index(self, camera: Camera) -> int:
+        """Index of ``camera`` among those seen so far: a calibration may change, or frames of several cameras come."""
+        for index, known in enumerate(self._cameras):
+            if camera is known or camera.matches(known):
+                return index
+        self._cameras.append(camera)
+        return len(self._cameras) - 1
+
+    def _without_pose(self, frame: LocatedFrame, refusal: Refusal) -> tuple[bool, dict[int, str]]:
+        """What a frame without a pose may still teach of new markers."""
+        expected = frame.expected
+        if self.frozen or not len(frame.new):
+            return False, {}
+        if refusal.rivals is not None and refusal.covariances is not None:
+            return self._place_new(frame, Viewpoint(refusal.rivals, refusal.covariances))
+        if expected is None or self._last is None:
+            return False, {}
+        if not 0 <= frame.stamp_ns - self._last.stamp_ns <= self.config.bridge_duration * 1e9:
+            return False, {}
+        return self._bridge(frame, expected)
+
+    def _bridge(self, frame: LocatedFrame, expected: Expected) -> tuple[bool, dict[int, str]]:
+        """Place new markers from the odometry while no known one is in view."""
+        pose, rows = expected.pose, frame.new
+        keyframe = _keyframe(rows, pose, self._camera_index(frame.camera), expected)
+        if not any(int(key) in self._candidates for key in rows['id']):
+            # Nothing but the odometry joins these markers to the map. Once is enough: its error is the same for all
+            # that follow, which hang together through the markers themselves.
+            self._keyframes.add(self._last_frame)
+            self._keyframes.links.append(link(self._last_frame, keyframe, pose.covariance))
+            self._keyframes.add(keyframe)
+        elif len(rows) >= 2:
+            self._keyframes.add(keyframe)
+        if self._gap is None:
+            self._gap = pose
+        # What the odometry had gathered when the gap's first marker came is the same for all its views.
+        viewpoint = Viewpoint.known(pose.T_map_camera, growth(self._gap, expected))
+        return self._place_new(frame, replace(viewpoint, common=self._gap.covariance))
+
+    def refinement_due(self, stamp_ns: int) -> bool:
+        """Whether enough has been seen since the last joint refinement for another to be worth its time."""
+        period = self.config.refinement_period
+        if self.frozen or not self._keyframes.frames or period == 0.0 or stamp_ns - self._refined_ns < period * 1e9:
+            return False
+        enough = self._keyframes.added - self._frames_then >= _GROWTH * self._refined_frames + _FEW
+        return enough or len(self.map.markers) > self._refined_markers
+
+    def snapshot(self) -> Snapshot | None:
+        """What a refinement works on, for ``bundle_adjustment.refine``; None: nothing yet.
+
+        The snapshot is immutable: the refinement may run elsewhere while frames are processed.
+        """
+        if not self._keyframes.frames:
+            return None
+        frames = tuple(self._keyframes.frames.values())
+        self._refined_ns = frames[-1].stamp_ns
+        self._refined_frames, self._refined_markers = len(frames), len(self.map.markers)
+        self._frames_then = self._keyframes.added
+        return Snapshot(
+            {key: marker for key, marker in self.map.markers.items() if marker.trusted},
+            frames,
+            Rig(tuple(self._cameras), np.broadcast_to(np.eye(4), (len(self._cameras), 4, 4))),
+            tuple(self._keyframes.links),
+            prior_poses(self._initial.markers),
+            self.map.version,
+            LASTING_SHARE,
+        )
+
+    def refine(self) -> Refinement | None:
+        """Refine here and now, and take it over: for tools, and wherever time doesn't press."""
+        snapshot = self.snapshot()
+        refinement = refine(snapshot) if snapshot is not None else None
+        if refinement is not None:
+            self.apply(refinement)
+        return refinement
+
+    def apply(self, refinement: Refinement) -> MapJump | None:
+        """Take over a refinement: markers, keyframes, candidates and the last pose move together.
+
+        Returns
+        -------
+        The jump, to be told to whoever holds poses in the map; None where the map is frozen, or was replaced since.
+        """
+        if self.frozen or refinement.map_version < self._initial.version:
+            return None
+        before = dict(self.map.markers)
+        for marker_id, adjusted in refinement.markers.items():
+            marker = self.map.markers.get(marker_id)
+            if marker is not None and marker.trusted:
+                self.map.markers[marker_id] = replace(
+                    marker, T_map_marker=adjusted.T_map_marker, covariance=adjusted.covariance
+                )
+                if marker_id in refinement.inconsistent:
+                    self._trust.accuse(marker)
+                    self._set_standing(marker_id, trusted=False)
+        displacement = self._keyframes.move(refinement.keyframes)
+        for candidate in self._candidates.values():
+            candidate.move(displacement)
+        T_new_old = np.eye(4)
+        if self._last is not None:
+            T_new_old = correction(tuple(self._recent)[::_EVERY], self._cameras, before, self.map.markers, self._belief)
+            self._recent = deque((in_moved_map(frame, T_new_old) for frame in self._recent), maxlen=_RECENT)
+            self._last = replace(self._last, T_map_camera=T_new_old @ self._last.T_map_camera)
+            self._motion = CameraMotion()
+            self._last_frame = in_moved_map(self._last_frame, T_new_old)
+        self.map.version += 1
+        self.resets += 1
+        return MapJump(self.map.version, self.resets, T_new_old)
+
+    @property
+    def candidates(self) -> dict[int, Candidate]:
+        """Markers on trial."""
+        return dict(self._candidates)
+
+    def enter(self, stamp_ns: int, candidate: Candidate, T_map_marker: FloatArray, covariance: FloatArray) -> None:
+        """Take a candidate into the map."""
+        self._candidates.pop(candidate.id, None)
+        self._trust.forget([candidate.id])
+        self.map.markers[candidate.id] = MapMarker(
+            candidate.id, candidate.size, False, T_map_marker, covariance, first_seen_ns=stamp_ns, last_seen_ns=stamp_ns
+        )
+
+    def _result(
+        self,
+        frame: LocatedFrame,
+        changed: bool,
+        residuals: dict[int, float] | None = None,
+        waiting: dict[int, str] | None = None,
+    ) -> MapperResult:
+        return MapperResult(
+            frame.stamp_ns,
+            frame.pose,
+            frame.outcome.reason,
+            changed,
+            residuals or {},
+            waiting or {},
+            tuple(sorted(self._quarantined)),
+            self.map.version,
+            self.resets,
+        )
+
+
+def _fused(location: Location, expected: Expected | None) -> Fused:
+    lasting = positive(location.covariance - location.relative_covariance)
+    if expected is None:
+        return Fused(location.T_map_camera, location.relative_covariance, lasting)
+    return together(location.T_map_camera, location.relative_covariance, lasting, expected.pose)
+
+
+def _viewpoint(fused: Fused) -> Viewpoint:
+    return replace(Viewpoint.known(fused.T_map_camera, fused.changing), common=fused.lasting)
+
+
+def _keyframe(rows: Markers, pose: CameraPose, camera: int, expected: Expected | None) -> Keyframe:
+    frame = Keyframe(
+        pose.stamp_ns,
+        pose.T_map_camera,
+        rows['id'].astype(np.int64),
+        corners_px(rows),
+        corner_covariances(rows),
+        np.full(len(rows), camera),
+    )
+    if expected is None:
+        return frame
+    information = np.asarray(np.linalg.inv(ALIKE * expected.pose.covariance), dtype=np.float64)
+    return replace(frame, T_odometry=expected.pose.T_map_camera, information=information)
+
+
+def _expected_errors(known: Sight, location: Location, camera: Camera) -> FloatArray:
+    """Rms error (N,) [px] that the noise, the pose and the map's own uncertainty explain."""
+    n = len(known.markers)
+    T = np.broadcast_to(location.T_map_camera, (n, 4, 4))
+    _, J_camera, J_marker = linearise(camera, T, known.T_map_marker, known.sizes)
+    noise = np.trace(known.covariances, axis1=-2, axis2=-1).sum(axis=-1)
+    pose = np.sum(J_camera @ location.covariance * J_camera, axis=(1, 2))
+    marker = np.sum(J_marker @ known.map_covariances * J_marker, axis=(1, 2))
+    variance = 0.25 * (noise + pose + marker)
+    return np.asarray(np.sqrt(np.nan_to_num(variance) + TOLERANCE_PX**2))

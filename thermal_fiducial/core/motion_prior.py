@@ -1,0 +1,69 @@
+"""What the filter hands to the stages before it: its latest states, and the offset between the two clocks.
+
+The filter alone estimates motion and clock offset once it runs. Detector and mapper ask this one record of it, by the
+stamps of their frames.
+"""
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable
+
+from thermal_fiducial.core.measurements import Odometry
+
+# Frames come no later than this; nothing older is kept [ns].
+_KEPT_NS = 500_000_000
+# Stamps that go back farther are those of another clock, or of a bag that starts anew.
+_RESTART_NS = 1_000_000_000
+
+
+class MotionPrior:
+    """States in the order of their stamps, each read only when somebody wants it, and the camera's clock.
+
+    Parameters
+    ----------
+    camera_time_offset : offset of the clocks to begin with, t_odometry = t_camera + offset [s]
+    """
+
+    def __init__(self, camera_time_offset: float = 0.0) -> None:
+        self._stamps_ns: list[int] = []
+        self._readers: list[Callable[[], Odometry]] = []
+        self._offset_ns = round(camera_time_offset * 1e9)
+        #: whether the filter has estimated the offset of the clocks: before that it is the parameter's
+        self.clock_is_known = False
+
+    def set_clock_offset(self, seconds: float) -> None:
+        """Take over the filter's estimate, t_odometry = t_camera + ``seconds`` [s]."""
+        self._offset_ns = round(seconds * 1e9)
+        self.clock_is_known = True
+
+    def in_odometry_clock(self, camera_stamp_ns: int) -> int:
+        """The instant of a frame in the clock of the odometry [ns]."""
+        return camera_stamp_ns + self._offset_ns
+
+    def add(self, stamp_ns: int, read: Callable[[], Odometry]) -> None:
+        """Keep the state of a stamp, which ``read`` gives."""
+        if self._stamps_ns and stamp_ns < self._stamps_ns[-1] - _RESTART_NS:
+            self._stamps_ns, self._readers = [], []
+        place = bisect_right(self._stamps_ns, stamp_ns)
+        self._stamps_ns.insert(place, stamp_ns)
+        self._readers.insert(place, read)
+        if self._stamps_ns[-1] - self._stamps_ns[0] > 2 * _KEPT_NS:
+            old = bisect_left(self._stamps_ns, self._stamps_ns[-1] - _KEPT_NS)
+            del self._stamps_ns[:old], self._readers[:old]
+
+    def latest(self) -> Odometry | None:
+        """The newest state; None when there is none."""
+        return self._readers[-1]() if self._readers else None
+
+    def nearest(self, stamp_ns: int) -> Odometry | None:
+        """The state whose stamp, in the clock of the odometry, is nearest."""
+        place = bisect_left(self._stamps_ns, stamp_ns)
+        around = range(max(place - 1, 0), min(place + 1, len(self._stamps_ns)))
+        best = min(around, key=lambda index: abs(self._stamps_ns[index] - stamp_ns), default=None)
+        return None if best is None else self._readers[best]()
+
+    def between(self, first_ns: int, last_ns: int, at_most: int) -> list[Odometry]:
+        """States from the first to the last stamp, of more than ``at_most`` so many, as evenly apart as can be."""
+        first, last = bisect_left(self._stamps_ns, first_ns), bisect_right(self._stamps_ns, last_ns)
+        count = last - first
+        kept = min(count, at_most)
+        return [self._readers[first + place * (count - 1) // max(kept - 1, 1)]() for place in range(kept)]

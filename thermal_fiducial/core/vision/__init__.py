@@ -1,1 +1,0 @@
-"""Seeing markers in a frame: search, reading, sharpening, rows."""
