@@ -1,18 +1,22 @@
 # make demo    set everything up and run the main job: simulate, replay through the four nodes, score, report
 # make test    set everything up, check the code and run all tests
 # make bench   accuracy and speed against OpenCV and a batch smoother, in the same run
-# make tables  put measured tables, parameters and pictures into the README
+# make tables  put measured tables and parameters into the documents
+# make docs    build the documentation as a web site in build/site; a link that leads nowhere fails it
 PYTHON ?= $(firstword $(foreach version,3.12 3.11,$(if $(shell python$(version) -c 'import venv, ensurepip' 2>/dev/null && echo yes),python$(version))) python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DOCS := $(VENV)/.docs
 
 # Traffic stays on this machine; small matrices are slower on many threads than on one.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
+# A notice of the theme about its successor.
+export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help demo test lint bench tables format clean
+.PHONY: help demo test lint bench tables docs format clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -47,6 +51,14 @@ bench: $(READY)
 tables: $(READY)
 	THERMAL_FIDUCIAL_TABLES=1 $(BIN)/python -m pytest --quiet test/real
 	$(BIN)/python test/bench/readme.py
+
+$(DOCS): setup.py $(READY)
+	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+	@touch $@
+
+docs: $(DOCS)
+	@echo '== Documentation: build/site/index.html'
+	$(BIN)/python -m mkdocs build --strict --quiet
 
 format: $(READY)
 	$(BIN)/ruff check --fix .

@@ -32,6 +32,7 @@ setup(
         'tools': ['scipy', 'rich', 'matplotlib', 'ezdxf', 'jinja2'],
         'test': ['pytest', 'shapely', 'hypothesis', 'pytest-benchmark', 'pytest-xdist', 'evo'],
         'lint': ['ruff', 'mypy', 'import-linter', 'types-PyYAML'],
+        'docs': ['mkdocs-material==9.8.1', 'mkdocstrings[python]==1.0.8'],
         'colcon': ['colcon-core', 'colcon-ros', 'colcon-python-setup-py', 'colcon-bash'],
     },
     python_requires='>=3.11',

@@ -30,7 +30,7 @@ def measured():
     rows = []
     yield lambda *row: rows.append(row)
     if rows and os.environ.get('THERMAL_FIDUCIAL_TABLES'):
-        table = Path(__file__).resolve().parents[1] / '.doc' / 'tables' / 'real.md'
+        table = Path(__file__).resolve().parents[1] / 'doc' / 'tables' / 'real.md'
         lines = [('real data', 'goal', 'measured'), ('---', '---', '---'), *rows]
         table.write_text(''.join(f'| {" | ".join(map(str, line))} |\n' for line in lines))
 

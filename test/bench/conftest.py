@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 
-TABLES = Path(__file__).resolve().parents[2] / '.doc' / 'tables'
+TABLES = Path(__file__).resolve().parents[2] / 'doc' / 'tables'
 
 
 @pytest.fixture
 def write_table(request):
-    """Write rows of cells, the first one the head, as ``.doc/tables/NAME.md``; only benchmarks proper do."""
+    """Write rows of cells, the first one the head, as ``doc/tables/NAME.md``; only benchmarks proper do."""
     if not request.config.getoption('benchmark_only'):
         pytest.skip('a measurement of minutes: make bench')
 

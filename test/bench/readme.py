@@ -1,7 +1,7 @@
-"""Regenerates the tables of the README and the parameter file: ``python test/bench/readme.py`` (``make tables``).
+"""Regenerates the tables of the documents and the parameter file: ``python test/bench/readme.py`` (``make tables``).
 
 A table stands between ``<!-- NAME -->`` and ``<!-- end -->``. Parameters come from ``config.py``; measured tables
-from the Markdown files that the benchmarks leave in ``.doc/tables/``.
+from the Markdown files that the benchmarks leave in ``doc/tables/``.
 """
 
 import json
@@ -12,6 +12,7 @@ from thermal_fiducial.config import NODES, parameters
 from thermal_fiducial.ros.parameter_file import parameter_file
 
 ROOT = Path(__file__).resolve().parents[2]
+PAGES = (ROOT / 'doc' / 'accuracy.md', ROOT / 'doc' / 'nodes.md')
 
 
 def parameter_table(config: type) -> str:
@@ -27,7 +28,7 @@ def parameter_table(config: type) -> str:
 
 def tables() -> dict[str, str]:
     """Name to Markdown of every table that can be made now."""
-    measured = {path.stem: path.read_text().strip() for path in sorted((ROOT / '.doc' / 'tables').glob('*.md'))}
+    measured = {path.stem: path.read_text().strip() for path in sorted((ROOT / 'doc' / 'tables').glob('*.md'))}
     return measured | {f'parameters {name}': parameter_table(config) for name, config in NODES.items()}
 
 
@@ -40,7 +41,7 @@ def spliced(text: str, contents: dict[str, str]) -> str:
 
 
 if __name__ == '__main__':
-    readme = ROOT / 'README.md'
-    readme.write_text(spliced(readme.read_text(), tables()))
-    print(f'{readme.name}: {len(tables())} tables')
+    contents = tables()
+    for page in PAGES:
+        page.write_text(spliced(page.read_text(), contents))
     (ROOT / 'config' / 'thermal_fiducial.yaml').write_text(parameter_file())

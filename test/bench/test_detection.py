@@ -22,7 +22,7 @@ from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.render import Quality
 from thermal_fiducial.sim.scenario import named
 
-PLOT = Path(__file__).resolve().parents[2] / '.doc' / 'detection.png'
+PLOT = Path(__file__).resolve().parents[2] / 'doc' / 'figures' / 'detection.png'
 SECONDS, SEED = 20.0, 21
 #: Two stretches of flight, clear of the shutter; the first frames of each are for the motion estimate to settle.
 STRETCHES = ((120, 138), (300, 318))
