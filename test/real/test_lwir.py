@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import Tau2CameraConfig
-from thermal_fiducial.core.imaging.frame_cleaner import EightBitView, FrameCleaner
+from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
+from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.files.camera_info import load_camera
 
 PERIOD_NS = 33_333_333

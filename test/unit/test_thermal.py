@@ -5,14 +5,8 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import Tau2CameraConfig
-from thermal_fiducial.core.imaging.frame_cleaner import (
-    EightBitView,
-    FrameCleaner,
-    FROZEN,
-    REPEATED_STAMP,
-    SETTLING,
-    SHUTTER,
-)
+from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
+from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner, FROZEN, REPEATED_STAMP, SETTLING, SHUTTER
 from thermal_fiducial.errors import InputError
 
 PERIOD_NS = 33_333_333
@@ -427,3 +421,12 @@ def test_the_view_jumps_to_a_scene_that_is_off_its_scale():
 def test_a_flat_scene_is_not_stretched_to_noise():
     picture = EightBitView(Tau2CameraConfig())(noisy(np.full((512, 640), 7000.0), np.random.default_rng(20)))
     assert picture.std() < 12.0  # 1.3 counts of 40
+
+
+@pytest.mark.parametrize('shape', [(16, 16), (16, 17), (17, 16), (33, 641), (512, 641), (19, 23)])
+def test_frames_of_any_size_from_16_pixels_pass(shape):
+    rng = np.random.default_rng(23)
+    camera = Camera()
+    for _ in range(20):
+        frame = noisy(scene(shape=(512, 700))[: shape[0], : shape[1]], rng)
+        assert np.array_equal(camera(frame).counts, frame)

@@ -10,7 +10,7 @@ from sensor_msgs.msg import Image, PointCloud2
 from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.imaging.frame_cleaner import EightBitView
+from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary

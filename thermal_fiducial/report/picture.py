@@ -9,7 +9,8 @@ import numpy as np
 from PIL import Image
 
 from thermal_fiducial.config import Tau2CameraConfig
-from thermal_fiducial.core.imaging.frame_cleaner import EightBitView, FrameCleaner
+from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
+from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, IMAGE_TOPIC

@@ -83,7 +83,8 @@ class BadPixelFinder:
 
 def pixel_noise(counts: Counts) -> float:
     """Standard deviation of the noise between neighbouring pixels [counts], robust, at least half a count."""
-    difference = np.abs(counts[::8, 1::4].astype(np.int32) - counts[::8, 0::4])
+    right = counts[::8, 1::4].astype(np.int32)
+    difference = np.abs(right - counts[::8, 0::4][:, : right.shape[1]])
     return max(0.5, 1.4826 * float(np.median(difference)) / float(np.sqrt(2.0)))
 
 
