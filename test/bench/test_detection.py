@@ -14,7 +14,7 @@ import cv2
 from matplotlib.figure import Figure
 import numpy as np
 import pytest
-from support.scenes import camera_of, detector_of, told
+from support.scenes import camera_of, detector_of, motion_prior
 
 from thermal_fiducial.core.detection import detector as detection
 from thermal_fiducial.core.measurements import corners_px, Odometry
@@ -118,7 +118,7 @@ def our_detector(case, guided):
     camera, detector = camera_of(case.scene), detector_of(case.scene, with_map=guided)
 
     def prepared(frame):
-        return frame, told(*odometry(case, frame, rng)) if guided else None
+        return frame, motion_prior(*odometry(case, frame, rng)) if guided else None
 
     def detect(frame, state):
         rows = detector.detect(frame.stamp_ns, frame.counts, camera, state)

@@ -1,4 +1,4 @@
-"""The camera and the detector of a simulated scenario, and what a filter tells it."""
+"""The camera and the detector of a simulated scenario, and what a filter knows."""
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
@@ -24,9 +24,11 @@ def detector_of(scenario, *, with_map):
     return detector
 
 
-def told(*states):
-    """A log of these states of the filter."""
-    log = MotionPrior()
+def motion_prior(*states, clock_offset=0.0):
+    """What these states of the filter say [s]; None: it doesn't know the offset of the clocks yet."""
+    prior = MotionPrior()
+    if clock_offset is not None:
+        prior.set_clock_offset(clock_offset)
     for state in states:
-        log.add(state.stamp_ns, lambda state=state: state)
-    return log
+        prior.add(state.stamp_ns, lambda state=state: state)
+    return prior

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.scenes import told
+from support.scenes import motion_prior
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import _common_shift, MarkerDetector
@@ -66,7 +66,7 @@ def test_finds_markers_of_the_noise_s_own_contrast():
     for frame in frames(0.05):
         expected += len(frame.corners_px)
         for each in seen:
-            rows = each.detect(frame.stamp_ns, frame.counts, CAMERA, told(odometry(frame)))
+            rows = each.detect(frame.stamp_ns, frame.counts, CAMERA, motion_prior(odometry(frame)))
             truth = np.array([frame.corners_px[marker_id] for marker_id in rows['id'].tolist()]).reshape(-1, 4, 2)
             error = np.linalg.norm((corners_px(rows) - truth).mean(axis=1), axis=-1)
             # A third of a cell: at this contrast a corner is good to a pixel or two, a marker's centre is better.
@@ -78,7 +78,7 @@ def test_finds_markers_of_the_noise_s_own_contrast():
 
 def shape_error(each, shown, counts):
     """Rms of the corners' errors [px] without what each marker's four have in common."""
-    rows = each.detect(shown.stamp_ns, counts, CAMERA, told(odometry(shown)))
+    rows = each.detect(shown.stamp_ns, counts, CAMERA, motion_prior(odometry(shown)))
     truth = np.stack([shown.corners_px[marker_id] for marker_id in rows['id'].tolist()])
     error = corners_px(rows) - truth
     return np.sqrt(np.mean((error - error.mean(axis=1, keepdims=True)) ** 2))
@@ -107,33 +107,19 @@ def test_never_invents_a_marker(noise):
     for index in range(10):
         counts = np.rint(7000 + rng.normal(0, noise, frame.counts.shape)).astype(np.uint16)
         hint = replace(odometry(frame), stamp_ns=frame.stamp_ns + index)
-        assert len(guided.detect(frame.stamp_ns + index, counts, CAMERA, told(hint))) == 0
+        assert len(guided.detect(frame.stamp_ns + index, counts, CAMERA, motion_prior(hint))) == 0
 
 
 def test_wrong_prediction_leaves_the_blind_search_to_find_all():
     frame = frames(8.0, 1)[0]
-    rows = detector().detect(frame.stamp_ns, frame.counts, CAMERA, told(odometry(frame, shift=(0.0, 0.4, 0.2))))
+    rows = detector().detect(frame.stamp_ns, frame.counts, CAMERA, motion_prior(odometry(frame, shift=(0.0, 0.4, 0.2))))
     assert rows['id'].tolist() == sorted(frame.corners_px)
 
 
 def test_branch_follows_the_map():
     frame = frames(8.0, 1)[0]
-    rows = detector().detect(frame.stamp_ns, frame.counts, CAMERA, told(odometry(frame)))
+    rows = detector().detect(frame.stamp_ns, frame.counts, CAMERA, motion_prior(odometry(frame)))
     for row in rows:
         R = se3.rotation_from_quaternion([row['qx'], row['qy'], row['qz'], row['qw']])
         expected = frame.T_map_camera[:3, :3].T @ MAP[int(row['id'])][0][:3, :3]
         assert np.linalg.norm(se3.so3_log(R @ expected.T)) < np.radians(6.0)
-
-
-def test_odometry_is_read_on_the_camera_s_clock():
-    """A filter on a clock 60 ms behind the camera's tells of the frame's own time with the offset known."""
-    frame = frames(8.0, 1)[0]
-    state = odometry(frame)
-    velocity = np.array([0.0, 4.0, 0.0])
-    late = replace(state, stamp_ns=frame.stamp_ns - 60_000_000, velocity_body=velocity)
-    guided = detector(camera_time_offset=-0.060)
-    told_ns = guided._told_ns(frame.stamp_ns)
-    assert told_ns == late.stamp_ns
-    assert guided._at_frame(told_ns, told(late)) == [late]
-    impossible = replace(late, angular_velocity_body=np.full(3, 1e3))
-    assert guided._at_frame(told_ns, told(impossible)) == []

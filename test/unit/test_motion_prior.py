@@ -1,7 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
-from support.scenes import told
+from support.scenes import motion_prior
 
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
@@ -27,7 +27,7 @@ def test_empty():
 
 def test_nearest_and_between_whatever_the_order_of_arrival():
     given = states(20)
-    log = told(*given[:10], *given[15:], *given[10:15])
+    log = motion_prior(*given[:10], *given[15:], *given[10:15])
     assert log.latest().stamp_ns == 19 * PERIOD_NS
     assert [log.nearest(t).stamp_ns // PERIOD_NS for t in (-(10**9), 12_000_000, 13_000_000, 10**12)] == [0, 2, 3, 19]
     assert stamps(log.between(4 * PERIOD_NS, 8 * PERIOD_NS, 10)) == [k * PERIOD_NS for k in range(4, 9)]
@@ -35,11 +35,11 @@ def test_nearest_and_between_whatever_the_order_of_arrival():
 
 
 def test_many_are_thinned_out_evenly():
-    assert stamps(told(*states(19)).between(0, 10**9, 10)) == [2 * k * PERIOD_NS for k in range(10)]
-    uneven = stamps(told(*states(12)).between(0, 10**9, 10))
+    assert stamps(motion_prior(*states(19)).between(0, 10**9, 10)) == [2 * k * PERIOD_NS for k in range(10)]
+    uneven = stamps(motion_prior(*states(12)).between(0, 10**9, 10))
     assert len(uneven) == 10
     assert (uneven[0], uneven[-1]) == (0, 11 * PERIOD_NS)
-    assert len(told(*states(12)).between(0, 10**9, 1)) == 1
+    assert len(motion_prior(*states(12)).between(0, 10**9, 1)) == 1
 
 
 def test_only_those_asked_for_are_read():
@@ -51,7 +51,7 @@ def test_only_those_asked_for_are_read():
 
 
 def test_old_states_are_forgotten_and_a_clock_set_back_begins_anew():
-    log = told(*states(1000))
+    log = motion_prior(*states(1000))
     kept = stamps(log.between(0, 10**12, 10**6))
     # half a second at least, a second at most
     assert 100 <= len(kept) <= 201

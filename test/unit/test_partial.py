@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support import approach
 from support.close_views import BITS, BLUR_WITH_PIXEL, CAMERAS, draw, plate, pose
-from support.scenes import told
+from support.scenes import motion_prior
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.grid import adjusted, grid_edges, Layer
@@ -147,7 +147,7 @@ def test_a_detector_with_odometry_sees_it():
     state = Odometry(frame.stamp_ns, T_map_body, *motion, 1e-6 * np.eye(6), 1e-4 * np.eye(6))
     detector, camera = approach.detector_of(scenario, with_map=True), approach.camera_of(scenario)
     assert len(detector.detect(frame.stamp_ns, frame.counts, camera)) == 0
-    row = detector.detect(frame.stamp_ns + 1, frame.counts, camera, told(state))
+    row = detector.detect(frame.stamp_ns + 1, frame.counts, camera, motion_prior(state))
     assert row['id'].tolist() == [7]
     marker = scenario.markers[0]
     T = se3.inverse(frame.T_map_camera) @ marker.T_map_marker

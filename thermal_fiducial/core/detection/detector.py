@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
-from thermal_fiducial.core.detection.clock_offset import ClockOffset
 from thermal_fiducial.core.detection.contrast import noise_of, without_columns
 from thermal_fiducial.core.detection.corners.edges import edges_behind
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
@@ -16,15 +15,16 @@ from thermal_fiducial.core.detection.decoding import Decoder
 from thermal_fiducial.core.detection.displayed import DisplayedSides, for_display
 from thermal_fiducial.core.detection.following import Followed
 from thermal_fiducial.core.detection.frame import Frame, Places
-from thermal_fiducial.core.detection.guided import camera_in_map, Expected, KnownMarkers, look
+from thermal_fiducial.core.detection.guided import Expected, KnownMarkers, look
 from thermal_fiducial.core.detection.ids import among, pairs
 from thermal_fiducial.core.detection.lag import markers_sharpened, REMAINING, SmearField, without_lag
 from thermal_fiducial.core.detection.local_corners import local_corners
 from thermal_fiducial.core.detection.marker_rows import marker_rows
-from thermal_fiducial.core.detection.motion import MotionTracker, plausible, Tracked, Twist
+from thermal_fiducial.core.detection.motion import MotionTracker, Tracked, Twist
 from thermal_fiducial.core.detection.partial import CutMarkerSearch
 from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.detection.polarity import Polarity
+from thermal_fiducial.core.detection.prediction import Predictor
 from thermal_fiducial.core.detection.readout import expected_displacement, seen_displacement
 from thermal_fiducial.core.detection.refining import (
     Refinement,
@@ -44,7 +44,7 @@ from thermal_fiducial.core.geometry.planar_pose import (
     planar_poses,
     PlanarPoses,
 )
-from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers, Odometry
+from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 
@@ -64,9 +64,6 @@ _ENOUGH_WHOLE = 2
 _READ_THERE = 0.1
 # Where not all markers are known, or not all seen that should be, a blind search follows at least every so many frames.
 _INCOMPLETE = 2
-# The filter's states from so many time constants before a frame to one after it, symmetric about the velocity that
-# smears it, tell its motion; so many of them at most. Without lag, those of so long a time.
-_MEMORY_LAGS, _STATES, _SHORTEST_LAG_S = 3, 10, 0.005
 # Corners of a marker of side 1 in its plane.
 _FACE = marker_corners(1.0)[:, :2]
 _NONE_FOUND, _NONE_FOLLOWED = Found.none(), Followed.none()
@@ -99,16 +96,14 @@ class MarkerDetector:
         self._sizes = size_overrides(config.marker_size_overrides)
         bits = marker_bits(dictionary)
         self._decoder = Decoder(bits, int(dictionary.maxCorrectionBits))
-        self._T_body_camera = se3.transform(
-            se3.rotation_from_quaternion(config.camera_orientation), config.camera_position
-        )
-        self._motion = MotionTracker(self._T_body_camera, config.bolometer_lag)
+        T_body_camera = se3.transform(se3.rotation_from_quaternion(config.camera_orientation), config.camera_position)
+        self._motion = MotionTracker(T_body_camera, config.bolometer_lag)
+        self._predictor = Predictor(T_body_camera, config.bolometer_lag)
         self._scratch = Scratch()
         self._refiner = Refiner(edges_behind(bits), self._motion)
         self._displayed = DisplayedSides(bits)
         self._search = BlindSearch(self._decoder, self._scratch)
         self._cut = CutMarkerSearch(self._decoder, bits)
-        self._clock_offset = ClockOffset()
         self._polarity = Polarity()
         self._field: SmearField | None = None
         self._depth = _TYPICAL_DEPTH
@@ -134,14 +129,12 @@ class MarkerDetector:
         stamp_ns : of the frame
         counts : (height, width), clean
         camera : its intrinsics
-        odometry : the filter's latest states, where there are any
+        odometry : the filter's latest states and the offset of its clock, where there are any
         """
         with one_thread():
-            told_ns = self._told_ns(stamp_ns)
-            states = [] if odometry is None else self._at_frame(told_ns, odometry)
-            twist = self._motion.predict(stamp_ns, states, told_ns)
+            prediction = self._predictor.predict(stamp_ns, odometry, self._motion, self.config.max_odometry_age)
+            twist, T_camera_map = prediction.twist, prediction.T_camera_map if self._map else None
             frame = self._frame(stamp_ns, counts, camera, twist)
-            T_camera_map = self._predicted_pose(told_ns, states, twist)
             in_map = None
             if T_camera_map is not None and self.config.guided:
                 in_map = self._known.expected(T_camera_map, camera, self.config.min_side_px)
@@ -155,7 +148,7 @@ class MarkerDetector:
             self._saw_cut = False
             if in_map is None or T_camera_map is None:
                 return whole
-            return self._with_cut(whole, counts, frame, T_camera_map, states)
+            return self._with_cut(whole, counts, frame, T_camera_map, prediction.position_std_m)
 
     def _whole(
         self,
@@ -168,7 +161,6 @@ class MarkerDetector:
     ) -> Markers:
         """Rows of the markers that were found, refined."""
         ids, refinement = self._refined(frame, found, followed, in_map)
-        self._learn_offset(frame, in_map, ids, refinement.places)
         corners, at = refinement.corners, refinement.places.at
         if self.config.refinement == 'subpix' or (self.config.refinement == 'auto' and counts.dtype == np.uint8):
             corners = local_corners(frame.image, corners, self._decoder.cells)
@@ -186,15 +178,16 @@ class MarkerDetector:
         counts: Counts | Gray,
         frame: Frame,
         T_camera_map: FloatArray,
-        states: list[Odometry],
+        position_std_m: float,
     ) -> Markers:
         """The rows of ``whole`` markers; where few of them are known, those of known ones that are cut as well."""
         seen = whole['id'].astype(np.int64)
         if among(seen, self._known.ids).sum() >= _ENOUGH_WHOLE:
             return whole
         cut = self._known.cut(T_camera_map, frame.camera, seen)
-        unsure = float(np.sqrt(np.trace(states[-1].pose_covariance[:3, :3])))
-        ids, corners = self._cut.look(frame, cut, unsure, self._allowed(), self.config, bent=for_display(counts))
+        ids, corners = self._cut.look(
+            frame, cut, position_std_m, self._allowed(), self.config, bent=for_display(counts)
+        )
         self._saw_cut = len(ids) > 0
         if not self._saw_cut:
             return whole
@@ -209,18 +202,6 @@ class MarkerDetector:
             return self._map[marker_id][1]
         return self._sizes.get(marker_id, self.config.marker_size)
 
-    def _told_ns(self, stamp_ns: int) -> int:
-        """The stamp of a frame in the clock of the filter's states."""
-        return stamp_ns + round(self.config.camera_time_offset * 1e9) + self._clock_offset.ns
-
-    def _at_frame(self, told_ns: int, odometry: MotionPrior) -> list[Odometry]:
-        """The filter's states while a frame came about, or the nearest; its stamp in their clock."""
-        lag_ns = round(1e9 * max(self.config.bolometer_lag, _SHORTEST_LAG_S))
-        states = odometry.between(told_ns - _MEMORY_LAGS * lag_ns, told_ns + lag_ns, _STATES)
-        if not states and (nearest := odometry.nearest(told_ns)) is not None:
-            states = [nearest]
-        return [state for state in states if plausible(state)]
-
     def _frame(self, stamp_ns: int, counts: Counts | Gray, camera: Camera, twist: Twist | None) -> Frame:
         """The frame, without the pattern of columns where that matters."""
         noise = noise_of(counts)
@@ -230,23 +211,6 @@ class MarkerDetector:
         if counts.dtype != np.uint8 and not self._motion.all_clearer_than(_CLEARER_THAN_COLUMNS):
             return replace(frame, counts=without_columns(frame.image, noise, self._scratch))
         return frame
-
-    def _learn_offset(self, frame: Frame, in_map: Expected | None, ids: IntArray, places: Places) -> None:
-        """How far seen corners are off their places tells what is left of the clocks' offset."""
-        if in_map is None or frame.twist is None:
-            return
-        predicted, seen = pairs(in_map.ids, ids)
-        off, velocity = places.at.px[seen] - in_map.corners_px[predicted], places.velocity(frame.twist)[seen]
-        self._clock_offset.learn(frame.stamp_ns, off, velocity)
-
-    def _predicted_pose(self, told_ns: int, states: list[Odometry], twist: Twist | None) -> FloatArray | None:
-        """T_camera_map at the frame, where odometry that is fresh enough tells it."""
-        if not states or twist is None or not self._map:
-            return None
-        nearest = min(states, key=lambda state: abs(told_ns - state.stamp_ns))
-        if abs(told_ns - nearest.stamp_ns) * 1e-9 > self.config.max_odometry_age:
-            return None
-        return se3.inverse(camera_in_map(told_ns, nearest, self._T_body_camera, twist))
 
     def _find(self, frame: Frame, in_map: Expected | None) -> tuple[Found, Followed]:
         """Markers where they should be, and whatever a blind search shows, when that is due; and which are followed."""

@@ -12,13 +12,11 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.decoding import Decoder, Reading
 from thermal_fiducial.core.detection.ids import among
-from thermal_fiducial.core.detection.motion import Twist
 from thermal_fiducial.core.detection.scratch import Scratch
 from thermal_fiducial.core.detection.search import Found, read_quads
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import marker_corners
-from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 # A marker turned further from the camera than this shows too little to be expected.
@@ -115,14 +113,6 @@ class KnownMarkers:
         whole = camera.contains(corners, _WHOLE_PX).all(axis=1)
         some = np.flatnonzero(facing & overlap & ~whole & ~among(self.ids, without))
         return CutMarkers(self.ids[some], T[some], self._sizes[some])
-
-
-def camera_in_map(stamp_ns: int, odometry: Odometry, T_body_camera: FloatArray, twist: Twist) -> FloatArray:
-    """T_map_camera (4, 4) at a frame, from the odometry before it carried on with the camera's twist."""
-    dt = (stamp_ns - odometry.stamp_ns) * 1e-9
-    mean = twist.ago(0.5 * dt)
-    moved = se3.transform(se3.so3_exp(mean[3:] * dt), mean[:3] * dt)
-    return np.asarray(odometry.T_map_body @ T_body_camera @ moved)
 
 
 def look(

@@ -194,25 +194,34 @@ class MotionTracker:
         self._seen = Tracked.none()
         self._last_seen_ns: int | None = None
 
-    def predict(self, stamp_ns: int, odometry: Sequence[Odometry], told_ns: int | None = None) -> Twist | None:
+    def predict(
+        self,
+        stamp_ns: int,
+        odometry: Sequence[Odometry],
+        odometry_ns: int | None = None,
+        clock_std_s: float = 0.0,
+    ) -> Twist | None:
         """Twist expected at a frame; None when nothing is known.
 
         Parameters
         ----------
         odometry : states round the time that smears the frame, or the nearest that there is
-        told_ns : the frame's stamp in their clock, if that is not the camera's
+        odometry_ns : the frame's stamp in their clock, if that is not the camera's
+        clock_std_s : standard deviation of that stamp [s]
         """
         dt = self._since(stamp_ns)
         carried = None
         if self._twist is not None and dt is not None and self._saw_lately(stamp_ns):
             carried = _carried(self._twist, dt)
-        told_ns = stamp_ns if told_ns is None else told_ns
+        odometry_ns = stamp_ns if odometry_ns is None else odometry_ns
         if len(odometry) >= _ENOUGH_STATES:
-            return _joined(carried or unknown_twist(), _line_through(told_ns, odometry, self._from_body))
-        if len(odometry) == 0 or abs(told_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
+            observed = _line_through(odometry_ns, odometry, self._from_body)
+            return _joined(carried or unknown_twist(), _of_unsure_stamp(observed, clock_std_s))
+        if len(odometry) == 0 or abs(odometry_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
             return carried
-        seen, later = _transferred(odometry[-1], self._from_body), (odometry[-1].stamp_ns - told_ns) * 1e-9
-        information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + _growth(abs(later))[0] * _RANDOM))
+        seen, later = _transferred(odometry[-1], self._from_body), (odometry[-1].stamp_ns - odometry_ns) * 1e-9
+        unsure = (_growth(abs(later))[0] + clock_std_s**2) * _RANDOM
+        information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + unsure))
         return _corrected(carried or unknown_twist(), information, information @ seen.value, later)
 
     def expected(self, stamp_ns: int, twist: Twist) -> Tracked:
@@ -341,6 +350,14 @@ def _line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatAr
     covariance[:6, 6:] = covariance[6:, :6] = -middle * slope
     covariance[6:, 6:] = slope
     return Twist(values.sum(axis=0) / len(t) - middle * acceleration, covariance, acceleration)
+
+
+def _of_unsure_stamp(twist: Twist, clock_std_s: float) -> Twist:
+    """``twist`` with what the uncertainty of its stamp [s] makes of it by its acceleration, and of what that is."""
+    covariance = twist.covariance.copy()
+    square = np.outer(twist.acceleration, twist.acceleration) + covariance[6:, 6:]
+    covariance[:6, :6] += clock_std_s**2 * square
+    return Twist(twist.value, covariance, twist.acceleration)
 
 
 def _joined(first: Twist, second: Twist) -> Twist:

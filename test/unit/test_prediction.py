@@ -1,0 +1,76 @@
+"""What odometry says of a frame, with the offset of its clock and without."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.scenes import camera_of, detector_of, motion_prior
+
+from thermal_fiducial.core.detection.motion import MotionTracker
+from thermal_fiducial.core.detection.prediction import Predictor
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.sim.camera import render_frames
+from thermal_fiducial.sim.scenario import named
+
+STAMP_NS, PERIOD_NS = 10**9, 5_000_000
+VELOCITY, ACCELERATION = np.array([0.0, 2.0, 0.0]), np.array([3.0, 0.0, 0.0])
+SECONDS, SEED = 20.0, 21
+
+
+def states(offset_s=0.0):
+    """Of a body that accelerates, in a clock that is ahead of the camera's."""
+    found = []
+    for seconds in np.arange(-8, 3) * 0.005:
+        T = np.eye(4)
+        T[:3, 3] = seconds * VELOCITY + 0.5 * seconds**2 * ACCELERATION
+        stamp_ns = STAMP_NS + round((seconds + offset_s) * 1e9)
+        velocity = VELOCITY + seconds * ACCELERATION
+        found.append(Odometry(stamp_ns, T, velocity, np.zeros(3), 1e-4 * np.eye(6), 1e-4 * np.eye(6)))
+    return found
+
+
+def predicted(prior):
+    return Predictor(np.eye(4), 0.010).predict(STAMP_NS, prior, MotionTracker(np.eye(4), 0.010), 0.2)
+
+
+@pytest.mark.parametrize('offset_s', [0.0, -0.060, 0.035])
+def test_odometry_is_read_at_the_frame_s_stamp_in_its_own_clock(offset_s):
+    found = predicted(motion_prior(*states(offset_s), clock_offset=offset_s))
+    np.testing.assert_allclose(found.T_camera_map, np.eye(4), atol=1e-3)
+    np.testing.assert_allclose(found.twist.value[:3], VELOCITY, atol=0.02)
+
+
+def test_an_unknown_clock_widens_what_is_said_of_motion_and_place():
+    known, unknown = (predicted(motion_prior(*states(), clock_offset=offset)) for offset in (0.0, None))
+    # 30 ms of the offset at 2 m/s, and at 3 m/s^2; the acceleration itself is known to a few m/s^2.
+    assert unknown.position_std_m == pytest.approx(np.hypot(known.position_std_m, 0.06), rel=1e-6)
+    assert np.sqrt(known.twist.covariance[0, 0]) < 0.02
+    assert 0.08 < np.sqrt(unknown.twist.covariance[0, 0]) < 0.3
+
+
+def test_impossible_odometry_is_left_alone():
+    found = predicted(motion_prior(*(replace(state, angular_velocity_body=np.full(3, 1e3)) for state in states())))
+    assert found.twist is None
+    assert found.T_camera_map is None
+
+
+@pytest.mark.parametrize('offset_s', [0.0, 0.035])
+def test_markers_are_found_whatever_the_offset_of_a_clock_that_is_not_known_yet(offset_s):
+    scenario = named('fast')
+    scenario = replace(scenario, sensor=replace(scenario.sensor, bad_pixel_share=0.0))
+    camera, detector, blind = camera_of(scenario), *(detector_of(scenario, with_map=known) for known in (True, False))
+    path, found, found_blind = scenario.trajectory(SECONDS, SEED), [], []
+    for frame in render_frames(scenario, SECONDS, SEED, start=300, stop=314):
+        motion = path([frame.seconds])
+        velocity = motion.rotation.inv().apply(motion.velocity)[0]
+        covariance = np.diag([1e-4] * 3 + [1e-5] * 3)
+        stamp_ns = frame.stamp_ns + round(offset_s * 1e9)
+        state = Odometry(
+            stamp_ns, motion.T_map_body[0], velocity, motion.angular_velocity_body[0], covariance, covariance
+        )
+        prior = motion_prior(state, clock_offset=None)
+        found.append(detector.detect(frame.stamp_ns, frame.counts, camera, prior)['id'].tolist())
+        found_blind.append(blind.detect(frame.stamp_ns, frame.counts, camera)['id'].tolist())
+        assert set(found[-1]) <= set(frame.corners_px)
+    # A frame or two later than without odometry a marker may come, as the blind search then looks every other frame.
+    assert sum(map(len, found)) >= sum(map(len, found_blind)) - 2
