@@ -1,0 +1,198 @@
+"""Recorded flights of real IMUs before real markers (``real_flights`` of the real data; its README says what they are).
+
+A folder has ``imu.csv``, corners a row a marker, ``rig.yaml``, and, the board, a map and a reference.
+"""
+
+import csv
+from functools import cache, partial
+import hashlib
+import os
+from pathlib import Path
+import tempfile
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+import yaml
+
+from support.batch_map import adjust
+from support.corner_runs import CornerFlight
+from thermal_fiducial.config import ImuNoise, MarkerMapperConfig
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
+from thermal_fiducial.core.geometry.reprojection import corners_in_map
+from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform, transform_from_quaternion
+from thermal_fiducial.core.mapping.map_building import build_map, rows_from_corners
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.measurements import corner_covariances, corners_px, ImuSample
+from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.files.trajectory import load_tum
+
+CARPETS = ('carpet_mountain', 'carpet_slow_circle')
+#: Corner noise [px]: what re-projection leaves of the board's corners, and the median that it leaves of the carpet's
+#: (0.24 px of both coordinates together; one corner in a hundred is 1.6 px off).
+BOARD_SIGMA_PX, CARPET_SIGMA_PX = 0.35, 0.20
+#: The marker that the carpet's map starts with lies on the floor, face up.
+CARPET_ORIGIN = 40
+#: Frames to either side that a pose of the carpet's reference is smoothed over.
+_NEIGHBOURS = 4
+#: Frames of fewer markers are no reference: single ones of the course's corners are pixels off.
+_FEWEST_MARKERS = 6
+#: Re-projection error [px] beyond which a frame's pose starts from its own markers, not from the last frame's pose.
+_LOST_PX = 2.0
+
+
+def folder(name) -> Path:
+    """Folder of a recording; a KeyError where there are no real data."""
+    return Path(os.environ['THERMAL_FIDUCIAL_DATA']) / 'real_flights' / name
+
+
+@cache
+def april_board(camera='cam0', sigma_px=BOARD_SIGMA_PX) -> CornerFlight:
+    """Forty seconds before the board through ``cam0`` or ``cam1``, with the published densities."""
+    place = folder('april_board')
+    rig = yaml.safe_load((place / 'rig.yaml').read_text())
+    entry = rig['cameras'][camera]
+    marker_map = load_map(place / 'map.yaml')
+    stamps, positions, quaternions = load_tum(place / 'reference.tum')
+    size = next(iter(marker_map.markers.values())).size
+    published = {name: value for name, value in rig['imu'].items() if name != 'rate_hz'}
+    lens = _lens(entry)
+    return CornerFlight(
+        f'april board {camera}',
+        _samples(place / 'imu.csv'),
+        _frames(place / f'{camera}.csv', size, lens, sigma_px),
+        lens,
+        np.array(entry['T_body_camera']).reshape(4, 4),
+        marker_map,
+        stamps,
+        transform_from_quaternion(positions, quaternions),
+        size,
+        ImuNoise(**published),
+    )
+
+
+@cache
+def carpet(name, sigma_px=CARPET_SIGMA_PX) -> CornerFlight:
+    """A flight over the carpet. Its reference is smoothed from the poses of all corners, on the map of all corners."""
+    place = folder(name)
+    rig = yaml.safe_load((place / 'rig.yaml').read_text())
+    entry, size = rig['cameras']['cam0'], rig['marker_size']
+    lens = _lens(entry)
+    frames = _frames(place / 'detections.csv', size, lens, sigma_px)
+    T_body_camera = transform_from_quaternion(entry['camera_position'], entry['camera_orientation'])
+    marker_map = batch_map(name, sigma_px)
+    rich = {stamp: rows for stamp, rows in frames.items() if len(rows) >= _FEWEST_MARKERS}
+    stamps, cameras = _camera_poses(rich, lens, marker_map)
+    reference = _smoothed(stamps, cameras) @ inverse(T_body_camera)
+    samples = _samples(place / 'imu.csv')
+    return CornerFlight(name, samples, frames, lens, T_body_camera, marker_map, stamps, reference, size)
+
+
+@cache
+def batch_map(name, sigma_px=CARPET_SIGMA_PX) -> MarkerMap:
+    """The carpet's map by an adjustment of all corners of a flight that shares nothing with ours, taken for exact.
+
+    It takes a minute, and is kept among the temporary files.
+    """
+    detections = (folder(name) / 'detections.csv').read_bytes()
+    kept = (
+        Path(tempfile.gettempdir()) / f'thermal_fiducial_{hashlib.sha256(detections).hexdigest()[:16]}_{sigma_px}.yaml'
+    )
+    if not kept.exists():
+        save_map(kept, _adjusted_map(name, sigma_px))
+    return load_map(kept)
+
+
+def _adjusted_map(name, sigma_px):
+    place = folder(name)
+    rig = yaml.safe_load((place / 'rig.yaml').read_text())
+    size, lens = rig['marker_size'], _lens(rig['cameras']['cam0'])
+    frames = _frames(place / 'detections.csv', size, lens, sigma_px)
+    frames_for_start = list(frames.values())[::4]
+    built = build_map(frames_for_start, lens, origin_alone(), MarkerMapperConfig(marker_size=size)).map
+    stamps, cameras = _camera_poses(frames, lens, built)
+    views = [
+        (int(stamp), int(key), corners)
+        for stamp in stamps
+        for key, corners in zip(frames[stamp]['id'], corners_px(frames[stamp]), strict=True)
+        if int(key) in built.markers
+    ]
+    starts = {key: marker.T_map_marker for key, marker in built.markers.items()}
+    poses = dict(zip(stamps.tolist(), cameras, strict=True))
+    adjusted, _ = adjust(lens.K, size, views, poses, starts, held=CARPET_ORIGIN)
+    return MarkerMap({key: MapMarker(key, size, True, T) for key, T in adjusted.items()})
+
+
+def origin_alone() -> MarkerMap:
+    """What mapping the carpet starts with."""
+    size = yaml.safe_load((folder(CARPETS[0]) / 'rig.yaml').read_text())['marker_size']
+    return MarkerMap({CARPET_ORIGIN: MapMarker(CARPET_ORIGIN, size, True, np.eye(4))})
+
+
+def map_error_mm(marker_map, other) -> float:
+    """Rms distance of the common markers' centres after the best similarity [mm]: of any scale."""
+    common = sorted(marker_map.markers.keys() & other.markers.keys())
+    a, b = (np.array([m.markers[key].T_map_marker[:3, 3] for key in common]) for m in (marker_map, other))
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    turned = Rotation.align_vectors(b, a)[0].apply(a)
+    scale = np.sum(turned * b) / np.sum(turned * turned)
+    return 1e3 * float(np.sqrt(np.mean(np.sum((scale * turned - b) ** 2, axis=1))))
+
+
+def _camera_poses(frames, lens, marker_map):
+    """Stamps (N,) and T_map_camera (N, 4, 4) by least squares over the corners of each frame."""
+    stamps, poses = [], []
+    for stamp, rows in frames.items():
+        rows = rows[np.isin(rows['id'], list(marker_map.markers))]
+        if not len(rows):
+            continue
+        known = [marker_map.markers[int(key)] for key in rows['id']]
+        squares = corners_in_map(np.stack([m.T_map_marker for m in known]), np.array([m.size for m in known]))
+        solve = partial(solve_camera_pose, corners_px(rows), corner_covariances(rows), squares, lens)
+        solution = solve(poses[-1], compete=False) if poses else solve()
+        solution = solution if solution.rms_px < _LOST_PX else solve()
+        stamps.append(stamp)
+        poses.append(solution.T_map_camera)
+    return np.array(stamps), np.array(poses)
+
+
+def _smoothed(stamps, poses):
+    """Each pose by a cubic through its neighbours, so that a frame's own noise hardly counts."""
+    smooth = np.empty_like(poses)
+    for k, (stamp, T) in enumerate(zip(stamps, poses, strict=True)):
+        near = slice(max(k - _NEIGHBOURS, 0), k + _NEIGHBOURS + 1)
+        t = (stamps[near] - stamp) * 1e-9
+        turns = so3_log(T[:3, :3].T @ poses[near, :3, :3])
+        values = np.concatenate((poses[near, :3, 3], turns), axis=1)
+        at_zero = np.linalg.lstsq(np.vander(t, 4), values, rcond=None)[0][-1]
+        smooth[k] = transform(T[:3, :3] @ so3_exp(at_zero[3:]), at_zero[:3])
+    return smooth
+
+
+def _lens(entry) -> Camera:
+    K = np.array(entry['K']).reshape(3, 3)
+    return Camera(entry['width'], entry['height'], K, entry['model'], np.array(entry['D']))
+
+
+def _table(path):
+    with path.open(newline='') as file:
+        rows = list(csv.reader(file))[1:]
+    return np.array([int(row[0]) for row in rows]), np.array([[float(word) for word in row[1:]] for row in rows])
+
+
+def _samples(path):
+    stamps, values = _table(path)
+    return [ImuSample(int(stamp), row[:3], row[3:]) for stamp, row in zip(stamps, values, strict=True)]
+
+
+def _frames(path, size, lens, sigma_px):
+    stamps, values = _table(path)
+    frames = {}
+    for stamp in np.unique(stamps):
+        rows = values[stamps == stamp]
+        covariances = np.broadcast_to(sigma_px**2 * np.eye(2), (len(rows), 4, 2, 2))
+        corners = rows[:, 1:9].reshape(-1, 4, 2)
+        frames[int(stamp)] = rows_from_corners(
+            rows[:, 0].astype(np.int64), corners, covariances, np.full(len(rows), size), lens
+        )
+    return frames
