@@ -73,7 +73,7 @@ class MarkerMapper:
         self.config = config
         self._sizes = size_overrides(config.marker_size_overrides)
         self._T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
-        #: no new markers, no changes of the map, while True
+        #: no new markers, no changes of the map, while True; ``config.mode`` only says how it starts
         self.frozen = config.mode == 'localization'
         self.resets = 0
         self._begin(marker_map)
@@ -108,6 +108,8 @@ class MarkerMapper:
         self._motion = CameraMotion()
         self._clocks = ClockDifference()
         self._recent: deque[Keyframe] = deque(maxlen=_RECENT)
+        #: what the map learned from last; None: nothing yet
+        self._last_frame: Keyframe | None = None
         self._belief: FloatArray | None = None
         self._cameras: list[Camera] = []
         self._noise = NoiseLevel()
@@ -260,11 +262,11 @@ class MarkerMapper:
     def _keep(self, frame: LocatedFrame, pose: CameraPose, fused: Fused) -> None:
         """Keep the frame for the refinement; of one marker alone nothing can be learned."""
         pose = replace(pose, T_map_camera=fused.T_map_camera)
-        self._last_frame = _keyframe(frame.rows, pose, self._camera_index(frame.camera), frame.expected)
+        self._last_frame = keyframe = _keyframe(frame.rows, pose, self._camera_index(frame.camera), frame.expected)
         self._belief = None if frame.expected is None else frame.expected.pose.covariance
-        self._recent.append(self._last_frame)
+        self._recent.append(keyframe)
         if len(frame.rows) >= 2:
-            self._keyframes.add(self._last_frame)
+            self._keyframes.add(keyframe)
 
     def _camera_index(self, camera: Camera) -> int:
         """Index of ``camera`` among those seen so far: a calibration may change, or frames of several cameras come."""
@@ -281,21 +283,22 @@ class MarkerMapper:
             return False, {}
         if refusal.rivals is not None and refusal.covariances is not None:
             return self._place_new(frame, Viewpoint(refusal.rivals, refusal.covariances))
-        if expected is None or self._last is None:
+        last = self._last_frame
+        if expected is None or last is None:
             return False, {}
-        if not 0 <= frame.stamp_ns - self._last.stamp_ns <= self.config.bridge_duration * 1e9:
+        if not 0 <= frame.stamp_ns - last.stamp_ns <= self.config.bridge_duration * 1e9:
             return False, {}
-        return self._bridge(frame, expected)
+        return self._bridge(frame, last, expected)
 
-    def _bridge(self, frame: LocatedFrame, expected: Expected) -> tuple[bool, dict[int, str]]:
-        """Place new markers from the odometry while no known one is in view."""
+    def _bridge(self, frame: LocatedFrame, last: Keyframe, expected: Expected) -> tuple[bool, dict[int, str]]:
+        """Place new markers from the odometry since ``last`` while no known one is in view."""
         pose, rows = expected.pose, frame.new
         keyframe = _keyframe(rows, pose, self._camera_index(frame.camera), expected)
         if not any(int(key) in self._candidates for key in rows['id']):
             # Nothing but the odometry joins these markers to the map. Once is enough: its error is the same for all
             # that follow, which hang together through the markers themselves.
-            self._keyframes.add(self._last_frame)
-            self._keyframes.links.append(link(self._last_frame, keyframe, pose.covariance))
+            self._keyframes.add(last)
+            self._keyframes.links.append(link(last, keyframe, pose.covariance))
             self._keyframes.add(keyframe)
         elif len(rows) >= 2:
             self._keyframes.add(keyframe)
@@ -365,7 +368,7 @@ class MarkerMapper:
         for candidate in self._candidates.values():
             candidate.move(displacement)
         T_new_old = np.eye(4)
-        if self._last is not None:
+        if self._last is not None and self._last_frame is not None:
             T_new_old = correction(tuple(self._recent)[::_EVERY], self._cameras, before, self.map.markers, self._belief)
             self._recent = deque((in_moved_map(frame, T_new_old) for frame in self._recent), maxlen=_RECENT)
             self._last = replace(self._last, T_map_camera=T_new_old @ self._last.T_map_camera)
