@@ -5,7 +5,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 
 PACKAGE = 'thermal_fiducial'
-NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf')
+NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf', 'thermal_source')
 
 
 def files(folder: str, pattern: str) -> list[str]:
@@ -28,6 +28,7 @@ setup(
     extras_require={
         'ros': ['ros-rclpy[fastrtps]==7.1.6', 'ros-common-interfaces==5.3.6'],
         'cloud': ['small_gicp', 'plyfile', 'pypcd4', 'scipy', 'rich', 'matplotlib'],
+        'cameras': ['pyusb'],  # and libusb-1.0-0, for a ThermalGrabber
         'smoother': ['gtsam>=4.3'],  # the reference of the filter's benchmark; brings pytest 9
         'tools': ['scipy', 'rich', 'matplotlib', 'ezdxf', 'jinja2'],
         'test': ['pytest', 'shapely', 'hypothesis', 'pytest-benchmark', 'pytest-xdist', 'evo'],

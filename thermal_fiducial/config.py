@@ -522,10 +522,36 @@ class PoseEkfConfig:
     )
 
 
-#: Node to its parameters.
+@dataclass(frozen=True)
+class ThermalSourceConfig:
+    """The camera's driver, where no other one is used."""
+
+    camera: str = param(
+        '',
+        'Where frames come from: a V4L2 device (/dev/video0), a TeAx ThermalGrabber ("teax", or "teax:SERIAL" where '
+        'there are several), or a folder or video of 16-bit pictures.',
+    )
+    image_width: int = param(0, 'Width to ask the camera for; 0: as it is set.', unit='px', minimum=0, maximum=4096)
+    image_height: int = param(0, 'Height to ask the camera for; 0: as it is set.', unit='px', minimum=0, maximum=4096)
+    frame_rate: float = param(
+        0.0,
+        'Rate to ask a V4L2 device for, or to show pictures at; 0: as the device is set, pictures at 30.',
+        unit='Hz',
+        minimum=0.0,
+        maximum=1000.0,
+    )
+    repeat: bool = param(True, 'Show a folder or video again when it ends.')
+    calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
+    frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
+
+
+#: Node to its parameters: the pipeline.
 NODES: dict[str, type] = {
     'tau2_camera': Tau2CameraConfig,
     'aruco_detector': ArucoDetectorConfig,
     'marker_mapper': MarkerMapperConfig,
     'pose_ekf': PoseEkfConfig,
 }
+
+#: Nodes beside them, which run only where they are asked for.
+OPTIONAL_NODES: dict[str, type] = {'thermal_source': ThermalSourceConfig}

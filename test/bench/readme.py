@@ -8,7 +8,7 @@ import json
 from pathlib import Path
 import re
 
-from thermal_fiducial.config import NODES, parameters
+from thermal_fiducial.config import NODES, OPTIONAL_NODES, parameters
 from thermal_fiducial.ros.parameter_file import parameter_file
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -29,7 +29,8 @@ def parameter_table(config: type) -> str:
 def tables() -> dict[str, str]:
     """Name to Markdown of every table that can be made now."""
     measured = {path.stem: path.read_text().strip() for path in sorted((ROOT / 'doc' / 'tables').glob('*.md'))}
-    return measured | {f'parameters {name}': parameter_table(config) for name, config in NODES.items()}
+    nodes = NODES | OPTIONAL_NODES
+    return measured | {f'parameters {name}': parameter_table(config) for name, config in nodes.items()}
 
 
 def spliced(text: str, contents: dict[str, str]) -> str:

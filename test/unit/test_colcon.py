@@ -12,7 +12,7 @@ import pytest
 from support.ros_graph import ros_graph
 
 ROOT = Path(__file__).resolve().parents[2]
-NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf')
+NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf', 'thermal_source')
 SOURCES = ('package.xml', 'setup.py', 'setup.cfg', 'resource', 'config', 'launch', 'thermal_fiducial')
 
 COLCON = Path(sys.executable).with_name('colcon')

@@ -15,10 +15,11 @@ from thermal_fiducial.config import (
     PoseEkfConfig,
     size_overrides,
     Tau2CameraConfig,
+    ThermalSourceConfig,
 )
 from thermal_fiducial.errors import InputError
 
-NODES = (Tau2CameraConfig, ArucoDetectorConfig, MarkerMapperConfig, PoseEkfConfig)
+NODES = (Tau2CameraConfig, ArucoDetectorConfig, MarkerMapperConfig, PoseEkfConfig, ThermalSourceConfig)
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from pathlib import Path
 from support.small_bag import side_files
 import yaml
 
-from thermal_fiducial.config import from_mapping, NODES, parameters
+from thermal_fiducial.config import from_mapping, NODES, OPTIONAL_NODES, parameters
 from thermal_fiducial.replay.settings import read_settings
 from thermal_fiducial.ros.parameter_file import parameter_file
 
@@ -19,14 +19,14 @@ def test_the_file_is_up_to_date():
 
 def test_the_file_holds_every_default():
     values = yaml.safe_load(FILE.read_text())['/**']['ros__parameters']
-    for kind in NODES.values():
+    for kind in (NODES | OPTIONAL_NODES).values():
         assert from_mapping(kind, values) == kind()
         assert {name for name, _, _ in parameters(kind)} <= set(values)
 
 
 def test_a_parameter_of_several_nodes_has_one_default():
     seen = {}
-    for kind in NODES.values():
+    for kind in (NODES | OPTIONAL_NODES).values():
         for name, _, default in parameters(kind):
             assert seen.setdefault(name, default) == default
 

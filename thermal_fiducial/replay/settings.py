@@ -12,6 +12,7 @@ from thermal_fiducial.config import (
     from_mapping,
     MarkerMapperConfig,
     NODES,
+    OPTIONAL_NODES,
     parameters,
     PoseEkfConfig,
     size_overrides,
@@ -55,7 +56,7 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any]) -> Settings
     """
     document = {} if params is None else _document(params)
     configs: dict[str, Any] = {}
-    known: set[str] = set()
+    known = {name for kind in OPTIONAL_NODES.values() for name, _, _ in parameters(kind)}
     for node, kind in NODES.items():
         names = {name for name, _, _ in parameters(kind)}
         configs[node] = from_mapping(kind, _values_for(node, document) | dict(overrides))

@@ -198,8 +198,8 @@ class StageNode(CountingNode, Generic[Config]):
             return ERROR, '; '.join(self.faults)
         if self._refused > self._diagnosed_refused:
             return WARN, self._refusal
-        source = self.inputs[0]
-        if source.count == self._diagnosed_inputs.get(source.topic, 0):
+        source = self.inputs[0] if self.inputs else None
+        if source is not None and source.count == self._diagnosed_inputs.get(source.topic, 0):
             return WARN, f'no {source.topic.lstrip("/")}'
         return self.state()
 

@@ -11,12 +11,12 @@ from typing import Any
 
 import yaml
 
-from thermal_fiducial.config import NODES, parameters
+from thermal_fiducial.config import NODES, OPTIONAL_NODES, parameters
 
 _WIDTH = 118
 _END_OF_SCALAR = '...\n'
 _HEAD = """\
-# Every parameter of the four nodes with its default. One file serves them all: a node takes the names it knows.
+# Every parameter of the nodes with its default. One file serves them all: a node takes the names it knows.
 #   ros2 run thermal_fiducial pose_ekf --ros-args --params-file thermal_fiducial.yaml
 /**:
   ros__parameters:
@@ -25,10 +25,11 @@ _HEAD = """\
 
 def parameter_file() -> str:
     """Text of the file: what several nodes share first, then node by node."""
-    uses = Counter(name for kind in NODES.values() for name, _, _ in parameters(kind))
+    nodes = NODES | OPTIONAL_NODES
+    uses = Counter(name for kind in nodes.values() for name, _, _ in parameters(kind))
     shared: dict[str, str] = {}
-    own: dict[str, list[str]] = {node: [] for node in NODES}
-    for node, kind in NODES.items():
+    own: dict[str, list[str]] = {node: [] for node in nodes}
+    for node, kind in nodes.items():
         for name, item, default in parameters(kind):
             entry = ''.join(_entry(name, item, default))
             if uses[name] > 1:

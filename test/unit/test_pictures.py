@@ -1,0 +1,101 @@
+"""Recorded pictures in the place of a camera."""
+
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from thermal_fiducial.cameras.pictures import Pictures
+from thermal_fiducial.cameras.source import EndOfFramesError
+from thermal_fiducial.errors import InputError
+
+PICTURES = [np.random.default_rng(k).integers(0, 1 << 14, (48, 64), dtype=np.uint16) for k in range(3)]
+
+
+def shown(source, count):
+    """That many pictures, however long each is waited for."""
+    frames = []
+    while len(frames) < count:
+        frames += source.read()
+    return frames
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for k, suffix in enumerate(('png', 'tiff', 'pgm')):
+        cv2.imwrite(str(tmp_path / f'frame_{k:03}.{suffix}'), PICTURES[k])
+    (tmp_path / 'notes.txt').write_text('no picture')
+    return tmp_path
+
+
+def test_a_folder_is_shown_in_order_at_its_rate_and_again(folder):
+    source = Pictures(str(folder), 50.0)
+    source.open()
+    start = time.time_ns()
+    frames = shown(source, 7)
+    for k, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.counts, PICTURES[k % 3])
+    assert frames[-1].stamp_ns - start >= 0.119e9  # six periods of 20 ms, by another clock
+    assert not source.events
+
+
+def test_it_ends_where_it_may(folder):
+    source = Pictures(str(folder), 1000.0, repeat=False)
+    source.open()
+    shown(source, 3)
+    with pytest.raises(EndOfFramesError):
+        shown(source, 1)
+
+
+def test_a_slow_rate_does_not_hold_the_reader(folder):
+    source = Pictures(str(folder), 0.1)
+    source.open()
+    shown(source, 1)
+    before = time.monotonic()
+    assert source.read() == []
+    assert time.monotonic() - before < 1.0
+
+
+def test_pictures_that_cannot_be_used_are_counted(folder):
+    (folder / 'frame_000.png').write_bytes(b'no PNG')
+    cv2.imwrite(str(folder / 'frame_003.png'), (PICTURES[0] >> 6).astype(np.uint8))
+    source = Pictures(str(folder), 1000.0, repeat=False)
+    source.open()
+    np.testing.assert_array_equal(shown(source, 1)[0].counts, PICTURES[1])
+    shown(source, 1)
+    with pytest.raises(EndOfFramesError):
+        shown(source, 1)
+    assert source.events == {'unusable pictures': 2}
+
+
+def test_a_stack_of_pictures_in_one_file(tmp_path):
+    path = str(tmp_path / 'stack.tif')
+    cv2.imwritemulti(path, PICTURES)
+    source = Pictures(path, 1000.0, repeat=False)
+    source.open()
+    for frame, expected in zip(shown(source, 3), PICTURES, strict=True):
+        np.testing.assert_array_equal(frame.counts, expected)
+
+
+def test_a_video_of_16_bits(tmp_path):
+    path = str(tmp_path / 'flight.mkv')
+    settings = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U, cv2.VIDEOWRITER_PROP_IS_COLOR, 0]
+    writer = cv2.VideoWriter(path, cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*'FFV1'), 30.0, (64, 48), settings)
+    for picture in PICTURES:
+        writer.write(picture)
+    writer.release()
+    source = Pictures(path, 1000.0, repeat=False)
+    source.open()
+    for frame, expected in zip(shown(source, 3), PICTURES, strict=True):
+        np.testing.assert_array_equal(frame.counts, expected)
+
+
+def test_what_is_no_source_is_refused(tmp_path):
+    with pytest.raises(InputError, match='neither a device'):
+        Pictures(str(tmp_path / 'nothing'))
+    with pytest.raises(InputError, match='no 16-bit'):
+        Pictures(str(tmp_path))
+    (tmp_path / 'a.avi').write_bytes(b'no video')
+    with pytest.raises(InputError, match='no 16-bit'):
+        Pictures(str(tmp_path / 'a.avi'))

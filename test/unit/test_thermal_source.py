@@ -1,0 +1,84 @@
+"""Node ``thermal_source`` on recorded pictures and without a camera."""
+
+import cv2
+import numpy as np
+import pytest
+from sensor_msgs.msg import CameraInfo, Image
+from support.ros_graph import ros_graph
+from support.small_bag import CAMERA
+
+from thermal_fiducial.files.camera_info import save_camera
+from thermal_fiducial.files.images import image_to_array
+from thermal_fiducial.nodes.tau2_camera import Tau2Camera
+from thermal_fiducial.nodes.thermal_source import ThermalSource
+from thermal_fiducial.ros import convert
+from thermal_fiducial.ros.node import ERROR, OK
+
+pytestmark = pytest.mark.ros
+PICTURES = [np.random.default_rng(k).integers(6000, 9000, (48, 64), dtype=np.uint16) for k in range(40)]
+
+
+@pytest.fixture
+def graph():
+    with ros_graph() as graph:
+        yield graph
+        for node in graph.nodes:
+            if isinstance(node, ThermalSource):
+                node.close()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / 'pictures').mkdir()
+    for k, counts in enumerate(PICTURES):
+        cv2.imwrite(str(tmp_path / 'pictures' / f'{k:03}.png'), counts)
+    return str(tmp_path / 'pictures')
+
+
+def test_counts_and_calibration_go_out_with_one_stamp(graph, folder, tmp_path):
+    save_camera(tmp_path / 'camera.yaml', CAMERA)
+    graph.listen(Image, 'thermal/image_raw')
+    graph.listen(CameraInfo, 'thermal/camera_info')
+    node = graph.add(ThermalSource, camera=folder, frame_rate=50.0, calibration_file=str(tmp_path / 'camera.yaml'))
+    images, infos = graph.heard['thermal/image_raw'], graph.heard['thermal/camera_info']
+    graph.spin_until(lambda: len(images) >= 5 and len(infos) >= 5)
+    assert images[0].encoding == 'mono16'
+    assert images[0].header.frame_id == 'thermal_camera_optical'
+    assert any(np.array_equal(image_to_array(images[0]), counts) for counts in PICTURES)
+    stamps = [convert.stamp_ns(message.header.stamp) for message in images]
+    assert np.all(np.diff(stamps) > 0)
+    assert set(stamps) & {convert.stamp_ns(message.header.stamp) for message in infos}
+    assert convert.camera(infos[0]).matches(CAMERA)
+    level, reason, figures = graph.diagnose(node)
+    assert (level, reason, figures['reconnections']) == (OK, 'ok', '0')
+
+
+def test_tau2_camera_takes_its_frames(graph, folder):
+    graph.listen(Image, 'thermal/image')
+    graph.add(Tau2Camera)
+    graph.add(ThermalSource, camera=folder, frame_rate=50.0)
+    graph.spin_until(lambda: len(graph.heard['thermal/image']) >= 3)
+
+
+def test_without_a_camera_it_waits_and_says_so(graph):
+    node = graph.add(ThermalSource, camera='/dev/video_that_is_not_there')
+    graph.spin_until(lambda: 'No such file' in node.state()[1])
+    level, reason, _ = graph.diagnose(node)
+    assert (level, reason) == (ERROR, '/dev/video_that_is_not_there: No such file or directory')
+
+
+@pytest.mark.parametrize(('camera', 'words'), [('', 'parameter camera'), ('/nowhere/pictures', 'neither a device')])
+def test_a_camera_that_is_none_is_a_fault(graph, camera, words):
+    node = graph.add(ThermalSource, camera=camera)
+    level, reason, _ = graph.diagnose(node)
+    assert level == ERROR
+    assert words in reason
+
+
+def test_a_frame_that_nobody_foresaw_does_not_end_it(graph, folder):
+    node = graph.add(ThermalSource, camera=folder, frame_rate=100.0)
+    graph.spin_until(lambda: node.state()[0] == OK)
+    node.guard(node._publish, None)
+    graph.listen(Image, 'thermal/image_raw')
+    graph.spin_until(lambda: graph.heard['thermal/image_raw'])
+    assert 'internal error' in graph.diagnose(node)[2]['last refusal']

@@ -1,0 +1,1 @@
+"""Drivers of thermal cameras: V4L2, TeAx ThermalGrabber, and recorded pictures. They need no ROS."""

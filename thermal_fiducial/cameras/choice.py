@@ -1,0 +1,33 @@
+"""Which driver a camera's name asks for."""
+
+from thermal_fiducial.cameras.pictures import Pictures
+from thermal_fiducial.cameras.source import FrameSource
+from thermal_fiducial.cameras.teax import ThermalGrabber
+from thermal_fiducial.cameras.v4l2 import is_video_device, V4l2Camera
+from thermal_fiducial.config import ThermalSourceConfig
+from thermal_fiducial.errors import InputError
+
+_TEAX = 'teax'
+#: Of recorded pictures, where none is asked for [Hz]: a Tau 2's.
+_PICTURE_RATE = 30.0
+
+
+def make_source(config: ThermalSourceConfig) -> FrameSource:
+    """The driver of ``config.camera``, not yet opened.
+
+    Raises
+    ------
+    InputError
+        No camera is named, or pictures that are not there.
+    """
+    kind, _, detail = config.camera.partition(':')
+    size = (config.image_width, config.image_height) if config.image_width and config.image_height else None
+    if bool(config.image_width) != bool(config.image_height):
+        raise InputError('parameters image_width and image_height: both or none')
+    if not config.camera:
+        raise InputError('parameter camera: a device (/dev/video0), "teax", or a folder or video of pictures')
+    if kind == _TEAX:
+        return ThermalGrabber(detail, size)
+    if is_video_device(config.camera):
+        return V4l2Camera(config.camera, size, config.frame_rate)
+    return Pictures(config.camera, config.frame_rate or _PICTURE_RATE, repeat=config.repeat)

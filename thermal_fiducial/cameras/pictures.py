@@ -1,0 +1,97 @@
+"""Recorded 16-bit pictures in the place of a camera: a folder of them (flirpy's, for instance), or a video."""
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+
+from thermal_fiducial.cameras.source import CapturedFrame, EndOfFramesError, now_ns
+from thermal_fiducial.core.types import Counts
+from thermal_fiducial.errors import InputError
+
+_PICTURES = ('.png', '.tif', '.tiff', '.pgm')
+_STACKS = ('.tif', '.tiff')
+_PATIENCE_S = 0.2
+
+
+class Pictures:
+    """A :class:`~thermal_fiducial.cameras.source.FrameSource` that shows pictures at an even rate, stamped when shown.
+
+    Parameters
+    ----------
+    path : a folder of PNG, TIFF or PGM files, shown in the order of their names; a TIFF of many pages; or a video
+        whose codec keeps 16 bits (FFV1 with gray16le)
+    rate : pictures a second [Hz]
+    repeat : begin again at the end
+
+    Raises
+    ------
+    InputError
+        There is nothing of this kind.
+    """
+
+    def __init__(self, path: str, rate: float = 30.0, *, repeat: bool = True) -> None:
+        self.name = path
+        self.events: Counter[str] = Counter()
+        self._path = Path(path)
+        self._period = 1.0 / rate
+        self._repeat = repeat
+        if not self._path.exists():
+            raise InputError(f'camera {path}: neither a device in /dev, nor "teax", nor a folder or video')
+        if not any(True for _ in self._one_pass()):
+            raise InputError(f'camera {path}: no 16-bit grey picture in it')
+        self.events.clear()
+
+    def open(self) -> None:
+        """Begin with the first picture."""
+        self._pictures = self._all()
+        self._due = time.monotonic()
+
+    def read(self) -> list[CapturedFrame]:
+        """The next picture, when it is its turn; see the protocol."""
+        wait = self._due - time.monotonic()
+        time.sleep(min(max(wait, 0.0), _PATIENCE_S))
+        if wait > _PATIENCE_S:
+            return []
+        counts = next(self._pictures, None)
+        if counts is None:
+            raise EndOfFramesError
+        # In step, unless a picture took longer to read than it may be shown.
+        self._due = max(self._due + self._period, time.monotonic() - self._period)
+        return [CapturedFrame(now_ns(), counts)]
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _all(self) -> Iterator[Counts]:
+        yield from self._one_pass()
+        while self._repeat:
+            yield from self._one_pass()
+
+    def _one_pass(self) -> Iterator[Counts]:
+        for picture in self._files() if self._path.is_dir() else self._video():
+            if picture is not None and picture.dtype == np.uint16 and picture.ndim == 2:
+                yield np.asarray(picture, dtype=np.uint16)
+            else:
+                self.events['unusable pictures'] += 1
+
+    def _files(self) -> Iterator[Any]:
+        for path in sorted(self._path.iterdir()):
+            if path.suffix.lower() in _PICTURES:
+                yield cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+
+    def _video(self) -> Iterator[Any]:
+        if self._path.suffix.lower() in _STACKS:
+            yield from cv2.imreadmulti(str(self._path), flags=cv2.IMREAD_UNCHANGED)[1]
+            return
+        video = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
+        video.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+        try:
+            while (picture := video.read())[0]:
+                yield picture[1]
+        finally:
+            video.release()

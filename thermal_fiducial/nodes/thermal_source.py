@@ -1,0 +1,73 @@
+"""Node ``thermal_source``: frames of a thermal camera, as it sends them, with stamps of capture."""
+
+import sys
+from typing import Any
+
+from sensor_msgs.msg import CameraInfo, Image
+
+from thermal_fiducial.cameras.capture import Capture
+from thermal_fiducial.cameras.choice import make_source
+from thermal_fiducial.cameras.source import CapturedFrame
+from thermal_fiducial.config import ThermalSourceConfig
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.node import ERROR, OK, StageNode
+from thermal_fiducial.ros.run import run
+
+
+class ThermalSource(StageNode[ThermalSourceConfig]):
+    """Publishes a camera's counts and calibration; a thread reads the camera, and publishes without delay."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__('thermal_source', ThermalSourceConfig, **kwargs)
+        config = self.config
+        self._calibration: Camera | None = None
+        if config.calibration_file:
+            self._calibration = self.attempt(lambda: load_camera(config.calibration_file), None)
+            self._camera_info = self.advertise(CameraInfo, 'thermal/camera_info', qos.IMAGE_OUTPUT)
+        self._image = self.advertise(Image, 'thermal/image_raw', qos.IMAGE_OUTPUT)
+        self._source = self.attempt(lambda: make_source(config), None)
+        self._capture: Capture | None = None
+        if self._source is not None:
+            self._capture = Capture(self._source, self._on_frame, self._on_change)
+
+    def _on_frame(self, frame: CapturedFrame) -> None:
+        self.guard(self._publish, frame)
+
+    def _publish(self, frame: CapturedFrame) -> None:
+        head = convert.header(frame.stamp_ns, self.config.frame_id)
+        if self._calibration is not None:
+            self._camera_info.send(convert.camera_info(self._calibration, head))
+        self._image.send(convert.image(frame.counts, head))
+
+    def _on_change(self, trouble: str) -> None:
+        if trouble:
+            self.get_logger().warning(trouble)
+        elif self._source is not None:
+            self.get_logger().info(f'{self._source.name}: frames are coming')
+
+    def state(self) -> tuple[bytes, str]:
+        """Why there are no frames."""
+        trouble = self._capture.trouble if self._capture is not None else ''
+        return (ERROR, trouble) if trouble else (OK, 'ok')
+
+    def figures(self) -> dict[str, object]:
+        """Frames that were damaged, by reason, and how often the camera was connected again."""
+        events = {} if self._source is None else dict(self._source.events)
+        return {'reconnections': self._capture.reconnections if self._capture else 0, **events}
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        if self._capture is not None:
+            self._capture.close()
+        super().close()
+
+
+def main() -> int:
+    """Run the node."""
+    return run(ThermalSource)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
