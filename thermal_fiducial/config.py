@@ -4,8 +4,9 @@ The nodes declare these as ROS parameters, the offline pipeline takes the same o
 ``config/thermal_fiducial.yaml`` is checked against them, so a default lives in one place.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, Field, field, fields, MISSING
+import difflib
 import math
 from typing import Any, TypeVar
 
@@ -14,6 +15,8 @@ from thermal_fiducial.errors import InputError
 Config = TypeVar('Config')
 #: By how much the norm of a quaternion that somebody typed may be off.
 _NORM_TOLERANCE = 0.01
+#: Parameters that rclpy declares on every node.
+_OF_ROS = ('use_sim_time', 'start_type_description_service')
 
 
 def param(
@@ -26,6 +29,7 @@ def param(
     choices: tuple[str, ...] = (),
     length: int | None = None,
     normed: bool = False,
+    verify: Callable[[Any], object] | None = None,
     live: bool = False,
 ) -> Any:
     """One parameter: a dataclass field with what ROS wants to know of it.
@@ -39,6 +43,7 @@ def param(
     choices : the allowed values of a string
     length : number of elements of a tuple of floats
     normed : whether their squares must add up to one, as a rotation's quaternion's do
+    verify : called with the value, raises InputError if it cannot be used
     live : whether it may be set while the node runs; otherwise it is declared read-only
     """
     metadata = {
@@ -48,9 +53,26 @@ def param(
         'choices': choices,
         'length': length,
         'normed': normed,
+        'verify': verify,
         'live': live,
     }
     return field(default=default, metadata=metadata)
+
+
+@dataclass(frozen=True)
+class SelfChecked:
+    """Base of the configs: values are checked wherever an object is made, also by hand or by ``replace``.
+
+    Raises
+    ------
+    InputError
+        A value of the wrong type, out of range, or not among the choices.
+    """
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            if item.default_factory is MISSING:
+                object.__setattr__(self, item.name, checked(item.name, item, getattr(self, item.name)))
 
 
 def group(kind: type) -> Any:
@@ -72,7 +94,7 @@ def parameters(config: Any, prefix: str = '') -> Iterator[tuple[str, 'Field[Any]
 def from_mapping(kind: type[Config], values: dict[str, Any]) -> Config:
     """Config of dataclass ``kind`` with ``values`` (ROS name to value) in place of the defaults.
 
-    Names that ``kind`` doesn't have are left alone: one parameter file serves all nodes.
+    Names that ``kind`` doesn't have are left alone, as one parameter file serves all nodes; see :func:`check_names`.
 
     Raises
     ------
@@ -111,6 +133,8 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
             raise InputError(f'parameter {name}: {element!r} is outside {low} .. {high}')
     if limits['normed'] and not abs(math.hypot(*result) - 1.0) < _NORM_TOLERANCE:
         raise InputError(f'parameter {name}: {list(result)} is no unit quaternion')
+    if limits['verify']:
+        limits['verify'](result)
     return result
 
 
@@ -147,7 +171,8 @@ def _marker_size() -> Any:
 
 
 def _marker_size_overrides() -> Any:
-    return param((), 'Sides of single markers, strings "ID:SIZE", e.g. ["7:0.50"].', unit='m')
+    text = 'Sides of single markers, strings "ID:SIZE", e.g. ["7:0.50"].'
+    return param((), text, unit='m', verify=size_overrides)
 
 
 def _map_file() -> Any:
@@ -203,7 +228,7 @@ def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
 
 
 @dataclass(frozen=True)
-class Tau2CameraConfig:
+class Tau2CameraConfig(SelfChecked):
     """Ingestion of raw thermal frames."""
 
     calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
@@ -248,7 +273,7 @@ class Tau2CameraConfig:
 
 
 @dataclass(frozen=True)
-class ArucoDetectorConfig:
+class ArucoDetectorConfig(SelfChecked):
     """Detection of markers and the pose of each."""
 
     dictionary: str = _dictionary()
@@ -351,7 +376,7 @@ class ArucoDetectorConfig:
 
 
 @dataclass(frozen=True)
-class MarkerMapperConfig:
+class MarkerMapperConfig(SelfChecked):
     """The incremental marker map."""
 
     dictionary: str = _dictionary()
@@ -382,7 +407,7 @@ class MarkerMapperConfig:
 
 
 @dataclass(frozen=True)
-class ImuNoise:
+class ImuNoise(SelfChecked):
     """Continuous noise densities of the IMU, under Kalibr's names and units."""
 
     gyroscope_noise_density: float = param(1.7e-4, 'Gyroscope white noise.', unit='rad/s/sqrt(Hz)', minimum=0.0)
@@ -410,7 +435,7 @@ class ImuNoise:
 
 
 @dataclass(frozen=True)
-class PoseEkfConfig:
+class PoseEkfConfig(SelfChecked):
     """The filter."""
 
     camera_position: tuple[float, ...] = _camera_position()
@@ -523,7 +548,7 @@ class PoseEkfConfig:
 
 
 @dataclass(frozen=True)
-class ThermalSourceConfig:
+class ThermalSourceConfig(SelfChecked):
     """The camera's driver, where no other one is used."""
 
     camera: str = param(
@@ -555,3 +580,19 @@ NODES: dict[str, type] = {
 
 #: Nodes beside them, which run only where they are asked for.
 OPTIONAL_NODES: dict[str, type] = {'thermal_source': ThermalSourceConfig}
+
+
+def check_names(names: Iterable[str]) -> None:
+    """Refuse a parameter that no node has: most likely a name that was mistyped.
+
+    Raises
+    ------
+    InputError
+        With the name that comes closest.
+    """
+    known = {name for kind in (NODES | OPTIONAL_NODES).values() for name, _, _ in parameters(kind)}
+    for name in sorted(set(names) - known - set(_OF_ROS)):
+        if name.startswith('qos_overrides.'):
+            continue
+        close = difflib.get_close_matches(name, known, 1)
+        raise InputError(f'parameter {name}: no node has it' + (f'; did you mean {close[0]}?' if close else ''))

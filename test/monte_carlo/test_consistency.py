@@ -7,7 +7,7 @@ correlated, so that a sound filter may well be outside of it for a whole second 
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.flights import config, Flight, matched, state_error, timeline
+from support.flights import CAMERA_POSITION, config, Flight, matched, state_error, timeline
 
 from thermal_fiducial.core.filter.pose_ekf import PoseEkf
 from thermal_fiducial.core.measurements import ImuSample
@@ -82,7 +82,7 @@ def test_shipped_parameters_are_conservative():
 
 FAULTS = {
     'extrinsics transposed': {'camera_orientation': (0.5, -0.5, 0.5, 0.5)},
-    'gravity upward': {'gravity': -9.80665},
+    'camera on the other side': {'camera_position': tuple(-x for x in CAMERA_POSITION)},
 }
 
 

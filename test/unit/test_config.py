@@ -1,18 +1,21 @@
 """Parameters: complete metadata, and refusal of what doesn't fit."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 
 from thermal_fiducial import config
 from thermal_fiducial.config import (
     ArucoDetectorConfig,
+    check_names,
     from_mapping,
     group,
+    ImuNoise,
     MarkerMapperConfig,
     param,
     parameters,
     PoseEkfConfig,
+    SelfChecked,
     size_overrides,
     Tau2CameraConfig,
     ThermalSourceConfig,
@@ -23,12 +26,12 @@ NODES = (Tau2CameraConfig, ArucoDetectorConfig, MarkerMapperConfig, PoseEkfConfi
 
 
 @dataclass(frozen=True)
-class Inner:
+class Inner(SelfChecked):
     gain: float = param(1.0, 'Gain.', unit='1', minimum=0.0, maximum=2.0)
 
 
 @dataclass(frozen=True)
-class Example:
+class Example(SelfChecked):
     name: str = param('a', 'Name.', choices=('a', 'b'))
     count: int = param(3, 'Count.', minimum=1)
     flag: bool = param(False, 'Flag.')
@@ -68,7 +71,7 @@ def test_parameters_of_a_class_and_of_an_instance():
     assert {name: value for name, _, value in parameters(changed)}['inner.gain'] == 0.5
 
 
-def test_values_take_the_place_of_defaults_and_strangers_are_left_alone():
+def test_values_take_the_place_of_defaults_and_names_of_others_are_left_alone():
     made = from_mapping(Example, {'name': 'b', 'place': [1, 2.5], 'words': ['x'], 'inner.gain': 2, 'other': object()})
     assert made == Example(name='b', place=(1.0, 2.5), words=('x',), inner=Inner(2.0))
     assert isinstance(made.inner.gain, float)
@@ -102,6 +105,39 @@ def test_what_does_not_fit_is_refused_by_name(values, words):
         from_mapping(Example, values)
     assert words in str(error.value)
     assert str(error.value).startswith(f'parameter {next(iter(values))}')
+
+
+@pytest.mark.parametrize(
+    ('make', 'words'),
+    [
+        (lambda: PoseEkfConfig(gravity=12.0), 'parameter gravity: 12.0 is outside 9.7 .. 9.9'),
+        (lambda: replace(PoseEkfConfig(), initial_poses=2.5), 'parameter initial_poses: 2.5 is not of type int'),
+        (lambda: ImuNoise(vibration=-1.0), 'parameter vibration: -1.0 is outside'),
+        (lambda: ArucoDetectorConfig(marker_size_overrides=('7',)), 'parameter marker_size_overrides'),
+        (lambda: MarkerMapperConfig(mode='surveying'), "parameter mode: 'surveying' is not one of"),
+    ],
+)
+def test_a_config_made_by_hand_checks_itself(make, words):
+    with pytest.raises(InputError) as error:
+        make()
+    assert words in str(error.value)
+
+
+def test_a_config_takes_lists_and_whole_numbers_as_a_file_does():
+    made = ArucoDetectorConfig(camera_position=[1, 0, 0], marker_size=1)
+    assert made == from_mapping(ArucoDetectorConfig, {'camera_position': [1, 0, 0], 'marker_size': 1})
+    assert made.camera_position == (1.0, 0.0, 0.0)
+
+
+def test_a_name_that_no_node_has_is_refused_with_the_closest_one():
+    with pytest.raises(
+        InputError,
+        match=r'noise_densty: no node has it; did you mean imu\.gyroscope_noise_density',
+    ):
+        check_names(['marker_size', 'imu.gyroscope_noise_densty'])
+    with pytest.raises(InputError, match=r'parameter xyzzy: no node has it$'):
+        check_names(['xyzzy'])
+    check_names(['gate', 'use_sim_time', 'qos_overrides./tf.publisher.depth'])
 
 
 def test_size_overrides():

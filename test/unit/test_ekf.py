@@ -71,10 +71,12 @@ def test_live_parameters_hold_from_then_on(flight):
     arrivals = timeline(flight.samples(), flight.poses, 0.03)
     half = len(arrivals) // 2
     _, before = run(ekf, arrivals[:half])
-    ekf.configure(config(gate=1e-3))
+    # A gate of one where six are expected, of poses that claim a tenth of their errors: hardly one passes.
+    ekf.configure(config(gate=1.0, pose_noise_scale=0.1, position_floor=0.0, attitude_floor=0.0, motion_floor=0.0))
     _, after = run(ekf, arrivals[half:])
     assert all(update.accepted for update in before[3:])
-    assert not any(update.accepted and not update.reason for update in after)
+    passed = [update for update in after if update.accepted and not update.reason]
+    assert len(passed) < 0.05 * len(after)
 
 
 def test_innovations_are_told_in_the_diagnostics(flight):

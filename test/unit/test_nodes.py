@@ -414,6 +414,7 @@ def test_silence_is_said(graph):
         ('marker_size:=big', 'marker_size'),
         ('camera_position:=[1.0, 2.0]', 'camera_position: 2 values, not 3'),
         ('marker_size_overrides:=["7"]', '"ID:SIZE"'),
+        ('min_contarst:=0.5', 'parameter min_contarst: no node has it; did you mean min_contrast?'),
     ],
 )
 def test_an_unusable_parameter_is_one_line(rule, reason):
@@ -424,6 +425,14 @@ def test_an_unusable_parameter_is_one_line(rule, reason):
             said = [str(error)]
     assert len(said) == 1
     assert reason in said[0]
+
+
+def test_parameters_of_the_other_nodes_are_neither_refused_nor_declared():
+    with ros_graph('-p', 'gate:=30.0', '-p', 'min_contrast:=0.5', '-p', 'whitelist:=[]') as graph:
+        node = graph.add(ArucoDetector)
+        assert node.config.min_contrast == 0.5
+        assert node.config.whitelist == ()
+        assert not node.has_parameter('gate')
 
 
 def test_parameters_are_described(graph):

@@ -2,10 +2,12 @@
 
 from pathlib import Path
 
+import pytest
 from support.small_bag import side_files
 import yaml
 
 from thermal_fiducial.config import from_mapping, NODES, OPTIONAL_NODES, parameters
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.replay.settings import read_settings
 from thermal_fiducial.ros.parameter_file import parameter_file
 
@@ -35,6 +37,20 @@ def test_a_replay_takes_the_file():
     settings = read_settings(FILE, {'mode': 'localization'})
     assert settings.warnings == ()
     assert settings.marker_mapper.mode == 'localization'
+
+
+@pytest.mark.parametrize('section', ['/**', '/pose_ekf', '/drone/pose_ekf'])
+def test_an_unknown_name_is_refused_in_a_section_of_ours(tmp_path, section):
+    file = tmp_path / 'rig.yaml'
+    file.write_text(yaml.safe_dump({section: {'ros__parameters': {'imu': {'gyroscope_noise': 1e-3}}}}))
+    with pytest.raises(InputError, match=r'parameter imu\.gyroscope_noise: no node has it'):
+        read_settings(file, {})
+
+
+def test_a_section_of_another_node_is_its_own_matter(tmp_path):
+    file = tmp_path / 'rig.yaml'
+    file.write_text(yaml.safe_dump({'/mavros': {'ros__parameters': {'fcu_url': 'udp://'}}}))
+    assert read_settings(file, {}).warnings == ()
 
 
 def test_a_map_of_another_dictionary_is_warned_of(tmp_path):

@@ -13,6 +13,7 @@ import numpy as np
 
 from thermal_fiducial.config import (
     ArucoDetectorConfig,
+    check_names,
     from_mapping,
     MarkerMapperConfig,
     PoseEkfConfig,
@@ -47,9 +48,10 @@ class PipelineConfig:
         Raises
         ------
         InputError
-            A value of the wrong type or out of range.
+            A name that no stage has, or a value of the wrong type or out of range.
         """
         values = dict(values)
+        check_names(values)
         return cls(
             from_mapping(Tau2CameraConfig, values),
             from_mapping(ArucoDetectorConfig, values),

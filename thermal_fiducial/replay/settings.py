@@ -9,10 +9,10 @@ import yaml
 
 from thermal_fiducial.config import (
     ArucoDetectorConfig,
+    check_names,
     from_mapping,
     MarkerMapperConfig,
     NODES,
-    OPTIONAL_NODES,
     parameters,
     PoseEkfConfig,
     size_overrides,
@@ -51,21 +51,17 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any]) -> Settings
     Raises
     ------
     InputError
-        An unreadable file, a value of the wrong type or out of range, or a file named in a parameter that cannot be
-        used.
+        An unreadable file, a parameter that no node has, a value of the wrong type or out of range, or a file named in
+        a parameter that cannot be used.
     """
     document = {} if params is None else _document(params)
     configs: dict[str, Any] = {}
-    known = {name for kind in OPTIONAL_NODES.values() for name, _, _ in parameters(kind)}
     for node, kind in NODES.items():
-        names = {name for name, _, _ in parameters(kind)}
-        configs[node] = from_mapping(kind, _values_for(node, document) | dict(overrides))
-        known |= names
-    given = {name for section in document.values() for name in section}
-    unknown = sorted(given - known - {'use_sim_time'})
+        values = _values_for(node, document) | dict(overrides)
+        check_names(values)
+        configs[node] = from_mapping(kind, values)
     settings = Settings(**configs)
-    warnings = [f'no node has parameter {", ".join(unknown)}'] if unknown else []
-    return replace(settings, warnings=(*warnings, *_check_files(settings)))
+    return replace(settings, warnings=tuple(_check_files(settings)))
 
 
 def _check_files(settings: Settings) -> list[str]:

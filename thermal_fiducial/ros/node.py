@@ -108,7 +108,7 @@ class StageNode(CountingNode, Generic[Config]):
     Raises
     ------
     InputError
-        A parameter of the wrong type, out of range, or not among the choices.
+        A parameter that no node has, of the wrong type, out of range, or not among the choices.
     """
 
     def __init__(self, name: str, kind: type[Config], *, live: bool = True, **kwargs: Any) -> None:

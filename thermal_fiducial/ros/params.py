@@ -9,7 +9,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from thermal_fiducial.config import from_mapping, parameters
+from thermal_fiducial.config import check_names, from_mapping, parameters
 from thermal_fiducial.errors import InputError
 
 Config = TypeVar('Config')
@@ -25,11 +25,19 @@ _UNBOUNDED = 1e300
 def declare(node: Node, kind: type[Config]) -> Config:
     """Declare all parameters of config dataclass ``kind`` on ``node``; their values from file and command line.
 
+    Parameters
+    ----------
+    node : whose parameters they become; those of other nodes in the same file are left alone
+    kind : config dataclass
+
     Raises
     ------
     InputError
-        A value of the wrong type, out of range, or not among the choices.
+        A name that no node has, or a value of the wrong type, out of range, or not among the choices.
     """
+    # rclpy has no public way to ask what was given: declaring it all (automatically_declare_parameters_from_overrides)
+    # fails on an empty list, which has no type.
+    check_names(getattr(node, '_parameter_overrides', {}))
     for name, item, default in parameters(kind):
         try:
             node.declare_parameter(name, _declared(item, default), _descriptor(item))
