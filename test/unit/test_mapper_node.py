@@ -17,7 +17,7 @@ from thermal_fiducial.files.map_history import entries
 from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.files.point_cloud import save_alignment
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
-from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros import clouds, convert, qos
 from thermal_fiducial.ros.node import ERROR, WARN
 
 pytestmark = pytest.mark.ros
@@ -85,7 +85,7 @@ def test_the_point_cloud_of_the_place_is_shown_in_the_map(graph, tmp_path, map_f
     graph.add(MarkerMapperNode, map_file=str(map_file), **files)
     graph.spin_until(lambda: graph.heard['marker_map/cloud'])
     (message,) = graph.heard['marker_map/cloud']
-    rows = convert.cloud_rows(message, np.dtype([(axis, '<f4') for axis in 'xyz']))
+    rows = clouds.cloud_rows(message, np.dtype([(axis, '<f4') for axis in 'xyz']))
     assert message.header.frame_id == 'map'
     assert 20_000 < len(rows) <= 60_000
     shown = np.stack([rows[axis] for axis in 'xyz'], axis=-1).astype(float)

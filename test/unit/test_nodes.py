@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 from support import small_bag
+from support.messages import frames, imu, info, pose
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.filter.innovations import innovations_of
@@ -24,41 +25,17 @@ from thermal_fiducial.nodes.aruco_detector import ArucoDetector
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
-from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros import clouds, convert, qos
 from thermal_fiducial.ros.node import ERROR, OK, WARN
 
 pytestmark = pytest.mark.ros
 START = small_bag.START_NS
-FRAME_NS = 33_333_333
 
 
 @pytest.fixture
 def graph():
     with ros_graph() as graph:
         yield graph
-
-
-def frames(count):
-    rng = np.random.default_rng(3)
-    pictures = [small_bag.frame(small_bag.true_pose(k / 30), rng) for k in range(count)]
-    return [convert.image(p, convert.header(START + k * FRAME_NS, 'camera')) for k, p in enumerate(pictures)]
-
-
-def info(camera=small_bag.CAMERA):
-    return convert.camera_info(camera, convert.header(START, 'camera'))
-
-
-def imu(k, rate=(0.0, 0.0, 0.0), force=(0.0, 0.0, 9.80665)):
-    message = Imu(header=convert.header(START + k * 5_000_000, 'base_link'))
-    message.angular_velocity = convert.vector(np.array(rate))
-    message.linear_acceleration = convert.vector(np.array(force))
-    return message
-
-
-def pose(k, T=None):
-    head = convert.header(START + k * 5_000_000, 'map')
-    T_map_camera = small_bag.T_BODY_CAMERA if T is None else T
-    return convert.pose_with_covariance(T_map_camera, np.diag([1e-6] * 3 + [1e-7] * 3), head)
 
 
 # --- tau2_camera --------------------------------------------------------------------------------------
@@ -179,7 +156,7 @@ def test_markers_come_as_rows_of_the_contract(graph):
     full, none = graph.heard['markers']
     assert [field.name for field in full.fields[:4]] == ['x', 'y', 'z', 'id']
     assert full.point_step == MARKER_DTYPE.itemsize
-    rows = convert.markers(full)
+    rows = clouds.markers(full)
     assert rows['id'].tolist() == [0, 1, 2, 3]
     # Flat pictures at 2.4 m: a few centimetres.
     np.testing.assert_allclose(rows['z'], 2.4, atol=0.1)
@@ -259,7 +236,7 @@ def test_the_map_is_latched_and_the_camera_found(graph, map_file):
     node = graph.add(MarkerMapperNode, map_file=str(map_file))
     graph.listen(PointCloud2, 'marker_map', qos.LATCHED)
     graph.spin_until(lambda: graph.heard['marker_map'])
-    rows = convert.cloud_rows(graph.heard['marker_map'][0], MAP_DTYPE)
+    rows = clouds.cloud_rows(graph.heard['marker_map'][0], MAP_DTYPE)
     assert (rows['id'].tolist(), rows['fixed'].tolist()) == ([0], [1])
     graph.listen(PoseWithCovarianceStamped, 'camera_pose')
     graph.send('thermal/camera_info', info())
@@ -347,7 +324,7 @@ def test_one_pose_and_one_odometry_for_each_imu_message(graph):
     assert convert.stamp_ns(message.header.stamp) == START + 79 * 5_000_000
     assert (message.header.frame_id, message.child_frame_id) == ('map', 'base_link')
     # At rest at the origin: what is left is noise of the made-up poses' floor.
-    np.testing.assert_allclose(convert.odometry(message).T_map_body, np.eye(4), atol=0.01)
+    np.testing.assert_allclose(convert.transform_of(message.pose.pose), np.eye(4), atol=0.01)
     level, reason, figures = graph.diagnose(node)
     assert (level, reason, figures['lost']) == (OK, 'tracking', 'False')
     # Of ten poses three start the filter; each is told once.

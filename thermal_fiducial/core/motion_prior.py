@@ -25,7 +25,7 @@ class MotionPrior:
 
     def __init__(self, camera_time_offset: float = 0.0) -> None:
         self._stamps_ns: list[int] = []
-        self._readers: list[Callable[[], Odometry]] = []
+        self._readers: list[Callable[[], Odometry | None]] = []
         self._offset_ns = round(camera_time_offset * 1e9)
         #: whether the filter has estimated the offset of the clocks: before that it is the parameter's
         self.clock_is_known = False
@@ -39,8 +39,8 @@ class MotionPrior:
         """The instant of a frame in the clock of the odometry [ns]."""
         return camera_stamp_ns + self._offset_ns
 
-    def add(self, stamp_ns: int, read: Callable[[], Odometry]) -> None:
-        """Keep the state of a stamp, which ``read`` gives."""
+    def add(self, stamp_ns: int, read: Callable[[], Odometry | None]) -> None:
+        """Keep the state of a stamp, which ``read`` gives; None if that proves to be unusable."""
         if self._stamps_ns and stamp_ns < self._stamps_ns[-1] - _RESTART_NS:
             self._stamps_ns, self._readers = [], []
         place = bisect_right(self._stamps_ns, stamp_ns)
@@ -66,4 +66,5 @@ class MotionPrior:
         first, last = bisect_left(self._stamps_ns, first_ns), bisect_right(self._stamps_ns, last_ns)
         count = last - first
         kept = min(count, at_most)
-        return [self._readers[first + place * (count - 1) // max(kept - 1, 1)]() for place in range(kept)]
+        states = [self._readers[first + place * (count - 1) // max(kept - 1, 1)]() for place in range(kept)]
+        return [state for state in states if state is not None]

@@ -15,7 +15,7 @@ from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import image_to_array
-from thermal_fiducial.ros import convert, display, qos
+from thermal_fiducial.ros import clouds, convert, display, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
 from thermal_fiducial.ros.node import OK
 from thermal_fiducial.ros.run import run
@@ -54,8 +54,8 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         _check_size(counts, camera)
         markers = self.detector.detect(stamp, counts, camera, self.odometry)
         self._seen = len(markers)
-        self._markers.send(convert.cloud(markers, message.header))
-        self._marker_poses.send(convert.marker_poses(markers, message.header))
+        self._markers.send(clouds.cloud(markers, message.header))
+        self._marker_poses.send(clouds.marker_poses(markers, message.header))
         if self._annotated.listeners:
             self._annotated.send(convert.image(display.annotated(self._gray(counts), markers), message.header))
 
@@ -64,7 +64,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
 
     def _on_map(self, message: PointCloud2) -> None:
         if self.detector is not None:
-            self.detector.set_map(convert.map_poses(message))
+            self.detector.set_map(clouds.map_poses(message))
 
     def state(self) -> tuple[bytes, str]:
         """Number of markers in the last frame."""

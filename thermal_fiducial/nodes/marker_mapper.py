@@ -24,7 +24,7 @@ from thermal_fiducial.files.dictionary import other_patterns
 from thermal_fiducial.files.map_history import save_with_history, undo
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.point_cloud import load_alignment, load_cloud, thinned
-from thermal_fiducial.ros import convert, display, qos
+from thermal_fiducial.ros import clouds, convert, display, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
 from thermal_fiducial.ros.node import OK, WARN
 from thermal_fiducial.ros.run import run
@@ -65,12 +65,12 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._map_cloud = self.advertise(PointCloud2, 'marker_map/cloud', qos.LATCHED)
         self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT)
         self.follow_hints()
-        self.create_service(Trigger, '~/save', self._on_save)
-        self.create_service(Trigger, '~/load', self._on_load)
-        self.create_service(Trigger, '~/undo', self._on_undo)
-        self.create_service(Trigger, '~/reset', self._on_reset)
-        self.create_service(Trigger, '~/refine', self._on_refine)
-        self.create_service(SetBool, '~/freeze', self._on_freeze)
+        self.serve(Trigger, '~/save', self._on_save)
+        self.serve(Trigger, '~/load', self._on_load)
+        self.serve(Trigger, '~/undo', self._on_undo)
+        self.serve(Trigger, '~/reset', self._on_reset)
+        self.serve(Trigger, '~/refine', self._on_refine)
+        self.serve(SetBool, '~/freeze', self._on_freeze)
         self._publish_map()
         self._draw_map()
         self.attempt(self._publish_cloud, None)
@@ -104,7 +104,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
 
     def _on_markers(self, message: PointCloud2) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
-        frame = self.mapper.locate(stamp, convert.markers(message), self.camera(), self.odometry.nearest(stamp))
+        frame = self.mapper.locate(stamp, clouds.markers(message), self.camera(), self.odometry.nearest(stamp))
         self._newest_ns = max(stamp, self._newest_ns) if stamp >= self._newest_ns - LATEST_NS else stamp
         if frame.pose is not None:
             head, told = convert.header(stamp, self.config.map_frame), self._as_told(frame.pose)
@@ -148,7 +148,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
 
     def _publish_map(self) -> None:
         rows = self.mapper.map.rows(self._result.in_view)
-        self._marker_map.send(convert.cloud(rows, convert.header(self._result.stamp_ns, self.config.map_frame)))
+        self._marker_map.send(clouds.cloud(rows, convert.header(self._result.stamp_ns, self.config.map_frame)))
         self._drawn = None
 
     def _draw_map(self) -> None:
@@ -179,7 +179,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         T_cloud_map = load_alignment(config.cloud_alignment_file) if config.cloud_alignment_file else np.eye(4)
         points = apply(inverse(T_cloud_map), thinned(load_cloud(config.cloud_file), _CLOUD_POINTS))
         rows = np.ascontiguousarray(points, '<f4').view(_XYZ)[:, 0]
-        self._map_cloud.send(convert.cloud(rows, convert.header(0, config.map_frame)))
+        self._map_cloud.send(clouds.cloud(rows, convert.header(0, config.map_frame)))
 
     def _on_save(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         return _answered(response, self._save)

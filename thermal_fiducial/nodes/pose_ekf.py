@@ -57,7 +57,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
         self.subscribe(TransformStamped, 'map_correction', self._on_map_correction, qos.RESULT)
-        self.create_service(Trigger, '~/reset', self._on_reset)
+        self.serve(Trigger, '~/reset', self._on_reset)
 
     def configure(self, config: PoseEkfConfig) -> None:
         """Take over the live parameters of ``config``."""

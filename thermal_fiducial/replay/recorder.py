@@ -19,7 +19,7 @@ from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagWriter
 from thermal_fiducial.files.trajectory import tum_line
 from thermal_fiducial.replay.topics import Topics
-from thermal_fiducial.ros import convert
+from thermal_fiducial.ros import clouds, convert
 from thermal_fiducial.ros.node import CountingNode
 
 
@@ -88,7 +88,7 @@ class RunFiles:
 
     def _on_markers(self, message: PointCloud2) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
-        rows = convert.markers(message)
+        rows = clouds.markers(message)
         self.frames_with_markers += len(rows) > 0
         for row in rows:
             values = [f'{row[name]:.5f}' for name in (*CORNER_FIELDS, 'sigma_px')]

@@ -8,6 +8,7 @@ from sensor_msgs.msg import CameraInfo, TimeReference
 
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros import convert, odometry_bytes, qos
@@ -50,7 +51,15 @@ class CameraStageNode(StageNode[Config]):
 
     def _on_odometry(self, message: bytes) -> None:
         """A few of these are wanted at frame rate, and only they are read."""
-        self.odometry.add(odometry_bytes.stamp_ns(message), partial(odometry_bytes.odometry, message))
+        self.odometry.add(odometry_bytes.stamp_ns(message), partial(self._read_odometry, message))
+
+    def _read_odometry(self, message: bytes) -> Odometry | None:
+        """A hint that cannot be used is dropped, not the frame that asks for it."""
+        try:
+            return odometry_bytes.odometry(message)
+        except InputError as error:
+            self.refuse(str(error))
+            return None
 
     def _on_camera_clock(self, message: TimeReference) -> None:
         self.odometry.set_clock_offset(convert.clock_offset(message))

@@ -6,6 +6,7 @@ Messages check nothing, so what comes in is checked here and what goes out is co
 
 from array import array
 from collections.abc import Iterable, Mapping
+import math
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -13,7 +14,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import (
     Point,
     Pose,
-    PoseArray,
     PoseStamped,
     PoseWithCovarianceStamped,
     Quaternion,
@@ -24,43 +24,41 @@ from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
 import numpy as np
 import numpy.typing as npt
-from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2, PointField, TimeReference
+from sensor_msgs.msg import CameraInfo, Image, Imu, TimeReference
 from std_msgs.msg import Header
 
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE, require_usable
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
-from thermal_fiducial.core.measurements import (
-    CameraPose,
-    CORNER_COVARIANCE_FIELDS,
-    corner_covariances,
-    corners_px,
-    ImuSample,
-    MAP_DTYPE,
-    MARKER_DTYPE,
-    Markers,
-    Odometry,
-)
+from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
-_POINT_TYPES = {
-    PointField.INT8: 'i1',
-    PointField.UINT8: 'u1',
-    PointField.INT16: 'i2',
-    PointField.UINT16: 'u2',
-    PointField.INT32: 'i4',
-    PointField.UINT32: 'u4',
-    PointField.FLOAT32: 'f4',
-    PointField.FLOAT64: 'f8',
-}
-_POINT_CODES = {code: datatype for datatype, code in _POINT_TYPES.items()}
-
+#: By how much the norm of a quaternion may be off.
+NORM_TOLERANCE = 0.1
+# What no IMU measures: seven times the widest gyroscopes' range [rad/s], and four times the widest accelerometers'.
+_FASTEST_TURN, _LARGEST_FORCE = 500.0, 8000.0
+# Clocks farther apart than this are not those of one robot [s].
+_LARGEST_CLOCK_OFFSET = 10.0
 # --- stamps, headers, poses ---------------------------------------------------------------------------
 
 
 def stamp_ns(stamp: Time) -> int:
-    """Integer nanoseconds of a stamp."""
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    """Integer nanoseconds of a stamp.
+
+    Raises
+    ------
+    InputError
+        A time before 1970, or with a second or more of nanoseconds.
+    """
+    return checked_stamp(int(stamp.sec), int(stamp.nanosec))
+
+
+def checked_stamp(seconds: int, nanoseconds: int) -> int:
+    """:func:`stamp_ns` of its two numbers."""
+    if seconds < 0 or nanoseconds >= 1_000_000_000:
+        raise InputError(f'stamp of {seconds} s and {nanoseconds} ns')
+    return seconds * 1_000_000_000 + nanoseconds
 
 
 def clock_reference(camera_stamp_ns: int, offset: float) -> TimeReference:
@@ -70,8 +68,17 @@ def clock_reference(camera_stamp_ns: int, offset: float) -> TimeReference:
 
 
 def clock_offset(message: TimeReference) -> float:
-    """What :func:`clock_reference` says [s]."""
-    return (stamp_ns(message.header.stamp) - stamp_ns(message.time_ref)) * 1e-9
+    """What :func:`clock_reference` says [s].
+
+    Raises
+    ------
+    InputError
+        Clocks that are farther apart than any the filter follows.
+    """
+    offset = (stamp_ns(message.header.stamp) - stamp_ns(message.time_ref)) * 1e-9
+    if abs(offset) > _LARGEST_CLOCK_OFFSET:
+        raise InputError(f'camera_clock that is {offset:.6g} s off')
+    return offset
 
 
 def header(stamp: int, frame_id: str) -> Header:
@@ -87,30 +94,25 @@ def pose(T: FloatArray) -> Pose:
     return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
 
 
-def transform_of(message: Pose) -> FloatArray:
+def transform_of(message: Pose, what: str = 'pose') -> FloatArray:
     """T_a_b (4, 4) of a pose message.
 
     Raises
     ------
     InputError
-        A value that is not finite, or a quaternion that is none.
+        A value that is not finite or beyond the bounds, or a quaternion that is none.
     """
     p, q = message.position, message.orientation
-    return transform_of_values(np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w]))
+    return transform_of_values(np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w]), what)
 
 
-def transform_of_values(values: FloatArray) -> FloatArray:
+def transform_of_values(values: FloatArray, what: str = 'pose') -> FloatArray:
     """:func:`transform_of` of position and quaternion x y z w (7,)."""
-    if not (np.all(np.isfinite(values)) and 0.9 < np.linalg.norm(values[3:]) < 1.1):
-        raise InputError('pose that is not finite or has no unit quaternion')
+    if not np.isfinite(values).all() or abs(math.sqrt(values[3:] @ values[3:]) - 1.0) > NORM_TOLERANCE:
+        raise InputError(f'{what} that is not finite or has no unit quaternion')
+    if not np.abs(values[:3]).max() < LARGEST_COORDINATE:
+        raise InputError(f'{what} {np.abs(values[:3]).max():.3g} m away')
     return transform_from_quaternion(values[:3], values[3:])
-
-
-def _matrix(message: Any, size: int) -> FloatArray:
-    covariance = np.array(message, dtype=np.float64).reshape(size, size)
-    if not np.all(np.isfinite(covariance)):
-        raise InputError('covariance that is not finite')
-    return covariance
 
 
 # --- images -------------------------------------------------------------------------------------------
@@ -122,11 +124,11 @@ def image(pixels: npt.NDArray[Any], head: Header) -> Image:
     message = Image(header=head, height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
     message.is_bigendian = 0
     message.step = pixels.strides[0] if pixels.flags.c_contiguous else pixels[0].nbytes
-    message.data = _bytes(pixels)
+    message.data = data_bytes(pixels)
     return message
 
 
-def _bytes(values: npt.NDArray[Any]) -> 'array[int]':
+def data_bytes(values: npt.NDArray[Any]) -> 'array[int]':
     """The one type that a message takes without looping over its bytes."""
     data = array('B')
     data.frombytes(np.ascontiguousarray(values).view(np.uint8).data if values.size else b'')
@@ -139,15 +141,14 @@ def camera(message: CameraInfo) -> Camera:
     Raises
     ------
     InputError
-        No calibration in it, an unknown model, or a binned or cropped image.
+        No calibration in it, one that no lens has, an unknown model, or a binned or cropped image.
     """
     if max(message.binning_x, message.binning_y) > 1 or message.roi.width or message.roi.height:
         raise InputError('camera_info of a binned or cropped image')
     model = message.distortion_model or 'plumb_bob'
     try:
-        return Camera(
-            int(message.width), int(message.height), np.array(message.k).reshape(3, 3), model, np.array(message.d)
-        )
+        K, D = np.array(message.k).reshape(3, 3), np.array(message.d)
+        return require_usable(Camera(int(message.width), int(message.height), K, model, D))
     except InputError as error:
         raise InputError(f'camera_info: {error}') from None
 
@@ -164,114 +165,6 @@ def camera_info(calibration: Camera, head: Header) -> CameraInfo:
     return message
 
 
-# --- rows as clouds -----------------------------------------------------------------------------------
-
-
-def cloud(rows: npt.NDArray[Any], head: Header) -> PointCloud2:
-    """PointCloud2 with one point a row of a structured array, fields as in its dtype."""
-    layout: Mapping[str, Any] = rows.dtype.fields or {}
-    return PointCloud2(
-        header=head,
-        height=1,
-        width=len(rows),
-        fields=[
-            PointField(name=name, offset=layout[name][1], datatype=_POINT_CODES[layout[name][0].str[1:]], count=1)
-            for name in rows.dtype.names or ()
-        ],
-        is_bigendian=False,
-        point_step=rows.dtype.itemsize,
-        row_step=rows.dtype.itemsize * len(rows),
-        data=_bytes(rows),
-        is_dense=True,
-    )
-
-
-def cloud_rows(message: PointCloud2, dtype: 'np.dtype[Any]', optional: Iterable[str] = ()) -> npt.NDArray[Any]:
-    """Rows (N,) of ``dtype`` of a cloud, its fields looked up by name; missing ``optional`` ones are 0.
-
-    Raises
-    ------
-    InputError
-        A missing field, or sizes that don't fit the data.
-    """
-    fields = {field.name: field for field in message.fields}
-    names = [name for name in dtype.names or () if name in fields]
-    missing = set(dtype.names or ()) - set(names) - set(optional)
-    if missing:
-        raise InputError(f'cloud without field {", ".join(sorted(missing))}')
-    count = int(message.width) * int(message.height)
-    source = _source_dtype(message, [fields[name] for name in names])
-    if message.row_step != message.point_step * message.width or len(message.data) < count * message.point_step:
-        raise InputError(f'cloud of {count} points of {message.point_step} bytes has {len(message.data)} bytes')
-    result = np.zeros(count, dtype)
-    if count:
-        points = np.frombuffer(message.data, source, count)
-        for name in names:
-            result[name] = points[name]
-    return result
-
-
-def _source_dtype(message: PointCloud2, fields: list[PointField]) -> 'np.dtype[Any]':
-    order = '>' if message.is_bigendian else '<'
-    try:
-        return np.dtype(
-            {
-                'names': [field.name for field in fields],
-                'formats': [order + _POINT_TYPES[field.datatype] for field in fields],
-                'offsets': [field.offset for field in fields],
-                'itemsize': message.point_step,
-            }
-        )
-    except (KeyError, ValueError):
-        raise InputError(f'cloud with fields outside its points of {message.point_step} bytes') from None
-
-
-def markers(message: PointCloud2) -> Markers:
-    """Rows of :data:`MARKER_DTYPE`; corner covariances from ``sigma_px`` where the cloud has none.
-
-    Raises
-    ------
-    InputError
-        A missing field, sizes that don't fit, or corners that are not finite.
-    """
-    rows = cloud_rows(message, MARKER_DTYPE, optional=CORNER_COVARIANCE_FIELDS)
-    if not {field.name for field in message.fields}.issuperset(CORNER_COVARIANCE_FIELDS):
-        for corner in range(4):
-            rows[f'c{corner}uu'] = rows[f'c{corner}vv'] = rows['sigma_px'] ** 2
-    if not (np.all(np.isfinite(corners_px(rows))) and np.all(np.isfinite(corner_covariances(rows)))):
-        raise InputError('markers with corners that are not finite')
-    return rows
-
-
-def marker_poses(rows: Markers, head: Header) -> PoseArray:
-    """The markers in the camera, for display."""
-    fields = zip(*(rows[name].tolist() for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')), strict=True)
-    return PoseArray(
-        header=head,
-        poses=[
-            Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
-            for x, y, z, qx, qy, qz, qw in fields
-        ],
-    )
-
-
-def map_poses(message: PointCloud2) -> dict[int, tuple[FloatArray, float]]:
-    """ID to T_map_marker (4, 4) and side [m] of the trusted markers of a ``marker_map`` cloud.
-
-    Raises
-    ------
-    InputError
-        A missing field, or sizes that don't fit.
-    """
-    rows = cloud_rows(message, MAP_DTYPE)
-    rows = rows[rows['trusted'] != 0]
-    T = transform_from_quaternion(
-        np.stack([rows[name] for name in 'xyz'], axis=-1),
-        np.stack([rows[name] for name in ('qx', 'qy', 'qz', 'qw')], axis=-1),
-    )
-    return {int(row['id']): (T_map_marker, float(row['size'])) for row, T_map_marker in zip(rows, T, strict=True)}
-
-
 # --- estimates ----------------------------------------------------------------------------------------
 
 
@@ -281,12 +174,15 @@ def imu_sample(message: Imu) -> ImuSample:
     Raises
     ------
     InputError
-        A value that is not finite, or a measurement that the driver marks as not there (REP-145).
+        A value that is not finite or that no IMU measures, or a measurement that the driver marks as not there
+        (REP-145).
     """
     w, a = message.angular_velocity, message.linear_acceleration
     angular_velocity, linear_acceleration = np.array([w.x, w.y, w.z]), np.array([a.x, a.y, a.z])
     if not (np.isfinite(angular_velocity.sum()) and np.isfinite(linear_acceleration.sum())):
         raise InputError('IMU message that is not finite')
+    if max(np.abs(angular_velocity).max() / _FASTEST_TURN, np.abs(linear_acceleration).max() / _LARGEST_FORCE) > 1.0:
+        raise InputError('IMU message beyond what any IMU measures')
     if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
         raise InputError('IMU message without angular velocity or without acceleration')
     return ImuSample(stamp_ns(message.header.stamp), angular_velocity, linear_acceleration)
@@ -306,10 +202,11 @@ def camera_pose(message: PoseWithCovarianceStamped) -> CameraPose:
     Raises
     ------
     InputError
-        A pose or covariance that is not finite, or a quaternion that is none.
+        A pose that cannot be, or a covariance that is none.
     """
-    T_map_camera = transform_of(message.pose.pose)
-    return CameraPose(stamp_ns(message.header.stamp), T_map_camera, _matrix(message.pose.covariance, 6))
+    T_map_camera = transform_of(message.pose.pose, 'camera_pose')
+    covariance = checked_covariance(np.array(message.pose.covariance).reshape(6, 6), 'camera_pose with a covariance')
+    return CameraPose(stamp_ns(message.header.stamp), T_map_camera, covariance)
 
 
 def odometry_frames(frame_id: str, child_frame_id: str) -> OdometryMessage:
@@ -333,25 +230,6 @@ def fill_odometry(message: OdometryMessage, odometry: Odometry) -> None:
     twist.linear.x, twist.linear.y, twist.linear.z = odometry.velocity_body.tolist()
     twist.angular.x, twist.angular.y, twist.angular.z = odometry.angular_velocity_body.tolist()
     message.twist.covariance[:] = odometry.twist_covariance.ravel()
-
-
-def odometry(message: OdometryMessage) -> Odometry:
-    """State of the robot.
-
-    Raises
-    ------
-    InputError
-        A value that is not finite, or a quaternion that is none.
-    """
-    v, w = message.twist.twist.linear, message.twist.twist.angular
-    return Odometry(
-        stamp_ns(message.header.stamp),
-        transform_of(message.pose.pose),
-        np.array([v.x, v.y, v.z]),
-        np.array([w.x, w.y, w.z]),
-        _matrix(message.pose.covariance, 6),
-        _matrix(message.twist.covariance, 6),
-    )
 
 
 def vector(v: FloatArray) -> Vector3:
@@ -380,7 +258,7 @@ def correction_of(message: TransformStamped) -> tuple[int, FloatArray]:
     """
     p = message.transform.translation
     place = Pose(position=Point(x=p.x, y=p.y, z=p.z), orientation=message.transform.rotation)
-    return stamp_ns(message.header.stamp), transform_of(place)
+    return stamp_ns(message.header.stamp), transform_of(place, 'map_correction')
 
 
 def path(poses: Iterable[tuple[int, Pose]], head: Header) -> Path:

@@ -159,8 +159,27 @@ class StageNode(CountingNode, Generic[Config]):
         except InputError as error:
             self.refuse(str(error))
         except Exception as error:
-            self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
-            self.refuse(f'{INTERNAL_ERROR}: {type(error).__name__}: {error}')
+            self.refuse(self._unforeseen(error))
+
+    def serve(self, kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
+        """A service; what ``answer`` cannot do is said in the response, which has ``success`` and ``message``."""
+
+        def guarded(request: Any, response: Any) -> Any:
+            try:
+                return answer(request, response)
+            except InputError as error:
+                response.message = str(error)
+            except Exception as error:
+                response.message = self._unforeseen(error)
+            response.success = False
+            return response
+
+        self.create_service(kind, name, guarded)
+
+    def _unforeseen(self, error: Exception) -> str:
+        """Log an error that nobody foresaw, and say it in a line."""
+        self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
+        return f'{INTERNAL_ERROR}: {type(error).__name__}: {error}'
 
     def refuse(self, reason: str) -> None:
         """Count a message that could not be used; the first and then one a second is logged."""
@@ -204,4 +223,4 @@ class StageNode(CountingNode, Generic[Config]):
         return self.state()
 
     def _on_timer(self) -> None:
-        self.diagnose(self.get_clock().now().nanoseconds)
+        self.guard(self.diagnose, self.get_clock().now().nanoseconds)

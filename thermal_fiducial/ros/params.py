@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from thermal_fiducial.config import check_names, from_mapping, parameters
-from thermal_fiducial.errors import InputError
+from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 
 Config = TypeVar('Config')
 
@@ -56,6 +56,8 @@ def follow(node: Node, kind: type[Config], apply: Callable[[Config], None]) -> N
             apply(from_mapping(kind, values))
         except InputError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        except Exception as error:  # a parameter that cannot be set is no reason to end
+            return SetParametersResult(successful=False, reason=f'{INTERNAL_ERROR}: {type(error).__name__}: {error}')
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(on_set)

@@ -1,0 +1,34 @@
+"""Messages for the nodes, as rclpy has them: the frames, IMU samples and poses of :mod:`support.small_bag`."""
+
+import numpy as np
+from sensor_msgs.msg import Imu
+
+from support import small_bag
+from thermal_fiducial.ros import convert
+
+START = small_bag.START_NS
+FRAME_NS = 33_333_333
+IMU_NS = 5_000_000
+
+
+def frames(count):
+    rng = np.random.default_rng(3)
+    pictures = [small_bag.frame(small_bag.true_pose(k / 30), rng) for k in range(count)]
+    return [convert.image(p, convert.header(START + k * FRAME_NS, 'camera')) for k, p in enumerate(pictures)]
+
+
+def info(camera=small_bag.CAMERA):
+    return convert.camera_info(camera, convert.header(START, 'camera'))
+
+
+def imu(k, rate=(0.0, 0.0, 0.0), force=(0.0, 0.0, 9.80665)):
+    message = Imu(header=convert.header(START + k * IMU_NS, 'base_link'))
+    message.angular_velocity = convert.vector(np.array(rate))
+    message.linear_acceleration = convert.vector(np.array(force))
+    return message
+
+
+def pose(k, T=None):
+    head = convert.header(START + k * IMU_NS, 'map')
+    T_map_camera = small_bag.T_BODY_CAMERA if T is None else T
+    return convert.pose_with_covariance(T_map_camera, np.diag([1e-6] * 3 + [1e-7] * 3), head)

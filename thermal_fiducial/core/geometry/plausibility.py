@@ -1,0 +1,87 @@
+"""What a camera, a position and a covariance can be: the bounds that every stage may rely on.
+
+They are far beyond anything real, and near enough that squares and products of what passes stay finite.
+"""
+
+import numpy as np
+
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.errors import InputError
+
+#: Farthest coordinate of anything in a map [m]; single precision still resolves a centimetre there.
+LARGEST_COORDINATE = 1e5
+#: Variances [m^2, rad^2, px^2]: from a tenth of a nanometre to ten kilometres, which others write for "unknown".
+SMALLEST_VARIANCE, LARGEST_VARIANCE = 1e-20, 1e8
+#: Least share of a variance that the other components may leave unexplained; rounding takes less than a tenth of it.
+_LEAST_INDEPENDENT = 1e-12
+#: Relative difference of entries that should be equal, by rounding of a few operations.
+_ROUNDING = 1e-9
+#: Focal length and distance of the principal point from the image, in longer sides of the image.
+_FOCAL_RANGE, _FARTHEST_CENTRE = (0.02, 1000.0), 1.0
+_IMAGE_SIDES = (8, 16384)
+#: Half-way from the centre to the corners a distortion must be one that can be undone, to this [px].
+_ROUND_TRIP_PX = 1.0
+
+
+def checked_covariance(values: FloatArray, what: str) -> FloatArray:
+    """``values``, or the symmetric part (..., n, n) of covariances that rounding alone does not make asymmetric.
+
+    Raises
+    ------
+    InputError
+        Not finite, not positive definite, or with a variance beyond the bounds.
+    """
+    P = 0.5 * (values + np.swapaxes(values, -1, -2))
+    if not np.isfinite(P).all():
+        raise InputError(f'{what} that is not finite')
+    variances = np.diagonal(P, axis1=-2, axis2=-1)
+    if not ((variances > SMALLEST_VARIANCE).all() and (variances < LARGEST_VARIANCE).all()):
+        raise InputError(f'{what} with a variance of {_most_extreme(variances):.3g}')
+    if not positive_definite(P).all():
+        raise InputError(f'{what} that is not positive definite')
+    return values if np.allclose(P, values, rtol=_ROUNDING, atol=0.0) else np.asarray(P)
+
+
+def _most_extreme(variances: FloatArray) -> float:
+    low, high = float(variances.min()), float(variances.max())
+    return low if low <= SMALLEST_VARIANCE else high
+
+
+def positive_definite(P: FloatArray) -> BoolArray:
+    """(...) which of symmetric matrices (..., n, n) with positive diagonals are, in any units of their components."""
+    scale = 1.0 / np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
+    correlations = P * scale[..., :, None] * scale[..., None, :]
+    return np.asarray(np.linalg.eigvalsh(correlations)[..., 0] > _LEAST_INDEPENDENT)
+
+
+def require_usable(camera: Camera) -> Camera:
+    """``camera``, if it can be that of a lens.
+
+    Raises
+    ------
+    InputError
+        An image size, camera matrix or distortion that no lens has.
+    """
+    K, longer = camera.K, max(camera.width, camera.height)
+    if not all(_IMAGE_SIDES[0] <= side <= _IMAGE_SIDES[1] for side in (camera.width, camera.height)):
+        raise InputError(f'calibration of an image of {camera.width}x{camera.height} pixels')
+    if K[1, 0] != 0.0 or not np.array_equal(K[2], (0.0, 0.0, 1.0)) or not abs(K[0, 1]) < K[0, 0]:
+        raise InputError('camera matrix that is not of the form fx s cx, 0 fy cy, 0 0 1')
+    for name, focal in (('fx', K[0, 0]), ('fy', K[1, 1])):
+        if not _FOCAL_RANGE[0] * longer < focal < _FOCAL_RANGE[1] * longer:
+            raise InputError(f'camera matrix with {name} {focal:.6g} for an image of {camera.width}x{camera.height}')
+    for name, centre, size in (('cx', K[0, 2], camera.width), ('cy', K[1, 2], camera.height)):
+        if not -_FARTHEST_CENTRE * size < centre < (1.0 + _FARTHEST_CENTRE) * size:
+            raise InputError(f'camera matrix with {name} {centre:.6g} for an image of {camera.width}x{camera.height}')
+    _require_invertible(camera)
+    return camera
+
+
+def _require_invertible(camera: Camera) -> None:
+    size = np.array([camera.width, camera.height], dtype=np.float64)
+    pixels = size * np.array([[0.5, 0.5], [0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]])
+    with np.errstate(all='ignore'):
+        error = np.abs(camera.distort(camera.normalise(pixels)) - pixels).max()
+    if not error < _ROUND_TRIP_PX:
+        raise InputError(f'distortion {np.array2string(camera.D, precision=4)} that no lens has')

@@ -1,0 +1,164 @@
+"""Rows of numpy as point clouds, and back: markers of a frame, the marker map."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion
+import numpy as np
+import numpy.typing as npt
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Header
+
+from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE, LARGEST_VARIANCE
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.measurements import (
+    columns,
+    CORNER_COVARIANCE_FIELDS,
+    corner_covariances,
+    corners_px,
+    MAP_DTYPE,
+    MARKER_DTYPE,
+    Markers,
+)
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.convert import data_bytes, NORM_TOLERANCE
+
+_POINT_TYPES = {
+    PointField.INT8: 'i1',
+    PointField.UINT8: 'u1',
+    PointField.INT16: 'i2',
+    PointField.UINT16: 'u2',
+    PointField.INT32: 'i4',
+    PointField.UINT32: 'u4',
+    PointField.FLOAT32: 'f4',
+    PointField.FLOAT64: 'f8',
+}
+_POINT_CODES = {code: datatype for datatype, code in _POINT_TYPES.items()}
+#: More rows than any map has; a cloud may promise four billion.
+_MOST_ROWS = 20_000
+# A ten-thousandth of a pixel, which no corner is known to, and an error that would take a marker out of its image [px].
+_SMALLEST_CORNER_VARIANCE, _LARGEST_ERROR_PX = 1e-8, 1e3
+# Longest side of a marker [m].
+_LARGEST_MARKER = 100.0
+_POSE_FIELDS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'ax', 'ay', 'az', 'aqx', 'aqy', 'aqz', 'aqw')
+
+
+def cloud(rows: npt.NDArray[Any], head: Header) -> PointCloud2:
+    """PointCloud2 with one point a row of a structured array, fields as in its dtype."""
+    layout: Mapping[str, Any] = rows.dtype.fields or {}
+    return PointCloud2(
+        header=head,
+        height=1,
+        width=len(rows),
+        fields=[
+            PointField(name=name, offset=layout[name][1], datatype=_POINT_CODES[layout[name][0].str[1:]], count=1)
+            for name in rows.dtype.names or ()
+        ],
+        is_bigendian=False,
+        point_step=rows.dtype.itemsize,
+        row_step=rows.dtype.itemsize * len(rows),
+        data=data_bytes(rows),
+        is_dense=True,
+    )
+
+
+def cloud_rows(message: PointCloud2, dtype: 'np.dtype[Any]', optional: Iterable[str] = ()) -> npt.NDArray[Any]:
+    """Rows (N,) of ``dtype`` of a cloud, its fields looked up by name; missing ``optional`` ones are 0.
+
+    Raises
+    ------
+    InputError
+        A missing field, one of fractions where whole numbers are wanted, sizes that don't fit the data, too many rows.
+    """
+    fields = {field.name: field for field in message.fields}
+    names = [name for name in dtype.names or () if name in fields]
+    missing = set(dtype.names or ()) - set(names) - set(optional)
+    if missing:
+        raise InputError(f'cloud without field {", ".join(sorted(missing))}')
+    count = int(message.width) * int(message.height)
+    if count > _MOST_ROWS:
+        raise InputError(f'cloud of {count} points, not {_MOST_ROWS} at most')
+    source = _source_dtype(message, [fields[name] for name in names])
+    if message.row_step != message.point_step * message.width or len(message.data) < count * message.point_step:
+        raise InputError(f'cloud of {count} points of {message.point_step} bytes has {len(message.data)} bytes')
+    result = np.zeros(count, dtype)
+    if count:
+        points = np.frombuffer(message.data, source, count)
+        with np.errstate(over='ignore'):
+            for name in names:
+                if dtype[name].kind == 'u' and source[name].kind == 'f':
+                    raise InputError(f'cloud whose field {name} is no whole number')
+                result[name] = points[name]
+    return result
+
+
+def _source_dtype(message: PointCloud2, fields: list[PointField]) -> 'np.dtype[Any]':
+    order = '>' if message.is_bigendian else '<'
+    try:
+        return np.dtype(
+            {
+                'names': [field.name for field in fields],
+                'formats': [order + _POINT_TYPES[field.datatype] for field in fields],
+                'offsets': [field.offset for field in fields],
+                'itemsize': message.point_step,
+            }
+        )
+    except (KeyError, ValueError, OverflowError):
+        raise InputError(f'cloud with fields outside its points of {message.point_step} bytes') from None
+
+
+def markers(message: PointCloud2) -> Markers:
+    """Rows of :data:`MARKER_DTYPE`; corner covariances from ``sigma_px`` where the cloud has none.
+
+    Raises
+    ------
+    InputError
+        A missing field, sizes that don't fit, or corners, covariances or poses that cannot be.
+    """
+    rows = cloud_rows(message, MARKER_DTYPE, optional=CORNER_COVARIANCE_FIELDS)
+    if not {field.name for field in message.fields}.issuperset(CORNER_COVARIANCE_FIELDS):
+        for corner in range(4):
+            rows[f'c{corner}uu'] = rows[f'c{corner}vv'] = rows['sigma_px'] ** 2
+    corners, variances = corners_px(rows), np.diagonal(corner_covariances(rows), axis1=-2, axis2=-1)
+    if not (np.abs(corners) < LARGEST_COORDINATE).all():
+        raise InputError('markers with corners that are not finite or far outside any image')
+    if not ((variances > _SMALLEST_CORNER_VARIANCE).all() and (variances < LARGEST_VARIANCE).all()):
+        raise InputError('markers with corners whose variance is not positive or beyond all bounds')
+    # A marker without a pose has NaN there, and an infinite error.
+    poses, errors = columns(rows, _POSE_FIELDS), columns(rows, ('rms_px', 'arms_px'))
+    if (np.abs(poses) > LARGEST_COORDINATE).any() or (np.isfinite(errors) & (np.abs(errors) > _LARGEST_ERROR_PX)).any():
+        raise InputError('markers with poses beyond all bounds')
+    return rows
+
+
+def marker_poses(rows: Markers, head: Header) -> PoseArray:
+    """The markers in the camera, for display."""
+    fields = zip(*(rows[name].tolist() for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')), strict=True)
+    return PoseArray(
+        header=head,
+        poses=[
+            Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+            for x, y, z, qx, qy, qz, qw in fields
+        ],
+    )
+
+
+def map_poses(message: PointCloud2) -> dict[int, tuple[FloatArray, float]]:
+    """ID to T_map_marker (4, 4) and side [m] of the trusted markers of a ``marker_map`` cloud.
+
+    Raises
+    ------
+    InputError
+        A missing field, sizes that don't fit, or a marker whose pose or side cannot be.
+    """
+    rows = cloud_rows(message, MAP_DTYPE)
+    rows = rows[rows['trusted'] != 0]
+    positions, quaternions = columns(rows, ('x', 'y', 'z')), columns(rows, ('qx', 'qy', 'qz', 'qw'))
+    possible = (np.abs(positions) < LARGEST_COORDINATE).all(axis=-1)
+    possible &= np.abs(np.linalg.norm(quaternions, axis=-1) - 1.0) < NORM_TOLERANCE
+    possible &= (rows['size'] > 0.0) & (rows['size'] < _LARGEST_MARKER)
+    if not possible.all():
+        raise InputError(f'marker_map with marker {rows["id"][~possible][0]} of an impossible pose or size')
+    T = transform_from_quaternion(positions, quaternions)
+    return {int(row['id']): (T_map_marker, float(row['size'])) for row, T_map_marker in zip(rows, T, strict=True)}
