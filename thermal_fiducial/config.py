@@ -204,6 +204,16 @@ def _camera_time_offset() -> Any:
     return param(0.0, 'Clock offset of the camera, t_imu = t_camera + offset.', unit='s', minimum=-1.0, maximum=1.0)
 
 
+def _time_offset_std() -> Any:
+    return param(
+        0.03,
+        'How far camera_time_offset may be wrong (standard deviation); when it is not estimated, what is allowed for.',
+        unit='s',
+        minimum=0.0,
+        maximum=0.2,
+    )
+
+
 def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
     """Marker ID to side [m] from strings "ID:SIZE".
 
@@ -392,6 +402,7 @@ class MarkerMapperConfig(SelfChecked):
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
     camera_time_offset: float = _camera_time_offset()
+    time_offset_std: float = _time_offset_std()
     bridge_duration: float = param(
         3.0,
         'How long after the last known marker new ones may still be placed from the odometry.',
@@ -442,13 +453,7 @@ class PoseEkfConfig(SelfChecked):
     camera_orientation: tuple[float, ...] = _camera_orientation()
     camera_time_offset: float = _camera_time_offset()
     estimate_time_offset: bool = param(True, 'Estimate what is left of the time offset while running.')
-    time_offset_std: float = param(
-        0.03,
-        'How far camera_time_offset may be wrong (standard deviation); when it is not estimated, what is allowed for.',
-        unit='s',
-        minimum=0.0,
-        maximum=0.2,
-    )
+    time_offset_std: float = _time_offset_std()
     time_offset_random_walk: float = param(
         5.0e-5, 'Drift of the two clocks against each other.', unit='s/sqrt(s)', minimum=0.0
     )

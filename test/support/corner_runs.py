@@ -173,7 +173,7 @@ class _Chain:
 
     def add_frame(self, stamp_ns) -> CameraPose | None:
         rows = self._flight.frames[stamp_ns]
-        pose = self.mapper.process(stamp_ns, rows, self._flight.camera, self._prior.nearest(stamp_ns)).pose
+        pose = self.mapper.process(stamp_ns, rows, self._flight.camera, self._prior).pose
         if pose is not None:
             self.filter.add_pose(pose)
         if (offset := self.filter.camera_time_offset) is not None:

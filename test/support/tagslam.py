@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import yaml
 
+from support.scenes import motion_prior
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
@@ -128,7 +129,7 @@ class _Filter:
     def odometry(self, stamp):
         T = self._at(stamp)
         if T is None or self._anchor is None:
-            return None
+            return []
         since, T_map_camera, known, T_then = self._anchor
         moved = self._T_camera_odometry @ inverse(T_then) @ T @ inverse(self._T_camera_odometry)
         walk = np.sqrt(abs(stamp - since) * 1e-9)
@@ -136,7 +137,7 @@ class _Filter:
         covariance = np.diag([sigma_m**2] * 3 + [(0.002 + _WALK_RAD * walk) ** 2] * 3)
         zero = np.zeros(3)
         twist = np.diag([_SPEED_SIGMA**2] * 3 + [_TURN_SIGMA**2] * 3)
-        return Odometry(stamp, T_map_camera @ moved, zero, zero, known + covariance, twist)
+        return [Odometry(stamp, T_map_camera @ moved, zero, zero, known + covariance, twist)]
 
 
 def solve(recording, passes=1):
@@ -161,7 +162,7 @@ def solve(recording, passes=1):
         stand_in = _Filter(recording)
         for stamp, seen in recording.views.items():
             rows = _frame(recording, [view for view in seen if view[1] == 0])
-            result = mapper.process(stamp, rows, camera, stand_in.odometry(stamp))
+            result = mapper.process(stamp, rows, camera, motion_prior(*stand_in.odometry(stamp)))
             if result.pose is not None:
                 stand_in.add(result.pose)
             if mapper.refinement_due(stamp):

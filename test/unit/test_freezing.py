@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from test.support.scenes import motion_prior
 from test.support.walls import CAMERA, flight, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
@@ -20,7 +21,7 @@ def started(poses, mode, known=(0, 1), **parameters):
 
 
 def odometry(k, T):
-    return Odometry(stamp(k), T, np.zeros(3), np.zeros(3), 1e-8 * np.eye(6), 1e-8 * np.eye(6))
+    return motion_prior(Odometry(stamp(k), T, np.zeros(3), np.zeros(3), 1e-8 * np.eye(6), 1e-8 * np.eye(6)))
 
 
 def fly(mapper, poses, frames, rng, only=None):

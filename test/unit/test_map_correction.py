@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from test.support.scenes import motion_prior
 from test.support.walls import CAMERA, flight, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.reprojection import difference, retract
@@ -12,7 +13,7 @@ from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.correction import correction
 from thermal_fiducial.core.mapping.keyframes import Keyframe
 from thermal_fiducial.core.mapping.mapper import MapMarker, MarkerMap, MarkerMapper
-from thermal_fiducial.core.mapping.odometry_prior import ClockDifference, together
+from thermal_fiducial.core.mapping.odometry_prior import predicted_camera, together
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Odometry
 
 AS_BODY = {'camera_orientation': (0.0, 0.0, 0.0, 1.0)}
@@ -90,21 +91,21 @@ def test_nothing_is_told_that_the_filter_follows_by_itself(moved_wall):
     np.testing.assert_array_equal(correction(frames, [CAMERA], old, new, unsure), np.eye(4))
 
 
-def test_the_clocks_difference_is_learned():
-    rng = np.random.default_rng(7)
-    poses, clocks, ahead = wall(rng), ClockDifference(), 0.02
-    m = MarkerMapper(MarkerMapperConfig(mode='localization', **AS_BODY), MarkerMap())
-    m.map.markers = {key: MapMarker(key, SIZE, True, pose) for key, pose in poses.items()}
-    errors = []
-    for k in range(150):
-        state = odometry(k, ahead)
-        expected = clocks.expected(state, stamp(k), np.eye(4))
-        errors.append(np.linalg.norm(difference(expected.pose.T_map_camera, flight(k / 30))))
-        pose = m.process(stamp(k), see(flight(k / 30), poses, 0.1, rng), CAMERA).pose
-        clocks.learn(expected, pose.T_map_camera, pose.covariance)
-    # 20 ms at the speed of this flight, 0.8 m/s; a tenth of what they make may be left.
-    assert errors[0] > 0.01
-    assert np.mean(errors[-50:]) < 0.1 * errors[0]
+def test_the_offset_of_the_clocks_is_the_filters_to_say():
+    """With the filter's offset the prediction is right; without, it is as wrong as its covariance says."""
+    ahead, config = 0.02, MarkerMapperConfig()
+    for k in range(0, 150, 10):
+        prior = motion_prior(odometry(k, ahead), clock_offset=None)
+        before = predicted_camera(prior, stamp(k), np.eye(4), config.time_offset_std).pose
+        error = difference(before.T_map_camera, flight(k / 30))
+        # 20 ms where 30 ms are allowed for, as one error along the motion.
+        known = odometry(k).pose_covariance
+        assert 0.3 < error @ np.linalg.solve(before.covariance, error) < 0.6
+        prior.set_clock_offset(ahead)
+        after = predicted_camera(prior, stamp(k), np.eye(4), config.time_offset_std).pose
+        # Velocities by differences over 2 ms.
+        np.testing.assert_allclose(after.T_map_camera, flight(k / 30), atol=1e-9)
+        np.testing.assert_allclose(after.covariance, known)
 
 
 @pytest.mark.parametrize(('place', 'own', 'sigma'), [(0, 1.0, 1e-6), (1, 1e-6, 1.0)])

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 from support.crowds import crowd, frames, mapped, SIZE
+from support.scenes import motion_prior
 from support.walls import CAMERA, FRAME_NS, look, see, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
@@ -51,7 +52,7 @@ def endless_flight(count):
         t = k * FRAME_NS * 1e-9
         T = look([-3.0 + 0.5 * np.sin(1.1 * t), np.sin(0.9 * t), 1.5 + 0.4 * np.sin(1.3 * t)], [0.0, 0.0, 1.5])
         zero = np.zeros(3)
-        odometry = Odometry(stamp(k), T, zero, zero, 1e-6 * np.eye(6), 1e-4 * np.eye(6))
+        odometry = motion_prior(Odometry(stamp(k), T, zero, zero, 1e-6 * np.eye(6), 1e-4 * np.eye(6)))
         if k % 25 > 19:
             # Markers far off, from hardly more than one direction: their ambiguity is never settled.
             key = 10 + k // 25 % 3

@@ -1,10 +1,10 @@
 """The mapper over whole flights: joint refinement behind it, jumps, gaps, starts in doubt, size of the map."""
 
-from dataclasses import replace
 import time
 
 import numpy as np
 
+from test.support.scenes import motion_prior
 from test.support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.reprojection import difference, retract
@@ -15,6 +15,7 @@ from thermal_fiducial.core.mapping.mapper import ASTRAY, MapMarker, MarkerMap, M
 from thermal_fiducial.core.measurements import Odometry
 
 # The body is the camera: odometry and camera pose are one.
+UNIT = np.eye(6)
 AS_BODY = {'camera_orientation': (0.0, 0.0, 0.0, 1.0)}
 
 
@@ -157,9 +158,9 @@ def test_refinement_goes_on_when_the_budget_is_used_up():
     assert max(due) > 150
 
 
-def odometry(k, T, T_error, covariance):
+def odometry(k, T, T_error, covariance, twist_covariance=UNIT):
     zero = np.zeros(3)
-    return Odometry(stamp(k), T_error @ T, zero, zero, covariance, np.eye(6))
+    return motion_prior(Odometry(stamp(k), T_error @ T, zero, zero, covariance, twist_covariance))
 
 
 def test_odometry_spans_a_gap_between_markers():
@@ -200,8 +201,8 @@ def test_drift_that_grows_with_the_way_does_not_set_neighbouring_frames_apart():
     for k in range(390, 405):
         T, seconds = flight(k / 30), (k - 30) / 30
         covariance = np.diag([(0.05 * seconds) ** 2] * 3 + [(0.01 * seconds) ** 2] * 3)
-        told = replace(odometry(k, T, np.eye(4), covariance), twist_covariance=speed)
-        m.process(stamp(k), see(T, {6: poses[6]}, 2.0, rng), CAMERA, told)
+        prior = odometry(k, T, np.eye(4), covariance, speed)
+        m.process(stamp(k), see(T, {6: poses[6]}, 2.0, rng), CAMERA, prior)
     apart = m.candidates[6].views[-1].viewpoint
     # The common error is that of 12 s and more; within the 14 frames since, 1 cm/s is 5 mm, and 2 mrad/s is 1 mrad.
     assert np.all(np.diag(apart.common)[:3] >= (0.05 * 12.0) ** 2)

@@ -119,7 +119,7 @@ class Pipeline:
         if frame.counts is None or self.camera is None:
             return FrameResult(stamp_ns, withheld=frame.reason or 'no camera_info')
         markers = self.detector.detect(stamp_ns, frame.counts, self.camera, self._odometry)
-        mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry.nearest(stamp_ns))
+        mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry)
         update = None if mapping.pose is None else self.filter.add_pose(_published_pose(mapping.pose))
         if (offset := self.filter.camera_time_offset) is not None:
             self._odometry.set_clock_offset(offset)

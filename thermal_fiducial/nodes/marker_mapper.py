@@ -104,7 +104,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
 
     def _on_markers(self, message: PointCloud2) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
-        frame = self.mapper.locate(stamp, clouds.markers(message), self.camera(), self.odometry.nearest(stamp))
+        frame = self.mapper.locate(stamp, clouds.markers(message), self.camera(), self.odometry)
         self._newest_ns = max(stamp, self._newest_ns) if stamp >= self._newest_ns - LATEST_NS else stamp
         if frame.pose is not None:
             head, told = convert.header(stamp, self.config.map_frame), self._as_told(frame.pose)

@@ -6,7 +6,7 @@ import numpy as np
 
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.localization import Location, Refusal, Sight
-from thermal_fiducial.core.mapping.odometry_prior import Expected
+from thermal_fiducial.core.mapping.odometry_prior import PredictedCamera
 from thermal_fiducial.core.measurements import CameraPose, Markers
 from thermal_fiducial.core.types import BoolArray
 
@@ -43,7 +43,7 @@ class LocatedFrame:
     known: Sight
     trusted: BoolArray
     #: where odometry has the camera
-    expected: Expected | None
+    predicted: PredictedCamera | None
     outcome: Located | Refusal
 
     @property

@@ -28,9 +28,17 @@ from thermal_fiducial.core.mapping.map_editing import align
 from thermal_fiducial.core.mapping.map_rows import marker_poses, usable
 from thermal_fiducial.core.mapping.motion import CameraMotion
 from thermal_fiducial.core.mapping.noise_level import NoiseLevel
-from thermal_fiducial.core.mapping.odometry_prior import ClockDifference, contradicts, Expected, Fused, growth, together
+from thermal_fiducial.core.mapping.odometry_prior import (
+    contradicts,
+    Fused,
+    growth,
+    predicted_camera,
+    PredictedCamera,
+    together,
+)
 from thermal_fiducial.core.mapping.trust import culprits, DISAGREEMENT, Trust
-from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers, Odometry
+from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers
+from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
@@ -106,7 +114,6 @@ class MarkerMapper:
         #: whether odometry has been in this map
         self._odometry_agreed = False
         self._motion = CameraMotion()
-        self._clocks = ClockDifference()
         self._recent: deque[Keyframe] = deque(maxlen=_RECENT)
         #: what the map learned from last; None: nothing yet
         self._last_frame: Keyframe | None = None
@@ -119,7 +126,7 @@ class MarkerMapper:
         self._frames_then = 0
 
     def process(
-        self, stamp_ns: int, markers: Markers, camera: Camera, odometry: Odometry | None = None
+        self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None
     ) -> MapperResult:
         """One frame of Algorithm 1.
 
@@ -127,11 +134,11 @@ class MarkerMapper:
         ----------
         markers : (N,) of MARKER_DTYPE
         camera : its intrinsics
-        odometry : the filter's latest output; settles ambiguities, and bridges gaps between known markers
+        prior : the filter's states and clock; settles ambiguities, and bridges gaps between known markers
         """
-        return self.learn(self.locate(stamp_ns, markers, camera, odometry))
+        return self.learn(self.locate(stamp_ns, markers, camera, prior))
 
-    def locate(self, stamp_ns: int, markers: Markers, camera: Camera, odometry: Odometry | None = None) -> LocatedFrame:
+    def locate(self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None) -> LocatedFrame:
         """The first half of :meth:`process`, which ends with the pose: whoever waits for that need wait no longer."""
         markers = usable(markers)
         self._noise.add(markers)
@@ -140,24 +147,23 @@ class MarkerMapper:
         known = self._sight(markers[is_known])
         trusted = np.array([marker.trusted for marker in known.markers], dtype=bool)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
-        expected = self._expected(stamp_ns, odometry)
-        outcome = self._locate(stamp_ns, known.select(trusted), camera, expected)
-        return LocatedFrame(stamp_ns, camera, markers, is_known, known, trusted, expected, outcome)
+        predicted = self._predicted(stamp_ns, prior)
+        outcome = self._locate(stamp_ns, known.select(trusted), camera, predicted)
+        return LocatedFrame(stamp_ns, camera, markers, is_known, known, trusted, predicted, outcome)
 
     def learn(self, frame: LocatedFrame) -> MapperResult:
         """The second half: errors, standings and new markers, from the frame that was located last."""
-        expected = frame.expected
+        predicted = frame.predicted
         if isinstance(frame.outcome, Refusal):
             changed, waiting = self._without_pose(frame, frame.outcome)
             return self._result(frame, changed, waiting=waiting)
         location, pose = frame.outcome.location, frame.outcome.pose
-        if expected is not None:
-            astray = contradicts(pose.T_map_camera, pose.covariance, expected.pose)
+        if predicted is not None:
+            astray = contradicts(pose.T_map_camera, pose.covariance, predicted.pose)
             if astray and self._odometry_agreed:
                 # A marker that was moved, or that hangs in two places: what it teaches would spoil the map.
                 return self._result(frame, False, waiting=dict.fromkeys(frame.new['id'].tolist(), ASTRAY))
             self._odometry_agreed |= not astray
-            self._clocks.learn(expected, pose.T_map_camera, pose.covariance)
         self._last, self._gap = pose, None
         # Step 7: errors updated.
         errors = self._update_errors(frame, location)
@@ -165,23 +171,25 @@ class MarkerMapper:
         # Step 8: new markers placed relative to the camera.
         waiting = {}
         if not self.frozen:
-            fused = _fused(location, expected)
+            fused = _fused(location, predicted)
             self._keep(frame, pose, fused)
             placed, waiting = self._place_new(frame, _viewpoint(fused))
             changed |= placed
         residuals = {marker.id: float(error) for marker, error in zip(frame.known.markers, errors, strict=True)}
         return self._result(frame, changed, residuals, waiting)
 
-    def _expected(self, stamp_ns: int, odometry: Odometry | None) -> Expected | None:
-        if odometry is None or abs(stamp_ns - odometry.stamp_ns) >= CONTINUITY_NS:
+    def _predicted(self, stamp_ns: int, prior: MotionPrior | None) -> PredictedCamera | None:
+        if prior is None:
             return None
-        return self._clocks.expected(odometry, stamp_ns, self._T_body_camera)
+        return predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
 
-    def _locate(self, stamp_ns: int, sight: Sight, camera: Camera, expected: Expected | None) -> Located | Refusal:
+    def _locate(
+        self, stamp_ns: int, sight: Sight, camera: Camera, predicted: PredictedCamera | None
+    ) -> Located | Refusal:
         if not sight.markers:
             return Refusal(self._nothing_known())
         errors = self._trust.running_errors(sight.markers)
-        location = locate(sight, errors, camera, self._prior(stamp_ns, expected))
+        location = locate(sight, errors, camera, self._prior(stamp_ns, predicted))
         if isinstance(location, Refusal):
             return location
         covariance = location.covariance + self._motion.unknown(stamp_ns, location.T_map_camera)
@@ -194,10 +202,10 @@ class MarkerMapper:
             return 'the map has no marker: give a map file with at least one'
         return 'no known marker in view'
 
-    def _prior(self, stamp_ns: int, expected: Expected | None) -> FloatArray | None:
+    def _prior(self, stamp_ns: int, predicted: PredictedCamera | None) -> FloatArray | None:
         """T_map_camera that is expected from the filter or, for a short while, from the last pose."""
-        if expected is not None:
-            return expected.pose.T_map_camera
+        if predicted is not None:
+            return predicted.pose.T_map_camera
         if self._last is not None and 0 < stamp_ns - self._last.stamp_ns < CONTINUITY_NS:
             return self._last.T_map_camera
         return None
@@ -262,8 +270,8 @@ class MarkerMapper:
     def _keep(self, frame: LocatedFrame, pose: CameraPose, fused: Fused) -> None:
         """Keep the frame for the refinement; of one marker alone nothing can be learned."""
         pose = replace(pose, T_map_camera=fused.T_map_camera)
-        self._last_frame = keyframe = _keyframe(frame.rows, pose, self._camera_index(frame.camera), frame.expected)
-        self._belief = None if frame.expected is None else frame.expected.pose.covariance
+        self._last_frame = keyframe = _keyframe(frame.rows, pose, self._camera_index(frame.camera), frame.predicted)
+        self._belief = None if frame.predicted is None else frame.predicted.pose.covariance
         self._recent.append(keyframe)
         if len(frame.rows) >= 2:
             self._keyframes.add(keyframe)
@@ -278,22 +286,22 @@ class MarkerMapper:
 
     def _without_pose(self, frame: LocatedFrame, refusal: Refusal) -> tuple[bool, dict[int, str]]:
         """What a frame without a pose may still teach of new markers."""
-        expected = frame.expected
+        predicted = frame.predicted
         if self.frozen or not len(frame.new):
             return False, {}
         if refusal.rivals is not None and refusal.covariances is not None:
             return self._place_new(frame, Viewpoint(refusal.rivals, refusal.covariances))
         last = self._last_frame
-        if expected is None or last is None:
+        if predicted is None or last is None:
             return False, {}
         if not 0 <= frame.stamp_ns - last.stamp_ns <= self.config.bridge_duration * 1e9:
             return False, {}
-        return self._bridge(frame, last, expected)
+        return self._bridge(frame, last, predicted)
 
-    def _bridge(self, frame: LocatedFrame, last: Keyframe, expected: Expected) -> tuple[bool, dict[int, str]]:
+    def _bridge(self, frame: LocatedFrame, last: Keyframe, predicted: PredictedCamera) -> tuple[bool, dict[int, str]]:
         """Place new markers from the odometry since ``last`` while no known one is in view."""
-        pose, rows = expected.pose, frame.new
-        keyframe = _keyframe(rows, pose, self._camera_index(frame.camera), expected)
+        pose, rows = predicted.pose, frame.new
+        keyframe = _keyframe(rows, pose, self._camera_index(frame.camera), predicted)
         if not any(int(key) in self._candidates for key in rows['id']):
             # Nothing but the odometry joins these markers to the map. Once is enough: its error is the same for all
             # that follow, which hang together through the markers themselves.
@@ -305,7 +313,7 @@ class MarkerMapper:
         if self._gap is None:
             self._gap = pose
         # What the odometry had gathered when the gap's first marker came is the same for all its views.
-        viewpoint = Viewpoint.known(pose.T_map_camera, growth(self._gap, expected))
+        viewpoint = Viewpoint.known(pose.T_map_camera, growth(self._gap, predicted))
         return self._place_new(frame, replace(viewpoint, common=self._gap.covariance))
 
     def refinement_due(self, stamp_ns: int) -> bool:
@@ -411,18 +419,18 @@ class MarkerMapper:
         )
 
 
-def _fused(location: Location, expected: Expected | None) -> Fused:
+def _fused(location: Location, predicted: PredictedCamera | None) -> Fused:
     lasting = positive(location.covariance - location.relative_covariance)
-    if expected is None:
+    if predicted is None:
         return Fused(location.T_map_camera, location.relative_covariance, lasting)
-    return together(location.T_map_camera, location.relative_covariance, lasting, expected.pose)
+    return together(location.T_map_camera, location.relative_covariance, lasting, predicted.pose)
 
 
 def _viewpoint(fused: Fused) -> Viewpoint:
     return replace(Viewpoint.known(fused.T_map_camera, fused.changing), common=fused.lasting)
 
 
-def _keyframe(rows: Markers, pose: CameraPose, camera: int, expected: Expected | None) -> Keyframe:
+def _keyframe(rows: Markers, pose: CameraPose, camera: int, predicted: PredictedCamera | None) -> Keyframe:
     frame = Keyframe(
         pose.stamp_ns,
         pose.T_map_camera,
@@ -431,10 +439,10 @@ def _keyframe(rows: Markers, pose: CameraPose, camera: int, expected: Expected |
         corner_covariances(rows),
         np.full(len(rows), camera),
     )
-    if expected is None:
+    if predicted is None:
         return frame
-    information = np.asarray(np.linalg.inv(ALIKE * expected.pose.covariance), dtype=np.float64)
-    return replace(frame, T_odometry=expected.pose.T_map_camera, information=information)
+    information = np.asarray(np.linalg.inv(ALIKE * predicted.pose.covariance), dtype=np.float64)
+    return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)
 
 
 def _expected_errors(known: Sight, location: Location, camera: Camera) -> FloatArray:
