@@ -1,6 +1,7 @@
 """Replay in lock-step: complete, deterministic, equal to the offline pipeline, robust against bad bags."""
 
 import json
+import time
 
 import numpy as np
 import pytest
@@ -9,13 +10,14 @@ from support import small_bag
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle, transform_from_quaternion
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.pipeline import Pipeline, PipelineConfig
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.trajectory import load_tum, tum_line
-from thermal_fiducial.replay import lockstep
+from thermal_fiducial.replay import lockstep, waiting
 from thermal_fiducial.ros import convert
 
 pytestmark = pytest.mark.ros
@@ -155,3 +157,15 @@ def _line(stamp, T):
 
 def _cells(stamp, row):
     return [str(stamp), str(row['id']), *(f'{row[name]:.5f}' for name in CORNER_FIELDS)]
+
+
+def test_a_callback_of_any_length_ends_nothing(folder, tmp_path, monkeypatch, capfd):
+    """As a refinement of minutes: it is waited for."""
+    monkeypatch.setattr(waiting, 'PATIENCE_S', 0.05)
+    learn = MarkerMapper.learn
+    monkeypatch.setattr(MarkerMapper, 'learn', lambda *frame: (time.sleep(0.2), learn(*frame))[1])
+    small_bag.recording(seconds=0.3).write(tmp_path / 'bag')
+    assert replay(tmp_path / 'bag', tmp_path / 'run', folder) == 0
+    summary = json.loads((tmp_path / 'run' / 'summary.json').read_text())
+    assert summary['messages_out']['markers'] == summary['messages_in'][IMAGE_TOPIC] == 9
+    assert 'Traceback' not in capfd.readouterr().err

@@ -1,4 +1,4 @@
-"""Command ``replay``: play a recorded bag through the four nodes."""
+"""Command ``replay``: play a recorded bag through the nodes."""
 
 import argparse
 from collections.abc import Callable, Iterator, Mapping
@@ -28,6 +28,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--rate', type=float, default=1.0, metavar='X', help='processes: times real time (default 1)')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bag')
     parser.add_argument('--images', action='store_true', help='record the cleaned images too (as large as the bag)')
+    parser.add_argument(
+        '--from',
+        dest='entry',
+        default='',
+        choices=('images', 'markers', 'poses'),
+        help='what the bag has beside the IMU: images, markers with camera_info, or camera poses (default: the '
+        'earliest of these that it has)',
+    )
     parser.add_argument('--no-report', action='store_true', help='write no report.html')
 
 
@@ -45,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
         transport=args.transport,
         rate=args.rate,
         images=args.images,
+        entry=args.entry,
         remaps=parse_remaps(args.remap),
     )
     started = time.monotonic()

@@ -24,10 +24,15 @@ from thermal_fiducial.errors import InputError
 IMAGE_TOPIC = 'thermal/image_raw'
 CAMERA_INFO_TOPIC = 'thermal/camera_info'
 IMU_TOPIC = 'imu/data'
+MARKERS_TOPIC = 'markers'
+CAMERA_POSE_TOPIC = 'camera_pose'
 TRUTH_TOPIC = 'ground_truth/odometry'
 
 #: Names that are looked for in any namespace of the bag.
 INTERFACE_TOPICS = (IMAGE_TOPIC, CAMERA_INFO_TOPIC, IMU_TOPIC, TRUTH_TOPIC)
+#: The same for what nodes publish; other programs' topics may end alike (``marker_map/markers``), so that these are
+#: left alone where several do.
+_COMMON_NAMES = (MARKERS_TOPIC, CAMERA_POSE_TOPIC)
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 
@@ -87,9 +92,11 @@ def resolve_topics(recorded: Iterable[str], remap: Mapping[str, str] | None = No
         if source not in plain:
             raise InputError(f'no topic {source} to remap; the bag has: {", ".join(sorted(plain)) or "none"}')
     names = {topic: renamed.get(name, name) for name, topic in plain.items()}
-    for wanted in INTERFACE_TOPICS:
+    for wanted in (*INTERFACE_TOPICS, *_COMMON_NAMES):
         matches = [topic for topic, name in names.items() if name.endswith('/' + wanted)]
-        if wanted in names.values():
+        if wanted in _COMMON_NAMES:
+            matches = [topic for topic in matches if not names[topic].endswith('marker_map/markers')]
+        if wanted in names.values() or (wanted in _COMMON_NAMES and len(matches) > 1):
             continue
         if len(matches) > 1:
             raise InputError(f'{" and ".join(sorted(matches))} could both be {wanted}: choose one with a remap')

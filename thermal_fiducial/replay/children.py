@@ -7,12 +7,14 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from typing import Self
 
-from thermal_fiducial.config import NODES
-from thermal_fiducial.errors import InputError
+from thermal_fiducial.errors import InputError, RunError
 
-_PATIENCE_S = 15.0
+#: A node that has been told to end, and has not worked for so long since, hangs [s].
+_IDLE_S = 15.0
+_GLANCE_S = 0.05
 _TICK = os.sysconf('SC_CLK_TCK')
 
 
@@ -22,10 +24,12 @@ class NodeProcesses:
     Parameters
     ----------
     domain_id : DDS domain
+    nodes : their names
     ros_arguments : for the nodes, after ``--ros-args``
     """
 
-    def __init__(self, domain_id: int, ros_arguments: Sequence[str]) -> None:
+    def __init__(self, domain_id: int, nodes: Sequence[str], ros_arguments: Sequence[str]) -> None:
+        self._nodes = tuple(nodes)
         self._environment = {**os.environ, 'ROS_DOMAIN_ID': str(domain_id)}
         self._arguments = ['--ros-args', *ros_arguments]
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
@@ -33,7 +37,7 @@ class NodeProcesses:
     def __enter__(self) -> Self:
         self._folder = tempfile.TemporaryDirectory(prefix='thermal_fiducial_')
         self._environment.setdefault('ROS_LOG_DIR', self._folder.name)
-        for node in NODES:
+        for node in self._nodes:
             command = [sys.executable, '-m', f'thermal_fiducial.nodes.{node}', *self._arguments]
             with self._log(node).open('wb') as log:
                 self._processes[node] = subprocess.Popen(
@@ -45,11 +49,7 @@ class NodeProcesses:
         for process in self._processes.values():
             process.send_signal(signal.SIGINT)
         for process in self._processes.values():
-            try:
-                process.wait(_PATIENCE_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            _await_end(process)
         self._folder.cleanup()
 
     def check(self) -> None:
@@ -59,7 +59,7 @@ class NodeProcesses:
         ------
         InputError
             It refused its parameters.
-        RuntimeError
+        RunError
             It died.
         """
         for node, process in self._processes.items():
@@ -70,7 +70,12 @@ class NodeProcesses:
             reason = lines[-1] if lines else f'exit status {status}'
             if status == 2:
                 raise InputError(reason)
-            raise RuntimeError(f'node {node} ended: {reason}')
+            raise RunError(f'node {node} ended: {reason}')
+
+    @property
+    def working(self) -> bool:
+        """Whether any of them computes, or would if the machine let it."""
+        return any(_works(process.pid) for process in self._processes.values())
 
     def cpu_seconds(self) -> dict[str, float]:
         """Processor time of each node so far."""
@@ -78,6 +83,28 @@ class NodeProcesses:
 
     def _log(self, node: str) -> Path:
         return Path(self._folder.name) / f'{node}.txt'
+
+
+def _await_end(process: subprocess.Popen[bytes]) -> None:
+    """Let a process end its work, however slow the machine; end it when it has none and stays."""
+    idle = 0
+    while process.poll() is None and idle * _GLANCE_S < _IDLE_S:
+        time.sleep(_GLANCE_S)
+        idle += not _works(process.pid)
+    process.kill()
+    process.wait()
+
+
+def _works(pid: int) -> bool:
+    """Whether a thread of the process runs, waits for a processor (R) or for a disk (D): the state in proc(5) stat."""
+    for path in Path(f'/proc/{pid}/task').glob('*/stat'):
+        try:
+            state = path.read_text().rpartition(')')[2].split()[0]
+        except OSError:  # the thread has just ended
+            continue
+        if state in 'RD':
+            return True
+    return False
 
 
 def _cpu_seconds(pid: int) -> float:

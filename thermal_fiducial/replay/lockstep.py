@@ -5,8 +5,8 @@ subscription's count equals the count of the publishers on its topic. So no queu
 is lost or reordered, and time does not matter.
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-import time
 from typing import Any
 
 from rclpy.context import Context
@@ -21,31 +21,41 @@ from thermal_fiducial.nodes.tau2_camera import Tau2Camera
 from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.replay.recorder import Recorder, RunFiles
 from thermal_fiducial.replay.topics import PLAYED, Topics
+from thermal_fiducial.replay.waiting import Wait
 from thermal_fiducial.ros.node import CountingNode, StageNode
 from thermal_fiducial.ros.run import initialise, make_executor
 
 _SECOND_NS = 1_000_000_000
-_PATIENCE_S = 30.0
+_KINDS: dict[str, type[StageNode[Any]]] = {
+    'tau2_camera': Tau2Camera,
+    'aruco_detector': ArucoDetector,
+    'marker_mapper': MarkerMapperNode,
+    'pose_ekf': PoseEkfNode,
+}
 
 
 def replay_lockstep(
     bag: BagReader,
+    nodes: Sequence[str],
     played: Sequence[str],
     files: RunFiles,
     recorded: Topics,
     ros_arguments: Sequence[str],
     progress: Callable[[int], None],
+    warn: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Play topics ``played`` of ``bag`` through the four nodes into ``files``.
+    """Play topics ``played`` of ``bag`` through ``nodes`` into ``files``.
 
     Parameters
     ----------
     bag : the bag, open
+    nodes : names of those that run
     played : topics to play
     files : what takes the published messages
     recorded : the topics that it takes
     ros_arguments : for the nodes, after ``--ros-args``
     progress : called with the bag's time [ns since its start]
+    warn : takes a line about what is waited for, where nothing has happened for long
 
     Returns
     -------
@@ -61,7 +71,7 @@ def replay_lockstep(
         initialise(['--ros-args', *ros_arguments], context, domain)
         graph = None
         try:
-            graph = _Graph(context, recorded)
+            graph = _Graph(context, nodes, recorded, warn)
             graph.play(bag, played, files, progress)
         finally:
             if graph is not None:
@@ -71,15 +81,17 @@ def replay_lockstep(
 
 
 class _Graph:
-    """The four nodes, a player and a recorder in one executor."""
+    """The nodes, a player and a recorder in one executor."""
 
-    def __init__(self, context: Context, recorded: Topics) -> None:
+    def __init__(self, context: Context, nodes: Sequence[str], recorded: Topics, warn: Callable[[str], None]) -> None:
+        self._warn = warn
         self._arrived: list[tuple[str, bytes]] = []
         self._order = {topic: index for index, topic in enumerate(recorded)}
         quiet: dict[str, Any] = {'context': context, 'enable_rosout': False, 'start_parameter_services': False}
         self._stages: list[StageNode[Any]] = []
-        for kind in (Tau2Camera, ArucoDetector, MarkerMapperNode, PoseEkfNode):
-            self._stages.append(kind(live=False, **quiet))
+        for name in nodes:
+            make: Callable[..., StageNode[Any]] = _KINDS[name]
+            self._stages.append(make(live=False, **quiet))
         self._player = CountingNode('player', use_global_arguments=False, **quiet)
         recorder = Recorder(self._take, recorded, use_global_arguments=False, **quiet)
         self._nodes: list[CountingNode] = [*self._stages, self._player, recorder]
@@ -120,29 +132,36 @@ class _Graph:
         outputs = [output for node in self._nodes for output in node.outputs]
         readers = [(output, sum(source.topic == output.topic for source in self._inputs)) for output in outputs]
         writers = [(source, sum(output.topic == source.topic for output in outputs)) for source in self._inputs]
-        self._wait(lambda: all(output.listeners == count for output, count in readers))
-        self._wait(lambda: all(source.publishers == count for source, count in writers))
+        self._wait(lambda: [output.topic for output, count in readers if output.listeners != count])
+        self._wait(lambda: [source.topic for source, count in writers if source.publishers != count])
         self._heard = [(output, count) for output, count in readers if count]
 
     def _settle(self, time_ns: int, files: RunFiles) -> None:
         """Run callbacks until nothing is under way; hand what was recorded on in a fixed order of topics."""
-        self._wait(self._all_received)
+        self._wait(self._under_way)
         self._arrived.sort(key=lambda entry: self._order[entry[0]])
         for topic, data in self._arrived:
             files.add(topic, time_ns, data)
         self._arrived.clear()
 
-    def _all_received(self) -> bool:
-        """Whether as much was received as was sent; as no topic can receive more than that, each has all."""
+    def _under_way(self) -> list[str]:
+        """Topics with messages under way; as no topic can receive more than was sent, sums that are equal say none."""
         sent = sum([output.count * readers for output, readers in self._heard])
-        return sent == sum([source.count for source in self._inputs])
+        if sent == sum([source.count for source in self._inputs]):
+            return []
+        left: Counter[str] = Counter()
+        for output, readers in self._heard:
+            left[output.topic] += output.count * readers
+        for source in self._inputs:
+            left[source.topic] -= source.count
+        return [topic for topic, count in left.items() if count]
 
-    def _wait(self, condition: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + _PATIENCE_S
-        while not condition():
+    def _wait(self, missing: Callable[[], list[str]]) -> None:
+        """Run callbacks until nothing is ``missing``, however long one of them takes."""
+        wait = Wait(lambda: f'messages on {", ".join(missing())}', self._warn)
+        while missing():
             self._executor.spin_once(timeout_sec=0.1)
-            if time.monotonic() > deadline:
-                raise RuntimeError('messages were lost between nodes in lock-step')
+            wait.go_on(sum([source.count for source in self._inputs]))
 
     def close(self) -> None:
         """Have the nodes finish (the map is saved) and destroy them."""

@@ -14,15 +14,15 @@ from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.replay.latency import header_stamp_ns, LatencyMeter
 from thermal_fiducial.replay.recorder import Recorder, RunFiles
 from thermal_fiducial.replay.topics import PLAYED, Topics
+from thermal_fiducial.replay.waiting import Wait
 from thermal_fiducial.ros.node import CountingNode
 from thermal_fiducial.ros.promptness import prompt
 from thermal_fiducial.ros.run import initialise, make_executor
 
-_PATIENCE_S = 30.0
 #: After both ends of each topic are known to the graph, the nodes still need a moment to match among themselves.
 _MATCHING_S = 0.7
-#: The replay is over when nothing has come for so long.
-_SILENCE_S = 1.5
+#: The replay is over when nothing has come for so long in which no node worked, looked at every so often.
+_SILENCE_S, _GLANCE_S = 1.5, 0.05
 #: With less time than this to the next message, nothing is written to disk before it.
 _SPARE_NS = 2_000_000
 #: What measures must not wait for what is measured: priority of the player, where the user may.
@@ -34,11 +34,13 @@ _KINDS = {IMAGE_TOPIC: 'image', IMU_TOPIC: 'imu'}
 
 def replay_processes(
     bag: BagReader,
+    nodes: Sequence[str],
     played: Sequence[str],
     files: RunFiles,
     recorded: Topics,
     ros_arguments: Sequence[str],
     progress: Callable[[int], None],
+    warn: Callable[[str], None],
     rate: float,
 ) -> dict[str, Any]:
     """Play topics ``played`` of ``bag`` at ``rate`` times real time; otherwise as in lock-step.
@@ -51,17 +53,19 @@ def replay_processes(
     ------
     InputError
         A parameter that a node refuses, or a damaged bag.
+    RunError
+        A node died.
     """
     context = Context()
     with own_domain() as domain:
         initialise(None, context, domain)
         try:
-            with NodeProcesses(domain, ros_arguments) as nodes:
+            with NodeProcesses(domain, nodes, ros_arguments) as processes:
                 player = _Player(context, played, files, recorded)
                 try:
-                    player.connect(nodes)
+                    player.connect(processes, nodes, warn)
                     with prompt(_PRIORITY):
-                        return player.play(bag, nodes, rate, progress)
+                        return player.play(bag, processes, rate, progress)
                 finally:
                     player.close()
         finally:
@@ -88,19 +92,18 @@ class _Player:
         self._executor.add_node(self._player)
         self._executor.add_node(self._recorder)
 
-    def connect(self, nodes: NodeProcesses) -> None:
-        """Wait until the four nodes are there."""
-        # camera_info has two readers, the detector and the mapper.
-        readers = {topic: 2 if topic == CAMERA_INFO_TOPIC else 1 for topic in self._outputs}
-        deadline = time.monotonic() + _PATIENCE_S
-        while not (
-            all(output.listeners >= readers[topic] for topic, output in self._outputs.items())
-            and all(source.publishers >= 1 for source in self._recorder.inputs)
-        ):
-            nodes.check()
+    def connect(self, processes: NodeProcesses, nodes: Sequence[str], warn: Callable[[str], None]) -> None:
+        """Wait until the nodes are there."""
+        # camera_info is read by the detector and by the mapper.
+        readers = {CAMERA_INFO_TOPIC: len({'aruco_detector', 'marker_mapper'} & set(nodes))}
+        wait = Wait(lambda: f'the nodes at {", ".join(missing)}', warn)
+        while missing := [
+            *(topic for topic, output in self._outputs.items() if output.listeners < readers.get(topic, 1)),
+            *(source.topic for source in self._recorder.inputs if source.publishers < 1),
+        ]:
+            processes.check()
             self._executor.spin_once(timeout_sec=0.05)
-            if time.monotonic() > deadline:
-                raise RuntimeError(f'the nodes were not up after {_PATIENCE_S:.0f} s')
+            wait.go_on(missing)
         deadline = time.monotonic() + _MATCHING_S
         while time.monotonic() < deadline:
             self._executor.spin_once(timeout_sec=0.05)
@@ -127,7 +130,7 @@ class _Player:
                 next_check = elapsed + 1_000_000_000
         seconds = (time.monotonic_ns() - self._start_ns) * 1e-9
         used = {node: total - cpu[node] for node, total in nodes.cpu_seconds().items()}
-        self._drain()
+        self._drain(nodes)
         self._latency.write(self._files.folder / 'latency.csv')
         return {
             'rate': rate,
@@ -136,10 +139,15 @@ class _Player:
             'player_late_ms': late_ns * 1e-6,
         }
 
-    def _drain(self) -> None:
-        heard = -1
-        while heard != (heard := sum(source.count for source in self._results())):
-            self._spin_until(time.monotonic_ns() + round(_SILENCE_S * 1e9))
+    def _drain(self, nodes: NodeProcesses) -> None:
+        """Take what still comes, until all is silent and no node has work: on a slow machine that may be long."""
+        heard, idle = -1, 0
+        while idle * _GLANCE_S < _SILENCE_S:
+            nodes.check()
+            self._spin_until(time.monotonic_ns() + round(_GLANCE_S * 1e9))
+            if heard != (heard := sum(source.count for source in self._results())):
+                idle = 0
+            idle += not nodes.working
         while self._arrived:
             self._file_one()
 

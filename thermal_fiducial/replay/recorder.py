@@ -18,7 +18,7 @@ from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagWriter
 from thermal_fiducial.files.trajectory import tum_line
-from thermal_fiducial.replay.topics import Topics
+from thermal_fiducial.replay.topics import Topics, type_name
 from thermal_fiducial.ros import clouds, convert
 from thermal_fiducial.ros.node import CountingNode
 
@@ -46,7 +46,7 @@ class RunFiles:
         self._detections.write(','.join(['stamp_ns', 'id', *CORNER_FIELDS, 'sigma_px']) + '\n')
         shutil.rmtree(folder / 'output', ignore_errors=True)
         self._bag = BagWriter(folder / 'output')
-        self._types = {topic: _type_name(kind) for topic, (kind, _) in topics.items()}
+        self._types = {topic: type_name(kind) for topic, (kind, _) in topics.items()}
         self._readers: dict[str, tuple[type, Callable[[Any], None]]] = {
             'pose': (PoseWithCovarianceStamped, self._on_pose),
             'camera_pose': (PoseWithCovarianceStamped, self._on_camera_pose),
@@ -128,7 +128,3 @@ def _sort_by_stamp(path: Path) -> None:
 def _write_pose(file: TextIO, message: PoseWithCovarianceStamped, pose: Pose) -> None:
     p, q = pose.position, pose.orientation
     file.write(tum_line(convert.stamp_ns(message.header.stamp), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)) + '\n')
-
-
-def _type_name(kind: Any) -> str:
-    return f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'

@@ -12,13 +12,13 @@ from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
 from thermal_fiducial.replay.recorder import RunFiles
 from thermal_fiducial.replay.settings import read_settings, Settings
-from thermal_fiducial.replay.topics import PLAYED, played_topics, recorded_topics
+from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED
 
 MAP_FILE = 'marker_map.yaml'
 
@@ -35,11 +35,13 @@ class Options:
     transport: str = 'lockstep'
     rate: float = 1.0
     images: bool = False
+    #: a key of ENTRIES: where the bag enters the chain; empty: as early as it can
+    entry: str = ''
     remaps: Mapping[str, str] = field(default_factory=dict)
 
 
 def replay(options: Options, progress: Callable[[float], None], warn: Callable[[str], None]) -> dict[str, Any]:
-    """Play a bag through the four nodes and write the run folder, all but the report.
+    """Play a bag through the nodes that its topics are for and write the run folder, all but the report.
 
     Parameters
     ----------
@@ -61,18 +63,26 @@ def replay(options: Options, progress: Callable[[float], None], warn: Callable[[
         warn(line)
     from_file = bool(settings.tau2_camera.calibration_file)
     with BagReader(options.bag, options.remaps) as bag:
-        played = played_topics(calibration_from_file=from_file)
+        entry = ENTRIES[options.entry] if options.entry else entry_of(bag.topics)
+        played = entry.played(calibration_from_file=from_file)
         bag.require(played)
-        arguments = _prepare(options, settings, warn)
-        recorded = recorded_topics(calibration_from_file=from_file, images=options.images)
+        arguments = _prepare(options, settings, entry, warn)
+        recorded = entry.recorded(calibration_from_file=from_file, images=options.images)
         extrinsics = settings.pose_ekf.camera_position, settings.pose_ekf.camera_orientation
         with RunFiles(options.run, transform_from_quaternion(*extrinsics), recorded) as files:
             duration = max(bag.duration_ns, 1)
             play = partial(replay_processes, rate=options.rate) if options.transport == 'processes' else replay_lockstep
             timing = play(
-                bag, tuple(played), files, recorded, arguments, lambda time_ns: progress(min(1.0, time_ns / duration))
+                bag,
+                entry.nodes,
+                tuple(played),
+                files,
+                recorded,
+                arguments,
+                lambda time_ns: progress(min(1.0, time_ns / duration)),
+                warn,
             )
-        _report_refusals(files, warn)
+        _report_refusals(files, entry, warn)
         marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)
         summary = _summary(options, settings, bag, files) | {'markers_in_map': len(marker_map.markers)} | timing
     (options.run / 'summary.json').write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
@@ -88,7 +98,7 @@ def _settings(options: Options) -> Settings:
     return read_settings(options.params, overrides)
 
 
-def _prepare(options: Options, settings: Settings, warn: Callable[[str], None]) -> list[str]:
+def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[[str], None]) -> list[str]:
     """Make the run folder, with parameters and a map of its own: the nodes never write to the user's."""
     try:
         options.run.mkdir(parents=True, exist_ok=True)
@@ -101,7 +111,8 @@ def _prepare(options: Options, settings: Settings, warn: Callable[[str], None]) 
     arguments = ['--params-file', str(options.run / 'parameters.yaml')]
     if not given:
         run_map.unlink(missing_ok=True)
-        warn('no map (--map): without one marker of known pose there is nothing to find the camera from')
+        if 'marker_mapper' in entry.nodes:
+            warn('no map (--map): without one marker of known pose there is nothing to find the camera from')
         return arguments
     if Path(given).resolve() != run_map.resolve():
         shutil.copyfile(given, run_map)
@@ -120,24 +131,21 @@ def _final_map(path: Path, config: MarkerMapperConfig) -> MarkerMap:
     return marker_map
 
 
-def _report_refusals(files: RunFiles, warn: Callable[[str], None]) -> None:
+def _report_refusals(files: RunFiles, entry: Entry, warn: Callable[[str], None]) -> None:
     """Say which nodes refused messages.
 
     Raises
     ------
     InputError
-        Not one of the images, of the calibrations or of the IMU messages could be used.
+        Not one of the images (or what stands for them), of the calibrations or of the IMU messages could be used.
     """
-    for node, topic in (
-        ('tau2_camera', IMAGE_TOPIC),
-        ('aruco_detector', ''),
-        ('marker_mapper', ''),
-        ('pose_ekf', IMU_TOPIC),
-    ):
+    needed = {entry.nodes[0]: [entry.topic], 'pose_ekf': [IMU_TOPIC]}
+    for node in entry.nodes:
         figures = files.figures.get(node, {})
         refused, reason = int(figures.get('refused messages', 0)), figures.get('last refusal', '')
-        if topic and refused and refused >= int(figures[f'received /{topic}']):
-            raise InputError(f'not one message on {topic} could be used: {reason}')
+        for topic in needed.get(node, []):
+            if refused and refused >= int(figures[f'received /{topic}']):
+                raise InputError(f'not one message on {topic} could be used: {reason}')
         if figures.get('calibrations') == '0':
             raise InputError(f'not one message on {CAMERA_INFO_TOPIC} holds a usable calibration')
         if refused:

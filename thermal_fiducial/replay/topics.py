@@ -1,5 +1,7 @@
-"""What a replay plays and what it records: topic to message type and quality of service."""
+"""What a replay plays and what it records: topic to message type and quality of service, by where the bag begins."""
 
+from collections.abc import Collection
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -8,7 +10,8 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.config import NODES
+from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, CAMERA_POSE_TOPIC, IMAGE_TOPIC, IMU_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.ros import qos
 
 Topics: TypeAlias = dict[str, tuple[type, Any]]
@@ -16,29 +19,78 @@ Topics: TypeAlias = dict[str, tuple[type, Any]]
 PLAYED: Topics = {
     IMAGE_TOPIC: (Image, qos.IMAGE_OUTPUT),
     CAMERA_INFO_TOPIC: (CameraInfo, qos.RESULT),
+    MARKERS_TOPIC: (PointCloud2, qos.RESULT),
+    CAMERA_POSE_TOPIC: (PoseWithCovarianceStamped, qos.RESULT),
     IMU_TOPIC: (Imu, qos.IMU_RATE_RESULT),
 }
-_RESULTS: Topics = {
-    'markers': (PointCloud2, qos.RESULT),
-    'marker_poses': (PoseArray, qos.RESULT),
-    'camera_pose': (PoseWithCovarianceStamped, qos.RESULT),
-    'marker_map': (PointCloud2, qos.LATCHED),
-    'map_correction': (TransformStamped, qos.RESULT),
-    'marker_map/markers': (MarkerArray, qos.LATCHED),
-    'pose': (PoseWithCovarianceStamped, qos.IMU_RATE_RESULT),
-    'odometry': (Odometry, qos.IMU_RATE_RESULT),
-    '/diagnostics': (DiagnosticArray, qos.IMU_RATE_RESULT),
+_RESULTS: dict[str, Topics] = {
+    'tau2_camera': {},
+    'aruco_detector': {MARKERS_TOPIC: (PointCloud2, qos.RESULT), 'marker_poses': (PoseArray, qos.RESULT)},
+    'marker_mapper': {
+        CAMERA_POSE_TOPIC: (PoseWithCovarianceStamped, qos.RESULT),
+        'marker_map': (PointCloud2, qos.LATCHED),
+        'map_correction': (TransformStamped, qos.RESULT),
+        'marker_map/markers': (MarkerArray, qos.LATCHED),
+    },
+    'pose_ekf': {
+        'pose': (PoseWithCovarianceStamped, qos.IMU_RATE_RESULT),
+        'odometry': (Odometry, qos.IMU_RATE_RESULT),
+    },
 }
+_DIAGNOSTICS: Topics = {'/diagnostics': (DiagnosticArray, qos.IMU_RATE_RESULT)}
 _CALIBRATION: Topics = {CAMERA_INFO_TOPIC: (CameraInfo, qos.RESULT)}
 _IMAGES: Topics = {'thermal/image': (Image, qos.IMAGE_OUTPUT)}
 
 
-def played_topics(*, calibration_from_file: bool) -> dict[str, str]:
-    """Topic to message type of what a bag must have."""
-    types = {IMAGE_TOPIC: 'sensor_msgs/msg/Image', IMU_TOPIC: 'sensor_msgs/msg/Imu'}
-    return types if calibration_from_file else types | {CAMERA_INFO_TOPIC: 'sensor_msgs/msg/CameraInfo'}
+@dataclass(frozen=True)
+class Entry:
+    """Where a bag enters the chain of nodes.
+
+    Parameters
+    ----------
+    topic : what its first node reads
+    skipped : nodes that the bag stands in for
+    needs_calibration : whether some node that runs reads ``thermal/camera_info``
+    """
+
+    topic: str
+    skipped: int
+    needs_calibration: bool = True
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        """The nodes that run, in their order."""
+        return tuple(NODES)[self.skipped :]
+
+    def played(self, *, calibration_from_file: bool) -> dict[str, str]:
+        """Topic to message type of what a bag must have."""
+        topics = [self.topic, IMU_TOPIC]
+        # Only the first node publishes a calibration from a file.
+        if self.needs_calibration and not (calibration_from_file and self.skipped == 0):
+            topics.append(CAMERA_INFO_TOPIC)
+        return {topic: type_name(PLAYED[topic][0]) for topic in topics}
+
+    def recorded(self, *, calibration_from_file: bool, images: bool) -> Topics:
+        """What the nodes publish, and what the bag has in their place; images only on request, as they are large."""
+        topics = {name: entry for node in self.nodes for name, entry in _RESULTS[node].items()}
+        if self.skipped:
+            return {self.topic: PLAYED[self.topic]} | topics | _DIAGNOSTICS
+        return topics | _DIAGNOSTICS | (_CALIBRATION if calibration_from_file else {}) | (_IMAGES if images else {})
 
 
-def recorded_topics(*, calibration_from_file: bool, images: bool) -> Topics:
-    """What the nodes publish; images only on request, as they are nearly those of the bag."""
-    return _RESULTS | (_CALIBRATION if calibration_from_file else {}) | (_IMAGES if images else {})
+#: By name, the earliest first.
+ENTRIES = {
+    'images': Entry(IMAGE_TOPIC, 0),
+    'markers': Entry(MARKERS_TOPIC, 2),
+    'poses': Entry(CAMERA_POSE_TOPIC, 3, needs_calibration=False),
+}
+
+
+def entry_of(topics: Collection[str]) -> Entry:
+    """The earliest entry that a bag with ``topics`` has; images where it has none, for what is missing to be named."""
+    return next((entry for entry in ENTRIES.values() if entry.topic in topics), ENTRIES['images'])
+
+
+def type_name(kind: Any) -> str:
+    """E.g. ``sensor_msgs/msg/Image`` of a message class."""
+    return f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'

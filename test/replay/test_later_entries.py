@@ -1,0 +1,64 @@
+"""Bags that begin later in the chain: markers, or camera poses, in the place of images."""
+
+import json
+
+import pytest
+from support import small_bag
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.files.bags import BagReader, BagWriter, CAMERA_INFO_TOPIC, IMU_TOPIC
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    """A bag of images, its run, and bags of what its nodes published beside the IMU and the calibration."""
+    folder = tmp_path_factory.mktemp('entries')
+    small_bag.recording(seconds=2.0).write(folder / 'images')
+    small_bag.side_files(folder, ids=(0, 1, 2, 3))
+    assert replay(folder, 'images') == 0
+    for topic in ('markers', 'camera_pose'):
+        with BagWriter(folder / topic) as bag, BagReader(folder / 'images') as images:
+            played = [*images.messages([IMU_TOPIC, CAMERA_INFO_TOPIC])]
+            with BagReader(folder / 'images_run' / 'output') as output:
+                played += output.messages([topic])
+            for message in sorted(played, key=lambda item: item.stamp_ns):
+                bag.write(f'/drone/{message.topic}', message.stamp_ns, message.cdr, message.msgtype)
+    return folder
+
+
+def replay(folder, bag, *extra):
+    """Exit status of the command; the map is known, so that frames do not change it."""
+    run = ['--out', folder / f'{bag}_run', '--params', folder / 'params.yaml', '--map', folder / 'map.yaml']
+    return main([str(word) for word in ('replay', folder / bag, *run, '--mode', 'localization', '--no-report', *extra)])
+
+
+@pytest.mark.parametrize('entry', ['markers', 'camera_pose'])
+@pytest.mark.parametrize('transport', ['lockstep', 'processes'])
+def test_the_same_poses_as_from_images(folder, entry, transport):
+    assert replay(folder, entry, '--transport', transport, '--rate', '0.5') == 0
+    run, images = folder / f'{entry}_run', folder / 'images_run'
+    summary = json.loads((run / 'summary.json').read_text())
+    assert 'tau2_camera' not in summary['diagnostics']
+    assert set(summary['messages_in']) == {IMU_TOPIC, CAMERA_INFO_TOPIC, entry}
+    if transport == 'lockstep':
+        for name in ('fused.tum', 'fiducial.tum'):
+            assert (run / name).read_bytes() == (images / name).read_bytes()
+        assert main(['evaluate', str(run)]) == 0
+    else:
+        # In real time, single messages may be lost on a machine that tests starve.
+        assert summary['messages_out']['pose'] > 0.9 * len((images / 'fused.tum').read_text().splitlines())
+
+
+def test_what_is_missing_is_named(folder, tmp_path, capfd):
+    recorded = small_bag.recording(seconds=0.2).without('thermal/image_raw')
+    recorded.write(tmp_path / 'bag')
+    arguments = ['replay', tmp_path / 'bag', '--out', tmp_path / 'run', '--no-report']
+    assert main([*map(str, arguments), '--from', 'markers']) == 2
+    (line,) = capfd.readouterr().err.splitlines()
+    assert 'no topic markers' in line
+
+
+def test_a_bag_of_images_is_replayed_from_any_entry_that_it_has(folder):
+    assert replay(folder, 'markers', '--from', 'images') == 2
