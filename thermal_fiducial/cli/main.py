@@ -7,7 +7,7 @@ import os
 import sys
 
 from thermal_fiducial import __version__
-from thermal_fiducial.errors import InputError
+from thermal_fiducial.errors import InputError, RunError
 
 PROGRAM = 'thermal-fiducial'
 INSTALL_HINT = "pip install '.[tools,ros]' in the package's folder, or apt on the robot"
@@ -18,12 +18,16 @@ COMMANDS = {
     'demo': 'simulate a flight through fog, replay it through the four nodes, score it, write the report',
     'simulate': 'write a synthetic thermal bag with ground truth',
     'replay': 'play a recorded bag through the four nodes',
+    'import': "a bag from a recording of CSV files: ours, EuRoC's or Kalibr's",
     'evaluate': 'errors against ground truth, jitter, consistency, latency; tables and plots',
     'map': 'show, check, edit, merge, refine and align marker maps',
     'markers': 'make markers that can be cut: dictionaries, drawings, planning',
     'calibrate': 'calibrate the thermal camera, and camera against IMU',
     'check-bridge': 'verify what a flight controller would receive',
 }
+
+#: Commands whose module cannot have their name.
+MODULES = {'import': 'import_recording'}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -35,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns
     -------
-    Exit status: 0 done, 2 wrong usage or unusable input, 130 interrupted.
+    Exit status: 0 done, 1 something failed on the way, 2 wrong usage or unusable input, 130 interrupted.
     """
     argv = sys.argv[1:] if argv is None else list(argv)
     command = argv[0] if argv else ''
@@ -47,13 +51,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     choices = {name: subparsers.add_parser(name, help=text, description=text) for name, text in COMMANDS.items()}
     try:
         if command in choices:
-            module = import_module(f'thermal_fiducial.cli.{command.replace("-", "_")}')
+            module = import_module(f'thermal_fiducial.cli.{MODULES.get(command, command.replace("-", "_"))}')
             module.add_arguments(choices[command])
         args = parser.parse_args(argv)
         return int(module.run(args))
     except InputError as error:
         print(f'{PROGRAM} {command}: {error}', file=sys.stderr)
         return 2
+    except RunError as error:
+        print(f'{PROGRAM} {command}: {error}', file=sys.stderr)
+        return 1
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition('.')[0] == 'thermal_fiducial':
             raise

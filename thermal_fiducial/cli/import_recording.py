@@ -1,0 +1,64 @@
+"""``import FOLDER``: a bag from a recording of CSV files, in our layout, EuRoC's or Kalibr's."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from thermal_fiducial.cli.replay import progress_bar
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import STORAGES
+from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.flight_bags import frame_count, write_recording
+from thermal_fiducial.files.recordings import read_recording
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = (
+        'layouts:\n'
+        '  ours    imu.csv, rig.yaml, and detections.csv or CAMERA.csv (corners) or camera_pose.csv\n'
+        '  EuRoC   [mav0/]imu0/data.csv, CAMERA/data.csv and pictures, a sensor.yaml in each\n'
+        '  Kalibr  imu0.csv, CAMERA/STAMP.png, a camchain and an IMU file\n\n'
+        'The bag has params.yaml (the rig) in its folder, for replay --params.'
+    )
+    parser.add_argument('folder', type=Path, metavar='FOLDER', help='the recording')
+    parser.add_argument('--out', type=Path, required=True, metavar='BAG', help='folder to create')
+    parser.add_argument('--camera', default='cam0', help='which of the cameras (default: cam0)')
+    parser.add_argument('--camchain', type=Path, metavar='YAML', help="Kalibr's camchain (default: in the folder)")
+    parser.add_argument('--imu', type=Path, metavar='YAML', help="Kalibr's IMU file (default: in the folder)")
+    parser.add_argument('--marker-size', type=float, metavar='M', help='side of the markers, for corners')
+    parser.add_argument('--dictionary', metavar='NAME', help='of the markers')
+    parser.add_argument(
+        '--sigma-px', type=float, default=0.3, help='standard deviation of corners that come without (default: 0.3)'
+    )
+    parser.add_argument('--late', type=float, default=0.0, metavar='S', help='frames arrive so late (default: 0)')
+    parser.add_argument('--storage', choices=sorted(STORAGES), default='mcap', help='of the bag (default: mcap)')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, write, say how to replay."""
+    if not (0.0 < args.sigma_px < 100.0 and 0.0 <= args.late < 10.0):
+        raise InputError('--sigma-px is between 0 and 100, --late between 0 and 10')
+    recording = read_recording(args.folder, args.camera, args.camchain, args.imu)
+    rig = recording.rig
+    if args.marker_size is not None:
+        rig = replace(rig, marker_size=args.marker_size)
+    if args.dictionary is not None:
+        load_dictionary(args.dictionary)
+        rig = replace(rig, dictionary=args.dictionary)
+    recording = replace(recording, rig=rig)
+    total, done = max(frame_count(recording), 1), 0
+    with progress_bar(f'import {args.folder.name}') as share:
+
+        def advance(frames: int) -> None:
+            nonlocal done
+            done += frames
+            share(done / total)
+
+        write_recording(args.out, recording, args.sigma_px, args.late, args.storage, advance)
+    print(
+        f'{args.out}: {len(recording.samples)} IMU samples, {done} frames\n'
+        f'replay it with: thermal-fiducial replay {args.out} --params {args.out}/params.yaml --map MAP --out RUN'
+    )
+    return 0

@@ -1,0 +1,123 @@
+"""A recording as a bag for ``replay``, with the parameters of its rig beside it."""
+
+from collections.abc import Callable, Iterator
+import heapq
+from pathlib import Path
+import shutil
+from typing import Any
+
+import numpy as np
+import yaml
+
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
+from thermal_fiducial.core.mapping.map_building import rows_from_corners
+from thermal_fiducial.core.measurements import Markers
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files import messages
+from thermal_fiducial.files.bags import (
+    BagWriter,
+    CAMERA_INFO_TOPIC,
+    CAMERA_POSE_TOPIC,
+    IMAGE_TOPIC,
+    IMU_TOPIC,
+    MARKERS_TOPIC,
+    TRUTH_TOPIC,
+)
+from thermal_fiducial.files.recordings import Corners, Recording
+from thermal_fiducial.files.rig_files import Rig
+
+_Event = tuple[int, str, Any]
+
+
+def write_recording(
+    out: Path,
+    recording: Recording,
+    sigma_px: float,
+    late: float = 0.0,
+    storage: str = 'mcap',
+    progress: Callable[[int], None] = lambda frames: None,
+) -> None:
+    """Write the bag ``out``, with ``params.yaml`` in its folder.
+
+    Parameters
+    ----------
+    sigma_px : standard deviation of corners whose file does not say it [px]
+    late : frames reach the recorder so long after their stamps [s]
+    progress : called with the number of frames written since the last call
+
+    Raises
+    ------
+    InputError
+        ``out`` exists or cannot be written, a picture is none, or corners without a marker size.
+    """
+    if recording.corners and recording.rig.marker_size <= 0.0:
+        raise InputError('the recording does not say how large its markers are: give --marker-size')
+    late_ns = round((late + recording.rig.time_offset) * 1e9)
+    parts = [_imu(recording), _frames(recording, sigma_px, late_ns), _truth(recording)]
+    writer = BagWriter(out, storage)
+    try:
+        with writer as bag:
+            for stamp_ns, topic, message in heapq.merge(*parts, key=lambda event: event[0]):
+                bag.write(topic, stamp_ns, message)
+                if topic in (IMAGE_TOPIC, MARKERS_TOPIC, CAMERA_POSE_TOPIC):
+                    progress(1)
+    except BaseException:
+        # Half a flight looks like a whole one.
+        shutil.rmtree(out, ignore_errors=True)
+        raise
+    parameters = {'/**': {'ros__parameters': _parameters(recording.rig)}}
+    text = yaml.safe_dump(parameters, sort_keys=False, default_flow_style=None, width=120)
+    (out / 'params.yaml').write_text(text, encoding='utf-8')
+
+
+def frame_count(recording: Recording) -> int:
+    """Number of frames, of whatever kind."""
+    return len(recording.pictures) + len(recording.corners) + len(recording.poses)
+
+
+def _imu(recording: Recording) -> Iterator[_Event]:
+    """Samples as they came, also those whose stamp goes back: they reach the recorder after the ones before."""
+    arrival_ns = 0
+    for sample in recording.samples:
+        arrival_ns = max(arrival_ns, sample.stamp_ns)
+        yield arrival_ns, IMU_TOPIC, messages.imu(sample)
+
+
+def _frames(recording: Recording, sigma_px: float, late_ns: int) -> Iterator[_Event]:
+    camera = recording.rig.camera
+    for picture in recording.pictures:
+        arrival = picture.stamp_ns + late_ns
+        yield arrival, CAMERA_INFO_TOPIC, messages.camera_info(picture.stamp_ns, camera)
+        yield arrival, IMAGE_TOPIC, messages.image(picture.stamp_ns, picture.pixels())
+    for frame in recording.corners:
+        arrival = frame.stamp_ns + late_ns
+        yield arrival, CAMERA_INFO_TOPIC, messages.camera_info(frame.stamp_ns, camera)
+        yield arrival, MARKERS_TOPIC, messages.markers(frame.stamp_ns, _rows(frame, recording.rig, sigma_px))
+    for pose in recording.poses:
+        yield pose.stamp_ns + late_ns, CAMERA_POSE_TOPIC, messages.camera_pose(pose)
+
+
+def _rows(frame: Corners, rig: Rig, sigma_px: float) -> Markers:
+    sigma = np.where(np.isfinite(frame.sigma_px), frame.sigma_px, sigma_px)
+    covariances = (sigma**2)[:, None, None, None] * np.broadcast_to(np.eye(2), (len(sigma), 4, 2, 2))
+    sizes = np.full(len(sigma), rig.marker_size)
+    return rows_from_corners(frame.ids, frame.corners_px, covariances, sizes, rig.camera)
+
+
+def _truth(recording: Recording) -> Iterator[_Event]:
+    if recording.truth is not None:
+        for stamp_ns, T_map_body in zip(*recording.truth, strict=True):
+            yield int(stamp_ns), TRUTH_TOPIC, messages.truth(int(stamp_ns), T_map_body)
+
+
+def _parameters(rig: Rig) -> dict[str, Any]:
+    """The rig under the names that the nodes use; no thermal camera, so no lag."""
+    return {
+        **({'dictionary': rig.dictionary} if rig.dictionary else {}),
+        **({'marker_size': rig.marker_size} if rig.marker_size > 0.0 else {}),
+        'camera_position': rig.T_body_camera[:3, 3].tolist(),
+        'camera_orientation': quaternion_from_rotation(rig.T_body_camera[:3, :3]).tolist(),
+        'camera_time_offset': rig.time_offset,
+        'bolometer_lag': 0.0,
+        **({'imu': rig.imu_noise} if rig.imu_noise else {}),
+    }

@@ -1,0 +1,229 @@
+"""Recordings that are no bags: folders of CSV files of ours, of EuRoC and of Kalibr, as one flight.
+
+Ours: ``imu.csv`` (``stamp_ns,wx,wy,wz,ax,ay,az``), ``rig.yaml``, and of a camera either ``detections.csv`` (or
+``CAMERA.csv``: ``stamp_ns,id,u0,v0,u1,v1,u2,v2,u3,v3[,sigma_px]``) or ``camera_pose.csv``
+(``stamp_ns,x,y,z,qx,qy,qz,qw`` and the 36 numbers of the covariance); ``reference.tum`` where there is a truth.
+EuRoC (ASL): ``[mav0/]imu0/data.csv``, ``CAMERA/data.csv`` with pictures, a ``sensor.yaml`` in each.
+Kalibr: ``imu0.csv`` and pictures ``CAMERA/STAMP.png``, with a camchain and an IMU file.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.measurements import CameraPose, ImuSample
+from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.rig_files import NOISE_NAMES, of_camchain, of_rig, of_sensor, read_yaml, Rig
+from thermal_fiducial.files.trajectory import load_tum
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Markers of one frame: IDs (N,), corners (N, 4, 2) [px], and their standard deviations (N,) [px], NaN: unknown."""
+
+    stamp_ns: int
+    ids: IntArray
+    corners_px: FloatArray
+    sigma_px: FloatArray
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A frame on disk."""
+
+    stamp_ns: int
+    path: Path
+
+    def pixels(self) -> npt.NDArray[Any]:
+        """(H, W) uint8 or uint16.
+
+        Raises
+        ------
+        InputError
+            No picture.
+        """
+        pixels = cv2.imread(str(self.path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+        if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+            raise InputError(f'{self.path}: not a picture of 8 or 16 bit')
+        return pixels
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A flight from a folder, frames either as pictures, as corners or as camera poses."""
+
+    rig: Rig
+    samples: list[ImuSample]
+    pictures: list[Picture] = field(default_factory=list)
+    corners: list[Corners] = field(default_factory=list)
+    poses: list[CameraPose] = field(default_factory=list)
+    #: (N,) [ns], (N, 4, 4) T_map_body
+    truth: tuple[IntArray, FloatArray] | None = None
+
+
+def read_recording(
+    folder: Path, camera: str = 'cam0', camchain: Path | None = None, imu: Path | None = None
+) -> Recording:
+    """The flight in ``folder``, whichever of the three layouts it has.
+
+    Parameters
+    ----------
+    camera : which of the cameras
+    camchain, imu : Kalibr's files of the rig; default: those in the folder
+
+    Raises
+    ------
+    InputError
+        None of the layouts, a missing file, or content that is none; the message names file and line.
+    """
+    if not folder.is_dir():
+        raise InputError(f'{folder}: no such folder')
+    if (folder / 'imu.csv').is_file():
+        return _ours(folder, camera)
+    asl = next((place for place in (folder, folder / 'mav0') if (place / 'imu0' / 'data.csv').is_file()), None)
+    if asl is not None:
+        return _asl(asl, camera)
+    if (folder / 'imu0.csv').is_file():
+        return _kalibr(folder, camera, camchain, imu)
+    raise InputError(f'{folder}: no imu.csv (ours), imu0/data.csv (EuRoC) or imu0.csv (Kalibr)')
+
+
+def _ours(folder: Path, camera: str) -> Recording:
+    rig = of_rig(folder / 'rig.yaml', camera)
+    reference = folder / 'reference.tum'
+    truth = None
+    if reference.is_file():
+        stamps, positions, quaternions = load_tum(reference)
+        truth = stamps, transform_from_quaternion(positions, quaternions)
+    samples = _samples(folder / 'imu.csv')
+    poses = folder / 'camera_pose.csv'
+    if poses.is_file():
+        return Recording(rig, samples, poses=_poses(poses), truth=truth)
+    files = [folder / name for name in (f'{camera}.csv', 'detections.csv')]
+    detections = next((path for path in files if path.is_file()), None)
+    if detections is None:
+        raise InputError(f'{folder}: no {camera}.csv, detections.csv or camera_pose.csv')
+    return Recording(rig, samples, corners=list(_corners(detections)), truth=truth)
+
+
+def _asl(folder: Path, camera: str) -> Recording:
+    rig = of_sensor(folder / camera / 'sensor.yaml', folder / 'imu0' / 'sensor.yaml')
+    pictures = [
+        Picture(_stamp(f'{folder / camera / "data.csv"} line {number}', words[0]), folder / camera / 'data' / words[1])
+        for number, words in _lines(folder / camera / 'data.csv', 2)
+    ]
+    truth = None
+    reference = folder / 'state_groundtruth_estimate0' / 'data.csv'
+    if reference.is_file():
+        # Position, then the quaternion with w first.
+        stamps, values = _table(reference, 8)
+        truth = stamps, transform_from_quaternion(values[:, :3], values[:, [4, 5, 6, 3]])
+    return Recording(rig, _samples(folder / 'imu0' / 'data.csv'), pictures=pictures, truth=truth)
+
+
+def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) -> Recording:
+    chain = camchain or next(iter(sorted(folder.glob('*camchain*.yaml'))), None)
+    if chain is None:
+        raise InputError(f'{folder}: no camchain file beside the pictures: name it with --camchain')
+    noise = imu or next((path for path in sorted(folder.glob('*imu*.yaml')) if path != chain), None)
+    densities = {} if noise is None else _densities(read_yaml(noise))
+    place = folder / camera
+    pictures = [
+        Picture(_stamp(str(path), path.stem), path)
+        for path in sorted(place.glob('*'))
+        if path.suffix.lower() in ('.png', '.pgm', '.tif', '.tiff', '.jpg')
+    ]
+    if not pictures:
+        raise InputError(f'{place}: no pictures')
+    pictures.sort(key=lambda picture: picture.stamp_ns)
+    return Recording(of_camchain(chain, camera, densities), _samples(folder / 'imu0.csv'), pictures=pictures)
+
+
+def _densities(document: Mapping[str, Any]) -> dict[str, float]:
+    section = document.get('imu0', document)
+    return {name: float(section[name]) for name in NOISE_NAMES if name in section}
+
+
+# --- tables -------------------------------------------------------------------------------------------
+
+
+def _lines(path: Path, least: int) -> Iterator[tuple[int, list[str]]]:
+    """Number and cells of each line, without comments and the head.
+
+    Raises
+    ------
+    InputError
+        Unreadable, no line, or one of fewer cells than ``least``.
+    """
+    try:
+        lines = path.read_text(encoding='utf-8').splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f'{path}: {getattr(error, "strerror", None) or "no text"}') from None
+    numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line[0] != '#']
+    if numbered and not numbered[0][1][0].isdigit():
+        del numbered[0]
+    if not numbered:
+        raise InputError(f'{path}: no lines of numbers')
+    for number, line in numbered:
+        words = [word.strip() for word in line.split(',')]
+        if len(words) < least:
+            raise InputError(f'{path} line {number}: {len(words)} values, at least {least} are needed')
+        yield number, words
+
+
+def _table(path: Path, columns: int) -> tuple[IntArray, FloatArray]:
+    """Stamps (N,) [ns] and the values (N, M) after them, at least ``columns`` with the stamp."""
+    stamps, rows = [], []
+    for number, words in _lines(path, columns):
+        where = f'{path} line {number}'
+        stamps.append(_stamp(where, words[0]))
+        rows.append(_numbers(where, words[1:]))
+    if len({len(row) for row in rows}) > 1:
+        raise InputError(f'{path}: lines of different lengths')
+    return np.array(stamps, dtype=np.int64), np.array(rows)
+
+
+def _stamp(where: str, word: str) -> int:
+    try:
+        return int(word)
+    except ValueError:
+        raise InputError(f'{where}: {word!r} is no stamp in nanoseconds') from None
+
+
+def _numbers(where: str, words: list[str]) -> list[float]:
+    try:
+        values = [float(word) for word in words]
+    except ValueError:
+        raise InputError(f'{where}: not numbers') from None
+    if not np.isfinite(values).all():
+        raise InputError(f'{where}: not finite')
+    return values
+
+
+def _samples(path: Path) -> list[ImuSample]:
+    stamps, values = _table(path, 7)
+    return [ImuSample(int(stamp), row[:3], row[3:6]) for stamp, row in zip(stamps, values, strict=True)]
+
+
+def _corners(path: Path) -> Iterator[Corners]:
+    stamps, values = _table(path, 10)
+    order = np.argsort(stamps, kind='stable')
+    stamps, values = stamps[order], values[order]
+    for rows in np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(stamps)) + 1):
+        frame = values[rows]
+        sigma = frame[:, 9] if values.shape[1] > 9 else np.full(len(rows), np.nan)
+        yield Corners(int(stamps[rows[0]]), frame[:, 0].astype(np.int64), frame[:, 1:9].reshape(-1, 4, 2), sigma)
+
+
+def _poses(path: Path) -> list[CameraPose]:
+    stamps, values = _table(path, 44)
+    T_map_camera = transform_from_quaternion(values[:, :3], values[:, 3:7])
+    rows = zip(stamps, T_map_camera, values[:, 7:43].reshape(-1, 6, 6), strict=True)
+    return [CameraPose(int(stamp), T, covariance) for stamp, T, covariance in rows]
