@@ -1,11 +1,14 @@
 """ament_python package; ``pip install .[ros]`` brings ROS itself from wheels where there is none."""
 
 from pathlib import Path
+import sys
 
 from setuptools import find_packages, setup
 
 PACKAGE = 'thermal_fiducial'
 NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf', 'thermal_source')
+#: pip makes the command itself; a workspace has it beside the nodes, so this one puts it on the PATH.
+ON_PATH = [] if {'bdist_wheel', 'editable_wheel'} & set(sys.argv) else [('bin', ['scripts/thermal-fiducial'])]
 
 
 def files(folder: str, pattern: str) -> list[str]:
@@ -19,6 +22,7 @@ setup(
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={PACKAGE: ['py.typed', '**/*.xml', '**/*.yaml', '**/*.html', '**/*.json']},
     data_files=[
+        *ON_PATH,
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
         (f'share/{PACKAGE}', ['package.xml']),
         (f'share/{PACKAGE}/config', files('config', '*')),

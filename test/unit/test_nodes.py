@@ -1,6 +1,7 @@
 """The four nodes one by one: what they publish, say and survive."""
 
 from dataclasses import replace
+import time
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
@@ -187,6 +188,25 @@ def test_an_image_of_another_size_than_the_calibration_is_refused(graph):
     graph.send('thermal/camera_info', info())
     graph.send('thermal/image', convert.image(np.zeros((256, 320), np.uint16), convert.header(START, 'camera')))
     assert graph.diagnose(node)[:2] == (WARN, 'image of 320x256, camera_info of 640x512 pixels')
+
+
+def test_a_detector_that_cannot_keep_up_takes_the_newest_image_and_counts_the_others(graph):
+    node = graph.add(ArucoDetector, marker_size=small_bag.SIZE)
+    graph.listen(PointCloud2, 'markers')
+    graph.send('thermal/camera_info', info())
+    output = graph.tester.advertise(Image, 'thermal/image')
+    graph.spin_until(lambda: output.listeners == 1 and node._images.publishers == 1)
+    images = frames(6)
+    for image in images:
+        output.send(image)
+    time.sleep(0.3)  # all have arrived, none has been looked at
+    graph.spin_until(lambda: node._images.count == 6)
+    graph.spin_until(lambda: graph.heard['markers'])
+    stamps = [convert.stamp_ns(message.header.stamp) for message in graph.heard['markers']]
+    assert stamps == [convert.stamp_ns(images[-1].header.stamp)]
+    _, reason, figures = graph.diagnose(node)
+    assert figures['left /thermal/image'] == '5'
+    assert '5 older images left' in reason
 
 
 def test_an_unknown_dictionary_is_a_fault_and_the_node_lives(graph):

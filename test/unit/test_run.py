@@ -51,7 +51,7 @@ def test_parameters_of_every_kind_come_from_the_command_line():
 
 def test_parameters_come_from_a_file(tmp_path):
     file = tmp_path / 'params.yaml'
-    file.write_text('/**: {ros__parameters: {name: b, sizes: [], inner: {gain: 0.5}, foreign: 1}}')
+    file.write_text('/**: {ros__parameters: {name: b, sizes: [], inner: {gain: 0.5}, gravity: 9.8}}')
     with ros_graph('--params-file', str(file)) as graph:
         assert graph.add(Stage).config == Parameters(name='b', inner=Inner(0.5))
 
@@ -69,6 +69,33 @@ def test_parameters_come_from_a_file(tmp_path):
 def test_a_refused_parameter_is_an_input_error(rule, words):
     with ros_graph('-p', rule) as graph, pytest.raises(InputError, match=f'parameter .*{words}'):
         graph.add(Stage)
+
+
+def test_every_parameter_has_a_value_also_an_empty_list():
+    """``ros2 param dump`` asks for all at once, and gets nothing if one of them is not set."""
+    with ros_graph('-p', 'weights:=[1.0]') as graph:
+        graph.add(Stage)
+        names = ['name', 'count', 'sizes', 'weights', 'inner.gain']
+        values = graph.call(GetParameters, 'stage/get_parameters', GetParameters.Request(names=names)).values
+        assert [value.type for value in values] == [4, 2, 9, 8, 3]
+        assert (list(values[2].string_array_value), list(values[3].double_array_value)) == ([], [1.0])
+        assert set_parameter(graph, 'sizes', ['7:0.5']) == (False, 'Trying to set a read-only parameter: sizes.')
+        assert set_parameter(graph, 'weights', [2.0]) == (True, '')
+
+
+def test_a_node_works_on_one_thread_unless_the_user_wants_more():
+    program = """
+import thermal_fiducial.nodes.aruco_detector
+import cv2, os, threading
+print(cv2.getNumThreads(), os.environ['OPENBLAS_NUM_THREADS'])
+"""
+    limits = ('OPENBLAS_NUM_THREADS', 'OMP_NUM_THREADS', 'MKL_NUM_THREADS', 'OPENCV_FOR_THREADS_NUM')
+    bare = {name: value for name, value in os.environ.items() if name not in limits}
+    for environment, said in ((bare, '1 1'), ({**bare, 'OPENBLAS_NUM_THREADS': '3'}, '1 3')):
+        done = subprocess.run(
+            [sys.executable, '-c', program], env=environment, capture_output=True, text=True, timeout=60, check=False
+        )
+        assert done.stdout.strip() == said, done.stderr
 
 
 def set_parameter(graph, name, value):

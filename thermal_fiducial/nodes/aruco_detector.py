@@ -17,7 +17,7 @@ from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.ros import clouds, convert, display, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
-from thermal_fiducial.ros.node import OK
+from thermal_fiducial.ros.node import OK, WARN
 from thermal_fiducial.ros.run import run
 
 
@@ -28,11 +28,11 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         super().__init__('aruco_detector', ArucoDetectorConfig, **kwargs)
         self.detector = self.attempt(self._make_detector, None)
         self.view = EightBitView(Tau2CameraConfig())
-        self._seen = 0
+        self._seen = self._left = 0
         self._markers = self.advertise(PointCloud2, 'markers')
         self._marker_poses = self.advertise(PoseArray, 'marker_poses')
         self._annotated = self.advertise(Image, 'thermal/image_markers', qos.IMAGE_OUTPUT)
-        self.subscribe(Image, 'thermal/image', self._on_image, qos.CAMERA_INPUT)
+        self._images = self.subscribe_newest(Image, 'thermal/image', self._on_image, qos.IMAGE_INPUT)
         self.follow_hints()
         self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
 
@@ -67,7 +67,10 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
             self.detector.set_map(clouds.map_poses(message))
 
     def state(self) -> tuple[bytes, str]:
-        """Number of markers in the last frame."""
+        """Number of markers in the last frame, and of images that there was no time for since the last word."""
+        left, self._left = self._images.left - self._left, self._images.left
+        if left:
+            return WARN, f'{self._seen} markers; {left} older images left'
         return OK, f'{self._seen} markers'
 
 

@@ -48,7 +48,10 @@ class Input:
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
+        #: messages that were taken, or left for newer ones
         self.count = 0
+        #: messages that were left because a newer one had come when their turn was
+        self.left = 0
         self._subscription: Any = None
 
     def attach(self, subscription: Any) -> None:
@@ -86,6 +89,35 @@ class CountingNode(Node):
             self.guard(callback, message)
 
         source.attach(self.create_subscription(kind, topic, receive, profile, raw=raw))
+        self.inputs.append(source)
+        return source
+
+    def subscribe_newest(self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile) -> Input:
+        """Call ``callback`` with the newest message that has come; what is older by then is left and counted.
+
+        The executor takes a task after the messages that were waiting before it, so the task finds the last of them.
+        Executors that take turns otherwise go through all that ``profile`` keeps.
+        """
+        waiting: list[Any] = []
+
+        def work() -> None:
+            source.count += 1
+            self.guard(callback, waiting.pop())
+
+        def receive(message: Any) -> None:
+            if waiting:
+                source.count += 1
+                source.left += 1
+                waiting[:] = [message]
+                return
+            waiting.append(message)
+            if self.executor is None:
+                work()
+            else:
+                self.executor.create_task(work)
+
+        source = Input(self.resolve_topic_name(topic))
+        source.attach(self.create_subscription(kind, topic, receive, profile))
         self.inputs.append(source)
         return source
 
@@ -203,6 +235,7 @@ class StageNode(CountingNode, Generic[Config]):
         """Publish the diagnostics of the time since the last call."""
         level, reason = self._level()
         counts: dict[str, object] = {f'received {source.topic}': source.count for source in self.inputs}
+        counts |= {f'left {source.topic}': source.left for source in self.inputs if source.left}
         counts |= {
             f'published {output.topic}': output.count for output in self.outputs if output.topic != '/diagnostics'
         }

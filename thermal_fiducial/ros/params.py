@@ -37,10 +37,11 @@ def declare(node: Node, kind: type[Config]) -> Config:
     """
     # rclpy has no public way to ask what was given: declaring it all (automatically_declare_parameters_from_overrides)
     # fails on an empty list, which has no type.
-    check_names(getattr(node, '_parameter_overrides', {}))
+    own = {name for name, _, _ in parameters(kind)}
+    check_names(set(getattr(node, '_parameter_overrides', {})) - own)
     for name, item, default in parameters(kind):
         try:
-            node.declare_parameter(name, _declared(item, default), _descriptor(item))
+            _declare(node, name, item, default)
         except ParameterException as error:
             reason = str(error).removesuffix(f': {name}')
             raise InputError(f'parameter {name}: {reason}') from None
@@ -69,11 +70,18 @@ def current_values(node: Node, kind: type) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def _declared(item: 'Field[Any]', default: Any) -> Any:
-    """The default as ROS wants it; for an empty list only its type, which ROS could not tell from the value."""
-    if not isinstance(default, tuple):
-        return default
-    return list(default) if default else _ARRAYS[get_args(item.type)[0]]
+def _declare(node: Node, name: str, item: 'Field[Any]', default: Any) -> None:
+    if default != ():
+        node.declare_parameter(name, list(default) if isinstance(default, tuple) else default, _descriptor(item))
+        return
+    # ROS cannot tell the type of an empty list, and leaves a parameter unset that is declared by its type alone;
+    # asked for all parameters, it then gives none. It can be set only until it is read-only.
+    kind = _ARRAYS[get_args(item.type)[0]]
+    writable, final = _descriptor(item), _descriptor(item)
+    writable.read_only, final.type = False, kind.value
+    if node.declare_parameter(name, kind, writable).value is None:
+        node.set_parameters([Parameter(name, kind, [])])
+    node.set_descriptor(name, final)
 
 
 def _descriptor(item: 'Field[Any]') -> ParameterDescriptor:

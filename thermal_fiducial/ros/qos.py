@@ -18,6 +18,8 @@ def _profile(depth: int, *, reliable: bool = True, latched: bool = False) -> QoS
 
 #: subscription to images and camera_info of any publisher
 CAMERA_INPUT = _profile(5, reliable=False)
+#: subscription of whoever takes the newest image only, and counts the others that have come meanwhile
+IMAGE_INPUT = _profile(10, reliable=False)
 #: subscription to the IMU of any publisher
 IMU_INPUT = _profile(400, reliable=False)
 #: our images
