@@ -44,6 +44,14 @@ def test_damaged_frames_are_counted():
     }  # fmt: skip
 
 
+def test_several_short_frames_in_one_read():
+    good = packed(picture(1))
+    stream = TeaxStream()
+    data = good[:5000] + good[:300] + good[:20] + good
+    assert [len(stream.feed(piece, 0)) for piece in (data, good)] == [1, 1]
+    assert stream.events == {'short frames': 3}
+
+
 def test_another_size_is_taken_when_it_comes_twice_unless_one_was_asked_for():
     data = packed(picture(1)) + packed(picture(2, 336, 256)) + packed(picture(3, 336, 256))
     assert [frame.counts.shape for frame in TeaxStream().feed(data, 0)] == [(HEIGHT, WIDTH), (256, 336)]

@@ -7,6 +7,8 @@ from collections import Counter
 import importlib
 from typing import Any
 
+import numpy as np
+
 from thermal_fiducial.cameras.source import CapturedFrame, now_ns
 from thermal_fiducial.cameras.teax_stream import TeaxStream
 from thermal_fiducial.errors import InputError
@@ -29,7 +31,9 @@ _MAKER = 'teax'
 
 def without_status(data: bytes) -> bytes:
     """The payload of the USB packets ``data``."""
-    return b''.join(data[at + _STATUS : at + _PACKET] for at in range(0, len(data), _PACKET))
+    whole = len(data) - len(data) % _PACKET
+    packets = np.frombuffer(data, np.uint8, whole).reshape(-1, _PACKET)
+    return packets[:, _STATUS:].tobytes() + data[whole + _STATUS :]
 
 
 class ThermalGrabber:

@@ -38,6 +38,8 @@ class TeaxStream:
         self._size = size
         self._other_size: tuple[int, int] | None = None
         self._buffer = bytearray()
+        #: bytes of the buffer that hold no magic but a first one
+        self._searched = 0
         #: bytes of the stream before the buffer
         self._dropped = 0
         #: (bytes of the stream so far, when they had come [ns])
@@ -82,7 +84,7 @@ class TeaxStream:
             words = int.from_bytes(self._buffer[4:_HEADER_BYTES], 'little')
             length = _HEADER_BYTES + 2 * words
             plausible = _SMALLEST <= words <= _LARGEST
-            following = self._buffer.find(MAGIC, len(MAGIC), length) if plausible else -1
+            following = self._following_magic(length) if plausible else -1
             if plausible and following < 0:
                 return length if len(self._buffer) >= length else 0
             self.events['short frames' if plausible else 'scrambled frames'] += 1
@@ -90,6 +92,12 @@ class TeaxStream:
             if not self._skip_to_magic():
                 break
         return 0
+
+    def _following_magic(self, end: int) -> int:
+        """Where in the buffer before ``end`` another magic is, -1 if there is none; no byte is looked at twice."""
+        at = self._buffer.find(MAGIC, max(len(MAGIC), self._searched - len(MAGIC) + 1), end)
+        self._searched = at if at >= 0 else min(len(self._buffer), end)
+        return at
 
     def _accepted(self, counts: Counts | None) -> Counts | None:
         """``counts`` if they are a frame of the size that is expected."""
@@ -125,6 +133,7 @@ class TeaxStream:
     def _drop(self, count: int) -> None:
         del self._buffer[:count]
         self._dropped += count
+        self._searched = max(0, self._searched - count)
 
 
 def _begun_magic(buffer: bytearray, end: int) -> int:
@@ -136,12 +145,16 @@ def _pixels(words: 'np.ndarray[tuple[int], np.dtype[np.uint16]]', size: tuple[in
     """(H, W) counts of a frame's words; None where its rows differ in length."""
     valid = words >= _PIXEL_FLAGS
     edges = np.flatnonzero(np.diff(valid, prepend=False, append=False))
-    lengths = edges[1::2] - edges[::2]
+    starts, lengths = edges[::2], edges[1::2] - edges[::2]
     if not lengths.size or np.any(lengths != lengths[0]):
         return None
-    counts = (words[valid] & _COUNTS).astype(np.uint16)
-    if len(lengths) > 1:
-        return counts.reshape(len(lengths), lengths[0])
+    pitches = np.diff(starts)
+    if pitches.size:
+        if np.any(pitches != pitches[0]):
+            return None
+        rows = np.lib.stride_tricks.sliding_window_view(words, int(lengths[0]))[starts[0] : starts[-1] + 1 : pitches[0]]
+        return np.bitwise_and(rows, _COUNTS, dtype=np.uint16)
+    counts = np.bitwise_and(words[valid], _COUNTS, dtype=np.uint16)
     for width, height in _KNOWN_SIZES if size is None else (size, *_KNOWN_SIZES):
         if counts.size == width * height:
             return counts.reshape(height, width)
