@@ -242,6 +242,11 @@ class Tau2CameraConfig(SelfChecked):
     """Ingestion of raw thermal frames."""
 
     calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
+    image_transport: str = param(
+        'raw',
+        'raw: thermal/image_raw; compressed: thermal/image_raw/compressed, PNG of 16 bits as image_transport makes it.',
+        choices=('raw', 'compressed'),
+    )
     bad_pixel_file: str = param('', 'List of dead pixels: a text file, "column row" a line. Empty: none.')
     find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.', live=True)
     bits: int = param(

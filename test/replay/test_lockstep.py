@@ -53,6 +53,16 @@ def test_every_imu_message_after_the_start_has_its_pose(run):
     assert stamps[0] - small_bag.START_NS < 300_000_000
 
 
+def test_compressed_images_give_the_same_poses(folder):
+    short = small_bag.recording(1.0)
+    short.write(folder / 'raw_bag')
+    short.compressed().renamed(lambda topic: f'/drone/{topic}').write(folder / 'compressed_bag')
+    for kind in ('raw', 'compressed'):
+        assert replay(folder / f'{kind}_bag', folder / f'{kind}_run', folder) == 0
+    for name in ('fused.tum', 'detections.csv'):
+        assert (folder / 'compressed_run' / name).read_text() == (folder / 'raw_run' / name).read_text()
+
+
 def test_poses_are_those_of_the_flight(run):
     # Three times what comes out: 1.7 and 2.5 mm, most of it before the second, third and fourth marker are known.
     for name, tolerance in (('fused.tum', 0.005), ('fiducial.tum', 0.008)):

@@ -18,7 +18,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import marker_corners
 from thermal_fiducial.core.geometry.se3 import apply, inverse, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import save_map
 
 START_NS = 1_700_000_000_000_000_000
@@ -74,6 +74,13 @@ class Recording:
 
     def renamed(self, rename):
         return Recording([(stamp, rename(topic), message) for stamp, topic, message in self.events])
+
+    def compressed(self):
+        """The same with its images compressed."""
+        return Recording([
+            (stamp, COMPRESSED_TOPIC, compressed(message)) if topic == IMAGE_TOPIC else (stamp, topic, message)
+            for stamp, topic, message in self.events
+        ])  # fmt: skip
 
     def write(self, path, storage='mcap'):
         with BagWriter(path, storage) as bag:
@@ -165,6 +172,15 @@ def image(stamp_ns, counts):
         is_bigendian=0,
         step=2 * width,
         data=counts.astype('<u2').view(np.uint8).ravel(),
+    )
+
+
+def compressed(message):
+    """An image as image_transport's plugin ``compressed`` records it with ``format: png``."""
+    pixels = np.frombuffer(message.data.tobytes(), '<u2').reshape(message.height, message.width)
+    data = cv2.imencode('.png', pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
+    return _TYPES['sensor_msgs/msg/CompressedImage'](
+        header=message.header, format='mono16; png compressed mono16', data=data.ravel()
     )
 
 

@@ -1,5 +1,6 @@
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 
@@ -43,6 +44,33 @@ def test_eight_bits_and_a_last_row_without_padding():
 def test_refuses_what_does_not_fit(broken):
     with pytest.raises(InputError, match='image'):
         image_to_array(broken)
+
+
+def compressed(data, form='mono16; png compressed '):
+    return SimpleNamespace(format=form, data=np.frombuffer(data, np.uint8))
+
+
+@pytest.mark.parametrize('suffix', ['.png', '.tiff'])
+@pytest.mark.parametrize('pixels', [PIXELS, PIXELS.astype(np.uint8)])
+def test_lossless_compression_gives_the_same_pixels(suffix, pixels):
+    result = image_to_array(compressed(cv2.imencode(suffix, pixels)[1].tobytes()))
+    np.testing.assert_array_equal(result, pixels)
+    assert result.dtype == pixels.dtype
+
+
+@pytest.mark.parametrize(
+    ('data', 'words'),
+    [
+        (cv2.imencode('.jpg', PIXELS.astype(np.uint8))[1].tobytes(), 'only PNG'),
+        (b'', 'only PNG'),
+        (cv2.imencode('.png', PIXELS)[1].tobytes()[:40], 'cannot be decoded'),
+        (cv2.imencode('.png', np.zeros((2, 3, 3), np.uint8))[1].tobytes(), 'not grey'),
+        (cv2.imencode('.tiff', PIXELS.astype(np.float32))[1].tobytes(), 'not grey'),
+    ],
+)
+def test_compressed_images_that_are_refused(data, words):
+    with pytest.raises(InputError, match=words):
+        image_to_array(compressed(data))
 
 
 def test_stamps_are_exact():

@@ -3,13 +3,14 @@
 from dataclasses import replace
 import time
 
+import cv2
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
 from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 from support import small_bag
 from support.messages import frames, imu, info, pose
@@ -58,6 +59,23 @@ def test_clean_frames_go_out_with_their_stamp_and_frozen_ones_do_not(graph):
     ]
     assert graph.heard['thermal/image'][0].header.frame_id == 'thermal_camera_optical'
     assert graph.diagnose(node)[:2] == (OK, 'ok')
+
+
+def test_compressed_frames_are_those_that_were_compressed(graph):
+    node = graph.add(Tau2Camera, image_transport='compressed')
+    graph.listen(Image, 'thermal/image')
+    (raw,) = frames(1)
+    data = cv2.imencode('.png', image_to_array(raw))[1].tobytes()
+    graph.send(
+        'thermal/image_raw/compressed',
+        CompressedImage(header=raw.header, format='mono16; png compressed ', data=data),
+        CompressedImage(header=raw.header, format='mono16; jpeg compressed ', data=b'\xff\xd8\xff\xe0'),
+    )
+    graph.spin_until(lambda: graph.heard['thermal/image'])
+    np.testing.assert_array_equal(image_to_array(graph.heard['thermal/image'][0]), image_to_array(raw))
+    level, reason, figures = graph.diagnose(node)
+    assert (level, figures['refused messages']) == (WARN, '1')
+    assert 'only PNG' in reason
 
 
 def test_frames_of_8_bits_are_taken_and_what_they_cost_is_said(graph):

@@ -13,11 +13,12 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 
 PICTURES = ('.png', '.tif', '.tiff', '.pgm', '.jpg', '.jpeg', '.bmp')
 _IMAGE_TYPE, _IMU_TYPE, _INFO_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/CameraInfo'
+_COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 
 
 @dataclass(frozen=True)
@@ -75,9 +76,9 @@ def read_picture(path: Path) -> Counts | Gray:
 
 def clean_frames(bag: BagReader) -> Iterator[Frame]:
     """Frames of a bag as the detector gets them: without those that the shutter or the driver froze."""
-    bag.require({IMAGE_TOPIC: _IMAGE_TYPE})
+    bag.require({bag.image_topic: _COMPRESSED_TYPE if bag.image_topic == COMPRESSED_TOPIC else _IMAGE_TYPE})
     cleaner = FrameCleaner(Tau2CameraConfig())
-    for index, entry in enumerate(bag.messages([IMAGE_TOPIC])):
+    for index, entry in enumerate(bag.messages([bag.image_topic])):
         stamp_ns = stamp_to_ns(entry.message.header.stamp)
         frame = cleaner.process(stamp_ns, image_to_array(entry.message))
         if frame.counts is not None:

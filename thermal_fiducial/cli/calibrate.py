@@ -283,7 +283,7 @@ def _camera_imu(args: argparse.Namespace) -> int:
     with BagReader(args.bag, parse_remaps(args.remap)) as bag:
         camera = recorded_camera(bag) if args.calibration is None else load_camera(args.calibration)
         imu, start_ns = imu_track(bag)
-        frames = track(clean_frames(bag), 'finding markers', bag.message_count(['thermal/image_raw']), transient=True)
+        frames = track(clean_frames(bag), 'finding markers', bag.message_count([bag.image_topic]), transient=True)
         seen = sorted(_mapped_corners(frames, marker_map, camera), key=lambda frame: frame.stamp_ns)
     result = calibrate_rolling_camera_imu(seen, camera, imu, start_ns, noise)
     args.out.write_text(_extrinsics_text(result), encoding='utf-8')

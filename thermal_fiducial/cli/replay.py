@@ -32,8 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--from',
         dest='entry',
         default='',
-        choices=('images', 'markers', 'poses'),
-        help='what the bag has beside the IMU: images, markers with camera_info, or camera poses (default: the '
+        choices=('images', 'compressed', 'markers', 'poses'),
+        help='what the bag has beside the IMU: images, compressed ones, markers with camera_info, or camera poses (default: the '
         'earliest of these that it has)',
     )
     parser.add_argument('--no-report', action='store_true', help='write no report.html')

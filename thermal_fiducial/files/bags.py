@@ -22,6 +22,7 @@ from rosbags.typesys.store import Typestore
 from thermal_fiducial.errors import InputError
 
 IMAGE_TOPIC = 'thermal/image_raw'
+COMPRESSED_TOPIC = 'thermal/image_raw/compressed'
 CAMERA_INFO_TOPIC = 'thermal/camera_info'
 IMU_TOPIC = 'imu/data'
 MARKERS_TOPIC = 'markers'
@@ -29,7 +30,7 @@ CAMERA_POSE_TOPIC = 'camera_pose'
 TRUTH_TOPIC = 'ground_truth/odometry'
 
 #: Names that are looked for in any namespace of the bag.
-INTERFACE_TOPICS = (IMAGE_TOPIC, CAMERA_INFO_TOPIC, IMU_TOPIC, TRUTH_TOPIC)
+INTERFACE_TOPICS = (IMAGE_TOPIC, COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, IMU_TOPIC, TRUTH_TOPIC)
 #: The same for what nodes publish; other programs' topics may end alike (``marker_map/markers``), so that these are
 #: left alone where several do.
 _COMMON_NAMES = (MARKERS_TOPIC, CAMERA_POSE_TOPIC)
@@ -182,6 +183,11 @@ class BagReader:
     def duration_ns(self) -> int:
         """From the first to the last message."""
         return max(0, int(self._open.duration) - 1)  # the library's ends one after the last
+
+    @property
+    def image_topic(self) -> str:
+        """Where the frames are: raw, else compressed; the raw topic too where there are none."""
+        return COMPRESSED_TOPIC if COMPRESSED_TOPIC in self.topics and IMAGE_TOPIC not in self.topics else IMAGE_TOPIC
 
     def require(self, topics: Mapping[str, str]) -> None:
         """Check that the bag has ``topics`` (name to message type).

@@ -1,7 +1,8 @@
-"""Pixels of ``sensor_msgs/msg/Image``, from rclpy or from a bag."""
+"""Pixels of ``sensor_msgs/msg/Image`` and ``CompressedImage``, from rclpy or from a bag."""
 
 from typing import Any
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -10,6 +11,8 @@ from thermal_fiducial.errors import InputError
 
 #: Bytes a pixel of the encodings that a thermal camera may have.
 ENCODINGS = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
+#: How files begin whose compression loses nothing: PNG, and TIFF of either byte order.
+_LOSSLESS = (b'\x89PNG', b'II*\0', b'MM\0*')
 
 
 def image_to_array(message: Any) -> Counts | Gray:
@@ -17,13 +20,16 @@ def image_to_array(message: Any) -> Counts | Gray:
 
     Parameters
     ----------
-    message : anything with the fields of sensor_msgs/msg/Image
+    message : anything with the fields of sensor_msgs/msg/Image, or of CompressedImage as image_transport's
+        ``compressed`` makes it with ``format: png``
 
     Raises
     ------
     InputError
-        An encoding other than 8 or 16 bit mono, or sizes that don't fit the data.
+        An encoding other than 8 or 16 bit mono, sizes that don't fit the data, or a compression that loses something.
     """
+    if hasattr(message, 'format'):
+        return _decompressed(message)
     itemsize = ENCODINGS.get(message.encoding)
     if itemsize is None:
         raise InputError(f'image of encoding {message.encoding!r}, not one of {", ".join(ENCODINGS)}')
@@ -39,6 +45,23 @@ def image_to_array(message: Any) -> Counts | Gray:
     if itemsize == 1:
         return np.ascontiguousarray(pixels, dtype=np.uint8)
     return np.ascontiguousarray(pixels, dtype=np.uint16)
+
+
+def _decompressed(message: Any) -> Counts | Gray:
+    data = np.frombuffer(message.data, np.uint8)
+    if not data[:4].tobytes().startswith(_LOSSLESS):
+        raise InputError(f'compressed image of format {message.format!r}: only PNG keeps the counts')
+    try:
+        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise InputError(f'compressed image of {data.size} bytes cannot be decoded')
+    if pixels.ndim != 2 or pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(f'compressed image of format {message.format!r} is not grey')
+    if pixels.dtype == np.uint8:
+        return np.asarray(pixels, dtype=np.uint8)
+    return np.asarray(pixels, dtype=np.uint16)
 
 
 def stamp_to_ns(stamp: Any) -> int:

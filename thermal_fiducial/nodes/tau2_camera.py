@@ -5,7 +5,7 @@ import sys
 from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.geometry.camera import Camera
@@ -40,14 +40,19 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
         self._late = 0
         self._reason = ''
         self._displayed = False
-        self.subscribe(Image, 'thermal/image_raw', self._on_image, qos.CAMERA_INPUT)
+        if config.image_transport == 'compressed':
+            # As image_transport names it: under the name that the raw topic has after remapping.
+            topic = self.resolve_topic_name('thermal/image_raw') + '/compressed'
+            self.subscribe(CompressedImage, topic, self._on_image, qos.CAMERA_INPUT)
+        else:
+            self.subscribe(Image, 'thermal/image_raw', self._on_image, qos.CAMERA_INPUT)
 
     def configure(self, config: Tau2CameraConfig) -> None:
         """Take over live parameters."""
         super().configure(config)
         self.cleaner.config = self.view.config = config
 
-    def _on_image(self, message: Image) -> None:
+    def _on_image(self, message: Image | CompressedImage) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
         pixels = image_to_array(message)
         self._displayed = pixels.dtype == np.uint8

@@ -8,7 +8,14 @@ from typing import Any
 
 from rclpy.context import Context
 
-from thermal_fiducial.files.bags import BagMessage, BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import (
+    BagMessage,
+    BagReader,
+    CAMERA_INFO_TOPIC,
+    COMPRESSED_TOPIC,
+    IMAGE_TOPIC,
+    IMU_TOPIC,
+)
 from thermal_fiducial.replay.children import NodeProcesses
 from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.replay.latency import header_stamp_ns, LatencyMeter
@@ -29,7 +36,7 @@ _SPARE_NS = 2_000_000
 _PRIORITY = 1
 #: Messages read ahead; a piece of a bag takes 25 ms to read.
 _AHEAD = 60
-_KINDS = {IMAGE_TOPIC: 'image', IMU_TOPIC: 'imu'}
+_KINDS = {IMAGE_TOPIC: 'image', COMPRESSED_TOPIC: 'image', IMU_TOPIC: 'imu'}
 
 
 def replay_processes(

@@ -1,7 +1,7 @@
 """A replay from start to end: check what is given, play, leave the run folder of the contract."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
@@ -66,6 +66,8 @@ def replay(options: Options, progress: Callable[[float], None], warn: Callable[[
         entry = ENTRIES[options.entry] if options.entry else entry_of(bag.topics)
         played = entry.played(calibration_from_file=from_file)
         bag.require(played)
+        transport = 'compressed' if entry.topic == COMPRESSED_TOPIC else 'raw'
+        settings = replace(settings, tau2_camera=replace(settings.tau2_camera, image_transport=transport))
         arguments = _prepare(options, settings, entry, warn)
         recorded = entry.recorded(calibration_from_file=from_file, images=options.images)
         extrinsics = settings.pose_ekf.camera_position, settings.pose_ekf.camera_orientation

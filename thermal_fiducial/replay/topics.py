@@ -7,17 +7,25 @@ from typing import Any, TypeAlias
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
-from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from thermal_fiducial.config import NODES
-from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, CAMERA_POSE_TOPIC, IMAGE_TOPIC, IMU_TOPIC, MARKERS_TOPIC
+from thermal_fiducial.files.bags import (
+    CAMERA_INFO_TOPIC,
+    CAMERA_POSE_TOPIC,
+    COMPRESSED_TOPIC,
+    IMAGE_TOPIC,
+    IMU_TOPIC,
+    MARKERS_TOPIC,
+)
 from thermal_fiducial.ros import qos
 
 Topics: TypeAlias = dict[str, tuple[type, Any]]
 
 PLAYED: Topics = {
     IMAGE_TOPIC: (Image, qos.IMAGE_OUTPUT),
+    COMPRESSED_TOPIC: (CompressedImage, qos.IMAGE_OUTPUT),
     CAMERA_INFO_TOPIC: (CameraInfo, qos.RESULT),
     MARKERS_TOPIC: (PointCloud2, qos.RESULT),
     CAMERA_POSE_TOPIC: (PoseWithCovarianceStamped, qos.RESULT),
@@ -81,6 +89,7 @@ class Entry:
 #: By name, the earliest first.
 ENTRIES = {
     'images': Entry(IMAGE_TOPIC, 0),
+    'compressed': Entry(COMPRESSED_TOPIC, 0),
     'markers': Entry(MARKERS_TOPIC, 2),
     'poses': Entry(CAMERA_POSE_TOPIC, 3, needs_calibration=False),
 }

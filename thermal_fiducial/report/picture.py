@@ -13,7 +13,7 @@ from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, IMAGE_TOPIC
+from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.plots import draw_view, FIDUCIAL, FUSED, INK, styled, thinned
@@ -68,7 +68,7 @@ def _view(bag: Path, stamp_ns: int) -> Gray:
     """The frame in 8 bit, its scale and bad pixels from the second before it."""
     cleaner, view, picture = FrameCleaner(Tau2CameraConfig()), EightBitView(Tau2CameraConfig()), None
     with BagReader(bag) as reader:
-        for item in reader.messages([IMAGE_TOPIC]):
+        for item in reader.messages([reader.image_topic]):
             if not stamp_ns - 1_000_000_000 < item.stamp_ns < stamp_ns + 1_000_000_000:
                 continue
             stamp = stamp_to_ns(item.message.header.stamp)
