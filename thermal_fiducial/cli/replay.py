@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest='entry',
         default='',
         choices=('images', 'compressed', 'markers', 'poses'),
-        help='what the bag has beside the IMU: images, compressed ones, markers with camera_info, or camera poses (default: the '
-        'earliest of these that it has)',
+        help='what the bag has beside the IMU: images, compressed images, markers with camera_info, or camera poses '
+        '(default: the earliest of these that it has)',
     )
     parser.add_argument('--no-report', action='store_true', help='write no report.html')
 
