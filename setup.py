@@ -1,6 +1,7 @@
 """ament_python package; ``pip install .[ros]`` brings ROS itself from wheels where there is none."""
 
 from pathlib import Path
+import re
 import sys
 
 from setuptools import find_packages, setup
@@ -9,6 +10,7 @@ PACKAGE = 'thermal_fiducial'
 NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf', 'thermal_source')
 #: pip makes the command itself; a workspace has it beside the nodes, so this one puts it on the PATH.
 ON_PATH = [] if {'bdist_wheel', 'editable_wheel'} & set(sys.argv) else [('bin', ['scripts/thermal-fiducial'])]
+VERSION = re.findall(r"(?m)^__version__ = '(.+)'", Path(PACKAGE, '__init__.py').read_text(encoding='utf-8'))[0]
 
 
 def files(folder: str, pattern: str) -> list[str]:
@@ -18,7 +20,7 @@ def files(folder: str, pattern: str) -> list[str]:
 
 setup(
     name=PACKAGE,
-    version='0.1.0',
+    version=VERSION,
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
     package_data={PACKAGE: ['py.typed', '**/*.xml', '**/*.yaml', '**/*.html', '**/*.json']},
     data_files=[

@@ -18,6 +18,7 @@ from thermal_fiducial.config import (
     size_overrides,
     Tau2CameraConfig,
 )
+from thermal_fiducial.core.pipeline import PipelineConfig
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bad_pixels import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
@@ -62,6 +63,23 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any]) -> Settings
         configs[node] = from_mapping(kind, values)
     settings = Settings(**configs)
     return replace(settings, warnings=tuple(_check_files(settings)))
+
+
+def load_config(path: str | Path | None = None, **overrides: Any) -> PipelineConfig:
+    """Parameters of the four stages.
+
+    Parameters
+    ----------
+    path : ROS parameter file; None: the defaults
+    overrides : name to value, before those of the file
+
+    Raises
+    ------
+    InputError
+        As :func:`read_settings`.
+    """
+    settings = read_settings(None if path is None else Path(path), overrides)
+    return PipelineConfig(settings.tau2_camera, settings.aruco_detector, settings.marker_mapper, settings.pose_ekf)
 
 
 def _check_files(settings: Settings) -> list[str]:

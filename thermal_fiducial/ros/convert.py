@@ -24,41 +24,27 @@ from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
 import numpy as np
 import numpy.typing as npt
-from sensor_msgs.msg import CameraInfo, Image, Imu, TimeReference
+from sensor_msgs.msg import CameraInfo, Image, TimeReference
 from std_msgs.msg import Header
 
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE, require_usable
+from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
-from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
+from thermal_fiducial.core.measurements import CameraPose, Odometry
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
+# What a bag without ROS needs as well.
+from thermal_fiducial.files.records import camera as camera
+from thermal_fiducial.files.records import checked_stamp as checked_stamp
+from thermal_fiducial.files.records import imu_sample as imu_sample
+from thermal_fiducial.files.records import stamp_ns as stamp_ns
+
 #: By how much the norm of a quaternion may be off.
 NORM_TOLERANCE = 0.1
-# What no IMU measures: seven times the widest gyroscopes' range [rad/s], and four times the widest accelerometers'.
-_FASTEST_TURN, _LARGEST_FORCE = 500.0, 8000.0
 # Clocks farther apart than this are not those of one robot [s].
 _LARGEST_CLOCK_OFFSET = 10.0
 # --- stamps, headers, poses ---------------------------------------------------------------------------
-
-
-def stamp_ns(stamp: Time) -> int:
-    """Integer nanoseconds of a stamp.
-
-    Raises
-    ------
-    InputError
-        A time before 1970, or with a second or more of nanoseconds.
-    """
-    return checked_stamp(int(stamp.sec), int(stamp.nanosec))
-
-
-def checked_stamp(seconds: int, nanoseconds: int) -> int:
-    """:func:`stamp_ns` of its two numbers."""
-    if seconds < 0 or nanoseconds >= 1_000_000_000:
-        raise InputError(f'stamp of {seconds} s and {nanoseconds} ns')
-    return seconds * 1_000_000_000 + nanoseconds
 
 
 def clock_reference(camera_stamp_ns: int, offset: float) -> TimeReference:
@@ -135,24 +121,6 @@ def data_bytes(values: npt.NDArray[Any]) -> 'array[int]':
     return data
 
 
-def camera(message: CameraInfo) -> Camera:
-    """Intrinsics of a camera_info message.
-
-    Raises
-    ------
-    InputError
-        No calibration in it, one that no lens has, an unknown model, or a binned or cropped image.
-    """
-    if max(message.binning_x, message.binning_y) > 1 or message.roi.width or message.roi.height:
-        raise InputError('camera_info of a binned or cropped image')
-    model = message.distortion_model or 'plumb_bob'
-    try:
-        K, D = np.array(message.k).reshape(3, 3), np.array(message.d)
-        return require_usable(Camera(int(message.width), int(message.height), K, model, D))
-    except InputError as error:
-        raise InputError(f'camera_info: {error}') from None
-
-
 def camera_info(calibration: Camera, head: Header) -> CameraInfo:
     """camera_info message of a camera."""
     K = calibration.K
@@ -166,26 +134,6 @@ def camera_info(calibration: Camera, head: Header) -> CameraInfo:
 
 
 # --- estimates ----------------------------------------------------------------------------------------
-
-
-def imu_sample(message: Imu) -> ImuSample:
-    """One IMU measurement.
-
-    Raises
-    ------
-    InputError
-        A value that is not finite or that no IMU measures, or a measurement that the driver marks as not there
-        (REP-145).
-    """
-    w, a = message.angular_velocity, message.linear_acceleration
-    angular_velocity, linear_acceleration = np.array([w.x, w.y, w.z]), np.array([a.x, a.y, a.z])
-    if not (np.isfinite(angular_velocity.sum()) and np.isfinite(linear_acceleration.sum())):
-        raise InputError('IMU message that is not finite')
-    if max(np.abs(angular_velocity).max() / _FASTEST_TURN, np.abs(linear_acceleration).max() / _LARGEST_FORCE) > 1.0:
-        raise InputError('IMU message beyond what any IMU measures')
-    if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
-        raise InputError('IMU message without angular velocity or without acceleration')
-    return ImuSample(stamp_ns(message.header.stamp), angular_velocity, linear_acceleration)
 
 
 def pose_with_covariance(T: FloatArray, covariance: FloatArray, head: Header) -> PoseWithCovarianceStamped:

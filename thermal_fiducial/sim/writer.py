@@ -19,7 +19,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, TRUTH_TOPIC
 from thermal_fiducial.files.trajectory import save_tum
 from thermal_fiducial.sim import messages
-from thermal_fiducial.sim.camera import CHUNK, FlightPlan, SimFrame, START_NS, ThermalCamera
+from thermal_fiducial.sim.camera import CHUNK, FlightPlan, plan, SimFrame, START_NS, ThermalCamera
 from thermal_fiducial.sim.scenario import Scenario
 from thermal_fiducial.sim.scene import Marker
 
@@ -35,6 +35,30 @@ class _Event:
     arrival_ns: int
     topic: str
     message: Any
+
+
+def simulate(out: str | Path, scenario: Scenario | str = 'fog', seconds: float | None = None, seed: int = 0) -> Path:
+    """Simulate a flight into the new folder ``out``.
+
+    Parameters
+    ----------
+    out : becomes a rosbag2 with the truth, the true map and the parameters in it, see :func:`write_flight`
+    scenario : its name (``thermal-fiducial simulate --help`` lists them) or an object
+    seconds : length of the flight, at least 11; None: the scenario's own
+    seed : of path and noise; the same seed gives the same bytes
+
+    Returns
+    -------
+    The folder.
+
+    Raises
+    ------
+    InputError
+        ``out`` exists or cannot be written, or there is no such scenario.
+    """
+    folder = Path(out)
+    write_flight(folder, plan(scenario, seconds, seed))
+    return folder
 
 
 def write_flight(

@@ -1,0 +1,77 @@
+"""Records out of messages, from rclpy or from a bag, checked at the door."""
+
+from typing import Any
+
+import numpy as np
+
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.plausibility import require_usable
+from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.errors import InputError
+
+# What no IMU measures: seven times the widest gyroscopes' range [rad/s], and four times the widest accelerometers'.
+_FASTEST_TURN, _LARGEST_FORCE = 500.0, 8000.0
+
+
+def stamp_ns(stamp: Any) -> int:
+    """Integer nanoseconds of a stamp.
+
+    Raises
+    ------
+    InputError
+        A time before 1970, or with a second or more of nanoseconds.
+    """
+    return checked_stamp(int(stamp.sec), int(stamp.nanosec))
+
+
+def checked_stamp(seconds: int, nanoseconds: int) -> int:
+    """:func:`stamp_ns` of its two numbers."""
+    if seconds < 0 or nanoseconds >= 1_000_000_000:
+        raise InputError(f'stamp of {seconds} s and {nanoseconds} ns')
+    return seconds * 1_000_000_000 + nanoseconds
+
+
+def camera(message: Any) -> Camera:
+    """Intrinsics of a camera_info message.
+
+    Parameters
+    ----------
+    message : anything with the fields of sensor_msgs/msg/CameraInfo
+
+    Raises
+    ------
+    InputError
+        No calibration in it, one that no lens has, an unknown model, or a binned or cropped image.
+    """
+    if max(message.binning_x, message.binning_y) > 1 or message.roi.width or message.roi.height:
+        raise InputError('camera_info of a binned or cropped image')
+    model = message.distortion_model or 'plumb_bob'
+    try:
+        K, D = np.array(message.k).reshape(3, 3), np.array(message.d)
+        return require_usable(Camera(int(message.width), int(message.height), K, model, D))
+    except InputError as error:
+        raise InputError(f'camera_info: {error}') from None
+
+
+def imu_sample(message: Any) -> ImuSample:
+    """One IMU measurement.
+
+    Parameters
+    ----------
+    message : anything with the fields of sensor_msgs/msg/Imu
+
+    Raises
+    ------
+    InputError
+        A value that is not finite or that no IMU measures, or a measurement that the driver marks as not there
+        (REP-145).
+    """
+    w, a = message.angular_velocity, message.linear_acceleration
+    angular_velocity, linear_acceleration = np.array([w.x, w.y, w.z]), np.array([a.x, a.y, a.z])
+    if not (np.isfinite(angular_velocity.sum()) and np.isfinite(linear_acceleration.sum())):
+        raise InputError('IMU message that is not finite')
+    if max(np.abs(angular_velocity).max() / _FASTEST_TURN, np.abs(linear_acceleration).max() / _LARGEST_FORCE) > 1.0:
+        raise InputError('IMU message beyond what any IMU measures')
+    if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
+        raise InputError('IMU message without angular velocity or without acceleration')
+    return ImuSample(stamp_ns(message.header.stamp), angular_velocity, linear_acceleration)
