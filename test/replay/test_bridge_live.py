@@ -68,7 +68,7 @@ def fly(data, domain, ready):
     context.init(args=[], domain_id=domain)
     node = CountingNode('drone', context=context)
     outputs = {
-        ImuSample: node.advertise(Imu, 'imu/data', qos.IMU_RATE_RESULT),
+        ImuSample: node.advertise(Imu, 'mavros/imu/data', qos.IMU_RATE_RESULT),
         None: node.advertise(PoseWithCovarianceStamped, 'camera_pose'),
     }
     # First the filter, then check-bridge too, so that none misses the seconds at rest.
@@ -98,6 +98,9 @@ def flying(monkeypatch):
             'bridge_rate': 40.0,
         }
         arguments = [word for name, value in parameters.items() for word in ('-p', f'{name}:={value}')]
+        # As mavros.launch.py has it.
+        for name, other in (('bridge/odometry', 'mavros/odometry/out'), ('imu/data', 'mavros/imu/data')):
+            arguments += ['-r', f'{name}:={other}']
         command = [sys.executable, '-m', 'thermal_fiducial.nodes.pose_ekf', '--ros-args', *arguments]
         node = subprocess.Popen(command, env=os.environ, stderr=subprocess.DEVNULL)
         ready = threading.Event()
@@ -112,7 +115,8 @@ def flying(monkeypatch):
 
 def test_the_filter_as_a_flight_controller_sees_it(flying, capfd):
     status = main(['check-bridge', '--seconds', str(SECONDS + 0.5), '--json'])
-    printed = capfd.readouterr().out
+    printed, said = capfd.readouterr()
+    assert 'Listening to /mavros/odometry/out and /mavros/imu/data' in said
     findings = {finding['check']: finding for finding in json.loads(printed[printed.index('[') :])}
     levels = {name: finding['level'] for name, finding in findings.items()}
     # a machine that tests keep busy may deliver late, and is told so; all else is the same on any

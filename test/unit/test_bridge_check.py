@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 import json
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -205,3 +207,17 @@ def test_a_recorded_run_is_checked(tmp_path, flying, capsys):
     assert findings['yaw']['level'] == 'ok'
     assert findings['gravity']['level'] == 'not tested'
     assert main(['check-bridge', str(tmp_path), '--topic', 'nothing']) == 2
+
+
+def test_listening_needs_no_optional_package_and_takes_ros_arguments():
+    program = """
+import sys
+for name in ('rich', 'matplotlib', 'scipy', 'rosbags', 'jinja2', 'ezdxf'):
+    sys.modules[name] = None
+from thermal_fiducial.cli.main import main
+sys.exit(main(['check-bridge', '--seconds', '0.1', '--ros-args', '-r', '__ns:=/drone', '-r', 'imu/data:=imu/raw']))
+"""
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert 'bridge/odometry' in done.stderr
+    assert 'fault  messages: 0 messages' in done.stdout

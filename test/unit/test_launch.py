@@ -10,13 +10,43 @@ import yaml
 
 from thermal_fiducial import config
 from thermal_fiducial.config import NODES as PARAMETERS
+from thermal_fiducial.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = ['tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf']
 
 
+MAVROS = [('bridge/odometry', 'mavros/odometry/out'), ('imu/data', 'mavros/imu/data')]
+PARAMETER_FILE = '/share/thermal_fiducial/config/thermal_fiducial.yaml'
+ARGUMENTS = {
+    'params_file': '', 'map_file': '', 'camera': '', 'image_topic': 'thermal/image_raw',
+    'camera_info_topic': 'thermal/camera_info', 'imu_topic': 'imu/data', 'namespace': '', 'use_sim_time': 'false',
+    'log_level': 'info', 'rviz': 'false',
+}  # fmt: skip
+
+
 def _record(kind):
     return lambda *args, **kwargs: SimpleNamespace(kind=kind, args=args, **kwargs)
+
+
+class Context(dict):
+    """Stand-in of LaunchContext: the configurations, and what was on the command line."""
+
+    is_shutdown = False
+
+    @property
+    def argv(self):
+        return [f'{name}:={value}' for name, value in self.items()]
+
+
+class NotInstalledError(KeyError):
+    """Stand-in of PackageNotFoundError."""
+
+
+def prefix(package):
+    if package == 'rviz2':
+        raise NotInstalledError(package)
+    return f'/prefix/{package}'
 
 
 class Configuration:
@@ -26,7 +56,7 @@ class Configuration:
         self.name = name
 
     def perform(self, context):
-        return context[self.name]
+        return {**context.declared, **context}[self.name]
 
 
 @pytest.fixture
@@ -34,14 +64,23 @@ def launched(monkeypatch):
     """Run a launch file with arguments: its declared arguments (name to default) and its nodes."""
     stand_ins = {
         'launch': {'LaunchDescription': list},
-        'launch.launch_context': {'LaunchContext': dict},
+        'launch.launch_context': {'LaunchContext': Context},
         'launch.launch_description': {'LaunchDescription': list},
-        'launch.actions': {'DeclareLaunchArgument': _record('argument'), 'OpaqueFunction': _record('function')},
+        'launch.actions': {
+            'DeclareLaunchArgument': _record('argument'),
+            'OpaqueFunction': _record('function'),
+            'LogInfo': _record('log'),
+            'TimerAction': _record('timer'),
+        },
         'launch.substitutions': {'LaunchConfiguration': Configuration},
         'launch_ros': {},
         'launch_ros.actions': {'Node': _record('node')},
         'ament_index_python': {},
-        'ament_index_python.packages': {'get_package_share_directory': lambda package: f'/share/{package}'},
+        'ament_index_python.packages': {
+            'get_package_share_directory': lambda package: f'/share/{package}',
+            'get_package_prefix': lambda package: f'/prefix/{package}',
+            'PackageNotFoundError': NotInstalledError,
+        },
     }
     for name, content in stand_ins.items():
         module = ModuleType(name)
@@ -53,7 +92,9 @@ def launched(monkeypatch):
         actions = runpy.run_path(str(ROOT / 'launch' / file))['generate_launch_description']()
         declared = {action.args[0]: action.default_value for action in actions if action.kind == 'argument'}
         (start,) = [action.function for action in actions if action.kind == 'function']
-        return declared, start({**declared, **arguments})
+        context = Context(arguments)
+        context.declared = declared
+        return declared, start(context)
 
     yield launch
     sys.modules.pop('thermal_fiducial.ros.launching', None)
@@ -62,40 +103,94 @@ def launched(monkeypatch):
 @pytest.mark.parametrize('mode', ['mapping', 'localization'])
 def test_four_nodes_with_the_parameters_of_the_package(launched, mode):
     declared, nodes = launched(f'{mode}.launch.py')
-    assert declared == {
-        'params_file': '', 'map_file': '', 'namespace': '', 'use_sim_time': 'false', 'rviz': 'false'
-    }  # fmt: skip
+    assert declared == ARGUMENTS
     assert [node.executable for node in nodes] == NODES
     for node in nodes:
         assert node.package == 'thermal_fiducial'
-        assert node.parameters == [
-            '/share/thermal_fiducial/config/thermal_fiducial.yaml', {'mode': mode, 'use_sim_time': False}
-        ]  # fmt: skip
+        assert node.parameters == [PARAMETER_FILE, {'mode': mode, 'use_sim_time': False}]
+        assert node.remappings == []
 
 
-def test_arguments_reach_the_nodes(launched):
+def test_arguments_reach_the_nodes(launched, tmp_path):
+    rig = tmp_path / 'rig.yaml'
+    rig.touch()
     _, nodes = launched(
         'localization.launch.py',
-        params_file='rig.yaml',
+        params_file=str(rig),
         map_file='hall.yaml',
         namespace='drone',
         use_sim_time='True',
+        image_topic='tau2/image_raw',
+        imu_topic='/mavros/imu/data',
+        log_level='WARN',
         rviz='true',
     )
     assert [node.executable for node in nodes] == [*NODES, 'rviz2']
     assert {node.namespace for node in nodes} == {'drone'}
     for node in nodes[:4]:
-        assert node.parameters[0] == 'rig.yaml'
+        assert node.parameters[0] == str(rig)
         assert node.parameters[1] == {'mode': 'localization', 'use_sim_time': True, 'map_file': 'hall.yaml'}
+        assert node.remappings == [('thermal/image_raw', 'tau2/image_raw'), ('imu/data', '/mavros/imu/data')]
+        assert node.ros_arguments == ['--log-level', 'warn']
     view = Path(nodes[4].arguments[1])
     assert (ROOT / view.relative_to('/share/thermal_fiducial')).is_file()
+
+
+def test_a_camera_is_started_with_the_nodes(launched):
+    _, nodes = launched('mapping.launch.py', camera='/dev/video0')
+    assert [node.executable for node in nodes] == ['thermal_source', *NODES]
+    assert nodes[0].parameters[1]['camera'] == '/dev/video0'
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'words'),
+    [
+        ({'params_file': '/nowhere/rig.yaml'}, 'params_file /nowhere/rig.yaml: no such file'),
+        ({'map_fil': 'hall.yaml'}, 'launch argument map_fil: there is none; did you mean map_file'),
+        ({'log_level': 'loud'}, 'log_level loud: not one of debug'),
+        ({'rviz': 'maybe'}, 'rviz maybe: true or false'),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_in_words(launched, arguments, words):
+    with pytest.raises(InputError, match=words):
+        launched('localization.launch.py', **arguments)
+
+
+def test_arguments_of_others_are_named(launched):
+    _, (log, *nodes) = launched('localization.launch.py', fcu_url='udp://:14540')
+    assert 'fcu_url' in log.msg
+    assert [node.executable for node in nodes] == NODES
+
+
+def test_without_rviz_the_nodes_start_and_it_is_said(launched, monkeypatch):
+    monkeypatch.setattr(sys.modules['ament_index_python.packages'], 'get_package_prefix', prefix)
+    _, actions = launched('localization.launch.py', rviz='true')
+    assert [action.executable for action in actions[:4]] == NODES
+    assert 'rviz2 is not installed' in actions[4].msg
+
+
+def test_a_crash_is_followed_by_another_start_and_refused_parameters_are_not(launched):
+    _, nodes = launched('localization.launch.py')
+    context = Context()
+    ekf = nodes[3]
+    for status in (1, -11, 134):
+        log, timer = ekf.on_exit(SimpleNamespace(returncode=status), context)
+        assert f'status {status}' in log.msg
+        (again,) = timer.actions
+        assert (again.executable, again.parameters) == (ekf.executable, ekf.parameters)
+        assert len(again.on_exit(SimpleNamespace(returncode=status), context)) == 2
+    (log,) = ekf.on_exit(SimpleNamespace(returncode=2), context)
+    assert 'not started again' in log.msg
+    assert ekf.on_exit(SimpleNamespace(returncode=0), context) == []
+    context.is_shutdown = True
+    assert ekf.on_exit(SimpleNamespace(returncode=-9), context) == []
 
 
 @pytest.mark.parametrize(
     ('file', 'parameters', 'remappings'),
     [
-        ('mavros', {'bridge_rate': 30.0}, [('bridge/odometry', 'mavros/odometry/out')]),
-        ('ardupilot', {'bridge_rate': 20.0}, [('bridge/odometry', 'mavros/odometry/out')]),
+        ('mavros', {'bridge_rate': 30.0}, MAVROS),
+        ('ardupilot', {'bridge_rate': 20.0}, MAVROS),
         ('px4', {'bridge_rate': 50.0, 'px4': True}, []),
     ],
 )

@@ -3,12 +3,14 @@
 import argparse
 import json
 from pathlib import Path
+import sys
+import textwrap
 
-from thermal_fiducial.cli.evaluate import print_tables
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.bridge_check import check_bridge, Finding, Level
-from thermal_fiducial.report.bridge_record import BridgeRecord, ODOMETRY_TOPICS, read_bridge, Recorder
-from thermal_fiducial.report.tables import Table
+from thermal_fiducial.report.bridge_record import BridgeRecord, read_bridge, Recorder
+
+_WIDTH = 118
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,9 +21,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'still for some seconds, then turn it by hand to the left and back. Exit status 1 if there is a fault.'
     )
     parser.add_argument('recording', nargs='?', type=Path, metavar='RECORDING', help='bag or run folder; none: listen')
-    parser.add_argument('--topic', default='', help='odometry to check (default: bridge/odometry, else odometry)')
+    parser.add_argument('--topic', default='', help='odometry to check (default: what pose_ekf sends, as remapped)')
     parser.add_argument('--imu', type=Path, metavar='BAG', help='bag with imu/data, where RECORDING has none')
     parser.add_argument('--seconds', type=float, default=15.0, help='how long to listen (default: 15)')
+    parser.add_argument(
+        '--ros-args', nargs=argparse.REMAINDER, default=[], help='remaps and the like, as for any node; last'
+    )
     parser.add_argument('--json', action='store_true', help='print the findings as JSON')
 
 
@@ -30,28 +35,44 @@ def run(args: argparse.Namespace) -> int:
     if args.recording is not None:
         record = read_bridge(args.recording, args.topic, args.imu)
     else:
-        record = _listen(args.topic or ODOMETRY_TOPICS[0], args.seconds)
+        record = _listen(args.topic, args.seconds, args.ros_args)
     findings = check_bridge(record)
     if args.json:
         print(json.dumps([_as_json(finding) for finding in findings], indent=2))
     else:
-        rows = [(finding.check, finding.level.value, finding.seen, finding.consequence) for finding in findings]
-        print_tables(
-            [Table('what a flight controller would receive', ('check', '', 'seen', 'what it does'), rows, textual=True)]
-        )
+        print('What a flight controller would receive:')
+        for finding in findings:
+            print(_line(finding))
     return int(any(finding.level is Level.FAULT for finding in findings))
 
 
-def _listen(topic: str, seconds: float) -> BridgeRecord:
+def _line(finding: Finding) -> str:
+    text = f'{finding.seen}. {finding.consequence}' if finding.consequence else finding.seen
+    return textwrap.fill(
+        f'{finding.level.value:>10}  {finding.check}: {text}',
+        _WIDTH,
+        subsequent_indent=' ' * 12,
+        break_long_words=False,
+    )
+
+
+def _listen(topic: str, seconds: float, ros_arguments: list[str]) -> BridgeRecord:
     if not 0.0 < seconds < 3600.0:
         raise InputError(f'--seconds {seconds:g}: between 0 and 3600')
     try:
-        from thermal_fiducial.ros.bridge_listener import listen
+        from thermal_fiducial.ros.bridge_listener import listen, Topics
     except ImportError as error:
         raise InputError(f'listening needs ROS 2 ({error.name} is missing); name a recording instead') from None
     recorder = Recorder(live=True)
-    print(f'Listening to {topic} and imu/data for {seconds:g} s: keep still, then turn left and back by hand.')
-    listen(topic, seconds, recorder.odometry, recorder.imu)
+
+    def announce(topics: Topics) -> None:
+        print(
+            f'Listening to {topics.odometry} and {topics.imu} for {seconds:g} s: '
+            'keep still, then turn left and back by hand.',
+            file=sys.stderr,
+        )
+
+    listen(seconds, recorder.odometry, recorder.imu, topic=topic, announce=announce, ros_arguments=ros_arguments)
     return recorder.record()
 
 

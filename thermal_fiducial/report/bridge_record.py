@@ -9,11 +9,10 @@ import numpy as np
 from thermal_fiducial.core.geometry.se3 import rotation_from_quaternion
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, IMU_TOPIC
 from thermal_fiducial.files.images import stamp_to_ns
 
 #: Topics that a bridge is looked for on, the first one that there is.
-ODOMETRY_TOPICS = ('bridge/odometry', 'odometry')
+ODOMETRY_TOPICS = ('bridge/odometry', 'mavros/odometry/out', 'odometry')
 
 
 @dataclass(frozen=True)
@@ -97,6 +96,9 @@ def read_bridge(path: Path, topic: str = '', imu_bag: Path | None = None) -> Bri
     InputError
         Unreadable, or no such topic.
     """
+    # Only a recording needs what reads recordings.
+    from thermal_fiducial.files.bags import BagReader, IMU_TOPIC
+
     recorder = Recorder()
     with BagReader(path / 'output' if (path / 'output').is_dir() else path) as bag:
         wanted = [name for name in ([topic] if topic else ODOMETRY_TOPICS) if name in bag.topics]

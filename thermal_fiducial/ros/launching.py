@@ -1,78 +1,149 @@
 """What the launch files share. Needs ROS's ``launch`` and ``launch_ros``, which a robot has and PyPI has not."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+import difflib
 from pathlib import Path
 from typing import Any
 
-from ament_index_python.packages import get_package_share_directory
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from ament_index_python.packages import get_package_prefix, get_package_share_directory, PackageNotFoundError
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction, TimerAction
 from launch.launch_context import LaunchContext
 from launch.launch_description import LaunchDescription
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from thermal_fiducial.config import NODES
+from thermal_fiducial.errors import InputError
 
 PACKAGE = 'thermal_fiducial'
+#: A node that crashed is started again after this [s].
+_RESPAWN_DELAY = 1.0
+_LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
+#: Exit status of a node that was told to stop, or that refuses its parameters: neither is tried again.
+_STOPPED, _REFUSED = 0, 2
 
 _ARGUMENTS = {
     'params_file': ('', 'parameter file of the rig; default: the one of the package'),
     'map_file': ('', 'marker map; default: what the parameter file says'),
+    'camera': ('', 'start thermal_source with this camera: /dev/video0, teax, a folder; default: another driver runs'),
+    'image_topic': ('thermal/image_raw', 'raw images of the camera'),
+    'camera_info_topic': ('thermal/camera_info', 'calibration of the camera'),
+    'imu_topic': ('imu/data', 'IMU, in the frame of the robot'),
     'namespace': ('', 'namespace of all nodes and topics'),
     'use_sim_time': ('false', 'time from /clock; only diagnostics use it'),
+    'log_level': ('info', f'one of {", ".join(_LEVELS)}'),
     'rviz': ('false', 'start RViz with the view of the package'),
 }
+_TOPICS = ('image_topic', 'camera_info_topic', 'imu_topic')
 
 
 def describe(
-    mode: str, remappings: Iterable[tuple[str, str]] = (), parameters: dict[str, Any] | None = None
+    mode: str,
+    remappings: Iterable[tuple[str, str]] = (),
+    parameters: Mapping[str, Any] | None = None,
+    defaults: Mapping[str, str] | None = None,
 ) -> LaunchDescription:
-    """The four nodes, one process each, started again if one ends.
+    """The nodes, one process each, started again if one crashes.
 
     Parameters
     ----------
     mode : mapping or localization
     remappings : (from, to) for all nodes
     parameters : name to value, before those of the parameter file
+    defaults : launch argument to its default, where it is not that of all launch files
     """
 
-    def start(context: LaunchContext) -> list[Node]:
-        return _nodes(context, mode, list(remappings), parameters or {})
+    def start(context: LaunchContext) -> list[Any]:
+        return _actions(context, mode, list(remappings), dict(parameters or {}))
 
     declared = [
-        DeclareLaunchArgument(name, default_value=default, description=description)
+        DeclareLaunchArgument(name, default_value=(defaults or {}).get(name, default), description=description)
         for name, (default, description) in _ARGUMENTS.items()
     ]
     return LaunchDescription([*declared, OpaqueFunction(function=start)])
 
 
-def _nodes(
+def _actions(
     context: LaunchContext, mode: str, remappings: list[tuple[str, str]], parameters: dict[str, Any]
-) -> list[Node]:
+) -> list[Any]:
     given = {name: LaunchConfiguration(name).perform(context) for name in _ARGUMENTS}
+    actions: list[Any] = _unknown_arguments(context)
     share = Path(get_package_share_directory(PACKAGE))
-    overrides = {'mode': mode, 'use_sim_time': _is_true(given['use_sim_time']), **parameters}
-    if given['map_file']:
-        overrides['map_file'] = given['map_file']
-    nodes = [
-        Node(
-            package=PACKAGE,
-            executable=name,
-            name=name,
-            namespace=given['namespace'],
-            parameters=[given['params_file'] or str(share / 'config' / f'{PACKAGE}.yaml'), overrides],
-            remappings=remappings,
-            output='screen',
-            respawn=True,
-            respawn_delay=1.0,
-        )
-        for name in NODES
-    ]
-    if _is_true(given['rviz']):
-        view = str(share / 'config' / f'{PACKAGE}.rviz')
-        nodes.append(Node(package='rviz2', executable='rviz2', namespace=given['namespace'], arguments=['-d', view]))
-    return nodes
+    overrides = {'mode': mode, 'use_sim_time': _is_true('use_sim_time', given), **parameters}
+    overrides |= {name: given[name] for name in ('map_file', 'camera') if given[name]}
+    settings = {
+        'package': PACKAGE,
+        'namespace': given['namespace'],
+        'parameters': [_params_file(given['params_file'], share), overrides],
+        'remappings': [*remappings, *_topics(given)],
+        'ros_arguments': ['--log-level', _log_level(given['log_level'])],
+        'output': 'screen',
+    }
+    names = ['thermal_source', *NODES] if given['camera'] else list(NODES)
+    actions += [_node(name, settings) for name in names]
+    if _is_true('rviz', given):
+        actions.append(_rviz(given['namespace'], share))
+    return actions
 
 
-def _is_true(text: str) -> bool:
-    return text.strip().lower() in ('true', '1', 'yes', 'on')
+def _node(name: str, settings: dict[str, Any]) -> Node:
+    def after(event: Any, context: LaunchContext) -> list[Any]:
+        """Crashed: once more. Refused its parameters: it would refuse them again."""
+        if context.is_shutdown or event.returncode == _STOPPED:
+            return []
+        if event.returncode == _REFUSED:
+            return [LogInfo(msg=f'{name}: unusable parameters or arguments (see above); it is not started again')]
+        told = LogInfo(msg=f'{name}: ended with status {event.returncode}; it is started again')
+        return [told, TimerAction(period=_RESPAWN_DELAY, actions=[_node(name, settings)])]
+
+    return Node(executable=name, name=name, on_exit=after, **settings)
+
+
+def _unknown_arguments(context: LaunchContext) -> list[Any]:
+    """A warning of each argument on the command line that is not ours; one that is nearly ours is refused.
+
+    A launch file that includes ours may have others.
+    """
+    given = [argument.partition(':=')[0] for argument in context.argv if ':=' in argument]
+    warnings = []
+    for name in given:
+        if name in _ARGUMENTS:
+            continue
+        close = difflib.get_close_matches(name, _ARGUMENTS, 1, cutoff=0.75)
+        if close:
+            raise InputError(f'launch argument {name}: there is none; did you mean {close[0]}?')
+        warnings.append(LogInfo(msg=f'launch argument {name}: {PACKAGE} has none; see --show-args'))
+    return warnings
+
+
+def _params_file(path: str, share: Path) -> str:
+    if path and not Path(path).is_file():
+        raise InputError(f'params_file {path}: no such file')
+    return path or str(share / 'config' / f'{PACKAGE}.yaml')
+
+
+def _topics(given: dict[str, str]) -> list[tuple[str, str]]:
+    ours = {name: _ARGUMENTS[name][0] for name in _TOPICS}
+    return [(topic, given[name]) for name, topic in ours.items() if given[name] != topic]
+
+
+def _log_level(level: str) -> str:
+    if level.lower() not in _LEVELS:
+        raise InputError(f'log_level {level}: not one of {", ".join(_LEVELS)}')
+    return level.lower()
+
+
+def _rviz(namespace: str, share: Path) -> Any:
+    try:
+        get_package_prefix('rviz2')
+    except PackageNotFoundError:
+        return LogInfo(msg='rviz:=true: the package rviz2 is not installed (ros-jazzy-rviz2); the nodes run without it')
+    view = str(share / 'config' / f'{PACKAGE}.rviz')
+    return Node(package='rviz2', executable='rviz2', namespace=namespace, arguments=['-d', view])
+
+
+def _is_true(name: str, given: dict[str, str]) -> bool:
+    text = given[name].strip().lower()
+    if text not in ('true', '1', 'yes', 'on', 'false', '0', 'no', 'off'):
+        raise InputError(f'{name} {given[name]}: true or false')
+    return text in ('true', '1', 'yes', 'on')
