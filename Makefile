@@ -1,8 +1,10 @@
-# make demo    set everything up and run the main job: simulate, replay through the four nodes, score, report
-# make test    set everything up, check the code and run all tests
-# make bench   accuracy and speed against OpenCV and a batch smoother, in the same run
-# make tables  put measured tables and parameters into the documents
-# make docs    build the documentation as a web site in build/site; a link that leads nowhere fails it
+# make demo      set everything up and run the main job: simulate, replay through the four nodes, score, report
+# make test      set everything up, check the code and run all tests
+# make coverage  all tests, with the branch coverage of the core: less than 95 % fails
+# make bench     accuracy and speed against OpenCV and a batch smoother, in the same run
+# make tables    put measured tables and parameters into the documents
+# make structure print how large and how deep the package is, beside what it aims at
+# make docs      build the documentation as a web site in build/site; a link that leads nowhere fails it
 PYTHON ?= $(firstword $(foreach version,3.12 3.11,$(if $(shell python$(version) -c 'import venv, ensurepip' 2>/dev/null && echo yes),python$(version))) python3)
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -16,7 +18,7 @@ export OMP_NUM_THREADS := 1
 # A notice of the theme about its successor.
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help demo test lint bench tables docs format clean
+.PHONY: help demo test lint coverage bench tables structure docs format clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -44,6 +46,11 @@ test: lint
 	@echo '== Tests (real data are used where THERMAL_FIDUCIAL_DATA names their folder)'
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --durations 15 $(PYTEST_ARGS)
 
+coverage: $(READY)
+	@echo '== Tests with the branch coverage of the core'
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --cov thermal_fiducial.core --cov-branch \
+		--cov-report term-missing:skip-covered --cov-fail-under 95 $(PYTEST_ARGS)
+
 bench: $(READY)
 	@echo '== Benchmarks, one thread'
 	$(BIN)/python -m pytest test/bench --benchmark-only --benchmark-columns=median,min,max,rounds $(PYTEST_ARGS)
@@ -55,6 +62,9 @@ tables: $(READY)
 $(DOCS): setup.py $(READY)
 	$(BIN)/python -m pip install --quiet --editable '.[docs]'
 	@touch $@
+
+structure: $(READY)
+	$(BIN)/python test/structure.py
 
 docs: $(DOCS)
 	@echo '== Documentation: build/site/index.html'

@@ -97,6 +97,11 @@ def true_pose(t):
     return _motion().pose(t)
 
 
+def true_imu(t):
+    """Angular velocity and specific force (6,) at ``t`` [s]."""
+    return _motion().imu(t)
+
+
 def _motion():
     # Small and slow, so that the markers stay in view whatever the seed.
     return Motion.random(np.random.default_rng(7), speed=0.12, turn=0.05)
