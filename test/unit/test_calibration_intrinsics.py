@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from support.boards import random_view
 
-from thermal_fiducial.calibration.intrinsics import _Fit, calibrate, choose_model
+from thermal_fiducial.calibration.intrinsics import calibrate
+from thermal_fiducial.calibration.lens_check import image_error, reaches_corners
+from thermal_fiducial.calibration.lens_choice import choose_model
+from thermal_fiducial.calibration.lens_fit import LensFit
 from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -55,10 +58,10 @@ def test_covariance_is_what_the_errors_are(name):
 
 @pytest.mark.parametrize(('name', 'model'), [('7.5mm', 'equidistant'), ('13mm', 'plumb_bob')])
 def test_held_out_error_chooses_the_lens_model(name, model):
-    best, errors = choose_model(sightings(LENSES[name], 16, 0.02, 3), 640, 512)
+    best, fits = choose_model(sightings(LENSES[name], 16, 0.02, 3), 640, 512)
     assert best.camera.model == model
     # Noise of 0.02 px a coordinate is 0.028 px in the plane.
-    assert errors[model] == pytest.approx(0.028, abs=0.003)
+    assert fits[model].held_out_px[0] == pytest.approx(0.028, abs=0.003)
 
 
 def test_views_that_do_not_belong_are_dropped():
@@ -98,16 +101,87 @@ def test_derivatives_against_differences(model):
     D['rational_polynomial'] = [0.3, 0.05, 3e-4, -2e-4, 0.01, 0.6, 0.1, 0.02]
     camera = Camera(640, 512, np.array([[600.0, 0, 320], [0, 610.0, 250], [0, 0, 1]]), model, np.array(D[model]))
     T = se3.transform(se3.so3_exp([0.2, -0.3, 0.1]), [-0.15, -0.1, 0.6])[None]
-    fit = _Fit([Sighting(POINTS, np.zeros((48, 2)))], camera, 0.0)
-    by_intrinsics, by_pose = fit._jacobian(camera, T)
+    fit = LensFit([Sighting(POINTS, np.zeros((48, 2)))], camera, 0.0)
+    by_intrinsics, by_pose = fit.jacobian(camera, T)
     J = np.concatenate([by_intrinsics, by_pose], axis=2)
     h = 1e-6
     for column in range(J.shape[2]):
         step = np.zeros(J.shape[2])
         step[column] = h
-        ahead, behind = (fit._error(*fit._moved(camera, T, sign * step)) for sign in (1.0, -1.0))
+        ahead, behind = (fit.error(*fit.moved(camera, T, sign * step)) for sign in (1.0, -1.0))
         # Second-order terms of h^2 times a third derivative of the order of 1e3 px.
         assert J[:, :, column] == pytest.approx((ahead - behind) / (2 * h), rel=1e-5, abs=1e-4)
+
+
+def turned_best(points, wanted):
+    """Turn of directions (N, 3) onto the ``wanted`` ones (Kabsch)."""
+    U, _, Vt = np.linalg.svd(wanted.T @ points)
+    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+
+
+def middle_third(lens, count, sigma, seed):
+    """Views of a board that stays in the middle third of the image."""
+    rng, views = np.random.default_rng(seed), []
+    while len(views) < count:
+        distance = 1.12 * lens.focal[0] * rng.uniform(1.0, 1.3) / 640.0
+        R = se3.so3_exp(rng.normal(0.0, 0.35, 3))
+        pixels = lens.project(POINTS @ R.T + np.array([0.0, 0.0, distance]) - R @ POINTS.mean(axis=0))
+        if np.all(np.abs(pixels - [320, 256]) < [110, 90]):
+            views.append(Sighting(POINTS, pixels + rng.normal(0.0, sigma, pixels.shape)))
+    return views
+
+
+@pytest.mark.parametrize('name', ['7.5mm', '9mm', '13mm'])
+def test_views_in_the_middle_do_not_determine_the_corners(name):
+    lens = LENSES[name]
+    views = middle_third(lens, 6, 0.05, 1)
+    best, _ = choose_model(views, 640, 512)
+    assert len(best.free) <= 1
+    assert reaches_corners(best.camera)
+    error = image_error(best.camera, best.covariance, views)
+    u, v = np.meshgrid(error.u, error.v)
+    uv, inside = np.stack([u, v], axis=-1).reshape(-1, 2), error.covered.ravel()
+    rays, true = best.camera.rays(uv), lens_rays(lens, uv)
+    turn = turned_best(rays[inside], true[inside])
+    off = np.linalg.norm(lens.project(rays @ turn.T) - uv, axis=1)
+    assert error.covered_share < 0.12
+    # Three standard deviations, in the middle and at the corners alike.
+    assert np.all(off < 3.0 * error.sigma_px.ravel() + 0.01)
+    # And not so wide that it says nothing: a fifth of the distance to the corner.
+    assert off[~inside].max() > 0.4
+    assert error.outside_px < 85.0
+
+
+def lens_rays(lens, uv):
+    slopes = np.array([lens.slopes(pixel) for pixel in uv])
+    rays = np.column_stack([slopes, np.ones(len(uv))])
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def test_views_all_over_the_image_say_so():
+    views = sightings(LENSES['7.5mm'], 16, 0.02, 1)
+    best, _ = choose_model(views, 640, 512, ['equidistant'])
+    error = image_error(best.camera, best.covariance, views)
+    assert error.covered_share > 0.5
+    assert error.inside_px < 0.05
+    assert '% of the image' in error.sentence()
+
+
+def test_a_lens_that_folds_back_is_never_the_answer():
+    K = np.array([[440.0, 0, 320], [0, 440.0, 256], [0, 0, 1]])
+    assert reaches_corners(Camera(640, 512, K, 'equidistant', np.array([-0.125, -0.016, 0.006, 0.002])))
+    assert not reaches_corners(Camera(640, 512, K, 'equidistant', np.array([0.008, -11.0, 380.0, -3913.0])))
+    # Barrel distortion without its second term turns round at 1 / sqrt(3 |k1|).
+    assert not reaches_corners(Camera(640, 512, K, 'plumb_bob', np.array([-0.3, 0.0, 0.0, 0.0, 0.0])))
+    best, fits = choose_model(middle_third(LENSES['7.5mm'], 6, 0.3, 10), 640, 512)
+    assert reaches_corners(best.camera)
+    assert all(reaches_corners(fit.camera) for fit in fits.values())
+
+
+def test_halves_of_a_set_agree():
+    views = sightings(LENSES['7.5mm'], 24, 0.1, 5)
+    halves = [choose_model(views[start::2], 640, 512, ['equidistant'])[0].camera.focal_px for start in (0, 1)]
+    assert halves[0] == pytest.approx(halves[1], rel=5e-3)
 
 
 def test_too_few_views():

@@ -1,12 +1,15 @@
 """Boards in rendered frames: found whatever the polarity, and measured to a few hundredths of a pixel."""
 
+import re
+
 import cv2
 import numpy as np
 import pytest
 from support.boards import chessboard_levels, circle_levels, plate_pose, random_view, render
+import yaml
 
 from thermal_fiducial.calibration.keypoints import without_speckles
-from thermal_fiducial.calibration.targets import Chessboard, CircleGrid
+from thermal_fiducial.calibration.targets import BoardNotFound, Chessboard, CircleGrid
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -39,7 +42,6 @@ def test_chessboard_of_either_polarity(contrast):
     for seed in range(4):
         counts, truth = chessboard_view(rng, contrast, seed)
         sighting = CHESSBOARD.find(counts, GUESS)
-        assert sighting is not None
         errors.append(smallest_error(sighting.pixels, truth))
     rms = np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1)))
     # Measured 0.017 px at 8 K; noise grows as contrast falls.
@@ -51,7 +53,6 @@ def test_chessboard_beside_something_hot():
     hot = counts.copy()
     hot[:8, :200] = 14000
     sighting = CHESSBOARD.find(hot, GUESS)
-    assert sighting is not None
     assert np.abs(smallest_error(sighting.pixels, truth)).max() < 0.3
 
 
@@ -64,7 +65,6 @@ def test_circles(name):
         T = random_view(lens, CIRCLES.points, rng)
         plate = plate_pose(T, np.array([0.5 * width - 0.03, 0.5 * height - 0.03]))
         sighting = CIRCLES.find(render(lens, plate, levels, width, height, 8.0, seed), GUESS)
-        assert sighting is not None
         # Without those that the rim of the image cuts.
         assert len(sighting.points) >= 38
         # Centroids differ from projected centres by perspective, at these sizes by less than half a pixel.
@@ -74,8 +74,9 @@ def test_circles(name):
 
 def test_no_board_in_noise():
     noise = np.random.default_rng(1).normal(3600.0, 3.0, (512, 640)).astype(np.uint16)
-    assert CHESSBOARD.find(noise, GUESS) is None
-    assert CIRCLES.find(noise, GUESS) is None
+    for board in (CHESSBOARD, CIRCLES):
+        with pytest.raises(BoardNotFound):
+            board.find(noise, GUESS)
 
 
 def test_speckles_go_and_corners_stay():
@@ -98,6 +99,7 @@ def test_command_calibrates_a_folder(tmp_path, capsys):
     for index in range(10):
         counts, _ = chessboard_view(rng, 8.0 if index % 2 else -8.0, index)
         cv2.imwrite(str(tmp_path / f'{index:02}.png'), counts)
+    cv2.imwrite(str(tmp_path / '10.png'), np.full((512, 640), 7000, np.uint16))
     out = tmp_path / 'camera.yaml'
     assert main(['calibrate', 'intrinsics', str(tmp_path), '--out', str(out), '--models', 'plumb_bob,equidistant']) == 0
     camera = load_camera(out)
@@ -105,9 +107,56 @@ def test_command_calibrates_a_folder(tmp_path, capsys):
     # Ten views in place of forty: twice the errors that forty may have.
     assert camera.K[0, 0] == pytest.approx(LENS.focal[0], rel=1e-3)
     assert camera.K[:2, 2] == pytest.approx(LENS.centre, abs=0.6)
-    assert 'cells covered' in capsys.readouterr().out
-    assert '<img' in out.with_suffix('.html').read_text()
-    assert (tmp_path / 'camera_covariance.yaml').is_file()
+    printed = capsys.readouterr().out
+    assert 'cells covered' in printed
+    assert '% of the image' in printed
+    assert '10.png: not used: no regular grid' in printed
+    page = out.with_suffix('.html').read_text()
+    # Every view with its points and residuals under its name, and the one that gave nothing with the reason.
+    assert page.count('<figure>') == 10
+    assert page.count('<circle') == page.count('<path') >= 10 * 24
+    assert all(f'{index:02}.png:' in page for index in range(10))
+    assert re.search(r'<td>10.png</td><td>no regular grid', page)
+    covariance = yaml.safe_load((tmp_path / 'camera_covariance.yaml').read_text())
+    assert 0.3 < covariance['covered_share'] < 1.0
+    assert covariance['sigma_covered_px'] < covariance['sigma_not_covered_px']
+
+
+def test_points_that_were_measured_elsewhere(tmp_path, capsys):
+    rng, out = np.random.default_rng(4), tmp_path / 'camera.yaml'
+    lines = ['view,point,u,v,x,y']
+    for view in range(9):
+        pixels = LENS.project(se3.apply(random_view(LENS, CHESSBOARD.points, rng), CHESSBOARD.points))
+        for point, (uv, xyz) in enumerate(
+            zip(pixels + rng.normal(0.0, 0.02, pixels.shape), CHESSBOARD.points, strict=True)
+        ):
+            lines.append(f'v{view},{point},{uv[0]:.4f},{uv[1]:.4f},{xyz[0]:.4f},{xyz[1]:.4f}')
+    table = tmp_path / 'points.csv'
+    table.write_text('\n'.join(lines))
+    command = ['calibrate', 'intrinsics', str(table), '--out', str(out), '--models', 'plumb_bob']
+    assert main([*command, '--size', '640', '512']) == 0
+    # Nine views in place of forty.
+    assert load_camera(out).K[0, 0] == pytest.approx(LENS.focal[0], rel=1e-3)
+    assert 'v8: 48 points' in out.with_suffix('.html').read_text()
+    capsys.readouterr()
+    for broken, words in (('v0,0,1,1,0,0', 'second time'), ('v0,99,x,1,0,0', 'numbers'), ('v0,99,-9,1,0,0', 'outside')):
+        table.write_text('\n'.join([*lines, broken]))
+        assert main([*command, '--size', '640', '512']) == 2
+        assert words in capsys.readouterr().err
+    assert main(command) == 2
+    assert '--size' in capsys.readouterr().err
+
+
+def test_too_few_views_are_counted_and_the_others_named(tmp_path, capsys):
+    rng = np.random.default_rng(12)
+    for index in range(2):
+        cv2.imwrite(str(tmp_path / f'good{index}.png'), chessboard_view(rng, 8.0, index)[0])
+    cv2.imwrite(str(tmp_path / 'blank.png'), np.full((512, 640), 7000, np.uint16))
+    assert main(['calibrate', 'intrinsics', str(tmp_path), '--out', str(tmp_path / 'c.yaml')]) == 2
+    error = capsys.readouterr().err
+    assert '2 of 3 frames are usable views' in error
+    assert 'blank.png: no regular grid of points' in error
+    assert not (tmp_path / 'c.yaml').exists()
 
 
 @pytest.mark.parametrize('content', [None, b'no picture', 'blank'])

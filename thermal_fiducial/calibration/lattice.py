@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from thermal_fiducial.calibration.keypoints import Keypoints
-from thermal_fiducial.calibration.placement import BoardNodes
+from thermal_fiducial.calibration.placement import BoardNodes, Refusal
 from thermal_fiducial.calibration.surface import local_surface, REACH
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -38,25 +38,31 @@ class BoardPoints:
     ----------
     points : (N,) their index on the board
     pixels : (N, 2) where they are, to a pixel or a tenth of their spacing
+    beyond_nodes, beyond_pixels : (B, 2) points that continue the grid where the board has none
     """
 
     points: IntArray
     pixels: FloatArray
+    beyond_nodes: IntArray
+    beyond_pixels: FloatArray
 
 
-def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | None:
-    """Most complete sighting of a board among several sets of keypoints; None where there is none."""
+def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | Refusal:
+    """Most complete sighting of a board among several sets of keypoints, or why there is none."""
     best: BoardPoints | None = None
+    refusal = Refusal('no regular grid of points')
     for keypoints in views:
         for grid in Grower(keypoints).grids():
             nodes = np.array(list(grid), dtype=np.int64)
             pixels = keypoints.pixels[list(grid.values())]
             placed = board.place(_facing(nodes, pixels))
-            if placed is not None and (best is None or len(placed[0]) > len(best.points)):
-                best = BoardPoints(placed[0], pixels[placed[1]])
+            if isinstance(placed, Refusal):
+                refusal = max(refusal, placed, key=lambda other: other.points)
+            elif best is None or len(placed.points) > len(best.points):
+                best = BoardPoints(placed.points, pixels[placed.rows], placed.beyond_nodes, pixels[placed.beyond])
         if best is not None and len(best.points) == len(board.nodes):
             break
-    return best
+    return best or refusal
 
 
 def _facing(nodes: IntArray, pixels: FloatArray) -> IntArray:

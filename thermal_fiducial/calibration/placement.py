@@ -1,4 +1,6 @@
-"""Where a board lies in a grid of points; refused where it could as well lie elsewhere."""
+"""Where a board lies in a grid of points; refused where it could as well lie elsewhere, or goes on."""
+
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.signal import correlate2d
@@ -16,67 +18,128 @@ _SHEARS = tuple(np.array([[1, 0], [0, 1]]) + shear * axis for axis in _OFF_DIAGO
 _QUARTER = np.array([[0, -1], [1, 0]])
 
 
+@dataclass(frozen=True)
+class Refusal:
+    """Why a grid is not the board, in words, and how many points it has: of several the largest says most."""
+
+    reason: str
+    points: int = 0
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a board lies in a grid.
+
+    Parameters
+    ----------
+    points, rows : (K,) points of the board, and the rows of the grid that show them
+    beyond, beyond_nodes : (B,) rows of the grid that the board has no point for, and (B, 2) their nodes on the board
+    """
+
+    points: IntArray
+    rows: IntArray
+    beyond: IntArray
+    beyond_nodes: IntArray
+
+
 class BoardNodes:
     """Nodes of a board's points, and the ways in which they may appear in a grid.
 
     Parameters
     ----------
     nodes : (N, 2) integers
+    missing : (M, 2) nodes within the board where it has no point
     """
 
-    def __init__(self, nodes: IntArray) -> None:
+    def __init__(self, nodes: IntArray, missing: IntArray | None = None) -> None:
         self.nodes = nodes
-        self._views = _views(nodes)
-        self._margin = len(nodes) - _largest_two(self._overlaps(nodes))[1]
+        missing = np.zeros((0, 2), np.int64) if missing is None else missing
+        # A board with a hole looks the same after half a turn but for the hole: its outline says where it lies.
+        self._outline = np.concatenate([nodes, missing])
+        self._views = _views(self._outline)
+        self._margin = len(self._outline) - _largest_two(self._overlaps(self._outline))[1]
 
-    def place(self, grid: IntArray) -> tuple[IntArray, IntArray] | None:
-        """Points of the board (K,) and the rows (K,) of ``grid`` that show them; None where that is not certain.
+    def place(self, grid: IntArray) -> Placement | Refusal:
+        """Where the board lies in ``grid``.
 
         Parameters
         ----------
         grid : (M, 2) nodes of a grid whose axes turn like those of the board: it is seen from the front
         """
-        if len(grid) < _LEAST_SHARE * len(self.nodes):
-            return None
+        count = len(self._outline)
+        if len(grid) < _LEAST_SHARE * count:
+            return Refusal(f'only {len(grid)} points in a regular grid, the board has {len(self.nodes)}', len(grid))
         overlaps = self._overlaps(grid)
         most, second = _largest_two(overlaps)
-        enough = most >= _LEAST_SHARE * len(self.nodes) and len(grid) - most <= _BEYOND * len(self.nodes) + 1.0
-        if not enough or most - second < _CLEAR * self._margin:
-            return None
+        beyond = len(grid) - int(most)
+        if most < _LEAST_SHARE * count:
+            return Refusal(f'a grid of {len(grid)} points that is not like the board', len(grid))
+        if beyond > _BEYOND * count + 1.0 or (beyond > 0 and most - second < _CLEAR * self._margin):
+            return Refusal(goes_on(beyond), len(grid))
+        if most - second < _CLEAR * self._margin:
+            return Refusal(f'{most:.0f} of {count} points found, which may lie in more than one place', len(grid))
         best = int(np.argmax([overlap.max() for overlap in overlaps]))
         view, overlap = self._views[best], overlaps[best]
-        shift = np.array(np.unravel_index(int(np.argmax(overlap)), overlap.shape)) - view.max(axis=0)
-        rows = {tuple(node): row for row, node in enumerate((grid - grid.min(axis=0)).tolist())}
-        pairs = [(point, rows[node]) for point, node in enumerate(map(tuple, (view + shift).tolist())) if node in rows]
-        points, shown = np.array(pairs, dtype=np.int64).T
-        return points, shown
+        pattern = view.nodes(self._outline)
+        shift = np.array(np.unravel_index(int(np.argmax(overlap)), overlap.shape)) - pattern.max(axis=0)
+        placements = [self._placement(matrix, view.origin(matrix, self._outline), shift, grid) for matrix in view.ways]
+        return max(placements, key=lambda placement: len(placement.points))
+
+    def _placement(self, matrix: IntArray, origin: IntArray, shift: IntArray, grid: IntArray) -> Placement:
+        inverse = np.rint(np.linalg.inv(matrix)).astype(np.int64)
+        on_board = (grid - grid.min(axis=0) - shift + origin) @ inverse
+        index = {node: point for point, node in enumerate(map(tuple, self._outline.tolist()))}
+        point = np.array([index.get(node, -1) for node in map(tuple, on_board.tolist())], dtype=np.int64)
+        shown = np.flatnonzero((point >= 0) & (point < len(self.nodes)))
+        shown = shown[np.argsort(point[shown])]
+        outside = np.flatnonzero(point < 0)
+        return Placement(point[shown], shown, outside, on_board[outside])
 
     def _overlaps(self, grid: IntArray) -> list[FloatArray]:
         """Points that each view of the board has in common with a grid, for each shift."""
-        seen = _occupancy(grid)
-        return [correlate2d(seen, _occupancy(view)) for view in self._views]
+        occupied = _occupancy(grid)
+        return [correlate2d(occupied, _occupancy(view.nodes(self._outline))) for view in self._views]
 
 
-def _views(nodes: IntArray) -> list[IntArray]:
-    """Different patterns of the board by quarter turns and shears, each from zero."""
-    views, patterns = [], set()
+def goes_on(beyond: int) -> str:
+    """Reason to refuse a grid with points ``beyond`` the board."""
+    return f'the grid goes on beyond the one described: {beyond} more points'
+
+
+@dataclass(frozen=True)
+class _View:
+    """A pattern of the board in a grid, and the quarter turns and shears (2, 2) that lead to it."""
+
+    ways: list[IntArray]
+
+    def nodes(self, outline: IntArray) -> IntArray:
+        """Nodes (N, 2) from zero."""
+        return outline @ self.ways[0] - self.origin(self.ways[0], outline)
+
+    @staticmethod
+    def origin(matrix: IntArray, outline: IntArray) -> IntArray:
+        """Least node (2,) after the turn."""
+        return np.asarray((outline @ matrix).min(axis=0))
+
+
+def _views(outline: IntArray) -> list[_View]:
+    """Different patterns of the board by quarter turns and shears."""
+    views: dict[frozenset[tuple[int, ...]], _View] = {}
     for shear in _SHEARS:
-        turned = nodes @ shear
+        matrix = shear
         for _ in range(4):
-            view = turned - turned.min(axis=0)
-            pattern = frozenset(map(tuple, view.tolist()))
-            if pattern not in patterns:
-                patterns.add(pattern)
-                views.append(view)
-            turned = turned @ _QUARTER
-    return views
+            turned = outline @ matrix
+            pattern = frozenset(map(tuple, (turned - turned.min(axis=0)).tolist()))
+            views.setdefault(pattern, _View([])).ways.append(matrix)
+            matrix = matrix @ _QUARTER
+    return list(views.values())
 
 
 def _occupancy(nodes: IntArray) -> FloatArray:
     nodes = nodes - nodes.min(axis=0)
-    seen: BoolArray = np.zeros(nodes.max(axis=0) + 1, dtype=np.bool_)
-    seen[nodes[:, 0], nodes[:, 1]] = True
-    return seen.astype(np.float64)
+    occupied: BoolArray = np.zeros(nodes.max(axis=0) + 1, dtype=np.bool_)
+    occupied[nodes[:, 0], nodes[:, 1]] = True
+    return occupied.astype(np.float64)
 
 
 def _largest_two(overlaps: list[FloatArray]) -> tuple[float, float]:

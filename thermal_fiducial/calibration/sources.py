@@ -1,6 +1,7 @@
 """Raw frames, IMU samples and intrinsics from a folder of pictures or a bag."""
 
 from collections.abc import Iterator
+import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,14 +9,17 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.calibration.preintegration import ImuTrack
+from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
-from thermal_fiducial.core.types import Counts, Gray
+from thermal_fiducial.core.types import Counts, FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 
+#: Columns of a file of measured points; a header may hold more.
+POINT_COLUMNS = ('view', 'point', 'u', 'v', 'x', 'y')
 PICTURES = ('.png', '.tif', '.tiff', '.pgm', '.jpg', '.jpeg', '.bmp')
 _IMAGE_TYPE, _IMU_TYPE, _INFO_TYPE = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/Imu', 'sensor_msgs/msg/CameraInfo'
 _COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
@@ -72,6 +76,45 @@ def read_picture(path: Path) -> Counts | Gray:
     if image.dtype not in (np.uint8, np.uint16) or min(image.shape) < 32:
         raise InputError(f'{path}: a picture of {image.shape[1]}x{image.shape[0]} {image.dtype}, not 8 or 16 bit grey')
     return image.astype(np.uint8) if image.dtype == np.uint8 else image.astype(np.uint16)
+
+
+def measured_points(path: Path, width: int, height: int) -> list[tuple[str, Sighting]]:
+    """Views of a flat board from a CSV file with the columns view, point, u, v [px], x, y [m], by their names.
+
+    Raises
+    ------
+    InputError
+        No such file or columns, numbers that are none, points outside the image or twice in a view.
+    """
+    views: dict[str, dict[str, list[float]]] = {}
+    try:
+        with path.open(newline='', encoding='utf-8') as file:
+            table = csv.DictReader(file, skipinitialspace=True)
+            if not set(POINT_COLUMNS) <= set(table.fieldnames or ()):
+                raise InputError(f'{path}: the first line must name the columns {", ".join(POINT_COLUMNS)}')
+            for row in table:
+                where = f'{path}, line {table.line_num}'
+                points = views.setdefault(row['view'], {})
+                if row['point'] in points:
+                    raise InputError(f'{where}: point {row["point"]} of view {row["view"]} for the second time')
+                points[row['point']] = _measured(row, where, width, height)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f'{path}: {error}') from None
+    return [(name, _flat_sighting(np.array(list(points.values())))) for name, points in views.items()]
+
+
+def _measured(row: dict[str, str], where: str, width: int, height: int) -> list[float]:
+    try:
+        u, v, x, y = (float(row[name]) for name in POINT_COLUMNS[2:])
+    except (TypeError, ValueError):
+        raise InputError(f'{where}: u, v, x and y must be numbers') from None
+    if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5 and np.isfinite(x) and np.isfinite(y)):
+        raise InputError(f'{where}: a point that lies outside {width} x {height} pixels, or on no board')
+    return [u, v, x, y]
+
+
+def _flat_sighting(values: FloatArray) -> Sighting:
+    return Sighting(np.column_stack([values[:, 2:], np.zeros(len(values))]), values[:, :2])
 
 
 def clean_frames(bag: BagReader) -> Iterator[Frame]:

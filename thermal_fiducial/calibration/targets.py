@@ -1,6 +1,6 @@
 """Calibration boards and how their points are found in raw frames: chessboard, circle grid, marker board."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.calibration.appearance import Appearance, Disc, SquaresMeet
 from thermal_fiducial.calibration.keypoints import blobs, Keypoints, saddles, without_speckles
 from thermal_fiducial.calibration.lattice import find_board
-from thermal_fiducial.calibration.placement import BoardNodes
+from thermal_fiducial.calibration.placement import BoardNodes, goes_on, Refusal
 from thermal_fiducial.calibration.subpixel import refine
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
@@ -17,9 +17,10 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.fabrication.boards import asymmetric_circles
 
 _APART_NS = 10_000_000_000
+# Discs that continue the grid, as sharp and as warm as the board's own, of which one or two may be clutter.
+_ANOTHER_GRID = 3
 
 
 @dataclass(frozen=True)
@@ -36,14 +37,24 @@ class Sighting:
     pixels: FloatArray
 
 
+class BoardNotFound(InputError):  # noqa: N818  (nothing went wrong)
+    """A frame does not show the board; why not."""
+
+
 class Target(Protocol):
     """A calibration board."""
 
     #: radius of the board's points [m]: 0 for corners
     radius: float
 
-    def find(self, counts: Counts | Gray, camera: Camera) -> Sighting | None:
-        """The board in a raw frame; ``camera`` is the best guess so far; None where it isn't seen."""
+    def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
+        """The board in a raw frame; ``camera`` is the best guess so far.
+
+        Raises
+        ------
+        BoardNotFound
+            It is not in view, or it is another one: the reason in words.
+        """
 
 
 class Detector(Protocol):
@@ -70,11 +81,13 @@ class Chessboard:
         nodes = _rectangle(columns, rows)
         self.points = _on_board(square * nodes.astype(np.float64))
         self._board = BoardNodes(nodes)
+        # Outer corners of the outermost squares may look like points: one of every other square.
+        self._line = min(columns, rows)
 
-    def find(self, counts: Counts | Gray, camera: Camera) -> Sighting | None:
+    def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
         """See :class:`Target`."""
         image = without_speckles(counts)
-        return _sighting(image, saddles(image), self._board, self.points, SquaresMeet())
+        return _sighting(image, saddles(image), self._board, self.points, SquaresMeet(), self._line)
 
 
 class CircleGrid:
@@ -86,27 +99,53 @@ class CircleGrid:
     spacing : between two rows [m]
     diameter : of a circle [m]
     asymmetric : whether every other row is shifted by ``spacing``, circles in a row two of them apart
+    longer : circles that every other row, from the second on, has more than ``columns``; shifted rows are then centred
+        on each other
+    missing : column and row, from 0, of circles that the grid does not have
     """
 
-    def __init__(self, columns: int, rows: int, spacing: float, diameter: float, *, asymmetric: bool = True) -> None:
+    def __init__(
+        self,
+        columns: int,
+        rows: int,
+        spacing: float,
+        diameter: float,
+        *,
+        asymmetric: bool = True,
+        longer: int = 0,
+        missing: Sequence[tuple[int, int]] = (),
+    ) -> None:
         pitch = spacing * np.sqrt(2.0) if asymmetric else spacing
         if columns < 2 or rows < 3 or not 0.0 < diameter < pitch:
             raise InputError('a circle grid needs 2 x 3 circles or more, and circles smaller than their spacing')
-        nodes = _rectangle(columns, rows)
-        centres = asymmetric_circles(columns, rows, spacing) if asymmetric else spacing * nodes.astype(np.float64)
-        self.points = _on_board(centres)
-        if asymmetric:
-            # The nearest circles are those of the next row: the grid's axes run along the diagonals.
-            x, y = np.rint(self.points[:, :2].T / spacing).astype(np.int64)
-            nodes = np.stack([(x + y) // 2, (y - x) // 2], axis=1)
-        self._board = BoardNodes(nodes)
+        if longer < 0 or (asymmetric and longer not in (0, 1)):
+            raise InputError('every other row may have one circle more, or in a symmetric grid several')
+        places = [(c, r) for r in range(rows) for c in range(columns + longer * (r % 2))]
+        if not set(missing) <= set(places):
+            raise InputError(f'there is no circle {sorted(set(missing) - set(places))[0]} in this grid to be missing')
+        nodes, centres = _circles(np.array(places, dtype=np.int64), spacing, longer, asymmetric=asymmetric)
+        there = np.array([place not in set(missing) for place in places])
+        self.points = _on_board(centres[there])
+        self._board = BoardNodes(nodes[there], nodes[~there])
         self._disc = Disc(0.5 * diameter / pitch)
         self.radius = 0.5 * diameter
 
-    def find(self, counts: Counts | Gray, camera: Camera) -> Sighting | None:
+    def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
         """See :class:`Target`."""
         image = without_speckles(counts)
-        return _sighting(image, blobs(image), self._board, self.points, self._disc)
+        return _sighting(image, blobs(image), self._board, self.points, self._disc, _ANOTHER_GRID)
+
+
+def _circles(places: IntArray, spacing: float, longer: int, *, asymmetric: bool) -> tuple[IntArray, FloatArray]:
+    """Nodes (N, 2) and centres (N, 2) [m] of circles at columns and rows (N, 2)."""
+    column, row = places.T
+    if not asymmetric:
+        return places, spacing * places.astype(np.float64)
+    # A longer row begins half a pitch earlier, one of the same length half a pitch later.
+    x, y = 2 * column + (row % 2) * (-1 if longer else 1), row
+    # The nearest circles are those of the next row: the grid's axes run along the diagonals.
+    nodes = np.stack([(x + y) // 2, (y - x) // 2], axis=1)
+    return nodes, spacing * np.stack([x, y], axis=1).astype(np.float64)
 
 
 def _rectangle(columns: int, rows: int) -> IntArray:
@@ -120,18 +159,34 @@ def _on_board(points: FloatArray) -> FloatArray:
 
 
 def _sighting(
-    image: Float32Array, keypoints: Iterable[Keypoints], board: BoardNodes, points: FloatArray, appearance: Appearance
-) -> Sighting | None:
-    """Find a board roughly, then its points to a few hundredths of a pixel."""
+    image: Float32Array,
+    keypoints: Iterable[Keypoints],
+    board: BoardNodes,
+    points: FloatArray,
+    appearance: Appearance,
+    another: int,
+) -> Sighting:
+    """Find a board roughly, then its points to a few hundredths of a pixel.
+
+    With ``another`` points of its kind beyond it, it is another board.
+    """
     found = find_board(keypoints, board)
-    if found is None:
-        return None
-    nodes = board.nodes.astype(np.float64)
-    pixels = refine(image, nodes[found.points], found.pixels, nodes, appearance)
-    seen = np.isfinite(pixels[:, 0])
-    kept = found.points[seen]
-    # What turns out to be no point of the board may have been all that told where in the grid it lies.
-    return Sighting(points[kept], pixels[seen]) if board.place(board.nodes[kept]) is not None else None
+    if isinstance(found, Refusal):
+        raise BoardNotFound(found.reason)
+    # What continues the grid is looked at as closely as the board: clutter is no point of it, another board's is.
+    nodes = np.concatenate([board.nodes[found.points], found.beyond_nodes]).astype(np.float64)
+    every = np.concatenate([board.nodes, found.beyond_nodes]).astype(np.float64)
+    pixels = refine(image, nodes, np.concatenate([found.pixels, found.beyond_pixels]), every, appearance)
+    good, count = np.isfinite(pixels[:, 0]), len(found.points)
+    beyond = int(np.sum(good[count:]))
+    if beyond >= another:
+        raise BoardNotFound(goes_on(beyond))
+    kept = found.points[good[:count]]
+    # What turns out to be no point of the board may have been all that showed where in the grid it lies.
+    placed = board.place(board.nodes[kept]) if len(kept) else Refusal('none of its points is sharp enough')
+    if isinstance(placed, Refusal):
+        raise BoardNotFound(placed.reason)
+    return Sighting(points[kept], pixels[:count][good[:count]])
 
 
 class MarkerBoard:
@@ -149,14 +204,14 @@ class MarkerBoard:
         self._board, self._detector = board, detector
         self._stamp_ns = 0
 
-    def find(self, counts: Counts | Gray, camera: Camera) -> Sighting | None:
+    def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
         """See :class:`Target`."""
         # Views have nothing to do with each other: far apart in time none hints at motion to the next.
         self._stamp_ns += _APART_NS
         rows = self._detector.detect(self._stamp_ns, counts, camera)
         rows = rows[np.isin(rows['id'], list(self._board.markers))]
         if len(rows) < 2:
-            return None
+            raise BoardNotFound(f'{len(rows)} markers of the board, of which two are needed')
         markers = [self._board.markers[marker_id] for marker_id in rows['id'].tolist()]
         T = np.stack([marker.T_map_marker for marker in markers])
         points = corners_in_map(T, np.array([marker.size for marker in markers]))

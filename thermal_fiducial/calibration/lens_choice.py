@@ -1,0 +1,155 @@
+"""Which lens model, with which coefficients: as few as predict views that were not fitted no worse.
+
+Stepwise: a coefficient enters when it lowers the error of held-out views by more than the standard error of the
+difference, view by view; what does not enter stays at zero. A model that folds back before the image's corners is none.
+T. Hastie, R. Tibshirani, J. Friedman, "The Elements of Statistical Learning", 2009, section 7.10 (one standard error).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thermal_fiducial.calibration.intrinsics import board_pose, calibrate, calibrate_from, Calibration
+from thermal_fiducial.calibration.lens_check import reaches_corners
+from thermal_fiducial.calibration.lens_fit import LensFit
+from thermal_fiducial.calibration.targets import Sighting
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+
+#: Models from the fewest parameters to the most: of equals the first is chosen.
+CANDIDATES = ('equidistant', 'plumb_bob', 'rational_polynomial')
+
+_FOLDS = 5
+# A share of the mean squared error that no one would notice.
+_NEAR_TIE = 0.02
+# Coefficients that enter together, each group's in their order: radial ones, then tangential ones.
+_GROUPS: dict[str, tuple[tuple[tuple[int, ...], ...], ...]] = {
+    'equidistant': (((0,), (1,), (2,), (3,)),),
+    'plumb_bob': (((0,), (1,), (4,)), ((2, 3),)),
+    'rational_polynomial': (((0, 5), (1, 6), (4, 7)), ((2, 3),)),
+}
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A fit to all views, and the mean squared error of each when it is held out (V,) [px^2].
+
+    One that is not ``usable`` folds back within the image; what enters next may mend that.
+    """
+
+    fit: Calibration
+    squares: FloatArray
+    usable: bool
+
+    @property
+    def size(self) -> int:
+        return len(self.fit.free)
+
+    @property
+    def error(self) -> float:
+        return float(np.mean(self.squares))
+
+    def clearly_better_than(self, other: '_Candidate') -> bool:
+        """Whether the mean is lower by more than the standard error of the differences, and not next to nothing."""
+        gain = other.squares - self.squares
+        error = float(np.std(gain, ddof=1) / np.sqrt(len(gain)))
+        return bool(np.mean(gain) > max(error, _NEAR_TIE * self.error))
+
+    def finished(self) -> Calibration:
+        rms = float(np.sqrt(self.error))
+        sigma = float(np.std(self.squares, ddof=1) / np.sqrt(len(self.squares)) / (2.0 * rms)) if rms > 0.0 else 0.0
+        return replace(self.fit, held_out_px=(rms, sigma))
+
+
+def choose_model(
+    sightings: Sequence[Sighting],
+    width: int,
+    height: int,
+    models: Sequence[str] = CANDIDATES,
+    *,
+    radius: float = 0.0,
+    focal_px: float = 600.0,
+) -> tuple[Calibration, dict[str, Calibration]]:
+    """The best lens, and the best of each model; see the module's head.
+
+    Raises
+    ------
+    InputError
+        As :func:`calibrate`; or no model reaches the corners.
+    """
+    starts = [_start(sightings, width, height, model, radius, focal_px) for model in models]
+    # Compared on equal terms: what is an outlier to the model that fits best is one to all.
+    reference = min(starts, key=lambda fit: (len(fit.dropped), fit.rms_px))
+    used = [sightings[index] for index in reference.views.tolist()]
+    chosen: dict[str, _Candidate] = {}
+    for start in starts:
+        candidate = _stepwise(used, start, radius)
+        if candidate is not None:
+            chosen[candidate.fit.camera.model] = candidate
+    if not chosen:
+        raise InputError('no lens model fits these views that goes on growing out to the corners of the image')
+    best = min(chosen.values(), key=lambda candidate: candidate.error)
+    equals = [
+        candidate for candidate in chosen.values() if candidate is best or not best.clearly_better_than(candidate)
+    ]
+    simplest = min(equals, key=lambda candidate: (candidate.size, CANDIDATES.index(candidate.fit.camera.model)))
+    fits = {
+        model: replace(candidate.finished(), views=reference.views, dropped=reference.dropped)
+        for model, candidate in chosen.items()
+    }
+    return fits[simplest.fit.camera.model], fits
+
+
+def _start(
+    sightings: Sequence[Sighting], width: int, height: int, model: str, radius: float, focal_px: float
+) -> Calibration:
+    """The model with its first two radial terms: enough to see which views do not belong."""
+    free = [index for group in _GROUPS[model][0][:2] for index in group]
+    return calibrate(sightings, width, height, model, radius=radius, focal_px=focal_px, free=free)
+
+
+def _stepwise(sightings: Sequence[Sighting], start: Calibration, radius: float) -> _Candidate | None:
+    """The model with the coefficients that the views determine; None where none of it is usable."""
+    camera = replace(start.camera, D=np.zeros_like(start.camera.D))
+    poses = np.stack([board_pose(sighting, camera) for sighting in sightings])
+    groups = _GROUPS[camera.model]
+    entered = [0] * len(groups)
+    current = _candidate(sightings, replace(start, camera=camera, T_camera_board=poses), (), radius)
+    best = current if current.usable else None
+    while True:
+        steps = [
+            (place, _candidate(sightings, current.fit, (*current.fit.free, *group[count]), radius))
+            for place, (group, count) in enumerate(zip(groups, entered, strict=True))
+            if count < len(group)
+        ]
+        better = [(place, step) for place, step in steps if step.clearly_better_than(current)]
+        if not better:
+            return best
+        place, current = min(better, key=lambda step: step[1].error)
+        entered[place] += 1
+        if current.usable and (best is None or current.clearly_better_than(best)):
+            best = current
+
+
+def _candidate(sightings: Sequence[Sighting], near: Calibration, free: tuple[int, ...], radius: float) -> _Candidate:
+    """Fit from a solution ``near`` by."""
+    fit = calibrate_from(sightings, near.camera, near.T_camera_board, radius=radius, free=free, drop=False)
+    return _Candidate(fit, _held_out_squares(sightings, fit, radius), reaches_corners(fit.camera))
+
+
+def _held_out_squares(sightings: Sequence[Sighting], fit: Calibration, radius: float) -> FloatArray:
+    """Mean squared error (V,) [px^2] of views whose pose alone was fitted, with intrinsics from the other folds."""
+    squares = np.zeros(len(sightings))
+    # Few views: all but one at a time.
+    folds = _FOLDS if len(sightings) >= 2 * _FOLDS else len(sightings)
+    index = np.arange(len(sightings))
+    for fold in range(folds):
+        inside, outside = index[index % folds != fold].tolist(), index[fold::folds].tolist()
+        training = LensFit([sightings[k] for k in inside], fit.camera, radius, fit.free)
+        trained, _ = training.solve(fit.T_camera_board[inside])
+        held_out = LensFit([sightings[k] for k in outside], trained, radius, poses_only=True)
+        _, T = held_out.solve(fit.T_camera_board[outside])
+        for view, residual in zip(outside, held_out.residuals(trained, T), strict=True):
+            squares[view] = float(np.mean(np.sum(residual**2, axis=1)))
+    return squares

@@ -1,0 +1,236 @@
+"""Least squares over the intrinsics of a camera and the pose of a board in every view.
+
+The residuals come from the package's own camera model, so what is estimated is what is used. Distortion coefficients
+have a prior: none moves a point at the image's corner by more than a part of its distance from the centre. It is far
+too wide to matter where views reach the corner, and holds what they do not determine.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from thermal_fiducial.calibration.targets import Sighting
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import Camera, MODELS
+from thermal_fiducial.core.types import FloatArray, IntArray
+
+# Errors beyond this many standard deviations [px after scaling] lose weight (Huber).
+_HUBER = 3.0
+# Step of the numerical derivative by the distortion coefficients, which are of order 0.01 to 1.
+_STEP = 1e-6
+_MAX_STEPS = 60
+# A step that lowers the cost by less than this share is the last; damping at which no step lowers it any more.
+_CONVERGED, _HOPELESS = 1e-7, 1e9
+# Centroids of circles are brought up to date until they change by less than this [px].
+_ROUNDS, _SETTLED_PX = 4, 1e-4
+_CIRCLE = np.stack([np.cos(np.arange(24) * np.pi / 12), np.sin(np.arange(24) * np.pi / 12), np.zeros(24)], axis=1)
+# Shares of the distance from the centre by which the first radial term, a higher one and the tangential terms may move
+# the image's corner (standard deviations): lenses of 40 to 100 degrees have up to 0.3, 0.07 and 0.005.
+_FIRST, _HIGHER, _TANGENTIAL = 0.3, 0.1, 0.02
+#: Number of fx fy cx cy, which come before the coefficients.
+MATRIX = 4
+
+
+def prior_sigmas(camera: Camera) -> FloatArray:
+    """Standard deviations about zero of the distortion coefficients (MODELS[model],)."""
+    last = np.array([camera.width, camera.height]) - 1.0
+    focal = np.array([camera.K[0, 0], camera.K[1, 1]])
+    reach = float(np.linalg.norm(np.maximum(camera.K[:2, 2], last - camera.K[:2, 2]) / focal))
+    if camera.model == 'equidistant':
+        return np.array([_FIRST, _HIGHER, _HIGHER, _HIGHER]) / reach ** np.array([2, 4, 6, 8])
+    sigmas = np.array([_FIRST, _HIGHER, _TANGENTIAL, _TANGENTIAL, _HIGHER, _FIRST, _HIGHER, _HIGHER])
+    powers = np.array([2, 4, 1, 1, 6, 2, 4, 6])
+    return np.asarray((sigmas / reach**powers)[: MODELS[camera.model]])
+
+
+class LensFit:
+    """Levenberg-Marquardt for a camera and its views.
+
+    Parameters
+    ----------
+    camera : to start from; coefficients that are not ``free`` stay as they are there
+    radius : of the board's circles [m]; 0 for corners
+    free : indices of the coefficients to estimate; None: all
+    poses_only : whether the camera is known
+    """
+
+    def __init__(
+        self,
+        sightings: Sequence[Sighting],
+        camera: Camera,
+        radius: float,
+        free: Sequence[int] | None = None,
+        *,
+        poses_only: bool = False,
+    ) -> None:
+        self._points = np.concatenate([sighting.points for sighting in sightings])
+        self._pixels = np.concatenate([sighting.pixels for sighting in sightings])
+        self._lengths = [len(sighting.points) for sighting in sightings]
+        self._view = np.repeat(np.arange(len(sightings)), self._lengths)
+        self._camera, self._radius = camera, radius
+        self._centroid = np.zeros_like(self._pixels)
+        coefficients = range(MODELS[camera.model]) if free is None else sorted(free)
+        shared = [] if poses_only else [*range(MATRIX), *(MATRIX + index for index in coefficients)]
+        self._free: IntArray = np.array(shared, dtype=np.int64)
+        self._prior = np.zeros(MATRIX + MODELS[camera.model])
+        self._prior[MATRIX:] = prior_sigmas(camera) ** -2
+
+    def solve(self, T: FloatArray) -> tuple[Camera, FloatArray]:
+        """Camera and poses T_camera_board (V, 4, 4), from poses to start with."""
+        camera = self._camera
+        for _ in range(_ROUNDS):
+            change = self._update_centroids(camera, T)
+            camera, T = self._minimise(camera, T)
+            if change < _SETTLED_PX:
+                break
+        return camera, T
+
+    def covariance(self, camera: Camera, T: FloatArray) -> FloatArray:
+        """Of fx fy cx cy and all coefficients, those held included, with the noise that the residuals show."""
+        free, self._free = self._free, np.arange(len(self._prior))
+        information, _ = self._normal_equations(camera, T, np.inf, 0.0)
+        self._free = free
+        error = self.error(camera, T)
+        variance = float(np.sum(error**2)) / max(1, error.size - len(information))
+        count = len(self._prior)
+        information[range(count), range(count)] += variance * self._prior
+        scale = np.sqrt(np.diag(information)) + 1e-12
+        inverse = np.linalg.pinv(information / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
+        return np.asarray(variance * inverse[:count, :count])
+
+    def residuals(self, camera: Camera, T: FloatArray) -> list[FloatArray]:
+        """Measured minus predicted (N, 2) [px] of each view."""
+        return np.split(-self.error(camera, T), np.cumsum(self._lengths)[:-1])
+
+    def error(self, camera: Camera, T: FloatArray) -> FloatArray:
+        """Predicted minus measured (N, 2) [px]; large where the model cannot show a point."""
+        predicted = camera.project(_in_camera(T[self._view], self._points)) + self._centroid
+        return np.asarray(np.nan_to_num(predicted - self._pixels, nan=1e3))
+
+    def moved(self, camera: Camera, T: FloatArray, step: FloatArray) -> tuple[Camera, FloatArray]:
+        """Camera and poses after a ``step`` (free parameters, then 6 V)."""
+        shared = len(self._free)
+        if shared:
+            parameters = camera_parameters(camera)
+            parameters[self._free] += step[:shared]
+            camera = _with_parameters(camera, parameters)
+        turn = step[shared:].reshape(-1, 6)
+        return camera, se3.transform(se3.so3_exp(turn[:, 3:]) @ T[:, :3, :3], T[:, :3, 3] + turn[:, :3])
+
+    def jacobian(self, camera: Camera, T: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of :meth:`error`, by the free parameters (N, 2, I) and by the pose of the point's view (N, 2, 6).
+
+        Circles move like their centres to first order.
+        """
+        points = _in_camera(T[self._view], self._points)
+        _, by_point = camera.project_jacobian(points)
+        by_pose = np.concatenate([by_point, -by_point @ se3.skew(points - T[self._view, :3, 3])], axis=-1)
+        by_shared = by_parameters(camera, points, self._free)
+        return np.nan_to_num(by_shared), np.asarray(np.nan_to_num(by_pose))
+
+    def _minimise(self, camera: Camera, T: FloatArray) -> tuple[Camera, FloatArray]:
+        noise = self._noise(camera, T)
+        cost, damping = self._cost(camera, T, noise), 1e-3
+        for _ in range(_MAX_STEPS):
+            information, gradient = self._normal_equations(camera, T, _HUBER * noise, noise)
+            while damping < _HOPELESS:
+                damped = information + damping * np.diag(np.diag(information) + 1e-12)
+                moved = self.moved(camera, T, -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64))
+                lower = self._cost(*moved, noise)
+                if lower < cost:
+                    break
+                damping *= 10.0
+            else:
+                break
+            gain, (camera, T), cost, damping = (cost - lower) / cost, moved, lower, 0.1 * damping
+            if gain < _CONVERGED:
+                break
+            noise = min(noise, self._noise(camera, T))
+            cost = self._cost(camera, T, noise)
+        return camera, T
+
+    def _cost(self, camera: Camera, T: FloatArray, noise: float) -> float:
+        """Huber's: quadratic up to three times the ``noise`` [px], linear beyond; and the prior's."""
+        size, limit = np.abs(self.error(camera, T)), _HUBER * noise
+        misfit = float(np.sum(np.where(size <= limit, 0.5 * size**2, limit * (size - 0.5 * limit))))
+        return misfit + 0.5 * noise**2 * float(self._prior[self._free] @ camera_parameters(camera)[self._free] ** 2)
+
+    def _normal_equations(
+        self, camera: Camera, T: FloatArray, limit: float, noise: float
+    ) -> tuple[FloatArray, FloatArray]:
+        error = self.error(camera, T)
+        weight = np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-12))
+        by_shared, by_pose = self.jacobian(camera, T)
+        shared = len(self._free)
+        information = np.zeros((shared + 6 * len(T), shared + 6 * len(T)))
+        gradient = np.zeros(len(information))
+        ends = np.cumsum(self._lengths)
+        for view, (start, end) in enumerate(zip(ends - self._lengths, ends, strict=True)):
+            J = np.concatenate([by_shared[start:end], by_pose[start:end]], axis=2).reshape(-1, shared + 6)
+            w = weight[start:end].reshape(-1)
+            columns = np.concatenate([np.arange(shared), shared + 6 * view + np.arange(6)])
+            information[np.ix_(columns, columns)] += (J * w[:, None]).T @ J
+            gradient[columns] += J.T @ (w * error[start:end].reshape(-1))
+        prior = noise**2 * self._prior[self._free]
+        information[range(shared), range(shared)] += prior
+        gradient[:shared] += prior * camera_parameters(camera)[self._free]
+        return information, gradient
+
+    def _noise(self, camera: Camera, T: FloatArray) -> float:
+        """Standard deviation of a coordinate, from the median; at least a hundredth of a pixel."""
+        return max(1.4826 * float(np.median(np.abs(self.error(camera, T)))), 0.01)
+
+    def _update_centroids(self, camera: Camera, T: FloatArray) -> float:
+        """How far the circles' centroids lie from their centres now; by how much that changed at most [px]."""
+        if self._radius == 0.0:
+            return 0.0
+        outline = camera.project(se3.apply(T[self._view], self._points[:, None] + self._radius * _CIRCLE))
+        centre = camera.project(_in_camera(T[self._view], self._points))
+        before = self._centroid
+        self._centroid = np.nan_to_num(_area_centroid(outline) - centre)
+        return float(np.abs(self._centroid - before).max())
+
+
+def camera_parameters(camera: Camera) -> FloatArray:
+    """Values of fx fy cx cy and the distortion coefficients."""
+    K = camera.K
+    return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], camera.D])
+
+
+def by_parameters(camera: Camera, points: FloatArray, chosen: IntArray | None = None) -> FloatArray:
+    """Derivative (N, 2, K) of the pixels of points (N, 3) by fx fy cx cy and the coefficients, or the ``chosen``."""
+    x = points[:, :2] / points[:, 2:]
+    parameters = camera_parameters(camera)
+    chosen = np.arange(len(parameters)) if chosen is None else chosen
+    J = np.zeros((len(points), 2, len(chosen)))
+    distorted = (camera.distort(x) - camera.K[:2, 2]) / [camera.K[0, 0], camera.K[1, 1]]
+    for place, index in enumerate(chosen.tolist()):
+        if index < MATRIX:
+            J[:, index % 2, place] = distorted[:, index] if index < 2 else 1.0
+            continue
+        step = np.zeros(len(parameters))
+        step[index] = _STEP
+        # Without the check for points that the lens cannot show, which costs more than the points.
+        ahead, behind = (_with_parameters(camera, parameters + sign * step).distort(x) for sign in (1.0, -1.0))
+        J[:, :, place] = (ahead - behind) / (2.0 * _STEP)
+    return J
+
+
+def _with_parameters(camera: Camera, parameters: FloatArray) -> Camera:
+    fx, fy, cx, cy = parameters[:MATRIX]
+    K = np.array([[max(fx, 1.0), 0.0, cx], [0.0, max(fy, 1.0), cy], [0.0, 0.0, 1.0]])
+    return Camera(camera.width, camera.height, K, camera.model, parameters[MATRIX:])
+
+
+def _in_camera(T: FloatArray, points: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum('nij,nj->ni', T[:, :3, :3], points) + T[:, :3, 3])
+
+
+def _area_centroid(outline: FloatArray) -> FloatArray:
+    """Centroid (N, 2) of the areas that closed polygons (N, M, 2) enclose: what the moments of a disc measure."""
+    middle = outline.mean(axis=1, keepdims=True)
+    a = outline - middle
+    b = np.roll(a, -1, axis=1)
+    cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    centroid = np.sum((a + b) * cross[..., None], axis=1) / (3.0 * np.sum(cross, axis=1)[:, None])
+    return np.asarray(middle[:, 0] + centroid)
