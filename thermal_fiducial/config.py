@@ -417,6 +417,13 @@ class MarkerMapperConfig(SelfChecked):
         live=True,
     )
     keyframe_budget: int = param(800, 'Frames kept for the joint refinement.', minimum=10, maximum=20000)
+    autosave_period: float = param(
+        30.0,
+        'A map that has learned something is written to <map_file>.autosave this often; 0: never.',
+        unit='s',
+        minimum=0.0,
+        maximum=3600.0,
+    )
     refinement_period: float = param(
         2.0, 'Shortest time between two joint refinements; 0: never.', unit='s', minimum=0.0, maximum=3600.0, live=True
     )

@@ -90,3 +90,15 @@ def test_unknown_name(name):
 def test_a_map_of_another_dictionary_is_told(of, read_as, words):
     told = other_patterns([60, 3] if '250' in of else [3], of, read_as)
     assert words in told if words else told == ''
+
+
+def test_a_map_names_a_dictionary_or_a_file_beside_it_and_opens_no_other(tmp_path):
+    (tmp_path / 'maps').mkdir()
+    for folder in (tmp_path, tmp_path / 'maps'):
+        save_dictionary(folder / 'own.yaml', 'OWN', load_dictionary('DICT_5X5_50'))
+    beside = tmp_path / 'maps'
+    assert 'marker 3 is another one' in other_patterns([3], 'own.yaml', 'DICT_4X4_50', beside)
+    for path in (str(tmp_path / 'own.yaml'), '../own.yaml', '/dev/zero', '/etc/passwd'):
+        assert 'not opened' in other_patterns([3], path, 'DICT_4X4_50', beside)
+    # The parameter is the user's own: it may be any path, and the map that is written says so.
+    assert other_patterns([3], '/elsewhere/own.yaml', str(tmp_path / 'own.yaml'), beside) == ''

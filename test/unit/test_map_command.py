@@ -59,7 +59,7 @@ def test_edits_make_versions_that_can_be_undone(path, poses, capsys):
     assert run('rename', path, 4, 40) == 0
     assert run('delete', path, 5, 6) == 0
     edited = load_map(path)
-    assert edited.version == 5
+    assert edited.revision == 5
     assert sorted(edited.markers) == [0, 1, 2, 3, 7, 40]
     assert edited.markers[1].fixed
     np.testing.assert_allclose(edited.markers[3].T_map_marker[:3, 3], [1, 2, 3])

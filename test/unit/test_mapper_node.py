@@ -67,6 +67,10 @@ def test_a_map_of_another_dictionary_is_used_and_warned_of(graph, map_file):
 def test_saving_keeps_what_was_in_the_file(graph, map_file):
     graph.add(MarkerMapperNode, map_file=str(map_file))
     before = map_file.read_text()
+    # As long as nothing has changed there is nothing to keep.
+    assert graph.call(Trigger, 'marker_mapper/save', Trigger.Request()).success
+    assert entries(map_file) == []
+    assert graph.call(Trigger, 'marker_mapper/reset', Trigger.Request()).success
     assert graph.call(Trigger, 'marker_mapper/save', Trigger.Request()).success
     (earlier,) = entries(map_file)
     assert earlier.path.read_text().endswith(before)
@@ -108,7 +112,8 @@ def test_all_markers_are_drawn_once_and_then_those_that_change_colour(graph, tmp
     node = graph.add(MarkerMapperNode, map_file=str(path))
     graph.listen(MarkerArray, 'marker_map/markers', qos.LATCHED)
     heard = graph.heard['marker_map/markers']
-    graph.spin_until(lambda: heard and node._map_markers.listeners == 1)
+    (drawing,) = (output for output in node.outputs if output.topic == '/marker_map/markers')
+    graph.spin_until(lambda: heard and drawing.listeners == 1)
     graph.diagnose(node)
     graph.spin_until(lambda: len(heard) == 2)
     plates = [[m.id for m in message.markers if m.ns == 'plates'] for message in heard]

@@ -35,8 +35,8 @@ def test_one_known_marker_starts_a_map_of_all():
     m = mapper(known(poses, [0]))
     changed = [m.process(stamp(k), see(flight(k / 30), poses, 0.02, rng), CAMERA).map_changed for k in range(90)]
     assert sorted(m.map.markers) == sorted(poses)
-    assert m.map.version > 1
-    assert sum(changed) == m.map.version - 1
+    assert m.map.revision > 1
+    assert sum(changed) == m.map.revision - 1
     for key, marker in m.map.markers.items():
         d = difference(marker.T_map_marker, poses[key])
         # A marker placed through the pose from a single small one is centimetres off, and must know it: five sigma of
@@ -69,7 +69,7 @@ def test_localization_never_changes_the_map():
         assert result.pose is not None
         assert not result.map_changed
     assert m.map.markers == before.markers
-    assert m.map.version == before.version
+    assert m.map.revision == before.revision
 
 
 def test_frozen_maps_stay_and_reset_forgets():

@@ -1,5 +1,6 @@
 """Marker maps on disk: round trip, defaults, clear errors, and no map lost to a kill."""
 
+from dataclasses import replace
 from pathlib import Path
 import signal
 import subprocess
@@ -12,9 +13,12 @@ import pytest
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.map_format import parse_document, upgraded
 from thermal_fiducial.files.marker_map import dump_map, load_map, save_map
 
-HEAD = 'format: thermal_fiducial/marker_map\nversion: 4\nframe_id: hall\ndictionary: DICT_5X5_50\nmarkers:\n'
+HEAD = (
+    'format: thermal_fiducial/marker_map\nversion: 1\nrevision: 4\nframe_id: hall\ndictionary: DICT_5X5_50\nmarkers:\n'
+)
 ENTRY = '  - {id: 2, size: 0.3, fixed: true, position: [1, 2, 3], orientation: [0, 0, 0, 1]}\n'
 
 
@@ -29,7 +33,7 @@ def some_map():
         },
         frame_id='hall',
         dictionary='DICT_5X5_50',
-        version=9,
+        revision=9,
     )
 
 
@@ -37,7 +41,7 @@ def test_a_saved_map_is_loaded_as_it_was(tmp_path):
     path = tmp_path / 'map.yaml'
     save_map(path, some_map())
     loaded = load_map(path)
-    assert (loaded.frame_id, loaded.dictionary, loaded.version) == ('hall', 'DICT_5X5_50', 9)
+    assert (loaded.frame_id, loaded.dictionary, loaded.revision) == ('hall', 'DICT_5X5_50', 9)
     for marker in some_map().markers.values():
         read = loaded.markers[marker.id]
         # Nine decimals are written of a pose, six digits of a covariance.
@@ -62,7 +66,7 @@ def test_what_is_left_out_has_defaults(tmp_path):
     assert not loaded.markers[2].fixed
     assert loaded.markers[2].trusted
     np.testing.assert_array_equal(loaded.markers[2].covariance, 1e-4 * np.eye(6))
-    assert loaded.version == 1
+    assert loaded.revision == 1
 
 
 @pytest.mark.parametrize(
@@ -79,12 +83,18 @@ def test_what_is_left_out_has_defaults(tmp_path):
         (HEAD + ENTRY.replace('size: 0.3', 'size: -1'), 'marker 2.*size'),
         (HEAD + ENTRY.replace('size: 0.3, ', ''), 'no size'),
         (HEAD + ENTRY.replace('fixed: true', 'fixed: maybe'), 'fixed'),
-        (HEAD + ENTRY.replace('[1, 2, 3]', '[1, 2]'), 'position is not a list of 3 numbers'),
-        (HEAD + ENTRY.replace('[1, 2, 3]', '[1, 2, .nan]'), 'position is not a list of 3 numbers'),
+        (HEAD + ENTRY.replace('[1, 2, 3]', '[1, 2]'), 'position: not a list of 3 numbers'),
+        (HEAD + ENTRY.replace('[1, 2, 3]', '[1, 2, .nan]'), "position\\[2\\]: '.nan' is not a number"),
         (HEAD + ENTRY.replace('[0, 0, 0, 1]', '[0, 0, 0, 0]'), 'no unit quaternion'),
         (HEAD + ENTRY.replace('size: 0.3', 'covariance: [1]'), 'size|36 numbers'),
         (HEAD + ENTRY.replace('size:', 'sise:'), "unknown field 'sise'"),
         (HEAD.replace('hall', '[1]') + ENTRY, 'frame_id'),
+        (
+            HEAD.replace('version: 1', 'version: 99') + ENTRY,
+            'line 2: version: schema 99 is unknown',
+        ),
+        (HEAD.replace('version: 1\nrevision: 4', 'version: 4') + ENTRY, 'schema 4 is unknown.*map upgrade'),
+        (HEAD.replace('revision', 'revsion') + ENTRY, "line 3: unknown field 'revsion'"),
     ],
 )
 def test_a_broken_map_is_refused_with_file_and_entry(tmp_path, text, complaint):
@@ -122,7 +132,7 @@ from thermal_fiducial.files.marker_map import load_map, save_map
 path = sys.argv[1]
 old = load_map(path)
 print('ready', flush=True)
-for old.version in itertools.count(old.version + 1):
+for old.revision in itertools.count(old.revision + 1):
     save_map(path, old)
 """
 
@@ -132,9 +142,9 @@ def test_no_map_is_lost_to_a_kill(tmp_path):
     """Writers are killed at random moments; each time the file holds one of the maps, whole."""
     path = tmp_path / 'map.yaml'
     save_map(path, some_map())
-    expected = dump_map(some_map()).splitlines()[2:]
+    expected = dump_map(some_map()).splitlines()[3:]
     rng = np.random.default_rng(5)
-    versions = [load_map(path).version]
+    versions = [load_map(path).revision]
     for _ in range(10):
         writer = subprocess.Popen([sys.executable, '-c', _WRITER, str(path)], stdout=subprocess.PIPE)
         assert writer.stdout is not None
@@ -144,8 +154,8 @@ def test_no_map_is_lost_to_a_kill(tmp_path):
         writer.wait()
         writer.stdout.close()
         loaded = load_map(path)
-        versions.append(loaded.version)
-        assert dump_map(loaded).splitlines()[2:] == expected
+        versions.append(loaded.revision)
+        assert dump_map(loaded).splitlines()[3:] == expected
     assert versions == sorted(versions)
     # The kills must have met writers at work, or nothing was tested.
     assert versions[-1] > versions[0] + 2
@@ -166,3 +176,37 @@ def test_an_interrupted_write_leaves_the_old_map(tmp_path, monkeypatch):
         monkeypatch.undo()
         assert path.read_text() == before
         assert [entry.name for entry in Path(tmp_path).iterdir()] == ['map.yaml']
+
+
+def test_a_map_from_before_the_revisions_keeps_loading_or_is_upgraded(tmp_path):
+    path = tmp_path / 'map.yaml'
+    path.write_text(HEAD.replace('revision: 4\n', '') + ENTRY)
+    assert load_map(path).revision == 1
+    path.write_text(HEAD.replace('version: 1\nrevision: 4', 'version: 12') + ENTRY)
+    assert parse_document(str(path), upgraded(str(path))).revision == 12
+    path.write_text(HEAD + ENTRY)
+    with pytest.raises(InputError, match='present format already'):
+        upgraded(str(path))
+
+
+@pytest.mark.parametrize('spoilt', [{'size': np.nan}, {'id': -3}, {'T_map_marker': np.full((4, 4), np.inf)}])
+def test_what_could_not_be_read_back_is_not_written(tmp_path, spoilt):
+    path = tmp_path / 'map.yaml'
+    save_map(path, some_map())
+    before = path.read_bytes()
+    bad = some_map()
+    bad.markers[7] = replace(bad.markers[7], **spoilt)
+    with pytest.raises(InputError, match='not written'):
+        save_map(path, bad)
+    assert path.read_bytes() == before
+
+
+def test_a_symbolic_link_stays_one(tmp_path):
+    (tmp_path / 'maps').mkdir()
+    save_map(tmp_path / 'maps' / 'real.yaml', MarkerMap())
+    link = tmp_path / 'map.yaml'
+    link.symlink_to('maps/real.yaml')
+    save_map(link, some_map())
+    assert link.is_symlink()
+    assert load_map(tmp_path / 'maps' / 'real.yaml').revision == 9
+    assert [entry.name for entry in (tmp_path / 'maps').iterdir()] == ['real.yaml']

@@ -87,14 +87,14 @@ def _load(args: argparse.Namespace, path: Path | None = None) -> MarkerMap:
 
 def _save(args: argparse.Namespace, edited: MarkerMap, action: str) -> int:
     map_history.save_with_history(args.map, edited, action)
-    print(f'{args.map}: {action}; version {edited.version}, {len(edited.markers)} markers')
+    print(f'{args.map}: {action}; revision {edited.revision}, {len(edited.markers)} markers')
     return 0
 
 
 def _show(args: argparse.Namespace) -> int:
     marker_map = _load(args)
     table = Table(
-        title=f'{args.map}: {marker_map.dictionary}, frame {marker_map.frame_id}, version {marker_map.version}'
+        title=f'{args.map}: {marker_map.dictionary}, frame {marker_map.frame_id}, revision {marker_map.revision}'
     )
     for name in ('ID', 'size m', 'x m', 'y m', 'z m', 'faces', 'sigma mm', 'deg', 'error px', 'seen', 'standing'):
         table.add_column(name, justify='right' if name not in ('faces', 'standing') else 'left')
@@ -208,13 +208,13 @@ def _survey(path: Path) -> dict[int, FloatArray]:
 def _history(args: argparse.Namespace) -> int:
     earlier = map_history.entries(args.map)
     for entry in earlier:
-        print(f'{entry.number:6d}  version {entry.version}, {entry.markers} markers, before: {entry.action}')
+        print(f'{entry.number:6d}  revision {entry.revision}, {entry.markers} markers, before: {entry.action}')
     current = _load(args)
-    print(f'   now  version {current.version}, {len(current.markers)} markers')
+    print(f'   now  revision {current.revision}, {len(current.markers)} markers')
     return 0
 
 
 def _undo(args: argparse.Namespace) -> int:
     entry = map_history.undo(args.map)
-    print(f'{args.map}: undone: {entry.action}; version {entry.version}, {entry.markers} markers')
+    print(f'{args.map}: undone: {entry.action}; revision {entry.revision}, {entry.markers} markers')
     return 0

@@ -12,6 +12,9 @@ import numpy as np
 from thermal_fiducial.core.types import FloatArray
 
 _F4 = '<f4'
+#: Frames that come later than this after newer ones are those of a clock that was set back [ns].
+LATEST_NS = 1_000_000_000
+
 CORNER_FIELDS = tuple(f'{axis}{corner}' for corner in range(4) for axis in 'uv')
 CORNER_COVARIANCE_FIELDS = tuple(f'c{corner}{term}' for corner in range(4) for term in ('uu', 'uv', 'vv'))
 

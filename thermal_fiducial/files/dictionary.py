@@ -54,17 +54,27 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> cv2.aruco.Dictionar
     return _from_document(name, document)
 
 
-def other_patterns(markers: Iterable[int], of: str, read_as: str) -> str:
-    """In words, whether a map's ``markers`` of dictionary ``of`` may be others in ``read_as``; empty: they are not."""
-    if of == read_as:
+def other_patterns(markers: Iterable[int], of: str, read_as: str, folder: Path = Path()) -> str:
+    """In words, whether a map's ``markers`` of dictionary ``of`` may be others in ``read_as``; empty: they are not.
+
+    A map comes from anybody: what it calls its dictionary is a name, or a file in its own ``folder``; nothing else is
+    opened.
+    """
+    if Path(of).name == Path(read_as).name:
         return ''
+    differ = f'the map is of {of}, looked for is {read_as}'
+    beside = folder / of
+    if not of.startswith('DICT_') and not (PACKAGED / f'{of}.yaml').is_file():
+        if of != Path(of).name:
+            return f'{differ}: not opened, as it is neither a name nor a file beside the map'
+        of = str(beside)
     try:
         theirs, ours = marker_bits(load_dictionary(of)), marker_bits(load_dictionary(read_as))
     except InputError as error:
-        return f'the map is of {of}, looked for is {read_as}: {error}'
+        return f'{differ}: {error}'
     both = min(len(theirs), len(ours))
     other = [m for m in sorted(markers) if m >= both or not np.array_equal(theirs[m], ours[m])]
-    return f'the map is of {of}, looked for is {read_as}: marker {other[0]} is another one there' if other else ''
+    return f'{differ}: marker {other[0]} is another one there' if other else ''
 
 
 def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: cv2.aruco.Dictionary) -> None:

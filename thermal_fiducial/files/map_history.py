@@ -1,15 +1,32 @@
-"""Earlier versions of a map file, kept in a folder beside it, for undo."""
+"""Earlier versions of a map file, kept in a folder beside it, for undo; and the copy that a running mapper leaves.
 
+Everybody who changes a map goes through here: one at a time, and only on top of what he has read.
+"""
+
+from contextlib import suppress
 from dataclasses import dataclass
+import hashlib
 from pathlib import Path
+import re
 
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.marker_map import load_map, save_map, write_atomically
+from thermal_fiducial.files.atomic import clean_up, locked, sync_folder, write_atomically
+from thermal_fiducial.files.map_format import parse_document
+from thermal_fiducial.files.marker_map import dump_map
+from thermal_fiducial.files.reading import cannot_write, read_text
 
 #: Earlier versions kept.
 KEPT = 50
+#: What is said of an autosaved map that is taken up, or put aside.
+TAKE_UP = 'take up the autosaved map'
+PUT_ASIDE = 'an autosaved map that was never taken up'
 _MARK = '# before: '
+_NAME = re.compile(r'[0-9]{1,9}\.yaml')
+
+
+class ChangedMeanwhileError(InputError):
+    """Somebody else has changed the map since it was read."""
 
 
 @dataclass(frozen=True)
@@ -20,9 +37,11 @@ class Entry:
     path: Path
     #: what was done to it then
     action: str
-    #: version that the map had
-    version: int
-    markers: int
+    #: revision and number of markers that it had; 0 when it cannot be read
+    revision: int = 0
+    markers: int = 0
+    #: why it cannot be read, in words
+    problem: str = ''
 
 
 def history_folder(path: Path) -> Path:
@@ -30,57 +49,156 @@ def history_folder(path: Path) -> Path:
     return path.with_name(f'{path.name}.history')
 
 
-def save_with_history(path: Path, marker_map: MarkerMap, action: str) -> None:
+def autosave_file(path: Path) -> Path:
+    """Where a running mapper leaves its copy of the map at ``path``."""
+    return path.with_name(f'{path.name}.autosave')
+
+
+def digest(path: Path) -> str:
+    """What tells the present content of ``path`` from any other; empty when there is none."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ''
+    except OSError:
+        return ''
+
+
+def save_with_history(path: Path, marker_map: MarkerMap, action: str, read: str | None = None) -> None:
     """Write ``marker_map`` to ``path``, the file that is there now (whatever it holds) into its history.
+
+    Parameters
+    ----------
+    path : the map file
+    marker_map : the map
+    action : what was done, in words
+    read : :func:`digest` of the file that the map follows; None: whatever there is
+
+    Raises
+    ------
+    InputError
+        The folder can't be written to, or (:class:`ChangedMeanwhileError`) the file is not the one that was read.
+    """
+    text = dump_map(marker_map)
+    with locked(path):
+        if read is not None and digest(path) not in (read, ''):
+            raise ChangedMeanwhileError(f'{path}: changed by another program meanwhile; nothing is written')
+        replace(path, text, action)
+
+
+def replace(path: Path, text: str, action: str) -> None:
+    """Put ``text`` into ``path``, what was there into its history; only under :func:`locked`.
 
     Raises
     ------
     InputError
         The folder can't be written to.
     """
-    if path.exists():
-        folder = history_folder(path)
-        earlier = _files(path)
-        number = int(earlier[-1].stem) + 1 if earlier else 1
-        try:
-            folder.mkdir(exist_ok=True)
-            text = path.read_text(encoding='utf-8')
-            write_atomically(folder / f'{number:06d}.yaml', f'{_MARK}{" ".join(action.split())}\n{text}')
-        except OSError as error:
-            raise InputError(f'{folder}: cannot keep the earlier map: {error.strerror}') from error
-        for file in _files(path)[:-KEPT]:
-            file.unlink()
-    save_map(path, marker_map)
+    try:
+        clean_up(path)
+        if path.exists():
+            earlier = path.read_text(encoding='utf-8', errors='replace')
+            if earlier == text:
+                return
+            keep(path, earlier, action)
+        write_atomically(path, text)
+    except OSError as error:
+        raise cannot_write(path, 'the map', error) from None
+
+
+def keep(path: Path, text: str, action: str) -> None:
+    """Put ``text`` into the history of ``path``; only under :func:`locked`. Raises OSError."""
+    folder = history_folder(path)
+    folder.mkdir(exist_ok=True)
+    files = _files(path)
+    number = int(files[-1].stem) + 1 if files else 1
+    write_atomically(folder / f'{number:06d}.yaml', f'{_MARK}{" ".join(action.split())}\n{text}')
+    for file in files[: max(0, len(files) + 1 - KEPT)]:
+        file.unlink(missing_ok=True)
 
 
 def entries(path: Path) -> list[Entry]:
-    """Earlier versions of the map at ``path``, the oldest first."""
-    found = []
-    for file in _files(path):
-        first = file.read_text(encoding='utf-8').partition('\n')[0]
-        earlier = load_map(file, marker_size=1.0)
-        action = first.removeprefix(_MARK) if first.startswith(_MARK) else ''
-        found.append(Entry(int(file.stem), file, action, earlier.version, len(earlier.markers)))
-    return found
+    """Earlier versions of the map at ``path``, the oldest first; those that cannot be read say why."""
+    return [_entry(file) for file in _files(path)]
+
+
+def _entry(file: Path) -> Entry:
+    number = int(file.stem)
+    try:
+        text = read_text(file)
+        document = parse_document(str(file), text)
+    except InputError as error:
+        return Entry(number, file, '', problem=str(error))
+    return Entry(number, file, _action(text), document.revision, len(document.markers))
+
+
+def _action(text: str) -> str:
+    first = text.partition('\n')[0]
+    return first.removeprefix(_MARK) if first.startswith(_MARK) else ''
 
 
 def _files(path: Path) -> list[Path]:
-    return sorted(history_folder(path).glob('[0-9]*.yaml'))
+    try:
+        found = [file for file in history_folder(path).iterdir() if _NAME.fullmatch(file.name)]
+    except OSError:
+        return []
+    return sorted(found, key=lambda file: int(file.stem))
 
 
 def undo(path: Path) -> Entry:
-    """Put the latest earlier version back in place, byte for byte.
+    """Put the latest earlier version that can be read back in place, byte for byte.
 
     Raises
     ------
     InputError
-        There is none.
+        There is none, or it can't be written.
     """
-    earlier = entries(path)
-    if not earlier:
-        raise InputError(f'{path}: no earlier version is kept')
-    last = earlier[-1]
-    text = last.path.read_text(encoding='utf-8')
-    write_atomically(path, text.partition('\n')[2] if text.startswith(_MARK) else text)
-    last.path.unlink()
-    return last
+    with locked(path):
+        earlier = [entry for entry in entries(path) if not entry.problem]
+        if not earlier:
+            raise InputError(f'{path}: no earlier version is kept')
+        last = earlier[-1]
+        text = read_text(last.path)
+        try:
+            clean_up(path)
+            write_atomically(path, text.partition('\n')[2] if text.startswith(_MARK) else text)
+            last.path.unlink()
+        except OSError as error:
+            raise cannot_write(path, 'the map', error) from None
+        return last
+
+
+def autosaved(path: Path) -> Entry | None:
+    """The copy of a mapper that ended without saving, if it is newer than the map itself."""
+    file = autosave_file(path)
+    try:
+        if path.exists() and file.stat().st_mtime_ns < path.stat().st_mtime_ns:
+            return None
+        document = parse_document(str(file), read_text(file))
+    except (OSError, InputError):
+        return None
+    return Entry(0, file, TAKE_UP, document.revision, len(document.markers))
+
+
+def take_up_autosave(path: Path) -> None:
+    """Make the autosaved map the map; the present one goes into the history.
+
+    Raises
+    ------
+    InputError
+        There is none, or it cannot be read or written.
+    """
+    file = autosave_file(path)
+    with locked(path):
+        text = read_text(file)
+        parse_document(str(file), text)
+        replace(path, text, TAKE_UP)
+        with suppress(OSError):
+            file.unlink()
+
+
+def put_autosave_aside(path: Path) -> None:
+    """Move an autosaved map that nobody has taken up into the history; only under :func:`locked`. Raises OSError."""
+    file = autosave_file(path)
+    if file.is_file():
+        keep(path, file.read_text(encoding='utf-8', errors='replace'), PUT_ASIDE)
+        file.unlink(missing_ok=True)
+        sync_folder(path.resolve().parent)

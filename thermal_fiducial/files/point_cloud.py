@@ -8,7 +8,7 @@ import yaml
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.marker_map import write_atomically
+from thermal_fiducial.files.atomic import write_atomically
 
 _NEEDED = "reading point clouds needs the extra 'cloud': pip install thermal_fiducial[cloud]"
 

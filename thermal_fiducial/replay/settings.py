@@ -96,7 +96,8 @@ def _check_files(settings: Settings) -> list[str]:
         foreign = sorted(set(marker_map.markers) - set(range(len(dictionary.bytesList))))
         if foreign:
             raise InputError(f'{mapper.map_file}: marker {foreign[0]} is not in {settings.aruco_detector.dictionary}')
-        other = other_patterns(marker_map.markers, marker_map.dictionary, settings.aruco_detector.dictionary)
+        folder = Path(mapper.map_file).parent
+        other = other_patterns(marker_map.markers, marker_map.dictionary, settings.aruco_detector.dictionary, folder)
         return [f'{mapper.map_file}: {other}'] if other else []
     return []
 

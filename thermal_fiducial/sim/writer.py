@@ -17,6 +17,7 @@ import yaml
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, TRUTH_TOPIC
+from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry
 from thermal_fiducial.files.trajectory import save_tum
 from thermal_fiducial.sim import messages
 from thermal_fiducial.sim.camera import CHUNK, FlightPlan, plan, SimFrame, START_NS, ThermalCamera
@@ -180,8 +181,8 @@ def _write_side_files(folder: Path, flight: FlightPlan) -> None:
     times, stamps = flight.imu_stamps()
     motion = scenario.trajectory(flight.seconds, flight.seed)(times)
     save_tum(folder / 'ground_truth.tum', stamps.tolist(), motion.position, motion.rotation.as_quat())
-    _dump(folder / 'map_true.yaml', _marker_map(scenario, scenario.markers))
-    _dump(folder / 'map_one.yaml', _marker_map(scenario, scenario.markers[:1]))
+    (folder / 'map_true.yaml').write_text(_marker_map(scenario, scenario.markers), encoding='utf-8')
+    (folder / 'map_one.yaml').write_text(_marker_map(scenario, scenario.markers[:1]), encoding='utf-8')
     _dump(folder / 'params.yaml', {'/**': {'ros__parameters': _parameters(scenario)}})
 
 
@@ -189,19 +190,14 @@ def _dump(path: Path, content: dict[str, Any]) -> None:
     path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120), encoding='utf-8')
 
 
-def _marker_map(scenario: Scenario, markers: tuple[Marker, ...]) -> dict[str, Any]:
+def _marker_map(scenario: Scenario, markers: tuple[Marker, ...]) -> str:
     entries = [
-        {
-            'id': marker.id,
-            'size': marker.size,
-            'fixed': True,
-            'position': [float(value) for value in marker.position],
-            'orientation': [round(float(value), 12) for value in marker.rotation.as_quat()],
-        }
+        MarkerEntry(
+            marker.id, marker.size, True, tuple(map(float, marker.position)), tuple(marker.rotation.as_quat().tolist())
+        )
         for marker in markers
     ]
-    head = {'format': 'thermal_fiducial/marker_map', 'version': 1, 'frame_id': messages.MAP_FRAME}
-    return {**head, 'dictionary': scenario.dictionary, 'markers': entries}
+    return dump_document(MapDocument(tuple(entries), messages.MAP_FRAME, scenario.dictionary))
 
 
 def _parameters(scenario: Scenario) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import numpy as np
 from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder
 from thermal_fiducial.core.imaging.stops import FramePeriod, FreezeDetector, Settling, ShutterDetector
+from thermal_fiducial.core.measurements import LATEST_NS
 from thermal_fiducial.core.types import Counts, Gray, IntArray
 from thermal_fiducial.errors import InputError
 
@@ -14,9 +15,6 @@ FROZEN = 'frozen'
 SHUTTER = 'FFC'
 SETTLING = 'settling after FFC'
 REPEATED_STAMP = 'stamp seen before'
-
-# Frames that come later than this after newer ones are those of a clock that was set back [ns].
-LATEST_NS = 1_000_000_000
 
 # Bits that a driver shifts counts up by at least, to fill 16.
 _SHIFTED = 2

@@ -100,7 +100,7 @@ def _settle(mapper: MarkerMapper, camera: Camera) -> bool:
         winner = decide(snapshot, candidate.id, candidate.size, candidate.solutions(camera)[:2])
         if winner is not None:
             mapper.enter(candidate.views[-1].stamp_ns, candidate, winner.T_map_marker, winner.covariance)
-            mapper.map.version += 1
+            mapper.map.revision += 1
             return True
     return False
 

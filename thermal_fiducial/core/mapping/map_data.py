@@ -48,13 +48,13 @@ class MapMarker:
 class MarkerMap:
     """Markers by ID, all in one frame.
 
-    ``version`` grows with every change of the geometry; statistics leave it alone.
+    ``revision`` grows with every change of the geometry; statistics leave it alone.
     """
 
     markers: dict[int, MapMarker] = field(default_factory=dict)
     frame_id: str = 'map'
     dictionary: str = 'DICT_4X4_50'
-    version: int = 1
+    revision: int = 1
 
     def copy(self) -> 'MarkerMap':
         """A map that shares the (immutable) markers but not the table of them."""
@@ -101,6 +101,10 @@ class MapperResult:
     map_version: int = 0
     #: how often a refinement has moved the map
     map_resets: int = 0
+    #: why each of them is there, with numbers
+    quarantine_reasons: dict[int, str] = field(default_factory=dict)
+    #: the map took something in: a new marker, or what the known ones were seen like
+    learned: bool = False
 
     @property
     def in_view(self) -> frozenset[int]:

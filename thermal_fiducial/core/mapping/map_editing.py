@@ -1,4 +1,4 @@
-"""Editing of marker maps: each function answers a new map of the next version and leaves its input alone."""
+"""Editing of marker maps: each function answers a new map of the next revision and leaves its input alone."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -250,4 +250,4 @@ def _get(marker_map: MarkerMap, marker_id: int) -> MapMarker:
 
 
 def _changed(marker_map: MarkerMap, changes: Mapping[int, MapMarker]) -> MarkerMap:
-    return replace(marker_map, markers={**marker_map.markers, **changes}, version=marker_map.version + 1)
+    return replace(marker_map, markers={**marker_map.markers, **changes}, revision=marker_map.revision + 1)

@@ -36,7 +36,7 @@ from thermal_fiducial.core.mapping.odometry_prior import (
     PredictedCamera,
     together,
 )
-from thermal_fiducial.core.mapping.trust import culprits, DISAGREEMENT, Trust
+from thermal_fiducial.core.mapping.trust import culprits, DISAGREEMENT, MEMORY, Trust
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray
@@ -51,6 +51,8 @@ ALIKE = 30.0
 #: Factor on the variance of what a camera pose owes to the map: of all frames of the same markers that error is the
 #: same, while whoever takes in the poses lets their errors average out.
 LASTING = 3.0
+#: Why a marker is in quarantine that came so with the map.
+FROM_FILE = 'in quarantine since before the map was loaded'
 #: Why nothing is learned from a frame that has a pose.
 ASTRAY = 'the known markers in view contradict the odometry'
 #: What a marker's corners are off by in all views alike (its shape, the edge's model), as a share of their noise:
@@ -91,7 +93,7 @@ class MarkerMapper:
         return self.load(self._initial)
 
     def load(self, marker_map: MarkerMap) -> MapJump | None:
-        """Go on with another map of the place, of the next version; what was seen before is forgotten.
+        """Go on with another map of the place, of the next revision; what was seen before is forgotten.
 
         Returns
         -------
@@ -101,15 +103,15 @@ class MarkerMapper:
             T_new_old = align(marker_map.markers, self.map.markers).T
         except InputError:
             T_new_old = None
-        self._begin(replace(marker_map, version=max(self.map.version, marker_map.version) + 1))
+        self._begin(replace(marker_map, revision=max(self.map.revision, marker_map.revision) + 1))
         self.resets += 1
-        return None if T_new_old is None else MapJump(self.map.version, self.resets, T_new_old)
+        return None if T_new_old is None else MapJump(self.map.revision, self.resets, T_new_old)
 
     def _begin(self, marker_map: MarkerMap) -> None:
         self._initial, self.map = marker_map.copy(), marker_map.copy()
         self._candidates: dict[int, Candidate] = {}
         self._trust = Trust()
-        self._quarantined = {key for key, marker in self.map.markers.items() if not marker.trusted}
+        self._quarantined = {key: FROM_FILE for key, marker in self.map.markers.items() if not marker.trusted}
         self._last: CameraPose | None = None
         #: whether odometry has been in this map
         self._odometry_agreed = False
@@ -233,16 +235,21 @@ class MarkerMapper:
         known = frame.known
         if len(known.markers) < 2:
             return False
-        disagrees = errors > DISAGREEMENT * _expected_errors(known, location, frame.camera)
-        blamed = culprits(disagrees, frame.trusted, known.markers)
+        explained = _expected_errors(known, location, frame.camera)
+        blamed = culprits(errors > DISAGREEMENT * explained, frame.trusted, known.markers)
         changes = self._trust.judge(known.markers, blamed.tolist())
-        for marker_id, trusted_now in changes.items():
-            self._set_standing(marker_id, trusted=trusted_now)
+        for marker, error, sigma in zip(known.markers, errors, explained, strict=True):
+            if marker.id in changes:
+                reason = f'{error:.1f} px off, {error / sigma:.1f} sigma, in most of the last {1.0 / MEMORY:.0f} frames'
+                self._set_standing(marker.id, '' if changes[marker.id] else reason)
         return bool(changes)
 
-    def _set_standing(self, marker_id: int, *, trusted: bool) -> None:
-        self.map.markers[marker_id] = replace(self.map.markers[marker_id], trusted=trusted)
-        (self._quarantined.discard if trusted else self._quarantined.add)(marker_id)
+    def _set_standing(self, marker_id: int, reason: str) -> None:
+        """Trust a marker, or put it in quarantine for a reason."""
+        self.map.markers[marker_id] = replace(self.map.markers[marker_id], trusted=not reason)
+        self._quarantined.pop(marker_id, None)
+        if reason:
+            self._quarantined[marker_id] = reason
 
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, dict[int, str]]:
         """Show new markers to their candidates; whether any entered the map, and what the others wait for."""
@@ -264,7 +271,7 @@ class MarkerMapper:
             if placement.T_map_marker is not None:
                 self.enter(frame.stamp_ns, candidate, placement.T_map_marker, placement.covariance)
                 placed = True
-        self.map.version += placed
+        self.map.revision += placed
         return placed, {candidate.id: candidate.reason for candidate in shown if candidate.id in self._candidates}
 
     def _keep(self, frame: LocatedFrame, pose: CameraPose, fused: Fused) -> None:
@@ -341,7 +348,7 @@ class MarkerMapper:
             Rig(tuple(self._cameras), np.broadcast_to(np.eye(4), (len(self._cameras), 4, 4))),
             tuple(self._keyframes.links),
             prior_poses(self._initial.markers),
-            self.map.version,
+            self.map.revision,
             LASTING_SHARE,
         )
 
@@ -360,7 +367,7 @@ class MarkerMapper:
         -------
         The jump, to be told to whoever holds poses in the map; None where the map is frozen, or was replaced since.
         """
-        if self.frozen or refinement.map_version < self._initial.version:
+        if self.frozen or refinement.map_version < self._initial.revision:
             return None
         before = dict(self.map.markers)
         for marker_id, adjusted in refinement.markers.items():
@@ -371,7 +378,8 @@ class MarkerMapper:
                 )
                 if marker_id in refinement.inconsistent:
                     self._trust.accuse(marker)
-                    self._set_standing(marker_id, trusted=False)
+                    share = 100.0 * refinement.outliers[marker_id]
+                    self._set_standing(marker_id, f'{share:.0f} % of its views contradict the joint refinement')
         displacement = self._keyframes.move(refinement.keyframes)
         for candidate in self._candidates.values():
             candidate.move(displacement)
@@ -382,9 +390,9 @@ class MarkerMapper:
             self._last = replace(self._last, T_map_camera=T_new_old @ self._last.T_map_camera)
             self._motion = CameraMotion()
             self._last_frame = in_moved_map(self._last_frame, T_new_old)
-        self.map.version += 1
+        self.map.revision += 1
         self.resets += 1
-        return MapJump(self.map.version, self.resets, T_new_old)
+        return MapJump(self.map.revision, self.resets, T_new_old)
 
     @property
     def candidates(self) -> dict[int, Candidate]:
@@ -414,8 +422,10 @@ class MarkerMapper:
             residuals or {},
             waiting or {},
             tuple(sorted(self._quarantined)),
-            self.map.version,
+            self.map.revision,
             self.resets,
+            dict(self._quarantined),
+            not self.frozen and bool(changed or residuals),
         )
 
 

@@ -1,0 +1,101 @@
+"""Files that are replaced as a whole: a kill at any moment leaves the old content or the new one, and nothing else."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+import fcntl
+import os
+from pathlib import Path
+import tempfile
+import time
+
+from thermal_fiducial.errors import InputError
+
+#: How long to wait for another program that writes in the same folder [s].
+PATIENCE_S = 5.0
+_POLL_S = 0.02
+_MODE = 0o644
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Replace the content of ``path``; whoever reads it, at any time, sees the old text or the new one.
+
+    A symbolic link stays one: the file that it points to is replaced.
+
+    Raises
+    ------
+    OSError
+        As the file system says; the old file is then untouched.
+    """
+    path = path.resolve()
+    descriptor, name = tempfile.mkstemp(prefix=f'.{path.name}.', suffix='.tmp', dir=path.parent)
+    temporary = Path(name)
+    try:
+        with os.fdopen(descriptor, 'w', encoding='utf-8') as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.chmod(path.stat().st_mode if path.exists() else _MODE)
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    sync_folder(path.parent)
+
+
+def sync_folder(folder: Path) -> None:
+    """Make renames and removals in ``folder`` survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def clean_up(path: Path) -> None:
+    """Remove what killed writers of ``path`` have left; only under :func:`locked`."""
+    path = path.resolve()
+    for litter in path.parent.glob(f'.{_literal(path.name)}.*.tmp'):
+        litter.unlink(missing_ok=True)
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Keep others that ask for it from writing in the folder of ``path``, for as long as the context lasts.
+
+    The folder itself carries the lock: there is no lock file to be left behind or to be put there by somebody else.
+
+    Raises
+    ------
+    InputError
+        No such folder, or another program does not give it free.
+    """
+    folder = path.resolve().parent
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise InputError(f'{folder}: {error.strerror}') from None
+    try:
+        _wait_for(descriptor, folder)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _wait_for(descriptor: int, folder: Path) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        except BlockingIOError:
+            if time.monotonic() > until:
+                raise InputError(f'{folder}: another program is writing there') from None
+            time.sleep(_POLL_S)
+        except OSError:
+            # A file system without locks: as good as one writer.
+            return
+
+
+def _literal(name: str) -> str:
+    """``name`` as a pattern that matches only itself."""
+    return ''.join(f'[{character}]' if character in '*?[' else character for character in name)

@@ -1,0 +1,158 @@
+"""The map file of a running mapper: loaded, saved, autosaved, and in no case lost."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from threading import Thread
+import time
+
+from thermal_fiducial.core.mapping.map_data import MarkerMap
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files import map_history
+from thermal_fiducial.files.atomic import locked, write_atomically
+from thermal_fiducial.files.marker_map import dump_map, load_map
+
+#: A mapper that starts so many autosave periods after the last autosave has crashed and goes on where it was.
+RESTART_PERIODS = 2.0
+
+
+class MapKeeper:
+    """Keeps one map file.
+
+    Parameters
+    ----------
+    path : the file; None: nothing is kept
+    marker_size : side of markers whose entry has none [m]
+    size_overrides : marker ID to side [m], before ``marker_size``
+    """
+
+    def __init__(self, path: Path | None, marker_size: float, size_overrides: Mapping[int, float]) -> None:
+        self._path = path
+        self._sizes = marker_size, size_overrides
+        # Of what the map follows. Nothing that is there follows from what could not be read.
+        self._read = 'nothing'
+        self._own_autosave = False
+        self._writer: Thread | None = None
+        self._fault = ''
+        #: whether the map has learned something since it was loaded or saved
+        self.unsaved = False
+
+    @property
+    def path(self) -> Path:
+        """The file.
+
+        Raises
+        ------
+        InputError
+            There is none.
+        """
+        if self._path is None:
+            raise InputError('parameter map_file is empty: there is no map on disk')
+        return self._path
+
+    def load(self) -> MarkerMap:
+        """The map as the file has it now.
+
+        Raises
+        ------
+        InputError
+            There is no file, or it cannot be read.
+        """
+        read = map_history.digest(self.path)
+        marker_map = load_map(self.path, *self._sizes)
+        self._read, self.unsaved = read, False
+        return marker_map
+
+    def recover(self, autosave_period: float) -> tuple[MarkerMap | None, str]:
+        """The autosaved map of a mapper that has just crashed (or None), and what there is to say of one.
+
+        Parameters
+        ----------
+        autosave_period : of mappers here [s]; 0: none is taken up
+        """
+        entry = None if self._path is None else map_history.autosaved(self._path)
+        if entry is None:
+            return None, ''
+        found = f'{entry.path} (revision {entry.revision}, {entry.markers} markers)'
+        age_s = time.time() - entry.path.stat().st_mtime
+        if not 0.0 <= age_s <= RESTART_PERIODS * autosave_period:
+            return None, f'{found} was never saved: thermal-fiducial map undo {self._path} takes it up'
+        try:
+            recovered = load_map(entry.path, *self._sizes)
+        except InputError as error:
+            return None, str(error)
+        self.unsaved = self._own_autosave = True
+        return recovered, f'goes on with {found}, {age_s:.0f} s old, as the last mapper did not end in order'
+
+    def save(self, marker_map: MarkerMap) -> Path:
+        """Write the map: to its file, or beside it where that holds something that the map does not follow.
+
+        Returns
+        -------
+        Where it was written.
+
+        Raises
+        ------
+        InputError
+            Nothing can be written there.
+        """
+        self._await_writer()
+        try:
+            map_history.save_with_history(self.path, marker_map, 'save', self._read)
+        except InputError:
+            beside = self.path.with_name(f'{self.path.stem}.new{self.path.suffix}')
+            map_history.save_with_history(beside, marker_map, 'save')
+            self.unsaved = False
+            return beside
+        self._read, self.unsaved = map_history.digest(self.path), False
+        self._retire_autosave()
+        return self.path
+
+    def undo(self) -> str:
+        """Put the latest earlier version of the file back in place; what was undone.
+
+        Raises
+        ------
+        InputError
+            There is none.
+        """
+        return map_history.undo(self.path).action
+
+    def autosave(self, marker_map: MarkerMap) -> None:
+        """Leave a copy of the map beside its file, where it has learned something; in a thread, as disks are slow.
+
+        Raises
+        ------
+        InputError
+            The last one failed.
+        """
+        fault, self._fault = self._fault, ''
+        if self._path is not None and self.unsaved and (self._writer is None or not self._writer.is_alive()):
+            self._writer = Thread(target=self._autosave, args=(marker_map.copy(),), daemon=True)
+            self._writer.start()
+        if fault:
+            raise InputError(fault)
+
+    def _autosave(self, marker_map: MarkerMap) -> None:
+        try:
+            text = dump_map(marker_map)
+            with locked(self.path):
+                if not self._own_autosave:
+                    map_history.put_autosave_aside(self.path)
+                write_atomically(map_history.autosave_file(self.path), text)
+            self._own_autosave = True
+        except (OSError, InputError) as error:
+            self._fault = f'autosave failed: {error}'
+
+    def _retire_autosave(self) -> None:
+        """The map is saved: its copy goes, an earlier one that was never taken up is kept in the history."""
+        with suppress(OSError, InputError), locked(self.path):
+            if self._own_autosave:
+                map_history.autosave_file(self.path).unlink(missing_ok=True)
+            else:
+                map_history.put_autosave_aside(self.path)
+        self._own_autosave = False
+
+    def _await_writer(self) -> None:
+        if self._writer is not None:
+            self._writer.join()

@@ -1,0 +1,70 @@
+"""The joint refinement of a mapper, beside the frames: in a process of its own as soon as the map may change."""
+
+from thermal_fiducial.core.mapping.bundle_adjustment import refine, Refinement, Snapshot
+from thermal_fiducial.core.mapping.map_data import MapJump
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.worker import Background, Foreground
+
+Worker = Background[Snapshot, Refinement | None] | Foreground[Snapshot, Refinement | None]
+
+
+class MapRefinement:
+    """Refines the map of ``mapper``; ``live``: in the background, else at once (a replay in lock-step)."""
+
+    def __init__(self, mapper: MarkerMapper, *, live: bool) -> None:
+        self._mapper = mapper
+        self._live = live
+        self._worker: Worker | None = None
+        self.prepare()
+
+    @property
+    def busy(self) -> bool:
+        """Whether no refinement can be started: one is under way, or the process for it starts."""
+        return self._worker is not None and self._worker.busy
+
+    def prepare(self) -> None:
+        """Start the process, which takes a while, where the map may change."""
+        if self._worker is None and not self._mapper.frozen:
+            self._worker = Background(refine) if self._live else Foreground(refine)
+
+    def step(self, stamp_ns: int) -> MapJump | None:
+        """After each frame: start a refinement where one is due, take over one that is done.
+
+        Raises
+        ------
+        InputError
+            A refinement failed.
+        """
+        if self._worker is None:
+            return None
+        if not self._worker.busy and self._mapper.refinement_due(stamp_ns):
+            self._begin(self._worker)
+        refinement = self._worker.take()
+        return None if refinement is None else self._mapper.apply(refinement)
+
+    def start(self) -> None:
+        """Start a refinement now.
+
+        Raises
+        ------
+        InputError
+            The map is frozen, one is under way already, or there is nothing to refine yet.
+        """
+        if self._mapper.frozen or self._worker is None:
+            raise InputError('the map is frozen')
+        if self._worker.busy:
+            raise InputError('a refinement is under way')
+        if not self._begin(self._worker):
+            raise InputError('nothing to refine yet')
+
+    def _begin(self, worker: Worker) -> bool:
+        snapshot = self._mapper.snapshot()
+        if snapshot is not None:
+            worker.start(snapshot)
+        return snapshot is not None
+
+    def close(self) -> None:
+        """End it, also in the middle of its work."""
+        if self._worker is not None:
+            self._worker.close()

@@ -1,0 +1,133 @@
+"""The map of a mapper and its file: loaded at the start, saved, edited by services, saved at the end."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from std_srvs.srv import SetBool, Trigger
+
+from thermal_fiducial.config import MarkerMapperConfig, size_overrides
+from thermal_fiducial.core.mapping.map_data import MapJump, MarkerMap
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.dictionary import other_patterns
+from thermal_fiducial.files.map_keeper import MapKeeper
+from thermal_fiducial.ros.map_refinement import MapRefinement
+from thermal_fiducial.ros.node import StageNode
+
+Answer = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
+
+
+class MapServices:
+    """Makes the mapper of ``node`` from its map file, and answers its services.
+
+    Parameters
+    ----------
+    node : a mapper's node
+    publish_jump : called with what becomes of the map when a service has replaced it
+    """
+
+    def __init__(self, node: StageNode[MarkerMapperConfig], publish_jump: Callable[[MapJump | None], None]) -> None:
+        config = node.config
+        self._node = node
+        self._publish_jump = publish_jump
+        file = Path(config.map_file) if config.map_file else None
+        self._keeper = MapKeeper(file, config.marker_size, size_overrides(config.marker_size_overrides))
+        #: in words: the map is of another dictionary than the one that is looked for
+        self.other_dictionary = ''
+        self.mapper = MarkerMapper(config, self._first_map())
+        self.refinement = MapRefinement(self.mapper, live=node.live)
+        for name in ('save', 'load', 'undo', 'reset', 'refine'):
+            node.serve(Trigger, f'~/{name}', _answer(getattr(self, name)))
+        node.serve(SetBool, '~/freeze', self._on_freeze)
+        if node.live and config.autosave_period:
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            node.create_timer(config.autosave_period, self._autosave, clock=clock)
+
+    def _first_map(self) -> MarkerMap:
+        node, config = self._node, self._node.config
+        empty = MarkerMap(frame_id=config.map_frame, dictionary=config.dictionary)
+        if not config.map_file:
+            return empty
+        loaded = node.attempt(self._read, empty)
+        may_recover = node.live and config.mode == 'mapping'
+        recovered, note = self._keeper.recover(config.autosave_period if may_recover else 0.0)
+        if note:
+            node.get_logger().warning(note)
+        return loaded if recovered is None else recovered
+
+    def _read(self) -> MarkerMap:
+        loaded = self._keeper.load()
+        wanted = self._node.config.dictionary
+        folder = self._keeper.path.parent
+        self.other_dictionary = other_patterns(loaded.markers, loaded.dictionary, wanted, folder)
+        return loaded
+
+    def _autosave(self) -> None:
+        self._node.guard(self._keeper.autosave, self.mapper.map)
+
+    def note_learned(self) -> None:
+        """The map has learned something that is not in its file."""
+        self._keeper.unsaved = True
+
+    def save(self) -> str:
+        """Write the map file, or one beside it where that holds something that the map does not follow."""
+        path = self._keeper.save(self.mapper.map)
+        return f'{len(self.mapper.map.markers)} markers saved to {path}'
+
+    def load(self) -> str:
+        """Take over the map file as it is now: what ``thermal-fiducial map`` has made of it."""
+        self._refuse_frozen()
+        loaded = self._read()
+        self._publish_jump(self.mapper.load(loaded))
+        return f'{len(loaded.markers)} markers loaded from {self._keeper.path}'
+
+    def undo(self) -> str:
+        """Put the earlier version of the map file back, and take it over."""
+        self._refuse_frozen()
+        return f'undone: {self._keeper.undo()}; {self.load()}'
+
+    def reset(self) -> str:
+        """Back to the map that was loaded last."""
+        self._refuse_frozen()
+        self._publish_jump(self.mapper.reset())
+        return f'{len(self.mapper.map.markers)} markers left'
+
+    def refine(self) -> str:
+        """Start a joint refinement now."""
+        self.refinement.start()
+        return 'refinement started'
+
+    def _refuse_frozen(self) -> None:
+        if self.mapper.frozen:
+            raise InputError('the map is frozen')
+
+    def _on_freeze(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self.mapper.frozen = bool(request.data)
+        self.refinement.prepare()
+        response.success, response.message = True, 'map frozen' if request.data else 'map free'
+        return response
+
+    def close(self) -> None:
+        """End the refinement; save what was mapped."""
+        self.refinement.close()
+        file = self._node.config.map_file
+        lost = not self.mapper.frozen and not Path(file).exists()
+        if file and (self._keeper.unsaved or lost) and self.mapper.map.markers:
+            logger = self._node.get_logger()
+            try:
+                logger.info(self.save())
+            except InputError as error:
+                logger.error(str(error))
+
+
+def _answer(act: Callable[[], str]) -> Answer:
+    """A service that says what ``act`` did."""
+
+    def answer(_: Trigger.Request, response: Trigger.Response) -> Any:
+        response.message, response.success = act(), True
+        return response
+
+    return answer

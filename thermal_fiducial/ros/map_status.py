@@ -1,0 +1,40 @@
+"""What a mapper says of itself: diagnostics in words and numbers, and what is worth a line on the console."""
+
+from collections.abc import Iterable
+
+from thermal_fiducial.core.mapping.map_data import MapperResult, MarkerMap
+from thermal_fiducial.ros.node import OK, WARN
+
+
+def state(result: MapperResult, other_dictionary: str, *, frozen: bool) -> tuple[bytes, str]:
+    """Level and words: why the last frame gave no pose, whether the map is meant, which markers are not trusted."""
+    if result.reason or other_dictionary:
+        return WARN, '; '.join(filter(None, (result.reason, other_dictionary)))
+    if result.quarantined:
+        return WARN, f'quarantined: {_listed(result.quarantined)}'
+    return OK, 'map frozen' if frozen else 'ok'
+
+
+def figures(marker_map: MarkerMap, corrections: int, result: MapperResult) -> dict[str, object]:
+    """The map in numbers, what waits to enter it, and why markers are in quarantine."""
+    return {
+        'markers in map': len(marker_map.markers),
+        'map revision': marker_map.revision,
+        'map corrections': corrections,
+        'in view': _listed(sorted(result.in_view)),
+        'quarantined': _listed(result.quarantined),
+        'quarantine': '; '.join(f'{key}: {why}' for key, why in sorted(result.quarantine_reasons.items())),
+        'candidates': '; '.join(f'{key}: {reason}' for key, reason in result.candidates.items()),
+    }
+
+
+def news(before: MapperResult, now: MapperResult) -> list[str]:
+    """Lines for the console: markers that went into quarantine, with the reason, and those that came out."""
+    reasons = now.quarantine_reasons
+    into = [f'marker {key} quarantined: {reasons[key]}' for key in now.quarantined if key not in before.quarantined]
+    out = [f'marker {key} is trusted again' for key in before.quarantined if key not in now.quarantined]
+    return into + out
+
+
+def _listed(ids: Iterable[int]) -> str:
+    return ', '.join(str(key) for key in ids)

@@ -1,0 +1,82 @@
+"""The marker map as topics: its rows, how it has moved, and what RViz shows of it."""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+from geometry_msgs.msg import TransformStamped
+import numpy as np
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import MarkerArray
+
+from thermal_fiducial.core.geometry.se3 import apply, inverse
+from thermal_fiducial.core.mapping.map_data import MarkerMap
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.files.point_cloud import load_alignment, load_cloud, thinned
+from thermal_fiducial.ros import clouds, convert, display, qos
+from thermal_fiducial.ros.node import CountingNode
+
+# Points of the cloud that is shown: 0.7 MB, which goes through shared memory in one piece.
+_CLOUD_POINTS = 60_000
+_XYZ = np.dtype([(axis, '<f4') for axis in 'xyz'])
+
+
+@dataclass(frozen=True)
+class _Drawing:
+    """What RViz has been shown, and how many it was."""
+
+    in_view: frozenset[int]
+    listeners: int
+
+
+class MapTopics:
+    """The topics of ``node`` that show the map, in ``frame_id``."""
+
+    def __init__(self, node: CountingNode, frame_id: str) -> None:
+        self._frame_id = frame_id
+        self._drawn: _Drawing | None = None
+        self._rows = node.advertise(PointCloud2, 'marker_map', qos.LATCHED)
+        self._drawing = node.advertise(MarkerArray, 'marker_map/markers', qos.LATCHED)
+        self._correction = node.advertise(TransformStamped, 'map_correction')
+        self._cloud = node.advertise(PointCloud2, 'marker_map/cloud', qos.LATCHED)
+
+    def publish(self, marker_map: MarkerMap, in_view: Collection[int], stamp_ns: int) -> None:
+        """The map as it is after the frame of ``stamp_ns``, which shows the markers ``in_view``."""
+        self._rows.send(clouds.cloud(marker_map.rows(in_view), convert.header(stamp_ns, self._frame_id)))
+        self._drawn = None
+
+    def publish_correction(self, T_new_old: FloatArray, stamp_ns: int) -> None:
+        """How the map has moved after the frame of ``stamp_ns``: (4, 4) from the old to the new."""
+        old = f'{self._frame_id}_before'
+        self._correction.send(convert.transform_message(T_new_old, stamp_ns, self._frame_id, old))
+
+    def draw(self, marker_map: MarkerMap, in_view: frozenset[int], stamp_ns: int) -> None:
+        """The markers for RViz: all when they have changed or someone new looks on, else those of another colour."""
+        now = _Drawing(in_view, self._drawing.listeners)
+        whole = self._drawn is None or now.listeners > self._drawn.listeners
+        recoloured = in_view if self._drawn is None else in_view ^ self._drawn.in_view
+        if whole or recoloured:
+            rows = marker_map.rows(in_view)
+            shown = rows if whole else rows[np.isin(rows['id'], list(recoloured))]
+            head = convert.header(stamp_ns, self._frame_id)
+            self._drawing.send(display.map_markers(shown, head, whole=whole))
+        self._drawn = now
+
+    def draw_for_listeners(self, marker_map: MarkerMap, in_view: frozenset[int], stamp_ns: int) -> None:
+        """The same where anybody looks on."""
+        if self._drawing.listeners:
+            self.draw(marker_map, in_view, stamp_ns)
+        else:
+            self._drawn = None
+
+    def publish_cloud(self, cloud_file: str, alignment_file: str) -> None:
+        """The point cloud of the place, in the frame of the map, once: for RViz beside the markers.
+
+        Raises
+        ------
+        InputError
+            A file that cannot be used.
+        """
+        T_cloud_map = load_alignment(alignment_file) if alignment_file else np.eye(4)
+        points = apply(inverse(T_cloud_map), thinned(load_cloud(cloud_file), _CLOUD_POINTS))
+        rows = np.ascontiguousarray(points, '<f4').view(_XYZ)[:, 0]
+        self._cloud.send(clouds.cloud(rows, convert.header(0, self._frame_id)))
