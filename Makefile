@@ -57,7 +57,7 @@ bench: $(READY)
 
 tables: $(READY)
 	THERMAL_FIDUCIAL_TABLES=1 $(BIN)/python -m pytest --quiet test/real
-	$(BIN)/python test/bench/readme.py
+	$(BIN)/python test/documents.py
 
 $(DOCS): setup.py $(READY)
 	$(BIN)/python -m pip install --quiet --editable '.[docs]'
