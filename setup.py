@@ -7,7 +7,7 @@ import sys
 from setuptools import find_packages, setup
 
 PACKAGE = 'thermal_fiducial'
-NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf', 'thermal_source')
+NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf', 'thermal_source', 'landing_target')
 #: pip makes the command itself; a workspace has it beside the nodes, so this one puts it on the PATH.
 ON_PATH = [] if {'bdist_wheel', 'editable_wheel'} & set(sys.argv) else [('bin', ['scripts/thermal-fiducial'])]
 VERSION = re.findall(r"(?m)^__version__ = '(.+)'", Path(PACKAGE, '__init__.py').read_text(encoding='utf-8'))[0]

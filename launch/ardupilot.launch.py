@@ -14,7 +14,7 @@ def generate_launch_description() -> LaunchDescription:
     """The four nodes with the output of mavros, at the rate of ArduPilot."""
     return describe(
         'localization',
-        [('bridge/odometry', 'mavros/odometry/out')],
-        {'bridge_rate': 20.0},
+        [('bridge/odometry', 'mavros/odometry/out'), ('landing_target', 'mavros/landing_target/pose')],
+        {'bridge_rate': 20.0, 'landing_target_frame': 'body'},
         {'imu_topic': 'mavros/imu/data'},
     )

@@ -15,7 +15,7 @@ def generate_launch_description() -> LaunchDescription:
     """The four nodes with the output of mavros."""
     return describe(
         'localization',
-        [('bridge/odometry', 'mavros/odometry/out')],
-        {'bridge_rate': 30.0},
+        [('bridge/odometry', 'mavros/odometry/out'), ('landing_target', 'mavros/landing_target/pose')],
+        {'bridge_rate': 30.0, 'landing_target_frame': 'map'},
         {'imu_topic': 'mavros/imu/data'},
     )

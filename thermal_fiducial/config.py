@@ -587,6 +587,24 @@ class ThermalSourceConfig(SelfChecked):
     frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
 
 
+@dataclass(frozen=True)
+class LandingTargetConfig(SelfChecked):
+    """The landing pad, for an autopilot behind mavros."""
+
+    landing_pad: tuple[int, ...] = param(
+        (), 'Markers of the landing pad. Its place is the middle between them, its axes are those of the first.'
+    )
+    landing_target_frame: str = param(
+        'body',
+        'body: relative to the robot (ArduPilot; mavros with mav_frame BODY_FRD); map: in the map (PX4; LOCAL_NED).',
+        choices=('body', 'map'),
+    )
+    camera_position: tuple[float, ...] = _camera_position()
+    camera_orientation: tuple[float, ...] = _camera_orientation()
+    map_frame: str = param('map', 'Frame of the map.')
+    base_frame: str = param('base_link', 'Frame of the robot: that of the IMU.')
+
+
 #: Node to its parameters: the pipeline.
 NODES: dict[str, type] = {
     'tau2_camera': Tau2CameraConfig,
@@ -596,7 +614,7 @@ NODES: dict[str, type] = {
 }
 
 #: Nodes beside them, which run only where they are asked for.
-OPTIONAL_NODES: dict[str, type] = {'thermal_source': ThermalSourceConfig}
+OPTIONAL_NODES: dict[str, type] = {'thermal_source': ThermalSourceConfig, 'landing_target': LandingTargetConfig}
 
 
 def check_names(names: Iterable[str]) -> None:

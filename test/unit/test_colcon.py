@@ -13,7 +13,7 @@ import pytest
 from support.ros_graph import ros_graph
 
 ROOT = Path(__file__).resolve().parents[2]
-NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf', 'thermal_source')
+NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf', 'thermal_source', 'landing_target')
 SOURCES = ('package.xml', 'setup.py', 'setup.cfg', 'resource', 'config', 'launch', 'scripts', 'thermal_fiducial')
 
 COLCON = Path(sys.executable).with_name('colcon')

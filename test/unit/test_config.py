@@ -11,6 +11,7 @@ from thermal_fiducial.config import (
     from_mapping,
     group,
     ImuNoise,
+    LandingTargetConfig,
     MarkerMapperConfig,
     param,
     parameters,
@@ -22,7 +23,14 @@ from thermal_fiducial.config import (
 )
 from thermal_fiducial.errors import InputError
 
-NODES = (Tau2CameraConfig, ArucoDetectorConfig, MarkerMapperConfig, PoseEkfConfig, ThermalSourceConfig)
+NODES = (
+    Tau2CameraConfig,
+    ArucoDetectorConfig,
+    MarkerMapperConfig,
+    PoseEkfConfig,
+    ThermalSourceConfig,
+    LandingTargetConfig,
+)
 
 
 @dataclass(frozen=True)

@@ -10,16 +10,21 @@ import yaml
 
 from thermal_fiducial import config
 from thermal_fiducial.config import NODES as PARAMETERS
+from thermal_fiducial.config import OPTIONAL_NODES
 from thermal_fiducial.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 NODES = ['tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf']
 
 
-MAVROS = [('bridge/odometry', 'mavros/odometry/out'), ('imu/data', 'mavros/imu/data')]
+MAVROS = [
+    ('bridge/odometry', 'mavros/odometry/out'),
+    ('landing_target', 'mavros/landing_target/pose'),
+    ('imu/data', 'mavros/imu/data'),
+]
 PARAMETER_FILE = '/share/thermal_fiducial/config/thermal_fiducial.yaml'
 ARGUMENTS = {
-    'params_file': '', 'map_file': '', 'camera': '', 'image_topic': 'thermal/image_raw',
+    'params_file': '', 'map_file': '', 'camera': '', 'landing_pad': '', 'image_topic': 'thermal/image_raw',
     'camera_info_topic': 'thermal/camera_info', 'imu_topic': 'imu/data', 'namespace': '', 'use_sim_time': 'false',
     'log_level': 'info', 'rviz': 'false',
 }  # fmt: skip
@@ -142,11 +147,19 @@ def test_a_camera_is_started_with_the_nodes(launched):
     assert nodes[0].parameters[1]['camera'] == '/dev/video0'
 
 
+def test_a_landing_pad_is_reported_where_one_is_named(launched):
+    _, nodes = launched('ardupilot.launch.py', landing_pad='7,8,9')
+    assert [node.executable for node in nodes] == [*NODES, 'landing_target']
+    assert nodes[-1].parameters[1]['landing_pad'] == [7, 8, 9]
+    assert ('landing_target', 'mavros/landing_target/pose') in nodes[-1].remappings
+
+
 @pytest.mark.parametrize(
     ('arguments', 'words'),
     [
         ({'params_file': '/nowhere/rig.yaml'}, 'params_file /nowhere/rig.yaml: no such file'),
         ({'map_fil': 'hall.yaml'}, 'launch argument map_fil: there is none; did you mean map_file'),
+        ({'landing_pad': 'H'}, 'landing_pad H: IDs'),
         ({'log_level': 'loud'}, 'log_level loud: not one of debug'),
         ({'rviz': 'maybe'}, 'rviz maybe: true or false'),
     ],
@@ -189,14 +202,14 @@ def test_a_crash_is_followed_by_another_start_and_refused_parameters_are_not(lau
 @pytest.mark.parametrize(
     ('file', 'parameters', 'remappings'),
     [
-        ('mavros', {'bridge_rate': 30.0}, MAVROS),
-        ('ardupilot', {'bridge_rate': 20.0}, MAVROS),
+        ('mavros', {'bridge_rate': 30.0, 'landing_target_frame': 'map'}, MAVROS),
+        ('ardupilot', {'bridge_rate': 20.0, 'landing_target_frame': 'body'}, MAVROS),
         ('px4', {'bridge_rate': 50.0, 'px4': True}, []),
     ],
 )
 def test_flight_controllers_get_their_output(launched, file, parameters, remappings):
     _, nodes = launched(f'{file}.launch.py')
-    known = {name: item for kind in PARAMETERS.values() for name, item, _ in config.parameters(kind)}
+    known = {name: item for kind in (PARAMETERS | OPTIONAL_NODES).values() for name, item, _ in config.parameters(kind)}
     for node in nodes:
         assert node.remappings == remappings
         assert node.parameters[1] == {'mode': 'localization', 'use_sim_time': False, **parameters}

@@ -26,6 +26,7 @@ _ARGUMENTS = {
     'params_file': ('', 'parameter file of the rig; default: the one of the package'),
     'map_file': ('', 'marker map; default: what the parameter file says'),
     'camera': ('', 'start thermal_source with this camera: /dev/video0, teax, a folder; default: another driver runs'),
+    'landing_pad': ('', 'start landing_target with these markers as the pad: 7, or 7,8,9; default: none'),
     'image_topic': ('thermal/image_raw', 'raw images of the camera'),
     'camera_info_topic': ('thermal/camera_info', 'calibration of the camera'),
     'imu_topic': ('imu/data', 'IMU, in the frame of the robot'),
@@ -79,7 +80,10 @@ def _actions(
         'ros_arguments': ['--log-level', _log_level(given['log_level'])],
         'output': 'screen',
     }
+    if given['landing_pad']:
+        overrides['landing_pad'] = _ids(given['landing_pad'])
     names = ['thermal_source', *NODES] if given['camera'] else list(NODES)
+    names += ['landing_target'] if given['landing_pad'] else []
     actions += [_node(name, settings) for name in names]
     if _is_true('rviz', given):
         actions.append(_rviz(given['namespace'], share))
@@ -114,6 +118,13 @@ def _unknown_arguments(context: LaunchContext) -> list[Any]:
             raise InputError(f'launch argument {name}: there is none; did you mean {close[0]}?')
         warnings.append(LogInfo(msg=f'launch argument {name}: {PACKAGE} has none; see --show-args'))
     return warnings
+
+
+def _ids(text: str) -> list[int]:
+    try:
+        return [int(marker_id) for marker_id in text.split(',')]
+    except ValueError:
+        raise InputError(f'landing_pad {text}: IDs of markers, as in 7,8,9') from None
 
 
 def _params_file(path: str, share: Path) -> str:

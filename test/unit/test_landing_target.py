@@ -1,0 +1,143 @@
+"""The landing pad as an autopilot gets it, through the node and through what mavros does with its message."""
+
+from geometry_msgs.msg import PoseStamped
+import numpy as np
+import pytest
+from support.ros_graph import ros_graph
+
+from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, so3_exp, transform
+from thermal_fiducial.core.mapping.landing_pad import from_mavros
+from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
+from thermal_fiducial.nodes.landing_target import LandingTarget
+from thermal_fiducial.ros import clouds, convert, qos
+from thermal_fiducial.ros.node import ERROR, OK, WARN
+
+pytestmark = pytest.mark.ros
+STAMP = 1_700_000_000_000_000_000
+#: A camera below the robot that looks down: its x to the right, its y backward.
+R_BODY_CAMERA = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+T_BODY_CAMERA = transform(R_BODY_CAMERA, [0.1, 0.02, -0.05])
+EXTRINSICS = {
+    'camera_position': T_BODY_CAMERA[:3, 3].tolist(),
+    'camera_orientation': quaternion_from_rotation(R_BODY_CAMERA).tolist(),
+}
+T_MAP_BODY = transform(so3_exp(np.array([0.05, -0.1, 0.7])), [3.0, -2.0, 2.5])
+#: Two markers that lie on the ground; their z is up, each turned by another angle.
+T_MAP_MARKERS = {
+    7: transform(so3_exp(np.array([0.0, 0.0, 0.3])), [3.2, -1.6, 0.0]),
+    8: transform(so3_exp(np.array([0.0, 0.0, -1.0])), [3.6, -1.6, 0.1]),
+}
+PAD = np.array([3.4, -1.6, 0.05])
+
+
+@pytest.fixture
+def graph():
+    with ros_graph() as graph:
+        graph.listen(PoseStamped, 'landing_target')
+        yield graph
+
+
+def marker_map(ids=(7, 8)):
+    rows = np.zeros(len(ids), MAP_DTYPE)
+    for row, marker_id in zip(rows, ids, strict=True):
+        T = T_MAP_MARKERS[marker_id]
+        row['id'], row['size'], row['trusted'] = marker_id, 0.3, 1
+        row['x'], row['y'], row['z'] = T[:3, 3]
+        row['qx'], row['qy'], row['qz'], row['qw'] = quaternion_from_rotation(T[:3, :3])
+    return clouds.cloud(rows, convert.header(STAMP, 'map'))
+
+
+def markers(*ids, stamp=STAMP):
+    rows = np.zeros(len(ids), MARKER_DTYPE)
+    for row, marker_id in zip(rows, ids, strict=True):
+        T_camera_marker = inverse(T_MAP_BODY @ T_BODY_CAMERA) @ T_MAP_MARKERS.get(marker_id, np.eye(4))
+        row['id'] = marker_id
+        row['x'], row['y'], row['z'] = T_camera_marker[:3, 3]
+        row['qx'], row['qy'], row['qz'], row['qw'] = quaternion_from_rotation(T_camera_marker[:3, :3])
+        for corner in range(4):
+            row[f'c{corner}uu'] = row[f'c{corner}vv'] = 0.01
+    return clouds.cloud(rows, convert.header(stamp, 'thermal_camera_optical'))
+
+
+def camera_pose(stamp=STAMP):
+    head = convert.header(stamp, 'map')
+    return convert.pose_with_covariance(T_MAP_BODY @ T_BODY_CAMERA, np.diag([1e-6] * 6), head)
+
+
+def mavros_ned(message):
+    """Position and attitude of the MAVLink message that mavros makes of it (plugin landing_target, frame_tf)."""
+    T = convert.transform_of(message.pose)
+    ned_enu = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    return ned_enu @ T[:3, 3], ned_enu @ T[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+
+
+def heard(graph, count=1):
+    graph.spin_until(lambda: len(graph.heard['landing_target']) >= count)
+    return graph.heard['landing_target']
+
+
+def test_ardupilot_gets_the_pad_in_forward_right_down(graph):
+    node = graph.add(LandingTarget, landing_pad=[7, 8], **EXTRINSICS)
+    graph.send('marker_map', marker_map(), profile=qos.LATCHED)
+    graph.send('markers', markers(8))
+    graph.send('camera_pose', camera_pose())
+    (message,) = heard(graph)
+    forward, left, up = inverse(T_MAP_BODY)[:3, :3] @ (PAD - T_MAP_BODY[:3, 3])
+    position, attitude = mavros_ned(message)
+    # 1e-6: poses of markers travel as float32
+    np.testing.assert_allclose(position, [forward, -left, -up], atol=1e-6)
+    frd = np.diag([1.0, -1.0, -1.0])
+    R_body_pad = T_MAP_BODY[:3, :3].T @ T_MAP_MARKERS[7][:3, :3]
+    np.testing.assert_allclose(attitude, frd @ R_body_pad @ frd, atol=1e-6)
+    assert position[2] > 2.0
+    assert message.header.frame_id == 'base_link_rfu'
+    assert convert.stamp_ns(message.header.stamp) == STAMP
+    received = np.array([[message.pose.position.x, message.pose.position.y, message.pose.position.z]])
+    np.testing.assert_allclose(from_mavros(received), [[forward, left, up]], atol=1e-6)
+    assert graph.diagnose(node)[:2] == (OK, 'ok')
+
+
+def test_px4_gets_it_in_the_map_that_its_odometry_is_in(graph):
+    graph.add(LandingTarget, landing_pad=[7, 8], landing_target_frame='map', **EXTRINSICS)
+    graph.send('marker_map', marker_map(), profile=qos.LATCHED)
+    graph.send('markers', markers(7, 8))
+    graph.send('camera_pose', camera_pose())
+    (message,) = heard(graph)
+    assert message.header.frame_id == 'map'
+    np.testing.assert_allclose(convert.transform_of(message.pose)[:3, 3], PAD, atol=1e-6)
+
+
+def test_it_is_silent_while_the_pad_is_not_in_view(graph):
+    node = graph.add(LandingTarget, landing_pad=[7], **EXTRINSICS)
+    graph.send('marker_map', marker_map(), profile=qos.LATCHED)
+    graph.send('markers', markers(8))
+    graph.send('camera_pose', camera_pose())
+    assert graph.diagnose(node)[:2] == (OK, 'the pad is not in view')
+    graph.send('markers', markers(7, stamp=STAMP + 1))
+    graph.send('camera_pose', camera_pose(), camera_pose(STAMP + 1))
+    assert convert.stamp_ns(heard(graph)[0].header.stamp) == STAMP + 1
+
+
+def test_a_pad_of_one_marker_needs_no_map(graph):
+    node = graph.add(LandingTarget, landing_pad=[7], **EXTRINSICS)
+    graph.send('markers', markers(7, 3))
+    (message,) = heard(graph)
+    expected = inverse(T_MAP_BODY)[:3, :3] @ (T_MAP_MARKERS[7][:3, 3] - T_MAP_BODY[:3, 3])
+    np.testing.assert_allclose(mavros_ned(message)[0], expected * [1.0, -1.0, -1.0], atol=1e-6)
+    assert graph.diagnose(node)[:2] == (OK, 'ok')
+
+
+@pytest.mark.parametrize('parameters', [{'landing_pad': [7, 8]}, {'landing_pad': [7], 'landing_target_frame': 'map'}])
+def test_what_cannot_be_told_without_the_map_is_said(graph, parameters):
+    node = graph.add(LandingTarget, **parameters, **EXTRINSICS)
+    graph.send('marker_map', marker_map([8]), profile=qos.LATCHED)
+    graph.send('markers', markers(7, 8))
+    graph.send('camera_pose', camera_pose())
+    assert graph.diagnose(node)[:2] == (WARN, 'the pad is not in the map')
+    assert not graph.heard['landing_target']
+
+
+def test_no_pad_is_a_fault(graph):
+    level, reason, _ = graph.diagnose(graph.add(LandingTarget))
+    assert level == ERROR
+    assert 'landing_pad' in reason

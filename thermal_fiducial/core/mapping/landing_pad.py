@@ -1,0 +1,38 @@
+"""Where a landing pad is: a marker of the map, or several that belong together."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from thermal_fiducial.core.geometry.se3 import transform
+from thermal_fiducial.core.types import FloatArray
+
+#: mavros turns east-north-up into north-east-down, (x, y, z) into (y, x, -z), whatever frame it then names. A robot's
+#: forward-left-up becomes forward-right-down by it when it is turned by a quarter first: right-forward-up.
+_T_RFU_FLU = transform([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.zeros(3))
+
+
+def pad_in_map(T_map_markers: Mapping[int, FloatArray], pad_ids: Sequence[int]) -> FloatArray | None:
+    """T_map_pad (4, 4): in the middle between the pad's markers, with the axes of the first; None if one is unknown.
+
+    Parameters
+    ----------
+    T_map_markers : ID to T_map_marker (4, 4) of the map
+    pad_ids : markers of the pad
+    """
+    poses = [T_map_markers[marker_id] for marker_id in pad_ids if marker_id in T_map_markers]
+    if not poses or len(poses) < len(pad_ids):
+        return None
+    T_map_pad = poses[0].copy()
+    T_map_pad[:3, 3] = np.mean([T[:3, 3] for T in poses], axis=0)
+    return T_map_pad
+
+
+def for_mavros(T_body_pad: FloatArray) -> FloatArray:
+    """T_rfu_pad (4, 4), which mavros sends on as the pad in the robot's forward-right-down frame (BODY_FRD)."""
+    return np.asarray(_T_RFU_FLU @ T_body_pad)
+
+
+def from_mavros(positions: FloatArray) -> FloatArray:
+    """Positions (N, 3) in ``base_link`` [m] of those that :func:`for_mavros` made."""
+    return positions @ _T_RFU_FLU[:3, :3]

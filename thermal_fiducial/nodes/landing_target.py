@@ -1,0 +1,97 @@
+"""Node ``landing_target``: where the landing pad is, for an autopilot behind mavros."""
+
+from collections import OrderedDict
+import sys
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from sensor_msgs.msg import PointCloud2
+
+from thermal_fiducial.config import LandingTargetConfig
+from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
+from thermal_fiducial.core.mapping.landing_pad import for_mavros, pad_in_map
+from thermal_fiducial.core.mapping.map_rows import marker_poses, usable
+from thermal_fiducial.core.measurements import Markers
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.ros import clouds, convert, qos
+from thermal_fiducial.ros.node import OK, StageNode, WARN
+from thermal_fiducial.ros.run import run
+
+#: Frames that may wait for their pose.
+_WAITING = 10
+
+
+class LandingTarget(StageNode[LandingTargetConfig]):
+    """Publishes the pad with the stamp of each frame that shows one of its markers."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__('landing_target', LandingTargetConfig, **kwargs)
+        config = self.config
+        if not config.landing_pad:
+            self.fault('parameter landing_pad: name the markers of the pad')
+        self._T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
+        self._T_map_pad: FloatArray | None = None
+        #: stamps of frames that show the pad, whose pose is still to come
+        self._frames: OrderedDict[int, None] = OrderedDict()
+        self._in_view = False
+        self._target = self.advertise(PoseStamped, 'landing_target')
+        self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT)
+        self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
+        self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
+
+    def _on_map(self, message: PointCloud2) -> None:
+        poses = {marker_id: T_map_marker for marker_id, (T_map_marker, _) in clouds.map_poses(message).items()}
+        self._T_map_pad = pad_in_map(poses, self.config.landing_pad)
+
+    def _on_markers(self, message: PointCloud2) -> None:
+        stamp, rows = convert.stamp_ns(message.header.stamp), usable(clouds.markers(message))
+        rows = rows[[int(marker_id) in self.config.landing_pad for marker_id in rows['id']]]
+        self._in_view = len(rows) > 0
+        if not self._in_view:
+            return
+        if self._T_map_pad is not None:
+            self._frames[stamp] = None
+            if len(self._frames) > _WAITING:
+                self._frames.popitem(last=False)
+        elif self._needs_no_map:
+            self._send_detected(stamp, rows)
+
+    @property
+    def _needs_no_map(self) -> bool:
+        """Whether the pad is one marker, wanted in the body: its own detection says where it is."""
+        return len(self.config.landing_pad) == 1 and self.config.landing_target_frame == 'body'
+
+    def _send_detected(self, stamp: int, rows: Markers) -> None:
+        (T_camera_pad,) = marker_poses(rows, '')
+        self._send_in_body(stamp, self._T_body_camera @ T_camera_pad)
+
+    def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
+        pose = convert.camera_pose(message)
+        if self._T_map_pad is None or pose.stamp_ns not in self._frames:
+            return
+        del self._frames[pose.stamp_ns]
+        if self.config.landing_target_frame == 'body':
+            self._send_in_body(pose.stamp_ns, self._T_body_camera @ inverse(pose.T_map_camera) @ self._T_map_pad)
+        else:
+            self._send(pose.stamp_ns, self.config.map_frame, self._T_map_pad)
+
+    def _send_in_body(self, stamp: int, T_body_pad: FloatArray) -> None:
+        self._send(stamp, f'{self.config.base_frame}_rfu', for_mavros(T_body_pad))
+
+    def _send(self, stamp: int, frame: str, T_frame_pad: FloatArray) -> None:
+        self._target.send(PoseStamped(header=convert.header(stamp, frame), pose=convert.pose(T_frame_pad)))
+
+    def state(self) -> tuple[bytes, str]:
+        """Whether the pad is known and in view."""
+        if self._T_map_pad is None and not self._needs_no_map:
+            return WARN, 'the pad is not in the map'
+        return OK, 'ok' if self._in_view else 'the pad is not in view'
+
+
+def main() -> int:
+    """Run the node."""
+    return run(LandingTarget)
+
+
+if __name__ == '__main__':
+    sys.exit(main())
