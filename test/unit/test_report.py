@@ -12,8 +12,8 @@ import yaml
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.report import evaluate_run, write_report
 from thermal_fiducial.report.evaluation import evaluate
+from thermal_fiducial.report.page import evaluate_run, write_report
 from thermal_fiducial.report.plots import euler_deg, near, svg, thinned, visible_spans
 from thermal_fiducial.report.run_folder import read_run
 from thermal_fiducial.report.tables import cards, number, tables

@@ -11,7 +11,7 @@ from typing import Any
 from thermal_fiducial.cli.evaluate import print_tables
 from thermal_fiducial.cli.replay import progress_bar
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.report import evaluate_run, Evaluation, write_page
+from thermal_fiducial.report.page import evaluate_run, Evaluation, write_page
 from thermal_fiducial.report.tables import tables
 
 SCENARIO = 'fog'

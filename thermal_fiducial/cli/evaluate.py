@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.report import evaluate_run, write_page
+from thermal_fiducial.report.page import evaluate_run, write_page
 from thermal_fiducial.report.tables import Table, tables
 
 

@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         f'{summary["markers_in_map"]} markers in the map; {summary["duration_s"]:.1f} s of bag in {seconds:.1f} s'
     )
     if not args.no_report:
-        importlib.import_module('thermal_fiducial.report').write_report(args.out, truth=None)
+        importlib.import_module('thermal_fiducial.report.page').write_report(args.out, truth=None)
     errors = _internal_errors(summary['diagnostics'])
     for error in errors:
         print(error, file=sys.stderr)
