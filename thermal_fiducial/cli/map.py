@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Callable
 import csv
 from pathlib import Path
+import re
 from typing import TypeAlias
 
 import numpy as np
@@ -12,13 +13,18 @@ from rich.table import Table
 
 from thermal_fiducial.cli import map_cloud, map_sources
 from thermal_fiducial.config import size_overrides
+from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping import map_editing
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import map_history
-from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.files.atomic import locked
+from thermal_fiducial.files.dictionary import not_in_dictionary
+from thermal_fiducial.files.map_format import upgraded
+from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.reading import read_text
 
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 
@@ -39,7 +45,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action.set_defaults(fixed=fixed)
     _add_editing(commands)
     _command(commands, 'history', 'earlier versions of a map', _history)
-    _command(commands, 'undo', 'put the latest earlier version back', _undo)
+    _command(commands, 'undo', 'put the latest earlier version back, or take up a map that was never saved', _undo)
+    _command(commands, 'upgrade', 'rewrite a map from before 0.2, whose version counted its changes', _upgrade)
     map_sources.add_build(commands.add_parser('build', help='a map from a folder of photos in any order'))
     map_sources.add_refine(commands.add_parser('refine', help='adjust a map to the detections of a run'))
     map_cloud.add_align(commands.add_parser('align', help='hold a map against a point cloud of the place'))
@@ -85,8 +92,18 @@ def _load(args: argparse.Namespace, path: Path | None = None) -> MarkerMap:
     return load_map(path or args.map, args.marker_size, size_overrides(tuple(args.marker_size_override)))
 
 
-def _save(args: argparse.Namespace, edited: MarkerMap, action: str) -> int:
-    map_history.save_with_history(args.map, edited, action)
+def _edit(args: argparse.Namespace, action: str, change: Callable[[MarkerMap], MarkerMap]) -> int:
+    """Change the map where nobody else can do so meanwhile."""
+    read = map_history.digest(args.map)
+    edited = change(_load(args))
+    while True:
+        try:
+            map_history.save_with_history(args.map, edited, action, read)
+            break
+        except map_history.ChangedMeanwhileError:
+            # An edit says what to do, not what comes out: on top of what another one has made it is as good.
+            read = map_history.digest(args.map)
+            edited = change(_load(args))
     print(f'{args.map}: {action}; revision {edited.revision}, {len(edited.markers)} markers')
     return 0
 
@@ -128,7 +145,10 @@ def _facing(normal: FloatArray) -> str:
 
 
 def _check(args: argparse.Namespace) -> int:
-    found = map_editing.problems(_load(args))
+    marker_map = _load(args)
+    found = map_editing.problems(marker_map)
+    for key in not_in_dictionary(marker_map.markers, marker_map.dictionary, args.map.parent):
+        found.append(f'marker {key}: not in {marker_map.dictionary}')
     for line in found:
         print(line)
     print(f'{args.map}: {len(found)} doubts' if found else f'{args.map}: sound')
@@ -137,84 +157,117 @@ def _check(args: argparse.Namespace) -> int:
 
 def _fix(args: argparse.Namespace) -> int:
     names = ' '.join(str(key) for key in args.ids)
-    return _save(
-        args,
-        map_editing.set_fixed(_load(args), args.ids, args.fixed),
-        f'{"fix" if args.fixed else "unfix"} {names}',
-    )
+    action = f'{"fix" if args.fixed else "unfix"} {names}'
+    return _edit(args, action, lambda marker_map: map_editing.set_fixed(marker_map, args.ids, args.fixed))
 
 
 def _move(args: argparse.Namespace) -> int:
-    marker_map = _load(args)
+    if not np.all(np.isfinite(args.position)):
+        raise InputError('--position is not three finite numbers')
+    if args.orientation and not 0.9 < float(np.linalg.norm(args.orientation)) < 1.1:
+        raise InputError('--orientation is no unit quaternion x y z w')
+    for name, sigma in (('--sigma', args.sigma), ('--sigma-deg', args.sigma_deg)):
+        if not 0.0 <= sigma < np.inf:
+            raise InputError(f'{name} {sigma:g} is no standard deviation')
+    covariance = np.diag([args.sigma**2 / 3.0] * 3 + [np.deg2rad(args.sigma_deg) ** 2 / 3.0] * 3)
+    return _edit(args, f'move {args.id}', lambda marker_map: _moved(args, marker_map, covariance))
+
+
+def _moved(args: argparse.Namespace, marker_map: MarkerMap, covariance: FloatArray) -> MarkerMap:
     if args.id not in marker_map.markers:
         raise InputError(f'{args.map}: marker {args.id} is not in the map')
     T = marker_map.markers[args.id].T_map_marker.copy()
     if args.orientation:
-        if not 0.9 < float(np.linalg.norm(args.orientation)) < 1.1:
-            raise InputError('--orientation is no unit quaternion x y z w')
         T = transform_from_quaternion(args.position, args.orientation)
     T[:3, 3] = args.position
-    covariance = np.diag([args.sigma**2 / 3.0] * 3 + [np.deg2rad(args.sigma_deg) ** 2 / 3.0] * 3)
-    return _save(args, map_editing.move(marker_map, args.id, T, covariance), f'move {args.id}')
+    return map_editing.move(marker_map, args.id, T, covariance)
 
 
 def _rename(args: argparse.Namespace) -> int:
-    return _save(args, map_editing.rename(_load(args), args.old, args.new), f'rename {args.old} to {args.new}')
+    def renamed(marker_map: MarkerMap) -> MarkerMap:
+        foreign = not_in_dictionary([args.new], marker_map.dictionary, args.map.parent)
+        if foreign or args.new < 0:
+            raise InputError(f'{args.map}: there is no marker {args.new} in {marker_map.dictionary}')
+        return map_editing.rename(marker_map, args.old, args.new)
+
+    return _edit(args, f'rename {args.old} to {args.new}', renamed)
 
 
 def _delete(args: argparse.Namespace) -> int:
     names = ' '.join(str(key) for key in args.ids)
-    return _save(args, map_editing.delete(_load(args), args.ids), f'delete {names}')
+    return _edit(args, f'delete {names}', lambda marker_map: map_editing.delete(marker_map, args.ids))
 
 
 def _merge(args: argparse.Namespace) -> int:
-    merged, alignment = map_editing.merge(_load(args), _load(args, args.other))
+    other = _load(args, args.other)
+    _, alignment = map_editing.merge(_load(args), other)
     for key, residual in alignment.residuals_m.items():
         note = '  left out: it disagrees with the others' if key in alignment.outliers else ''
         print(f'marker {key}: {1e3 * residual:.1f} mm{note}')
     if args.out:
-        save_map(args.out, merged)
+        merged, _ = map_editing.merge(_load(args), other)
+        map_history.save_with_history(args.out, merged, f'merge {args.map.name} and {args.other.name}')
         print(f'{args.out}: {len(merged.markers)} markers')
         return 0
-    return _save(args, merged, f'merge {args.other.name}')
+    return _edit(args, f'merge {args.other.name}', lambda marker_map: map_editing.merge(marker_map, other)[0])
 
 
 def _anchor(args: argparse.Namespace) -> int:
     surveyed = _survey(args.survey)
-    anchored, distances = map_editing.anchor(_load(args), surveyed)
+    _, distances = map_editing.anchor(_load(args), surveyed)
     for key, distance in distances.items():
         print(f'marker {key}: {1e3 * distance:.1f} mm from its surveyed place')
-    if args.fix:
-        anchored = map_editing.set_fixed(anchored, distances, True)
-    return _save(args, anchored, f'anchor to {args.survey.name}')
+
+    def anchored(marker_map: MarkerMap) -> MarkerMap:
+        moved, used = map_editing.anchor(marker_map, surveyed)
+        return map_editing.set_fixed(moved, used, True) if args.fix else moved
+
+    return _edit(args, f'anchor to {args.survey.name}', anchored)
 
 
 def _survey(path: Path) -> dict[int, FloatArray]:
     surveyed: dict[int, FloatArray] = {}
-    try:
-        with path.open(newline='', encoding='utf-8') as file:
-            for number, row in enumerate(csv.reader(file), start=1):
-                if not row or row[0].strip().lower() in ('id', '') or row[0].startswith('#'):
-                    continue
-                try:
-                    surveyed[int(row[0])] = np.array([float(value) for value in row[1:4]]).reshape(3)
-                except ValueError:
-                    raise InputError(f'{path}: line {number} is not "id,x,y,z"') from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'{path}: cannot read the survey') from error
+    for number, row in enumerate(csv.reader(read_text(path).splitlines()), start=1):
+        if not row or row[0].strip().lower() in ('id', '') or row[0].startswith('#'):
+            continue
+        try:
+            if not re.fullmatch(r'\s*\d{1,9}\s*', row[0]):
+                raise ValueError
+            centre = np.array([float(value) for value in row[1:4]]).reshape(3)
+        except ValueError:
+            raise InputError(f'{path}: line {number} is not "id,x,y,z"') from None
+        if not np.all(np.abs(centre) < LARGEST_COORDINATE):
+            raise InputError(f'{path}: line {number} is not a place [m]')
+        surveyed[int(row[0])] = centre
     return surveyed
 
 
 def _history(args: argparse.Namespace) -> int:
-    earlier = map_history.entries(args.map)
-    for entry in earlier:
-        print(f'{entry.number:6d}  revision {entry.revision}, {entry.markers} markers, before: {entry.action}')
+    for entry in map_history.entries(args.map):
+        what = entry.problem or f'revision {entry.revision}, {entry.markers} markers, before: {entry.action}'
+        print(f'{entry.number:6d}  {what}')
     current = _load(args)
     print(f'   now  revision {current.revision}, {len(current.markers)} markers')
+    copy = map_history.autosaved(args.map)
+    if copy is not None:
+        print(f'autosaved  revision {copy.revision}, {copy.markers} markers: map undo takes it up')
     return 0
 
 
 def _undo(args: argparse.Namespace) -> int:
+    copy = map_history.autosaved(args.map)
+    if copy is not None:
+        map_history.take_up_autosave(args.map)
+        print(f'{args.map}: the autosaved map is taken up; revision {copy.revision}, {copy.markers} markers')
+        return 0
     entry = map_history.undo(args.map)
     print(f'{args.map}: undone: {entry.action}; revision {entry.revision}, {entry.markers} markers')
+    return 0
+
+
+def _upgrade(args: argparse.Namespace) -> int:
+    text = upgraded(str(args.map))
+    with locked(args.map):
+        map_history.replace(args.map, text, 'upgrade')
+    print(f'{args.map}: upgraded; revision {_load(args).revision}')
     return 0

@@ -57,24 +57,42 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> cv2.aruco.Dictionar
 def other_patterns(markers: Iterable[int], of: str, read_as: str, folder: Path = Path()) -> str:
     """In words, whether a map's ``markers`` of dictionary ``of`` may be others in ``read_as``; empty: they are not.
 
-    A map comes from anybody: what it calls its dictionary is a name, or a file in its own ``folder``; nothing else is
-    opened.
+    A map comes from anybody: what it calls its dictionary is a name, or a file in its own ``folder``.
     """
     if Path(of).name == Path(read_as).name:
         return ''
     differ = f'the map is of {of}, looked for is {read_as}'
-    beside = folder / of
-    if not of.startswith('DICT_') and not (PACKAGED / f'{of}.yaml').is_file():
-        if of != Path(of).name:
-            return f'{differ}: not opened, as it is neither a name nor a file beside the map'
-        of = str(beside)
     try:
-        theirs, ours = marker_bits(load_dictionary(of)), marker_bits(load_dictionary(read_as))
+        theirs, ours = marker_bits(load_dictionary(_of_map(of, folder))), marker_bits(load_dictionary(read_as))
     except InputError as error:
         return f'{differ}: {error}'
     both = min(len(theirs), len(ours))
     other = [m for m in sorted(markers) if m >= both or not np.array_equal(theirs[m], ours[m])]
     return f'{differ}: marker {other[0]} is another one there' if other else ''
+
+
+def not_in_dictionary(markers: Iterable[int], name: str, folder: Path) -> list[int]:
+    """Those of ``markers`` that the dictionary of a map in ``folder`` does not have; none where it can't be opened."""
+    try:
+        known = len(load_dictionary(_of_map(name, folder)).bytesList)
+    except InputError:
+        return []
+    return [marker for marker in sorted(markers) if marker >= known]
+
+
+def _of_map(name: str, folder: Path) -> str:
+    """What a map in ``folder`` calls its dictionary: a name, or a file beside it; nothing else is opened.
+
+    Raises
+    ------
+    InputError
+        Neither.
+    """
+    if name.startswith('DICT_') or (PACKAGED / f'{Path(name).name}.yaml').is_file():
+        return Path(name).name
+    if name != Path(name).name:
+        raise InputError(f'{name} is not opened, as it is neither a name nor a file beside the map')
+    return str(folder / name)
 
 
 def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: cv2.aruco.Dictionary) -> None:

@@ -28,7 +28,7 @@ _NORM_TOLERANCE = 0.01
 _ROUNDING = 1e-6
 _MOST = 2**63 - 1
 _LARGEST_ID = 2**31 - 1
-_LARGEST_M = 1e6
+_LARGEST_M = 1e5
 _FIELDS = {'format', 'version', 'revision', 'frame_id', 'dictionary', 'markers'}
 _MARKER_FIELDS = {
     'id', 'size', 'fixed', 'position', 'orientation', 'covariance', 'reprojection_error_px', 'observations',

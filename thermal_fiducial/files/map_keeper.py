@@ -96,7 +96,7 @@ class MapKeeper:
         InputError
             Nothing can be written there.
         """
-        self._await_writer()
+        self.finish()
         try:
             map_history.save_with_history(self.path, marker_map, 'save', self._read)
         except InputError:
@@ -153,6 +153,7 @@ class MapKeeper:
                 map_history.put_autosave_aside(self.path)
         self._own_autosave = False
 
-    def _await_writer(self) -> None:
+    def finish(self) -> None:
+        """Wait for what is being written."""
         if self._writer is not None:
             self._writer.join()

@@ -10,11 +10,13 @@ from typing import Any
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, try_shutdown
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.node import StageNode
 from thermal_fiducial.ros.promptness import keep_for_good, take_priority
+from thermal_fiducial.ros.stopping import StopSignals
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
 #: Fast DDS 2 (Jazzy) reads the first, Fast DDS 3 the second.
@@ -39,7 +41,12 @@ def make_executor(context: Context | None = None) -> Any:
     return EventsExecutor(context=context)
 
 
-def initialise(args: Sequence[str] | None, context: Context | None = None, domain_id: int | None = None) -> None:
+def initialise(
+    args: Sequence[str] | None,
+    context: Context | None = None,
+    domain_id: int | None = None,
+    signals: SignalHandlerOptions | None = None,
+) -> None:
     """``rclpy.init`` whose refusal of arguments or of a parameter file is an :class:`InputError`.
 
     Raises
@@ -49,7 +56,12 @@ def initialise(args: Sequence[str] | None, context: Context | None = None, domai
     """
     use_transport_profile()
     try:
-        rclpy.init(args=None if args is None else list(args), context=context, domain_id=domain_id)
+        rclpy.init(
+            args=None if args is None else list(args),
+            context=context,
+            domain_id=domain_id,
+            signal_handler_options=signals,
+        )
     except RuntimeError as error:
         reason = str(error).splitlines()[0].removeprefix('failed to initialize rcl: ').partition(', at /')[0]
         raise InputError(reason) from None
@@ -67,34 +79,35 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     -------
     Exit status: 0 stopped, 2 unusable arguments or parameters (one line says which).
     """
+    stop = StopSignals(try_shutdown)
     # What must be saved is saved first, before anything is taken down that may fail or hang.
     with ExitStack() as ending:
         ending.callback(try_shutdown)
         try:
-            initialise(args)
+            initialise(args, signals=SignalHandlerOptions.NO)
             node = make_node()
             ending.callback(node.destroy_node)
             executor = make_executor()
             ending.callback(executor.shutdown)
             ending.callback(node.close)
             executor.add_node(node)
-            _spin(node, executor)
+            _spin(node, executor, stop)
         except InputError as error:
             print(f'{Path(sys.argv[0]).name}: {error}', file=sys.stderr)
             return 2
-        except (KeyboardInterrupt, ExternalShutdownException):
+        except ExternalShutdownException:
             pass
         except Exception:
             # Told to stop while the node is being made, rcl refuses the rest of it: not an error of the node.
-            if ok():
+            if ok() and not stop.asked:
                 raise
     return 0
 
 
-def _spin(node: StageNode[Any], executor: Any) -> None:
+def _spin(node: StageNode[Any], executor: Any, stop: StopSignals) -> None:
     keep_for_good()
     if node.realtime_priority and not take_priority(node.realtime_priority):
         node.get_logger().info('no real-time priority: this user may not')
     # EventsExecutor.spin() and spin_once(None) fire nothing on some builds.
-    while ok():
+    while ok() and not stop.asked:
         executor.spin_once(timeout_sec=1.0)

@@ -1,0 +1,204 @@
+"""No map is lost: signals during shutdown, kills, other programs at the same file, files that cannot be replaced."""
+
+from concurrent.futures import ThreadPoolExecutor
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from support.shutdowns import grown, whole
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files import map_history
+from thermal_fiducial.files.map_keeper import MapKeeper
+from thermal_fiducial.files.marker_map import load_map, save_map
+
+ROOT = Path(__file__).resolve().parents[2]
+AUTOSAVE_S = 30.0
+
+
+@pytest.fixture
+def path(tmp_path):
+    folder = tmp_path / 'maps'
+    folder.mkdir()
+    save_map(folder / 'hall.yaml', grown(1))
+    return folder / 'hall.yaml'
+
+
+def keeper_of(path):
+    keeper = MapKeeper(path, 0.3, {})
+    keeper.load()
+    keeper.unsaved = True
+    return keeper
+
+
+def autosaved(keeper, marker_map):
+    """Leave a copy as a timer would, and wait for the disk."""
+    keeper.unsaved = True
+    keeper.autosave(marker_map)
+    keeper.finish()
+
+
+@pytest.mark.ros
+@pytest.mark.slow
+@pytest.mark.parametrize(('way', 'count'), [('signals', 20), ('kill', 20)])
+def test_no_way_to_end_a_mapper_loses_its_map(tmp_path, way, count):
+    """Two or three of SIGINT, SIGTERM and SIGHUP 1 to 400 ms apart; SIGKILL at any instant."""
+    command = [sys.executable, '-m', 'support.shutdowns', str(tmp_path), str(count), '7', way]
+    environment = os.environ | {'PYTHONPATH': f'{ROOT}{os.pathsep}{ROOT / "test"}'}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600, check=False)
+    assert (done.returncode, done.stdout) == (0, ''), done.stderr[-2000:]
+
+
+def test_an_autosave_is_named_offered_and_taken_up(path, capsys):
+    autosaved(keeper_of(path), grown(2))
+    # The mapper is killed here, and started again the day after: the map file counts until somebody says otherwise.
+    file = map_history.autosave_file(path)
+    later = MapKeeper(path, 0.3, {})
+    os.utime(file, (file.stat().st_atime, path.stat().st_mtime + 1.0))
+    recovered, note = later.recover(0.0)
+    assert recovered is None
+    assert str(file) in note
+    assert 'map undo' in note
+    assert main(['map', 'history', str(path)]) == 0
+    assert 'autosaved  revision 2' in capsys.readouterr().out
+    assert main(['map', 'undo', str(path)]) == 0
+    assert whole(path) == 2
+    assert not file.exists()
+    assert main(['map', 'undo', str(path)]) == 0
+    assert whole(path) == 1
+
+
+def test_a_mapper_that_crashed_goes_on_where_it_was(path):
+    autosaved(keeper_of(path), grown(2))
+    restarted = MapKeeper(path, 0.3, {})
+    restarted.load()
+    recovered, note = restarted.recover(AUTOSAVE_S)
+    assert recovered.revision == 2
+    assert 'goes on with' in note
+    assert restarted.save(grown(3)) == path
+    assert not map_history.autosave_file(path).exists()
+
+
+def test_an_autosave_that_nobody_took_up_is_kept_when_the_next_mapper_leaves_its_own(path):
+    autosaved(keeper_of(path), grown(2))
+    autosaved(keeper_of(path), grown(3))
+    assert whole(map_history.autosave_file(path)) == 3
+    (entry,) = map_history.entries(path)
+    assert (entry.action, entry.revision) == (map_history.PUT_ASIDE, 2)
+
+
+def test_nothing_is_autosaved_when_nothing_was_learned(path):
+    keeper = keeper_of(path)
+    keeper.unsaved = False
+    keeper.autosave(grown(2))
+    keeper.finish()
+    assert not map_history.autosave_file(path).exists()
+
+
+def test_a_file_that_another_program_has_changed_is_not_overwritten(path):
+    keeper = keeper_of(path)
+    assert main(['map', 'move', str(path), '3', '--position', '1', '2', '3']) == 0
+    edited = path.read_bytes()
+    beside = keeper.save(grown(2))
+    assert beside == path.with_name('hall.new.yaml')
+    assert (path.read_bytes(), whole(beside)) == (edited, 2)
+    keeper.load()
+    assert keeper.save(grown(5)) == path
+
+
+def test_a_file_that_cannot_be_replaced_is_saved_beside(path, monkeypatch):
+    keeper = keeper_of(path)
+    path.unlink()
+    path.mkdir()
+    (path / 'x').touch()
+    assert whole(keeper.save(grown(2))) == 2
+
+
+def test_two_writers_lose_no_edit(path):
+    """Forty edits each, in processes of their own."""
+    program = (
+        'import sys\nfrom thermal_fiducial.cli.main import main\n'
+        'for i in range(int(sys.argv[2]), 60, 2):\n'
+        "    assert main(['map', 'move', sys.argv[1], str(i), '--position', str(i), '7', '7']) == 0\n"
+    )
+
+    def write(first):
+        arguments = [sys.executable, '-c', program, str(path), str(first)]
+        return subprocess.run(arguments, capture_output=True, text=True, timeout=300, check=False)
+
+    with ThreadPoolExecutor(2) as pool:
+        done = list(pool.map(write, (0, 1)))
+    assert [each.returncode for each in done] == [0, 0], done[0].stderr + done[1].stderr
+    found = load_map(path)
+    assert found.revision == 61
+    for i, marker in found.markers.items():
+        np.testing.assert_allclose(marker.T_map_marker[:3, 3], [i, 7.0, 7.0])
+
+
+def test_undo_survives_broken_entries_and_strange_names(path):
+    save = map_history.save_with_history
+    for revision in (2, 3, 4):
+        save(path, grown(revision), f'make {revision}')
+    folder = map_history.history_folder(path)
+    (folder / '000001.yaml').write_bytes(b'\xff\xfe')
+    (folder / '000003.yaml').write_text('not: [a map')
+    (folder / '9a.yaml').write_text('what is this')
+    (path.parent / '.hall.yaml.abc.tmp').write_text('left by a writer that was killed')
+    assert [bool(entry.problem) for entry in map_history.entries(path)] == [True, False, True]
+    assert map_history.undo(path).revision == 2
+    assert whole(path) == 2
+    with pytest.raises(InputError, match='no earlier version'):
+        map_history.undo(path)
+    save(path, grown(5), 'make 5')
+    assert sorted(file.name for file in path.parent.iterdir()) == ['hall.yaml', 'hall.yaml.history']
+
+
+def test_a_map_that_has_not_changed_makes_no_history(path):
+    for _ in range(3):
+        map_history.save_with_history(path, grown(1), 'save')
+    assert map_history.entries(path) == []
+
+
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        ['move', '0', '--position', 'nan', '0', '0'],
+        ['move', '0', '--position', 'inf', '0', '0'],
+        ['move', '0', '--position', '1e300', '0', '0'],
+        ['move', '0', '--position', '0', '0', '0', '--sigma', '-1'],
+        ['move', '0', '--position', '0', '0', '0', '--sigma-deg', 'nan'],
+        ['move', '0', '--position', '0', '0', '0', '--orientation', 'nan', '0', '0', '1'],
+        ['rename', '2', '-3'],
+        ['rename', '2', '50'],
+        ['rename', '2', str(2**70)],
+    ],
+)
+def test_an_edit_that_could_not_be_read_back_is_refused(path, capsys, arguments):
+    before = path.read_bytes()
+    try:
+        status = main(['map', arguments[0], str(path), *arguments[1:]])
+    except SystemExit as error:  # argparse's own refusal
+        status = error.code
+    assert status == 2
+    assert path.read_bytes() == before
+    assert 'Traceback' not in capsys.readouterr().err
+
+
+def test_an_old_map_is_upgraded(path, capsys):
+    text = path.read_text()
+    path.write_text(text.replace('version: 1\nrevision: 1', 'version: 12'))
+    assert main(['map', 'show', str(path)]) == 2
+    assert 'map upgrade' in capsys.readouterr().err
+    assert main(['map', 'upgrade', str(path)]) == 0
+    assert load_map(path).revision == 12
+
+
+def test_the_check_names_markers_that_the_dictionary_has_not(path, capsys):
+    save_map(path, MarkerMap({77: MapMarker(77, 0.3, True, np.eye(4))}))
+    assert main(['map', 'check', str(path)]) == 1
+    assert 'marker 77: not in DICT_4X4_50' in capsys.readouterr().out
