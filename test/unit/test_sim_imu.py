@@ -1,8 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thermal_fiducial.sim.camera import plan, simulate_imu
-from thermal_fiducial.sim.imu import ImuModel, ImuNoise
+from thermal_fiducial.sim.imu import Delivery, ImuModel, ImuNoise
 from thermal_fiducial.sim.scenario import SCENARIOS
 from thermal_fiducial.sim.trajectory import GRAVITY
 
@@ -77,3 +79,52 @@ def test_stamps_and_seeds():
     np.testing.assert_array_equal(first.angular_velocity, again.angular_velocity)
     assert np.any(first.angular_velocity != other.angular_velocity)
     assert plan('wall', 12.0, 1).imu_stamps()[1][0] == first.stamps_ns[0]
+
+
+# --- errors beside the noise --------------------------------------------------------------------------
+
+
+def recorded(model, seed=3):
+    """Readings of a silent but otherwise faulty IMU, and what is true, in a flight that turns."""
+    t = np.arange(0.0, 20.0, 1 / model.rate)
+    path = SCENARIOS['fast'].trajectory(20.0, 0)
+    stamps = np.round(t * 1e9).astype(np.int64)
+    return t, model.sample(path, t, stamps, seed), replace(SILENT, rate=model.rate).sample(path, t, stamps, seed)
+
+
+def test_axes_and_g_sensitivity_are_matrices_on_what_is_true():
+    faulty = replace(SILENT, gyroscope_axes=0.01, accelerometer_axes=0.02, g_sensitivity=1e-3)
+    _, readings, truth = recorded(faulty)
+    inputs = np.hstack([truth.angular_velocity, truth.linear_acceleration])
+    outputs = np.hstack([readings.angular_velocity, readings.linear_acceleration])
+    matrix = np.linalg.lstsq(inputs, outputs, rcond=None)[0].T - np.eye(6)
+    # Nothing but three matrices of nine draws each: their rms scatters by a quarter, seldom by half.
+    for block, deviation in ((matrix[:3, :3], 0.01), (matrix[3:, 3:], 0.02), (matrix[:3, 3:], 1e-3)):
+        assert 0.5 * deviation < np.sqrt(np.mean(block**2)) < 1.5 * deviation
+    np.testing.assert_allclose(matrix[3:, :3], 0.0, atol=1e-10)
+
+
+def test_an_instability_has_its_deviation_and_its_time():
+    model = replace(SILENT, gyroscope_instability=1e-3, accelerometer_instability=0.05, instability_time=0.2)
+    _, readings, truth = recorded(model)
+    wander = readings.linear_acceleration - truth.linear_acceleration
+    np.testing.assert_allclose(wander, readings.accelerometer_bias, atol=1e-12)
+    # 20 s are 50 independent stretches of each of three axes: its variance is known to a tenth.
+    assert 0.8 * 0.05 < np.std(wander) < 1.2 * 0.05
+    steps = round(0.2 * model.rate)
+    correlation = np.mean(wander[steps:] * wander[:-steps]) / np.mean(wander**2)
+    assert 0.2 < correlation < 0.55  # e^-1, by as many stretches
+
+
+def test_a_driver_that_reads_now_and_then():
+    model = replace(SILENT, rate=80.0, delivery=Delivery(gaps=((4.0, 0.8),), steps_back=(6.0,)))
+    t, readings, truth = recorded(model)
+    steps = np.diff(readings.stamps_ns) * 1e-9
+    assert np.sum(steps < 0.0) == 1
+    np.testing.assert_allclose(steps[np.argmin(steps)], -1e-3, atol=1e-9)
+    assert 0.8 < steps.max() < 0.9
+    bursts = steps[(steps > 0.0) & (steps < 0.4)]
+    assert set(np.round(bursts, 5)) <= {0.00013, 0.03287, 0.033, 0.03274, 0.034, 0.03387}
+    # What was sampled between two readings of the driver comes with the second, none of it changed.
+    lost = (t % 10.0 >= 4.0) & (t % 10.0 < 4.8)
+    np.testing.assert_array_equal(readings.angular_velocity, truth.angular_velocity[~lost])

@@ -2,12 +2,14 @@
 
 import argparse
 from dataclasses import replace
+from functools import partial
 import os
 from pathlib import Path
 
 from rich.console import Console
 from rich.progress import Progress, TimeElapsedColumn
 
+from thermal_fiducial.cli.simulate_corners import write_corner_flight
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import STORAGES
 from thermal_fiducial.sim.camera import FlightPlan, plan
@@ -65,7 +67,11 @@ def run(args: argparse.Namespace) -> int:
     console = Console(stderr=True)
     with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console) as progress:
         task = progress.add_task(f'{scenario.name}, {flight.seconds:g} s', total=flight.frame_count)
-        write_flight(args.out, flight, args.storage, args.workers, lambda n: progress.advance(task, n))
+        advance = partial(progress.advance, task)
+        if scenario.corner_noise is None:
+            write_flight(args.out, flight, args.storage, args.workers, advance)
+        else:
+            write_corner_flight(args.out, flight, scenario.corner_noise, args.storage, advance)
         progress.update(task, completed=flight.frame_count)
     print(_summary(args.out, flight))
     return 0
@@ -100,10 +106,16 @@ def _sensor(sensor: Sensor, args: argparse.Namespace) -> Sensor:
 
 
 def _summary(out: Path, flight: FlightPlan) -> str:
+    start = f'{out}/{_start_map(flight)}'
     return (
         f'{out}: {flight.scenario.name}, {flight.seconds:g} s, seed {flight.seed}\n'
-        f'replay it with: thermal-fiducial replay {out} --params {out}/params.yaml --map {out}/map_one.yaml --out RUN'
+        f'replay it with: thermal-fiducial replay {out} --params {out}/params.yaml --map {start} --out RUN'
     )
+
+
+def _start_map(flight: FlightPlan) -> str:
+    """A board is known, a room is to be mapped."""
+    return 'map_one.yaml' if flight.scenario.corner_noise is None else 'map_true.yaml --mode localization'
 
 
 def _cores() -> int:

@@ -138,16 +138,19 @@ def true_corners(
     """ID to corners (4, 2) [px] of the markers that are wholly in the image, show their face and aren't hidden."""
     R, origin = T_map_camera[:3, :3], T_map_camera[:3, 3]
     high = np.array([lens.width, lens.height]) - 1 - margin_px
-    seen: list[tuple[Marker, FloatArray]] = []
-    for marker in markers:
-        points = (marker.corners_map - origin) @ R
-        if (origin - marker.T_map_marker[:3, 3]) @ marker.T_map_marker[:3, 2] <= 0 or np.any(points[:, 2] < 0.05):
-            continue
-        pixels = lens.project(points)
-        if np.all((pixels >= margin_px) & (pixels <= high)) and np.all(_unfolded(lens, points, pixels)):
-            seen.append((marker, pixels))
+    poses = np.array([marker.T_map_marker for marker in markers])
+    points = (np.array([marker.corners_map for marker in markers]) - origin) @ R
+    faces = np.sum((origin - poses[:, :3, 3]) * poses[:, :3, 2], axis=1) > 0
+    ahead = np.flatnonzero(faces & np.all(points[..., 2] >= 0.05, axis=1))
+    pixels = lens.project(points[ahead])
+    inside = np.all((pixels >= margin_px) & (pixels <= high), axis=(1, 2))
+    ahead, pixels = ahead[inside], pixels[inside]
+    whole = np.all(_unfolded(lens, points[ahead], pixels), axis=1)
+    seen = [(markers[index], uv) for index, uv in zip(ahead[whole], pixels[whole], strict=True)]
     if not seen:
         return {}
+    if not plates:
+        return {marker.id: pixels for marker, pixels in seen}
     spread = np.array([marker.spread_map for marker, _ in seen])
     hidden = np.any([plate.hides(origin, spread) for plate in plates], axis=(0, 2))
     return {marker.id: pixels for (marker, pixels), covered in zip(seen, hidden, strict=True) if not covered}
@@ -155,9 +158,9 @@ def true_corners(
 
 def _unfolded(lens: Lens, points: FloatArray, pixels: FloatArray) -> BoolArray:
     """Whether the lens maps the pixels back to the points: beyond its field the distortion folds them into it."""
-    slopes = points[:, :2] / points[:, 2:]
-    off = np.linalg.norm(lens.slopes(pixels) - slopes, axis=1)
-    return np.asarray(off < 1e-6 * (1.0 + np.linalg.norm(slopes, axis=1)))
+    slopes = points[..., :2] / points[..., 2:]
+    off = np.linalg.norm(lens.slopes(pixels) - slopes, axis=-1)
+    return np.asarray(off < 1e-6 * (1.0 + np.linalg.norm(slopes, axis=-1)))
 
 
 class ThermalCamera:

@@ -1,8 +1,9 @@
-"""An IMU on the simulated body: exact rates and specific force, white noise, wandering biases."""
+"""An IMU on the simulated body: exact rates and specific force, errors of its axes, noise, and how its stamps come."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.sim.trajectory import GRAVITY, Path
@@ -21,6 +22,17 @@ class ImuRecord:
     gyroscope_bias: FloatArray
     accelerometer_bias: FloatArray
 
+    def delivered(self, delivery: 'Delivery', times: FloatArray, start_ns: int) -> 'ImuRecord':
+        """What of samples taken at ``times`` (N,) [s] after ``start_ns`` arrives, with the stamps that it gets."""
+        kept, stamps = delivery.stamps(times)
+        return ImuRecord(
+            start_ns + stamps,
+            self.angular_velocity[kept],
+            self.linear_acceleration[kept],
+            self.gyroscope_bias[kept],
+            self.accelerometer_bias[kept],
+        )
+
 
 @dataclass(frozen=True)
 class ImuNoise:
@@ -33,8 +45,43 @@ class ImuNoise:
 
 
 @dataclass(frozen=True)
+class Delivery:
+    """How samples reach the recorder through a driver that stamps them when it reads them.
+
+    Parameters
+    ----------
+    period : the driver reads what has gathered every so often [s]; its stamps are then ``spacing`` apart [s]
+    gaps : begin and length [s] of times without samples, again after ``every`` [s]
+    steps_back : times at which one stamp goes back by a millisecond [s]
+    """
+
+    period: float = 0.033
+    spacing: float = 0.00013
+    gaps: tuple[tuple[float, float], ...] = ()
+    every: float = 10.0
+    steps_back: tuple[float, ...] = ()
+
+    def stamps(self, times: FloatArray) -> tuple[IntArray, IntArray]:
+        """Of samples taken at ``times`` (N,) [s]: which arrive (M,), and their stamps since the start (M,) [ns]."""
+        within = times[:, None] % self.every
+        lost = np.any(
+            [(within[:, 0] >= begin) & (within[:, 0] < begin + length) for begin, length in self.gaps], axis=0
+        )
+        kept = np.flatnonzero(~np.broadcast_to(lost, times.shape))
+        burst = np.ceil(times[kept] / self.period).astype(np.int64)
+        first = np.searchsorted(burst, burst)
+        seconds = burst * self.period + (np.arange(len(kept)) - first) * self.spacing
+        stamps = np.round(seconds * 1e9).astype(np.int64)
+        for moment in self.steps_back:
+            place = int(np.searchsorted(stamps, moment * 1e9))
+            if 0 < place < len(stamps):
+                stamps[place] = stamps[place - 1] - 1_000_000
+        return kept, stamps
+
+
+@dataclass(frozen=True)
 class ImuModel:
-    """Noise of the IMU.
+    """Errors of the IMU.
 
     Parameters
     ----------
@@ -44,6 +91,12 @@ class ImuModel:
     gyroscope_rattle, accelerometer_rattle : broadband noise of a sample by vibration, which no data sheet counts
         [rad/s], [m/s^2]
     stamp_jitter : standard deviation of the stamps about the sampling; they stay in order [s]
+    gyroscope_axes, accelerometer_axes : standard deviation of each entry of the matrices of scale and misalignment
+    g_sensitivity : the same of the matrix from specific force to rate [rad/s per m/s^2]
+    gyroscope_instability, accelerometer_instability : standard deviation of a first-order Gauss-Markov process beside
+        the biases [rad/s], [m/s^2]
+    instability_time : its time constant [s]
+    delivery : how stamps come; None: each with its own
     """
 
     noise: ImuNoise = ImuNoise()
@@ -53,6 +106,13 @@ class ImuModel:
     gyroscope_rattle: float = 0.0
     accelerometer_rattle: float = 0.0
     stamp_jitter: float = 0.0
+    gyroscope_axes: float = 0.0
+    accelerometer_axes: float = 0.0
+    g_sensitivity: float = 0.0
+    gyroscope_instability: float = 0.0
+    accelerometer_instability: float = 0.0
+    instability_time: float = 2.0
+    delivery: Delivery | None = None
 
     def sample(self, trajectory: Path, times: FloatArray, stamps_ns: IntArray, seed: int) -> ImuRecord:
         """What the IMU answers at ``times`` (N,) [s] of a flight, true stamps ``stamps_ns`` (N,).
@@ -72,13 +132,32 @@ class ImuModel:
         def white(density: float) -> FloatArray:
             return rng.normal(0.0, density * root, (len(times), 3))
 
-        gyroscope_bias = bias(self.gyroscope_bias_sigma, noise.gyroscope_random_walk)
-        accelerometer_bias = bias(self.accelerometer_bias_sigma, noise.accelerometer_random_walk)
-        rates = motion.angular_velocity_body + gyroscope_bias + white(noise.gyroscope_noise_density)
+        gyroscope_wander, accelerometer_wander = self._instabilities(len(times), seed)
+        gyroscope_bias = gyroscope_wander + bias(self.gyroscope_bias_sigma, noise.gyroscope_random_walk)
+        accelerometer_bias = accelerometer_wander + bias(self.accelerometer_bias_sigma, noise.accelerometer_random_walk)
+        true_rates, force = self._seen_by_its_axes(motion.angular_velocity_body, force, seed)
+        rates = true_rates + gyroscope_bias + white(noise.gyroscope_noise_density)
         forces = force + accelerometer_bias + white(noise.accelerometer_noise_density)
         shaken = np.random.default_rng([seed, 8])
         rates += shaken.normal(0.0, self.gyroscope_rattle, rates.shape)
         forces += shaken.normal(0.0, self.accelerometer_rattle, forces.shape)
         jitter = np.clip(shaken.normal(0.0, self.stamp_jitter, len(times)), -0.4 / self.rate, 0.4 / self.rate)
         stamps = stamps_ns + np.round(jitter * 1e9).astype(np.int64)
-        return ImuRecord(stamps, rates, forces, gyroscope_bias, accelerometer_bias)
+        record = ImuRecord(stamps, rates, forces, gyroscope_bias, accelerometer_bias)
+        return record if self.delivery is None else record.delivered(self.delivery, times, int(stamps_ns[0]))
+
+    def _seen_by_its_axes(self, rates: FloatArray, forces: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
+        """Rates and forces (N, 3) in axes of wrong scale that are not square, and rates that forces act upon."""
+        rng = np.random.default_rng([seed, 12])
+        deviations = self.gyroscope_axes, self.accelerometer_axes, self.g_sensitivity
+        gyroscope, accelerometer, sensitivity = (rng.normal(0.0, deviation, (3, 3)) for deviation in deviations)
+        return rates + rates @ gyroscope.T + forces @ sensitivity.T, forces + forces @ accelerometer.T
+
+    def _instabilities(self, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
+        """Two Gauss-Markov processes (count, 3), of the gyroscope and of the accelerometer."""
+        rng = np.random.default_rng([seed, 13])
+        kept = np.exp(-1.0 / (self.rate * self.instability_time))
+        driven = rng.normal(size=(count, 6))
+        driven[1:] *= np.sqrt(1.0 - kept**2)
+        wander = lfilter([1.0], [1.0, -kept], driven, axis=0)
+        return self.gyroscope_instability * wander[:, :3], self.accelerometer_instability * wander[:, 3:]

@@ -28,18 +28,18 @@ def _vector(values: FloatArray, kind: str = 'Vector3') -> Any:
     return _make(f'geometry_msgs/msg/{kind}', *values.tolist())
 
 
-def image(frame: SimFrame) -> Any:
-    """A frame as little-endian mono16."""
+def image(frame: SimFrame, *, eight_bit: bool = False) -> Any:
+    """A frame as little-endian mono16, or as mono8."""
     height, width = frame.counts.shape
     return _make(
         'sensor_msgs/msg/Image',
         header=_header(frame.stamp_ns, CAMERA_FRAME),
         height=height,
         width=width,
-        encoding='mono16',
+        encoding='mono8' if eight_bit else 'mono16',
         is_bigendian=0,
-        step=2 * width,
-        data=np.ascontiguousarray(frame.counts, dtype='<u2').view(np.uint8).ravel(),
+        step=width if eight_bit else 2 * width,
+        data=np.ascontiguousarray(frame.counts, dtype='u1' if eight_bit else '<u2').view(np.uint8).ravel(),
     )
 
 

@@ -7,13 +7,15 @@ from scipy.spatial.transform import Rotation
 
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.sim.imu import ImuModel
+from thermal_fiducial.sim.corner_noise import CornerNoise
+from thermal_fiducial.sim.imu import Delivery, ImuModel, ImuNoise
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.scene import Acrylic, Clutter, clutter_plate, Fog, Marker, marker_plate, Plate, Room
-from thermal_fiducial.sim.sensor import Sensor
+from thermal_fiducial.sim.sensor import IDEAL, Sensor
 from thermal_fiducial.sim.trajectory import Flight, Path, pose_matrix
 from thermal_fiducial.sim.vibration import Shaken, Vibration
+from thermal_fiducial.sim.waving import Waving
 
 #: Lenses of a Tau 2 (17 um pixels) by name.
 LENSES = {
@@ -38,6 +40,7 @@ class Scenario:
     camera_time_offset : clock of the camera, t_imu = t_camera + offset [s]
     stamp_jitter : of the camera's stamps, exponential: most a little early, few late; the offset is their mean [s]
     vibration : of the body, or none
+    corner_noise : errors of the corners of a flight that has no pictures; None: it has pictures
     dictionary : name of an OpenCV dictionary
     seconds : default length
     """
@@ -51,8 +54,9 @@ class Scenario:
     camera_time_offset: float = 0.0
     stamp_jitter: float = 0.0
     vibration: Vibration | None = None
+    corner_noise: CornerNoise | None = None
     dictionary: str = 'DICT_4X4_50'
-    flight: Flight | RecordedFlight = Flight()  # noqa: RUF009
+    flight: Flight | RecordedFlight | Waving = Flight()  # noqa: RUF009
     acrylic: Acrylic = Acrylic()  # noqa: RUF009
     fog: Fog = Fog()  # noqa: RUF009
     room: Room = Room()  # noqa: RUF009
@@ -131,6 +135,36 @@ _PEOPLE = (
 
 _TURNS = ((9.0, 1.9, 110.0), (12.5, 1.5, -95.0), (16.5, 3.5, 180.0), (21.5, 3.5, 165.0))
 
+
+def _board() -> tuple[Marker, ...]:
+    """Six times six tags of 88 mm in front of home, facing it, a third of their side apart."""
+    places = ((key, (key % 6 - 2.5) * 0.1144, (key // 6 - 2.5) * 0.1144) for key in range(36))
+    return tuple(Marker(key, (1.1, -right, 1.0 + up), 180.0, size=0.088) for key, right, up in places)
+
+
+def _carpet() -> tuple[Marker, ...]:
+    """Nine times nine tags of 193 mm on the floor, a side apart; the first is in the middle."""
+    cells = [(key, 0.386 * (key % 9 - 4), 0.386 * (key // 9 - 4)) for key in range(81)]
+    cells.insert(0, cells.pop(40))
+    return tuple(Marker(key, (x, y, 0.0), 0.0, -90.0, size=0.193) for key, x, y in cells)
+
+
+#: A global-shutter camera of visible light, and the same as it truly is when its calibration is off by a little.
+_WIDE = Lens((460.0, 459.0), (370.0, 245.0), 'plumb_bob', (-0.28, 0.07, 2e-4, 0.0, 0.0), 752, 480)
+_WIDE_TRUE = Lens((460.2, 459.2), (370.1, 244.9), 'plumb_bob', (-0.2805, 0.0708, 2.3e-4, -3e-5, 0.0), 752, 480)
+_DOWNWARD = Lens((364.0, 364.0), (288.0, 290.0), width=576, height=576)
+#: Published densities of a tactical-grade MEMS IMU, and what readings against a reference show beside them.
+_MEMS = ImuModel(
+    ImuNoise(1.7e-4, 2.0e-3, 2.0e-5, 3.0e-3),
+    gyroscope_bias_sigma=0.04,
+    accelerometer_bias_sigma=0.1,
+    gyroscope_axes=0.008,
+    accelerometer_axes=0.005,
+    g_sensitivity=2e-4,
+    gyroscope_instability=3e-4,
+    accelerometer_instability=0.02,
+)
+
 _SCENARIOS = (
     Scenario(
         'fog',
@@ -174,6 +208,64 @@ _SCENARIOS = (
         vibration=Vibration(),
         sensor=Sensor(readout=0.016),
         imu=ImuModel(gyroscope_rattle=0.015, accelerometer_rattle=0.35, stamp_jitter=2e-4),
+    ),
+    Scenario(
+        'april',
+        'corners of a board of 36 tags before a hand-held rig: an IMU whose axes are off, a lens not quite known',
+        _board(),
+        lens=_WIDE,
+        corner_noise=CornerNoise(true_lens=_WIDE_TRUE),
+        vibration=Vibration((9.0, 13.0, 19.0, 27.0, 38.0), 0.15, 0.008),
+        dictionary='DICT_APRILTAG_36h11',
+        flight=Waving((0.0, 0.0, 1.0), (1.1, 0.0, 1.0)),
+        sensor=Sensor(lag=0.0, frame_rate=20.0),
+        imu=_MEMS,
+        seconds=40.0,
+    ),
+    Scenario(
+        'carpet',
+        'a drone over 81 tags: 8-bit pictures whose edges bleed, IMU samples in bursts, with gaps and a stamp that '
+        'goes back',
+        _carpet(),
+        lens=_DOWNWARD,
+        camera_position=(-0.02, 0.1, 0.0),
+        camera_orientation=(0.70710678, -0.70710678, 0.0, 0.0),
+        dictionary='DICT_APRILTAG_36h11',
+        flight=Waving((0.0, 0.0, 1.3), speed=0.25, turn=0.12, frequencies=(0.1, 0.5)),
+        acrylic=Acrylic(contrast=8.0, gradient=0.0, steady=0.0),
+        room=Room(excess=(0.0,) * 6),
+        sensor=replace(
+            IDEAL,
+            lag=0.0,
+            psf_sigma_px=0.8,
+            netd=0.03,
+            counts_per_kelvin=48.0,
+            offset_counts=20.0,
+            frame_rate=20.0,
+            full_scale=255,
+        ),
+        imu=ImuModel(
+            ImuNoise(1e-3, 1e-2, 5e-5, 5e-4),
+            rate=80.0,
+            delivery=Delivery(gaps=((4.0, 0.3), (8.0, 0.8)), steps_back=(6.0,)),
+        ),
+        seconds=20.0,
+    ),
+    Scenario(
+        'cheap_imu',
+        'corners of the wall, a gentle flight, the IMU of a toy: ten times the noise, axes off by a per cent',
+        _wall(),
+        corner_noise=CornerNoise(0.05, 0.05),
+        sensor=Sensor(lag=0.0),
+        imu=ImuModel(
+            ImuNoise(2e-3, 2e-2, 2e-4, 2e-3),
+            gyroscope_bias_sigma=0.02,
+            accelerometer_bias_sigma=0.2,
+            gyroscope_axes=0.01,
+            accelerometer_axes=0.01,
+            g_sensitivity=5e-4,
+        ),
+        seconds=20.0,
     ),
     Scenario('low_contrast', 'the wall at 2 K', _wall(), acrylic=Acrylic(contrast=2.0, steady=0.1), seconds=20.0),
 )

@@ -40,6 +40,8 @@ class Sensor:
         nothing, ``shutter`` sends the view of the closed shutter
     shutter_excess : temperature of the shutter above ambient [K]
     frame_rate : [Hz]
+    full_scale : counts at which a pixel is saturated; below 256 the pictures have 8 bits. What is brighter than that
+        bleeds over its edges by as much as the blur reaches above half of the scale
     """
 
     lag: float = 0.010
@@ -62,6 +64,7 @@ class Sensor:
     ffc_behaviour: str = 'frozen'
     shutter_excess: float = 4.0
     frame_rate: float = 30.0
+    full_scale: int = FULL_SCALE
 
     def __post_init__(self) -> None:
         if self.ffc_behaviour not in FFC_BEHAVIOURS:
@@ -91,8 +94,8 @@ class Sensor:
             kelvin += rng.standard_normal(kelvin.shape, dtype=np.float32) * np.float32(self.netd)
         offset = self.offset_counts + self.drift_counts * float(np.sin(2 * np.pi * t / self.drift_period))
         levels = np.rint(kelvin * np.float32(self.counts_per_kelvin) + np.float32(offset))
-        counts: Counts = np.clip(levels, 0, FULL_SCALE).astype(np.uint16)
-        where, stuck = _bad_pixels(kelvin.shape, self.bad_pixel_share, seed)
+        counts: Counts = np.clip(levels, 0, self.full_scale).astype(np.uint16)
+        where, stuck = _bad_pixels(kelvin.shape, self.bad_pixel_share, seed, self.full_scale)
         counts.reshape(-1)[where] = stuck
         return counts
 
@@ -119,12 +122,12 @@ def _patterns(sensor: Sensor, shape: tuple[int, int], seed: int, index: int) -> 
 
 
 @lru_cache(maxsize=2)
-def _bad_pixels(shape: tuple[int, int], share: float, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def _bad_pixels(shape: tuple[int, int], share: float, seed: int, full_scale: int) -> tuple[np.ndarray, np.ndarray]:
     """Flat indices of bad pixels and what they always say: 0 or full scale (dead), or anything (stuck)."""
     rng = np.random.default_rng([seed, 6])
     count = round(share * shape[0] * shape[1])
     where = rng.choice(shape[0] * shape[1], count, replace=False)
-    stuck = np.where(rng.random(count) < 0.5, rng.choice([0, FULL_SCALE], count), rng.integers(0, FULL_SCALE, count))
+    stuck = np.where(rng.random(count) < 0.5, rng.choice([0, full_scale], count), rng.integers(0, full_scale, count))
     return where, stuck.astype(np.uint16)
 
 

@@ -13,14 +13,17 @@ import tempfile
 from typing import Any
 
 import cv2
+import numpy as np
 import yaml
 
+from thermal_fiducial.core.types import IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, TRUTH_TOPIC
 from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry
 from thermal_fiducial.files.trajectory import save_tum
 from thermal_fiducial.sim import messages
 from thermal_fiducial.sim.camera import CHUNK, FlightPlan, plan, SimFrame, START_NS, ThermalCamera
+from thermal_fiducial.sim.imu import ImuRecord
 from thermal_fiducial.sim.scenario import Scenario
 from thermal_fiducial.sim.scene import Marker
 
@@ -93,7 +96,7 @@ def write_flight(
         raise InputError(f'{out}: {error.strerror}') from None
     try:
         _write_bag(folder / out.name, flight, storage, workers, progress or (lambda _: None))
-        _write_side_files(folder / out.name, flight)
+        write_side_files(folder / out.name, flight)
         (folder / out.name).rename(out)
     except OSError as error:
         raise InputError(f'{out}: {error.strerror}') from None
@@ -127,7 +130,7 @@ def _camera_events(frames: Iterable[SimFrame], flight: FlightPlan) -> Iterator[_
     for frame in frames:
         arrival = START_NS + round(frame.seconds * 1e9) + IMAGE_DELAY_NS
         yield _Event(arrival, CAMERA_INFO_TOPIC, messages.camera_info(flight.scenario.lens, frame.stamp_ns))
-        yield _Event(arrival, IMAGE_TOPIC, messages.image(frame))
+        yield _Event(arrival, IMAGE_TOPIC, messages.image(frame, eight_bit=flight.scenario.sensor.full_scale < 256))
 
 
 def _body_events(flight: FlightPlan) -> Iterator[_Event]:
@@ -139,9 +142,24 @@ def _body_events(flight: FlightPlan) -> Iterator[_Event]:
     quaternions, velocities = motion.rotation.as_quat(), motion.rotation.inv().apply(motion.velocity)
     truth = zip(motion.position, quaternions, velocities, motion.angular_velocity_body, strict=True)
     samples = zip(record.stamps_ns.tolist(), record.angular_velocity, record.linear_acceleration, strict=True)
-    for stamp, sample, state in zip(stamps.tolist(), samples, truth, strict=True):
-        yield _Event(stamp + IMU_DELAY_NS, IMU_TOPIC, messages.imu(*sample, scenario.imu))
-        yield _Event(stamp + IMU_DELAY_NS, TRUTH_TOPIC, messages.odometry(stamp, *state))
+    yield from heapq.merge(
+        (
+            _Event(arrival + IMU_DELAY_NS, IMU_TOPIC, messages.imu(*sample, scenario.imu))
+            for arrival, sample in zip(_arrivals(record, stamps, scenario), samples, strict=True)
+        ),
+        (
+            _Event(stamp + IMU_DELAY_NS, TRUTH_TOPIC, messages.odometry(stamp, *state))
+            for stamp, state in zip(stamps.tolist(), truth, strict=True)
+        ),
+        key=lambda event: event.arrival_ns,
+    )
+
+
+def _arrivals(record: ImuRecord, stamps: IntArray, scenario: Scenario) -> list[int]:
+    """When samples come: as they are taken, or as a driver has stamped them that reads them now and then."""
+    if scenario.imu.delivery is None:
+        return stamps.tolist()  # type: ignore[no-any-return]
+    return np.maximum.accumulate(record.stamps_ns).tolist()  # type: ignore[no-any-return]
 
 
 # --- rendering in chunks ------------------------------------------------------------------------------
@@ -176,7 +194,8 @@ def _frames(flight: FlightPlan, workers: int) -> Iterator[SimFrame]:
 # --- what a replay needs beside the bag ---------------------------------------------------------------
 
 
-def _write_side_files(folder: Path, flight: FlightPlan) -> None:
+def write_side_files(folder: Path, flight: FlightPlan) -> None:
+    """Truth, maps and parameters of a flight into the folder of its bag."""
     scenario = flight.scenario
     times, stamps = flight.imu_stamps()
     motion = scenario.trajectory(flight.seconds, flight.seed)(times)
@@ -213,6 +232,7 @@ def _parameters(scenario: Scenario) -> dict[str, Any]:
         'camera_position': [float(value) for value in scenario.camera_position],
         'camera_orientation': [float(value) for value in scenario.camera_orientation],
         'camera_time_offset': float(scenario.camera_time_offset),
+        **({} if scenario.sensor.lag else {'bolometer_lag': 0.0}),
         **({'readout_time': scenario.sensor.readout} if scenario.sensor.readout else {}),
         'imu': {item.name: getattr(noise, item.name) for item in fields(noise)},
     }

@@ -1,0 +1,65 @@
+"""Simulated flights that are made like recorded ones: what they show must be what the recordings show."""
+
+import numpy as np
+import pytest
+from support.corner_runs import fly
+from support.sim_flights import simulated
+
+from thermal_fiducial.core.measurements import corners_px
+from thermal_fiducial.sim.camera import render_frames, simulate_imu
+
+pytestmark = pytest.mark.slow
+
+
+def test_the_board_moves_as_by_hand():
+    """As the recorded one: 0.3 to 0.4 m/s and 25 to 40 deg/s rms an axis, 35 of 36 tags in view, markers to 3.4 mm."""
+    flight = simulated('april', seconds=10.0)
+    rates = np.degrees([sample.angular_velocity for sample in flight.samples])
+    assert 15.0 < np.sqrt(np.mean(rates**2)) < 45.0
+    assert np.mean([len(rows) for rows in flight.frames.values()]) > 30.0
+    score = fly(flight).markers.score(flight)
+    assert 1.0 < score.rms_mm < 4.0
+    assert 0.5 < score.nees < 8.0
+
+
+def test_edges_of_the_carpet_bleed():
+    """A bright pixel that saturates spreads over its edges: black squares are smaller by 0.4 px at each side."""
+    cv2 = pytest.importorskip('cv2')
+    (frame,) = render_frames('carpet', 20.0, start=150, stop=151)
+    assert frame.counts.max() == 255
+    seen = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    found, ids, _ = cv2.aruco.ArucoDetector(seen).detectMarkers(frame.counts.astype(np.uint8))
+    assert len(found) > 15
+    profile = [_edge_displacement(frame, frame.corners_px[int(key)]) for key in ids.ravel() if key in frame.corners_px]
+    # Half of full scale against half of the step from black to white, by the same blur everywhere.
+    assert 0.3 < np.mean(profile) < 0.55
+
+
+def _edge_displacement(frame, corners):
+    """How far inside the true left side the picture passes from white to black [px]."""
+    middle, inward = 0.5 * (corners[0] + corners[3]), corners[1] - corners[0]
+    inward = inward / np.linalg.norm(inward)
+    at = np.arange(-3.0, 3.0, 0.05)
+    x, y = (middle + at[:, None] * inward).T
+    x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
+    fx, fy = x - x0, y - y0
+    c = frame.counts.astype(float)
+    values = (1 - fy) * ((1 - fx) * c[y0, x0] + fx * c[y0, x0 + 1])
+    values += fy * ((1 - fx) * c[y0 + 1, x0] + fx * c[y0 + 1, x0 + 1])
+    return at[np.argmin(np.abs(values - 0.5 * (values.max() + values.min())))]
+
+
+def test_samples_over_the_carpet_come_as_recorded():
+    stamps = simulate_imu('carpet', 20.0).stamps_ns
+    steps = np.diff(stamps) * 1e-6
+    # The recordings: 0.125 ms within a burst, 33 ms between two, gaps of tenths of a second.
+    assert np.sum(steps < 0) == 1
+    assert np.mean((steps > 0) & (steps < 0.2)) > 0.5
+    assert np.mean((steps > 30) & (steps < 36)) > 0.3
+    assert np.sum(steps > 300) == 4
+
+
+def test_corners_repeat_with_the_seed():
+    first, second = (simulated.__wrapped__('cheap_imu', seconds=12.0) for _ in range(2))
+    for a, b in zip(first.frames.values(), second.frames.values(), strict=True):
+        np.testing.assert_array_equal(corners_px(a), corners_px(b))

@@ -1,0 +1,54 @@
+"""A simulated flight that begins with the corners, as a bag of ``markers``."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.files.flight_bags import write_recording
+from thermal_fiducial.files.recordings import Corners, Recording
+from thermal_fiducial.files.rig_files import Rig
+from thermal_fiducial.sim.camera import FlightPlan
+from thermal_fiducial.sim.corner_flight import corner_frames
+from thermal_fiducial.sim.corner_noise import CornerNoise
+from thermal_fiducial.sim.writer import IMAGE_DELAY_NS, write_side_files
+
+
+def simulated_recording(flight: FlightPlan, noise: CornerNoise) -> Recording:
+    """What a recording of the flight holds: IMU samples as they arrive, corners, truth at the IMU's instants."""
+    scenario = flight.scenario
+    times, stamps = flight.imu_stamps()
+    path = scenario.trajectory(flight.seconds, flight.seed)
+    record = scenario.imu.sample(path, times, stamps, flight.seed)
+    samples = [
+        ImuSample(int(stamp), rate, force)
+        for stamp, rate, force in zip(
+            record.stamps_ns, record.angular_velocity, record.linear_acceleration, strict=True
+        )
+    ]
+    frames = [
+        Corners(frame.stamp_ns, frame.ids, frame.corners_px, np.full(len(frame.ids), noise.claimed_px))
+        for frame in corner_frames(flight, noise)
+    ]
+    lens = scenario.lens
+    camera = Camera(lens.width, lens.height, lens.matrix, lens.model, np.array(lens.distortion))
+    size = scenario.markers[0].size
+    rig = Rig(camera, scenario.T_body_camera, {}, scenario.camera_time_offset, size, scenario.dictionary)
+    return Recording(rig, samples, corners=frames, truth=(stamps, path(times).T_map_body))
+
+
+def write_corner_flight(
+    out: Path, flight: FlightPlan, noise: CornerNoise, storage: str, progress: Callable[[int], None]
+) -> None:
+    """Write the bag ``out`` with truth, maps and parameters beside it, as of a flight with pictures.
+
+    Raises
+    ------
+    InputError
+        ``out`` exists or cannot be written.
+    """
+    late = IMAGE_DELAY_NS * 1e-9
+    write_recording(out, simulated_recording(flight, noise), noise.claimed_px, late, storage, progress)
+    write_side_files(out, flight)
