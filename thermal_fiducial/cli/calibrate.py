@@ -1,4 +1,4 @@
-"""``calibrate``: intrinsics of the thermal camera, and camera against IMU."""
+"""``calibrate``: intrinsics of the thermal camera, camera against IMU, and noise of the IMU."""
 
 import argparse
 from collections.abc import Iterable, Iterator
@@ -11,6 +11,7 @@ from thermal_fiducial.calibration.camera_imu import calibrate_rolling_camera_imu
 from thermal_fiducial.calibration.rolling import FrameCorners
 from thermal_fiducial.calibration.sources import clean_frames, Frame, imu_track, recorded_camera
 from thermal_fiducial.cli import calibrate_intrinsics
+from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.geometry import se3
@@ -29,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         commands.add_parser('intrinsics', help='camera_info from thermal views of a board')
     )
     _add_camera_imu(commands.add_parser('camera-imu', help='pose and clock of the camera relative to the IMU'))
+    add_imu(commands.add_parser('imu', help='noise densities of an IMU at rest'))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,0 +1,73 @@
+"""``calibrate imu``: noise densities of an IMU at rest, in Kalibr's names."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from thermal_fiducial.calibration.imu_noise import AllanFit, fit_noise, ImuNoiseFit
+from thermal_fiducial.calibration.sources import imu_track
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import BagReader, parse_remaps
+
+#: With less than this [s] at rest a random walk is hardly seen beside the white noise.
+_LONG_S = 600.0
+#: Averaging times whose deviation is printed [s].
+_SHOWN = (0.01, 0.1, 1.0, 10.0, 100.0, 1000.0)
+
+
+def add_imu(parser: argparse.ArgumentParser) -> None:
+    """Options of the action."""
+    parser.set_defaults(do=calibrate_imu)
+    parser.add_argument('bag', type=Path, help='bag with imu/data, the robot at rest (minutes, better hours)')
+    parser.add_argument('--out', type=Path, default=Path('imu.yaml'), help='parameters to write (default: imu.yaml)')
+    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bag')
+
+
+def calibrate_imu(args: argparse.Namespace) -> int:
+    """Read, fit, write, show."""
+    with BagReader(args.bag, parse_remaps(args.remap)) as bag:
+        track, _ = imu_track(bag)
+    fit = fit_noise(track)
+    text = noise_text(fit)
+    try:
+        args.out.write_text(text, encoding='utf-8')
+    except OSError as error:
+        raise InputError(f'{args.out}: {error.strerror}') from None
+    for name, sensor, unit in (('gyroscope', fit.gyroscope, 'rad/s'), ('accelerometer', fit.accelerometer, 'm/s^2')):
+        print(_deviations(name, sensor, unit))
+    print(text)
+    return 0
+
+
+def noise_text(fit: ImuNoiseFit) -> str:
+    """Parameter file of the nodes: the rms of the three axes, with each axis as a comment."""
+    lines = [
+        f'# Allan deviation of {fit.seconds:.0f} s at rest, {fit.rate_hz:.1f} Hz; in brackets x, y, z',
+        *([] if fit.seconds >= _LONG_S else [f'# random walks need more than {_LONG_S:.0f} s: take these for bounds']),
+        '/**:',
+        '  ros__parameters:',
+        '    imu:',
+    ]
+    for name, values in (
+        ('gyroscope_noise_density', fit.gyroscope.white),
+        ('accelerometer_noise_density', fit.accelerometer.white),
+        ('gyroscope_random_walk', fit.gyroscope.walk),
+        ('accelerometer_random_walk', fit.accelerometer.walk),
+    ):
+        axes = ', '.join(f'{value:.2e}' for value in values)
+        lines.append(f'      {name}: {_rms(values):.4e}  # ({axes})')
+    for name, sensor in (('gyroscope', fit.gyroscope), ('accelerometer', fit.accelerometer)):
+        lines.append(f'# bias instability of the {name}: {_rms(sensor.instability):.2e}')
+    return '\n'.join(lines) + '\n'
+
+
+def _deviations(name: str, sensor: AllanFit, unit: str) -> str:
+    nearest = [int(np.argmin(np.abs(np.log(sensor.tau / tau)))) for tau in _SHOWN if tau <= 1.5 * sensor.tau[-1]]
+    parts = [f'{sensor.tau[k]:.3g} s: {_rms(sensor.deviation[k]):.2e}' for k in nearest]
+    return f'{name}, Allan deviation [{unit}]: ' + ', '.join(parts)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
