@@ -28,7 +28,7 @@ $(READY): setup.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or 3.12 is needed: make PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip 'setuptools<80' wheel
-	$(BIN)/python -m pip install --progress-bar on --quiet --editable '.[ros,tools,test,lint,colcon]'
+	$(BIN)/python -m pip install --progress-bar on --quiet --editable '.[ros,tools,batch,test,lint,colcon]'
 	@touch $@
 
 demo: $(READY)

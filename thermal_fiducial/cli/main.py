@@ -18,11 +18,12 @@ COMMANDS = {
     'demo': 'simulate a flight through fog, replay it through the four nodes, score it, write the report',
     'simulate': 'write a synthetic thermal bag with ground truth',
     'replay': 'play a recorded bag through the four nodes',
+    'batch': 'replay many bags on many workers, and one map of all',
     'import': "a bag from a recording of CSV files: ours, EuRoC's or Kalibr's",
     'evaluate': 'errors against ground truth, jitter, consistency, latency; tables and plots',
     'map': 'show, check, edit, merge, refine and align marker maps',
     'markers': 'make markers that can be cut: dictionaries, drawings, planning',
-    'calibrate': 'calibrate the thermal camera, and camera against IMU',
+    'calibrate': 'calibrate the thermal camera, camera against IMU, and noise of the IMU',
     'check-bridge': 'verify what a flight controller would receive',
 }
 

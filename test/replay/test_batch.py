@@ -1,0 +1,100 @@
+"""Many bags on workers of Dask: the same bytes from any number of them, also when one is killed."""
+
+import os
+from pathlib import Path
+import signal
+import threading
+import time
+
+import pytest
+from support import small_bag
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.files.marker_map import load_map
+
+pytest.importorskip('distributed', reason='the extra "batch" is not installed')
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.slow,
+    # The cluster's own event loops and sockets, closed while the interpreter collects them.
+    pytest.mark.filterwarnings('ignore::ResourceWarning', 'ignore::DeprecationWarning'),
+    pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning'),
+]
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    """Three short bags, with parameters and a map of one marker."""
+    folder = tmp_path_factory.mktemp('batch')
+    for seed in range(3):
+        small_bag.recording(seconds=0.6, seed=seed).write(folder / f'flight{seed}')
+    small_bag.side_files(folder)
+    return folder
+
+
+def batch(folder, out, *extra, bags=('flight0', 'flight1', 'flight2')):
+    """Exit status of the command."""
+    given = ['--out', folder / out, '--map', folder / 'map.yaml', '--params', folder / 'params.yaml', *extra]
+    return main([str(word) for word in ('batch', *(folder / bag for bag in bags), *given)])
+
+
+def contents(out):
+    """Path to bytes of every file."""
+    return {path.relative_to(out): path.read_bytes() for path in sorted(out.rglob('*')) if path.is_file()}
+
+
+@pytest.fixture(scope='module')
+def alone(folder):
+    assert batch(folder, 'alone') == 0
+    return folder / 'alone'
+
+
+def test_runs_and_a_joint_map(alone):
+    assert sorted(load_map(alone / 'marker_map.yaml').markers) == [0, 1, 2, 3]
+    assert {path.name for path in alone.iterdir()} == {'flight0', 'flight1', 'flight2', 'marker_map.yaml', 'batch.json'}
+    assert (alone / 'flight1' / 'fused.tum').read_text()
+
+
+def test_two_workers_write_the_same_bytes(folder, alone):
+    assert batch(folder, 'two', '--workers', '2') == 0
+    assert contents(folder / 'two') == contents(alone)
+
+
+def test_a_killed_worker_costs_time_only(folder, alone):
+    killed = []
+
+    def kill_the_first():
+        """As soon as a bag is being replayed: its run folder has a beginning then."""
+        while not killed:
+            time.sleep(0.05)
+            if any((folder / 'killed').glob('.flight*/*/fused.tum')):
+                worker = _workers_of(os.getpid())[0]
+                os.kill(worker, signal.SIGKILL)
+                killed.append(worker)
+
+    thread = threading.Thread(target=kill_the_first, daemon=True)
+    thread.start()
+    assert batch(folder, 'killed') == 0
+    assert killed
+    assert contents(folder / 'killed') == contents(alone)
+
+
+def _workers_of(pid):
+    """Process IDs of Dask's workers below a process: spawned ones, the resource tracker aside."""
+    children = Path(f'/proc/{pid}/task').glob('*/children')
+    below = [int(word) for path in children for word in path.read_text().split()]
+    return [child for child in below if b'spawn_main' in Path(f'/proc/{child}/cmdline').read_bytes()]
+
+
+def test_a_bad_bag_is_named_and_the_others_are_replayed(folder, capfd):
+    (folder / 'broken').mkdir(exist_ok=True)
+    assert batch(folder, 'partly', bags=('flight0', 'broken')) == 2
+    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith('thermal-fiducial')]
+    assert len(lines) == 1
+    assert 'broken' in lines[0]
+    assert (folder / 'partly' / 'flight0' / 'summary.json').exists()
+
+
+def test_two_bags_of_one_name(folder, capfd):
+    assert batch(folder, 'never', bags=('flight0', 'flight0')) == 2
+    assert 'flight0' in capfd.readouterr().err

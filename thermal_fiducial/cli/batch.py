@@ -1,0 +1,57 @@
+"""``batch BAG...``: replay many bags on many workers and make one map of them."""
+
+import argparse
+from pathlib import Path
+import sys
+
+from thermal_fiducial.cli.replay import progress_bar
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import parse_remaps
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='as for replay')
+    parser.add_argument('--out', type=Path, required=True, metavar='FOLDER', help='for a run folder a bag and the map')
+    parser.add_argument('--map', type=Path, required=True, metavar='FILE', help='marker map to start from')
+    parser.add_argument('--params', type=Path, metavar='FILE', help='ROS parameter file for the nodes')
+    parser.add_argument('--mode', choices=('mapping', 'localization'), help='of each replay')
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument('--workers', type=int, default=1, metavar='N', help='processes of this machine (default 1)')
+    where.add_argument(
+        '--scheduler', default='', metavar='ADDRESS', help='of a Dask cluster that sees the same files, tcp://HOST:8786'
+    )
+    parser.add_argument(
+        '--max-frames', type=int, default=1000, metavar='N', help='frames of all bags in the joint map (default 1000)'
+    )
+    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bags')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay, adjust, say what came of it."""
+    if not (1 <= args.workers <= 256 and args.max_frames >= 1):
+        raise InputError('--workers is between 1 and 256, --max-frames at least 1')
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError("needs the extra 'batch': pip install thermal_fiducial[batch]") from None
+    from thermal_fiducial.replay.batch import Batch, run_batch, workers
+    from thermal_fiducial.replay.replay import Options
+
+    options = Options(
+        bag=args.bags[0],
+        run=args.out,
+        params=None if args.params is None else args.params.resolve(),
+        map_file=args.map.resolve(),
+        mode=args.mode,
+        remaps=parse_remaps(args.remap),
+    )
+    batch = Batch(tuple(args.bags), args.out, options, args.max_frames)
+    batch.runs()
+    with workers(min(args.workers, len(args.bags)), args.scheduler) as client, progress_bar('batch') as progress:
+        summary = run_batch(batch, client, progress, lambda line: print(f'warning: {line}', file=sys.stderr))
+    print(
+        f'{args.out}: {len(summary["runs"])} runs; {len(summary["markers"])} markers in the joint map, '
+        f'{summary["frames_used"]} of {summary["frames"]} frames used'
+    )
+    return 0

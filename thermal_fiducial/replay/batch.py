@@ -1,0 +1,214 @@
+"""Many bags, one map: a replay of each bag on workers of Dask distributed, then one joint adjustment of all markers.
+
+A replay is a function of its bag alone, so that it may run anywhere and again: a worker that dies costs the time of
+its bag. Run folders appear whole or not at all.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+import json
+import logging
+from pathlib import Path
+import shutil
+import tempfile
+from typing import Any
+
+import numpy as np
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import CameraInfo, PointCloud2
+
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.mapping.map_building import build_map, Built
+from thermal_fiducial.core.measurements import Markers
+from thermal_fiducial.errors import InputError, RunError
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, MARKERS_TOPIC
+from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.replay.replay import MAP_FILE, Options, replay
+from thermal_fiducial.replay.settings import read_settings, Settings
+from thermal_fiducial.ros import clouds, convert
+
+#: Workers that one bag may outlive: whatever ends more of them is in the bag.
+_DEATHS = 10
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What to replay and where to.
+
+    Parameters
+    ----------
+    bags : one run each
+    out : folder of the runs, of the joint map and of ``batch.json``
+    options : of each replay, but for bag and run folder
+    max_frames : of all bags together, evenly chosen, for the joint adjustment
+    """
+
+    bags: tuple[Path, ...]
+    out: Path
+    options: Options
+    max_frames: int = 1000
+
+    def runs(self) -> list[Options]:
+        """The replays, in the order of the bags.
+
+        Raises
+        ------
+        InputError
+            Two bags of one name: their runs would share a folder.
+        """
+        names = [bag.resolve().stem for bag in self.bags]
+        doubles = sorted({name for name in names if names.count(name) > 1})
+        if doubles:
+            raise InputError(f'two bags are named {doubles[0]}: their runs would share a folder')
+        return [
+            replace(self.options, bag=bag.resolve(), run=self.out.resolve() / name)
+            for bag, name in zip(self.bags, names, strict=True)
+        ]
+
+
+@contextmanager
+def workers(count: int, scheduler: str = '') -> Iterator[Any]:
+    """A client of ``count`` worker processes of this machine, or of the cluster at address ``scheduler``.
+
+    Raises
+    ------
+    InputError
+        No cluster answers there.
+    """
+    import dask
+    from distributed import Client, LocalCluster
+
+    with dask.config.set({'distributed.scheduler.allowed-failures': _DEATHS}):
+        if scheduler:
+            try:
+                client = Client(scheduler)
+            except (OSError, ValueError) as error:
+                raise InputError(f'no scheduler at {scheduler}: {error}') from None
+            with client:
+                yield client
+            return
+        cluster = LocalCluster(
+            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=logging.CRITICAL
+        )
+        with cluster, Client(cluster) as client:
+            yield client
+
+
+def run_batch(
+    batch: Batch, client: Any, progress: Callable[[float], None], warn: Callable[[str], None]
+) -> dict[str, Any]:
+    """Replay all bags on the workers of ``client``, then adjust one map to the markers of all.
+
+    Parameters
+    ----------
+    batch : bags and options; the workers must find the paths
+    client : of Dask distributed
+    progress : called with the share done, 0 to 1
+    warn : takes lines about what is suspicious
+
+    Returns
+    -------
+    Content of ``batch.json``; nothing in it depends on the number of workers.
+
+    Raises
+    ------
+    InputError
+        A bag, a map or a parameter that cannot be used; the other bags have their runs nevertheless.
+    RunError
+        A bag that worker after worker dies of.
+    """
+    runs = batch.runs()
+    settings = read_settings(batch.options.params, {})
+    if batch.options.map_file is None:
+        raise InputError('a joint map needs --map with at least one marker of known pose')
+    batch.out.mkdir(parents=True, exist_ok=True)
+    _replay_all(runs, client, progress, warn)
+    built, frames = _joint_map(batch, runs, settings)
+    save_map(batch.out / MAP_FILE, built.map)
+    summary = {
+        'format': 'thermal_fiducial/batch',
+        'version': 1,
+        'runs': [run.run.name for run in runs],
+        'frames': frames,
+        'frames_used': built.frames_used,
+        'rms_px': None if built.refinement is None else built.refinement.rms_px,
+        'markers': sorted(built.map.markers),
+        'unplaced': {str(key): why for key, why in sorted(built.unplaced.items())},
+    }
+    (batch.out / 'batch.json').write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
+    return summary
+
+
+def _replay_all(
+    runs: Sequence[Options], client: Any, progress: Callable[[float], None], warn: Callable[[str], None]
+) -> None:
+    from distributed import as_completed
+
+    futures = {client.submit(replay_whole, run, pure=False): run for run in runs}
+    failures: dict[str, BaseException] = {}
+    warnings: dict[str, list[str]] = {}
+    for done, future in enumerate(as_completed(futures), 1):
+        name = futures[future].run.name
+        if future.exception() is not None:
+            failures[name] = future.exception()
+        else:
+            warnings[name] = future.result()
+        progress(done / len(runs))
+    for run in runs:
+        # What a worker that died had begun.
+        for unfinished in run.run.parent.glob(f'.{run.run.name}-*'):
+            shutil.rmtree(unfinished, ignore_errors=True)
+        for line in warnings.get(run.run.name, []):
+            warn(f'{run.run.name}: {line}')
+    for name, failure in sorted(failures.items()):
+        if isinstance(failure, InputError):
+            raise InputError(f'{name}: {failure}')
+        raise RunError(f'{name}: {type(failure).__name__}: {str(failure).splitlines()[0] if str(failure) else ""}')
+
+
+def replay_whole(options: Options) -> list[str]:
+    """A replay whose run folder is there whole or not at all, in the place of an earlier one; its warnings."""
+    warnings: list[str] = []
+    options.run.parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix=f'.{options.run.name}-', dir=options.run.parent))
+    try:
+        replay(replace(options, run=folder / options.run.name), lambda share: None, warnings.append)
+        shutil.rmtree(options.run, ignore_errors=True)
+        (folder / options.run.name).rename(options.run)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return warnings
+
+
+def _joint_map(batch: Batch, runs: Sequence[Options], settings: Settings) -> tuple[Built, int]:
+    config = replace(settings.marker_mapper, mode='mapping')
+    start = load_map(Path(str(batch.options.map_file)), config.marker_size)
+    cameras = [_camera(run, settings) for run in runs]
+    for run, camera in zip(runs, cameras, strict=True):
+        if not camera.matches(cameras[0]):
+            raise InputError(f'{run.run.name} has another calibration than {runs[0].run.name}: no joint map')
+    share = max(batch.max_frames // len(runs), 1)
+    frames = [rows for run in runs for rows in _frames(run, share)]
+    if not frames:
+        raise InputError('no markers in any of the bags')
+    return build_map(frames, cameras[0], start, config), len(frames)
+
+
+def _camera(run: Options, settings: Settings) -> Camera:
+    if settings.tau2_camera.calibration_file:
+        return load_camera(settings.tau2_camera.calibration_file)
+    with BagReader(run.bag, run.remaps) as bag:
+        for message in bag.messages([CAMERA_INFO_TOPIC]):
+            return convert.camera(deserialize_message(message.cdr, CameraInfo))
+    raise InputError(f'{run.bag}: no message on {CAMERA_INFO_TOPIC}')
+
+
+def _frames(run: Options, most: int) -> list[Markers]:
+    """Rows of the frames with markers, evenly chosen."""
+    with BagReader(run.run / 'output') as output:
+        messages = [deserialize_message(item.cdr, PointCloud2) for item in output.messages([MARKERS_TOPIC])]
+    messages = [message for message in messages if message.width]
+    chosen = np.linspace(0, len(messages) - 1, min(most, len(messages))).astype(int)
+    return [clouds.markers(messages[index]) for index in chosen]
