@@ -7,6 +7,7 @@ benchmarks leave in ``doc/tables/``. What a topic is for stands in ``doc/interfa
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib import import_module
 from itertools import groupby
 import json
 from pathlib import Path
@@ -22,27 +23,29 @@ import yaml
 from thermal_fiducial.config import NODES, OPTIONAL_NODES, parameters
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
 from thermal_fiducial.files.camera_info import save_camera
-from thermal_fiducial.nodes.aruco_detector import ArucoDetector
-from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
-from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
-from thermal_fiducial.nodes.tau2_camera import Tau2Camera
-from thermal_fiducial.nodes.thermal_source import ThermalSource
+from thermal_fiducial.ros.node import StageNode
 from thermal_fiducial.ros.parameter_file import parameter_file
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = (ROOT / 'doc' / 'accuracy.md', ROOT / 'doc' / 'nodes.md')
 INTERFACES = ROOT / 'doc' / 'interfaces.yaml'
-#: Node to its class and to the parameters that switch its optional topics on; CALIBRATION becomes a file.
 CALIBRATION = 'CALIBRATION'
-STARTED: dict[str, tuple[type, tuple[dict[str, Any], ...]]] = {
-    'tau2_camera': (Tau2Camera, ({'calibration_file': CALIBRATION}, {'image_transport': 'compressed'})),
-    'aruco_detector': (ArucoDetector, ({},)),
-    'marker_mapper': (MarkerMapperNode, ({},)),
-    'pose_ekf': (PoseEkfNode, ({'smoothing_time': 0.5, 'bridge_rate': 30.0},)),
-    'thermal_source': (ThermalSource, ({'calibration_file': CALIBRATION},)),
+#: Parameters that switch the optional topics of a node on, a start for each set; CALIBRATION becomes a file.
+SWITCHES: dict[str, tuple[dict[str, Any], ...]] = {
+    'tau2_camera': ({'calibration_file': CALIBRATION}, {'image_transport': 'compressed'}),
+    'pose_ekf': ({'smoothing_time': 0.5, 'bridge_rate': 30.0},),
+    'thermal_source': ({'calibration_file': CALIBRATION},),
 }
 #: What every node has of rclpy, and the diagnostics, of which the page speaks once.
 OF_ALL = re.compile(r'/(rosout|parameter_events|diagnostics)|.*/(.*_parameters(_atomically)?|get_.*)')
+
+
+def node_class(name: str) -> Any:
+    """The class of node ``name``, which its module defines."""
+    module = import_module(f'thermal_fiducial.nodes.{name}')
+    own = [item for item in vars(module).values() if isinstance(item, type) and item.__module__ == module.__name__]
+    (kind,) = [item for item in own if issubclass(item, StageNode)]
+    return kind
 
 
 @contextmanager
@@ -66,10 +69,9 @@ def running(kind: type, values: Mapping[str, Any]) -> Iterator[Any]:
 
 def interfaces(name: str) -> dict[tuple[str, str], str]:
     """(in, out or service; topic) to type of node ``name``."""
-    kind, variants = STARTED[name]
     found: dict[tuple[str, str], str] = {}
-    for values in variants:
-        with running(kind, values) as node:
+    for values in SWITCHES.get(name, ({},)):
+        with running(node_class(name), values) as node:
             inputs = [('in', item.topic_name, item.msg_type) for item in node.subscriptions]
             outputs = [('out', item.topic_name, item.msg_type) for item in node.publishers]
             services = [('service', item.srv_name, item.srv_type) for item in node.services]

@@ -6,6 +6,8 @@ import re
 import documents
 import pytest
 
+from thermal_fiducial.config import NODES, OPTIONAL_NODES
+
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / 'README.md'
 LINK = re.compile(r'\]\(([^)#\s]+)')
@@ -16,6 +18,12 @@ def test_tables_are_up_to_date():
     # They are made anew by: make tables
     for page, text in documents.pages().items():
         assert page.read_text(encoding='utf-8') == text
+
+
+@pytest.mark.parametrize('node', NODES | OPTIONAL_NODES)
+def test_each_node_is_on_the_page(node):
+    page = (ROOT / 'doc' / 'nodes.md').read_text(encoding='utf-8')
+    assert all(f'<!-- {table} {node} -->' in page for table in ('topics', 'parameters'))
 
 
 def test_the_readme_is_short():
