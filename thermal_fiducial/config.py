@@ -317,7 +317,7 @@ class ArucoDetectorConfig(SelfChecked):
     )
     refinement: str = param(
         'auto',
-        'Corners from the lines of the sides, or each locally as OpenCV does. auto: local on 8-bit images only.',
+        'Corners from the lines of the sides (auto and edges are the same), or each locally as OpenCV does.',
         choices=('auto', 'edges', 'subpix'),
         live=True,
     )

@@ -1,5 +1,6 @@
 """The detector on real images: asserted corners, a room full of tags, long-wave frames without any."""
 
+from dataclasses import replace
 import json
 
 import cv2
@@ -25,7 +26,7 @@ def test_asserted_corners(name, real_data, measured):
     folder = real_data / 'ubiquity_fiducials'
     expected = json.loads((folder / 'expected.json').read_text())[name]
     image = cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE)
-    detector = MarkerDetector(CONFIG, load_dictionary('DICT_5X5_1000'))
+    detector = MarkerDetector(replace(CONFIG, refinement='subpix'), load_dictionary('DICT_5X5_1000'))
     rows = detector.detect(0, image, camera_for(image))
     assert rows['id'].tolist() == sorted(int(marker_id) for marker_id in expected)
     truth = np.array([expected[str(marker_id)] for marker_id in rows['id'].tolist()])

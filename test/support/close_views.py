@@ -32,7 +32,7 @@ def draw(camera, grid, T, size=0.3, samples=4, blur=BLUR):
     fine = (np.arange(camera.width * samples) + 0.5) / samples - 0.5
     rows = (np.arange(camera.height * samples) + 0.5) / samples - 0.5
     image = np.empty((camera.height, camera.width), dtype=np.float32)
-    # Strips of rows bound the memory.
+    # Strips of rows bound the lag tail.
     for first in range(0, camera.height, 32):
         v = rows[first * samples : (first + 32) * samples]
         x = camera.normalise(np.stack(np.meshgrid(fine, v), axis=-1))

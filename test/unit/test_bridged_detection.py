@@ -24,9 +24,9 @@ CORNERS = 0.5e-3 * SIZE_MM * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, 
 
 def raster(drawing, origin):
     """Cells of two millimetres, True where the warm surface shows, their lines on the edges of the black square."""
-    rim = RIM_MM + 2.0 * np.ceil(0.5 * origin) - origin
-    count = round(0.5 * (drawing.width + 2.0 * rim))
-    x = 2.0 * (np.arange(count) + 0.5) - rim
+    border = RIM_MM + 2.0 * np.ceil(0.5 * origin) - origin
+    count = round(0.5 * (drawing.width + 2.0 * border))
+    x = 2.0 * (np.arange(count) + 0.5) - border
     u, v = np.meshgrid(x, x[::-1])
     acrylic = acrylic_at(drawing, np.stack([u.ravel(), v.ravel()], axis=1)).reshape(count, count)
     for hole in drawing.holes:

@@ -123,7 +123,7 @@ def test_the_rim_of_its_plate_does_not_make_a_narrow_marker_narrower(width):
     image, corners = draw(camera, 7, T, 0.3, around=0.0)
     error = refine(image, corners + 0.2, camera, 7).corners_px[0] - corners
     wider = (error[[1, 2]] - error[[0, 3]]).mean(axis=0)[0]
-    # It was 0.3 px narrower at 13 px as long as more of the margin was looked at than shows nothing of its rim.
+    # It was 0.3 px narrower at 13 px as long as more of the margin was looked at than shows nothing of its border.
     assert abs(wider) < 0.15
 
 
@@ -187,7 +187,7 @@ def test_covariance_is_honest(contrast):
 
 
 def test_poses_of_faint_markers_are_as_good_as_their_corners_claim():
-    """Corners err together: what the sides and the square tell all of them must not count for each of them anew."""
+    """Corners err together: what the sides and the square show all of them must not count for each of them anew."""
     rng, camera, squared = np.random.default_rng(10), CAMERAS['plumb_bob'], []
     for turn in rng.uniform(-3.0, 3.0, 8):
         T = se3.transform(se3.so3_exp([0.0, 0.0, turn]), np.zeros(3))

@@ -71,7 +71,7 @@ def test_what_a_display_displaces_the_border_tells(frames, bent):
     outward = np.sum(error * np.sign(truth - truth.mean(axis=1, keepdims=True)), axis=-1).mean()
     assert abs(outward) < 0.04
     nees = np.einsum('nki,nkij,nkj->nk', error, np.linalg.inv(corner_covariances(rows)), error).mean()
-    # 2 of an honest corner; a real camera's scale is bent from place to place, not by one curve.
+    # 2 of a consistent corner; a real camera's scale is bent from place to place, not by one curve.
     assert nees < 2.0
 
 

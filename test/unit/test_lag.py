@@ -7,13 +7,13 @@ import pytest
 from thermal_fiducial.core.detection.frame import Places
 from thermal_fiducial.core.detection.lag import (
     common_error,
-    markers_sharpened,
+    LagField,
+    markers_deblurred,
     model_error,
     REMAINING,
-    SmearField,
     without_lag,
 )
-from thermal_fiducial.core.detection.motion import Twist
+from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
@@ -22,11 +22,11 @@ TWIST = np.array([0.5, -0.3, 0.8, 0.4, -0.6, 0.7])
 
 def test_field_agrees_with_the_points():
     twist = Twist(TWIST, np.eye(6))
-    field = SmearField(CAMERA).full(SmearField(CAMERA).at(twist, 3.0, 0.01))
+    field = LagField(CAMERA).full(LagField(CAMERA).at(twist, 3.0, 0.01))
     assert field.shape == (512, 640, 2)
     pixels = np.array([[100, 80], [320, 250], [550, 430]])
     x = CAMERA.normalise(pixels.astype(float))
-    expected = Places.of(ImagePoints.seen_at(x, CAMERA), np.full(3, 3.0)).smear(twist, 0.01)
+    expected = Places.of(ImagePoints.seen_at(x, CAMERA), np.full(3, 3.0)).lag_blur(twist, 0.01)
     # The coarse field is interpolated linearly between nodes 16 px apart.
     np.testing.assert_allclose(field[pixels[:, 1], pixels[:, 0]], expected, atol=0.01)
 
@@ -71,8 +71,8 @@ def test_sharpened_corners_do_not_depend_on_the_form_of_the_lag(steps):
         seen += weight * np.outer(row, column)
     image = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), 0.6)
     corners = np.array([[low, low], [high, low], [high, high], [low, high]])
-    smeared = np.broadcast_to(-tau * velocity, (1, 4, 2))
-    sharp = markers_sharpened(image, corners[None], smeared, 60)
+    blurred = np.broadcast_to(-tau * velocity, (1, 4, 2))
+    sharp = markers_deblurred(image, corners[None], blurred, 60)
     v, u = np.mgrid[:100, :100]
     centre = np.array([(sharp * u).sum(), (sharp * v).sum()]) / sharp.sum()
     mean_age = float(weights @ ages)
@@ -85,22 +85,22 @@ def test_sharpened_corners_do_not_depend_on_the_form_of_the_lag(steps):
     assert wide < before
 
 
-@pytest.mark.parametrize('smear', [0.3, 0.7, 2.1])
-def test_sharpened_edges_are_those_of_a_response_that_forgets(smear):
-    """Across a vertical side the image is the one of a bolometer that remembers no longer than the memory's age."""
+@pytest.mark.parametrize('lag_blur', [0.3, 0.7, 2.1])
+def test_sharpened_edges_are_those_of_a_response_that_forgets(lag_blur):
+    """Across a vertical side the image is the one of a bolometer that remembers no longer than the lag tail's age."""
     ages = np.arange(0.0, 10.0, 0.002)
     weights = np.exp(-ages)
 
     def seen(kept):
         profile = sum(
-            w * np.clip(np.minimum(np.arange(100.0) + 0.5, 64.7 - smear * a) - (np.arange(100.0) - 0.5), 0.0, 1.0)
+            w * np.clip(np.minimum(np.arange(100.0) + 0.5, 64.7 - lag_blur * a) - (np.arange(100.0) - 0.5), 0.0, 1.0)
             for w, a in zip(weights[kept] / weights[kept].sum(), ages[kept], strict=True)
         )
         return cv2.GaussianBlur(np.tile(profile, (60, 1)).astype(np.float32), (0, 0), 0.6)
 
     corners = np.array([[[44.7, 20.0], [64.7, 20.0], [64.7, 40.0], [44.7, 40.0]]])
-    smeared = np.broadcast_to([-smear, 0.0], (1, 4, 2))
-    sharp, young = markers_sharpened(seen(ages < 10.0), corners, smeared, 12)[30], seen(ages < 0.75)[30]
+    blurred = np.broadcast_to([-lag_blur, 0.0], (1, 4, 2))
+    sharp, young = markers_deblurred(seen(ages < 10.0), corners, blurred, 12)[30], seen(ages < 0.75)[30]
     slope = np.gradient(young)
     side = slice(59, 70)
     displaced = slope[side] @ (sharp - young)[side] / (slope[side] @ slope[side])
@@ -138,7 +138,7 @@ def test_an_unknown_motion_is_limited_by_sharp_edges_and_by_cells_that_can_be_re
     cell = np.array([10.0, 10.0, 30.0, 10.0])
     covariances = common_error(displacement, 1.5**2 * np.eye(6), np.array([0.015, 0.05, 0.1, 0.1]), cell)
     deviation = np.sqrt(covariances[..., 0, 0])
-    # Of a faint marker, whose residuals tell nothing, as much as the motion does, or 0.4 cells.
+    # Of a faint marker, whose residuals show nothing, as much as the motion does, or 0.4 cells.
     np.testing.assert_allclose(deviation, np.broadcast_to([[0.3], [1.0], [7.5], [4.0]], (4, 4)), rtol=1e-6)
     np.testing.assert_allclose(common_error(0.0 * displacement, np.eye(6), np.zeros(4), cell), 0.0)
 
@@ -147,4 +147,4 @@ def test_windows_outside_or_without_numbers_are_skipped():
     image = np.random.default_rng(2).normal(size=(60, 80)).astype(np.float32)
     square = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 20.0], [0.0, 20.0]])
     corners = np.stack([square + 500.0, square - 500.0, square + np.nan])
-    np.testing.assert_array_equal(markers_sharpened(image, corners, np.ones((3, 4, 2)), 16), image)
+    np.testing.assert_array_equal(markers_deblurred(image, corners, np.ones((3, 4, 2)), 16), image)

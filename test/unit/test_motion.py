@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core.detection.lag import (
-    MEMORY_AGE,
+    LAG_TAIL_AGE,
 )
-from thermal_fiducial.core.detection.motion import camera_twist, interaction, MotionTracker, plausible, Tracked, Twist
+from thermal_fiducial.core.detection.tracking import MotionTrack, TrackedMarkers
+from thermal_fiducial.core.detection.twist import camera_twist, interaction, plausible, Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import Odometry
@@ -48,10 +49,10 @@ def test_twist_of_the_camera_from_that_of_the_body():
 def test_tracker_finds_the_twist_from_two_frames():
     rng = np.random.default_rng(1)
     points = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3))
-    tracker, ids, dt = MotionTracker(np.eye(4)), np.arange(5), 1 / 30
+    tracker, ids, dt = MotionTrack.of_rig(np.eye(4)), np.arange(5), 1 / 30
     later = moved(points, dt)
     x = [p[..., :2] / p[..., 2:] for p in (points, later)]
-    tracker.remember(10**9, None, Tracked(ids, x[0], points[..., 2], np.full(5, 100.0)))
+    tracker = tracker.after(10**9, None, TrackedMarkers(ids, x[0], points[..., 2], np.full(5, 100.0)))
     assert tracker.predict(10**9 + 10**10, []) is None
     found = tracker.correct(10**9 + round(dt * 1e9), None, ids, x[1], later[..., 2], np.full(5, 1e-5))
     # A finite step of a thirtieth of a second differs from the derivative in second order; the prior pulls a little.
@@ -63,16 +64,16 @@ def test_tracker_finds_the_twist_from_two_frames():
 @pytest.mark.parametrize('seed', range(3))
 def test_a_marker_that_moves_by_itself_tells_nothing(speed, seed):
     """One of five is carried away, at up to 1000 px/s; the others know how the camera moves."""
-    rng, tracker, ids, dt = np.random.default_rng(seed), MotionTracker(np.eye(4), LAG), np.arange(5), 1 / 30
+    rng, tracker, ids, dt = np.random.default_rng(seed), MotionTrack.of_rig(np.eye(4), LAG), np.arange(5), 1 / 30
     points = rng.uniform([-0.7, -0.5, 2], [0.7, 0.5, 4], (5, 1, 3)) + rng.uniform(-0.15, 0.15, (5, 4, 3))
     for frame in range(8):
         x = points[..., :2] / points[..., 2:] + 2e-5 * rng.standard_normal((5, 4, 2))
         x[0] += max(frame - 4, 0) * dt * speed * np.array([1.0, 0.3])
         stamp = round((1.0 + frame * dt) * 1e9)
         twist = tracker.correct(stamp, tracker.predict(stamp, []), ids, x, points[..., 2], np.full(5, 2e-5))
-        tracker.remember(stamp, twist, Tracked(ids, x, points[..., 2], np.full(5, 100.0)))
+        tracker = tracker.after(stamp, twist, TrackedMarkers(ids, x, points[..., 2], np.full(5, 100.0)))
         points = moved(points, dt)
-    # What the other four tell to; all five alike are wrong by 0.1 rad/s at the least speed, and by 7 at the greatest.
+    # What the other four show to; all five alike are wrong by 0.1 rad/s at the least speed, and by 7 at the greatest.
     np.testing.assert_allclose(twist.value, TWIST, atol=0.04)
     error = twist.value - TWIST
     assert error @ np.linalg.solve(twist.covariance[:6, :6], error) < 16.8  # 99 % of six degrees of freedom
@@ -82,7 +83,7 @@ def turning(stamp_ns, states, jitter_ns=0, seed=6):
     """Twists of frames that turn ever faster, where their stamps jitter, and what they should be one lag ago."""
     points = np.random.default_rng(5).uniform([-0.6, -0.5, 2], [0.6, 0.5, 4], (5, 4, 3))
     rng, acceleration, covariance = np.random.default_rng(seed), np.array([0.0, 6.0, 2.0]), np.diag([1e-4] * 6)
-    tracker, ids = MotionTracker(np.eye(4), LAG), np.arange(5)
+    tracker, ids = MotionTrack.of_rig(np.eye(4), LAG), np.arange(5)
     for stamp in stamp_ns:
         at = stamp * 1e-9
         ages_ns = np.arange(-2, 7)[::-1] * 5_000_000 if states else []
@@ -97,23 +98,23 @@ def turning(stamp_ns, states, jitter_ns=0, seed=6):
         seen = points @ se3.so3_exp(0.5 * acceleration * (seen_ns * 1e-9) ** 2)
         x = seen[..., :2] / seen[..., 2:]
         twist = tracker.correct(stamp, tracker.predict(stamp, heard), ids, x, seen[..., 2], np.full(5, 1e-5))
-        tracker.remember(stamp, twist, Tracked(ids, x, seen[..., 2], np.full(5, 100.0)))
+        tracker = tracker.after(stamp, twist, TrackedMarkers(ids, x, seen[..., 2], np.full(5, 100.0)))
         yield twist, acceleration * (at - LAG)
 
 
 def test_twist_is_that_of_the_time_that_smears():
-    """A camera that turns faster and faster: the lag of 10 ms shows how it turned 10 ms ago, its memory 14 ms."""
+    """A camera that turns faster and faster: the lag of 10 ms shows how it turned 10 ms ago, its lag tail 14 ms."""
     points = np.random.default_rng(5).uniform([-0.6, -0.5, 2], [0.6, 0.5, 4], (5, 4, 3))
     lag, dt, acceleration = 0.010, 1 / 30, np.array([0.0, 6.0, 2.0])
-    tracker, ids, twist = MotionTracker(np.eye(4), lag), np.arange(5), None
+    tracker, ids, twist = MotionTrack.of_rig(np.eye(4), lag), np.arange(5), None
     for frame in range(8):
         turned = se3.so3_exp(0.5 * acceleration * (frame * dt) ** 2)
         seen = points @ turned
         stamp = round(frame * dt * 1e9)
         x = seen[..., :2] / seen[..., 2:]
         twist = tracker.correct(stamp, tracker.predict(stamp, []), ids, x, seen[..., 2], np.full(5, 1e-5))
-        tracker.remember(stamp, twist, Tracked(ids, x, seen[..., 2], np.full(5, 100.0)))
-    ages = [lag, lag * MEMORY_AGE]
+        tracker = tracker.after(stamp, twist, TrackedMarkers(ids, x, seen[..., 2], np.full(5, 100.0)))
+    ages = [lag, lag * LAG_TAIL_AGE]
     # A frame ago it turned slower by 0.2 rad/s. What is left, that steps of 1/30 s curve, is half a thousandth of what
     # it turns in 10 ms: accelerations are expected to die down within a few frames.
     expected = [acceleration * (7 * dt - age) for age in ages]
@@ -136,7 +137,7 @@ def test_states_without_any_error_are_no_division_by_zero():
     certain = [
         Odometry(k * 5_000_000, np.eye(4), TWIST[:3], TWIST[3:], np.zeros((6, 6)), np.zeros((6, 6))) for k in range(6)
     ]
-    twist = MotionTracker(np.eye(4)).predict(25_000_000, certain)
+    twist = MotionTrack.of_rig(np.eye(4)).predict(25_000_000, certain)
     # The prior, which knows nothing, pulls by the ratio of variances: what the acceleration may have changed by in half
     # the window makes a part in ten thousand, and what a change of it is expected to be a hundredth of a m/s^2.
     np.testing.assert_allclose(twist.value, TWIST, atol=2e-4)
@@ -145,9 +146,9 @@ def test_states_without_any_error_are_no_division_by_zero():
 
 def test_twist_of_a_late_frame_is_carried_back():
     points = np.random.default_rng(5).uniform([-0.6, -0.5, 2], [0.6, 0.5, 4], (5, 4, 3))
-    seen = Tracked(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
-    acceleration, tracker, now = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]), MotionTracker(np.eye(4)), 10**9
-    tracker.remember(now, Twist(TWIST, 1e-6 * np.eye(12), acceleration), seen)
+    seen = TrackedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
+    acceleration, tracker, now = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]), MotionTrack.of_rig(np.eye(4)), 10**9
+    tracker = tracker.after(now, Twist(TWIST, 1e-6 * np.eye(12), acceleration), seen)
     ahead, back = (tracker.predict(now + dt_ns, []) for dt_ns in (30_000_000, -30_000_000))
     # Accelerations last for 0.15 s: a tenth of them is gone on the way.
     np.testing.assert_allclose(back.value, TWIST - 0.030 * acceleration, rtol=0.1, atol=0.01)
@@ -161,8 +162,10 @@ def test_markers_are_expected_where_the_motion_carries_them():
     rng = np.random.default_rng(4)
     points, dt = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3)), 1 / 30
     later, twist = moved(points, dt), Twist(TWIST, np.eye(6))
-    tracker = MotionTracker(np.eye(4))
-    tracker.remember(0, twist, Tracked(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5)))
+    tracker = MotionTrack.of_rig(np.eye(4))
+    tracker = tracker.after(
+        0, twist, TrackedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
+    )
     expected = tracker.expected(round(dt * 1e9), twist)
     # The stamp is a whole number of nanoseconds.
     np.testing.assert_allclose(expected.x, later[..., :2] / later[..., 2:], atol=1e-8)
@@ -173,17 +176,17 @@ def test_markers_are_expected_where_the_motion_carries_them():
 def test_a_late_frame_disturbs_nothing_and_a_clock_set_back_is_followed():
     rng = np.random.default_rng(4)
     points, twist = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3)), Twist(TWIST, np.eye(12))
-    seen = Tracked(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
-    tracker, now = MotionTracker(np.eye(4)), 10**9
-    tracker.remember(now, twist, seen)
+    seen = TrackedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
+    tracker, now = MotionTrack.of_rig(np.eye(4)), 10**9
+    tracker = tracker.after(now, twist, seen)
     ahead = tracker.expected(now + 33_000_000, twist)
     # Whose own markers are expected where they were then.
     late, before = tracker.expected(now - 66_000_000, twist), moved(points, -0.066)
     np.testing.assert_allclose(late.x, before[..., :2] / before[..., 2:], atol=1e-8)
-    tracker.remember(now - 66_000_000, None, Tracked.none())
+    tracker = tracker.after(now - 66_000_000, None, TrackedMarkers.none())
     np.testing.assert_array_equal(tracker.expected(now + 33_000_000, twist).x, ahead.x)
     assert tracker.predict(now + 33_000_000, []) is not None
-    tracker.remember(now - 10**9, twist, seen)
+    tracker = tracker.after(now - 10**9, twist, seen)
     np.testing.assert_array_equal(tracker.expected(now - 10**9 + 33_000_000, twist).x, ahead.x)
 
 
@@ -196,14 +199,16 @@ def test_implausible_odometry_is_known(velocity, turn):
 
 def test_motion_that_shows_no_markers_is_forgotten():
     """A wrong one would blur them away in frame after frame; the filter's states are heard all the same."""
-    tracker, period_ns = MotionTracker(np.eye(4)), 33_333_333
-    tracker.remember(
-        0, Twist(np.full(6, 9.0), np.eye(12)), Tracked(np.arange(1), *(np.ones(s) for s in ((1, 4, 2), (1, 4), 1)))
+    tracker, period_ns = MotionTrack.of_rig(np.eye(4)), 33_333_333
+    tracker = tracker.after(
+        0,
+        Twist(np.full(6, 9.0), np.eye(12)),
+        TrackedMarkers(np.arange(1), *(np.ones(s) for s in ((1, 4, 2), (1, 4), 1))),
     )
     for frame in range(1, 8):
         twist = tracker.predict(frame * period_ns, [])
         assert (twist is None) == (frame * period_ns > 150_000_000)
-        tracker.remember(frame * period_ns, twist, Tracked.none())
+        tracker = tracker.after(frame * period_ns, twist, TrackedMarkers.none())
     state = Odometry(8 * period_ns, np.eye(4), TWIST[:3], TWIST[3:], 1e-6 * np.eye(6), 1e-6 * np.eye(6))
     # The twist of which nothing is known pulls by its share of the variance.
     np.testing.assert_allclose(tracker.predict(8 * period_ns, [state]).value, TWIST, atol=1e-5)

@@ -1,4 +1,4 @@
-"""Known markers that the rim of the image cuts: measured where they show themselves, and never anything else."""
+"""Known markers that the border of the image cuts: measured where they show themselves, and never anything else."""
 
 from functools import cache
 
@@ -12,9 +12,9 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.grid import adjusted, grid_edges, Layer
 from thermal_fiducial.core.detection.decoding import Decoder
 from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.guided import KnownMarkers
-from thermal_fiducial.core.detection.motion import Twist
-from thermal_fiducial.core.detection.partial import CutMarkerSearch
+from thermal_fiducial.core.detection.known_markers import KnownMarkers
+from thermal_fiducial.core.detection.partial import PartialMarkerSearch
+from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_camera_pose
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, Odometry
@@ -22,7 +22,7 @@ from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.trajectory import Trajectory
 
 SIZE, ID, CELLS = 0.3, 8, BITS.shape[1] + 2
-#: Side [px], direction of the middle, and rotation: a side outside, a corner, all four, a small one at the rim, one
+#: Side [px], direction of the middle, and rotation: a side outside, a corner, all four, a small one at the border, one
 #: that is tilted.
 VIEWS = {
     'side': (180, -0.35, 0.0, (0.1, 0.05, 0.2)),
@@ -32,7 +32,7 @@ VIEWS = {
     'tilted': (200, 0.15, 0.3, (0.6, 0.1, 0.0)),
 }
 CONFIG = ArucoDetectorConfig(blur_px=BLUR_WITH_PIXEL)
-SEARCH = CutMarkerSearch(Decoder(BITS), BITS)
+SEARCH = PartialMarkerSearch(Decoder(BITS), BITS)
 STILL = Twist(np.zeros(6), 1e-9 * np.eye(12))
 
 
@@ -45,7 +45,7 @@ def look(image, camera, T_expected, noise, marker_id=ID):
     """What is found of a marker where it is expected."""
     frame = Frame(0, image.astype(np.float32), noise, camera, STILL, 0.010, 0.0)
     known = KnownMarkers({marker_id: (T_expected, SIZE)})
-    cut = known.cut(np.eye(4), camera, np.zeros(0, dtype=np.int64))
+    cut = known.partially_visible(np.eye(4), camera, np.zeros(0, dtype=np.int64))
     assert len(cut.ids) == 1
     return SEARCH.look(frame, cut, 0.01, np.ones(len(BITS), dtype=bool), CONFIG)
 

@@ -11,7 +11,7 @@ BOTH = np.array([5.0, -5.0])
 def seen(*frames):
     polarity = Polarity()
     for frame in frames:
-        polarity.learn(np.array(frame))
+        polarity = polarity.after(np.array(frame))
     return polarity
 
 

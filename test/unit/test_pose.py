@@ -1,4 +1,4 @@
-"""Pose of markers and of the camera: exact without noise, honest covariances with it."""
+"""Pose of markers and of the camera: exact without noise, consistent covariances with it."""
 
 import numpy as np
 import pytest

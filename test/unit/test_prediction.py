@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from support.scenes import camera_of, detector_of, motion_prior
 
-from thermal_fiducial.core.detection.motion import MotionTracker
 from thermal_fiducial.core.detection.prediction import Predictor
+from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.scenario import named
@@ -30,7 +30,7 @@ def states(offset_s=0.0):
 
 
 def predicted(prior):
-    return Predictor(np.eye(4), 0.010).predict(STAMP_NS, prior, MotionTracker(np.eye(4), 0.010), 0.2)
+    return Predictor(np.eye(4), 0.010).predict(STAMP_NS, prior, MotionTrack.of_rig(np.eye(4), 0.010), 0.2)
 
 
 @pytest.mark.parametrize('offset_s', [0.0, -0.060, 0.035])

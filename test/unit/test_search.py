@@ -7,14 +7,15 @@ import pytest
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.contrast import noise_of
 from thermal_fiducial.core.detection.decoding import Decoder, Reading, shrunk
+from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.patterns import marker_bits
-from thermal_fiducial.core.detection.scratch import Scratch
-from thermal_fiducial.core.detection.search import _inside_out, BlindSearch, Found, Sought
+from thermal_fiducial.core.detection.search import _inside_out, BlindSearch, Found, SearchScales
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))
 DECODER = Decoder(BITS)
-SEARCH = BlindSearch(DECODER, Scratch())
+SEARCH = BlindSearch(DECODER)
 EVERY = np.ones(len(BITS), dtype=bool)
 
 
@@ -31,8 +32,14 @@ def scene(marker_id, contrast, noise, seed=0, slope=0.0):
 CORNERS = np.array([[199.5, 149.5], [271.5, 149.5], [271.5, 221.5], [199.5, 221.5]])
 
 
+def frame_of(image):
+    height, width = image.shape
+    camera = Camera(width, height, [[500.0, 0, width / 2], [0, 500.0, height / 2], [0, 0, 1]])
+    return Frame(0, image, noise_of(image), camera, None, 0.0, 0.0)
+
+
 def search(image, config=None, allowed=EVERY):
-    return SEARCH.search(image, noise_of(image), image, allowed, config or ArucoDetectorConfig())
+    return SEARCH.search(frame_of(image), image, allowed, config or ArucoDetectorConfig(), Found.none())
 
 
 @pytest.mark.parametrize('turn', range(4))
@@ -92,8 +99,8 @@ def test_bright_markers_far_away_are_found(contrast):
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_rim_of_a_plate_is_no_marker_inside_out(sign):
-    """Readings at one place: a marker without much of a surround, the rim of its plate, bits in it, another marker."""
+def test_edge_of_a_plate_is_no_marker_inside_out(sign):
+    """Readings at one place: a marker without much of a surround, the edge of its plate, bits in it, another."""
     correlation = sign * np.array([0.96, -0.89, -0.88, -0.9])
     reading = Reading(
         np.array([19, 10, 17, 4]),
@@ -118,15 +125,15 @@ def test_what_is_seen_already_is_not_sought():
     image = scene(21, 100.0, 2.0)
     image[300:396, 400:496] = scene(8, 100.0, 2.0)[138:234, 188:284]
     seen = Found(np.array([21]), CORNERS[None], np.ones(1), np.ones(1, dtype=bool))
-    found = SEARCH.search(image, noise_of(image), image, EVERY, ArucoDetectorConfig(), seen)
+    found = SEARCH.search(frame_of(image), image, EVERY, ArucoDetectorConfig(), seen)
     assert found.ids.tolist() == [8]
 
 
-@pytest.mark.parametrize('sought', [Sought.FINE, Sought.FAINT])
+@pytest.mark.parametrize('scales', [SearchScales.FINE, SearchScales.FAINT])
 @pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_either_resolution_shows_a_clear_marker(sought, sign):
+def test_either_resolution_shows_a_clear_marker(scales, sign):
     image = scene(21, 50.0 * sign, 2.0)
-    found = SEARCH.search(image, noise_of(image), image, EVERY, ArucoDetectorConfig(), sought=sought)
+    found = SEARCH.search(frame_of(image), image, EVERY, ArucoDetectorConfig(), Found.none(), scales)
     assert found.ids.tolist() == [21]
 
 

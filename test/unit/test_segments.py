@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.corners.segments import counts_across, Memory
+from thermal_fiducial.core.detection.corners.segments import counts_across, LagTail
 from thermal_fiducial.core.detection.corners.sides import sides_of
-from thermal_fiducial.core.detection.lag import GAIN, markers_sharpened, memory_maps
+from thermal_fiducial.core.detection.lag import GAIN, lag_tail_maps, markers_deblurred
 from thermal_fiducial.core.geometry.camera import Camera
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 527.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 1e-4, -2e-4, 0.0])
@@ -41,7 +41,7 @@ def test_pixels_lie_across_the_sides(image):
 def test_columns_beyond_the_image_do_not_count(image):
     corners = CORNERS[:1] - [97.0, 60.0]
     sides = sides_of(CAMERA.normalise(corners), CAMERA, image.shape, cells=6, columns=6, half=5)
-    # The left side is cut off by the rim of the image: its lower half lies outside, the top side does not.
+    # The left side is cut off by the border of the image: its lower half lies outside, the top side does not.
     assert sides.inside is not None
     assert sides.fresh[..., 0].any()
     assert not sides.fresh[..., 2].all()
@@ -50,9 +50,9 @@ def test_columns_beyond_the_image_do_not_count(image):
 def test_memory_is_taken_out_as_in_a_whole_image(image):
     displacement = np.array([[[3.0, 1.0]] * 4, [[0.0, 0.0]] * 4])
     sides = sides_of(CAMERA.normalise(CORNERS), CAMERA, image.shape, cells=6, columns=6, half=5)
-    memory = Memory(memory_maps(CORNERS, displacement), np.array([GAIN, 1.0]))
-    counts = counts_across(image, sides, memory)
-    sharp = markers_sharpened(image, CORNERS[:1], displacement[:1], 14)
+    lag_tail = LagTail(lag_tail_maps(CORNERS, displacement), np.array([GAIN, 1.0]))
+    counts = counts_across(image, sides, lag_tail)
+    sharp = markers_deblurred(image, CORNERS[:1], displacement[:1], 14)
     # OpenCV interpolates between thirty-seconds of a pixel, to which both ways may round differently.
     np.testing.assert_allclose(counts, sharp.ravel()[sides.pixel], atol=2.0)
     assert np.abs(counts - image.ravel()[sides.pixel])[..., :4].max() > 10.0

@@ -54,10 +54,11 @@ def test_corners_are_those_of_squares_and_as_good_as_they_claim():
     assert np.count_nonzero(known.doubt) <= 4
 
 
-def test_the_square_tells_what_the_image_does_not():
+def test_the_square_constrains_what_the_image_does_not():
     truth = views(50, marker_corners(0.3))
     faint, clear = (
-        as_squares(truth, np.zeros((50, 8, 1)), np.tile(sigma**2 * np.eye(8), (50, 1, 1))).told for sigma in (3.0, 1e-4)
+        as_squares(truth, np.zeros((50, 8, 1)), np.tile(sigma**2 * np.eye(8), (50, 1, 1))).constrained
+        for sigma in (3.0, 1e-4)
     )
     # Both of its conditions, or none.
     np.testing.assert_allclose(faint, 2.0, atol=0.1)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection import detector as detection
+from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.detection.search import BlindSearch
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corners_px
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -43,7 +44,7 @@ def lagging_frame(index, rng, speed_px, tau, contrast=20.0):
 
 
 def test_fast_faint_markers_keep_their_shape():
-    detector = detection.MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.010), DICTIONARY)
+    detector = MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.010), DICTIONARY)
     rng, errors = np.random.default_rng(4), []
     for k in range(16):
         rows = detector.detect(k * PERIOD_NS, lagging_frame(k, rng, 450.0, 0.010), CAMERA)
@@ -52,32 +53,32 @@ def test_fast_faint_markers_keep_their_shape():
             corners = corners_px(rows)
             shape = corners - corners.mean(axis=1, keepdims=True)
             errors.append(shape - 18.0 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]))
-    # Noise of a tenth of the contrast, doubled by sharpening, makes 0.2 px of 36 px sides; a tail of 4.5 px that passes
+    # Noise of a tenth of the contrast, doubled by deblurring, makes 0.2 px of 36 px sides; a tail of 4.5 px that passes
     # for a symmetric blur makes a pixel of each.
     assert np.sqrt(np.mean(np.square(errors))) < 0.35
 
 
 def test_the_second_frame_knows_the_motion_and_sharpens_by_it():
-    detector = detection.MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.010), DICTIONARY)
+    detector = MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.010), DICTIONARY)
     rng, speed = np.random.default_rng(4), 450.0
     for k in range(2):
         rows = detector.detect(k * PERIOD_NS, lagging_frame(k, rng, speed, 0.010, contrast=400.0), CAMERA)
     assert rows['id'].tolist() == [4, 7, 9]
     corners = corners_px(rows)
     left = 59.5 + speed * PERIOD_NS * 1e-9
-    # Edges smeared by 4.5 px, taken for sharp ones, seem to lie less than that behind: corners would be 2.7 px ahead.
+    # Edges blurred by 4.5 px, taken for sharp ones, seem to lie less than that behind: corners would be 2.7 px ahead.
     # What the first frame's are off by, unknown, is a tenth of the way between the frames.
     assert np.abs(corners[:, [0, 3], 0] - left).max() < 0.6
 
 
 def test_the_first_frames_say_what_they_know_of_the_motion():
-    detector = detection.MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.010), DICTIONARY)
+    detector = MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.010), DICTIONARY)
     rng, speed = np.random.default_rng(4), 450.0
     for k in range(4):
         rows = detector.detect(k * PERIOD_NS, lagging_frame(k, rng, speed, 0.010, contrast=400.0), CAMERA)
         corners = corners_px(rows)
         off = (corners[:, [0, 3], 0] - 59.5 - speed * k * PERIOD_NS * 1e-9).mean()
-        # All are off alike, by no more than three standard deviations of one while nothing tells the motion.
+        # All are off alike, by no more than three standard deviations of one while nothing shows the motion.
         if k < 2:
             assert abs(off) < 3.0 * rows['sigma_px'].max()
     assert rows['sigma_px'].max() < 0.2
@@ -87,13 +88,13 @@ def test_the_first_frames_say_what_they_know_of_the_motion():
 def searches(monkeypatch):
     """How often a frame was searched blindly."""
     count = []
-    search = detection.BlindSearch.search
-    monkeypatch.setattr(detection.BlindSearch, 'search', lambda *args: count.append(1) or search(*args))
+    search = BlindSearch.search
+    monkeypatch.setattr(BlindSearch, 'search', lambda *args: count.append(1) or search(*args))
     return count
 
 
 def test_seen_markers_are_followed(searches):
-    detector = detection.MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.0), DICTIONARY)
+    detector = MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.0), DICTIONARY)
     rng = np.random.default_rng(1)
     for k in range(11):
         rows = detector.detect(k * PERIOD_NS, frame(k, rng), CAMERA)
@@ -106,7 +107,7 @@ def test_seen_markers_are_followed(searches):
 
 
 def test_a_marker_that_is_gone_is_not_followed(searches):
-    detector = detection.MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.0), DICTIONARY)
+    detector = MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.0), DICTIONARY)
     rng = np.random.default_rng(2)
     for k in range(4):
         detector.detect(k * PERIOD_NS, frame(k, rng), CAMERA)
@@ -118,7 +119,7 @@ def test_a_marker_that_is_gone_is_not_followed(searches):
 
 
 def test_nothing_is_followed_across_a_gap(searches):
-    detector = detection.MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.0), DICTIONARY)
+    detector = MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.0), DICTIONARY)
     rng = np.random.default_rng(3)
     for k in range(6):
         detector.detect(k * 10**9, frame(k, rng), CAMERA)

@@ -1,6 +1,6 @@
 """Rough outlines of markers pulled onto the pattern that they show.
 
-An outline of a faint marker has a corner or two off by up to a cell. Once its cells tell which marker it is, the whole
+An outline of a faint marker has a corner or two off by up to a cell. Once its cells show which marker it is, the whole
 pattern with its white surroundings is fitted to the image: Gauss-Newton on the four corners, together with contrast
 and a background that may bend (B. Lucas, T. Kanade, "An iterative image registration technique", 1981).
 """
@@ -17,8 +17,10 @@ from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
 from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
 
 _STEPS = 3
-# Smoothing of the image [px], so that its slope tells the way from half a cell away.
+# Smoothing of the image [px], so that its slope shows the way from half a cell away.
 _SMOOTHING = 1.0
+# The same at most where there is no noise to smooth [cells].
+_SMOOTHING_CELLS = 0.4
 # Samples along a cell, and one outside the sides, in cells.
 _SAMPLES = (0.17, 0.5, 0.83)
 _OUTSIDE = 0.35
@@ -52,17 +54,30 @@ def _grid(cells: int) -> _Grid:
     return _Grid(places, places.astype(np.float32), smooth, _blur(share, cells))
 
 
-def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArray, decoder: Decoder) -> FloatArray:
-    """Quadrilaterals (Q, 4, 2) moved to where ``image`` looks most like the markers ``ids`` (Q,), turned (Q,)."""
+def aligned(
+    image: Float32Array,
+    quads: FloatArray,
+    ids: IntArray,
+    turns: IntArray,
+    decoder: Decoder,
+    *,
+    noisy: bool = True,
+) -> FloatArray:
+    """Quadrilaterals (Q, 4, 2) moved to where ``image`` looks most like the markers ``ids`` (Q,), turned (Q,).
+
+    One that is not ``noisy`` is smoothed no more than the cells of a typical marker bear.
+    """
     grid = _grid(decoder.cells)
     cells = np.ones((len(ids), decoder.cells + 2, decoder.cells + 2))
     cells[:, 1:-1, 1:-1] = decoder.seen(ids, turns)
     J = np.empty((len(ids), 15, grid.places.shape[1]), dtype=np.float32)
     J[:, 8:14] = grid.smooth
     J[:, 14] = (grid.blur @ cells @ grid.blur.T).reshape(len(ids), -1)
+    cell = float(np.median(np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1))) / (math.sqrt(2.0) * decoder.cells)
+    smoothing = _SMOOTHING if noisy else min(_SMOOTHING, _SMOOTHING_CELLS * cell)
     image, origin = _window(image, quads, decoder.cells)
     quads = quads - origin
-    picture = cv2.GaussianBlur(image - np.float32(image.mean()), (0, 0), _SMOOTHING)
+    picture = cv2.GaussianBlur(image - np.float32(image.mean()), (0, 0), smoothing)
     slope_u = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.125)
     slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.125)
     planes: list[Float32Array] = [np.asarray(plane) for plane in (picture, slope_u, slope_v)]

@@ -9,7 +9,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.scratch import Scratch
 from thermal_fiducial.core.types import Counts, Float32Array, Gray
 
 # The spread is taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
@@ -18,6 +17,9 @@ _LOCAL = 17
 _SPECKS = 3
 # Half-resolution pixels along a row over which columns are compared.
 _COLUMNS = 9
+# In a picture for a display: odd width of the surroundings, no wider than the white round the smallest markers; and by
+# how much darker a pixel must be [gray levels], and in standard deviations of the noise.
+_PICTURE_WINDOW_PX, _PICTURE_STEP, _PICTURE_NOISE = 5, 3.0, 2.0
 # Mean of Gaussian noise clipped at one standard deviation moves by 0.68 of a small offset.
 _CLIPPED = 1.0 / 0.68
 # 1 / (sqrt(2) * 0.6745): standard deviation from the median absolute difference of two pixels.
@@ -38,28 +40,26 @@ def noise_of(counts: Counts | Gray | Float32Array) -> float:
     return max(float(np.partition(difference, middle)[middle]) * _MAD_OF_DIFFERENCE, 0.3)
 
 
-def halved(counts: Float32Array, scratch: Scratch) -> Float32Array:
+def halved(counts: Float32Array) -> Float32Array:
     """Half the resolution: means of 2 x 2 pixels, with half the noise."""
     height, width = counts.shape[0] // 2, counts.shape[1] // 2
-    half = scratch.floats('halved', (height, width))
-    return np.asarray(cv2.resize(counts, (width, height), dst=half, interpolation=cv2.INTER_AREA))
+    return np.asarray(cv2.resize(counts, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-def without_columns(counts: Float32Array, noise: float, scratch: Scratch) -> Float32Array:
-    """``counts``, changed in place, without the offsets of its columns.
+def without_columns(counts: Float32Array, noise: float) -> Float32Array:
+    """``counts`` without the offsets of its columns.
 
     They show in the typical pixel of each column against its neighbours. What the scene does to a column is bounded by
     the noise: no pixel counts for more than that.
     """
-    deviation = cv2.blur(counts, (_COLUMNS, 1), dst=scratch.floats('deviation', counts.shape))
-    np.subtract(counts, deviation, out=deviation)
+    deviation = counts - cv2.blur(counts, (_COLUMNS, 1))
     np.clip(deviation, -noise, noise, out=deviation)
-    counts -= _CLIPPED * cv2.reduce(deviation, 0, cv2.REDUCE_AVG)
-    return counts
+    offsets = np.float32(_CLIPPED) * cv2.reduce(deviation, 0, cv2.REDUCE_AVG)
+    return np.asarray(np.subtract(counts, offsets, out=deviation))
 
 
 class Scale(NamedTuple):
-    """How dark places are sought at one resolution."""
+    """How dark places are looked for at one resolution."""
 
     #: standard deviation of the Gaussian before the search [px]
     smoothing_px: float
@@ -72,7 +72,7 @@ class Scale(NamedTuple):
     floor: float
 
 
-def dark(counts: Float32Array, noise: float, scale: Scale, scratch: Scratch) -> Gray:
+def dark(counts: Float32Array, noise: float, scale: Scale) -> Gray:
     """Mask (height, width) of what is darker than its surroundings, 255 where it is.
 
     Parameters
@@ -82,17 +82,23 @@ def dark(counts: Float32Array, noise: float, scale: Scale, scratch: Scratch) -> 
     """
     shape = counts.shape
     reach = 2 * round(2.5 * scale.smoothing_px) + 1
-    smooth = scratch.floats('smooth', shape)
-    cv2.GaussianBlur(counts, (reach, reach), scale.smoothing_px, dst=smooth)
-    coarse = counts if scale.window_shrink == 1 else halved(counts, scratch)
+    smooth = cv2.GaussianBlur(counts, (reach, reach), scale.smoothing_px)
+    coarse = counts if scale.window_shrink == 1 else halved(counts)
     limit = cv2.blur(smooth if scale.window_shrink == 1 else coarse, (scale.window_px, scale.window_px))
-    small = halved(coarse, scratch)
+    small = halved(coarse)
     deviation = small - cv2.blur(small, (_LOCAL, _LOCAL))
     variance = np.maximum(cv2.blur(deviation * deviation, (_LOCAL, _LOCAL)), 1e-6)
     asked = (scale.depth / np.sqrt(variance)) * (variance + (scale.floor * noise) ** 2)
     cv2.subtract(limit, cv2.resize(asked, limit.shape[::-1], interpolation=cv2.INTER_LINEAR), dst=limit)
     if limit.shape != shape:
-        limit = cv2.resize(limit, shape[::-1], dst=scratch.floats('limit', shape), interpolation=cv2.INTER_LINEAR)
-    mask = cv2.compare(smooth, limit, cv2.CMP_LT, dst=scratch.bytes('mask', shape))
+        limit = cv2.resize(limit, shape[::-1], interpolation=cv2.INTER_LINEAR)
+    mask = cv2.compare(smooth, limit, cv2.CMP_LT)
     # Specks of noise are many, and each is an outline to follow.
     return np.asarray(cv2.medianBlur(mask, _SPECKS))
+
+
+def dark_in_picture(picture: Float32Array, noise: float) -> Gray:
+    """The same of a picture for a display, whose pixels have little noise: markers of cells of a pixel show in it."""
+    mean = np.asarray(cv2.blur(picture, (_PICTURE_WINDOW_PX, _PICTURE_WINDOW_PX)), dtype=np.float32)
+    limit = mean - np.float32(max(_PICTURE_STEP, _PICTURE_NOISE * noise))
+    return np.asarray(cv2.compare(picture, limit, cv2.CMP_LT), dtype=np.uint8)

@@ -18,7 +18,7 @@ from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatAr
 _OUTSIDE = 0.4
 _OUTSIDE_PX = 2.5
 # Correlation below which nothing is a marker whatever surrounds it.
-_ALIKE = 0.5
+_SIMILAR = 0.5
 # Samples along a cell, in its middle, away from blurred edges.
 _SAMPLES = np.array([0.3, 0.5, 0.7])
 
@@ -46,7 +46,7 @@ class Reading:
     surround: FloatArray
 
 
-class Likeness(NamedTuple):
+class PatternMatch(NamedTuple):
     """Which patterns Q quadrilaterals look most like."""
 
     #: (Q, m * m) contrast of the cells, without background
@@ -99,12 +99,14 @@ class Decoder:
             return Reading(none, none, nothing, nothing, nothing, none, none, nothing)
         values, best, correlation, runner_up = self.likeness(image, quads, allowed)
         steps = np.zeros((len(quads), 4))
-        alike = np.flatnonzero(np.abs(correlation) >= _ALIKE)
+        alike = np.flatnonzero(np.abs(correlation) >= _SIMILAR)
         if len(alike):
             steps[alike] = self._steps(image, quads[alike])
         return self._judged(values, best, correlation, runner_up, steps)
 
-    def likeness(self, image: Counts | Float32Array, quads: FloatArray, allowed: BoolArray | None = None) -> Likeness:
+    def likeness(
+        self, image: Counts | Float32Array, quads: FloatArray, allowed: BoolArray | None = None
+    ) -> PatternMatch:
         """Most similar patterns of quadrilaterals (Q, 4, 2) among those ``allowed`` (M,), or all."""
         values = self._contrasts(image, quads)
         spread = np.sqrt((values * values).sum(axis=1, keepdims=True))
@@ -116,7 +118,7 @@ class Decoder:
         correlation = similar[rows, best]
         by_id = size.reshape(len(quads), -1, 4)
         by_id[rows, best // 4] = 0.0
-        return Likeness(values, best, correlation, by_id.max(axis=(1, 2)))
+        return PatternMatch(values, best, correlation, by_id.max(axis=(1, 2)))
 
     def match(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
         """Correlation (Q,) of quadrilaterals (Q, 4, 2) with the upright patterns of ``ids`` (Q,)."""

@@ -1,15 +1,19 @@
 """A frame, and what is known of it before anything is found."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from thermal_fiducial.core.detection.lag import MEMORY_AGE
-from thermal_fiducial.core.detection.motion import interaction, Twist
-from thermal_fiducial.core.detection.scratch import Scratch
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.contrast import noise_of, without_columns
+from thermal_fiducial.core.detection.lag import LAG_TAIL_AGE
+from thermal_fiducial.core.detection.twist import interaction, Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
+
+# Largest number of gray levels of what is meant for a display.
+_LEVELS = 256
 
 
 @dataclass(frozen=True)
@@ -25,17 +29,31 @@ class Frame:
     #: time constant of the bolometers, and time from the first row's sampling to the last's [s]
     lag: float
     readout: float
-    #: for the image
-    scratch: Scratch = field(default_factory=Scratch)
+    #: whether it has gone through the camera's processing for a display, which bends the scale of counts
+    displayed: bool = False
+
+    @staticmethod
+    def of(
+        stamp_ns: int,
+        counts: Counts | Gray,
+        camera: Camera,
+        twist: Twist | None,
+        config: ArucoDetectorConfig,
+        *,
+        keep_columns: bool,
+    ) -> 'Frame':
+        """A frame without its columns' fixed pattern, unless that is kept or the frame has eight bits."""
+        noise, displayed = noise_of(counts), bool(counts[::64].max() < _LEVELS)
+        lag, readout = config.bolometer_lag, config.readout_time
+        if counts.dtype == np.uint8 or keep_columns:
+            return Frame(stamp_ns, counts, noise, camera, twist, lag, readout, displayed)
+        plain = without_columns(counts.astype(np.float32), noise)
+        return Frame(stamp_ns, plain, noise, camera, twist, lag, readout, displayed)
 
     @cached_property
     def image(self) -> Float32Array:
         """As floating-point numbers: a copy that few places of it are not worth."""
-        if self.counts.dtype == np.float32:
-            return np.asarray(self.counts, dtype=np.float32)
-        image = self.scratch.floats('image', self.counts.shape)
-        np.copyto(image, self.counts)
-        return image
+        return np.asarray(self.counts, dtype=np.float32)
 
     @property
     def samples(self) -> Counts | Float32Array:
@@ -70,16 +88,16 @@ class Places:
         """Of the image (N, 4, 2) [px/s]."""
         return np.asarray(self.flow @ twist.value)
 
-    def smear(self, twist: Twist, lag: float) -> FloatArray:
+    def lag_blur(self, twist: Twist, lag: float) -> FloatArray:
         """Mean displacement (N, 4, 2) [px] by a lag [s]."""
         return np.asarray(-lag * (self.flow @ twist.ago(lag)))
 
-    def memory(self, twist: Twist, lag: float) -> FloatArray:
-        """Displacement (N, 4, 2) [px] in so long a time as the lag, as it places the image's memory of the past."""
-        return np.asarray(-lag * (self.flow @ twist.ago(MEMORY_AGE * lag)))
+    def lag_tail(self, twist: Twist, lag: float) -> FloatArray:
+        """Displacement (N, 4, 2) [px] in so long a time as the lag, as it places the image's lag tail."""
+        return np.asarray(-lag * (self.flow @ twist.ago(LAG_TAIL_AGE * lag)))
 
     def unknown(self, twist: Twist, lag: float) -> FloatArray:
-        """Covariances (N, 4, 2, 2) [px^2] of the smear by what is unknown of the twist.
+        """Covariances (N, 4, 2, 2) [px^2] of the motion blur by what is unknown of the twist.
 
         What the corners of a marker have in common is no error of its shape.
         """

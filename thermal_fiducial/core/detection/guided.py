@@ -4,120 +4,65 @@ A marker is accepted by its own evidence alone: its pattern, in its expected pla
 the image clearly, and better than the pattern of any other marker or any other turn of its own.
 """
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.confirmation import read_quads
 from thermal_fiducial.core.detection.decoding import Decoder, Reading
-from thermal_fiducial.core.detection.ids import among
-from thermal_fiducial.core.detection.scratch import Scratch
-from thermal_fiducial.core.detection.search import Found, read_quads
-from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.detection.frame import Frame, Places
+from thermal_fiducial.core.detection.ids import pairs
+from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
+from thermal_fiducial.core.detection.lag import markers_deblurred, REMAINING
+from thermal_fiducial.core.detection.readout import expected_displacement
+from thermal_fiducial.core.detection.refining import BLUR_THAT_MATTERS_PX, WINDOW_MARGIN_PX
+from thermal_fiducial.core.detection.search import Found, merged
+from thermal_fiducial.core.detection.twist import Twist
+from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# A marker turned further from the camera than this shows too little to be expected.
-_MAX_TILT_COSINE = 0.2
-_NEXT = np.array([1, 2, 3, 0])
-# A marker predicted as far inside the image as this is not cut by its rim [px].
-_WHOLE_PX = 10.0
 # Places round the prediction that are tried, in shares of a cell: near first, then far.
 _NEAR = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]), axis=-1).reshape(-1, 2)
 _FAR = np.stack(np.meshgrid([-1.4, -0.7, 0.0, 0.7, 1.4], [-1.4, -0.7, 0.0, 0.7, 1.4]), axis=-1).reshape(-1, 2)
 
 
-class Expected(NamedTuple):
-    """Places of N markers in a frame."""
-
-    #: (N,)
-    ids: IntArray
-    #: (N, 4, 2) in pixels, and normalised
-    corners_px: FloatArray
-    x: FloatArray
-    #: (N, 4) of the corners [m]
-    depth: FloatArray
-
-    def only(self, keep: BoolArray) -> 'Expected':
-        """Those of the markers ``keep`` (N,)."""
-        return Expected(self.ids[keep], self.corners_px[keep], self.x[keep], self.depth[keep])
-
-    def joined(self, others: 'Expected') -> 'Expected':
-        """Those of ``others`` as well."""
-        return Expected(
-            np.concatenate([self.ids, others.ids]),
-            np.concatenate([self.corners_px, others.corners_px]),
-            np.concatenate([self.x, others.x]),
-            np.concatenate([self.depth, others.depth]),
-        )
-
-
-class CutMarkers(NamedTuple):
-    """N markers that show a face and may be in view, but not wholly."""
-
-    #: (N,)
-    ids: IntArray
-    #: (N, 4, 4)
-    T_camera_marker: FloatArray
-    #: (N,) sides [m]
-    sizes: FloatArray
+def near_prediction(
+    frame: Frame,
+    twist: Twist,
+    expected: ExpectedMarkers,
+    decoder: Decoder,
+    config: ArucoDetectorConfig,
+) -> Found:
+    """Those of the ``expected`` markers that the frame shows near where they are expected."""
+    places = Places.of(ImagePoints.at(expected.corners_px, frame.camera), expected.depth)
+    shift, rolling = places.lag_blur(twist, frame.lag), expected_displacement(places, twist, frame)
+    ids, corners = expected.ids, expected.corners_px + rolling
+    blurred = np.abs(shift).max(axis=(1, 2)) > BLUR_THAT_MATTERS_PX
+    scene = frame.image
+    if blurred.any():
+        scene = markers_deblurred(frame.image, corners[blurred], shift[blurred], WINDOW_MARGIN_PX)
+    left = np.where(blurred[:, None, None], REMAINING * shift, shift)
+    found, there = _look(scene, ids, corners + left, decoder, frame.noise, config)
+    found = replace(found, corners_px=found.corners_px - (left + rolling)[there])
+    faint = np.flatnonzero(blurred & ~there)
+    if len(faint) == 0:
+        return found
+    # Freeing a faint marker of its lag may have drowned it in noise.
+    also, there = _look(frame.image, ids[faint], (corners + shift)[faint], decoder, frame.noise, config)
+    return merged(found, replace(also, corners_px=also.corners_px - (shift + rolling)[faint[there]]))
 
 
-class KnownMarkers:
-    """The markers of a map.
-
-    Parameters
-    ----------
-    markers : ID to (T_map_marker, side [m])
-    """
-
-    def __init__(self, markers: Mapping[int, tuple[FloatArray, float]]) -> None:
-        #: (M,)
-        self.ids = np.array(sorted(markers), dtype=np.int64)
-        entries = [markers[marker_id] for marker_id in self.ids.tolist()]
-        self._T_map_marker = T_map_marker = (
-            np.stack([entry[0] for entry in entries]) if entries else np.zeros((0, 4, 4))
-        )
-        self._sizes = sizes = np.array([entry[1] for entry in entries])
-        corners = se3.apply(T_map_marker, sizes[:, None, None] * marker_corners(1.0))
-        self._corners_and_normals = np.concatenate([corners, T_map_marker[:, None, :3, 2]], axis=1)
-
-    def expected(self, T_camera_map: FloatArray, camera: Camera, min_side_px: float) -> Expected:
-        """Those that are wholly in view and show a face."""
-        rotated = self._corners_and_normals @ T_camera_map[:3, :3].T
-        points, normal = rotated[:, :4] + T_camera_map[:3, 3], rotated[:, 4]
-        corners = camera.project(points)
-        centre = 0.25 * points.sum(axis=1)
-        facing = (normal * centre).sum(axis=1) < -_MAX_TILT_COSINE * np.sqrt((centre * centre).sum(axis=1))
-        span = corners.take(_NEXT, axis=1) - corners
-        large = ((span * span).sum(axis=-1) >= min_side_px**2).all(axis=1)
-        seen = np.flatnonzero(camera.contains(corners, 2.0).all(axis=1) & facing & large)
-        points = points[seen]
-        return Expected(self.ids[seen], corners[seen], points[..., :2] / points[..., 2:], points[..., 2])
-
-    def cut(self, T_camera_map: FloatArray, camera: Camera, without: IntArray) -> CutMarkers:
-        """Those that show a face and may be partly in view, but for those of the IDs ``without``."""
-        T = T_camera_map @ self._T_map_marker
-        centre, normal = T[:, :3, 3], T[:, :3, 2]
-        distance = np.sqrt(np.sum(centre * centre, axis=1))
-        facing = np.sum(normal * centre, axis=1) < -_MAX_TILT_COSINE * distance
-        corners = camera.project(se3.apply(T_camera_map, self._corners_and_normals[:, :4].reshape(-1, 3))).reshape(
-            -1, 4, 2
-        )
-        near = np.nan_to_num(corners, nan=-1e9)
-        low, high = near.min(axis=1), near.max(axis=1)
-        inside = camera.contains(corners)
-        overlap = inside.any(axis=1) | ((low < (camera.width, camera.height)) & (high > 0.0)).all(axis=1)
-        whole = camera.contains(corners, _WHOLE_PX).all(axis=1)
-        some = np.flatnonzero(facing & overlap & ~whole & ~among(self.ids, without))
-        return CutMarkers(self.ids[some], T[some], self._sizes[some])
+def common_shift(ids: IntArray, corners: FloatArray, observed: Found) -> FloatArray:
+    """By how much (2,) markers are off their predicted corners (N, 4, 2): the median of those that are observed."""
+    predicted, found = pairs(ids, observed.ids)
+    if len(found) == 0:
+        return np.zeros(2)
+    return np.asarray(np.median((observed.corners_px[found] - corners[predicted]).mean(axis=1), axis=0))
 
 
-def look(
+def _look(
     image: Float32Array,
-    scratch: Scratch,
     ids: IntArray,
     corners: FloatArray,
     decoder: Decoder,
@@ -126,13 +71,13 @@ def look(
 ) -> tuple[Found, BoolArray]:
     """The expected markers (N,), (N, 4, 2) that the image shows, and which (N,) of them these are."""
     corners = _shifted(image, ids, corners, decoder, _NEAR)
-    reading = read_quads(image, scratch, corners, decoder)
+    reading = read_quads(image, corners, decoder)
     good, contrast = _confirmed(reading, ids, noise, config), reading.contrast.copy()
     missing = np.flatnonzero(~good)
     if len(missing):
         far = _shifted(image, ids[missing], corners[missing], decoder, _FAR)
         corners[missing] = _shifted(image, ids[missing], far, decoder, _NEAR)
-        reading = read_quads(image, scratch, corners[missing], decoder)
+        reading = read_quads(image, corners[missing], decoder)
         good[missing], contrast[missing] = _confirmed(reading, ids[missing], noise, config), reading.contrast
     return Found(ids[good], corners[good], contrast[good] / noise, np.ones(int(good.sum()), dtype=bool)), good
 

@@ -1,4 +1,4 @@
-"""The bolometers' lag that smears what moves.
+"""The bolometers' lag that blurs what moves.
 
 A bolometer answers the scene x with y, ``tau dy/dt + y = x``. While the image moves with velocity w, the pattern y is
 carried along, ``dy/dt = -w . grad y``, so the scene at the very stamp is ``x = y - tau w . grad y``: the search for
@@ -8,8 +8,8 @@ time m is taken out, ``(y(t) - b y(t - m)) / (1 - b)`` with ``b = exp(-m / tau)`
 one, shifted. What is left is a short blur along the motion, that the model of an edge knows, and its mean delay.
 
 While the velocity w changes by a, every age has one of its own: what was seen s ago lies s w - s^2 a / 2 behind. So the
-mean delay of an exponential, -tau w + tau^2 a, is that of the velocity one time constant ago, and the memory is as far
-from the image as the velocity of tau + m / 2 ago has carried it.
+mean delay of an exponential, -tau w + tau^2 a, is that of the velocity one time constant ago, and the lag tail
+is as far from the image as the velocity of tau + m / 2 ago has carried it.
 """
 
 import math
@@ -17,46 +17,47 @@ import math
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.motion import interaction, Twist
+from thermal_fiducial.core.detection.twist import interaction, Twist
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import Float32Array, FloatArray
 
 # First derivative, exact up to the sixth order: on images blurred by a pixel's optics the eighth does not matter.
 _DERIVATIVE = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0], dtype=np.float32) / 60.0
-# Linear interpolation blurs the memory more than the image that it is taken from, and would displace the difference.
+# Linear interpolation blurs the lag tail more than the image that it is taken from, and would displace the difference.
 _WARP = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP
 # How much of the past is taken out of the image, in time constants, and its weight.
-_MEMORY = 0.75
-_FORGOTTEN = math.exp(-_MEMORY)
-#: The present's weight when the memory is taken out.
+_TAIL = 0.75
+_FORGOTTEN = math.exp(-_TAIL)
+#: The present's weight when the lag tail is taken out.
 GAIN = 1.0 / (1.0 - _FORGOTTEN)
-#: What is left of the smear: its mean, and its standard deviation about that, as shares of the whole.
-REMAINING = 1.0 - _MEMORY * _FORGOTTEN * GAIN
-SPREAD = math.sqrt(1.0 - _MEMORY**2 * _FORGOTTEN * GAIN**2)
+#: What is left of the motion blur: its mean, and its standard deviation about that, as shares of the whole.
+REMAINING = 1.0 - _TAIL * _FORGOTTEN * GAIN
+SPREAD = math.sqrt(1.0 - _TAIL**2 * _FORGOTTEN * GAIN**2)
 _EYE = np.eye(2)
-#: Age, in time constants, of the velocity that has carried the memory as far as it is from the image.
-MEMORY_AGE = 1.0 + 0.5 * _MEMORY
+#: Age, in time constants, of the velocity that has carried the lag tail as far as it is from the image.
+LAG_TAIL_AGE = 1.0 + 0.5 * _TAIL
 # How far the time constant may be off, and the displacement of an edge by a response that is no exponential: a share of
-# the smear, and one that grows with the square of the cells that the smear carries it.
+# the motion blur, and one that grows with the square of the cells that the motion blur carries it.
 _LAG_UNSURE = 0.35
 _FORM_UNSURE, _FORM_UNSURE_IN_CELLS = 0.010, 0.011
-# Displacement [px] by a smear over the residuals that it leaves of a model without one, in contrasts, and the residuals
-# that hardly grow with it any more: 0.015 where there is no smear, 0.05 where it is 1.5 px, 0.08 where it is 6 px.
-_SMEAR_THAT_SHOWS, _SMEARED_OUT = 20.0, 0.055
+# Displacement [px] by motion blur over the residuals that it leaves of a model without it, in contrasts, and the
+# residuals that hardly grow with it any more: 0.015 without it, 0.05 where it is 1.5 px, 0.08 where it is 6 px.
+_BLUR_THAT_SHOWS, _BLURRED_OUT = 20.0, 0.055
 # The same of any marker that can be read, in cells: nine of ten are off by less than 0.65, seen without a motion.
 _READABLE = 0.4
 
 
-def model_error(smear_px: FloatArray, corners_px: FloatArray, cells: int) -> FloatArray:
+def model_error(lag_blur_px: FloatArray, corners_px: FloatArray, cells: int) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] of what is wrong with an exponential lag of this time constant.
 
-    A wrong time constant displaces the corners along their smear (N, 4, 2). What they have in common no marker can
-    tell, and covariances of single corners cannot say; it is a delay, and belongs to the filter's time offset. The
-    differences change the marker's shape. So does a response of another form, and the more the farther it carries the
-    neighbouring edges, one cell away, into one another: those of a marker with m ``cells`` and corners (N, 4, 2).
+    A wrong time constant displaces the corners along their motion blur (N, 4, 2). What they have in common no
+    marker shows, and covariances of single corners cannot say; it is a delay, and belongs to the filter's time
+    offset. The differences change the marker's shape. So does a response of another form, and the more the farther
+    it carries the neighbouring edges, one cell away, into one another: those of a marker with m ``cells`` and corners
+    (N, 4, 2).
     """
-    common = 0.25 * smear_px.sum(axis=1)
-    change = _LAG_UNSURE * (smear_px - common[:, None])
+    common = 0.25 * lag_blur_px.sum(axis=1)
+    change = _LAG_UNSURE * (lag_blur_px - common[:, None])
     carried = cells**2 * _square_in_sides(common, corners_px)
     form = 0.5 * (_FORM_UNSURE**2 + (_FORM_UNSURE_IN_CELLS * carried) ** 2)[:, None, None]
     common = common[:, :, None]
@@ -81,8 +82,8 @@ def common_error(
 ) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] of corners that a motion displaces of which little is known.
 
-    Edges that are sharp limit it, and that cells can be told apart. It displaces all corners of a frame alike, which
-    covariances of single ones cannot say: what many of them tell together may be off by more than theirs.
+    Edges that are sharp limit it, and that cells can be distinguished. It displaces all corners of a frame alike, which
+    covariances of single ones cannot say: what many of them say together may be off by more than theirs.
 
     Parameters
     ----------
@@ -93,53 +94,48 @@ def common_error(
     """
     covariance = displacement @ twist_covariance @ np.swapaxes(displacement, -1, -2)
     variance = 0.5 * np.trace(covariance, axis1=-2, axis2=-1)
-    sharp = np.where(unsharpness < _SMEARED_OUT, _SMEAR_THAT_SHOWS * unsharpness, np.inf)
+    sharp = np.where(unsharpness < _BLURRED_OUT, _BLUR_THAT_SHOWS * unsharpness, np.inf)
     shown = np.minimum(sharp, _READABLE * cell_px)[:, None] ** 2
     return np.asarray(covariance * np.minimum(shown / np.maximum(variance, 1e-12), 1.0)[..., None, None])
 
 
-def without_lag(image: Float32Array, smear_u: Float32Array, smear_v: Float32Array) -> Float32Array:
-    """The scene at the stamp: ``image`` (height, width) plus smear (height, width) times gradient."""
+def without_lag(image: Float32Array, blur_u: Float32Array, blur_v: Float32Array) -> Float32Array:
+    """The scene at the stamp: ``image`` (height, width) plus blur (height, width) times gradient."""
     du = cv2.filter2D(image, cv2.CV_32F, _DERIVATIVE[None, :])
     dv = cv2.filter2D(image, cv2.CV_32F, _DERIVATIVE[:, None])
-    return np.asarray(image + smear_u * du + smear_v * dv)
+    return np.asarray(image + blur_u * du + blur_v * dv)
 
 
-def markers_sharpened(
+def markers_deblurred(
     image: Float32Array,
     corners_px: FloatArray,
-    smear_px: FloatArray,
+    lag_blur_px: FloatArray,
     margin_px: int,
-    result: Float32Array | None = None,
 ) -> Float32Array:
-    """``image`` with the windows round N markers (corners (N, 4, 2), smear (N, 4, 2) [px]) freed of old memories.
-
-    ``result`` is where it is put, if given.
-    """
-    result = np.empty_like(image) if result is None else result
-    np.copyto(result, image)
+    """``image`` with the windows round N markers (corners, motion blur: (N, 4, 2) [px]) freed of their lag tails."""
+    result = image.copy()
     height, width = image.shape
-    finite = np.isfinite(corners_px).all(axis=(1, 2)) & np.isfinite(smear_px).all(axis=(1, 2))
-    corners_px, smear_px = corners_px[finite], smear_px[finite]
-    maps = memory_maps(corners_px, smear_px)
+    finite = np.isfinite(corners_px).all(axis=(1, 2)) & np.isfinite(lag_blur_px).all(axis=(1, 2))
+    corners_px, lag_blur_px = corners_px[finite], lag_blur_px[finite]
+    maps = lag_tail_maps(corners_px, lag_blur_px)
     low = np.floor(corners_px.min(axis=1)).astype(int) - margin_px
     high = np.ceil(corners_px.max(axis=1)).astype(int) + margin_px + 1
     low, high = np.maximum(low, 0), np.minimum(high, (width, height))
     seen = (low < high).all(axis=1)
-    low, high, to_memory = low[seen], high[seen], maps[seen].astype(np.float32)
-    to_memory[:, :, 2:] += to_memory[:, :, :2] @ low[..., None].astype(np.float32)
-    for (u0, v0), (u1, v1), inverse in zip(low.tolist(), high.tolist(), to_memory, strict=True):
-        memory = cv2.warpAffine(image, inverse, (u1 - u0, v1 - v0), flags=_WARP, borderMode=cv2.BORDER_REPLICATE)
-        cv2.addWeighted(image[v0:v1, u0:u1], GAIN, memory, 1.0 - GAIN, 0.0, dst=result[v0:v1, u0:u1])
+    low, high, to_tail = low[seen], high[seen], maps[seen].astype(np.float32)
+    to_tail[:, :, 2:] += to_tail[:, :, :2] @ low[..., None].astype(np.float32)
+    for (u0, v0), (u1, v1), inverse in zip(low.tolist(), high.tolist(), to_tail, strict=True):
+        lag_tail = cv2.warpAffine(image, inverse, (u1 - u0, v1 - v0), flags=_WARP, borderMode=cv2.BORDER_REPLICATE)
+        cv2.addWeighted(image[v0:v1, u0:u1], GAIN, lag_tail, 1.0 - GAIN, 0.0, dst=result[v0:v1, u0:u1])
     return result
 
 
-def memory_maps(corners_px: FloatArray, smear_px: FloatArray) -> FloatArray:
-    """Affine maps (N, 2, 3) of the pixels round markers, (N, 4, 2) both, to where their memory lies.
+def lag_tail_maps(corners_px: FloatArray, lag_blur_px: FloatArray) -> FloatArray:
+    """Affine maps (N, 2, 3) of the pixels round markers, (N, 4, 2) both, to where their lag tail lies.
 
     What a pixel saw earlier, the scene now has farther on.
     """
-    return np.asarray(np.eye(2, 3) - _MEMORY * np.swapaxes(_affine(corners_px, smear_px), -1, -2))
+    return np.asarray(np.eye(2, 3) - _TAIL * np.swapaxes(_affine(corners_px, lag_blur_px), -1, -2))
 
 
 def _affine(points: FloatArray, values: FloatArray) -> FloatArray:
@@ -149,7 +145,7 @@ def _affine(points: FloatArray, values: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(A_T @ A, A_T @ values))
 
 
-class SmearField:
+class LagField:
     """Displacement by lag over the whole image, for a scene at one depth.
 
     Parameters
@@ -173,7 +169,7 @@ class SmearField:
         return _displacement(self._x, self._J, twist, depth, tau)
 
     def longest(self, twist: Twist, depth: float, tau: float) -> float:
-        """Its largest number [px]; of a field that is nearly quadratic, corners, rims and middle tell."""
+        """Its largest number [px]; of a field that is nearly quadratic, corners, borders and middle show."""
         return float(np.abs(_displacement(*self._some, twist, depth, tau)).max())
 
     def full(self, coarse: FloatArray) -> Float32Array:

@@ -1,6 +1,6 @@
 """Corners as OpenCV sees them: each by itself, from the gradients around it.
 
-What has gone through a camera's display processing (8 bits, gain control, sharpening) no longer has edges of a known
+What has gone through a camera's display processing (8 bits, gain control, deblurring) no longer has edges of a known
 shape or straight lines under a calibration that need not exist; there the local corner is the common definition. It
 lies a few tenths of a pixel inside that of the sides' lines, because blur rounds corners.
 """

@@ -1,7 +1,7 @@
-"""Known markers that the rim of the image cuts, or that fill it.
+"""Known markers that the border of the image cuts, or that fill it.
 
 Where the map and the odometry expect one, its visible cells must look like it and like nothing else there. All edges
-between its cells that are in view, inside and along its sides, then tell its pose, and that tells its corners, those
+between its cells that are in view, inside and along its sides, then show its pose, and that shows its corners, those
 outside the image as well.
 """
 
@@ -23,15 +23,15 @@ from thermal_fiducial.core.detection.corners.grid import (
     PoseFit,
 )
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
-from thermal_fiducial.core.detection.corners.segments import Memory
+from thermal_fiducial.core.detection.corners.segments import LagTail
 from thermal_fiducial.core.detection.decoding import Decoder
 from thermal_fiducial.core.detection.displayed import DISPLACED
 from thermal_fiducial.core.detection.frame import Frame, Places
-from thermal_fiducial.core.detection.guided import CutMarkers
-from thermal_fiducial.core.detection.lag import GAIN, MEMORY_AGE, memory_maps, model_error, REMAINING, SPREAD
-from thermal_fiducial.core.detection.motion import interaction
-from thermal_fiducial.core.detection.readout import expected_displacement, memory
-from thermal_fiducial.core.detection.refining import sides_px, worth_sharpening
+from thermal_fiducial.core.detection.known_markers import PartialMarkers
+from thermal_fiducial.core.detection.lag import GAIN, LAG_TAIL_AGE, lag_tail_maps, model_error, REMAINING, SPREAD
+from thermal_fiducial.core.detection.readout import expected_displacement, lag_tail
+from thermal_fiducial.core.detection.refining import sides_px, worth_deblurring
+from thermal_fiducial.core.detection.twist import interaction
 from thermal_fiducial.core.detection.visible_cells import VisibleCells
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -40,7 +40,7 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, Gray, IntArray
 
 # Cells narrower than this show no straight edges apart from each other [px]; those of the coarsest layer are no wider.
 _NARROWEST_PX, _COARSE_PX = 5.0, 8.0
-# So many markers at most, the largest, are looked for in a frame: more tell little more.
+# So many markers at most, the largest, are looked for in a frame: more show little more.
 _MOST = 2
 # Places near the prediction that are tried, in cells; others are so far apart, as far as so many standard deviations of
 # the prediction reach, but at least and at most so far.
@@ -49,7 +49,7 @@ _APART, _UNSURE, _LEAST_REACH, _REACH = 0.7, 2.5, 1.4, 4.9
 # Least number of cells in view, and of those by which any other marker differs, lest a stain make it another.
 _CELLS, _DIFFERENT = 16, 2
 # Least correlation, difference to the most similar other pattern as a share of what a perfect view has, and of squares.
-_ALIKE, _MARGIN, _EVIDENCE = 0.8, 0.5, 25.0
+_SIMILAR, _MARGIN, _EVIDENCE = 0.8, 0.5, 25.0
 # Correlation of a marker that need not be looked for elsewhere, and of a place that is worth a closer look.
 _THERE, _HINT = 0.95, 0.55
 # Least share of the edges in view that show a step like the others', and agree with the pose.
@@ -58,7 +58,7 @@ _SHOWN, _AGREEING = 0.7, 0.6
 # the first with so much more blur, to catch edges from farther away, and the last step of a pose that has settled [px].
 _COARSE_STEPS, _NEAR_PX = 3, 0.3
 _STEPS, _WIDE, _SETTLED_PX = 8, 1.5, 0.1
-# A corner that is known no better tells nothing, nor one so far outside the image, in image widths [px].
+# A corner that is known no better shows nothing, nor one so far outside the image, in image widths [px].
 _KNOWN_PX, _OUTSIDE = 8.0, 1.0
 # Depth of points that are no longer in front of the camera [m].
 _LEAST_DEPTH = 1e-3
@@ -85,7 +85,7 @@ class _Marker:
         return se3.apply(self.T_camera_marker, on_marker(self.window, self.size))
 
 
-class CutMarkerSearch:
+class PartialMarkerSearch:
     """Looks for known markers that are not wholly in view.
 
     Parameters
@@ -100,30 +100,29 @@ class CutMarkerSearch:
     def look(
         self,
         frame: Frame,
-        cut: CutMarkers,
+        candidates: PartialMarkers,
         unsure_m: float,
         allowed: BoolArray,
         config: ArucoDetectorConfig,
-        *,
-        bent: bool = False,
     ) -> tuple[IntArray, RefinedCorners]:
-        """Those of the markers ``cut`` that the frame shows: IDs (N,) and corners.
+        """Those of the ``candidates`` that the frame shows: IDs (N,) and corners.
 
         Parameters
         ----------
         frame : whose twist is known
         unsure_m : standard deviation of where they are expected
         allowed : (M,) IDs that there may be
-        bent : whether the frame is for a display, its scale bent by gain control
         """
         in_view = (
             self._expected(frame.camera, marker_id, size, T, unsure_m)
-            for marker_id, T, size in zip(cut.ids.tolist(), cut.T_camera_marker, cut.sizes.tolist(), strict=True)
+            for marker_id, T, size in zip(
+                candidates.ids.tolist(), candidates.T_camera_marker, candidates.sizes.tolist(), strict=True
+            )
         )
         largest = sorted((marker for marker in in_view if marker is not None), key=lambda marker: -marker.cell_px)
         seen = []
         for marker in largest[:_MOST]:
-            corners = self._one(frame, marker, allowed, config, bent=bent)
+            corners = self._one(frame, marker, allowed, config)
             if corners is not None:
                 seen.append((marker.id, corners))
         if not seen:
@@ -134,7 +133,7 @@ class CutMarkerSearch:
         return ids, RefinedCorners(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
     def _one(
-        self, frame: Frame, marker: _Marker, allowed: BoolArray, config: ArucoDetectorConfig, *, bent: bool
+        self, frame: Frame, marker: _Marker, allowed: BoolArray, config: ArucoDetectorConfig
     ) -> RefinedCorners | None:
         points = on_marker(self._visible.places, marker.size)
         factor = int(2 ** np.clip(np.floor(np.log2(marker.cell_px / _COARSE_PX)), 0, 3))
@@ -146,12 +145,12 @@ class CutMarkerSearch:
         rough = _settled(T, marker.size, pattern, [coarse] * _COARSE_STEPS, _NEAR_PX)
         if rough is None or not self._recognised(rough, marker, coarse, allowed, frame.noise, config):
             return None
-        fine = _sharpened(frame, marker.seen(), rough.contrast, config.blur_px, self._cells)
+        fine = _deblurred(frame, marker.seen(), rough.contrast, config.blur_px, self._cells)
         layers = [replace(fine, blur=_WIDE * fine.blur), *[fine] * _STEPS]
         fit = _settled(rough.T_camera_marker, marker.size, pattern, layers, _SETTLED_PX)
         if fit is None or fit.moved_px > _SETTLED_PX or not _agrees(fit):
             return None
-        return _corners(frame, marker, fit, self._cells, bent=bent)
+        return _corners(frame, marker, fit, self._cells)
 
     def _expected(
         self, camera: Camera, marker_id: int, size: float, T_camera_marker: FloatArray, unsure_m: float
@@ -183,7 +182,7 @@ class CutMarkerSearch:
             return marker.T_camera_marker
         at, near = np.zeros(2), cell_px * _NEAR
         similarity = similar(near)
-        if similarity.max() < _ALIKE:
+        if similarity.max() < _SIMILAR:
             far = cell_px * _around(marker.unsure_cells)
             at = far[np.argmax(similar(far))]
             similarity = similar(at + near)
@@ -211,7 +210,7 @@ class CutMarkerSearch:
         correlation, margin = abs(likeness.correlation), _MARGIN * (1.0 - likeness.perfect)
         return bool(
             likeness.cells >= _CELLS
-            and correlation >= _ALIKE
+            and correlation >= _SIMILAR
             and correlation - likeness.runner_up >= margin
             and likeness.distance >= _DIFFERENT
             and likeness.evidence >= _EVIDENCE
@@ -242,7 +241,7 @@ def _around(unsure_cells: float) -> FloatArray:
 
 
 def _plain(frame: Frame, window: FloatArray, blur_px: float, factor: int) -> Layer:
-    """The frame at one resolution in ``factor``, as smeared as it is round a ``window`` (4, 3) in the camera."""
+    """The frame at one resolution in ``factor``, as blurred as it is round a ``window`` (4, 3) in the camera."""
     camera = _coarser(frame.camera, factor)
     image = frame.image
     if factor > 1:
@@ -253,44 +252,44 @@ def _plain(frame: Frame, window: FloatArray, blur_px: float, factor: int) -> Lay
     def displacement(points: FloatArray) -> FloatArray:
         return _displaced(frame, points, 0.0) / factor
 
-    return Layer(image, camera, displacement, blur, _smear(frame, window) / factor)
+    return Layer(image, camera, displacement, blur, _lag_blur(frame, window) / factor)
 
 
-def _sharpened(frame: Frame, window: FloatArray, contrast: float, blur_px: float, cells: int) -> Layer:
-    """The frame as it is; without old memories round the window (4, 3), where that is worth its noise."""
+def _deblurred(frame: Frame, window: FloatArray, contrast: float, blur_px: float, cells: int) -> Layer:
+    """The frame as it is; without old lag tails round the window (4, 3), where that is worth its noise."""
     places, twist = _places(window, frame.camera), frame.twist
-    mean = _smear(frame, window)
-    clarity = np.array([contrast / frame.noise])
+    mean = _lag_blur(frame, window)
+    cnr = np.array([contrast / frame.noise])
     cell = sides_px(places.at.px) / cells
-    if twist is None or not worth_sharpening(np.array([mean @ mean]), cell, cells, clarity)[0]:
+    if twist is None or not worth_deblurring(np.array([mean @ mean]), cell, cells, cnr)[0]:
         return _plain(frame, window, blur_px, 1)
-    maps = memory_maps(places.at.px + _displaced(frame, window, 1.0 - REMAINING), memory(places, twist, frame))
+    maps = lag_tail_maps(places.at.px + _displaced(frame, window, 1.0 - REMAINING), lag_tail(places, twist, frame))
 
     def displacement(points: FloatArray) -> FloatArray:
         return _displaced(frame, points, 1.0 - REMAINING)
 
-    return Layer(frame.image, frame.camera, displacement, blur_px, SPREAD * mean, Memory(maps, np.array([GAIN])))
+    return Layer(frame.image, frame.camera, displacement, blur_px, SPREAD * mean, LagTail(maps, np.array([GAIN])))
 
 
 def _displaced(frame: Frame, points: FloatArray, removed: float) -> FloatArray:
-    """By how much points (P, 3) in the camera appear displaced (P, 2) [px], such a share of memories taken out."""
+    """By how much points (P, 3) in the camera appear displaced (P, 2) [px], such a share of lag tails taken out."""
     twist, lag = frame.twist, frame.lag
     if twist is None:
         return np.zeros((len(points), 2))
     depth = np.maximum(points[:, 2], _LEAST_DEPTH)
     x = points[:, :2] / depth[:, None]
-    back = -lag * (twist.ago(lag) - removed * twist.ago(MEMORY_AGE * lag))
+    back = -lag * (twist.ago(lag) - removed * twist.ago(LAG_TAIL_AGE * lag))
     shift = (frame.camera.distort_linearised(x)[1] @ (interaction(x, depth) @ back)[..., None])[..., 0]
     if frame.readout == 0.0:
         return np.asarray(shift)
     return np.asarray(shift + expected_displacement(_places(points, frame.camera), twist, frame)[0])
 
 
-def _smear(frame: Frame, window: FloatArray) -> FloatArray:
-    """Mean smear (2,) [px] of what is seen of a marker, whose window is (4, 3) in the camera."""
+def _lag_blur(frame: Frame, window: FloatArray) -> FloatArray:
+    """Mean motion blur (2,) [px] of what is seen of a marker, whose window is (4, 3) in the camera."""
     if frame.twist is None:
         return np.zeros(2)
-    return np.asarray(_places(window, frame.camera).smear(frame.twist, frame.lag)[0].mean(axis=0))
+    return np.asarray(_places(window, frame.camera).lag_blur(frame.twist, frame.lag)[0].mean(axis=0))
 
 
 def _coarser(camera: Camera, factor: int) -> Camera:
@@ -309,7 +308,7 @@ def _places(points: FloatArray, camera: Camera) -> Places:
     return Places.of(ImagePoints.seen_at(points[None, :, :2] / depth[..., None], camera), depth)
 
 
-def _corners(frame: Frame, marker: _Marker, fit: PoseFit, cells: int, *, bent: bool) -> RefinedCorners | None:
+def _corners(frame: Frame, marker: _Marker, fit: PoseFit, cells: int) -> RefinedCorners | None:
     """The corners that follow from a marker's pose, with covariances (2, 2) that claim no more than is known of it.
 
     None where they are too uncertain, or too far outside the image.
@@ -320,7 +319,7 @@ def _corners(frame: Frame, marker: _Marker, fit: PoseFit, cells: int, *, bent: b
     if not frame.camera.contains(corners, -limit).all():
         return None
     J = pose_jacobian(T, points, frame.camera)
-    information: FloatArray = np.asarray(np.linalg.inv(_pose_covariance(frame, marker, fit, cells, bent=bent)))
+    information: FloatArray = np.asarray(np.linalg.inv(_pose_covariance(frame, marker, fit, cells)))
     blocks = _independent(J, information)
     deviation = np.sqrt(np.trace(blocks, axis1=1, axis2=2).max())
     if not deviation < _KNOWN_PX:
@@ -329,23 +328,23 @@ def _corners(frame: Frame, marker: _Marker, fit: PoseFit, cells: int, *, bent: b
     return RefinedCorners(corners[None], blocks[None], *scalars)
 
 
-def _pose_covariance(frame: Frame, marker: _Marker, fit: PoseFit, cells: int, *, bent: bool) -> FloatArray:
+def _pose_covariance(frame: Frame, marker: _Marker, fit: PoseFit, cells: int) -> FloatArray:
     """Covariance (6, 6) of a pose by its edges' noise, and by what displaces all of them alike or in some order."""
     T = fit.T_camera_marker
     window = on_marker(marker.window, marker.size)
     J = pose_jacobian(T, window, frame.camera).reshape(8, 6)
-    blocks = np.broadcast_to((DISPLACED if bent else _FLOOR_PX) ** 2 * np.eye(2), (4, 2, 2))
+    blocks = np.broadcast_to((DISPLACED if frame.displayed else _FLOOR_PX) ** 2 * np.eye(2), (4, 2, 2))
     if frame.twist is not None:
         places = _places(se3.apply(T, window), frame.camera)
         unknown = places.unknown(frame.twist, frame.lag)
-        blocks = blocks + unknown[0] + model_error(places.smear(frame.twist, frame.lag), places.at.px, cells)[0]
+        blocks = blocks + unknown[0] + model_error(places.lag_blur(frame.twist, frame.lag), places.at.px, cells)[0]
     gain = np.linalg.pinv(J).reshape(6, 4, 2)
     systematic = np.einsum('ick,ckl,jcl->ij', gain, blocks, gain)
     return np.asarray(np.linalg.inv(fit.information) + systematic)
 
 
 def _independent(J: FloatArray, information: FloatArray) -> FloatArray:
-    """Covariances (4, 2, 2) of corners that, taken for independent, tell a pose no better than it is known.
+    """Covariances (4, 2, 2) of corners that, taken for independent, show a pose no better than it is known.
 
     Parameters
     ----------

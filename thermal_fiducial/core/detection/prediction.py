@@ -5,7 +5,8 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.motion import MotionTracker, plausible, Twist
+from thermal_fiducial.core.detection.tracking import MotionTrack
+from thermal_fiducial.core.detection.twist import plausible, Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
@@ -44,14 +45,14 @@ class Predictor:
         self._T_body_camera = T_body_camera
         self._lag_ns = round(1e9 * max(lag, _SHORTEST_LAG_S))
 
-    def predict(self, stamp_ns: int, prior: MotionPrior | None, tracker: MotionTracker, max_age_s: float) -> Prediction:
+    def predict(self, stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, max_age_s: float) -> Prediction:
         """Of a frame at ``stamp_ns`` in the camera's clock; odometry older than ``max_age_s`` says no pose."""
         if prior is None:
-            return Prediction(tracker.predict(stamp_ns, []), None, math.inf)
+            return Prediction(track.predict(stamp_ns, []), None, math.inf)
         odometry_ns = prior.in_odometry_clock(stamp_ns)
         clock_std_s = 0.0 if prior.clock_is_known else _UNKNOWN_CLOCK_S
         states = self._states(odometry_ns, prior)
-        twist = tracker.predict(stamp_ns, states, odometry_ns, clock_std_s)
+        twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)
         nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
         if nearest is None or twist is None or abs(odometry_ns - nearest.stamp_ns) * 1e-9 > max_age_s:
             return Prediction(twist, None, math.inf)

@@ -15,12 +15,14 @@ def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray) -> FloatArray
 
     Parameters
     ----------
-    mask : (height, width); overwritten where ``hidden``
+    mask : (height, width)
     min_side_px : shortest side
     hidden : (N, 4, 2) where not to look [px]
     """
-    for quad in np.rint(hidden).astype(np.int32):
-        cv2.fillConvexPoly(mask, quad, 0)
+    if len(hidden):
+        mask = mask.copy()
+        for quad in np.rint(hidden).astype(np.int32):
+            cv2.fillConvexPoly(mask, quad, 0)
     outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
     shortest, longest = 3.2 * min_side_px, 2.0 * sum(mask.shape)
     quads = []

@@ -7,7 +7,7 @@ motion that is an affine map of the image: straight sides stay straight, and shi
 import numpy as np
 
 from thermal_fiducial.core.detection.frame import Frame, Places
-from thermal_fiducial.core.detection.motion import interaction, Twist
+from thermal_fiducial.core.detection.twist import interaction, Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.types import FloatArray
 
@@ -22,9 +22,9 @@ def stretch(places: Places, twist: Twist, frame: Frame) -> FloatArray:
     return np.asarray(1.0 / (1.0 - frame.readout / (frame.camera.height - 1) * places.velocity(twist)[..., 1]))
 
 
-def memory(places: Places, twist: Twist, frame: Frame) -> FloatArray:
-    """:meth:`Places.memory` (N, 4, 2) [px] in an image whose rows are seen one after the other."""
-    still = places.memory(twist, frame.lag)
+def lag_tail(places: Places, twist: Twist, frame: Frame) -> FloatArray:
+    """:meth:`Places.lag_tail` (N, 4, 2) [px] in an image whose rows are seen one after the other."""
+    still = places.lag_tail(twist, frame.lag)
     return still * stretch(places, twist, frame)[..., None] if frame.readout > 0.0 else still
 
 
@@ -43,7 +43,7 @@ def expected_displacement(places: Places, twist: Twist | None, frame: Frame) -> 
     """The same (N, 4, 2) [px] for the rows in which corners will be seen, lag included."""
     if frame.readout == 0.0 or twist is None:
         return np.zeros_like(places.at.px)
-    rows = places.at.px[..., 1] + places.smear(twist, frame.lag)[..., 1]
+    rows = places.at.px[..., 1] + places.lag_blur(twist, frame.lag)[..., 1]
     return displacement(places, twist, frame, delays(rows, frame) * stretch(places, twist, frame))
 
 

@@ -1,8 +1,9 @@
-"""Corners refined in frames that motion and the bolometers' lag smear.
+"""Corners refined in frames that motion and the bolometers' lag blur.
 
-The smear of each marker follows from the camera's twist. Where it matters it is taken out round the marker, as far as
-that holds whatever the response is like; the edges are fitted with the blur that remains, and what lag has displaced
-them by is taken out of the corners. These correct the twist: where that changes the smear much, it is done once more.
+The motion blur of each marker follows from the camera's twist. Where it matters it is taken out round the marker, as
+far as that holds whatever the response is like; the edges are fitted with the blur that remains, and what lag has
+displaced them by is taken out of the corners. These correct the twist: where that changes the blur much, it is done
+once more.
 """
 
 from dataclasses import dataclass, replace
@@ -11,34 +12,34 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.refinement import refine_corners, RefinedCorners
-from thermal_fiducial.core.detection.corners.segments import Memory
+from thermal_fiducial.core.detection.corners.segments import LagTail
 from thermal_fiducial.core.detection.frame import Frame, Places
 from thermal_fiducial.core.detection.lag import (
     common_error,
     GAIN,
-    markers_sharpened,
-    memory_maps,
+    lag_tail_maps,
+    markers_deblurred,
     model_error,
     REMAINING,
     SPREAD,
 )
-from thermal_fiducial.core.detection.motion import MotionTracker, Twist, unknown_twist
-from thermal_fiducial.core.detection.readout import delays, expected_displacement, memory, seen_displacement
-from thermal_fiducial.core.detection.scratch import Scratch
+from thermal_fiducial.core.detection.readout import delays, expected_displacement, lag_tail, seen_displacement
 from thermal_fiducial.core.detection.search import Found
+from thermal_fiducial.core.detection.tracking import MotionTrack
+from thermal_fiducial.core.detection.twist import Twist, unknown_twist
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Smear by lag below which the shape of an edge doesn't change [px].
-SMEAR_THAT_MATTERS_PX = 0.4
+BLUR_THAT_MATTERS_PX = 0.4
 #: Pixels round a marker that the refinement may look at.
 WINDOW_MARGIN_PX = 14
-# What both ways to measure smeared corners cost: sharpening adds noise, in pixels times contrast over noise times root
+# What both ways to measure blurred corners cost: deblurring adds noise, in pixels times contrast over noise times root
 # of the side; without it the tail of the lag passes for a symmetric blur, which displaces corners by so much of the
-# square of the smear over a cell.
-_NOISE_OF_SHARPENING, _COST_OF_SMEAR = 6.5, 0.22
-# Contrast over noise below which a marker is faint. A clearer one is sharpened whatever the smear, as its corners are
+# square of the motion blur over a cell.
+_NOISE_OF_DEBLURRING, _COST_OF_BLUR = 6.5, 0.22
+# Contrast over noise below which a marker is faint. A clearer one is deblurred whatever its motion, as its corners are
 # so good that even a short tail shows in what they have in common; but not where there is hardly any [px].
-_CLEAR, _HARDLY_SMEARED_PX = 20.0, 0.2
+_CLEAR, _HARDLY_BLURRED_PX = 20.0, 0.2
 # Columns of pixels used of a cell; all of a faint marker's count.
 _COLUMNS, _COLUMNS_FAINT = 6, 12
 _ROUNDS = 2
@@ -46,58 +47,61 @@ _NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
 
 
 @dataclass(frozen=True, slots=True)
-class View:
-    """A frame in which the smear of N markers is short."""
+class DeblurredView:
+    """A frame in which the motion blur of N markers is short."""
 
     frame: Frame
     #: (N, 4, 2) where the corners appear in the view, off their places at the stamp [px]
     shift: FloatArray
-    #: (N, 4, 2) how much of the smear's shift is taken out
+    #: (N, 4, 2) how much of the motion blur's shift is taken out
     removed: FloatArray
-    #: (N, 2) standard deviation of what is left of the smear, along it
+    #: (N, 2) standard deviation of what is left of the motion blur, along it
     spread: FloatArray
-    #: (N,) round which markers old memories are taken out, by what displacement (N, 4, 2) these are off, and how
-    sharpened: BoolArray
+    #: (N,) round which markers old lag tails are taken out, by what displacement (N, 4, 2) these are off, and how
+    deblurred: BoolArray
     off: FloatArray
-    memory: Memory | None
+    lag_tail: LagTail | None
 
-    def only(self, keep: BoolArray) -> 'View':
+    def only(self, keep: BoolArray) -> 'DeblurredView':
         """That of the markers ``keep`` (N,)."""
-        return View(
+        return DeblurredView(
             self.frame,
             self.shift[keep],
             self.removed[keep],
             self.spread[keep],
-            self.sharpened[keep],
+            self.deblurred[keep],
             self.off[keep],
-            None if self.memory is None else self.memory.only(np.flatnonzero(keep)),
+            None if self.lag_tail is None else self.lag_tail.only(np.flatnonzero(keep)),
         )
 
-    def sharp(self, corners_px: FloatArray, which: IntArray, scratch: Scratch) -> Float32Array:
+    def image(self, corners_px: FloatArray, which: IntArray) -> Float32Array:
         """The view as an image, round the markers ``which`` with ``corners_px`` (N, 4, 2) in it."""
-        which = which[self.sharpened[which]]
-        sharp = scratch.floats('sharp', self.frame.counts.shape)
-        return markers_sharpened(self.frame.image, corners_px[which], self.off[which], WINDOW_MARGIN_PX, sharp)
+        which = which[self.deblurred[which]]
+        if len(which) == 0:
+            return self.frame.image
+        return markers_deblurred(self.frame.image, corners_px[which], self.off[which], WINDOW_MARGIN_PX)
 
 
 @dataclass(frozen=True, slots=True)
-class Refinement:
+class RefinedMarkers:
     """Refined corners of N markers."""
 
     #: as the view shows them
-    view: View
-    seen: RefinedCorners
+    view: DeblurredView
+    observed: RefinedCorners
     #: at the stamp, with what is unknown of the motion
     corners: RefinedCorners
     places: Places
     twist: Twist | None
 
-    def only(self, keep: BoolArray) -> 'Refinement':
+    def only(self, keep: BoolArray) -> 'RefinedMarkers':
         """That of the markers ``keep`` (N,)."""
         if keep.all():
             return self
         view, places = self.view.only(keep), self.places.only(keep)
-        return replace(self, view=view, seen=self.seen.only(keep), corners=self.corners.only(keep), places=places)
+        return replace(
+            self, view=view, observed=self.observed.only(keep), corners=self.corners.only(keep), places=places
+        )
 
 
 class Refiner:
@@ -106,15 +110,20 @@ class Refiner:
     Parameters
     ----------
     behind : (M, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.edges.edges_behind`
-    motion : what corrects the twist by the corners
     """
 
-    def __init__(self, behind: Float32Array, motion: MotionTracker) -> None:
-        self._behind, self._motion = behind, motion
+    def __init__(self, behind: Float32Array) -> None:
+        self._behind = behind
 
     def refine(
-        self, frame: Frame, found: Found, places: Places, near: BoolArray, config: ArucoDetectorConfig
-    ) -> Refinement:
+        self,
+        frame: Frame,
+        found: Found,
+        places: Places,
+        near: BoolArray,
+        track: MotionTrack,
+        config: ArucoDetectorConfig,
+    ) -> RefinedMarkers:
         """Corners of N markers.
 
         Parameters
@@ -122,49 +131,53 @@ class Refiner:
         found : the markers
         places : where they roughly are at the stamp
         near : (N,) which of them to a pixel
+        track : the frames before, which with the corners give the twist
         """
         cell = sides_px(found.corners_px) / self._behind.shape[2]
-        columns = _COLUMNS if np.abs(found.clarity).min() > _CLEAR else _COLUMNS_FAINT
+        columns = _COLUMNS if np.abs(found.cnr).min() > _CLEAR else _COLUMNS_FAINT
         twist = frame.twist
         for _ in range(_ROUNDS):
-            view = self._view(frame, places, twist, cell, found.clarity)
+            view = self._view(frame, places, twist, cell, found.cnr)
             start = places.at.moved(view.shift, frame.camera)
             behind = self._behind[found.ids]
             blur = config.blur_px, view.spread
             seen = refine_corners(
-                frame.samples, start, frame.camera, behind, *blur, columns, near=near, memory=view.memory
+                frame.samples, start, frame.camera, behind, *blur, columns, near=near, lag_tail=view.lag_tail
             )
-            refinement = self._at_stamp(frame, found, places, view, seen, twist)
+            refinement = self._at_stamp(frame, found, places, view, seen, twist, track)
             change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)
-            if refinement.twist is None or change.max(initial=0.0) < SMEAR_THAT_MATTERS_PX:
+            if refinement.twist is None or change.max(initial=0.0) < BLUR_THAT_MATTERS_PX:
                 break
             twist, places, near = refinement.twist, refinement.places, np.ones(len(near), dtype=bool)
         return refinement
 
-    def _view(self, frame: Frame, places: Places, twist: Twist | None, cell: FloatArray, clarity: FloatArray) -> View:
-        """The frame with known smear round all markers, sharpened round those for which that is worth its noise."""
+    def _view(
+        self, frame: Frame, places: Places, twist: Twist | None, cell: FloatArray, cnr: FloatArray
+    ) -> DeblurredView:
+        """The frame with the known motion blur of all markers, taken out where that is worth its noise."""
         if twist is None:
-            smear = old = np.zeros_like(places.at.px)
+            lag_blur = old = np.zeros_like(places.at.px)
         else:
-            smear, old = places.smear(twist, frame.lag), memory(places, twist, frame)
-        mean = 0.25 * smear.sum(axis=1)
-        sharpen = worth_sharpening((mean * mean).sum(axis=1), cell, self._behind.shape[2], clarity)
-        removed = (1.0 - REMAINING) * old * sharpen[:, None, None]
-        shift = smear - removed + expected_displacement(places, twist, frame)
-        spread, past = mean * np.where(sharpen, SPREAD, 1.0)[:, None], None
-        if sharpen.any():
-            past = Memory(memory_maps(places.at.px + shift, old), np.where(sharpen, GAIN, 1.0))
-        return View(frame, shift, removed, spread, sharpen, old, past)
+            lag_blur, old = places.lag_blur(twist, frame.lag), lag_tail(places, twist, frame)
+        mean = 0.25 * lag_blur.sum(axis=1)
+        deblur = worth_deblurring((mean * mean).sum(axis=1), cell, self._behind.shape[2], cnr)
+        removed = (1.0 - REMAINING) * old * deblur[:, None, None]
+        shift = lag_blur - removed + expected_displacement(places, twist, frame)
+        spread, past = mean * np.where(deblur, SPREAD, 1.0)[:, None], None
+        if deblur.any():
+            past = LagTail(lag_tail_maps(places.at.px + shift, old), np.where(deblur, GAIN, 1.0))
+        return DeblurredView(frame, shift, removed, spread, deblur, old, past)
 
     def _at_stamp(
         self,
         frame: Frame,
         found: Found,
         places: Places,
-        view: View,
+        view: DeblurredView,
         seen: RefinedCorners,
         known: Twist | None,
-    ) -> Refinement:
+        track: MotionTrack,
+    ) -> RefinedMarkers:
         """The corners without lag and as if all rows were seen at once, by the twist that they themselves correct."""
         at = places.at.moved(seen.corners_px - view.shift - places.at.px, frame.camera)
         variance = seen.covariances[..., 0, 0] + seen.covariances[..., 1, 1]
@@ -172,21 +185,21 @@ class Refiner:
         # The same displacement in two frames in a row hides from the first twist; once freed, they are not alike.
         twist = known
         if frame.twist is not None or known is None:
-            twist = self._motion.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
+            twist = track.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
         if twist is None:
             unsure = seen.covariances + _doubts(seen) + self._never_seen(frame, places, seen, unknown_twist())
-            return Refinement(view, seen, replace(seen, covariances=unsure), places.moved(at), None)
-        smear = places.smear(twist, frame.lag)
-        rolled = seen_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
-        corners = seen.corners_px - smear + view.removed - rolled
-        unknown = places.unknown(twist, frame.lag) + model_error(smear, places.at.px, self._behind.shape[2])
+            return RefinedMarkers(view, seen, replace(seen, covariances=unsure), places.moved(at), None)
+        lag_blur = places.lag_blur(twist, frame.lag)
+        rolling = seen_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
+        corners = seen.corners_px - lag_blur + view.removed - rolling
+        unknown = places.unknown(twist, frame.lag) + model_error(lag_blur, places.at.px, self._behind.shape[2])
         if frame.twist is None:
             unknown = unknown + self._never_seen(frame, places, seen, twist)
         refined = replace(seen, corners_px=corners, covariances=seen.covariances + _doubts(seen) + unknown)
-        return Refinement(view, seen, refined, places.moved(at.at_pixels(corners)), twist)
+        return RefinedMarkers(view, seen, refined, places.moved(at.at_pixels(corners)), twist)
 
     def _never_seen(self, frame: Frame, places: Places, seen: RefinedCorners, twist: Twist) -> FloatArray:
-        """Covariances (N, 4, 2, 2) [px^2] by a motion that the frames before tell nothing of."""
+        """Covariances (N, 4, 2, 2) [px^2] by a motion that the frames before show nothing of."""
         since = frame.lag - delays(seen.corners_px[..., 1], frame)
         unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), 1e-6)
         cell = sides_px(seen.corners_px) / self._behind.shape[2]
@@ -198,11 +211,11 @@ def _doubts(seen: RefinedCorners) -> FloatArray:
     return seen.doubt[:, None, None, None] * _EYE
 
 
-def worth_sharpening(square: FloatArray, cell: FloatArray, cells: int, clarity: FloatArray) -> BoolArray:
-    """For which markers with squares of the smear (N,) and cells (N,) [px] it costs more than sharpening's noise."""
-    systematic, noise = _COST_OF_SMEAR * square / cell, _NOISE_OF_SHARPENING / np.sqrt(cells * cell)
-    worth = (np.abs(clarity) > _CLEAR) | (systematic * np.abs(clarity) > noise)
-    return np.asarray(worth & (square > _HARDLY_SMEARED_PX**2))
+def worth_deblurring(square: FloatArray, cell: FloatArray, cells: int, cnr: FloatArray) -> BoolArray:
+    """For which markers with squares of the blur (N,) and cells (N,) [px] it costs more than deblurring's noise."""
+    systematic, noise = _COST_OF_BLUR * square / cell, _NOISE_OF_DEBLURRING / np.sqrt(cells * cell)
+    worth = (np.abs(cnr) > _CLEAR) | (systematic * np.abs(cnr) > noise)
+    return np.asarray(worth & (square > _HARDLY_BLURRED_PX**2))
 
 
 def sides_px(corners: FloatArray) -> FloatArray:

@@ -7,15 +7,14 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.alignment import aligned
-from thermal_fiducial.core.detection.contrast import dark, halved, Scale, without_columns
-from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
+from thermal_fiducial.core.detection.contrast import dark, dark_in_picture, halved, Scale, without_columns
 from thermal_fiducial.core.detection.decoding import Decoder, Reading, shrunk
+from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.ids import among
 from thermal_fiducial.core.detection.quads import find_quads
-from thermal_fiducial.core.detection.scratch import Scratch
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
-# Full resolution sees small and smeared markers; half resolution, without the pattern of columns, faint ones.
+# Full resolution sees small and blurred markers; half resolution, without the pattern of columns, faint ones.
 _FINE = Scale(smoothing_px=1.0, window_px=7, window_shrink=2, depth=0.2, floor=1.5)
 _FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0)
 # Among markers that are seen clearly noise is left alone, and with it what it would show of the faintest.
@@ -26,36 +25,20 @@ _SURROUNDED = 0.2
 # Correlation beyond which an outline needs no alignment, and from which, by such a margin, it is worth one.
 _CLEAR = 0.95
 _HINT, _HINT_MARGIN = 0.5, 0.06
-# Cells at least this wide are read at half the resolution, where a pixel has half the noise.
-_WIDE_CELL_PX = 8.0
-# Correlation at the refined corners: of a marker with sharp sides, and (less when faint) of one with softer sides.
-_ALIKE = 0.82
-_CLEARLY_ALIKE = 0.9
-# Share of a marker's isolation by which it must stand out among all others. That speaks for itself where markers differ
-# in so many bits that this many wrong ones can be corrected; noise and clutter often look a little like one of the few
-# patterns of a 4 x 4 dictionary.
-_CLEAR_MARGIN = 0.5
-_MANY_BITS = 3
 # Middles of outlines of one marker, in one another, are nearer than this share of the larger one's diagonal.
 _TOGETHER = 0.35
-# White surroundings are as white as white bits, give or take the background; the rim of a plate seen inside out is not.
-_WHITE = (0.4, 1.75)
-# Corner deviation [px] times contrast over noise times root of the side [px]: 4 to 7 for four clean sides.
-_SHARP = 7.5
-_SOFT = 12.0
-# Contrast over noise beyond which corners deviate by what optics and plates really are, and not by noise.
-_NOISY = 8.0
-# Width of a plate round its marker [cells], and what smear may add.
+# Width of a plate round its marker [cells], and what motion blur may add.
 _PLATE_CELLS = 1.6
-# Nearer to the rim of the image than this [px] a marker may be cut off.
-_RIM = 2.0
+# Nearer to the border of the image than this [px] a marker may be cut off.
+_BORDER = 2.0
+# Shortest side of a marker in a picture for a display, which has little noise, over that in raw counts: of one that is
+# seen obliquely, the other sides are longer.
+_PICTURE_SIDE = 0.25
 _NONE = np.zeros(0, dtype=np.intp)
-# Pixels along a side that the refinement uses of a long one.
-_SEEN_PX = 60.0
 
 
-class Sought(Flag):
-    """At which resolutions markers are sought."""
+class SearchScales(Flag):
+    """At which resolutions markers are looked for."""
 
     FINE = auto()
     FAINT = auto()
@@ -70,18 +53,18 @@ class Found:
     ----------
     ids : (N,)
     corners_px : (N, 4, 2) clockwise from the marker's top-left, to a pixel or two
-    clarity : (N,) contrast over the noise of a pixel, negative where black is warmer than white
-    expected : (N,) whether it was sought where it was found
+    cnr : (N,) contrast-to-noise ratio of a pixel; negative where black is warmer than white
+    expected : (N,) whether it was looked for where it was found
     """
 
     ids: IntArray
     corners_px: FloatArray
-    clarity: FloatArray
+    cnr: FloatArray
     expected: BoolArray
 
     def only(self, keep: BoolArray | IntArray) -> 'Found':
         """Those of the markers ``keep``."""
-        return Found(self.ids[keep], self.corners_px[keep], self.clarity[keep], self.expected[keep])
+        return Found(self.ids[keep], self.corners_px[keep], self.cnr[keep], self.expected[keep])
 
     @staticmethod
     def none() -> 'Found':
@@ -95,72 +78,103 @@ class BlindSearch:
     Parameters
     ----------
     decoder : of the dictionary
-    scratch : for its images
     """
 
-    def __init__(self, decoder: Decoder, scratch: Scratch) -> None:
-        self._decoder, self._scratch = decoder, scratch
+    def __init__(self, decoder: Decoder) -> None:
+        self._decoder = decoder
 
     def search(
         self,
-        image: Float32Array,
-        noise: float,
+        frame: Frame,
         scene: Float32Array,
         allowed: BoolArray,
         config: ArucoDetectorConfig,
-        seen: Found | None = None,
-        sought: Sought = Sought.ALL,
+        seen: Found,
+        scales: SearchScales = SearchScales.ALL,
         kinds: tuple[float, ...] = (1.0, -1.0),
     ) -> Found:
         """Markers with IDs ``allowed`` (M,), each ID once.
 
         Parameters
         ----------
-        image : (height, width) the frame
-        noise : standard deviation of a pixel in it [counts]
-        scene : the same freed of lag, which costs noise: the finest markers are sought there, the faintest in ``image``
-        seen : markers that are there: nothing is sought in them and their plates
-        sought : at which resolutions
-        kinds : of markers sought among the faintest, 1 for darker than their surroundings, -1 for brighter
+        scene : the frame freed of lag, which costs noise: the finest markers show there, the faintest in the frame
+        seen : markers that are there: nothing is looked for in them and their plates
+        scales : at which resolutions
+        kinds : of markers looked for among the faintest, 1 for darker than their surroundings, -1 for brighter
         """
-        decoder = self._decoder
-        seen = Found.none() if seen is None else seen
-        hidden = _grown(seen.corners_px, 1.0 + 2.0 * _PLATE_CELLS / decoder.cells)
+        hidden = _grown(seen.corners_px, 1.0 + 2.0 * _PLATE_CELLS / self._decoder.cells)
+        min_side_px = _PICTURE_SIDE * config.min_side_px if frame.displayed else config.min_side_px
         fine = faint = np.zeros((0, 4, 2))
-        if Sought.FINE in sought:
-            scale = _FINE if sought == Sought.ALL else _FINE_OF_CLEAR
-            fine = find_quads(dark(scene, noise, scale, self._scratch), config.min_side_px, hidden)
-        half = image
-        if Sought.FAINT in sought:
-            half = without_columns(halved(image, self._scratch), 0.5 * noise, self._scratch)
-            views = [half if kind > 0.0 else -half for kind in kinds]
-            scale = _FAINT if sought == Sought.ALL else _FAINT_OF_CLEAR
-            faint = np.concatenate([self._faint(view, noise, scale, config.min_side_px, hidden) for view in views])
+        half = scene
+        if SearchScales.FINE in scales:
+            fine = find_quads(_fine_mask(frame, scene, scales), min_side_px, hidden)
+        if SearchScales.FAINT in scales:
+            half = without_columns(halved(frame.image), 0.5 * frame.noise)
+            faint = _faint_quads(half, frame.noise, scales, kinds, config.min_side_px, hidden)
         if len(fine) + len(faint) == 0:
             return Found.none()
-        # Blur may leave nothing to be seen of a border between two white ones but the outline of the whole plate.
-        fine, faint = (_with_shrunk(outlines, decoder.cells) for outlines in (fine, faint))
-        quads = np.concatenate([fine, faint])
-        reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, _halfway(faint), allowed))
-        # At full resolution alone those are sought that show clearly, if not now then in a frame to come.
-        rough = _rough(reading, quads, seen.ids) if Sought.FAINT in sought else _NONE
-        if len(rough):
-            better = aligned(half, _halfway(quads[rough]), reading.ids[rough], reading.turns[rough], decoder)
-            reading = _joined(reading, decoder.read(half, better, allowed))
-            quads = np.concatenate([quads, 2.0 * better + 0.5])
-        good = accepted(reading, noise, decoder.correctable, config) & _large(quads, config.min_side_px)
-        good &= _whole(quads, image, _RIM)
+        # At full resolution alone those are looked for that show clearly, if not now then in a frame to come.
+        pull = SearchScales.FAINT in scales
+        reading, quads = self._read(frame, scene, half, (fine, faint), allowed, seen.ids if pull else None)
+        good = accepted(reading, frame.noise, self._decoder.correctable, config) & _large(quads, min_side_px)
+        good &= _whole(quads, frame.image, _BORDER)
         if not good.any():
             return Found.none()
-        good &= ~_inside_out(reading, quads, good, distinct(reading, noise, config))
-        return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), noise)
+        good &= ~_inside_out(reading, quads, good, distinct(reading, frame.noise, config))
+        return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), frame.noise)
 
-    def _faint(
-        self, half: Float32Array, noise: float, scale: Scale, min_side_px: float, hidden: FloatArray
-    ) -> FloatArray:
-        """Quadrilaterals of faint markers (Q, 4, 2) at half the resolution, in pixels of the full one."""
-        mask = dark(half, 0.5 * noise, scale, self._scratch)
-        return 2.0 * find_quads(mask, 0.5 * min_side_px + 2.0, _halfway(hidden)) + 0.5
+    def _read(
+        self,
+        frame: Frame,
+        scene: Float32Array,
+        half: Float32Array,
+        outlines: tuple[FloatArray, FloatArray],
+        allowed: BoolArray,
+        seen: IntArray | None,
+    ) -> tuple[Reading, FloatArray]:
+        """Readings of fine and faint outlines, and their corners (Q, 4, 2).
+
+        Those that show but not clearly are read once more after they are pulled onto their pattern, unless their IDs
+        are ``seen`` already; None: pull none.
+        """
+        decoder = self._decoder
+        # Blur may leave nothing to be seen of a border between two white ones but the outline of the whole plate.
+        fine, faint = (_with_shrunk(quads, decoder.cells) for quads in outlines)
+        quads = np.concatenate([fine, faint])
+        reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, _halfway(faint), allowed))
+        rough = _NONE if seen is None else _rough(reading, quads, seen)
+        if len(rough) == 0:
+            return reading, quads
+        ids, turns = reading.ids[rough], reading.turns[rough]
+        if frame.displayed:
+            pulled = aligned(scene, quads[rough], ids, turns, decoder, noisy=False)
+            again = decoder.read(scene, pulled, allowed)
+        else:
+            halfway = aligned(half, _halfway(quads[rough]), ids, turns, decoder)
+            pulled, again = 2.0 * halfway + 0.5, decoder.read(half, halfway, allowed)
+        return _joined(reading, again), np.concatenate([quads, pulled])
+
+
+def _fine_mask(frame: Frame, scene: Float32Array, scales: SearchScales) -> Gray:
+    """What is dark at full resolution."""
+    if frame.displayed and scene is frame.image:
+        return dark_in_picture(scene, frame.noise)
+    return dark(scene, frame.noise, _FINE if scales == SearchScales.ALL else _FINE_OF_CLEAR)
+
+
+def _faint_quads(
+    half: Float32Array,
+    noise: float,
+    scales: SearchScales,
+    kinds: tuple[float, ...],
+    min_side_px: float,
+    hidden: FloatArray,
+) -> FloatArray:
+    """Quadrilaterals of faint markers (Q, 4, 2) at half the resolution, in pixels of the full one."""
+    scale = _FAINT if scales == SearchScales.ALL else _FAINT_OF_CLEAR
+    masks = [dark(half if kind > 0.0 else -half, 0.5 * noise, scale) for kind in kinds]
+    found = [find_quads(mask, 0.5 * min_side_px + 2.0, _halfway(hidden)) for mask in masks]
+    return np.asarray(2.0 * np.concatenate(found) + 0.5)
 
 
 def _with_shrunk(outlines: FloatArray, cells: int) -> FloatArray:
@@ -223,7 +237,7 @@ def merged(first: Found, second: Found) -> Found:
     return Found(
         np.concatenate([first.ids, second.ids[new]]),
         np.concatenate([first.corners_px, second.corners_px[new]]),
-        np.concatenate([first.clarity, second.clarity[new]]),
+        np.concatenate([first.cnr, second.cnr[new]]),
         np.concatenate([first.expected | among(first.ids, second.ids[second.expected]), second.expected[new]]),
     )
 
@@ -250,7 +264,7 @@ def accepted(reading: Reading, noise: float, correctable: int, config: ArucoDete
 
 
 def _inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: BoolArray) -> BoolArray:
-    """Which good readings (Q,) are of a plate's rim or of bits: at a more similar readable one of other polarity."""
+    """Which good readings (Q,) are of a plate's border or of bits: at a more similar readable one of other polarity."""
     mine, others = np.flatnonzero(good), np.flatnonzero(readable)
     similarity, centre = np.abs(reading.correlation), quads.mean(axis=1)
     across = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)
@@ -262,52 +276,10 @@ def _inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: 
     return result
 
 
-def confirmed(
-    image: Float32Array,
-    scratch: Scratch,
-    found: Found,
-    refined: RefinedCorners,
-    decoder: Decoder,
-    config: ArucoDetectorConfig,
-) -> BoolArray:
-    """Which markers (N,) still look like themselves at their refined corners, with sides as sharp as their contrast.
-
-    Noise and clutter that happen to correlate with a pattern have no four straight sharp sides: their corners are far
-    less certain than contrast, noise and size of a marker make them.
-    """
-    if len(found.ids) == 0:
-        return np.zeros(0, dtype=bool)
-    reading = read_quads(image, scratch, refined.corners_px, decoder)
-    similarity = np.abs(reading.correlation)
-    contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
-    same = reading.ids == found.ids
-    margin = (similarity - reading.runner_up) / decoder.isolation[reading.ids]
-    distinct = (similarity >= _ALIKE) | (decoder.correctable >= _MANY_BITS)
-    white = (reading.surround >= _WHITE[0]) & (reading.surround <= _WHITE[1])
-    alike = distinct & (margin >= _CLEAR_MARGIN) & white
-    side = np.linalg.norm(refined.corners_px[:, 2] - refined.corners_px[:, 0], axis=-1) / np.sqrt(2.0)
-    deviation = np.sort(np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1)), axis=1)[:, 2]
-    softness = deviation * np.minimum(contrast, _NOISY) * np.sqrt(np.minimum(side, _SEEN_PX))
-    sharp = softness <= _SHARP
-    soft = (softness <= _SOFT) & (similarity >= np.minimum(_CLEARLY_ALIKE, 0.7 + 0.07 * contrast))
-    known = (similarity >= config.guided_min_correlation) & (similarity - reading.runner_up >= config.guided_min_margin)
-    there = np.abs(refined.corners_px - found.corners_px).max(axis=(1, 2)) < 0.7 * side / decoder.cells
-    return np.asarray(same & ((found.expected & known & there) | (alike & (sharp | soft))))
-
-
-def _whole(quads: FloatArray, image: Float32Array, rim: float) -> BoolArray:
-    """Which quadrilaterals (Q, 4, 2) lie in the image, ``rim`` away from its edges."""
+def _whole(quads: FloatArray, image: Float32Array, border: float) -> BoolArray:
+    """Which quadrilaterals (Q, 4, 2) lie in the image, ``border`` away from its edges."""
     height, width = image.shape
-    return np.asarray(((quads >= rim) & (quads <= (width - 1 - rim, height - 1 - rim))).all(axis=(1, 2)))
-
-
-def read_quads(image: Float32Array, scratch: Scratch, quads: FloatArray, decoder: Decoder) -> Reading:
-    """Readings of (Q, 4, 2) among all IDs, at half the resolution when all are large enough for it."""
-    everything = np.ones(decoder.count, dtype=bool)
-    sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
-    if sides.min(initial=np.inf) >= _WIDE_CELL_PX * decoder.cells:
-        return decoder.read(halved(image, scratch), 0.5 * (quads - 0.5), everything)
-    return decoder.read(image, quads, everything)
+    return np.asarray(((quads >= border) & (quads <= (width - 1 - border, height - 1 - border))).all(axis=(1, 2)))
 
 
 def _once(reading: Reading, quads: FloatArray, good: BoolArray, drop_duplicates: bool) -> IntArray:

@@ -16,8 +16,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 _SAMPLES = np.array([0.3, 0.5, 0.7])
 # Samples on either side of a line between cells, so far from it [cells].
 _BESIDE = np.array([0.2, 0.35])
-# Samples nearer to the rim of the image are not seen [px].
-_RIM_PX = 1.0
+# Samples nearer to the border of the image are not seen [px].
+_BORDER_PX = 1.0
 # Least number of steps that are compared, least sum of their squares in the pattern, and what keeps steps in a single
 # direction from a slope across it.
 _FEWEST, _LEAST_PATTERN, _RIDGE = 12, 2.0, 1e-6
@@ -25,7 +25,7 @@ _FEWEST, _LEAST_PATTERN, _RIDGE = 12, 2.0, 1e-6
 _NEXT = [(right, down) for right in (-1, 0, 1) for down in (-1, 0, 1) if (right, down) != (0, 0)]
 
 
-class Likeness(NamedTuple):
+class CellMatch(NamedTuple):
     """How the visible cells look like the marker that is expected there."""
 
     #: with its pattern, negative where black and white are swapped
@@ -83,7 +83,7 @@ class VisibleCells:
         seen = visible[:, self._first] & visible[:, self._second]
         return self._correlations(self._between(values), self._steps[4 * marker_id], seen)[0]
 
-    def likeness(self, image: Float32Array, px: FloatArray, marker_id: int, allowed: BoolArray) -> Likeness:
+    def likeness(self, image: Float32Array, px: FloatArray, marker_id: int, allowed: BoolArray) -> CellMatch:
         """Of what has its lines at pixels (12 P, 2) with a marker, among those ``allowed`` (M,)."""
         values, inside = _means(image, px[None], 6)
         values, seen = values.reshape(-1, 2), np.asarray(inside.reshape(-1, 2).all(axis=1))
@@ -93,15 +93,15 @@ class VisibleCells:
         others = np.repeat(allowed, 4)
         others[4 * marker_id] = False
         own, beside = self._steps[4 * marker_id], self._steps_beside[:, marker_id]
-        rivals = np.concatenate([self._steps[others], np.nan_to_num(beside)])
-        alike = np.broadcast_to(seen, (int(others.sum()), len(seen)))
-        compared = np.concatenate([alike, seen & np.isfinite(beside)])
+        alternatives = np.concatenate([self._steps[others], np.nan_to_num(beside)])
+        all_seen = np.broadcast_to(seen, (int(others.sum()), len(seen)))
+        compared = np.concatenate([all_seen, seen & np.isfinite(beside)])
         correlation, contrast = self._correlations(steps, own, seen[None])
         differ = (self._patterns[others] != self._patterns[4 * marker_id])[:, visible].sum(axis=1)
-        return Likeness(
+        return CellMatch(
             float(correlation[0]),
-            float(np.abs(self._correlations(steps, rivals, compared)[0]).max()),
-            float(np.abs(self._correlations(own, rivals, compared)[0]).max()),
+            float(np.abs(self._correlations(steps, alternatives, compared)[0]).max()),
+            float(np.abs(self._correlations(own, alternatives, compared)[0]).max()),
             float(contrast[0]),
             int(visible.sum()),
             int(differ.min(initial=len(visible))),
@@ -134,7 +134,7 @@ def _means(image: Float32Array, px: FloatArray, number: int) -> tuple[FloatArray
     """Mean counts (O, K) of so many samples in a row at pixels (O, number K, 2), and which are in view."""
     height, width = image.shape
     with np.errstate(invalid='ignore'):
-        inside: BoolArray = np.asarray((px >= _RIM_PX) & (px <= (width - 1 - _RIM_PX, height - 1 - _RIM_PX)))
+        inside: BoolArray = np.asarray((px >= _BORDER_PX) & (px <= (width - 1 - _BORDER_PX, height - 1 - _BORDER_PX)))
         inside = np.asarray(inside.all(axis=-1))
     places = np.where(inside[..., None], px, 0.0).astype(np.float32)
     counts = sampled(image, np.ascontiguousarray(np.moveaxis(places, -1, 0)))

@@ -16,7 +16,7 @@ _NARROW = 5.0
 _LINEAR, _CUBIC = 0.7988, 0.7988 * 0.04417
 # The plate ends one cell outside, at an edge that the model does not know: so many blurs from it nothing of it shows;
 # and what must be seen of the plate all the same [px].
-_RIM_SHOWS, _LEAST_QUIET_PX = 1.5, 0.8
+_PLATE_EDGE_SHOWS, _LEAST_QUIET_PX = 1.5, 0.8
 # Share of the side that a column must see: beyond its ends there is none.
 _MOSTLY = 0.7
 
@@ -57,10 +57,10 @@ def half_width(blur: float) -> int:
     return min(max(math.ceil(2.5 * blur + 1.0), 4), 10)
 
 
-def blurs(normal: FloatArray, optics: float, smear: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Blur (E,) across and along sides with normals (E, 2), of markers with smear (N, 2) [px]."""
-    u, v = normal[:, 0].reshape(len(smear), -1), normal[:, 1].reshape(len(smear), -1)
-    across, along = smear[:, :1] * u + smear[:, 1:] * v, smear[:, 1:] * u - smear[:, :1] * v
+def blurs(normal: FloatArray, optics: float, lag_blur: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Blur (E,) across and along sides with normals (E, 2), of markers with a motion blur (N, 2) [px]."""
+    u, v = normal[:, 0].reshape(len(lag_blur), -1), normal[:, 1].reshape(len(lag_blur), -1)
+    across, along = lag_blur[:, :1] * u + lag_blur[:, 1:] * v, lag_blur[:, 1:] * u - lag_blur[:, :1] * v
     square = optics * optics
     return np.sqrt(square + across * across).ravel(), np.sqrt(square + along * along).ravel()
 
@@ -90,7 +90,7 @@ def model(
     if narrow.any():
         _add_neighbours(value, slope, sides, np.flatnonzero(narrow), behind.reshape(-1, cells, len(NEIGHBOURS)), blur)
     reach = np.where(narrow, cell, cell - 2.0 * blur[0])
-    quiet = np.minimum(reach, np.maximum(cell - _RIM_SHOWS * blur[0], _LEAST_QUIET_PX))
+    quiet = np.minimum(reach, np.maximum(cell - _PLATE_EDGE_SHOWS * blur[0], _LEAST_QUIET_PX))
     weight = (sides.distance >= -quiet.astype(np.float32)) & (sides.distance <= reach.astype(np.float32))
     weight &= sides.fresh & (own > _MOSTLY)
     if sides.inside is not None:

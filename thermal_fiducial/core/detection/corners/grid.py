@@ -1,6 +1,6 @@
 """The edges between the cells of a marker, inside and along its sides, as a camera at a pose sees them.
 
-Each is a straight step between black and white whose place on the marker is known, so all that are in view tell the
+Each is a straight step between black and white whose place on the marker is known, so all that are in view show the
 marker's pose, wherever its corners are.
 """
 
@@ -16,8 +16,8 @@ from thermal_fiducial.core.detection.corners.segments import (
     counts_across,
     HOPELESS,
     KEPT_VARIANCE,
+    LagTail,
     measure,
-    Memory,
     REACHED,
 )
 from thermal_fiducial.core.detection.corners.sides import columns_across, NODES, Sides
@@ -87,9 +87,9 @@ class Layer:
     displacement: Callable[[FloatArray], FloatArray]
     #: standard deviation of optics and pixels [px], and what motion adds to it (2,), along itself
     blur: float
-    smear: FloatArray
+    lag_blur: FloatArray
     #: what to take out of the image; None: nothing
-    memory: Memory | None = None
+    lag_tail: LagTail | None = None
 
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (..., 2) in which points (..., 3) in the camera appear, NaN where the lens shows none."""
@@ -128,11 +128,11 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     onward = layer.project(se3.apply(T, on_marker(middle + pattern.onward, size))) - nodes[:, 2]
     length = float(np.linalg.norm(nodes[:, 4] - nodes[:, 0], axis=1).max())
     columns = int(np.clip(length / _EVERY_PX, _FEWEST, _MOST))
-    widest = math.hypot(layer.blur, float(np.linalg.norm(layer.smear)))
+    widest = math.hypot(layer.blur, float(np.linalg.norm(layer.lag_blur)))
     half = edges.half_width(widest)
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, columns, half)
-    blur = edges.blurs(sides.normal[0], layer.blur, layer.smear[None])
-    counts = counts_across(layer.image, sides, layer.memory)
+    blur = edges.blurs(sides.normal[0], layer.blur, layer.lag_blur[None])
+    counts = counts_across(layer.image, sides, layer.lag_tail)
     modelled = _model(sides, pattern.step, blur)
     measured = measure(counts, modelled, REACHED * blur[0], len(nodes))
     used = measured.variance[0] < HOPELESS

@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.detection.corners import edges
-from thermal_fiducial.core.detection.corners.segments import adjust, counts_across, HOPELESS, measure, Memory, REACHED
+from thermal_fiducial.core.detection.corners.segments import adjust, counts_across, HOPELESS, LagTail, measure, REACHED
 from thermal_fiducial.core.detection.corners.sides import sides_of
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
@@ -48,10 +48,12 @@ class RefinedCorners:
         """Those of the markers ``keep``."""
         return RefinedCorners(*(values[keep] for values in self._arrays))
 
-    def put(self, which: IntArray, others: 'RefinedCorners') -> None:
-        """Replace those of the markers ``which`` by ``others``."""
-        for values, new in zip(self._arrays, others._arrays, strict=True):
+    def with_others(self, which: IntArray, others: 'RefinedCorners') -> 'RefinedCorners':
+        """The same with ``others`` for those of the markers ``which``."""
+        arrays = [values.copy() for values in self._arrays]
+        for values, new in zip(arrays, others._arrays, strict=True):
             values[which] = new
+        return RefinedCorners(*arrays)
 
     @property
     def _arrays(self) -> tuple[FloatArray, ...]:
@@ -64,11 +66,11 @@ def refine_corners(
     camera: Camera,
     behind: Float32Array,
     blur_px: float,
-    smear_px: FloatArray | None = None,
+    lag_blur_px: FloatArray | None = None,
     columns: int = 6,
     *,
     near: BoolArray | None = None,
-    memory: Memory | None = None,
+    lag_tail: LagTail | None = None,
 ) -> RefinedCorners:
     """Corners of N markers, refined.
 
@@ -78,13 +80,13 @@ def refine_corners(
     corners : (N, 4) to within two pixels, or a third of a cell
     behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.edges.edges_behind`
     blur_px : standard deviation of optics and pixel
-    smear_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
+    lag_blur_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
     columns : of pixels, in a segment
     near : (N,) which corners are good to a pixel already, so that nothing wide need catch them
-    memory : what to take out of the image; nothing when left out
+    lag_tail : what to take out of the image; nothing when left out
     """
-    smear = np.zeros((len(corners.px), 2)) if smear_px is None else smear_px
-    task = _Task(image, camera, corners, behind, smear, columns, memory)
+    lag_blur = np.zeros((len(corners.px), 2)) if lag_blur_px is None else lag_blur_px
+    task = _Task(image, camera, corners, behind, lag_blur, columns, lag_tail)
     start = corners
     far = np.arange(len(corners.px)) if near is None else np.flatnonzero(~near)
     if len(far):
@@ -98,31 +100,31 @@ def refine_corners(
             break
         part = task.only(away)
         again, further = _pass(part, part.seen_from(found.corners_px[away]), blur_px, _PRIOR)
-        found.put(away, again)
-        step[:] = 0.0
+        found = found.with_others(away, again)
+        step = np.zeros(len(step))
         step[away] = further
     return found
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """What to refine, as :func:`refine_corners` is told it."""
+    """What to refine, as :func:`refine_corners` is given it."""
 
     image: Counts | Float32Array
     camera: Camera
     corners: ImagePoints
     behind: Float32Array
-    smear: FloatArray
+    lag_blur: FloatArray
     columns: int
-    memory: Memory | None
+    lag_tail: LagTail | None
 
     def only(self, which: IntArray) -> '_Task':
         """For the markers ``which``."""
         if len(which) == len(self.behind):
             return self
-        memory = None if self.memory is None else self.memory.only(which)
-        corners, behind, smear = self.corners.only(which), self.behind[which], self.smear[which]
-        return _Task(self.image, self.camera, corners, behind, smear, self.columns, memory)
+        lag_tail = None if self.lag_tail is None else self.lag_tail.only(which)
+        corners, behind, lag_blur = self.corners.only(which), self.behind[which], self.lag_blur[which]
+        return _Task(self.image, self.camera, corners, behind, lag_blur, self.columns, lag_tail)
 
     def seen_from(self, corners_px: FloatArray) -> ImagePoints:
         """The corners where they are by now (N, 4, 2)."""
@@ -133,11 +135,11 @@ class _Task:
 def _pass(task: _Task, start: ImagePoints, optics: float, prior: FloatArray) -> tuple[RefinedCorners, FloatArray]:
     """Where one linearised adjustment moves the corners, and the longest step (N,) of each marker."""
     cells = task.behind.shape[2]
-    widest = math.hypot(optics, math.sqrt(float((task.smear * task.smear).sum(axis=1).max())))
+    widest = math.hypot(optics, math.sqrt(float((task.lag_blur * task.lag_blur).sum(axis=1).max())))
     half = edges.half_width(widest)
     sides = sides_of(start.x, task.camera, task.image.shape, cells, task.columns, half)
-    blur = edges.blurs(sides.normal[cells // 2], optics, task.smear)
-    counts = counts_across(task.image, sides, task.memory)
+    blur = edges.blurs(sides.normal[cells // 2], optics, task.lag_blur)
+    counts = counts_across(task.image, sides, task.lag_tail)
     segments = measure(counts, edges.model(sides, task.behind, blur), REACHED * blur[0])
     shift, covariances, doubt = adjust(sides, segments, prior, start)
     good = segments.variance < HOPELESS

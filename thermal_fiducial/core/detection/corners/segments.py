@@ -38,7 +38,7 @@ _PRODUCTS = (1, 1), (1, 2), (2, 2), (1, 3), (2, 3), (3, 3)
 _PLANES = 4 + len(_PRODUCTS)
 
 
-class Memory(NamedTuple):
+class LagTail(NamedTuple):
     """What the image still shows of the past, to be taken out round N markers.
 
     Parameters
@@ -50,9 +50,9 @@ class Memory(NamedTuple):
     maps: FloatArray
     gain: FloatArray
 
-    def only(self, keep: IntArray) -> 'Memory':
+    def only(self, keep: IntArray) -> 'LagTail':
         """That round the markers ``keep``."""
-        return Memory(self.maps[keep], self.gain[keep])
+        return LagTail(self.maps[keep], self.gain[keep])
 
 
 class Segments(NamedTuple):
@@ -67,7 +67,7 @@ class Segments(NamedTuple):
     noise: FloatArray
 
 
-class _Fit(NamedTuple):
+class _SegmentFit(NamedTuple):
     """Least squares of segments (...) over level, contrast and contrast times displacement."""
 
     contrast: FloatArray
@@ -82,19 +82,19 @@ class _Fit(NamedTuple):
     number: FloatArray
 
 
-def counts_across(image: Counts | Float32Array, sides: Sides, memory: Memory | None = None) -> Float32Array:
-    """Counts (M, C, m, E) of the pixels across sides, without memory."""
+def counts_across(image: Counts | Float32Array, sides: Sides, lag_tail: LagTail | None = None) -> Float32Array:
+    """Counts (M, C, m, E) of the pixels across sides, without their lag tails."""
     counts = image.ravel().take(sides.pixel, mode='clip').astype(np.float32, copy=False)
-    if memory is None or not (memory.gain > 1.0).any():
+    if lag_tail is None or not (lag_tail.gain > 1.0).any():
         return counts
-    of_each = sides.pixel.shape[-1] // len(memory.gain)
-    pixel, which = sides.pixel.reshape(-1, len(memory.gain), of_each), np.flatnonzero(memory.gain > 1.0)
+    of_each = sides.pixel.shape[-1] // len(lag_tail.gain)
+    pixel, which = sides.pixel.reshape(-1, len(lag_tail.gain), of_each), np.flatnonzero(lag_tail.gain > 1.0)
     v, u = (a.astype(np.float32) for a in np.divmod(pixel[:, which].astype(np.int32), np.int32(image.shape[1])))
-    maps = memory.maps[which].astype(np.float32)[..., None]
+    maps = lag_tail.maps[which].astype(np.float32)[..., None]
     to_u, to_v = (maps[:, row, 0] * u + maps[:, row, 1] * v + maps[:, row, 2] for row in (0, 1))
     flat = (len(pixel), -1)
     past = cv2.remap(image, to_u.reshape(flat), to_v.reshape(flat), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
-    gain, of_marker = memory.gain[which, None].astype(np.float32), counts.reshape(pixel.shape)
+    gain, of_marker = lag_tail.gain[which, None].astype(np.float32), counts.reshape(pixel.shape)
     of_marker[:, which] = gain * of_marker[:, which] + (np.float32(1.0) - gain) * past.reshape(u.shape)
     return counts
 
@@ -122,9 +122,9 @@ def measure(
     X = X.reshape(_PLANES, -1, cells * len(reach))
     fit = _fit(_by_marker(_moments(X), cells, sides))
     noise = _noise(fit)
-    alike = np.abs(_residuals(fit, X, cells, sides)) <= _by_segment(_PIXEL_OUTLIER * np.sqrt(noise), cells, sides)
-    if not alike.all():
-        X[:4] *= alike.astype(np.float32)
+    inliers = np.abs(_residuals(fit, X, cells, sides)) <= _by_segment(_PIXEL_OUTLIER * np.sqrt(noise), cells, sides)
+    if not inliers.all():
+        X[:4] *= inliers.astype(np.float32)
         fit = _fit(_by_marker(_moments(X), cells, sides))
         noise = _noise(fit)
     farthest = np.empty((len(reach) // sides, cells, sides))
@@ -153,7 +153,7 @@ def _by_segment(values: FloatArray, cells: int, sides: int) -> Float32Array:
     return np.array(values.reshape(-1, cells, sides).swapaxes(0, 1), dtype=np.float32, order='C').ravel()
 
 
-def _fit(moments: FloatArray) -> _Fit:
+def _fit(moments: FloatArray) -> _SegmentFit:
     """Least squares of the counts on (1, model, derivative), of segments with :func:`_moments` (10, ...)."""
     number, x, y, z, xx, xy, yy, xz, yz, zz = moments
     x_mean, y_mean, z_mean = moments[1:4] / np.maximum(number, 1.0)
@@ -166,16 +166,16 @@ def _fit(moments: FloatArray) -> _Fit:
     contrast, product = c * p - b * q, a * q - b * p
     square = np.maximum(zz - z * z_mean - contrast * p - product * q, 0.0)
     level = z_mean - contrast * x_mean - product * y_mean
-    return _Fit(contrast, product, c, a, level, square, number)
+    return _SegmentFit(contrast, product, c, a, level, square, number)
 
 
-def _residuals(fit: _Fit, X: Float32Array, cells: int, sides: int) -> Float32Array:
+def _residuals(fit: _SegmentFit, X: Float32Array, cells: int, sides: int) -> Float32Array:
     """What the model leaves of the pixels (pixels, segments)."""
     level, contrast, product = (_by_segment(each, cells, sides) for each in (fit.level, fit.contrast, fit.product))
     return np.asarray(X[3] - level * X[0] - contrast * X[1] - product * X[2])
 
 
-def _noise(fit: _Fit) -> FloatArray:
+def _noise(fit: _SegmentFit) -> FloatArray:
     """Variances of pixels (N, S): of a marker's typical segment, or a segment's own where that is much larger."""
     free = fit.number - 3.0
     own = fit.square / np.maximum(free, 1.0)
@@ -183,7 +183,7 @@ def _noise(fit: _Fit) -> FloatArray:
     return np.where(own > 2.5 * typical, own, typical) + 1e-3
 
 
-def _judged(fit: _Fit, noise: FloatArray, reach: FloatArray) -> Segments:
+def _judged(fit: _SegmentFit, noise: FloatArray, reach: FloatArray) -> Segments:
     """Which segments measure anything, within their reach (N, S)."""
     contrast, product, usable = fit.contrast, fit.product, fit.number > 4.5
     typical = _Median(usable)(contrast)
@@ -191,7 +191,7 @@ def _judged(fit: _Fit, noise: FloatArray, reach: FloatArray) -> Segments:
     scale = np.sign(typical) / np.maximum(np.abs(typical), 1e-6)
     relative, unsure = contrast * scale, 2.0 * np.sqrt(own) * np.abs(scale)
     usable &= (relative > _LEAST_CONTRAST - unsure) & (relative < _MOST_CONTRAST + unsure)
-    # A faint segment hardly tells its contrast, by which its displacement is divided: the others tell it better.
+    # A faint segment hardly shows its contrast, by which its displacement is divided: the others show it better.
     others = (_CONTRAST_VARIES * typical) ** 2 + 1e-9
     safe = np.where(usable, (contrast * others + typical * own) / (others + own), 1.0)
     shift = np.where(usable, np.minimum(np.maximum(-product / safe, -reach), reach), 0.0)
@@ -243,11 +243,11 @@ def adjust(
     kept = used & (robust > 0.99)
     chi2 = (left * left * kept).sum(axis=1) / KEPT_VARIANCE
     free = np.maximum(kept.sum(axis=1) - 8.0, 0.0)
-    # The scatter of the segments corrects the noise of their pixels, as far as there are segments to tell.
+    # The scatter of the segments corrects the noise of their pixels, as far as there are enough of them.
     covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None] + _FLOOR
     known = as_squares(at, moved, covariance)
-    # Corners told by one another err together. Taken for independent, they would tell a pose so much too well.
-    together = (8.0 / (8.0 - known.told))[:, None, None, None]
+    # Corners that constrain one another err together. Taken for independent, they would claim so much too much.
+    together = (8.0 / (8.0 - known.constrained))[:, None, None, None]
     blocks = together * known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
     # A side of an outline that is no square's is that of something else.
     doubt = known.doubt * (0.25 * sides.along.reshape(-1, 4).sum(axis=1)) ** 2

@@ -66,8 +66,8 @@ class Squared(NamedTuple):
     #: (N,) squared Mahalanobis distance from the nearest square, and square of what is left of it in the corners
     chi2: FloatArray
     left: FloatArray
-    #: (N,) how many of the two conditions it is that told the corners, rather than the image
-    told: FloatArray
+    #: (N,) how many of the two conditions, rather than the image, constrain the corners
+    constrained: FloatArray
 
     @property
     def doubt(self) -> FloatArray:
@@ -84,7 +84,7 @@ def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squ
     Parameters
     ----------
     at : (N, 4) corners
-    seen, covariance : (N, 8, 1), (N, 8, 8) how far they are off, as the image tells [px]
+    seen, covariance : (N, 8, 1), (N, 8, 8) how far they are off, as the image shows [px]
     """
     together = np.empty((len(seen), 4, 2))
     together[:] = 0.25 * seen.reshape(-1, 4, 2).sum(axis=1, keepdims=True)
@@ -111,8 +111,8 @@ def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance:
         if np.abs(moved - before).max() < _BENDS_PX:
             break
     chi2, left = (error * weighted).sum(axis=(1, 2)), ((variance * weighted) ** 2).sum(axis=(1, 2))
-    told = 2.0 - (variance * information * _EYE).sum(axis=(1, 2))
-    return Squared(moved, covariance - spread @ information @ spread.swapaxes(1, 2), chi2, left, told)
+    constrained = 2.0 - (variance * information * _EYE).sum(axis=(1, 2))
+    return Squared(moved, covariance - spread @ information @ spread.swapaxes(1, 2), chi2, left, constrained)
 
 
 def squareness(x: FloatArray, inverse: FloatArray) -> Squareness:

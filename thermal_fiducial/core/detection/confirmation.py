@@ -1,0 +1,94 @@
+"""Whether markers still look like themselves at their refined corners."""
+
+import numpy as np
+
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.contrast import halved
+from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
+from thermal_fiducial.core.detection.decoding import Decoder, Reading
+from thermal_fiducial.core.detection.search import Found
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
+
+# Cells at least this wide are read at half the resolution, where a pixel has half the noise.
+_WIDE_CELL_PX = 8.0
+# Correlation at the refined corners: of a marker with sharp sides, and (less when faint) of one with softer sides.
+_SIMILAR = 0.82
+_CLEARLY_SIMILAR = 0.9
+_FAINT, _PER_CNR = 0.7, 0.07
+# The same of a marker in a picture for a display, which shows what is none: there textures of everyday things look like
+# patterns of few bits, at contrasts at which a marker is all but free of noise. Of 19 false positives of four such
+# dictionaries in 100 pictures the best had 0.90.
+_SIMILAR_IN_PICTURE = 0.92
+# Share of a marker's isolation by which it must stand out among all others. That speaks for itself where markers differ
+# in so many bits that this many wrong ones can be corrected; noise and clutter often look a little like one of the few
+# patterns of a 4 x 4 dictionary.
+_CLEAR_MARGIN = 0.5
+_MANY_BITS = 3
+# White surroundings are as white as white bits, give or take the background; the edge of a plate seen inside out is
+# not.
+_WHITE = (0.4, 1.75)
+# Corner deviation [px] times contrast over noise times root of the side [px]: 4 to 7 for four clean sides.
+_SHARP = 7.5
+_SOFT = 12.0
+# Contrast over noise beyond which corners deviate by what optics and plates really are, and not by noise.
+_NOISY = 8.0
+# Pixels along a side that the refinement uses of a long one.
+_SEEN_PX = 60.0
+
+
+def confirmed(
+    image: Float32Array,
+    found: Found,
+    refined: RefinedCorners,
+    decoder: Decoder,
+    config: ArucoDetectorConfig,
+    *,
+    standing_picture: BoolArray,
+) -> BoolArray:
+    """Which markers (N,) still look like themselves at their refined corners, with sides as sharp as their contrast.
+
+    Noise and clutter that happen to correlate with a pattern have no four straight sharp sides: their corners are far
+    less certain than contrast, noise and size of a marker make them.
+
+    Parameters
+    ----------
+    standing_picture : (N,) which are seen in a picture for a display, and not blurred by motion
+    """
+    if len(found.ids) == 0:
+        return np.zeros(0, dtype=bool)
+    reading = read_quads(image, refined.corners_px, decoder)
+    similarity = np.abs(reading.correlation)
+    contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
+    same = reading.ids == found.ids
+    asked = np.clip(_FAINT + _PER_CNR * np.abs(found.cnr), _SIMILAR, _SIMILAR_IN_PICTURE)
+    distinct = (similarity >= np.where(standing_picture, asked, _SIMILAR)) | (decoder.correctable >= _MANY_BITS)
+    alike = distinct & _stands_out(reading, decoder)
+    side = np.linalg.norm(refined.corners_px[:, 2] - refined.corners_px[:, 0], axis=-1) / np.sqrt(2.0)
+    deviation = np.sort(np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1)), axis=1)[:, 2]
+    softness = deviation * np.minimum(contrast, _NOISY) * np.sqrt(np.minimum(side, _SEEN_PX))
+    sharp = softness <= _SHARP
+    soft = (softness <= _SOFT) & (similarity >= np.minimum(_CLEARLY_SIMILAR, _FAINT + _PER_CNR * contrast))
+    known = (similarity >= config.guided_min_correlation) & (similarity - reading.runner_up >= config.guided_min_margin)
+    there = np.abs(refined.corners_px - found.corners_px).max(axis=(1, 2)) < 0.7 * side / decoder.cells
+    return np.asarray(same & ((found.expected & known & there) | (alike & (sharp | soft))))
+
+
+def speaks_for_itself(reading: Reading, decoder: Decoder) -> BoolArray:
+    """Which readings (N,) show a marker beyond doubt, whatever its sides are like."""
+    return np.asarray(_stands_out(reading, decoder) & (decoder.correctable >= _MANY_BITS))
+
+
+def _stands_out(reading: Reading, decoder: Decoder) -> BoolArray:
+    """Which readings (N,) are clearly of one marker, in white surroundings."""
+    margin = (np.abs(reading.correlation) - reading.runner_up) / decoder.isolation[reading.ids]
+    white = (reading.surround >= _WHITE[0]) & (reading.surround <= _WHITE[1])
+    return np.asarray((margin >= _CLEAR_MARGIN) & white)
+
+
+def read_quads(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
+    """Readings of (Q, 4, 2) among all IDs, at half the resolution when all are large enough for it."""
+    everything = np.ones(decoder.count, dtype=bool)
+    sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
+    if sides.min(initial=np.inf) >= _WIDE_CELL_PX * decoder.cells:
+        return decoder.read(halved(image), 0.5 * (quads - 0.5), everything)
+    return decoder.read(image, quads, everything)

@@ -1,0 +1,179 @@
+"""Markers of a frame: followed, known ones near their predicted places, and blindly when that is due."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.decoding import Decoder
+from thermal_fiducial.core.detection.following import Followed
+from thermal_fiducial.core.detection.frame import Frame
+from thermal_fiducial.core.detection.guided import common_shift, near_prediction
+from thermal_fiducial.core.detection.history import History
+from thermal_fiducial.core.detection.ids import among
+from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes
+from thermal_fiducial.core.detection.lag import LagField, without_lag
+from thermal_fiducial.core.detection.places import places_of
+from thermal_fiducial.core.detection.readout import seen_displacement
+from thermal_fiducial.core.detection.search import BlindSearch, Found, merged, SearchScales
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.types import BoolArray, Float32Array
+
+# Motion blur by lag below which the search misses nothing [px].
+_BLUR_THAT_HIDES_PX = 2.0
+# Share of the map's expected markers that, when observed, shows that the prediction holds.
+_ENOUGH = 0.5
+# Contrast over noise beyond which a marker shows at full and at half the resolution.
+_CLEAR = 20.0
+# Nearer to the border of the image than this a marker is not expected to be observed [px].
+_BORDER_PX = 2.0
+# Where not all markers are known, or not all observed that should be, a blind search follows at least every so many
+# frames.
+_INCOMPLETE = 2
+
+
+class Findings(NamedTuple):
+    """What is found in a frame."""
+
+    found: Found
+    #: those of the last frame that are observed again
+    followed: Followed
+    #: of :class:`History`
+    since_blind: int
+    scales: SearchScales
+
+
+class _Near(NamedTuple):
+    """What is found where it is expected."""
+
+    found: Found
+    followed: Followed
+    #: whether all that is expected is observed; and so much of it that the prediction must hold
+    complete: bool
+    holds: bool
+
+
+class MarkerFinder:
+    """Finds the markers of a dictionary.
+
+    Parameters
+    ----------
+    decoder : of the dictionary
+    sizes : sides of the markers
+    """
+
+    def __init__(self, decoder: Decoder, sizes: MarkerSizes) -> None:
+        self._decoder, self._sizes = decoder, sizes
+        self._search = BlindSearch(decoder)
+        self._lag_field: LagField | None = None
+
+    def find(
+        self,
+        frame: Frame,
+        history: History,
+        in_map: ExpectedMarkers | None,
+        known: KnownMarkers,
+        config: ArucoDetectorConfig,
+    ) -> Findings:
+        """Markers to a pixel or two, at the frame's stamp.
+
+        Parameters
+        ----------
+        in_map : markers of the map where they should be; None: nothing says where
+        known : the markers of the map
+        """
+        near = self._near(frame, history, in_map, known, config)
+        since_blind, interval = history.since_blind + 1, config.blind_interval
+        if in_map is None or not near.complete:
+            interval = min(interval, _INCOMPLETE)
+        if (near.complete or (near.holds and in_map is not None)) and since_blind < interval:
+            return Findings(near.found, near.followed, since_blind, history.scales)
+        scales = _next_scales(history, complete=near.complete)
+        blind = self._blind(frame, history, near.found, scales, known, config)
+        return Findings(merged(near.found, blind), near.followed, 0, scales)
+
+    def _near(
+        self,
+        frame: Frame,
+        history: History,
+        in_map: ExpectedMarkers | None,
+        known: KnownMarkers,
+        config: ArucoDetectorConfig,
+    ) -> _Near:
+        """Markers where they should be: followed from the last frame, and others of the map."""
+        if frame.twist is None or not config.guided:
+            return _Near(Found.none(), Followed.none(), complete=False, holds=False)
+        last = Followed.of(history.track.expected(frame.stamp_ns, frame.twist), frame)
+        expected = _expected(frame.camera, last, in_map, known)
+        followed = last.only(among(last.ids, expected.ids)).seen(frame, frame.twist, self._decoder, config)
+        found = followed.found()
+        new = ~among(expected.ids, followed.ids)
+        if new.any():
+            shift = common_shift(expected.ids, expected.corners_px, found)
+            others = expected.only(new).shifted(shift)
+            found = merged(found, near_prediction(frame, frame.twist, others, self._decoder, config))
+        number = len(expected.ids)
+        complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
+        return _Near(found, followed, complete, number > 0 and len(found.ids) >= _ENOUGH * number)
+
+    def _blind(
+        self,
+        frame: Frame,
+        history: History,
+        found: Found,
+        scales: SearchScales,
+        known: KnownMarkers,
+        config: ArucoDetectorConfig,
+    ) -> Found:
+        """Markers wherever they are, but for those that are ``found`` already."""
+        scene, allowed = self._scene(frame, history.depth_m), self.allowed(known, config)
+        kinds = history.polarity.kinds(config.polarity)
+        blind = self._search.search(frame, scene, allowed, config, found, scales, kinds)
+        blind = blind.only(history.polarity.possible(blind.cnr, config.polarity))
+        return self._without_rolling_shutter(frame, blind, known)
+
+    def _scene(self, frame: Frame, depth_m: float) -> Float32Array:
+        """The frame as the search sees it, freed of lag where motion is fast enough to matter there."""
+        if frame.twist is None or frame.lag <= 0.0:
+            return frame.image
+        if self._lag_field is None or self._lag_field.camera is not frame.camera:
+            self._lag_field = LagField(frame.camera)
+        motion = frame.twist, depth_m, frame.lag
+        if self._lag_field.longest(*motion) < _BLUR_THAT_HIDES_PX:
+            return frame.image
+        field = self._lag_field.full(self._lag_field.at(*motion))
+        return without_lag(frame.image, field[..., 0], field[..., 1])
+
+    def allowed(self, known: KnownMarkers, config: ArucoDetectorConfig) -> BoolArray:
+        """Which IDs of the dictionary may be found."""
+        wanted = known.ids if len(known.ids) and config.whitelist_from_map else np.array(config.whitelist, dtype=int)
+        if len(wanted) == 0:
+            return np.ones(self._decoder.count, dtype=bool)
+        return np.asarray(np.isin(np.arange(self._decoder.count), wanted))
+
+    def _without_rolling_shutter(self, frame: Frame, found: Found, known: KnownMarkers) -> Found:
+        """Markers where they would be if all rows were seen at once."""
+        if frame.readout == 0.0 or len(found.ids) == 0:
+            return found
+        places = places_of(frame, found, self._sizes.of(found.ids, known))
+        rolling = seen_displacement(places, frame.twist, frame, found.corners_px[..., 1])
+        return replace(found, corners_px=found.corners_px - rolling)
+
+
+def _next_scales(history: History, *, complete: bool) -> SearchScales:
+    """Both resolutions; where all that is expected is seen, so clearly that either shows it, only one, in turn."""
+    if not (complete and history.track.all_clearer_than(_CLEAR)):
+        return SearchScales.ALL
+    return SearchScales.FAINT if history.scales == SearchScales.FINE else SearchScales.FINE
+
+
+def _expected(camera: Camera, last: Followed, in_map: ExpectedMarkers | None, known: KnownMarkers) -> ExpectedMarkers:
+    """The map's markers and the last frame's others."""
+    at = last.places.at
+    others = ExpectedMarkers(last.ids, at.px, at.x, last.places.depth)
+    new: BoolArray = np.asarray(camera.contains(at.px, _BORDER_PX).all(axis=1))
+    if in_map is None:
+        return others.only(new)
+    new &= ~among(last.ids, known.ids)
+    return in_map.joined(others.only(new)) if new.any() else in_map

@@ -1,0 +1,248 @@
+"""Motion of the camera from frame to frame, as its markers and the filter's states show it.
+
+A Kalman filter holds the camera's twist and its change: predicted from the last frame, corrected by the filter's states
+round the frame and by how the markers' corners moved since.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from thermal_fiducial.core.detection.ids import pairs
+from thermal_fiducial.core.detection.twist import (
+    carried,
+    corrected,
+    growth,
+    interaction,
+    joined,
+    line_through,
+    of_unsure_stamp,
+    RANDOM,
+    transfer_from_body,
+    transferred,
+    Twist,
+    unknown_twist,
+)
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+
+# Frames farther apart show nothing of each other [s].
+_STALE_S = 0.15
+# So many states of the filter show the acceleration too.
+_ENOUGH_STATES = 4
+# Jitter of the camera's stamps [s].
+_JITTER_S = 0.001
+# How far corners that lag displaces may be off their mean delay, where the form of blurred edges is unknown [lag].
+_DELAY_UNSURE = 0.5
+# Mean square of a marker's residuals over what the noise of its corners makes of it, beyond which not all markers can
+# be of one scene (two in a hundred of brisk flights); how often weights are adapted, and when they have settled.
+_OUTLIER, _ROUNDS, _SETTLED = 12.0, 10, 0.02
+# Of the corners of a marker.
+_COORDINATES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedMarkers:
+    """Markers of a frame that the next one should show.
+
+    Parameters
+    ----------
+    ids : (N,)
+    x : (N, 4, 2) normalised corners
+    depth : (N, 4) [m]
+    cnr : (N,) contrast-to-noise ratio of a pixel
+    """
+
+    ids: IntArray
+    x: FloatArray
+    depth: FloatArray
+    cnr: FloatArray
+
+    def only(self, keep: BoolArray) -> 'TrackedMarkers':
+        """Those of the markers ``keep`` (N,)."""
+        return TrackedMarkers(self.ids[keep], self.x[keep], self.depth[keep], self.cnr[keep])
+
+    @staticmethod
+    def none() -> 'TrackedMarkers':
+        """No markers."""
+        return TrackedMarkers(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4)), np.zeros(0))
+
+
+class _Flow(NamedTuple):
+    """Velocities of the M = 8 N coordinates of N markers' corners.
+
+    Parameters
+    ----------
+    A : (M, 6) derivative by the twist
+    velocity : (M,) normalised
+    stretch : (M,) by what all velocities may be off together, one standard deviation
+    weight : (M,) inverse variance of what each may be off by itself
+    """
+
+    A: FloatArray
+    velocity: FloatArray
+    stretch: FloatArray
+    weight: FloatArray
+
+    def robust(self, start: Twist, ago: float) -> Twist:
+        """The twist ``start`` corrected by the velocities so many seconds before.
+
+        A marker that moves by itself, or whose corners went wrong, shows by its residuals beside those of the others,
+        and loses weight accordingly.
+        """
+        twist = corrected(start, *self._information(self.weight), -ago)
+        if self._chi2(twist.ago(ago), self.weight).max() <= _OUTLIER:
+            return twist
+        # Together with the others, those that are wrong hide among them: what was expected sets them apart.
+        trust = _trusted(self._chi2(start.ago(ago), self.weight))
+        for _ in range(_ROUNDS):
+            weight = np.repeat(trust, _COORDINATES) * self.weight
+            twist = corrected(start, *self._information(weight), -ago)
+            former, trust = trust, _trusted(self._chi2(twist.ago(ago), weight))
+            if np.abs(trust - former).max() < _SETTLED:
+                break
+        return twist
+
+    def _information(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Information on the twist (6, 6), and times the twist (6,)."""
+        weighted, stretched = self.A.T * weight, weight * self.stretch
+        spread = weighted @ self.stretch
+        share = spread / (1.0 + stretched @ self.stretch)
+        information = weighted @ self.A - spread[:, None] * share
+        return information, weighted @ self.velocity - share * (stretched @ self.velocity)
+
+    def _chi2(self, twist: FloatArray, weight: FloatArray) -> FloatArray:
+        """Squared residuals (N,) of markers from a twist (6,), per degree of freedom."""
+        residual, stretched = self.velocity - self.A @ twist, weight * self.stretch
+        residual = residual - (stretched @ residual) / (1.0 + stretched @ self.stretch) * self.stretch
+        return np.asarray((self.weight * residual * residual).reshape(-1, _COORDINATES).sum(axis=1) / _COORDINATES)
+
+
+def _trusted(chi2: FloatArray) -> FloatArray:
+    """Factors (N,) on the weights of markers, 1 for residuals like those of most (S. Geman, D. McClure, 1987)."""
+    half = (len(chi2) - 1) // 2
+    typical = max(float(np.partition(chi2, half)[half]), 1.0)
+    return np.asarray(np.minimum(2.0 * typical / (typical + chi2), 1.0) ** 2)
+
+
+@dataclass(frozen=True, slots=True)
+class MotionTrack:
+    """The camera's twist over the frames, and the markers that it saw: what one frame leaves to the next.
+
+    Parameters
+    ----------
+    from_body : (6, 6) what makes the camera's twist of the body's
+    lag : time constant of the bolometers [s]
+    stamp_ns, twist, markers : of the last frame
+    last_seen_ns : stamp of the last frame that showed markers
+    """
+
+    from_body: FloatArray
+    lag: float
+    stamp_ns: int | None = None
+    twist: Twist | None = None
+    markers: TrackedMarkers = field(default_factory=TrackedMarkers.none)
+    last_seen_ns: int | None = None
+
+    @staticmethod
+    def of_rig(T_body_camera: FloatArray, lag: float = 0.0) -> 'MotionTrack':
+        """Before the first frame, of a camera at ``T_body_camera`` (4, 4)."""
+        return MotionTrack(transfer_from_body(T_body_camera), lag)
+
+    def predict(
+        self,
+        stamp_ns: int,
+        odometry: Sequence[Odometry],
+        odometry_ns: int | None = None,
+        clock_std_s: float = 0.0,
+    ) -> Twist | None:
+        """Twist expected at a frame; None when nothing is known.
+
+        Parameters
+        ----------
+        odometry : states round the time that blurs the frame, or the nearest that there is
+        odometry_ns : the frame's stamp in their clock, if that is not the camera's
+        clock_std_s : standard deviation of that stamp [s]
+        """
+        dt = self._since(stamp_ns)
+        before = None
+        if self.twist is not None and dt is not None and self._saw_lately(stamp_ns):
+            before = carried(self.twist, dt)
+        odometry_ns = stamp_ns if odometry_ns is None else odometry_ns
+        if len(odometry) >= _ENOUGH_STATES:
+            observed = line_through(odometry_ns, odometry, self.from_body)
+            return joined(before or unknown_twist(), of_unsure_stamp(observed, clock_std_s))
+        if len(odometry) == 0 or abs(odometry_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
+            return before
+        seen, later = transferred(odometry[-1], self.from_body), (odometry[-1].stamp_ns - odometry_ns) * 1e-9
+        unsure = (growth(abs(later))[0] + clock_std_s**2) * RANDOM
+        information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + unsure))
+        return corrected(before or unknown_twist(), information, information @ seen.value, later)
+
+    def expected(self, stamp_ns: int, twist: Twist) -> TrackedMarkers:
+        """The last frame's markers where the camera's motion since has carried them."""
+        dt = self._since(stamp_ns)
+        if dt is None or self.twist is None or len(self.markers.ids) == 0:
+            return TrackedMarkers.none()
+        step = (0.5 * dt) * (twist.value + self.twist.value)
+        moved = se3.inverse(se3.transform(se3.so3_exp(step[3:]), step[:3]))
+        points = self.markers.depth[..., None] * (self.markers.x @ moved[:3, :2].T + moved[:3, 2]) + moved[:3, 3]
+        depth = np.maximum(points[..., 2], 1e-3)
+        return TrackedMarkers(self.markers.ids, points[..., :2] / depth[..., None], depth, self.markers.cnr)
+
+    def correct(
+        self,
+        stamp_ns: int,
+        predicted: Twist | None,
+        ids: IntArray,
+        x: FloatArray,
+        depth: FloatArray,
+        noise: FloatArray,
+    ) -> Twist | None:
+        """Twist from how the corners moved since the last frame.
+
+        Parameters
+        ----------
+        ids : (N,)
+        x : (N, 4, 2) normalised corners, where they would be without lag if the twist is predicted, and else as seen
+        depth : (N, 4) [m]
+        noise : (N,) standard deviation of a corner in normalised coordinates
+        """
+        now, before = pairs(ids, self.markers.ids)
+        dt = self._since(stamp_ns)
+        if len(now) == 0 or dt is None:
+            return predicted
+        begin, end = dt + (self.lag if self.twist is None else 0.0), self.lag if predicted is None else 0.0
+        seconds, start = begin - end, predicted or unknown_twist()
+        # Stamps that jitter stretch or shrink all velocities of a frame alike.
+        unsure = 2.0 * _JITTER_S**2 + (0.0 if self.twist is not None else (_DELAY_UNSURE * self.lag) ** 2)
+        A = interaction(0.5 * (x[now] + self.markers.x[before]), depth[now]).reshape(-1, 6)
+        velocity = (x[now] - self.markers.x[before]).reshape(-1) / seconds
+        stretch = A @ (np.zeros(6) if predicted is None else math.sqrt(unsure) / seconds * predicted.value)
+        flow = _Flow(A, velocity, stretch, np.repeat((seconds / (1.5 * noise[now])) ** 2, _COORDINATES))
+        return flow.robust(start, 0.5 * (begin + end))
+
+    def all_clearer_than(self, cnr: float) -> bool:
+        """Whether there were markers, all of more contrast over noise."""
+        return len(self.markers.ids) > 0 and bool(np.abs(self.markers.cnr).min() > cnr)
+
+    def after(self, stamp_ns: int, twist: Twist | None, markers: TrackedMarkers) -> 'MotionTrack':
+        """The track with a frame's twist and markers; of a frame that comes late there is nothing to keep."""
+        if self.stamp_ns is not None and 0 < self.stamp_ns - stamp_ns < _STALE_S * 1e9:
+            return self
+        last_seen_ns = stamp_ns if len(markers.ids) else self.last_seen_ns
+        return MotionTrack(self.from_body, self.lag, stamp_ns, twist, markers, last_seen_ns)
+
+    def _saw_lately(self, stamp_ns: int) -> bool:
+        """Whether markers show that the twist holds: one that went wrong would hide them from then on."""
+        return self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_S * 1e9
+
+    def _since(self, stamp_ns: int) -> float | None:
+        """Time since the last frame [s], negative for one that comes late; None when that shows nothing of this one."""
+        if self.stamp_ns is None or not 0 < abs(stamp_ns - self.stamp_ns) < _STALE_S * 1e9:
+            return None
+        return (stamp_ns - self.stamp_ns) * 1e-9
