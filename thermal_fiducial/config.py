@@ -382,6 +382,13 @@ class ArucoDetectorConfig(SelfChecked):
         0.6, 'min_correlation of an expected marker.', minimum=0.3, maximum=1.0, live=True
     )
     guided_min_margin: float = param(0.05, 'min_margin of an expected marker.', minimum=0.0, maximum=0.5, live=True)
+    detections: str = param(
+        '',
+        'Publish `detections` in the message of another package too, where it is installed: aruco_opencv_msgs, '
+        'apriltag_msgs or vision_msgs. Empty: none.',
+        choices=('', 'aruco_opencv', 'apriltag', 'vision'),
+    )
+    publish_marker_tf: bool = param(False, 'Publish each marker as marker_ID on /tf (needs tf2_ros).')
     duplicates: str = param(
         'drop',
         'An ID at two places of a frame, as in a reflection. drop: neither counts; best: the clearer one does.',
@@ -546,6 +553,12 @@ class PoseEkfConfig(SelfChecked):
     map_frame: str = param('map', 'Frame of the pose.')
     base_frame: str = param('base_link', 'Frame of the robot: that of the IMU.')
     camera_frame: str = param('thermal_camera_optical', 'Frame of the camera, for publish_tf.')
+    odom_frame: str = param(
+        '',
+        'With publish_tf and smoothing_time, as REP-105: the smooth output from here to base_frame, the rest from '
+        'map_frame to here. Empty: map_frame to base_frame.',
+    )
+    publish_lost: bool = param(False, 'Publish `pose` also while it counts as lost; `odometry` is always published.')
     publish_tf: bool = param(False, 'Publish map to base_frame and base_frame to camera_frame on /tf (needs tf2_ros).')
     bridge_rate: float = param(
         0.0,

@@ -187,6 +187,41 @@ def test_transforms_are_broadcast_where_tf2_is(monkeypatch):
     assert last.transform.translation.z == pose.pose.pose.position.z
 
 
+def test_with_an_odom_frame_the_smooth_pose_is_in_it_and_both_make_the_pose(monkeypatch):
+    tf2_ros = ModuleType('tf2_ros')
+    sent = []
+
+    class Pairs(Broadcaster):
+        def sendTransform(self, message):
+            sent.append(message)
+
+    tf2_ros.TransformBroadcaster, tf2_ros.StaticTransformBroadcaster = Pairs, StaticBroadcaster
+    monkeypatch.setitem(sys.modules, 'tf2_ros', tf2_ros)
+    with ros_graph() as graph:
+        frames = {'publish_tf': True, 'odom_frame': 'odom', 'smoothing_time': 0.5}
+        node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], **frames)
+        fly(graph, range(60))
+        smooth = node.filter.smooth
+        state = node.filter.state.T_map_body
+    map_to_odom, odom_to_base = sent[-1]
+    assert (map_to_odom.header.frame_id, map_to_odom.child_frame_id) == ('map', 'odom')
+    assert (odom_to_base.header.frame_id, odom_to_base.child_frame_id) == ('odom', 'base_link')
+    assert map_to_odom.header.stamp == odom_to_base.header.stamp
+    T_map_odom, T_odom_base = (convert.correction_of(message)[1] for message in sent[-1])
+    # A quaternion in between: the last digits may differ.
+    np.testing.assert_allclose(T_odom_base, smooth.T_map_body, atol=1e-12)
+    np.testing.assert_allclose(T_map_odom @ T_odom_base, state, atol=1e-12)
+
+
+def test_an_odom_frame_without_a_smooth_output_is_a_fault(monkeypatch):
+    tf2_ros = ModuleType('tf2_ros')
+    tf2_ros.TransformBroadcaster, tf2_ros.StaticTransformBroadcaster = Broadcaster, StaticBroadcaster
+    monkeypatch.setitem(sys.modules, 'tf2_ros', tf2_ros)
+    with ros_graph() as graph:
+        node = graph.add(PoseEkfNode, publish_tf=True, odom_frame='odom')
+        assert node.faults == ['parameter odom_frame: without smoothing_time nothing is smooth']
+
+
 def test_tf2_that_is_not_installed_is_a_fault():
     with ros_graph() as graph:
         node = graph.add(PoseEkfNode, publish_tf=True)

@@ -3,6 +3,7 @@
 from copy import deepcopy
 from dataclasses import replace
 import time
+from types import SimpleNamespace
 
 import cv2
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
@@ -421,6 +422,48 @@ def test_reset_starts_afresh(graph):
 def test_silence_is_said(graph):
     node = graph.add(PoseEkfNode)
     assert graph.diagnose(node)[:2] == (WARN, 'no imu/data')
+
+
+def test_an_input_that_stops_is_an_error_after_two_seconds(graph):
+    node = graph.add(PoseEkfNode)
+    fly(graph, [imu(0)])
+    levels = [graph.diagnose(node)[:2] for _ in range(3)]
+    assert levels[1:] == [(WARN, 'no imu/data'), (ERROR, 'no imu/data')]
+    fly(graph, [imu(1)])
+    assert graph.diagnose(node)[1] == levels[0][1] == 'waiting for markers'
+
+
+def test_the_console_has_a_line_for_each_change_that_a_pilot_must_know(graph, monkeypatch):
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
+    said = []
+    log = SimpleNamespace(info=said.append, warning=said.append)
+    monkeypatch.setattr(node, 'get_logger', lambda: log)
+    graph.diagnose(node)
+    flight = [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])]
+    for message in flight:
+        fly(graph, [message])
+        if convert.stamp_ns(message.header.stamp) % 50_000_000 == 0:
+            graph.diagnose(node)
+    graph.diagnose(node)
+    graph.diagnose(node)
+    fly(graph, [imu(k) for k in range(60, 240)])
+    for _ in range(3):
+        graph.diagnose(node)
+    assert [line for k, line in enumerate(said) if line not in said[:k]] == [
+        'waiting for imu/data', 'waiting for markers', 'initialising', 'tracking', 'coasting', 'imu/data has stopped',
+    ]  # fmt: skip
+
+
+def test_a_lost_pose_is_not_published_unless_asked_for(graph):
+    quiet = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], lost_position_std=0.001)
+    fly(graph, [m for k in range(60) for m in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
+    assert quiet.filter.lost
+    assert (quiet._pose.count, quiet._odometry.count > 20) == (0, True)
+    with ros_graph('-r', '__ns:=/aside') as other:
+        node = other.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], lost_position_std=0.001, publish_lost=True)
+        for message in [m for k in range(60) for m in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])]:
+            other.send('imu/data' if isinstance(message, Imu) else 'camera_pose', message)
+        assert node._pose.count == node._odometry.count > 20
 
 
 @pytest.mark.parametrize(

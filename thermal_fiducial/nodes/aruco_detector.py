@@ -17,6 +17,7 @@ from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.ros import clouds, convert, display, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
+from thermal_fiducial.ros.detections import OtherDetections
 from thermal_fiducial.ros.node import OK, WARN
 from thermal_fiducial.ros.run import run
 
@@ -31,6 +32,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         self._seen = self._left = 0
         self._markers = self.advertise(PointCloud2, 'markers')
         self._marker_poses = self.advertise(PoseArray, 'marker_poses')
+        self._others = OtherDetections(self, self.config, self.fault)
         self._annotated = self.advertise(Image, 'thermal/image_markers', qos.IMAGE_OUTPUT)
         self._images = self.subscribe_newest(Image, 'thermal/image', self._on_image, qos.IMAGE_INPUT)
         self.follow_hints()
@@ -56,6 +58,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         self._seen = len(markers)
         self._markers.send(clouds.cloud(markers, message.header))
         self._marker_poses.send(clouds.marker_poses(markers, message.header))
+        self._others.send(markers, message.header)
         if self._annotated.listeners:
             self._annotated.send(convert.image(display.annotated(self._gray(counts), markers), message.header))
 

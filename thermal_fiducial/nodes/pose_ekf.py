@@ -1,6 +1,7 @@
 """Node ``pose_ekf``: IMU and camera poses to the robot's pose and odometry, one for every IMU message."""
 
 from collections import deque
+import re
 import sys
 from typing import Any
 
@@ -13,7 +14,6 @@ from std_srvs.srv import Trigger
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_text
 from thermal_fiducial.core.filter.pose_ekf import PoseEkf
-from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, Odometry
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros import convert, qos
@@ -53,7 +53,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         if self.config.smoothing_time > 0.0:
             self._smooth_odometry = self.advertise(OdometryMessage, 'odometry_smooth', qos.IMU_RATE_RESULT)
         self._bridge = FlightControllerBridge(self, self.config, self.fault)
-        self._transforms = self._make_transforms() if self.config.publish_tf else None
+        self._transforms = TransformBroadcaster(self, self.config, self.fault) if self.config.publish_tf else None
         self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
         self.subscribe(TransformStamped, 'map_correction', self._on_map_correction, qos.RESULT)
@@ -64,26 +64,23 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         super().configure(config)
         self.filter.configure(config)
 
-    def _make_transforms(self) -> TransformBroadcaster:
-        config = self.config
-        T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
-        return TransformBroadcaster(self, config.base_frame, config.camera_frame, T_body_camera, self.fault)
-
     def _on_imu(self, message: Imu) -> None:
         odometry = self.filter.add_imu(convert.imu_sample(message))
         self._count_jumps()
         if odometry is None:
             return
         convert.fill_odometry(self._message, odometry)
-        self._pose.send(self._pose_message)
+        lost = self.filter.lost
+        if self.config.publish_lost or not lost:
+            self._pose.send(self._pose_message)
         self._odometry.send(self._message)
-        if self._transforms is not None:
-            self._transforms.send(self._pose_message)
         smooth = self.filter.smooth
+        if self._transforms is not None and not lost:
+            self._transforms.send(odometry, smooth)
         if smooth is not None:
             convert.fill_odometry(self._message, smooth)
             self._smooth_odometry.send(self._message)
-        if not self.filter.lost:
+        if not lost:
             self._bridge.send(smooth or odometry, self._jumps)
         self._extend_path(odometry)
 
@@ -135,6 +132,10 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         if self._last_refusal and not self.filter.lost:
             return WARN, f'{status}; pose {self._last_refusal}'
         return level, status
+
+    def headline(self) -> str:
+        """What the filter does, without numbers."""
+        return re.split(r'[:\d]', self.filter.status)[0].removesuffix(' for ')
 
     def figures(self) -> dict[str, object]:
         """The filter in numbers."""

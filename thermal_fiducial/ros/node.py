@@ -159,6 +159,8 @@ class StageNode(CountingNode, Generic[Config]):
         self._refusal = ''
         self._diagnosed_inputs: dict[str, int] = {}
         self._diagnosed_refused = 0
+        #: times in a row that the main input was silent, and what the console had last
+        self._silent, self._said = 0, ''
         self._diagnostics = self.advertise(DiagnosticArray, '/diagnostics')
         params.follow(self, kind, self.configure)
         if live:
@@ -224,6 +226,10 @@ class StageNode(CountingNode, Generic[Config]):
         """Level and reason in words of a stage that gets usable input."""
         return OK, 'ok'
 
+    def headline(self) -> str:
+        """What a pilot must know of the stage, in few words without numbers: a change of it goes to the console."""
+        return ''
+
     def figures(self) -> dict[str, object]:
         """Numbers of the stage for the diagnostics."""
         return {}
@@ -234,6 +240,7 @@ class StageNode(CountingNode, Generic[Config]):
     def diagnose(self, stamp_ns: int) -> None:
         """Publish the diagnostics of the time since the last call."""
         level, reason = self._level()
+        self._say(level)
         counts: dict[str, object] = {f'received {source.topic}': source.count for source in self.inputs}
         counts |= {f'left {source.topic}': source.left for source in self.inputs if source.left}
         counts |= {
@@ -252,8 +259,31 @@ class StageNode(CountingNode, Generic[Config]):
             return WARN, self._refusal
         source = self.inputs[0] if self.inputs else None
         if source is not None and source.count == self._diagnosed_inputs.get(source.topic, 0):
-            return WARN, f'no {source.topic.lstrip("/")}'
+            # A shutter takes half a second; whoever gets nothing for two, and had something, does nothing any more.
+            self._silent += 1
+            return ERROR if self._stopped else WARN, f'no {source.topic.lstrip("/")}'
+        self._silent = 0
         return self.state()
+
+    @property
+    def _stopped(self) -> bool:
+        return self._silent > 1 and self.inputs[0].count > 0
+
+    def _say(self, level: bytes) -> None:
+        """A line on the console where what a pilot must know has changed: one a second at most, as it is looked at."""
+        words, topic = self.headline(), self.inputs[0].topic.lstrip('/') if self.inputs else ''
+        if topic and not self.inputs[0].count:
+            words = f'waiting for {topic}'
+        elif topic and self._stopped:
+            words = f'{topic} has stopped'
+        if words == self._said:
+            return
+        self._said = words
+        # Two lines of code, as rclpy takes no two severities from one.
+        if words and level == OK:
+            self.get_logger().info(words)
+        elif words:
+            self.get_logger().warning(words)
 
     def _on_timer(self) -> None:
         self.guard(self.diagnose, self.get_clock().now().nanoseconds)

@@ -4,9 +4,9 @@ from collections.abc import Callable
 import importlib
 from typing import Any
 
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
+from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.ros import convert
 from thermal_fiducial.ros.node import CountingNode
 
@@ -14,41 +14,45 @@ from thermal_fiducial.ros.node import CountingNode
 class TransformBroadcaster:
     """Broadcasts the robot in the map, and once the camera on the robot; nothing where tf2_ros is missing.
 
+    With ``odom_frame`` as REP-105 has it: the smooth output from odom to the robot, and what it lacks from map to odom.
+
     Parameters
     ----------
     node : that broadcasts
-    base_frame, camera_frame : names
-    T_body_camera : (4, 4)
-    fault : told in words that tf2_ros is missing
+    config : names of the frames, pose of the camera
+    fault : called in words with what is missing
     """
 
-    def __init__(
-        self,
-        node: CountingNode,
-        base_frame: str,
-        camera_frame: str,
-        T_body_camera: FloatArray,
-        fault: Callable[[str], None],
-    ) -> None:
-        self._base_frame = base_frame
+    def __init__(self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None]) -> None:
+        self._config = config
         self._broadcaster: Any = None
         try:
             tf2_ros = importlib.import_module('tf2_ros')
         except ImportError:
             fault('parameter publish_tf: tf2_ros is not installed')
             return
+        if config.odom_frame and not config.smoothing_time:
+            fault('parameter odom_frame: without smoothing_time nothing is smooth')
+        T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
         self._broadcaster = tf2_ros.TransformBroadcaster(node)
         self._static = tf2_ros.StaticTransformBroadcaster(node)
-        self._static.sendTransform(convert.transform_message(T_body_camera, 0, base_frame, camera_frame))
+        self._static.sendTransform(convert.transform_message(T_body_camera, 0, config.base_frame, config.camera_frame))
 
-    def send(self, message: PoseWithCovarianceStamped) -> None:
-        """Broadcast the pose of the robot in the header's frame."""
+    def send(self, odometry: Odometry, smooth: Odometry | None) -> None:
+        """Broadcast the robot's pose, and with ``odom_frame`` the smooth one of the same stamp."""
         if self._broadcaster is None:
             return
-        pose = message.pose.pose
-        transform = TransformStamped(header=message.header, child_frame_id=self._base_frame)
-        p = pose.position
-        transform.transform.translation.x, transform.transform.translation.y = p.x, p.y
-        transform.transform.translation.z = p.z
-        transform.transform.rotation = pose.orientation
-        self._broadcaster.sendTransform(transform)
+        config, stamp, T_map_body = self._config, odometry.stamp_ns, odometry.T_map_body
+        if not config.odom_frame or smooth is None:
+            self._broadcaster.sendTransform(
+                convert.transform_message(T_map_body, stamp, config.map_frame, config.base_frame)
+            )
+            return
+        T_odom_body = smooth.T_map_body
+        T_map_odom = T_map_body @ inverse(T_odom_body)
+        self._broadcaster.sendTransform(
+            [
+                convert.transform_message(T_map_odom, stamp, config.map_frame, config.odom_frame),
+                convert.transform_message(T_odom_body, stamp, config.odom_frame, config.base_frame),
+            ]
+        )

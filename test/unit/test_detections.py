@@ -1,0 +1,112 @@
+"""Detections in the messages of other packages, which stand-ins have the fields of."""
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+import cv2
+from geometry_msgs.msg import PoseWithCovariance
+import numpy as np
+import pytest
+from sensor_msgs.msg import PointCloud2
+from support import small_bag
+from support.messages import frames, info, START
+from support.ros_graph import ros_graph
+
+from thermal_fiducial.core.measurements import corners_px, MARKER_DTYPE
+from thermal_fiducial.nodes.aruco_detector import ArucoDetector
+from thermal_fiducial.ros import convert, detections
+
+HEAD = convert.header(START, 'thermal_camera_optical')
+CORNERS = np.array([[100.0, 80.0], [160.0, 82.0], [158.0, 141.0], [99.0, 140.0]])
+
+
+def stand_in(**fields):
+    """A message class: each of ``fields`` is made anew for each message."""
+    return lambda: SimpleNamespace(**{name: make() for name, make in fields.items()})
+
+
+def point():
+    return SimpleNamespace(x=0.0, y=0.0)
+
+
+APRILTAG = SimpleNamespace(
+    AprilTagDetectionArray=stand_in(detections=list),
+    AprilTagDetection=stand_in(
+        centre=point, corners=lambda: [point() for _ in range(4)], homography=lambda: np.zeros(9)
+    ),
+)
+ARUCO = SimpleNamespace(ArucoDetection=stand_in(markers=list, boards=list), MarkerPose=stand_in())
+VISION = SimpleNamespace(
+    Detection3DArray=stand_in(detections=list),
+    Detection3D=stand_in(results=list, bbox=SimpleNamespace),
+    ObjectHypothesisWithPose=stand_in(hypothesis=SimpleNamespace, pose=PoseWithCovariance),
+)
+
+
+def rows():
+    row = np.zeros(1, MARKER_DTYPE)
+    row['id'], row['contrast_counts'] = 7, 250.0
+    for name, value in zip(('x', 'y', 'z', 'qx', 'qw'), (0.1, -0.2, 2.5, 1.0, 0.0), strict=True):
+        row[name] = value
+    for corner, (u, v) in enumerate(CORNERS):
+        row[f'u{corner}'], row[f'v{corner}'] = u, v
+    return row
+
+
+def test_aruco_opencv():
+    message = detections.aruco_opencv(ARUCO, rows(), HEAD)
+    (marker,) = message.markers
+    assert (message.header, marker.marker_id) == (HEAD, 7)
+    assert (marker.pose.position.z, marker.pose.orientation.x) == (2.5, 1.0)
+
+
+def test_apriltag_goes_round_from_the_lower_left_and_its_homography_meets_the_corners():
+    message = detections.apriltag(APRILTAG, rows(), HEAD, 'DICT_4X4_50')
+    (tag,) = message.detections
+    assert (tag.family, tag.id, tag.hamming, tag.decision_margin) == ('DICT_4X4_50', 7, 0, 250.0)
+    np.testing.assert_array_equal([[p.x, p.y] for p in tag.corners], CORNERS[[3, 2, 1, 0]])
+    square = np.array([[[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]]])
+    # float32 corners: a ten-thousandth of a pixel.
+    mapped = cv2.perspectiveTransform(square, np.reshape(tag.homography, (3, 3)))[0]
+    np.testing.assert_allclose(mapped, corners_px(rows())[0][[3, 2, 1, 0]], atol=1e-4)
+    assert 125.0 < tag.centre.x < 135.0
+    assert 105.0 < tag.centre.y < 115.0
+
+
+def test_vision():
+    message = detections.vision(VISION, rows(), HEAD, [0.3])
+    (detection,) = message.detections
+    (result,) = detection.results
+    assert (detection.id, result.hypothesis.class_id, result.hypothesis.score) == ('7', '7', 1.0)
+    assert result.pose.pose.position.z == detection.bbox.center.position.z == 2.5
+    assert (detection.bbox.size.x, detection.bbox.size.y) == (0.3, 0.3)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(('kind', 'package'), [(kind, package) for kind, (package, _) in detections.KINDS.items()])
+def test_messages_that_are_not_installed_are_a_fault_and_markers_come_all_the_same(kind, package):
+    with ros_graph() as graph:
+        node = graph.add(ArucoDetector, marker_size=small_bag.SIZE, detections=kind)
+        assert node.faults == [f'parameter detections: {package} is not installed']
+        graph.listen(PointCloud2, 'markers')
+        graph.send('thermal/camera_info', info())
+        graph.send('thermal/image', *frames(1))
+        graph.spin_until(lambda: graph.heard['markers'])
+
+
+@pytest.mark.ros
+def test_markers_are_published_on_tf(monkeypatch):
+    sent = []
+    tf2_ros = ModuleType('tf2_ros')
+    tf2_ros.TransformBroadcaster = lambda node: SimpleNamespace(sendTransform=sent.append)
+    monkeypatch.setitem(sys.modules, 'tf2_ros', tf2_ros)
+    with ros_graph() as graph:
+        graph.add(ArucoDetector, marker_size=small_bag.SIZE, publish_marker_tf=True)
+        graph.send('thermal/camera_info', info())
+        graph.send('thermal/image', *frames(1))
+        graph.spin_until(lambda: sent)
+    (transforms,) = sent
+    assert [t.child_frame_id for t in transforms] == ['marker_0', 'marker_1', 'marker_2', 'marker_3']
+    assert {t.header.frame_id for t in transforms} == {'camera'}
+    # Flat pictures at 2.4 m: a few centimetres.
+    np.testing.assert_allclose([t.transform.translation.z for t in transforms], 2.4, atol=0.1)

@@ -1,0 +1,130 @@
+"""Markers of a frame in the messages that other packages expect, and on /tf.
+
+``aruco_opencv`` (aruco_opencv_msgs/ArucoDetection), ``apriltag`` (apriltag_msgs/AprilTagDetectionArray) and ``vision``
+(vision_msgs/Detection3DArray), each where its package is installed.
+"""
+
+from collections.abc import Callable
+import importlib
+from typing import Any
+
+import cv2
+from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped, Vector3
+import numpy as np
+from std_msgs.msg import Header
+
+from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
+from thermal_fiducial.core.measurements import corners_px, Markers
+from thermal_fiducial.ros.node import CountingNode
+
+#: Value of the parameter ``detections`` to package and message.
+KINDS = {
+    'aruco_opencv': ('aruco_opencv_msgs', 'ArucoDetection'),
+    'apriltag': ('apriltag_msgs', 'AprilTagDetectionArray'),
+    'vision': ('vision_msgs', 'Detection3DArray'),
+}
+# AprilTag begins at the lower left and goes round against the clock; its square reaches from -1 to 1, y down.
+_APRILTAG_ORDER = [3, 2, 1, 0]
+_APRILTAG_SQUARE = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]], np.float32)
+_THICKNESS = 0.01
+
+
+class OtherDetections:
+    """What a detector publishes beside our own ``markers``, if anything.
+
+    Parameters
+    ----------
+    node : whose outputs they are
+    fault : called in words with what was asked for and cannot be had
+    """
+
+    def __init__(self, node: CountingNode, config: ArucoDetectorConfig, fault: Callable[[str], None]) -> None:
+        self._config = config
+        self._sizes = size_overrides(config.marker_size_overrides)
+        self._messages: Any = None
+        self._broadcaster: Any = None
+        if config.detections:
+            package, name = KINDS[config.detections]
+            try:
+                self._messages = importlib.import_module(f'{package}.msg')
+            except ImportError:
+                fault(f'parameter detections: {package} is not installed')
+            else:
+                self._output = node.advertise(getattr(self._messages, name), 'detections')
+        if config.publish_marker_tf:
+            try:
+                self._broadcaster = importlib.import_module('tf2_ros').TransformBroadcaster(node)
+            except ImportError:
+                fault('parameter publish_marker_tf: tf2_ros is not installed')
+
+    def send(self, markers: Markers, head: Header) -> None:
+        """Publish the markers of a frame, also when there are none."""
+        if self._messages is not None:
+            self._output.send(self._message(markers, head))
+        if self._broadcaster is not None and len(markers):
+            self._broadcaster.sendTransform([_transform(row, head) for row in markers])
+
+    def _message(self, markers: Markers, head: Header) -> Any:
+        if self._config.detections == 'aruco_opencv':
+            return aruco_opencv(self._messages, markers, head)
+        if self._config.detections == 'apriltag':
+            return apriltag(self._messages, markers, head, self._config.dictionary)
+        sides = [self._sizes.get(int(row['id']), self._config.marker_size) for row in markers]
+        return vision(self._messages, markers, head, sides)
+
+
+def aruco_opencv(messages: Any, markers: Markers, head: Header) -> Any:
+    """aruco_opencv_msgs/ArucoDetection, its marker's frame as ours: x right, y up, z out of the face."""
+    result = messages.ArucoDetection()
+    result.header = head
+    for row in markers:
+        marker = messages.MarkerPose()
+        marker.marker_id, marker.pose = int(row['id']), _pose(row)
+        result.markers.append(marker)
+    return result
+
+
+def apriltag(messages: Any, markers: Markers, head: Header, family: str) -> Any:
+    """apriltag_msgs/AprilTagDetectionArray; the margin is our contrast [counts]."""
+    result = messages.AprilTagDetectionArray()
+    result.header = head
+    for row, corners in zip(markers, corners_px(markers), strict=True):
+        tag = messages.AprilTagDetection()
+        tag.family, tag.id, tag.hamming = family, int(row['id']), 0
+        tag.decision_margin = float(row['contrast_counts'])
+        H = cv2.getPerspectiveTransform(_APRILTAG_SQUARE, corners[_APRILTAG_ORDER].astype(np.float32))
+        tag.homography[:] = H.ravel().tolist()
+        tag.centre.x, tag.centre.y = (float(value) for value in H[:2, 2])
+        for place, index in enumerate(_APRILTAG_ORDER):
+            tag.corners[place].x, tag.corners[place].y = (float(value) for value in corners[index])
+        result.detections.append(tag)
+    return result
+
+
+def vision(messages: Any, markers: Markers, head: Header, sides: list[float]) -> Any:
+    """vision_msgs/Detection3DArray; the class is the ID, the box the black square of ``sides`` [m]."""
+    result = messages.Detection3DArray()
+    result.header = head
+    for row, side in zip(markers, sides, strict=True):
+        detection, hypothesis = messages.Detection3D(), messages.ObjectHypothesisWithPose()
+        hypothesis.hypothesis.class_id, hypothesis.hypothesis.score = str(row['id']), 1.0
+        hypothesis.pose.pose = detection.bbox.center = _pose(row)
+        detection.bbox.size = Vector3(x=side, y=side, z=_THICKNESS)
+        detection.header, detection.id = head, str(row['id'])
+        detection.results.append(hypothesis)
+        result.detections.append(detection)
+    return result
+
+
+def _pose(row: Any) -> Pose:
+    x, y, z, qx, qy, qz, qw = (float(row[name]) for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'))
+    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
+def _transform(row: Any, head: Header) -> TransformStamped:
+    place = _pose(row)
+    transform = TransformStamped(header=head, child_frame_id=f'marker_{row["id"]}')
+    p = place.position
+    transform.transform.translation = Vector3(x=p.x, y=p.y, z=p.z)
+    transform.transform.rotation = place.orientation
+    return transform
