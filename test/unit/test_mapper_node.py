@@ -55,6 +55,11 @@ def test_edits_of_the_file_are_loaded_and_undone_in_flight(graph, map_file):
     assert graph.call(Trigger, 'marker_mapper/load', Trigger.Request()).message == 'the map is frozen'
 
 
+def test_a_map_that_is_loaded_is_said_on_the_console(graph, map_file, capfd):
+    graph.add(MarkerMapperNode, map_file=str(map_file))
+    assert f'map of 1 markers from {map_file}' in capfd.readouterr().err
+
+
 def test_a_map_of_another_dictionary_is_used_and_warned_of(graph, map_file):
     """Most likely the file's label is wrong: a drone that flies is not left without its map for that."""
     map_file.write_text(map_file.read_text().replace('DICT_4X4_50', 'DICT_5X5_50'))

@@ -229,6 +229,12 @@ def test_a_detector_that_cannot_keep_up_takes_the_newest_image_and_counts_the_ot
     assert '5 older images left' in reason
 
 
+def test_an_opencv_that_would_crash_is_refused_in_words(graph, monkeypatch):
+    monkeypatch.setattr('cv2.__version__', '4.6.0')
+    with pytest.raises(InputError, match=r'OpenCV 4\.6\.0: 4\.10 or newer is needed'):
+        graph.add(ArucoDetector)
+
+
 def test_an_unknown_dictionary_is_a_fault_and_the_node_lives(graph):
     node = graph.add(ArucoDetector, dictionary='DICT_9X9_9')
     graph.send('thermal/camera_info', info())

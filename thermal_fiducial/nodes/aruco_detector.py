@@ -3,6 +3,7 @@
 import sys
 from typing import Any
 
+import cv2
 from geometry_msgs.msg import PoseArray
 import numpy as np
 from sensor_msgs.msg import Image, PointCloud2
@@ -21,11 +22,15 @@ from thermal_fiducial.ros.detections import OtherDetections
 from thermal_fiducial.ros.node import OK, WARN
 from thermal_fiducial.ros.run import run
 
+#: The oldest that the tests have run with.
+_OPENCV = (4, 10)
+
 
 class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
     """Finds markers; with the map and the filter's odometry it looks where they must be."""
 
     def __init__(self, **kwargs: Any) -> None:
+        _require_opencv()
         super().__init__('aruco_detector', ArucoDetectorConfig, **kwargs)
         self.detector = self.attempt(self._make_detector, None)
         self.view = EightBitView(Tau2CameraConfig())
@@ -75,6 +80,13 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         if left:
             return WARN, f'{self._seen} markers; {left} older images left'
         return OK, f'{self._seen} markers'
+
+
+def _require_opencv() -> None:
+    """OpenCV 4.6, which Ubuntu 24.04 has, crashes on a dictionary of ours."""
+    if tuple(int(part) for part in cv2.__version__.split('.')[:2]) < _OPENCV:
+        needed = '.'.join(map(str, _OPENCV))
+        raise InputError(f"OpenCV {cv2.__version__}: {needed} or newer is needed, pip's opencv-python-headless")
 
 
 def _check_size(counts: Counts | Gray, camera: Camera) -> None:

@@ -60,6 +60,7 @@ class MapServices:
 
     def _read(self) -> MarkerMap:
         loaded = self._keeper.load()
+        self._node.get_logger().info(f'map of {len(loaded.markers)} markers from {self._keeper.path}')
         wanted = self._node.config.dictionary
         folder = self._keeper.path.parent
         self.other_dictionary = other_patterns(loaded.markers, loaded.dictionary, wanted, folder)
