@@ -15,7 +15,12 @@ The layers, each importing only from those below it (checked by import-linter)::
 """
 
 from importlib import import_module
+import os
 from typing import Any, TYPE_CHECKING
+
+# Read by OpenCV when it is loaded: a picture whose header promises more (100 times the Tau 2's) is refused before any
+# memory is taken for it.
+os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(1 << 25))
 
 if TYPE_CHECKING:
     from thermal_fiducial.core.detection.detector import MarkerDetector

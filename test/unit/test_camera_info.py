@@ -51,16 +51,16 @@ GOOD = {
     ('change', 'words'),
     [
         ({'image_width': None}, 'image_width is missing'),
-        ({'image_width': 'wide'}, 'image_width is not a whole number'),
+        ({'image_width': 'wide'}, "image_width: 'wide' is not a whole number"),
         ({'image_height': 0}, 'image size 640x0'),
-        ({'camera_matrix': {'data': [1.0] * 8}}, 'camera_matrix holds 8 numbers, not 9'),
-        ({'camera_matrix': {'data': ['a'] * 9}}, 'camera_matrix does not hold numbers'),
+        ({'camera_matrix': {'data': [1.0] * 8}}, 'camera_matrix: data: holds 8 numbers, not 9'),
+        ({'camera_matrix': {'data': ['a'] * 9}}, "camera_matrix: data[0]: 'a' is not a number"),
         ({'camera_matrix': {'data': [0.0] * 9}}, 'focal length'),
-        ({'camera_matrix': {'data': [float('nan')] * 9}}, 'focal length'),
+        ({'camera_matrix': {'data': [float('nan')] * 9}}, "data[0]: '.nan' is not a number"),
         ({'distortion_coefficients': None}, 'distortion_coefficients is missing'),
         ({'distortion_coefficients': {'data': [0.1] * 9}}, 'takes 5 coefficients, not 9'),
         ({'distortion_model': 'spline'}, "'spline' is not one of"),
-        ({'distortion_model': ['plumb_bob']}, 'is not one of'),
+        ({'distortion_model': ['plumb_bob']}, 'distortion_model: a list of 1 is not a name'),
     ],
 )
 def test_a_broken_calibration_is_named(tmp_path, change, words):

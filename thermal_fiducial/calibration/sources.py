@@ -17,6 +17,7 @@ from thermal_fiducial.core.types import Counts, FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
+from thermal_fiducial.files.images import read_picture as load_picture
 
 #: Columns of a file of measured points; a header may hold more.
 POINT_COLUMNS = ('view', 'point', 'u', 'v', 'x', 'y')
@@ -68,9 +69,7 @@ def read_picture(path: Path) -> Counts | Gray:
     InputError
         Not a picture of 8 or 16 bit.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise InputError(f'{path}: not a picture')
+    image = load_picture(path, cv2.IMREAD_UNCHANGED)
     if image.ndim == 3:
         image = cv2.cvtColor(image[:, :, :3], cv2.COLOR_BGR2GRAY)
     if image.dtype not in (np.uint8, np.uint16) or min(image.shape) < 32:

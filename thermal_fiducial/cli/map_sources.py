@@ -18,12 +18,18 @@ from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.images import read_picture
 from thermal_fiducial.files.map_history import save_with_history
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.reading import read_text
 
 _IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
 #: Noise of OpenCV's sub-pixel corners in photos [px]; the mapper takes the actual noise from the pictures.
 PHOTO_SIGMA_PX = 0.2
+# Of a table of detections: an hour of flight with ten markers in view has 150 MB.
+_DETECTIONS_BYTES = 400_000_000
+# Beyond any stamp [ns] and any corner [px]; and any ID of a dictionary.
+_LARGEST_VALUE, _LARGEST_ID = 9.2e18, 100_000
 # Between unordered pictures the detector shall see no motion.
 _APART_NS = 100_000_000_000
 
@@ -146,9 +152,7 @@ def _detect(photos: list[Path], camera: Camera, args: argparse.Namespace) -> lis
     frames = []
     with Progress(transient=True) as progress:
         for k, photo in enumerate(progress.track(photos, description='detecting')):
-            counts = cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-            if counts is None:
-                raise InputError(f'{photo}: not a readable picture')
+            counts = read_picture(photo, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
             if counts.shape != (camera.height, camera.width):
                 raise InputError(
                     f'{photo}: {counts.shape[1]}x{counts.shape[0]}, '
@@ -187,18 +191,7 @@ def _photo_detector(args: argparse.Namespace) -> cv2.aruco.ArucoDetector:
 
 def _read_detections(path: Path, start: MarkerMap, config: MarkerMapperConfig, camera: Camera) -> list[Markers]:
     """Rows of each frame of a ``detections.csv``."""
-    try:
-        with path.open(newline='', encoding='utf-8') as file:
-            table = np.array(
-                [
-                    [float(row[name]) for name in ('stamp_ns', 'id', 'sigma_px', *CORNER_FIELDS)]
-                    for row in csv.DictReader(file)
-                ]
-            )
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'{path}: cannot read the detections') from error
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f'{path}: not a table of detections: {error}') from error
+    table = _detection_table(path)
     if not len(table):
         raise InputError(f'{path}: no detections')
     stamps, firsts = np.unique(table[:, 0], return_index=True)
@@ -212,6 +205,23 @@ def _read_detections(path: Path, start: MarkerMap, config: MarkerMapperConfig, c
         frames.append(rows_from_corners(ids, rows[:, 3:].reshape(-1, 4, 2), _isotropic(rows[:, 2]), size, camera))
     assert len(frames) == len(stamps)
     return frames
+
+
+def _detection_table(path: Path) -> FloatArray:
+    """Stamp [ns], ID, sigma and corners [px] of each row of a ``detections.csv``, (N, 11)."""
+    names = ('stamp_ns', 'id', 'sigma_px', *CORNER_FIELDS)
+    rows = []
+    for number, row in enumerate(csv.DictReader(read_text(path, _DETECTIONS_BYTES).splitlines()), start=2):
+        try:
+            values = [float(row[name]) for name in names]
+        except (KeyError, TypeError, ValueError):
+            raise InputError(
+                f'{path}: line {number}: not a table of detections, which has {", ".join(names)}'
+            ) from None
+        if not all(abs(value) < _LARGEST_VALUE for value in values) or not 0 <= values[1] < _LARGEST_ID:
+            raise InputError(f'{path}: line {number}: not a detection')
+        rows.append(values)
+    return np.array(rows).reshape(-1, len(names))
 
 
 def _isotropic(sigma_px: FloatArray) -> FloatArray:

@@ -1,11 +1,15 @@
 """Lists of bad pixels: a text file with "column row" a line; ``#`` starts a comment."""
 
 from pathlib import Path
+import re
 
 import numpy as np
 
 from thermal_fiducial.core.types import IntArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.reading import read_text
+
+_WHOLE = re.compile(r'[0-9]{1,6}')
 
 
 def load_bad_pixels(path: str | Path) -> IntArray:
@@ -17,18 +21,17 @@ def load_bad_pixels(path: str | Path) -> IntArray:
         Unreadable, or a line that is not two whole numbers from 0 up.
     """
     try:
-        lines = Path(path).read_text(encoding='utf-8').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else 'not a text file'
-        raise InputError(f'bad pixel list {path}: {reason}') from None
+        lines = read_text(path).splitlines()
+    except InputError as error:
+        raise InputError(f'bad pixel list {error}') from None
     pixels = [_pixel(path, number, line) for number, line in enumerate(lines, 1) if line.partition('#')[0].strip()]
     return np.array(pixels, dtype=np.int64).reshape(-1, 2)
 
 
 def _pixel(path: str | Path, number: int, line: str) -> tuple[int, int]:
     words = line.partition('#')[0].replace(',', ' ').split()
-    if len(words) != 2 or not all(word.isdecimal() for word in words):
-        raise InputError(f'bad pixel list {path}, line {number}: {line.strip()!r} is not "column row"')
+    if len(words) != 2 or not all(_WHOLE.fullmatch(word) for word in words):
+        raise InputError(f'bad pixel list {path}, line {number}: {line.strip()[:60]!r} is not "column row"')
     return int(words[0]), int(words[1])
 
 

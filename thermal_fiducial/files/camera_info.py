@@ -9,7 +9,9 @@ import yaml
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.schema import load_yaml, Value
 
+_LARGEST_SIDE = 65_535
 #: Names that other tools use for our models.
 MODEL_SYNONYMS = {'fisheye': 'equidistant', 'radtan': 'plumb_bob', 'radial-tangential': 'plumb_bob'}
 
@@ -22,57 +24,46 @@ def load_camera(path: str | Path) -> Camera:
     InputError
         Unreadable, not a calibration, or values that no camera has.
     """
-    path = Path(path)
     try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'calibration {path}: {_first_line(error)}') from None
-    except yaml.YAMLError as error:
-        raise InputError(f'calibration {path} is not YAML: {_first_line(error)}') from None
-    if not isinstance(content, dict):
-        raise InputError(f'calibration {path} is not a camera_info file')
-    try:
-        return _camera(content)
+        root = load_yaml(path)
     except InputError as error:
-        raise InputError(f'calibration {path}: {error}') from None
+        raise InputError(f'calibration {error}') from None
+    try:
+        return _camera(root.mapping())
+    except InputError as error:
+        # What is wrong with a value says where it stands; what the values together are not does not.
+        place = '' if str(error).startswith(str(path)) else f'{path}: '
+        raise InputError(f'calibration {place}{error}') from None
 
 
-def _camera(content: dict[str, Any]) -> Camera:
-    model = str(content.get('distortion_model', 'plumb_bob'))
+def _camera(fields: dict[str, Value]) -> Camera:
+    model = fields['distortion_model'].text() if 'distortion_model' in fields else 'plumb_bob'
     return Camera(
-        width=_integer(content, 'image_width'),
-        height=_integer(content, 'image_height'),
-        K=_matrix(content, 'camera_matrix', 9).reshape(3, 3),
+        width=_integer(fields, 'image_width'),
+        height=_integer(fields, 'image_height'),
+        K=_matrix(fields, 'camera_matrix', 9).reshape(3, 3),
         model=MODEL_SYNONYMS.get(model, model),
-        D=_matrix(content, 'distortion_coefficients', None),
+        D=_matrix(fields, 'distortion_coefficients', None),
     )
 
 
-def _integer(content: dict[str, Any], key: str) -> int:
-    value = content.get(key)
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise InputError(f'{key} is {"missing" if value is None else "not a whole number"}')
-    return value
-
-
-def _matrix(content: dict[str, Any], key: str, size: int | None) -> FloatArray:
-    entry = content.get(key)
-    data = entry.get('data') if isinstance(entry, dict) else entry
-    if data is None:
+def _integer(fields: dict[str, Value], key: str) -> int:
+    if key not in fields:
         raise InputError(f'{key} is missing')
-    try:
-        values = np.array(data, dtype=np.float64).reshape(-1)
-    except (TypeError, ValueError):
-        raise InputError(f'{key} does not hold numbers') from None
-    if size is not None and values.size != size:
-        raise InputError(f'{key} holds {values.size} numbers, not {size}')
-    return values
+    return fields[key].integer(0, _LARGEST_SIDE)
 
 
-def _first_line(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror:
-        return error.strerror
-    return str(error).splitlines()[0]
+def _matrix(fields: dict[str, Value], key: str, size: int | None) -> FloatArray:
+    entry = fields.get(key)
+    if entry is not None and isinstance(entry.content, dict):
+        entry = entry.mapping().get('data')
+    if entry is None:
+        raise InputError(f'{key} is missing')
+    rows = [value.items() if isinstance(value.content, list) else [value] for value in entry.items()]
+    values = [value.number() for row in rows for value in row]
+    if len(values) != size and size is not None:
+        raise entry.error(f'holds {len(values)} numbers, not {size}')
+    return np.array(values)
 
 
 def save_camera(path: str | Path, camera: Camera, name: str = 'tau2') -> None:

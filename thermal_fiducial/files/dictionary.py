@@ -22,6 +22,8 @@ import yaml
 
 from thermal_fiducial.core.detection.patterns import correctable_bits, marker_bits
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.reading import read_text
+from thermal_fiducial.files.schema import parse_yaml, Value
 
 FORMAT = 'thermal_fiducial/dictionary'
 #: Folder of the dictionaries that the package ships, loadable by their bare name.
@@ -46,12 +48,13 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> cv2.aruco.Dictionar
     packaged = PACKAGED / f'{name}.yaml'
     path = packaged if '/' not in name and packaged.is_file() else Path(name)
     try:
-        document = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError):
+        text = read_text(path)
+    except InputError:
         raise InputError(f'dictionary {name!r}: neither a dictionary of OpenCV nor a readable file') from None
-    except yaml.YAMLError as error:
-        raise InputError(f'dictionary file {name}: not YAML: {" ".join(str(error).split())}') from None
-    return _from_document(name, document)
+    try:
+        return _from_document(parse_yaml(str(path), text))
+    except InputError as error:
+        raise InputError(f'dictionary file {error}') from None
 
 
 def other_patterns(markers: Iterable[int], of: str, read_as: str, folder: Path = Path()) -> str:
@@ -108,24 +111,26 @@ def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: cv2.aru
     Path(path).write_text(yaml.safe_dump(document, sort_keys=False, width=120), encoding='utf-8')
 
 
-def _from_document(name: str, document: Any) -> cv2.aruco.Dictionary:
-    if not isinstance(document, dict) or document.get('format') != FORMAT:
-        raise InputError(f'dictionary file {name}: not of format {FORMAT}')
-    if document.get('version') != 1:
-        raise InputError(f'dictionary file {name}: version {document.get("version")!r} is not 1')
-    size, correction = document.get('marker_size'), document.get('max_correction_bits', 0)
-    if type(size) is not int or not 2 <= size <= 10 or type(correction) is not int or correction < 0:
-        raise InputError(f'dictionary file {name}: marker_size and max_correction_bits must be whole numbers')
-    markers = document.get('markers')
-    if not isinstance(markers, list) or not markers:
-        raise InputError(f'dictionary file {name}: no markers')
-    packed = [_packed(name, index, rows, size) for index, rows in enumerate(markers)]
-    return cv2.aruco.Dictionary(np.concatenate(packed), size, correction)
+def _from_document(document: Value) -> cv2.aruco.Dictionary:
+    fields = document.mapping() if isinstance(document.content, dict) else {}
+    if 'format' not in fields or fields['format'].content != FORMAT:
+        raise document.error(f'not of format {FORMAT}')
+    if 'version' not in fields or fields['version'].content != '1':
+        raise document.error('no version 1')
+    for needed in ('marker_size', 'markers'):
+        if needed not in fields:
+            raise document.error(f'no {needed}')
+    size = fields['marker_size'].integer(2, 10)
+    correction = fields['max_correction_bits'].integer(0, size**2) if 'max_correction_bits' in fields else 0
+    markers = fields['markers'].items()
+    if not markers:
+        raise fields['markers'].error('no markers')
+    return cv2.aruco.Dictionary(np.concatenate([_packed(rows, size) for rows in markers]), size, correction)
 
 
-def _packed(name: str, index: int, rows: Any, size: int) -> Any:
-    right = isinstance(rows, list) and len(rows) == size
-    if not right or any(not isinstance(row, str) or len(row) != size or set(row) - {'0', '1'} for row in rows):
-        raise InputError(f'dictionary file {name}: marker {index} is not {size} strings of {size} bits')
-    bits = np.array([[int(bit) for bit in row] for row in rows], dtype=np.uint8)
+def _packed(rows: Value, size: int) -> Any:
+    words = [row.content if isinstance(row.content, str) else '' for row in rows.items()]
+    if len(words) != size or any(len(word) != size or set(word) - {'0', '1'} for word in words):
+        raise rows.error(f'not {size} strings of {size} bits')
+    bits = np.array([[int(bit) for bit in word] for word in words], dtype=np.uint8)
     return cv2.aruco.Dictionary.getByteListFromBits(bits)

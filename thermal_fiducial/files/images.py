@@ -1,5 +1,6 @@
 """Pixels of ``sensor_msgs/msg/Image`` and ``CompressedImage``, from rclpy or from a bag."""
 
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -8,9 +9,12 @@ import numpy.typing as npt
 
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.reading import read_bytes
 
 #: Bytes a pixel of the encodings that a thermal camera may have.
 ENCODINGS = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
+# Of a picture file: 33 million pixels of 16 bits, uncompressed, in colour.
+_LARGEST_FILE_BYTES = 250_000_000
 #: How files begin whose compression loses nothing: PNG, and TIFF of either byte order.
 _LOSSLESS = (b'\x89PNG', b'II*\0', b'MM\0*')
 
@@ -62,6 +66,25 @@ def _decompressed(message: Any) -> Counts | Gray:
     if pixels.dtype == np.uint8:
         return np.asarray(pixels, dtype=np.uint8)
     return np.asarray(pixels, dtype=np.uint16)
+
+
+def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
+    """Pixels of a picture file, as :func:`cv2.imread` reads it.
+
+    Raises
+    ------
+    InputError
+        No such file, or not a picture, or a larger one than any camera takes.
+    """
+    data = np.frombuffer(read_bytes(path, _LARGEST_FILE_BYTES), np.uint8)
+    try:
+        pixels = cv2.imdecode(data, flags) if data.size else None
+    except cv2.error as error:
+        reason = 'it is too large' if 'PIXELS' in str(error) or 'WIDTH' in str(error) else 'it is broken'
+        raise InputError(f'{path}: not a readable picture: {reason}') from None
+    if pixels is None:
+        raise InputError(f'{path}: not a readable picture')
+    return pixels
 
 
 def stamp_to_ns(stamp: Any) -> int:

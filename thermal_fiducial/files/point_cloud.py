@@ -1,15 +1,22 @@
 """Point clouds of a place: PLY and PCD files, read by the libraries of the extra ``cloud``; where a map lies in one."""
 
 from pathlib import Path
+import re
 
 import numpy as np
 import yaml
 
+from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.atomic import write_atomically
+from thermal_fiducial.files.schema import load_yaml
 
+# Counts of a header of PLY or PCD: its elements, points, and their width and height.
+_COUNTS = re.compile(rb'^(?:element +\S+|POINTS|WIDTH|HEIGHT) +([0-9]{1,18})[0-9]*\s*$', re.MULTILINE)
+_PACKED = re.compile(rb'^DATA +binary_compressed', re.MULTILINE)
+_HEADER_BYTES = 65_536
 _NEEDED = "reading point clouds needs the extra 'cloud': pip install thermal_fiducial[cloud]"
 
 
@@ -29,7 +36,10 @@ def load_cloud(path: str | Path) -> FloatArray:
     if not path.is_file():
         raise InputError(f'{path}: no such file')
     try:
+        _check_promise(path)
         points = reader(path)
+    except InputError:
+        raise
     except ImportError as error:
         raise InputError(_NEEDED) from error
     except Exception as error:
@@ -82,17 +92,35 @@ def load_alignment(path: str | Path) -> FloatArray:
     InputError
         Not such a file.
     """
-    try:
-        document = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-        numbers = [np.array([float(value) for value in document[key]]) for key in ('position', 'orientation')]
-    except OSError as error:
-        raise InputError(f'{path}: cannot read the transform: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f'{path}: not a transform written by map align: {type(error).__name__}') from error
-    position, orientation = numbers
-    if position.shape != (3,) or orientation.shape != (4,) or not 0.99 < np.linalg.norm(orientation) < 1.01:
-        raise InputError(f'{path}: not a position and a unit quaternion x y z w')
+    root = load_yaml(path)
+    fields = root.mapping()
+    if 'position' not in fields or 'orientation' not in fields:
+        raise root.error('not a transform written by map align: no position and orientation')
+    position = fields['position'].numbers(3, LARGEST_COORDINATE)
+    orientation = fields['orientation'].numbers(4, 2.0)
+    if not 0.99 < float(np.linalg.norm(orientation)) < 1.01:
+        raise fields['orientation'].error('no unit quaternion x y z w')
     return transform_from_quaternion(position, orientation)
+
+
+def _check_promise(path: Path) -> None:
+    """Refuse a file whose header promises more points than its bytes can be: a reader would make room for them.
+
+    Raises
+    ------
+    InputError
+        It does, or it has no header.
+    """
+    with path.open('rb') as file:
+        header = file.read(_HEADER_BYTES)
+    size = path.stat().st_size
+    counts = [int(count) for count in _COUNTS.findall(header.partition(b'end_header')[0])]
+    if not counts:
+        raise InputError(f'{path}: not a readable point cloud: no header')
+    # A value takes a byte at least; compressed clouds of the PCD library shrink no further than to a hundredth.
+    packed = _PACKED.search(header) is not None
+    if max(counts) > size * (100 if packed else 1):
+        raise InputError(f'{path}: the header promises {max(counts)} points, the file has {size} bytes')
 
 
 def _read_ply(path: Path) -> FloatArray:

@@ -22,7 +22,8 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
         # A pipe without a writer would be waited for.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:
-        raise InputError(f'{path}: cannot read it: {getattr(error, "strerror", None) or error}') from None
+        name = str(path) if str(path).isprintable() else repr(str(path))
+        raise InputError(f'{name}: cannot read it: {getattr(error, "strerror", None) or error}') from None
     try:
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode):
@@ -30,7 +31,7 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
         if found.st_size > limit:
             raise InputError(f'{path}: {found.st_size} bytes, more than such a file may have ({limit})')
         with os.fdopen(descriptor, 'rb', closefd=False) as file:
-            return file.read(limit)
+            return file.read(found.st_size)
     except OSError as error:
         raise InputError(f'{path}: cannot read it: {error.strerror}') from None
     finally:

@@ -9,8 +9,15 @@ import numpy as np
 
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.reading import read_text
 
 _NS = 1_000_000_000
+# What an integer of 64 bits holds in nanoseconds: the year 2262.
+_LATEST_S = 9_200_000_000
+# Of a position [m], as in the messages.
+_LARGEST = 1e5
+# Two hours at 200 Hz have 140 MB.
+_LIMIT_BYTES = 500_000_000
 
 
 def tum_line(stamp_ns: int, position: Iterable[float], orientation_xyzw: Iterable[float]) -> str:
@@ -45,10 +52,7 @@ def load_tum(path: str | Path) -> tuple[IntArray, FloatArray, FloatArray]:
     InputError
         Unreadable, empty, a line that isn't eight finite numbers, a quaternion of no length, stamps that go back.
     """
-    try:
-        text = Path(path).read_text(encoding='utf-8')
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'{path}: {getattr(error, "strerror", None) or "no text"}') from None
+    text = read_text(path, _LIMIT_BYTES)
     lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != '#']
     if not lines:
         raise InputError(f'{path}: no poses')
@@ -65,12 +69,17 @@ def load_tum(path: str | Path) -> tuple[IntArray, FloatArray, FloatArray]:
 def _row(path: str | Path, number: int, line: str) -> tuple[int, list[float]]:
     words = line.replace(',', ' ').split()
     try:
-        stamp = int((Decimal(words[0]) * _NS).to_integral_value())
+        seconds = Decimal(words[0])
+        if not abs(seconds) < _LATEST_S:
+            raise InputError(f'{path} line {number}: {words[0][:40]} is no stamp')
+        stamp = int((seconds * _NS).to_integral_value())
         values = [float(word) for word in words[1:]]
+    except InputError:
+        raise
     except (InvalidOperation, ValueError, OverflowError):
         raise InputError(f'{path} line {number}: not numbers') from None
-    if len(values) != 7 or not all(map(math.isfinite, values)):
-        raise InputError(f'{path} line {number}: {len(words)} values, or not finite ones; a pose has 8')
+    if len(values) != 7 or not all(abs(value) < _LARGEST for value in values):
+        raise InputError(f'{path} line {number}: {len(words)} values, or no real ones; a pose has 8')
     if math.hypot(*values[3:]) < 1e-6:
         raise InputError(f'{path} line {number}: a quaternion of no length')
     return stamp, values

@@ -27,7 +27,12 @@ def own_domain() -> Iterator[int]:
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     for domain in _DOMAINS:
         path = Path(tempfile.gettempdir()) / f'thermal_fiducial_{os.getuid()}_domain_{domain}.lock'
-        with path.open('w') as file:
+        try:
+            # In a folder that everybody may write to: what somebody else has put there is neither followed nor cut.
+            file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600), 'r+')
+        except OSError:
+            continue
+        with file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:

@@ -1,0 +1,231 @@
+"""Files that are meant to hurt: each is refused in one line, within a second of processor time and 200 MB.
+
+All are read in one process of bounded memory, so that none can take more unnoticed.
+"""
+
+import os
+from pathlib import Path
+import resource
+import struct
+import subprocess
+import sys
+import time
+import zlib
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bad_pixels import load_bad_pixels
+from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.point_cloud import load_alignment, load_cloud
+from thermal_fiducial.files.trajectory import load_tum
+from thermal_fiducial.replay.domain import own_domain
+
+YAML_LOADERS = (load_map, load_camera, load_dictionary, load_alignment)
+TEXT_LOADERS = (*YAML_LOADERS, load_bad_pixels, load_tum)
+#: What is left of a second on a machine whose processor is shared.
+SECONDS = 1.0
+#: What they may take beyond what the libraries have taken.
+BYTES = 200 << 20
+
+MAP = (
+    'format: thermal_fiducial/marker_map\nversion: 1\nrevision: 1\nmarkers:\n'
+    '  - {id: 2, size: 0.3, fixed: true, position: [1, 2, 3], orientation: [0, 0, 0, 1]}\n'
+)
+BOMB = 'a: &a [x, x, x, x, x, x, x, x, x]\n' + ''.join(
+    f'{chr(98 + k)}: &{chr(98 + k)} [{", ".join(["*" + chr(97 + k)] * 9)}]\n' for k in range(9)
+)
+YAML_TEXTS = {
+    'nothing': '',
+    'nested 3000 deep': '[' * 3000,
+    'nested 100000 deep': 'format: ' + '[' * 100_000,
+    'mappings 100000 deep': '{a: ' * 100_000,
+    'dashes 20000 deep': '- ' * 20_000,
+    'aliases that expand to gigabytes': BOMB,
+    'an alias of itself': 'a: &a [*a]',
+    'NUL': 'format: thermal\0fiducial',
+    'an object': '!!python/object/apply:os.system ["true"]',
+    'two documents': MAP + '---\n' + MAP,
+    'millions of values': 'format: [' + '1,' * 2_500_000 + ']',
+    'a long word': 'format: ' + 'x' * 5_000_000,
+    'a long key': 'x' * 5_000_000 + ': 1',
+}
+VALUES = ('2024-02-31', '2024-13-45T99:99:99', '!!int abc', '!!float {}', '9' * 5000, str(2**70), '-1', '1e400', '.inf')
+VALUES += ('.nan', 'null', '[]', '{}', '"\\0"', '0x10', '1:30:00', 'yes please', '!!binary aGk=')
+
+
+def refused(load, path):
+    """The line with which a file is refused; checks what it took."""
+    before = time.process_time()
+    with pytest.raises(InputError) as caught:
+        load(path)
+    assert time.process_time() - before < SECONDS
+    line = str(caught.value)
+    assert line.isprintable()
+    assert len(line) < 500
+    return line
+
+
+@pytest.fixture(autouse=True)
+def bounded_memory():
+    """What a loader takes beyond the limit is a MemoryError, which is no InputError."""
+    used = int(Path('/proc/self/statm').read_text().split()[0]) * resource.getpagesize()
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + BYTES, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+@pytest.mark.parametrize('load', TEXT_LOADERS)
+@pytest.mark.parametrize('name', YAML_TEXTS)
+def test_texts_that_are_no_document_of_ours(tmp_path, load, name):
+    path = tmp_path / 'file.yaml'
+    path.write_text(YAML_TEXTS[name])
+    if (load, name) == (load_bad_pixels, 'nothing'):
+        assert load(path).shape == (0, 2)
+        return
+    assert str(path) in refused(load, path)
+
+
+@pytest.mark.parametrize('load', TEXT_LOADERS)
+def test_files_that_are_none(tmp_path, load):
+    os.mkfifo(tmp_path / 'pipe')
+    with (tmp_path / 'sparse').open('wb') as file:
+        file.truncate(1 << 34)
+    for path in (
+        Path('/dev/zero'),
+        tmp_path,
+        tmp_path / 'pipe',
+        tmp_path / 'sparse',
+        Path('a\0b'),
+        tmp_path / ('x' * 300),
+    ):
+        refused(load, path)
+
+
+@pytest.mark.parametrize('value', VALUES)
+def test_values_of_a_map(tmp_path, value):
+    """Each in the place of each value; where one is a value there, the map loads."""
+    path = tmp_path / 'map.yaml'
+    accepted = []
+    for field, good in (
+        ('version', 'version: 1'), ('revision', 'revision: 1'), ('markers', '  - {id: 2'), ('id', 'id: 2'),
+        ('size', 'size: 0.3'), ('fixed', 'fixed: true'), ('position', '[1, 2, 3]'), ('x', '[1,'),
+        ('orientation', '[0, 0, 0, 1]'),
+    ):  # fmt: skip
+        bad = {'markers': f'  - {value}\n  - {{id: 2', 'position': value, 'orientation': value, 'x': f'[{value},'}
+        path.write_text(MAP.replace(good, bad.get(field, f'{field}: {value}')))
+        try:
+            load_map(path, 0.3)
+            accepted.append(field)
+        except InputError:
+            refused(lambda file: load_map(file, 0.3), path)
+    # Nothing at all leaves a field out that may be left out; -1 is a coordinate.
+    assert accepted == {'null': ['version', 'revision', 'size', 'fixed'], '-1': ['x']}.get(value, [])
+
+
+@pytest.mark.parametrize('stamp', ['1e30', '-1e30', '1e999999', 'nan', '9' * 5000, '1e-999999999'])
+def test_stamps_of_a_trajectory(tmp_path, stamp):
+    path = tmp_path / 'truth.tum'
+    path.write_text(f'{stamp} 0 0 0 0 0 0 1\n')
+    if stamp == '1e-999999999':
+        assert load_tum(path)[0].tolist() == [0]
+    else:
+        assert 'line 1' in refused(load_tum, path)
+    path.write_text('1 0 0 1e300 0 0 0 1\n')
+    refused(load_tum, path)
+
+
+@pytest.mark.parametrize('line', ['1e3 4', f'{2**70} 4', '9' * 5000 + ' 4', '٣ 4', 'nan 4'])
+def test_lists_of_bad_pixels(tmp_path, line):
+    path = tmp_path / 'bad.txt'
+    path.write_text(line)
+    assert 'line 1' in refused(load_bad_pixels, path)
+
+
+PLY = 'ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nend_header\n'
+PCD = 'VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\nDATA {1}\n'
+
+
+@pytest.mark.parametrize('count', [10**6, 10**12, 10**18, 10**30])
+def test_clouds_that_promise_more_than_they_hold(tmp_path, count):
+    contents = {'a.ply': PLY.format(count)} | {
+        f'{kind}.pcd': PCD.format(count, kind) for kind in ('ascii', 'binary', 'binary_compressed')
+    }
+    for name, head in contents.items():
+        (tmp_path / name).write_bytes(head.encode() + 100 * b'\0')
+        assert 'promises' in refused(load_cloud, tmp_path / name)
+
+
+def test_a_cloud_without_a_header(tmp_path):
+    (tmp_path / 'a.ply').write_bytes(os.urandom(100_000))
+    assert 'no header' in refused(load_cloud, tmp_path / 'a.ply')
+
+
+def png(width, height):
+    """A picture of zeros that is small only as a file."""
+
+    def chunk(kind, data):
+        return struct.pack('>I', len(data)) + kind + data + struct.pack('>I', zlib.crc32(kind + data))
+
+    head = struct.pack('>IIBBBBB', width, height, 16, 0, 0, 0, 0)
+    return (
+        b'\x89PNG\r\n\x1a\n' + chunk(b'IHDR', head) + chunk(b'IDAT', zlib.compress(bytes(1000))) + chunk(b'IEND', b'')
+    )
+
+
+@pytest.mark.parametrize('size', [(65_000, 65_000), (30_000, 30_000), (2**31 - 1, 1), (0, 0)])
+def test_pictures_that_promise_more_than_any_camera(tmp_path, size):
+    """In a process of its own: OpenCV reads its limit when it is loaded, which another test may have done before."""
+    path = tmp_path / 'photo.png'
+    path.write_bytes(png(*size))
+    program = (
+        'import resource, sys, time\nimport thermal_fiducial, cv2\nfrom thermal_fiducial.errors import InputError\n'
+        'from thermal_fiducial.files.images import read_picture\n'
+        'before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()\n'
+        'try:\n    read_picture(sys.argv[1], cv2.IMREAD_UNCHANGED)\n'
+        'except InputError as error:\n    print(error)\n'
+        'print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before, time.process_time() - start)\n'
+    )
+    done = subprocess.run([sys.executable, '-c', program, str(path)], capture_output=True, text=True, check=True)
+    line, figures = done.stdout.splitlines()
+    kilobytes, seconds = map(float, figures.split())
+    assert f'{path}: not a readable picture' in line
+    assert kilobytes < BYTES / 1024
+    assert seconds < SECONDS
+
+
+def test_detections_with_nan_are_refused(tmp_path, capsys):
+    from thermal_fiducial.cli.main import main
+
+    names = ['stamp_ns', 'id', *(f'{axis}{corner}' for corner in range(4) for axis in 'uv'), 'sigma_px']
+    good = ['1000', '2', *map(str, range(8)), '0.1']
+    (tmp_path / 'map.yaml').write_text(MAP)
+    K = np.array([[500.0, 0, 320], [0, 500, 256], [0, 0, 1]]).ravel().tolist()
+    (tmp_path / 'camera.yaml').write_text(
+        f'image_width: 640\nimage_height: 512\ncamera_matrix: {{data: {K}}}\n'
+        'distortion_coefficients: {data: [0, 0, 0, 0, 0]}\n'
+    )
+    for column, value in ((0, 'nan'), (1, '1e30'), (1, '-3'), (4, 'nan'), (10, 'inf'), (5, 'x')):
+        row = [*good[:column], value, *good[column + 1 :]]
+        (tmp_path / 'detections.csv').write_text(','.join(names) + '\n' + ','.join(row) + '\n')
+        files = [str(tmp_path / name) for name in ('map.yaml', 'detections.csv', 'camera.yaml')]
+        assert main(['map', 'refine', *files[:2], '--calibration', files[2]]) == 2
+        error = capsys.readouterr().err
+        assert 'line 2' in error
+        assert error.count('\n') == 1
+
+
+def test_a_lock_file_that_is_a_link_is_neither_followed_nor_cut(tmp_path, monkeypatch):
+    """Somebody has put links to a file of ours where the locks of all domains but the last would be."""
+    monkeypatch.setattr('tempfile.tempdir', str(tmp_path))
+    victim = tmp_path / 'victim'
+    victim.write_text('precious')
+    for domain in range(1, 89):
+        (tmp_path / f'thermal_fiducial_{os.getuid()}_domain_{domain}.lock').symlink_to(victim)
+    with own_domain() as domain:
+        assert domain == 89
+    assert victim.read_text() == 'precious'
