@@ -5,6 +5,7 @@ import pytest
 
 from test.support.walls import CAMERA, flight, see, SIZE, stamp, wall
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.cli.map_plot import draw_map
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference
 from thermal_fiducial.core.geometry.se3 import apply, inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
@@ -220,3 +221,13 @@ def test_align_along_a_lone_wall_says_what_stays_open(tmp_path, poses, capsys):
 def test_corners_of_the_map_are_those_of_the_markers():
     T = transform(so3_exp([0.2, 0.1, 0.3]), [1.0, 2.0, 3.0])
     np.testing.assert_allclose(corners_in_map(T, 0.4)[0], apply(T, np.array([[-0.2, 0.2, 0.0]]))[0])
+
+
+@pytest.mark.parametrize(('turn', 'inverted'), [(0.0, True), (np.pi, False)])
+def test_the_drawing_shows_the_faces_as_the_camera_sees_them(poses, turn, inverted):
+    """Whoever looks along x at markers that face him has y on his left; on the opposite wall, on his right."""
+    turned = transform(so3_exp([0.0, 0.0, turn]), np.zeros(3))
+    markers = {i: MapMarker(i, 0.3, True, turned @ T) for i, T in poses.items()}
+    front = draw_map(MarkerMap(markers)).axes[2]
+    assert front.xaxis_inverted() == inverted
+    assert ('along x' in front.get_title()) == inverted

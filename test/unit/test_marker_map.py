@@ -1,5 +1,7 @@
 """Algorithm 1: the camera from known markers, and new markers from the camera."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -162,6 +164,10 @@ def test_a_moved_marker_is_quarantined_and_the_rest_flies_on():
             assert 2 not in result.pose.marker_ids
     assert quarantined[-1] == (2,)
     assert quarantined.index((2,)) > 15
+    # Five centimetres at three metres are nine pixels, and some of that the pose takes up.
+    error_px, sigmas = map(float, re.match(r'([\d.]+) px off, ([\d.]+) sigma', result.quarantine_reasons[2]).groups())
+    assert 4.0 < error_px < 15.0
+    assert sigmas > 4.0
     for k in range(60, 200):
         result = m.process(stamp(k), see(flight(k / 30), poses, 0.05, rng), CAMERA)
     assert result.quarantined == ()

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 import numpy as np
 
@@ -12,33 +13,55 @@ from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
-_VIEWS = (('from above', 0, 1), ('from the side', 0, 2), ('from the front', 1, 2))
+# Axes that point right and up, as seen from above and along y.
+_VIEWS = (('from above', 0, 1), ('from the side, along y', 0, 2))
+_STANDINGS = {'fixed': 'black', 'free': 'tab:blue', 'in quarantine': 'tab:red'}
+#: Millimetres would not be seen in a drawing of metres.
+_ENLARGED = 20.0
 
 
 def plot_map(marker_map: MarkerMap, path: Path, cloud: FloatArray | None = None) -> None:
-    """Draw the markers with their normals and three-sigma ellipses, over a point cloud (N, 3) if there is one.
+    """Write the drawing of :func:`draw_map` to a file.
 
     Raises
     ------
     InputError
         The file can't be written.
     """
-    figure = Figure(figsize=(15, 5.5), layout='constrained')
-    for axis, (title, i, j) in zip(figure.subplots(1, len(_VIEWS)), _VIEWS, strict=True):
-        if cloud is not None:
-            axis.plot(cloud[:, i], cloud[:, j], ',', color='0.7')
-        for marker in marker_map.markers.values():
-            _draw(axis, marker, i, j)
-        axis.set(title=title, xlabel=f'{"xyz"[i]} [m]', ylabel=f'{"xyz"[j]} [m]', aspect='equal')
-        axis.grid(alpha=0.3)
+    figure = draw_map(marker_map, cloud)
     try:
         figure.savefig(path, dpi=120)
     except (OSError, ValueError) as error:
         raise InputError(f'{path}: cannot write the plot: {error}') from error
 
 
+def draw_map(marker_map: MarkerMap, cloud: FloatArray | None = None) -> Figure:
+    """The markers with their normals and enlarged ellipses, over a point cloud (N, 3) if there is one."""
+    figure = Figure(figsize=(15, 5.5), layout='constrained')
+    views = (*_VIEWS, (_front(marker_map), 1, 2))
+    for axis, (title, i, j) in zip(figure.subplots(1, len(views)), views, strict=True):
+        if cloud is not None:
+            axis.plot(cloud[:, i], cloud[:, j], ',', color='0.7')
+        for marker in marker_map.markers.values():
+            _draw(axis, marker, i, j)
+        axis.set(title=title, xlabel=f'{"xyz"[i]} [m]', ylabel=f'{"xyz"[j]} [m]', aspect='equal')
+        axis.grid(alpha=0.3)
+        if title.endswith('along x'):
+            axis.invert_xaxis()  # y points to the left of whoever looks along x
+    handles = [Line2D([], [], color=colour, label=standing) for standing, colour in _STANDINGS.items()]
+    title = f'{len(marker_map.markers)} markers, normals, ellipses of three sigma enlarged {_ENLARGED:g} times'
+    figure.legend(handles=handles, title=title, loc='outside lower center', ncols=len(handles))
+    return figure
+
+
+def _front(marker_map: MarkerMap) -> str:
+    """From where the faces of the markers are seen, as the camera sees them: along x, or against it."""
+    facing = sum(float(marker.T_map_marker[0, 2]) for marker in marker_map.markers.values())
+    return 'from the front, against x' if facing > 0.0 else 'from the front, along x'
+
+
 def _draw(axis: Axes, marker: MapMarker, i: int, j: int) -> None:
-    colour = 'black' if marker.fixed else 'tab:red' if not marker.trusted else 'tab:blue'
+    colour = _STANDINGS['in quarantine' if not marker.trusted else 'fixed' if marker.fixed else 'free']
     outline = corners_in_map(marker.T_map_marker, marker.size)[[0, 1, 2, 3, 0]]
     axis.plot(outline[:, i], outline[:, j], color=colour)
     centre = marker.T_map_marker[:3, 3]
@@ -46,6 +69,6 @@ def _draw(axis: Axes, marker: MapMarker, i: int, j: int) -> None:
     axis.plot([centre[i], tip[i]], [centre[j], tip[j]], color=colour, linewidth=0.8)
     axis.annotate(str(marker.id), (tip[i], tip[j]), color=colour, fontsize=8)
     values, vectors = np.linalg.eigh(marker.covariance[np.ix_((i, j), (i, j))])
-    width, height = 6.0 * np.sqrt(np.maximum(values, 0.0))
+    width, height = _ENLARGED * 6.0 * np.sqrt(np.maximum(values, 0.0))
     angle = np.rad2deg(np.arctan2(vectors[1, 0], vectors[0, 0]))
     axis.add_patch(Ellipse((centre[i], centre[j]), width, height, angle=angle, fill=False, color=colour, alpha=0.5))

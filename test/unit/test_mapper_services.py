@@ -1,0 +1,109 @@
+"""Every service of the mapper, frozen and free, started in either mode; what of it reaches the file and the console."""
+
+import multiprocessing
+
+import pytest
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import SetBool, Trigger
+from support import small_bag
+from support.ros_graph import ros_graph
+
+from thermal_fiducial.core.mapping.map_data import MapMarker, MapperResult, MarkerMap
+from thermal_fiducial.files.map_history import entries
+from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
+from thermal_fiducial.ros import map_status, qos
+
+pytestmark = pytest.mark.ros
+MODES = ('mapping', 'localization')
+FROZEN = 'the map is frozen'
+
+
+@pytest.fixture
+def graph():
+    with ros_graph() as graph:
+        yield graph
+
+
+@pytest.fixture
+def map_file(tmp_path):
+    return small_bag.side_files(tmp_path)[0]
+
+
+def ask(graph, name):
+    response = graph.call(Trigger, f'marker_mapper/{name}', Trigger.Request())
+    return response.success, response.message
+
+
+def freeze(graph, frozen):
+    return graph.call(SetBool, 'marker_mapper/freeze', SetBool.Request(data=frozen)).message
+
+
+@pytest.mark.parametrize('mode', MODES)
+def test_services_depend_on_whether_the_map_is_frozen_and_not_on_the_mode(graph, map_file, mode):
+    node = graph.add(MarkerMapperNode, map_file=str(map_file), mode=mode)
+    assert node.mapper.frozen == (mode == 'localization')
+    for frozen in (True, False, True, False):
+        assert freeze(graph, frozen) == ('map frozen' if frozen else 'map free')
+        assert node.mapper.frozen == frozen
+        before = node.mapper.map.revision
+        for name in ('load', 'undo', 'reset', 'refine'):
+            success, message = ask(graph, name)
+            if frozen:
+                assert (success, message) == (False, FROZEN)
+        assert (node.mapper.map.revision == before) == frozen
+        assert ask(graph, 'save')[0]
+        assert load_map(map_file).revision == node.mapper.map.revision
+
+
+@pytest.mark.parametrize('mode', MODES)
+def test_load_undo_and_save_of_a_free_map(graph, map_file, mode):
+    """The file is edited by another program, taken over, saved, and both are undone again."""
+    node = graph.add(MarkerMapperNode, map_file=str(map_file), mode=mode)
+    freeze(graph, False)
+    T = load_map(map_file).markers[0].T_map_marker
+    edited = load_map(map_file)
+    edited.markers[9] = MapMarker(9, 0.3, True, T)
+    save_map(map_file, edited)
+    # Who saves now would take the edit away, or the edit what was mapped: both are kept.
+    success, message = ask(graph, 'save')
+    assert success
+    assert 'map.new.yaml' in message
+    assert load_map(map_file).markers.keys() == {0, 9}
+    assert ask(graph, 'load') == (True, f'2 markers loaded from {map_file}')
+    assert node.mapper.map.markers.keys() == {0, 9}
+    assert ask(graph, 'save')[0]
+    assert len(entries(map_file)) == 1
+    assert ask(graph, 'undo')[0]
+    assert ask(graph, 'undo') == (False, f'{map_file}: no earlier version is kept')
+    assert ask(graph, 'reset') == (True, '2 markers left')
+
+
+@pytest.mark.parametrize('mode', MODES)
+def test_a_free_mapper_refines_in_a_process_of_its_own_in_either_mode(graph, map_file, mode):
+    before = set(multiprocessing.active_children())
+    node = graph.add(MarkerMapperNode, live=True, map_file=str(map_file), mode=mode)
+    try:
+        assert bool(set(multiprocessing.active_children()) - before) == (mode == 'mapping')
+        freeze(graph, False)
+        assert len(set(multiprocessing.active_children()) - before) == 1
+    finally:
+        node.close()
+    assert set(multiprocessing.active_children()) == before
+
+
+def test_the_map_is_published_again_when_a_service_has_replaced_it(graph, map_file):
+    graph.listen(PointCloud2, 'marker_map', qos.LATCHED)
+    graph.add(MarkerMapperNode, map_file=str(map_file))
+    graph.spin_until(lambda: len(graph.heard['marker_map']) == 1)
+    assert ask(graph, 'reset')[0]
+    graph.spin_until(lambda: len(graph.heard['marker_map']) == 2)
+
+
+def test_a_quarantined_marker_is_named_with_its_reason_once():
+    before = MapperResult(1, None, '', quarantined=(3,), quarantine_reasons={3: 'old'})
+    now = MapperResult(2, None, '', quarantined=(3, 7), quarantine_reasons={3: 'old', 7: '9.1 px off, 12.3 sigma'})
+    assert map_status.news(before, now) == ['marker 7 quarantined: 9.1 px off, 12.3 sigma']
+    assert map_status.news(now, before) == ['marker 7 is trusted again']
+    assert map_status.state(now, '', frozen=False)[1] == 'quarantined: 3, 7'
+    assert map_status.figures(MarkerMap(), 0, now)['quarantine'] == '3: old; 7: 9.1 px off, 12.3 sigma'
