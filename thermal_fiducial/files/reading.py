@@ -6,7 +6,7 @@ import stat
 
 from thermal_fiducial.errors import InputError
 
-#: Of a text that is taken into memory at once: a map of three thousand markers has 3 MB.
+#: Of a text that is taken into memory at once: a map of 1,700 markers has 2 MB.
 TEXT_LIMIT_BYTES = 6_000_000
 
 

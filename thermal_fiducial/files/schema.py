@@ -24,8 +24,8 @@ from thermal_fiducial.files.reading import read_text
 
 #: Levels of lists and mappings in each other; no file of ours has more than five.
 DEEPEST = 16
-#: Values in a file: a map of three thousand markers has 150 thousand.
-MOST_VALUES = 200_000
+#: Values in a file: a map of 1,700 markers with all that is known of them.
+MOST_VALUES = 100_000
 #: Characters of a value that are quoted in an error.
 _QUOTED = 60
 
