@@ -415,6 +415,13 @@ class MarkerMapperConfig(SelfChecked):
     camera_orientation: tuple[float, ...] = _camera_orientation()
     camera_time_offset: float = _camera_time_offset()
     time_offset_std: float = _time_offset_std()
+    marker_size_std: float = param(
+        0.003,
+        'Common relative error of all marker sizes and of the focal length: part of the covariance of map and poses.',
+        minimum=0.0,
+        maximum=0.1,
+        live=True,
+    )
     bridge_duration: float = param(
         3.0,
         'How long after the last known marker new ones may still be placed from the odometry.',

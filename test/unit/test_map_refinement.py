@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from test.support.walls import CAMERA, flight, see, SIZE, wall
+from thermal_fiducial.core.error_model import NO_SYSTEMATIC_ERRORS
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping import bundle_adjustment
@@ -308,9 +309,9 @@ def test_errors_that_last_are_in_the_covariances():
     """Corners that are off by the same in all views of a marker, and by nothing else."""
     poses, nees = wall(np.random.default_rng(0)), []
     exact = snapshot(np.random.default_rng(1), poses, sigma=0.0, disturbance=0.0)
-    problem = bundle_adjustment._Problem.build(exact)
-    evaluation = problem.evaluate(problem.start, 1.0)
-    P = problem._lasting(problem._blocks(problem.start, evaluation), evaluation, 1.0)[1:]
+    shape = replace(NO_SYSTEMATIC_ERRORS, marker_shape=1.0)
+    white, both = (refine(replace(exact, errors=errors)).markers for errors in (NO_SYSTEMATIC_ERRORS, shape))
+    P = np.stack([both[i].covariance - white[i].covariance for i in range(1, 8)])
     for seed in range(20):
         # Corners of noiseless rows declare 1e-3 px.
         off = 1e-3 * np.random.default_rng(seed).normal(size=(8, 4, 2))

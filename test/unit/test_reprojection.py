@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from thermal_fiducial.core.error_model import correlated_sum
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, shared_covariances, whitening
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
-from thermal_fiducial.core.mapping.candidates import correlated_sum
 
 CAMERAS = [
     Camera(640, 512, np.array([[440.0, 0.0, 320.0], [0.0, 442.0, 250.0], [0.0, 0.0, 1.0]]), model, D)

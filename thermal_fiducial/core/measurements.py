@@ -78,6 +78,8 @@ class CameraPose:
     T_map_camera: FloatArray
     #: (6, 6), ROS convention, in ``map`` [m, rad]
     covariance: FloatArray
+    #: (6, 6) the part of ``covariance`` that the next frames share: errors of map, scale, lens and delay
+    systematic_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     #: markers that it rests on
     marker_ids: tuple[int, ...] = field(default=())
     #: re-projection error, rms over their corners [px]
@@ -87,7 +89,12 @@ class CameraPose:
 def in_moved_map(pose: CameraPose, T_new_old: FloatArray) -> CameraPose:
     """``pose`` in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
     turn = np.kron(np.eye(2), T_new_old[:3, :3])
-    return replace(pose, T_map_camera=T_new_old @ pose.T_map_camera, covariance=turn @ pose.covariance @ turn.T)
+    return replace(
+        pose,
+        T_map_camera=T_new_old @ pose.T_map_camera,
+        covariance=turn @ pose.covariance @ turn.T,
+        systematic_covariance=turn @ pose.systematic_covariance @ turn.T,
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from thermal_fiducial.core.error_model import NO_SYSTEMATIC_ERRORS, scale_of_map, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
 from thermal_fiducial.core.geometry.se3 import inverse, skew
 from thermal_fiducial.core.mapping.keyframes import Keyframe, Link, packed, Rig, unpacked
@@ -53,11 +54,11 @@ class Snapshot:
     #: pose and covariance (6, 6) by ID of markers that were known beforehand; see :func:`prior_poses`
     priors: Mapping[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     map_version: int = 0
-    #: standard deviation of what each marker's corners are off by in all its views alike, as a share of their noise
-    lasting_share: float = 0.0
+    #: what the covariances are to allow for beside the noise
+    errors: SystematicErrors = NO_SYSTEMATIC_ERRORS
 
     def __reduce__(self) -> tuple[Any, ...]:
-        rest = (self.rig, self.links, self.priors, self.map_version, self.lasting_share)
+        rest = (self.rig, self.links, self.priors, self.map_version, self.errors)
         return _snapshot, (self.markers, packed(self.keyframes), *rest)
 
 
@@ -267,10 +268,11 @@ class _Problem:
         noise = max(factor, 1.0) * correlation_time(after.r[full], self.marker[full])
         blocks = self._blocks(state, after)
         covariances = self.equations.covariances(blocks, noise, held_covariances)
-        lasting = self._lasting(blocks, after, snapshot.lasting_share)
-        if covariances is None or lasting is None:
+        shape = self._shape_covariances(blocks, after, snapshot.errors)
+        if covariances is None or shape is None:
             return None
-        covariances += lasting
+        positions = state.T_map_marker[:, :3, 3]
+        covariances += shape + scale_of_map(positions, positions[self.held], snapshot.errors)
         adjusted = {
             key: replace(snapshot.markers[key], T_map_marker=state.T_map_marker[i], covariance=covariances[i])
             for i, key in enumerate(self.ids)
@@ -290,16 +292,16 @@ class _Problem:
             snapshot.map_version,
         )
 
-    def _lasting(self, blocks: Blocks, e: _Evaluation, share: float) -> FloatArray | None:
-        """Covariances (M, 6, 6) of what corners make of the map that are off alike in all views of a marker.
+    def _shape_covariances(self, blocks: Blocks, e: _Evaluation, errors: SystematicErrors) -> FloatArray | None:
+        """Covariances (M, 6, 6) of what corners make of the map that are wrong alike in all views of a marker.
 
         Nothing averages that out, and no residual shows it: the shape of a fixed marker turns the whole map. It is
         sampled, as every corner of every marker has a direction of its own.
         """
-        if share == 0.0:
+        if errors.marker_shape == 0.0:
             return np.zeros((len(self.ids), 6, 6))
         precision = np.bincount(self.marker, 0.5 * np.mean(np.sum(self.W**2, axis=(2, 3)), axis=1))
-        std = share * np.sqrt(np.bincount(self.marker) / precision)
+        std = errors.marker_shape * np.sqrt(np.bincount(self.marker) / precision)
         rng = np.random.default_rng(0)
         sampled = (std[:, None] * rng.standard_normal((len(self.ids), 8)) for _ in range(_SAMPLES))
         steps = self.equations.responses(blocks, (self._gradients(e, off[self.marker]) for off in sampled))

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import correlated_sum, SystematicErrors, with_corner_errors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.fitting import fit_pose
 from thermal_fiducial.core.geometry.reprojection import linearise
@@ -25,8 +26,6 @@ MIN_VIEWS = 3
 MAX_VIEWS = 16
 #: Difference of the two fits' chi squares that refutes the worse one: odds of e^-12 against a flip.
 DECISIVE = 25.0
-#: Corner errors that no covariance of white noise speaks of (lens, lag of a moving camera) [px].
-SYSTEMATIC_PX = 0.1
 #: Mean chi square of a view (8 residuals) above which the views don't belong to one marker that hangs still.
 INCONSISTENT = 200.0
 #: Fits that end nearer to each other than this are one fit [rad].
@@ -240,32 +239,8 @@ def _whitening(
     J_camera = np.where(possible[:, None, None], J_camera, 0.0)
     C = J_camera @ camera_covariances @ np.swapaxes(J_camera, -1, -2)
     corner = np.arange(4)
-    noise = np.stack([view.corner_covariances for view in views]) + SYSTEMATIC_PX**2 * np.eye(2)
+    noise = with_corner_errors(np.stack([view.corner_covariances for view in views]), SystematicErrors())
     C.reshape(n, 4, 2, 4, 2)[:, corner, :, corner] += np.swapaxes(noise, 0, 1)
     L = np.linalg.cholesky(C)
     log_determinants = 2.0 * np.sum(np.log(np.einsum('nii->ni', L)), axis=-1)
     return np.linalg.inv(L), np.where(possible, log_determinants, np.inf)
-
-
-def correlated_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Covariance (m, m) of ``sum_i gains_i x_i`` that holds whatever the correlations of the ``x_i`` are.
-
-    Errors of the markers of a map, and of camera poses that rest on the same map, are correlated by an amount that
-    nobody keeps. For any weights a_i that sum to one, ``sum_i gains_i P_i gains_i' / a_i`` is an upper bound (as in
-    covariance intersection; S. Julier, J. Uhlmann, 1997); these a_i make its trace the smallest.
-
-    Parameters
-    ----------
-    gains : (n, m, 6)
-    covariances : (n, 6, 6)
-    """
-    terms = gains @ covariances @ np.swapaxes(gains, -1, -2)
-    # Rotations and metres are made comparable by the terms' own mean variances.
-    variances = np.diagonal(terms, axis1=-2, axis2=-1)
-    total = np.sum(variances, axis=0)
-    shares = np.sqrt(np.sum(variances / np.where(total > 0.0, total, 1.0), axis=-1))
-    used = shares > 0.0
-    if not np.any(used):
-        return np.zeros(terms.shape[1:])
-    weights = shares[used] / np.sum(shares[used])
-    return np.asarray(np.sum(terms[used] / weights[:, None, None], axis=0))

@@ -4,24 +4,34 @@ S. Khattak, C. Papachristos, K. Alexis, "Marker based thermal-inertial localizat
 filled environments", ISVC 2018.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import (
+    corners_of_pose,
+    correlated_sum,
+    map_of_pose,
+    map_weights,
+    positive,
+    scale_of_pose,
+    SystematicErrors,
+    visible_share,
+    with_corner_errors,
+)
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.fitting import fit_pose
 from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
 from thermal_fiducial.core.geometry.reprojection import (
     corners_in_map,
+    corners_of,
     difference,
     linearise,
     reproject,
-    shared_covariances,
     whitening,
 )
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
-from thermal_fiducial.core.mapping.candidates import correlated_sum, SYSTEMATIC_PX
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
@@ -30,7 +40,7 @@ from thermal_fiducial.errors import InputError
 DECISIVE = 20.0
 #: Poses nearer to each other than this [rad] are one pose whose covariance covers both.
 SAME_POSE = np.deg2rad(2.0)
-#: Markers that fill more of the view than this [rad] show perspective: their pose has no rival.
+#: Markers that fill more of the view than this [rad] show perspective: their pose has no alternative.
 WIDE = np.deg2rad(25.0)
 # Re-projection error at which a hypothesis stops getting worse [px]: single-marker poses are rough.
 _HYPOTHESIS_PX = 3.0
@@ -66,6 +76,11 @@ class Sight:
         return np.array([marker.size for marker in self.markers])
 
     @cached_property
+    def points(self) -> FloatArray:
+        """(N, 4, 3) corners in the map [m]."""
+        return corners_in_map(self.T_map_marker, self.sizes)
+
+    @cached_property
     def map_covariances(self) -> FloatArray:
         """(N, 6, 6) of the markers' poses in the map."""
         return np.stack([marker.covariance for marker in self.markers])
@@ -79,19 +94,39 @@ class Sight:
 
 
 @dataclass(frozen=True)
+class PoseErrors:
+    """Covariances (6, 6) of a camera pose, ROS convention, by where its errors come from."""
+
+    #: noise of the corners, new in each frame
+    white: FloatArray
+    #: the map, the scale, the lens and the bias of the corners: as good as the same in the frames that follow
+    systematic: FloatArray
+    #: noise, and the map without the error that all markers in view share: how well it is placed among them
+    relative: FloatArray
+    #: share of the variance of the corners' systematic errors that the residuals show: the pose takes up the rest
+    visible: float = 0.0
+
+
+@dataclass(frozen=True)
 class Location:
     """Where the camera is."""
 
     T_map_camera: FloatArray
-    #: (6, 6), ROS convention, of the corners' noise and of the map
-    covariance: FloatArray
-    #: (6, 6) the same without the error that all markers in view share: how well it is placed among them
-    relative_covariance: FloatArray
-    #: (6, 6) the share of the map: an error that lasts as long as the same markers are in view
-    map_covariance: FloatArray
+    errors: PoseErrors
     #: (N,) weights of the markers, 1 for one as good as the rest
     weights: FloatArray
-    rms_px: float
+    #: (N, 4, 2) measured minus predicted [px]
+    residuals: FloatArray
+
+    @property
+    def rms_px(self) -> float:
+        """Re-projection error, rms over the corners [px]."""
+        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=-1))))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(6, 6), ROS convention, of all errors together."""
+        return self.errors.white + self.errors.systematic
 
 
 @dataclass(frozen=True)
@@ -100,108 +135,115 @@ class Refusal:
 
     reason: str
     #: (2, 4, 4) the two poses of an unsettled ambiguity, where it is that, and (2, 6, 6) their covariances
-    rivals: FloatArray | None = None
+    alternatives: FloatArray | None = None
     covariances: FloatArray | None = None
 
 
-def locate(sight: Sight, running_errors: FloatArray, camera: Camera, prior: FloatArray | None) -> Location | Refusal:
+def locate(
+    sight: Sight, running_errors: FloatArray, camera: Camera, prior: FloatArray | None, model: SystematicErrors
+) -> Location | Refusal:
     """Camera pose from N known markers.
 
     Parameters
     ----------
     sight : the markers and their corners
     running_errors : (N,) running rms re-projection error of each [px]
-    prior : (4, 4) roughly expected T_map_camera, decides between rival poses; or None
+    prior : (4, 4) roughly expected T_map_camera, decides between alternative poses; or None
 
     Returns
     -------
     The location, or why there is none.
     """
-    points = corners_in_map(sight.T_map_marker, sight.sizes)
-    hypotheses = _hypotheses(sight, points, camera, prior)
+    hypotheses = _hypotheses(sight, camera, prior)
     if not len(hypotheses):
         return Refusal('no usable pose of any known marker')
-    # Step 3: the pose from all known markers jointly; step 4: the error of each; step 5: weights; step 6: refinement.
-    covariances = _with_map_uncertainty(sight, hypotheses[0], camera)
     try:
-        first = solve_camera_pose(sight.corners, covariances, points, camera, hypotheses[0], compete=False)
+        T, weights = _joint_pose(sight, running_errors, camera, hypotheses[0], model)
     except InputError:
         return Refusal(f'no camera pose explains {_names(sight)}')
-    errors = _errors_px(first.residuals_px)
-    weights = marker_weights(errors, running_errors)
-    best = first
-    if np.any(weights < 1.0):
-        best = solve_camera_pose(sight.corners, covariances, points, camera, first.T_map_camera, weights, compete=False)
-    T = best.T_map_camera
+    other = _alternative(sight, weights, camera, T, hypotheses, model)
     spread = np.zeros((6, 6))
-    rival = _rival(sight, covariances, weights, camera, T, hypotheses)
-    if rival is not None:
-        if rotation_angle(T[:3, :3].T @ rival[:3, :3]) < SAME_POSE:
-            apart = difference(rival, T)
+    if other is not None:
+        if rotation_angle(T[:3, :3].T @ other[:3, :3]) < SAME_POSE:
+            apart = difference(other, T)
             spread = np.outer(apart, apart)
         elif prior is None:
-            rivals = np.stack([T, rival])
-            spreads = np.stack([pose_covariances(sight, covariances, weights, camera, pose)[0] for pose in rivals])
-            return Refusal(f'planar ambiguity of {_names(sight)} unsettled', rivals, spreads)
-        elif _distance(rival, prior) < _distance(T, prior):
-            T = rival
-    covariance, relative, from_map = pose_covariances(sight, covariances, weights, camera, T)
-    if not np.all(np.isfinite(covariance)):
+            poses = np.stack([T, other])
+            each = [pose_errors(sight, weights, camera, pose, model) for pose in poses]
+            covariances = np.stack([errors.white + errors.systematic for errors in each])
+            return Refusal(f'planar ambiguity of {_names(sight)} unsettled', poses, covariances)
+        elif _distance(other, prior) < _distance(T, prior):
+            T = other
+    errors = pose_errors(sight, weights, camera, T, model)
+    if not (np.all(np.isfinite(errors.white)) and np.all(np.isfinite(errors.systematic))):
         return Refusal(f'the pose from {_names(sight)} is not determined')
-    residuals = sight.corners - reproject(camera, T, points)
-    rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=-1))))
-    return Location(T, covariance + spread, relative + spread, from_map, weights, rms)
+    errors = replace(errors, systematic=errors.systematic + spread, relative=errors.relative + spread)
+    return Location(T, errors, weights, sight.corners - reproject(camera, T, sight.points))
 
 
-def marker_weights(errors: FloatArray, running_errors: FloatArray) -> FloatArray:
+def _joint_pose(
+    sight: Sight, running_errors: FloatArray, camera: Camera, start: FloatArray, model: SystematicErrors
+) -> tuple[FloatArray, FloatArray]:
+    """Steps 3 to 6: the pose (4, 4) from all markers jointly, weighted with (N,) by map and errors, and refined."""
+    by_map = _map_weights(sight, start, camera, model)
+    first = solve_camera_pose(sight.corners, sight.covariances, sight.points, camera, start, by_map, compete=False)
+    weights = by_map * marker_weights(_errors_px(first.residuals_px), running_errors, model)
+    T = first.T_map_camera
+    if np.any(weights < by_map):
+        T = solve_camera_pose(
+            sight.corners, sight.covariances, sight.points, camera, T, weights, compete=False
+        ).T_map_camera
+    return T, weights
+
+
+def marker_weights(errors: FloatArray, running_errors: FloatArray, model: SystematicErrors) -> FloatArray:
     """Step 5 of Algorithm 1: weights (N,) from the present and the running re-projection error of each marker [px].
 
     A marker whose error is that of its neighbours, or below what corners can be trusted to anyway, weighs 1; a worse
     one as its inverse square, which is what its error's variance deserves.
     """
     combined = 0.5 * (errors**2 + np.where(running_errors > 0.0, running_errors, errors) ** 2)
-    reference = max(float(np.median(combined)), SYSTEMATIC_PX**2)
+    reference = max(float(np.median(combined)), model.decision_px**2)
     return np.asarray(np.minimum(1.0, reference / np.maximum(combined, 1e-12)))
 
 
-def pose_covariances(
-    sight: Sight, covariances: FloatArray, weights: FloatArray, camera: Camera, T_map_camera: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Covariance (6, 6) of a camera pose that was estimated with ``weights`` and corner ``covariances`` (N, 4, 2, 2).
+def pose_errors(
+    sight: Sight, weights: FloatArray, camera: Camera, T_map_camera: FloatArray, model: SystematicErrors
+) -> PoseErrors:
+    """What a camera pose is uncertain by that was estimated with ``weights`` (N,) of the markers.
 
-    The estimate is linear in the corners and in the map near its optimum: noise of the corners goes in as white, at
-    least as large as the residuals say; errors of the map's markers go in with unknown correlations. The second
-    covariance leaves out what the best-known marker in view is uncertain by, as the error that all of them share.
+    The estimate is linear in corners, map and scale near its optimum: noise of the corners goes in as white, at least
+    as large as the residuals say; errors of the map's markers with unknown correlations; errors of corners and scale
+    as the error model has them.
     """
     n = len(sight.markers)
     T = np.broadcast_to(T_map_camera, (n, 4, 4))
     uv, J_camera, J_marker = linearise(camera, T, sight.T_map_marker, sight.sizes)
-    blocks = J_camera.reshape(n, 4, 2, 6)
-    information = np.linalg.inv(covariances) * weights[:, None, None, None]
+    blocks, of_marker = J_camera.reshape(n, 4, 2, 6), J_marker.reshape(n, 4, 2, 6)
+    information = np.linalg.inv(sight.covariances) * weights[:, None, None, None]
     weighted = information @ blocks
     A = np.sum(np.moveaxis(blocks, -1, -2) @ weighted, axis=(0, 1))
     try:
-        A_inverse = np.linalg.inv(A)
+        gains = np.linalg.inv(A) @ np.moveaxis(weighted, -1, -2)
     except np.linalg.LinAlgError:
-        return np.full((6, 6), np.nan), np.full((6, 6), np.nan), np.full((6, 6), np.nan)
-    gains = A_inverse @ np.moveaxis(weighted, -1, -2)
-    noise = np.sum(gains @ sight.covariances @ np.moveaxis(gains, -1, -2), axis=(0, 1))
+        nothing = np.full((6, 6), np.nan)
+        return PoseErrors(nothing, nothing, nothing)
+    white = np.sum(gains @ sight.covariances @ np.moveaxis(gains, -1, -2), axis=(0, 1))
     residuals = (sight.corners - uv)[..., None]
     chi2 = float(np.sum(residuals * (information @ residuals)))
-    noise *= max(1.0, chi2 / max(8 * n - 6, 1))
-    map_gains = -np.sum(gains @ J_marker.reshape(n, 4, 2, 6), axis=1)
-    whole, relative = sight.map_covariances, sight.relative_covariances
-    from_map = correlated_sum(map_gains, whole)
-    return noise + from_map, noise + correlated_sum(map_gains, relative), from_map
+    white *= max(1.0, chi2 / max(8 * n - 6, 1))
+    map_gains = -np.sum(gains @ of_marker, axis=1)
+    at = sight.corners.reshape(-1, 2)
+    corners = corners_of_pose(gains.reshape(4 * n, 6, 2), at, camera.width, model)
+    visible = visible_share(J_camera.reshape(-1, 2, 6), at, camera.width, model)
+    arms = corners_of(sight.sizes) @ np.swapaxes(sight.T_map_marker[:, :3, :3], -1, -2)
+    scale = scale_of_pose(np.sum(gains @ (of_marker[..., :3] @ arms[..., None]), axis=(0, 1))[:, 0], model)
+    of_map = map_of_pose(map_gains, sight.map_covariances, sight.T_map_marker[:, :3, 3], T_map_camera[:3, 3])
+    relative = white + correlated_sum(map_gains, sight.relative_covariances)
+    return PoseErrors(white, of_map + corners + scale, relative, visible)
 
 
-def positive(covariances: FloatArray) -> FloatArray:
-    """The nearest covariances (..., 6, 6): negative variances become none."""
-    values, vectors = np.linalg.eigh(0.5 * (covariances + np.swapaxes(covariances, -1, -2)))
-    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2))
-
-
-def _hypotheses(sight: Sight, points: FloatArray, camera: Camera, prior: FloatArray | None) -> FloatArray:
+def _hypotheses(sight: Sight, camera: Camera, prior: FloatArray | None) -> FloatArray:
     """Camera poses (H, 4, 4) from either branch of each of the largest markers and from the prior, the best first."""
     largest = np.argsort(-np.sum(np.ptp(sight.corners, axis=1), axis=-1), kind='stable')[:_PROPOSERS]
     branches = sight.branches[largest].reshape(-1, 4, 4)
@@ -209,36 +251,33 @@ def _hypotheses(sight: Sight, points: FloatArray, camera: Camera, prior: FloatAr
     poses = poses[np.all(np.isfinite(poses), axis=(1, 2))]
     if prior is not None:
         poses = np.concatenate([poses, prior[None]])
-    uv = reproject(camera, poses[:, None], points)
+    uv = reproject(camera, poses[:, None], sight.points)
     squared = np.sum((uv - sight.corners) ** 2, axis=(-2, -1)) / 4.0
     squared = np.where(np.isfinite(squared), squared, 1e12)
     cost = np.sum(np.log1p(squared / _HYPOTHESIS_PX**2), axis=-1)
     return np.asarray(poses[np.argsort(cost, kind='stable')])
 
 
-def _with_map_uncertainty(sight: Sight, T_map_camera: FloatArray, camera: Camera) -> FloatArray:
-    """Corner covariances (N, 4, 2, 2) to weight with: the noise, and what markers may be wrong by among each other.
-
-    What all of them may be wrong by together moves the camera along, and says nothing for one pose against another.
-    """
-    relative = sight.relative_covariances
-    if not np.any(relative):
-        return sight.covariances
+def _map_weights(sight: Sight, T_map_camera: FloatArray, camera: Camera, model: SystematicErrors) -> FloatArray:
+    """Weights (N,) of the markers by how well the map knows each."""
+    if not np.any(sight.map_covariances):
+        return np.ones(len(sight.markers))
     T = np.broadcast_to(T_map_camera, (len(sight.markers), 4, 4))
     _, _, J = linearise(camera, T, sight.T_map_marker, sight.sizes)
-    shared = np.nan_to_num(shared_covariances(J, relative))
-    return np.asarray(sight.covariances + shared, dtype=np.float64)
+    pixels = np.sqrt(np.nan_to_num(np.einsum('nij,njk,nik->n', J, sight.map_covariances, J) / 8.0))
+    noise = np.sqrt(np.trace(sight.covariances, axis1=-2, axis2=-1).mean(axis=-1) / 2.0)
+    return map_weights(pixels, noise, model)
 
 
-def _rival(
-    sight: Sight, covariances: FloatArray, weights: FloatArray, camera: Camera, T: FloatArray, hypotheses: FloatArray
+def _alternative(
+    sight: Sight, weights: FloatArray, camera: Camera, T: FloatArray, hypotheses: FloatArray, model: SystematicErrors
 ) -> FloatArray | None:
     """Another pose (4, 4) that the corners do not refute; None when there is none."""
     apart = rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE
     if not np.any(apart) or _extent(sight, camera) > WIDE:
         return None
     n = len(sight.markers)
-    W = whitening(covariances + SYSTEMATIC_PX**2 * np.eye(2)) * np.sqrt(weights)[:, None, None, None]
+    W = whitening(with_corner_errors(sight.covariances, model)) * np.sqrt(weights)[:, None, None, None]
 
     def evaluate(T: FloatArray) -> tuple[FloatArray, FloatArray]:
         uv, J, _ = linearise(camera, np.broadcast_to(T, (n, 4, 4)), sight.T_map_marker, sight.sizes)

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
+from thermal_fiducial.core.error_model import alike_odometry, INCONSISTENT_PX, positive, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise, reproject
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
@@ -21,13 +22,13 @@ from thermal_fiducial.core.mapping.bundle_adjustment import prior_poses, refine,
 from thermal_fiducial.core.mapping.candidates import Candidate, View, Viewpoint
 from thermal_fiducial.core.mapping.correction import correction
 from thermal_fiducial.core.mapping.keyframes import in_moved_map, Keyframe, KeyframeStore, Rig
-from thermal_fiducial.core.mapping.localization import locate, Location, positive, Refusal, Sight
+from thermal_fiducial.core.mapping.localization import locate, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.located import Located, LocatedFrame
 from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.map_editing import align
 from thermal_fiducial.core.mapping.map_rows import marker_poses, usable
 from thermal_fiducial.core.mapping.motion import CameraMotion
-from thermal_fiducial.core.mapping.noise_level import NoiseLevel
+from thermal_fiducial.core.mapping.noise_level import CornerBias, NoiseLevel
 from thermal_fiducial.core.mapping.odometry_prior import (
     contradicts,
     Fused,
@@ -44,22 +45,12 @@ from thermal_fiducial.errors import InputError
 
 __all__ = ['MapJump', 'MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
 
-#: A pose of the past tells rival poses apart for this long [ns].
+#: A pose of the past decides between alternative poses for this long [ns].
 CONTINUITY_NS = 300_000_000
-#: Keyframes whose poses by the odometry are off alike: together they tell no more than one.
-ALIKE = 30.0
-#: Factor on the variance of what a camera pose owes to the map: of all frames of the same markers that error is the
-#: same, while whoever takes in the poses lets their errors average out.
-LASTING = 3.0
 #: Why a marker is in quarantine that came so with the map.
 FROM_FILE = 'in quarantine since before the map was loaded'
 #: Why nothing is learned from a frame that has a pose.
 ASTRAY = 'the known markers in view contradict the odometry'
-#: What a marker's corners are off by in all views alike (its shape, the edge's model), as a share of their noise:
-#: as measured on rendered flights with three lenses and 0.5 to 9 K.
-LASTING_SHARE = 0.7
-#: Corner errors to allow for before a marker is said to disagree with the others [px].
-TOLERANCE_PX = 0.3
 #: Candidates that are judged in one frame: bounds its time when many are new.
 TRIALS = 3
 # Last frames that tell how the map has moved where the robot is, each so many-th of them: neighbours tell the same.
@@ -122,6 +113,7 @@ class MarkerMapper:
         self._belief: FloatArray | None = None
         self._cameras: list[Camera] = []
         self._noise = NoiseLevel()
+        self._bias = CornerBias(SystematicErrors())
         self._gap: CameraPose | None = None
         self._keyframes = KeyframeStore(self.config.keyframe_budget)
         self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(self.map.markers)
@@ -191,13 +183,21 @@ class MarkerMapper:
         if not sight.markers:
             return Refusal(self._nothing_known())
         errors = self._trust.running_errors(sight.markers)
-        location = locate(sight, errors, camera, self._prior(stamp_ns, predicted))
+        location = locate(sight, errors, camera, self._prior(stamp_ns, predicted), self._errors)
         if isinstance(location, Refusal):
             return location
-        covariance = location.covariance + self._motion.unknown(stamp_ns, location.T_map_camera)
-        covariance = covariance + (LASTING - 1.0) * location.map_covariance
-        ids = tuple(marker.id for marker in sight.markers)
-        return Located(location, CameraPose(stamp_ns, location.T_map_camera, covariance, ids, location.rms_px))
+        ids = np.array([marker.id for marker in sight.markers])
+        self._bias.add(stamp_ns, ids, location.residuals, location.errors.visible)
+        delay = self._motion.delay_covariance(stamp_ns, location.T_map_camera, self._errors)
+        systematic = location.errors.systematic + delay
+        covariance = location.errors.white + systematic
+        used = tuple(ids.tolist())
+        pose = CameraPose(stamp_ns, location.T_map_camera, covariance, systematic, used, location.rms_px)
+        return Located(location, pose)
+
+    @property
+    def _errors(self) -> SystematicErrors:
+        return SystematicErrors(corner_px=self._bias.px, marker_size_std=self.config.marker_size_std)
 
     def _nothing_known(self) -> str:
         if not self.map.markers:
@@ -296,8 +296,8 @@ class MarkerMapper:
         predicted = frame.predicted
         if self.frozen or not len(frame.new):
             return False, {}
-        if refusal.rivals is not None and refusal.covariances is not None:
-            return self._place_new(frame, Viewpoint(refusal.rivals, refusal.covariances))
+        if refusal.alternatives is not None and refusal.covariances is not None:
+            return self._place_new(frame, Viewpoint(refusal.alternatives, refusal.covariances))
         last = self._last_frame
         if predicted is None or last is None:
             return False, {}
@@ -349,7 +349,7 @@ class MarkerMapper:
             tuple(self._keyframes.links),
             prior_poses(self._initial.markers),
             self.map.revision,
-            LASTING_SHARE,
+            self._errors,
         )
 
     def refine(self) -> Refinement | None:
@@ -395,6 +395,11 @@ class MarkerMapper:
         return MapJump(self.map.revision, self.resets, T_new_old)
 
     @property
+    def corner_bias_px(self) -> float:
+        """Systematic error of the corners, as learned so far [px]."""
+        return self._bias.px
+
+    @property
     def candidates(self) -> dict[int, Candidate]:
         """Markers on trial."""
         return dict(self._candidates)
@@ -430,10 +435,10 @@ class MarkerMapper:
 
 
 def _fused(location: Location, predicted: PredictedCamera | None) -> Fused:
-    lasting = positive(location.covariance - location.relative_covariance)
+    lasting = positive(location.covariance - location.errors.relative)
     if predicted is None:
-        return Fused(location.T_map_camera, location.relative_covariance, lasting)
-    return together(location.T_map_camera, location.relative_covariance, lasting, predicted.pose)
+        return Fused(location.T_map_camera, location.errors.relative, lasting)
+    return together(location.T_map_camera, location.errors.relative, lasting, predicted.pose)
 
 
 def _viewpoint(fused: Fused) -> Viewpoint:
@@ -451,7 +456,7 @@ def _keyframe(rows: Markers, pose: CameraPose, camera: int, predicted: Predicted
     )
     if predicted is None:
         return frame
-    information = np.asarray(np.linalg.inv(ALIKE * predicted.pose.covariance), dtype=np.float64)
+    information = np.asarray(np.linalg.inv(alike_odometry(predicted.pose.covariance)), dtype=np.float64)
     return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)
 
 
@@ -464,4 +469,4 @@ def _expected_errors(known: Sight, location: Location, camera: Camera) -> FloatA
     pose = np.sum(J_camera @ location.covariance * J_camera, axis=(1, 2))
     marker = np.sum(J_marker @ known.map_covariances * J_marker, axis=(1, 2))
     variance = 0.25 * (noise + pose + marker)
-    return np.asarray(np.sqrt(np.nan_to_num(variance) + TOLERANCE_PX**2))
+    return np.asarray(np.sqrt(np.nan_to_num(variance) + INCONSISTENT_PX**2))

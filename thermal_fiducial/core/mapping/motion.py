@@ -7,12 +7,10 @@ corners: it is an error of the pose, as large for many markers as for one, and t
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import delay_of_pose, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.types import FloatArray
 
-#: Standard deviation of the delay [s], beside a constant one, which belongs to the clocks, and of half its mean square
-#: [s^2]. Both were measured on rendered flights whose lag was integrated in 4 to 16 steps of a frame.
-DELAY_STD, HALF_SQUARE_STD = 0.15e-3, 25e-6
 # Poses farther apart than this tell nothing of the velocity [s].
 _STALE_S = 0.15
 
@@ -25,16 +23,13 @@ class CameraMotion:
         self._T_map_camera: FloatArray | None = None
         self._velocity: FloatArray | None = None
 
-    def unknown(self, stamp_ns: int, T_map_camera: FloatArray) -> FloatArray:
+    def delay_covariance(self, stamp_ns: int, T_map_camera: FloatArray, errors: SystematicErrors) -> FloatArray:
         """Covariance (6, 6), ROS convention, that the motion up to this pose adds to it."""
-        covariance = np.zeros((6, 6))
         dt = (stamp_ns - self._stamp_ns) * 1e-9
-        velocity = None
+        velocity, covariance = None, np.zeros((6, 6))
         if self._T_map_camera is not None and 0.0 < dt < _STALE_S:
             velocity = difference(T_map_camera, self._T_map_camera) / dt
-            covariance += DELAY_STD**2 * np.outer(velocity, velocity)
-            if self._velocity is not None:
-                acceleration = (velocity - self._velocity) / dt
-                covariance += HALF_SQUARE_STD**2 * np.outer(acceleration, acceleration)
+            acceleration = np.zeros(6) if self._velocity is None else (velocity - self._velocity) / dt
+            covariance = delay_of_pose(velocity, acceleration, errors)
         self._stamp_ns, self._T_map_camera, self._velocity = stamp_ns, T_map_camera, velocity
         return covariance

@@ -10,21 +10,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import bounded_odometry, positive, split_odometry
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.mapping.bridging import camera_pose
-from thermal_fiducial.core.mapping.localization import positive
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray
 
 #: A state of the filter stands for frames up to this far from it [ns].
 NEAR_NS = 300_000_000
-# Share of the variance of odometry's errors that changes between the views of a new marker.
-CHANGING = 0.25
 #: Squared distance (6 degrees of freedom) beyond which markers and odometry contradict each other: ten sigma.
 CONTRADICTION = 100.0
-# However uncertain odometry says it is, it is no worse than this while it has agreed with the markers [m, rad].
-_WORST = np.repeat([0.3, 0.2], 3)
 
 
 @dataclass(frozen=True)
@@ -73,10 +69,8 @@ class Fused:
 
 def contradicts(T_map_camera: FloatArray, covariance: FloatArray, odometry: CameraPose) -> bool:
     """Whether a camera pose (4, 4) from markers is where odometry cannot be, even odometry that is in doubt itself."""
-    worst = _WORST**2
-    scale = min(1.0, float(np.min(worst / np.maximum(np.diag(odometry.covariance), 1e-12))))
     apart = difference(odometry.T_map_camera, T_map_camera)
-    return bool(apart @ np.linalg.solve(covariance + scale * odometry.covariance, apart) > CONTRADICTION)
+    return bool(apart @ np.linalg.solve(covariance + bounded_odometry(odometry.covariance), apart) > CONTRADICTION)
 
 
 def together(T_map_camera: FloatArray, changing: FloatArray, lasting: FloatArray, odometry: CameraPose) -> Fused:
@@ -90,11 +84,11 @@ def together(T_map_camera: FloatArray, changing: FloatArray, lasting: FloatArray
         return Fused(T_map_camera, changing, lasting)
     gain = np.linalg.solve(changing + lasting + P, changing + lasting).T
     rest = np.eye(6) - gain
-    inherited = gain @ P @ gain.T
+    new, common = split_odometry(gain @ P @ gain.T)
     return Fused(
         np.asarray(retract(T_map_camera, gain @ apart)),
-        rest @ changing @ rest.T + CHANGING * inherited,
-        rest @ lasting @ rest.T + (1.0 - CHANGING) * inherited,
+        rest @ changing @ rest.T + new,
+        rest @ lasting @ rest.T + common,
     )
 
 

@@ -1,0 +1,129 @@
+"""Systematic errors: each widens a covariance by what a simulated error of its size moves the pose by."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from test.support.walls import CAMERA, flight, see, SIZE, stamp, wall
+from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.error_model import (
+    corner_field,
+    map_of_pose,
+    NO_SYSTEMATIC_ERRORS,
+    scale_of_map,
+    SystematicErrors,
+)
+from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.measurements import CORNER_FIELDS, corners_px
+
+ERRORS = SystematicErrors()
+
+
+def located(poses, rows, size_std=0.0, size=SIZE):
+    """The camera's pose in an exact map, or one of markers of another ``size``."""
+    marker_map = MarkerMap({i: MapMarker(i, size, True, T) for i, T in poses.items()})
+    config = MarkerMapperConfig(mode='localization', marker_size_std=size_std)
+    return MarkerMapper(config, marker_map).process(stamp(0), rows, CAMERA).pose
+
+
+@pytest.mark.parametrize('count', [1, 4, 8])
+def test_corners_that_are_wrong_over_the_whole_image_are_in_the_systematic_covariance(count):
+    """NEES of poses whose corners have no noise but errors of the size and the length that the model declares."""
+    rng = np.random.default_rng(count)
+    poses = wall(rng, count)
+    nees = []
+    for k in range(60):
+        T = flight(k / 3)
+        rows = see(T, poses, 1e-3, rng)
+        if not len(rows):
+            continue
+        corners = corners_px(rows).reshape(-1, 2)
+        root = np.linalg.cholesky(corner_field(corners, CAMERA.width, ERRORS) + 1e-9 * np.eye(len(corners)))
+        moved = (corners + root @ rng.normal(size=corners.shape)).reshape(-1, 8)
+        for name, column in zip(CORNER_FIELDS, moved.T, strict=True):
+            rows[name] = column
+        pose = located(poses, rows)
+        if pose is not None:
+            d = difference(T, pose.T_map_camera)
+            nees.append(d @ np.linalg.solve(pose.systematic_covariance + 1e-12 * np.eye(6), d))
+    assert len(nees) > 30
+    # Six degrees of freedom; the mean of forty has a standard deviation of 0.55. Residuals that the pose cannot take up
+    # are not in it, and lone markers seen head-on are beyond first order.
+    assert 4.0 < np.mean(nees) < 8.0
+
+
+def test_markers_larger_than_the_map_says_move_the_camera_by_what_the_scale_allows_for():
+    poses = wall(np.random.default_rng(0), 1)
+    rows = see(flight(0.0), poses, 1e-3, np.random.default_rng(1), size=1.003 * SIZE)
+    exact, uncertain = (located(poses, rows, size_std=std) for std in (0.0, 0.003))
+    d = difference(flight(0.0), exact.T_map_camera)
+    # 0.3 % of 3.7 m, along the line of sight.
+    assert 0.008 < np.linalg.norm(d[:3]) < 0.014
+    scale = uncertain.covariance - exact.covariance
+    # One sigma to first order in the scale: within 2 % of its own size.
+    np.testing.assert_allclose(np.sqrt(np.diag(scale))[:3], np.abs(d[:3]), rtol=0.02, atol=2e-4)
+
+
+def test_the_scale_of_a_map_grows_from_the_nearest_marker_that_is_held():
+    positions, held = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [9.0, 0.0, 0.0]]), np.array([[0.0] * 3, [10.0, 0, 0]])
+    stds = np.sqrt(scale_of_map(positions, held, ERRORS)[:, 0, 0])
+    np.testing.assert_allclose(stds, 0.003 * np.array([0.0, 2.0, 1.0]))
+
+
+def test_a_rigid_error_of_the_map_is_that_of_the_camera():
+    """Markers that are wrong as parts of one rigid map: the bound is no wider than what they have in common."""
+    rng = np.random.default_rng(2)
+    arms = rng.normal(size=(5, 3))
+    common = np.diag([1e-3] * 3 + [1e-2] * 3) ** 2
+    A = np.tile(np.eye(6), (6, 1, 1))
+    for i, (x, y, z) in enumerate([*arms, [0.0, 0.0, 0.0]]):
+        A[i, :3, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    gains = 0.2 * np.linalg.inv(A[:5])
+    P = map_of_pose(gains, A[:5] @ common @ np.swapaxes(A[:5], -1, -2), arms, np.zeros(3))
+    # Three quarters exactly, a quarter by a bound that is at most the number of markers too wide.
+    assert np.all(np.diag(P) >= 0.99 * np.diag(common))
+    assert np.all(np.diag(P) <= (0.75 + 0.25 * 5) * np.diag(common) * 1.01)
+
+
+def test_white_and_systematic_errors_are_apart():
+    rng = np.random.default_rng(3)
+    poses = wall(rng)
+    covariance = np.diag([1e-4] * 3 + [1e-5] * 3)
+    unsure = MarkerMap({i: MapMarker(i, SIZE, False, T, covariance) for i, T in poses.items()})
+    rows = see(flight(0.0), poses, 0.02, rng)
+    pose = MarkerMapper(MarkerMapperConfig(mode='localization'), unsure).process(stamp(0), rows, CAMERA).pose
+    white = pose.covariance - pose.systematic_covariance
+    # 0.02 px at 4 m and 529 px of focal length, from thirty corners, beside a centimetre of the map.
+    assert np.all(np.sqrt(np.diag(white))[:3] < 1e-3)
+    assert np.trace(pose.systematic_covariance[:3, :3]) > np.trace(covariance[:3, :3])
+
+
+def test_a_model_without_errors_adds_nothing():
+    scale = scale_of_map(np.ones((2, 3)), np.zeros((1, 3)), NO_SYSTEMATIC_ERRORS)
+    assert not np.any(scale)
+    assert not np.any(corner_field(np.ones((3, 2)), 640, replace(ERRORS, corner_px=0.0)))
+
+
+@pytest.mark.parametrize('true_px', [0.0, 0.08])
+def test_the_bias_of_the_corners_is_learned_from_residuals_that_last(true_px):
+    """Corners with noise of 0.1 px, and with a smooth field over the image or without."""
+    rng = np.random.default_rng(4)
+    poses, model = wall(rng), replace(ERRORS, corner_px=max(true_px, 1e-6))
+    grid = np.stack(np.meshgrid(np.linspace(0, 640, 21), np.linspace(0, 512, 17)), axis=-1).reshape(-1, 2)
+    root = np.linalg.cholesky(corner_field(grid, CAMERA.width, model) + 1e-9 * np.eye(len(grid)))
+    field = (root @ rng.normal(size=grid.shape)) * (true_px > 0.0)
+    m = MarkerMapper(
+        MarkerMapperConfig(mode='localization'), MarkerMap({i: MapMarker(i, SIZE, True, T) for i, T in poses.items()})
+    )
+    for k in range(900):
+        rows = see(flight(k / 30), poses, 0.1, rng)
+        corners = corners_px(rows).reshape(-1, 2)
+        nearest = np.argmin(np.sum((corners[:, None] - grid) ** 2, axis=-1), axis=1)
+        for name, column in zip(CORNER_FIELDS, (corners + field[nearest]).reshape(-1, 8).T, strict=True):
+            rows[name] = column
+        m.process(stamp(k), rows, CAMERA)
+    # A flight sees a few independent pieces of one field, so the estimate is good to a third.
+    assert abs(m.corner_bias_px - true_px) < 0.035

@@ -1,0 +1,213 @@
+"""Every systematic error that the covariances allow for: name, unit, source, and where it enters.
+
+White noise averages out over the corners of a frame and over frames; a systematic error is the same for many of them
+and does not. Each is a field of :class:`SystematicErrors`; a covariance is widened by the functions here and nowhere
+else. An error that a frame shares with the next ones enters the covariance of a pose after the fit (as a consider
+parameter; S. Schmidt, 1966), never the weights frame by frame: weights that change with the markers in view would make
+the pose jump by what the markers are wrong by.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thermal_fiducial.core.geometry.se3 import skew
+from thermal_fiducial.core.types import FloatArray
+
+
+@dataclass(frozen=True)
+class SystematicErrors:
+    """Standard deviations of the systematic errors; zero leaves one out."""
+
+    #: Corners [px]: model of the lens and bias of the detector, which last as long as the view. To begin with what a
+    #: published calibration leaves of a board of 36 tags (means over cells of 60 px: 0.08 and 0.09 px; body poses from
+    #: two cameras differ by 6.6 mm, NEES 2.4 without it, 0.9 with it, correlation 0.86 after 0.1 s, 0.36 after 4 s);
+    #: learned in flight from residuals that last (``CornerBias``). Enters poses from markers (:func:`corner_field`).
+    corner_px: float = 0.1
+    #: Distance over which that error stays the same [share of the image's width]: a lens model is wrong by a smooth
+    #: function. On the same board lengths of 0.1 to 0.25 fit, 0.5 leaves NEES 1.1, 1.0 leaves 1.25.
+    corner_length: float = 0.25
+    #: Corners [px] where one hypothesis is weighed against another, and the limit below which no marker is worth more
+    #: than its neighbours. Enters the fit of new markers, the choice between two poses, and weights.
+    decision_px: float = 0.1
+    #: Common relative error of the markers' sides and of the focal length: ways of measuring tags on one carpet differ
+    #: by 1.2 %, a laser cutter's kerf of 0.3 mm is 0.1 %, and a calibration with a board is good to 0.1 to 0.3 %.
+    #: Enters poses from markers (:func:`scale_of_pose`) and the map (:func:`scale_of_map`).
+    marker_size_std: float = 0.003
+    #: Corners of one marker in all of its views [share of the corners' noise]: its shape and the model of its edges.
+    #: As measured on rendered flights with three lenses and 0.5 to 9 K. Enters the covariance of a joint adjustment.
+    marker_shape: float = 0.7
+    #: Delay of an image [s] beside a constant one, which belongs to the clocks, and half of its mean square [s^2]: what
+    #: the detector's lag is not. As measured on rendered flights whose lag was integrated in 4 to 16 steps of a frame.
+    #: Enters poses from markers (:func:`delay_of_pose`).
+    delay_std: float = 0.15e-3
+    delay_half_square_std: float = 25e-6
+
+
+#: For data that have no systematic errors: simulated corners.
+NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0)
+#: Share of the variance of the best marker in view that all others have in common with it, as parts of a rigid map: the
+#: place where they all come from, the gauge. Of maps from flights past eight markers nearly all is common; the rest
+#: covers markers that were surveyed one by one.
+MAP_COMMON = 0.75
+#: Poses of the odometry in succession are wrong alike: so many are worth one, as its errors last for seconds.
+CORRELATED_ODOMETRY = 30.0
+#: Share of the variance of the odometry's error that is new in each view of a marker: the rest is common to all views.
+ODOMETRY_SHARE_NEW = 0.25
+#: However uncertain odometry says it is, it is no worse than this while it agrees with the markers [m, rad].
+ODOMETRY_AT_WORST = np.repeat([0.3, 0.2], 3)
+#: Re-projection error to allow for before a marker counts as inconsistent [px]: bent plates, and the corners' bias.
+INCONSISTENT_PX = 0.3
+
+
+def corner_field(corners: FloatArray, width: int, errors: SystematicErrors) -> FloatArray:
+    """Covariance (n, n) [px^2] of the systematic errors of n corners, of either axis alone.
+
+    Parameters
+    ----------
+    corners : (n, 2) [px]
+    width : of the image [px]
+    """
+    squared = np.sum((corners[:, None] - corners) ** 2, axis=-1)
+    return np.asarray(errors.corner_px**2 * np.exp(-0.5 * squared / (errors.corner_length * width) ** 2))
+
+
+def visible_share(J: FloatArray, corners: FloatArray, width: int, errors: SystematicErrors) -> float:
+    """Share of the variance of the corners' systematic errors that a pose fitted to them leaves in the residuals.
+
+    Parameters
+    ----------
+    J : (n, 2, 6) derivatives of n corners with respect to the pose
+    """
+    field = corner_field(corners, width, replace(errors, corner_px=1.0))
+    Q = np.linalg.qr(J.reshape(-1, 6))[0].reshape(J.shape)
+    absorbed = float(np.sum(Q * np.tensordot(field, Q, axes=1)))
+    return 1.0 - absorbed / (2.0 * len(corners))
+
+
+def corners_of_pose(gains: FloatArray, corners: FloatArray, width: int, errors: SystematicErrors) -> FloatArray:
+    """Covariance (m, m) that the systematic errors of corners (n, 2) make of a pose.
+
+    Parameters
+    ----------
+    gains : (n, m, 2) what a pixel of each corner moves the pose by
+    """
+    if errors.corner_px == 0.0:
+        return np.zeros((gains.shape[1], gains.shape[1]))
+    mixed = np.tensordot(corner_field(corners, width, errors), gains, axes=1)
+    return np.asarray(np.einsum('nij,nkj->ik', gains, mixed))
+
+
+def scale_of_pose(moved: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Covariance (m, m) of a pose that moves by ``moved`` (m,) when all markers grow to twice their size."""
+    return np.asarray(errors.marker_size_std**2 * np.outer(moved, moved))
+
+
+def map_of_pose(
+    gains: FloatArray, covariances: FloatArray, positions: FloatArray, camera_position: FloatArray
+) -> FloatArray:
+    """Covariance (6, 6) of a camera pose by the errors of the map.
+
+    What the markers have in common moves the camera as if it hung on the same rigid map; for the rest any correlations
+    are allowed for.
+
+    Parameters
+    ----------
+    gains : (N, 6, 6) what a displacement of each marker moves the pose by; all together moved rigidly take it along
+    covariances, positions : (N, 6, 6), (N, 3) of the markers
+    camera_position : (3,)
+    """
+    best = int(np.argmin(np.trace(covariances, axis1=1, axis2=2)))
+    arms = np.concatenate([positions, camera_position[None]]) - positions[best]
+    A = np.tile(np.eye(6), (len(arms), 1, 1))
+    A[:, :3, 3:] = -skew(arms)
+    common = MAP_COMMON * A @ covariances[best] @ np.swapaxes(A, -1, -2)
+    return np.asarray(common[-1] + correlated_sum(gains, positive(covariances - common[:-1])))
+
+
+def positive(covariances: FloatArray) -> FloatArray:
+    """The nearest covariances (..., 6, 6): negative variances become none."""
+    values, vectors = np.linalg.eigh(0.5 * (covariances + np.swapaxes(covariances, -1, -2)))
+    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2))
+
+
+def correlated_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Covariance (m, m) of ``sum_i gains_i x_i`` that holds whatever the correlations of the ``x_i`` are.
+
+    Errors of the markers of a map, and of camera poses that rest on the same map, are correlated by an amount that
+    nobody keeps. For any weights a_i that sum to one, ``sum_i gains_i P_i gains_i' / a_i`` is an upper bound (as in
+    covariance intersection; S. Julier, J. Uhlmann, 1997); these a_i make its trace the smallest.
+
+    Parameters
+    ----------
+    gains : (n, m, 6)
+    covariances : (n, 6, 6)
+    """
+    terms = gains @ covariances @ np.swapaxes(gains, -1, -2)
+    # Rotations and metres are made comparable by the terms' own mean variances.
+    variances = np.diagonal(terms, axis1=-2, axis2=-1)
+    total = np.sum(variances, axis=0)
+    shares = np.sqrt(np.sum(variances / np.where(total > 0.0, total, 1.0), axis=-1))
+    used = shares > 0.0
+    if not np.any(used):
+        return np.zeros(terms.shape[1:])
+    weights = shares[used] / np.sum(shares[used])
+    return np.asarray(np.sum(terms[used] / weights[:, None, None], axis=0))
+
+
+def scale_of_map(positions: FloatArray, held: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Covariances (M, 6, 6) of markers at ``positions`` (M, 3), known by their distance from the nearest of ``held``.
+
+    Parameters
+    ----------
+    held : (H, 3) positions that are given, at least one: they carry the scale
+    """
+    arms = positions[:, None] - held
+    nearest = np.argmin(np.sum(arms**2, axis=-1), axis=1)
+    arm = arms[np.arange(len(positions)), nearest]
+    covariances = np.zeros((len(positions), 6, 6))
+    covariances[:, :3, :3] = errors.marker_size_std**2 * arm[:, :, None] * arm[:, None, :]
+    return covariances
+
+
+def delay_of_pose(velocity: FloatArray, acceleration: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Covariance (6, 6) of a pose whose image is late by an unknown delay, from its velocity and acceleration (6,)."""
+    return np.asarray(
+        errors.delay_std**2 * np.outer(velocity, velocity)
+        + errors.delay_half_square_std**2 * np.outer(acceleration, acceleration)
+    )
+
+
+def map_weights(pixels: FloatArray, noise: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Weights (N,) of markers whose places in the map are uncertain by ``pixels`` (N,) [px] in the view at hand.
+
+    They depend on each marker alone and change as slowly as the view does. Weighing with the covariance relative to the
+    best marker in view, poses over a carpet of 81 markers jittered twice as much as with the map taken for exact.
+
+    Parameters
+    ----------
+    noise : (N,) standard deviation of the corners [px]
+    """
+    own = noise**2 + errors.decision_px**2
+    return np.asarray(own / (own + pixels**2))
+
+
+def alike_odometry(covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of one of many poses by the odometry whose errors are the same for seconds."""
+    return CORRELATED_ODOMETRY * covariance
+
+
+def split_odometry(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The part of odometry's covariance (6, 6) that is new in each view of a marker, and that common to all."""
+    return ODOMETRY_SHARE_NEW * covariance, (1.0 - ODOMETRY_SHARE_NEW) * covariance
+
+
+def bounded_odometry(covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of odometry that has agreed with the markers so far: no worse than at its worst."""
+    scale = float(np.min(ODOMETRY_AT_WORST**2 / np.maximum(np.diag(covariance), 1e-12)))
+    return np.asarray(min(1.0, scale) * covariance)
+
+
+def with_corner_errors(covariances: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Corner covariances (..., 2, 2) [px^2] to decide between hypotheses with: noise, and what corners are off by."""
+    return np.asarray(covariances + errors.decision_px**2 * np.eye(2))
