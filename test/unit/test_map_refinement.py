@@ -89,7 +89,7 @@ def test_the_schur_complement_answers_like_the_whole_system():
     # Two ways of solving one system of condition 1e8.
     np.testing.assert_allclose(np.concatenate([frames.ravel(), markers.ravel()]), expected, rtol=1e-5, atol=1e-9)
     inverse_H = np.linalg.inv(H[np.ix_(free, free)])
-    covariances = problem.equations.covariances(blocks, 1.0, np.zeros((M, 6, 6)))
+    covariances = problem.equations.covariances(problem.equations.reduced(blocks), 1.0, np.zeros((M, 6, 6)))
     for k, m in enumerate(np.flatnonzero(~problem.held)):
         own = slice(6 * (F + k), 6 * (F + k) + 6)
         np.testing.assert_allclose(covariances[m], inverse_H[own, own], rtol=1e-4, atol=1e-15)
@@ -327,11 +327,11 @@ def test_responses_are_what_the_steps_are():
     rng = np.random.default_rng(13)
     start = snapshot(rng, wall(rng), count=8)
     problem = bundle_adjustment._Problem.build(start)
-    evaluation = problem.evaluate(problem.start, 1.0)
-    blocks = problem._blocks(problem.start, evaluation)
+    blocks = problem._blocks(problem.start, problem.evaluate(problem.start, 1.0))
     _, markers = problem.equations.solve(blocks, 0.0)
-    once = blocks.rig_gradient, blocks.marker_gradient
-    responses = problem.equations.responses(blocks, [once, (2.0 * once[0], 2.0 * once[1])])
+    once = blocks.rig_gradient[..., None], blocks.marker_gradient[..., None]
+    sides = (np.concatenate([side, 2.0 * side], axis=-1) for side in once)
+    responses = problem.equations.responses(problem.equations.reduced(blocks), *sides)
     np.testing.assert_allclose(responses, np.stack([markers, 2.0 * markers], axis=-1), atol=1e-10)
 
 

@@ -21,7 +21,7 @@ from thermal_fiducial.core.geometry.reprojection import difference, linearise, r
 from thermal_fiducial.core.geometry.se3 import inverse, skew
 from thermal_fiducial.core.mapping.keyframes import Keyframe, Link, packed, Rig, unpacked
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations
+from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations, ReducedSystem
 from thermal_fiducial.core.mapping.residual_checks import correlation_time, hangs_twice
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
@@ -30,12 +30,15 @@ ROBUST_CHI2 = 26.1
 #: Chi square of a pose from odometry (6 residuals) up to which it counts in full.
 ROBUST_ODOMETRY = 22.5
 MAX_ITERATIONS = 25
-# Relative decrease of the cost that ends the iteration.
-_CONVERGED = 1e-7
+# Decrease of the cost, in chi squares of the actual noise, that ends the iteration: a tenth of the standard deviation
+# of one pose.
+_CONVERGED = 0.01
 # Median of chi square of eight degrees of freedom.
 _MEDIAN_CHI2 = 7.34
 # Samples of errors that last: the covariance of six numbers from so many is good to a fifth.
 _SAMPLES = 32
+# Of these at a time: bounds the memory.
+_AT_ONCE = 8
 # Chi square of a view that no pose near the present one explains.
 _BEHIND_CHI2 = 1e8
 # Each round takes the corners' variance anew from the residuals.
@@ -118,7 +121,7 @@ def _minimise(problem: '_Problem', state: '_State', scale: float) -> tuple['_Sta
             continue
         gain = evaluation.cost - outcome.cost
         state, evaluation, damping = trial, outcome, max(0.1 * damping, 1e-9)
-        if gain <= _CONVERGED * evaluation.cost + 1e-9:
+        if gain <= _CONVERGED * scale:
             break
     return state, steps
 
@@ -267,12 +270,15 @@ class _Problem:
         held_covariances = np.stack([snapshot.markers[key].covariance for key in self.ids])
         noise = max(factor, 1.0) * correlation_time(after.r[full], self.marker[full])
         blocks = self._blocks(state, after)
-        covariances = self.equations.covariances(blocks, noise, held_covariances)
-        shape = self._shape_covariances(blocks, after, snapshot.errors)
-        if covariances is None or shape is None:
+        system = self.equations.reduced(blocks)
+        if system is None:
             return None
+        covariances = self.equations.covariances(system, noise, held_covariances)
         positions = state.T_map_marker[:, :3, 3]
-        covariances += shape + scale_of_map(positions, positions[self.held], snapshot.errors)
+        covariances += self._shape_covariances(system, after, snapshot.errors)
+        covariances += scale_of_map(positions, positions[self.held], snapshot.errors)
+        if not np.all(np.isfinite(covariances)):
+            return None
         adjusted = {
             key: replace(snapshot.markers[key], T_map_marker=state.T_map_marker[i], covariance=covariances[i])
             for i, key in enumerate(self.ids)
@@ -292,26 +298,28 @@ class _Problem:
             snapshot.map_version,
         )
 
-    def _shape_covariances(self, blocks: Blocks, e: _Evaluation, errors: SystematicErrors) -> FloatArray | None:
+    def _shape_covariances(self, system: ReducedSystem, e: _Evaluation, errors: SystematicErrors) -> FloatArray:
         """Covariances (M, 6, 6) of what corners make of the map that are wrong alike in all views of a marker.
 
         Nothing averages that out, and no residual shows it: the shape of a fixed marker turns the whole map. It is
         sampled, as every corner of every marker has a direction of its own.
         """
+        covariances = np.zeros((len(self.ids), 6, 6))
         if errors.marker_shape == 0.0:
-            return np.zeros((len(self.ids), 6, 6))
+            return covariances
         precision = np.bincount(self.marker, 0.5 * np.mean(np.sum(self.W**2, axis=(2, 3)), axis=1))
         std = errors.marker_shape * np.sqrt(np.bincount(self.marker) / precision)
+        whitened = e.weights[:, None, None, None] * self.W
+        rig, marker = (
+            np.swapaxes((np.swapaxes(whitened, -1, -2) @ J.reshape(-1, 4, 2, 6)).reshape(-1, 8, 6), -1, -2)
+            for J in (e.J_rig, e.J_marker)
+        )
         rng = np.random.default_rng(0)
-        sampled = (std[:, None] * rng.standard_normal((len(self.ids), 8)) for _ in range(_SAMPLES))
-        steps = self.equations.responses(blocks, (self._gradients(e, off[self.marker]) for off in sampled))
-        return None if steps is None else steps @ np.swapaxes(steps, -1, -2) / _SAMPLES
-
-    def _gradients(self, e: _Evaluation, off: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """J' r of each view's keyframe and marker, both (n, 6), for corners that are ``off`` (n, 8) [px]."""
-        r = (self.W @ off.reshape(-1, 4, 2, 1)).reshape(-1, 8, 1) * e.weights[:, None, None]
-        rig, marker = ((np.swapaxes(J, -1, -2) @ r)[..., 0] for J in (e.J_rig, e.J_marker))
-        return rig, marker
+        for _ in range(_SAMPLES // _AT_ONCE):
+            off = (std[:, None, None] * rng.standard_normal((len(self.ids), 8, _AT_ONCE)))[self.marker]
+            steps = self.equations.responses(system, rig @ off, marker @ off)
+            covariances += steps @ np.swapaxes(steps, -1, -2) / _SAMPLES
+        return covariances
 
     def _hangs_twice(self, marker: int, after: _Evaluation) -> bool:
         own = self.marker == marker

@@ -154,7 +154,20 @@ class KeyframeStore:
         }
         return displacement
 
+    def selected(self, views: int) -> tuple[Keyframe, ...]:
+        """Keyframes of at most about so many markers' views, spread like all of them."""
+        total = sum(len(frame.ids) for frame in self.frames.values())
+        if total <= views:
+            return tuple(self.frames.values())
+        kept = self._spread(max(len(self.frames) * views // total, 1))
+        return tuple(frame for stamp, frame in self.frames.items() if stamp in kept)
+
     def _thin(self, room: int) -> None:
+        kept = self._spread(room)
+        self.frames = {stamp: frame for stamp, frame in self.frames.items() if stamp in kept}
+
+    def _spread(self, room: int) -> set[int]:
+        """Stamps of about ``room`` keyframes from all places and directions, and of all that odometry links."""
         linked = {stamp for link in self.links for stamp in (link.stamp_a_ns, link.stamp_b_ns)}
         coarseness = 1.0
         while len(cells := self._cells(coarseness)) > room:
@@ -164,7 +177,7 @@ class KeyframeStore:
         for stamps in cells.values():
             chosen = np.linspace(0, len(stamps) - 1, min(share, len(stamps))).round().astype(int)
             kept.update(stamps[i] for i in chosen)
-        self.frames = {stamp: frame for stamp, frame in self.frames.items() if stamp in kept}
+        return kept
 
     def _cells(self, coarseness: float) -> dict[tuple[int, ...], list[int]]:
         """Stamps of the keyframes by cell of camera position and viewing direction."""

@@ -9,6 +9,7 @@ on them, covariances carry the map's own uncertainty, and markers that stop agre
 
 from collections import deque
 from dataclasses import replace
+import sys
 
 import numpy as np
 
@@ -59,6 +60,10 @@ _RECENT, _EVERY = 10, 3
 _PATIENCE = 6
 # A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
 _GROWTH, _FEW = 0.2, 15
+#: Views of markers that a refinement in flight takes: a second or two of a slow core.
+VIEWS = 10_000
+# Time between two refinements for each view of the last [s]: a view takes a tenth of it on a slow core.
+_PERIOD_A_VIEW = 1e-3
 
 
 class MarkerMapper:
@@ -117,7 +122,7 @@ class MarkerMapper:
         self._gap: CameraPose | None = None
         self._keyframes = KeyframeStore(self.config.keyframe_budget)
         self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(self.map.markers)
-        self._frames_then = 0
+        self._frames_then, self._refined_views = 0, 0
 
     def process(
         self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None
@@ -325,22 +330,29 @@ class MarkerMapper:
 
     def refinement_due(self, stamp_ns: int) -> bool:
         """Whether enough has been seen since the last joint refinement for another to be worth its time."""
-        period = self.config.refinement_period
-        if self.frozen or not self._keyframes.frames or period == 0.0 or stamp_ns - self._refined_ns < period * 1e9:
+        if self.frozen or not self._keyframes.frames or self.config.refinement_period == 0.0:
+            return False
+        period = max(self.config.refinement_period, _PERIOD_A_VIEW * self._refined_views)
+        if stamp_ns - self._refined_ns < period * 1e9:
             return False
         enough = self._keyframes.added - self._frames_then >= _GROWTH * self._refined_frames + _FEW
         return enough or len(self.map.markers) > self._refined_markers
 
-    def snapshot(self) -> Snapshot | None:
+    def snapshot(self, views: int = VIEWS) -> Snapshot | None:
         """What a refinement works on, for ``bundle_adjustment.refine``; None: nothing yet.
 
         The snapshot is immutable: the refinement may run elsewhere while frames are processed.
+
+        Parameters
+        ----------
+        views : about so many views of markers at most, which bounds its time
         """
         if not self._keyframes.frames:
             return None
-        frames = tuple(self._keyframes.frames.values())
-        self._refined_ns = frames[-1].stamp_ns
-        self._refined_frames, self._refined_markers = len(frames), len(self.map.markers)
+        frames = self._keyframes.selected(views)
+        self._refined_ns = next(reversed(self._keyframes.frames))
+        self._refined_frames, self._refined_markers = len(self._keyframes.frames), len(self.map.markers)
+        self._refined_views = sum(len(frame.ids) for frame in frames)
         self._frames_then = self._keyframes.added
         return Snapshot(
             {key: marker for key, marker in self.map.markers.items() if marker.trusted},
@@ -353,8 +365,8 @@ class MarkerMapper:
         )
 
     def refine(self) -> Refinement | None:
-        """Refine here and now, and take it over: for tools, and wherever time doesn't press."""
-        snapshot = self.snapshot()
+        """Refine here and now with all keyframes, and take it over: for tools, and wherever time doesn't press."""
+        snapshot = self.snapshot(views=sys.maxsize)
         refinement = refine(snapshot) if snapshot is not None else None
         if refinement is not None:
             self.apply(refinement)

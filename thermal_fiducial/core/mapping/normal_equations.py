@@ -1,6 +1,5 @@
 """Normal equations of a bundle adjustment over keyframes and markers: Schur complement, solution, covariances."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,8 +10,8 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 # Columns of the inverse that are computed at a time.
 _CHUNK = 96
-# Pairs of views of one keyframe that are multiplied at a time: bounds the memory.
-_PAIRS = 50_000
+# Unknowns up to which a dense factorisation is faster than a sparse one.
+_DENSE = 1500
 
 
 @dataclass(frozen=True)
@@ -33,6 +32,17 @@ class Blocks:
     #: (F, 6, 6) and (F, 6), J' J and J' r of what is known of the keyframes' poses beside the views
     known: FloatArray
     known_gradient: FloatArray
+
+
+@dataclass(frozen=True)
+class ReducedSystem:
+    """Schur complement over markers and tied keyframes (``nodes``)."""
+
+    #: sparse (6 nodes, 6 nodes), and the factors of its free part
+    matrix: Any
+    factor: Any
+    #: (n, 6, 6) what each view of a loose keyframe takes of that one's right side
+    eliminated: FloatArray
 
 
 class NormalEquations:
@@ -75,50 +85,40 @@ class NormalEquations:
             return None
         return frames, nodes[: self._markers]
 
-    def responses(self, blocks: Blocks, sides: Iterable[tuple[FloatArray, FloatArray]]) -> FloatArray | None:
-        """How far the markers go (M, 6, K) for each of K other right sides; None where the system is singular.
-
-        Parameters
-        ----------
-        sides : J' r of each view's keyframe and marker, both (n, 6), in place of those of ``blocks``
-        """
+    def reduced(self, blocks: Blocks) -> 'ReducedSystem | None':
+        """The undamped system without its loose keyframes, factorised; None where it is singular."""
         H_ff, g_f = self._frame_terms(blocks, 0.0)
         H_inverse = _inverse(H_ff)
         S, _ = self._reduced(blocks, H_inverse, g_f, 0.0)
-        lu = _factorise(self._select(S, self._free, self._free))
-        if lu is None:
-            return None
-        eliminated = self._eliminated(blocks, H_inverse)
-        g = np.stack([self._right_side(eliminated, *side) for side in sides], axis=-1)
+        factor = _factorise(self._select(S, self._free, self._free))
+        return None if factor is None else ReducedSystem(S, factor, self._eliminated(blocks, H_inverse))
+
+    def responses(self, system: 'ReducedSystem', rig: FloatArray, marker: FloatArray) -> FloatArray:
+        """How far the markers go (M, 6, K) for each of K other right sides.
+
+        Parameters
+        ----------
+        rig, marker : J' r of each view's keyframe and marker, both (n, 6, K), in place of those of the blocks
+        """
+        of_frames = np.add.reduceat(rig, np.flatnonzero(np.diff(self.frame, prepend=-1)), axis=0)
+        g = np.zeros((self._nodes, *rig.shape[1:]))
+        np.add.at(g, self.marker, marker - system.eliminated @ of_frames[self.frame])
+        g[self._tied_node[self.tied]] = of_frames[self.tied]
         nodes = np.zeros_like(g)
-        nodes[self._free] = lu.solve(g[self._free].reshape(-1, g.shape[-1])).reshape(-1, *g.shape[1:])
+        nodes[self._free] = system.factor.solve(g[self._free].reshape(-1, g.shape[-1])).reshape(-1, *g.shape[1:])
         return np.asarray(nodes[: self._markers])
 
-    def _right_side(self, eliminated: FloatArray, rig: FloatArray, marker: FloatArray) -> FloatArray:
-        """Right side (nodes, 6) of the reduced system from those of the views."""
-        of_frames = np.add.reduceat(rig, np.flatnonzero(np.diff(self.frame, prepend=-1)), axis=0)
-        g = np.zeros((self._nodes, 6))
-        np.add.at(g, self.marker, marker - (eliminated @ of_frames[self.frame][..., None])[..., 0])
-        g[self._tied_node[self.tied]] = of_frames[self.tied]
-        return g
-
-    def covariances(self, blocks: Blocks, factor: float, held_covariances: FloatArray) -> FloatArray | None:
+    def covariances(self, system: 'ReducedSystem', factor: float, held_covariances: FloatArray) -> FloatArray:
         """Covariances (M, 6, 6) of the markers: noise times ``factor``, and what the held markers (M, 6, 6) pass on."""
-        H_ff, g_f = self._frame_terms(blocks, 0.0)
-        S, _ = self._reduced(blocks, _inverse(H_ff), g_f, 0.0)
-        lu = _factorise(self._select(S, self._free, self._free))
-        if lu is None:
-            return None
         result = held_covariances.copy()
         unknown = self._free[self._free < self._markers]
-        result[unknown] = factor * _diagonal_blocks(lu, len(self._free))[: len(unknown)]
+        result[unknown] = factor * _diagonal_blocks(system.factor, len(self._free))[: len(unknown)]
         for node in self._held_nodes:
             if np.any(held_covariances[node]):
-                S_held = self._select(S, self._free, np.array([node])).toarray()
-                gains = -lu.solve(S_held).reshape(-1, 6, 6)[: len(unknown)]
+                S_held = self._select(system.matrix, self._free, np.array([node])).toarray()
+                gains = -system.factor.solve(S_held).reshape(-1, 6, 6)[: len(unknown)]
                 result[unknown] += gains @ held_covariances[node] @ np.swapaxes(gains, -1, -2)
-        symmetric = 0.5 * (result + np.swapaxes(result, -1, -2))
-        return symmetric if np.all(np.isfinite(symmetric)) else None
+        return np.asarray(0.5 * (result + np.swapaxes(result, -1, -2)))
 
     def _frame_terms(self, blocks: Blocks, damping: float) -> tuple[FloatArray, FloatArray]:
         starts = np.flatnonzero(np.diff(self.frame, prepend=-1))
@@ -149,7 +149,7 @@ class NormalEquations:
             g[node_b] += J_b.T @ e
             ends = ((node_a, J_a), (node_b, J_b))
             terms += [(np.array([i]), np.array([j]), (J_i.T @ J_j)[None]) for i, J_i in ends for j, J_j in ends]
-        S = self._eliminated_pairs(blocks, eliminated)
+        S = self._eliminated_pairs(blocks, H_inverse)
         return S + self._assemble(terms), g
 
     def _eliminated(self, blocks: Blocks, H_inverse: FloatArray) -> FloatArray:
@@ -163,32 +163,46 @@ class NormalEquations:
         rows, columns, cross = self._tied_node[self.frame[~loose]], self.marker[~loose], blocks.cross[~loose]
         return [(rows, columns, cross), (columns, rows, np.swapaxes(cross, -1, -2))]
 
-    def _eliminated_pairs(self, blocks: Blocks, eliminated: FloatArray) -> Any:
-        """What the elimination of keyframes takes from each pair of markers that one of them sees."""
-        first, second, order, starts = self._pairs
-        merged = np.zeros((len(starts), 6, 6))
-        group = np.cumsum(np.bincount(starts, minlength=len(order))) - 1 if len(order) else np.zeros(0, dtype=int)
-        for low in range(0, len(order), _PAIRS):
-            chosen = order[low : low + _PAIRS]
-            products = eliminated[first[chosen]] @ blocks.cross[second[chosen]]
-            inside = group[low : low + _PAIRS]
-            begin = np.flatnonzero(np.diff(inside, prepend=-1))
-            merged[inside[begin]] -= np.add.reduceat(products, begin, axis=0)
-        heads = order[starts]
-        return self._assemble([(self.marker[first[heads]], self.marker[second[heads]], merged)])
+    def _eliminated_pairs(self, blocks: Blocks, H_inverse: FloatArray) -> Any:
+        """What the elimination of keyframes takes from each pair of markers that one of them sees.
+
+        A keyframe of k views takes one product of (6 k, 6) matrices, not k^2 of (6, 6).
+        """
+        from scipy.sparse import bsr_array
+
+        rows, columns, target, twice = self._pairs
+        data = np.zeros((len(rows), 6, 6))
+        bounds = np.flatnonzero(np.diff(self.frame, prepend=-1, append=self._frames))
+        begin = 0
+        for frame in np.flatnonzero(~self.tied):
+            low, high = bounds[frame], bounds[frame + 1]
+            k = high - low
+            cross = np.swapaxes(blocks.cross[low:high], 0, 1).reshape(6, 6 * k)
+            product = (cross.T @ (H_inverse[frame] @ cross)).reshape(k, 6, k, 6).swapaxes(1, 2).reshape(k * k, 6, 6)
+            at = target[begin : begin + k * k]
+            begin += k * k
+            if twice:
+                np.subtract.at(data, at, product)
+            else:
+                data[at] -= product
+        starts = np.searchsorted(rows, np.arange(self._nodes + 1))
+        return bsr_array((data, columns, starts), shape=(6 * self._nodes, 6 * self._nodes)).tocsr()
 
     @cached_property
-    def _pairs(self) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-        """Pairs of views of one loose keyframe, their order by the two markers, and where each group of it starts."""
+    def _pairs(self) -> tuple[IntArray, IntArray, IntArray, bool]:
+        """Markers of each pair that a loose keyframe sees, rising, and which of them each of its pairs of views is.
+
+        The last says whether any keyframe sees a marker twice, with two cameras.
+        """
         counts = np.bincount(self.frame, minlength=self._frames)
         counts_of_view = np.where(self.tied[self.frame], 0, counts[self.frame])
         first = np.repeat(np.arange(len(self.frame)), counts_of_view)
         begin = np.concatenate([[0], np.cumsum(counts)[:-1]])[self.frame]
         within = np.arange(len(first)) - np.repeat(np.cumsum(counts_of_view) - counts_of_view, counts_of_view)
         second = np.repeat(begin, counts_of_view) + within
-        key = self.marker[first] * self._markers + self.marker[second]
-        order = np.argsort(key, kind='stable')
-        return first, second, order, np.flatnonzero(np.diff(key[order], prepend=-1))
+        keys, target = np.unique(self.marker[first] * self._markers + self.marker[second], return_inverse=True)
+        seen = np.unique(self.frame * self._markers + self.marker)
+        return keys // self._markers, keys % self._markers, target, len(seen) < len(self.frame)
 
     def _assemble(self, terms: list[tuple[IntArray, IntArray, FloatArray]]) -> Any:
         """Sparse matrix of 6 x 6 blocks at (row, column); blocks at one place add up."""
@@ -220,13 +234,28 @@ def _inverse(H: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(H), dtype=np.float64)
 
 
+@dataclass(frozen=True)
+class _Cholesky:
+    """A dense factor with the interface of scipy's sparse one."""
+
+    factor: tuple[FloatArray, bool]
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        from scipy.linalg import cho_solve
+
+        return np.asarray(cho_solve(self.factor, right, check_finite=False))
+
+
 def _factorise(S: Any) -> Any:
-    """LU factors of a sparse matrix; None when it is singular."""
+    """Factors of a sparse matrix; None when it is singular."""
+    from scipy.linalg import cho_factor
     from scipy.sparse.linalg import splu
 
     try:
+        if S.shape[0] <= _DENSE:
+            return _Cholesky(cho_factor(S.toarray(), lower=True, overwrite_a=True))
         return splu(S.tocsc(), permc_spec='MMD_AT_PLUS_A', options={'SymmetricMode': True}, diag_pivot_thresh=0.0)
-    except RuntimeError:
+    except (RuntimeError, ValueError, np.linalg.LinAlgError):
         return None
 
 
