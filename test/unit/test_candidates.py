@@ -8,7 +8,7 @@ from support.small_bag import CAMERA as STRAIGHT
 
 from thermal_fiducial.core.geometry.planar_pose import marker_corners
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
-from thermal_fiducial.core.mapping.candidates import Candidate, View, Viewpoint
+from thermal_fiducial.core.mapping.candidates import Candidate, MarkerView, Viewpoint
 
 # What lies far beside the axis a lens with distortion throws farthest.
 CAMERA = replace(STRAIGHT, D=np.array([-0.3, 0.12, 0.0, 0.0, -0.02]))
@@ -21,7 +21,7 @@ def view(stamp_ns, T_map_camera, covariance=1e-3):
     branch = transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 2.0])
     corners = CAMERA.project((branch[:3, :3] @ marker_corners(SIZE).T).T + branch[:3, 3])
     viewpoint = Viewpoint.known(T_map_camera, covariance * np.eye(6))
-    return View(stamp_ns, viewpoint, corners, np.tile(1e-4 * np.eye(2), (4, 1, 1)), np.stack([branch] * 2))
+    return MarkerView(stamp_ns, viewpoint, corners, np.tile(1e-4 * np.eye(2), (4, 1, 1)), np.stack([branch] * 2))
 
 
 @pytest.mark.parametrize('gap', [0.0, 1e-12, 1e-9, 1e-6, 1e-3])

@@ -70,7 +70,7 @@ def _snapshot(markers: Mapping[int, MapMarker], keyframes: tuple[Any, ...], *res
 
 
 @dataclass(frozen=True)
-class Refinement:
+class AdjustedMap:
     """The outcome of a refinement."""
 
     #: adjusted markers by ID; those that were held are not among them
@@ -92,7 +92,7 @@ class Refinement:
     map_version: int
 
 
-def refine(snapshot: Snapshot) -> Refinement | None:
+def refine(snapshot: Snapshot) -> AdjustedMap | None:
     """Adjust the map to all keyframes; None when they don't determine anything."""
     problem = _Problem.build(snapshot)
     if problem is None:
@@ -108,7 +108,7 @@ def refine(snapshot: Snapshot) -> Refinement | None:
     return problem.result(snapshot, state, before, problem.evaluate(state, scale), iterations)
 
 
-def _minimise(problem: '_Problem', state: '_State', scale: float) -> tuple['_State', int]:
+def _minimise(problem: '_Problem', state: '_Poses', scale: float) -> tuple['_Poses', int]:
     """Levenberg-Marquardt; the state at the minimum and the number of steps."""
     evaluation = problem.evaluate(state, scale)
     damping, steps = 1e-5, 0
@@ -142,7 +142,7 @@ def prior_poses(markers: Mapping[int, MapMarker]) -> dict[int, tuple[FloatArray,
 
 
 @dataclass(frozen=True)
-class _State:
+class _Poses:
     T_map_rig: FloatArray
     T_map_marker: FloatArray
 
@@ -163,7 +163,7 @@ class _Evaluation:
 class _Problem:
     """The snapshot as arrays: n views, F keyframes, M markers, views ordered by keyframe."""
 
-    start: _State
+    start: _Poses
     ids: list[int]
     stamps: list[int]
     sizes: FloatArray
@@ -200,7 +200,7 @@ class _Problem:
         for a, b, _, _ in joined:
             tied[[a, b]] = True
         return cls(
-            start=_State(np.stack([f.T_map_rig for f in frames]), np.stack([m.T_map_marker for m in markers])),
+            start=_Poses(np.stack([f.T_map_rig for f in frames]), np.stack([m.T_map_marker for m in markers])),
             ids=seen,
             stamps=[f.stamp_ns for f in frames],
             sizes=np.array([m.size for m in markers]),
@@ -222,7 +222,7 @@ class _Problem:
             equations=NormalEquations(frame, marker, tied, held),
         )
 
-    def evaluate(self, state: _State, scale: float) -> _Evaluation:
+    def evaluate(self, state: _Poses, scale: float) -> _Evaluation:
         """Whitened residuals, derivatives, robust weights and cost, for corners of ``scale`` times their variance."""
         n = len(self.frame)
         T_map_rig = state.T_map_rig[self.frame]
@@ -250,17 +250,17 @@ class _Problem:
         whitened = [(self.W @ J.reshape(n, 4, 2, 6)).reshape(n, 8, 6) for J in (J_camera, J_marker)]
         return _Evaluation(cost, r, whitened[0], whitened[1], weights, chi2, np.sum(residuals**2, axis=(1, 2)))
 
-    def step(self, state: _State, evaluation: _Evaluation, damping: float) -> _State | None:
+    def step(self, state: _Poses, evaluation: _Evaluation, damping: float) -> _Poses | None:
         """The state after one damped Gauss-Newton step; None where the equations are singular."""
         solution = self.equations.solve(self._blocks(state, evaluation), damping)
         if solution is None:
             return None
         frames, markers = solution
-        return _State(retract(state.T_map_rig, frames), retract(state.T_map_marker, markers))
+        return _Poses(retract(state.T_map_rig, frames), retract(state.T_map_marker, markers))
 
     def result(
-        self, snapshot: Snapshot, state: _State, before: _Evaluation, after: _Evaluation, iterations: int
-    ) -> Refinement | None:
+        self, snapshot: Snapshot, state: _Poses, before: _Evaluation, after: _Evaluation, iterations: int
+    ) -> AdjustedMap | None:
         """The outcome with its covariances; None where these do not exist."""
         n = len(self.frame)
         unknowns = 6 * (len(self.stamps) + np.count_nonzero(~self.held))
@@ -285,7 +285,7 @@ class _Problem:
             if not self.held[i]
         }
         outlying = np.bincount(self.marker, ~full) / np.bincount(self.marker)
-        return Refinement(
+        return AdjustedMap(
             adjusted,
             dict(zip(self.stamps, state.T_map_rig, strict=True)),
             float(np.sqrt(np.sum(before.squared_px) / (4 * n))),
@@ -325,7 +325,7 @@ class _Problem:
         own = self.marker == marker
         return hangs_twice(after.r[own], after.J_marker[own], after.weights[own] < 1.0)
 
-    def _blocks(self, state: _State, e: _Evaluation) -> Blocks:
+    def _blocks(self, state: _Poses, e: _Evaluation) -> Blocks:
         weighted_rig = np.swapaxes(e.J_rig, -1, -2) * e.weights[:, None, None]
         weighted_marker = np.swapaxes(e.J_marker, -1, -2) * e.weights[:, None, None]
         apart, chi2 = self._odometry_chi2(state)
@@ -342,12 +342,12 @@ class _Problem:
             known_gradient=(known @ apart[..., None])[..., 0],
         )
 
-    def _odometry_chi2(self, state: _State) -> tuple[FloatArray, FloatArray]:
+    def _odometry_chi2(self, state: _Poses) -> tuple[FloatArray, FloatArray]:
         """How far each keyframe is from where odometry has it (F, 6), and the chi square of that (F,)."""
         apart = difference(self.T_odometry, state.T_map_rig)
         return apart, np.einsum('fi,fij,fj->f', apart, self.information, apart)
 
-    def _linked(self, state: _State) -> list[tuple[int, int, FloatArray, FloatArray, FloatArray]]:
+    def _linked(self, state: _Poses) -> list[tuple[int, int, FloatArray, FloatArray, FloatArray]]:
         """Frames a and b, whitened residual (6,) of each link, and the derivatives of its prediction."""
         terms = []
         for a, b, T_a_b, root in self.links:
@@ -362,7 +362,7 @@ class _Problem:
             terms.append((a, b, root @ e, root @ J_a, root @ J_b))
         return terms
 
-    def _prior_terms(self, state: _State) -> list[tuple[int, FloatArray, FloatArray]]:
+    def _prior_terms(self, state: _Poses) -> list[tuple[int, FloatArray, FloatArray]]:
         """Marker, whitened residual (6,) of each prior, and the derivative of its prediction."""
         return [(m, root @ difference(T, state.T_map_marker[m]), root) for m, T, root in self.priors]
 

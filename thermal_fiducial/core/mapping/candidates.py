@@ -59,7 +59,7 @@ class Viewpoint:
 
 
 @dataclass(frozen=True)
-class View:
+class MarkerView:
     """A marker in one frame."""
 
     stamp_ns: int
@@ -87,14 +87,14 @@ class Candidate:
 
     id: int
     size: float
-    views: list[View] = field(default_factory=list)
+    views: list[MarkerView] = field(default_factory=list)
     #: what it waits for, in words
     reason: str = 'not judged yet'
     #: views since it was last judged
     untried: int = 0
     _directions: list[FloatArray] = field(default_factory=list)
 
-    def add(self, view: View) -> bool:
+    def add(self, view: MarkerView) -> bool:
         """Keep ``view`` if it shows the marker from a new direction; whether it did."""
         # Both branches put the centre at the same place: the direction doesn't depend on the ambiguity.
         arm = view.viewpoint.T_map_camera[0, :3, :3] @ view.branches[0, :3, 3]
@@ -155,7 +155,7 @@ class Candidate:
         index = int(np.argmax(np.max(cosines, axis=1)))
         del self.views[index], self._directions[index]
 
-    def _fits(self, camera: Camera) -> list['_Fit']:
+    def _fits(self, camera: Camera) -> list['_MarkerFit']:
         """Fits from every branch of two views far apart, the best first."""
         pairs = [view.viewpoint.poses[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
         starts = np.concatenate([pair.reshape(-1, 4, 4) for pair in pairs])
@@ -164,7 +164,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _MarkerFit:
     T: FloatArray
     chi2: float
     #: minus twice the logarithm of the likelihood: comparable where the residuals' covariances are not the same
@@ -173,7 +173,7 @@ class _Fit:
     from_cameras: FloatArray
 
 
-def _fit(start: FloatArray, size: float, views: list[View], camera: Camera) -> _Fit:
+def _fit(start: FloatArray, size: float, views: list[MarkerView], camera: Camera) -> _MarkerFit:
     """Fit of one marker to views; of a camera's two poses the one that suits the marker better is taken."""
     chosen = _choose(start, size, views, camera)
     fit = _fit_chosen(start, size, views, chosen, camera)
@@ -185,7 +185,7 @@ def _fit(start: FloatArray, size: float, views: list[View], camera: Camera) -> _
     return fit
 
 
-def _choose(T: FloatArray, size: float, views: list[View], camera: Camera) -> IntArray:
+def _choose(T: FloatArray, size: float, views: list[MarkerView], camera: Camera) -> IntArray:
     """Which of its two camera poses suits each of n views, (n,), for a marker at T."""
     n = len(views)
     if all(len(view.viewpoint.poses) == 1 for view in views):
@@ -199,7 +199,9 @@ def _choose(T: FloatArray, size: float, views: list[View], camera: Camera) -> In
     return np.asarray(np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=1), dtype=np.int64)
 
 
-def _fit_chosen(start: FloatArray, size: float, views: list[View], chosen: IntArray, camera: Camera) -> _Fit:
+def _fit_chosen(
+    start: FloatArray, size: float, views: list[MarkerView], chosen: IntArray, camera: Camera
+) -> _MarkerFit:
     n = len(views)
     T_map_camera = np.stack([view.viewpoint.T_map_camera[i] for view, i in zip(views, chosen, strict=True)])
     camera_covariances = np.stack([view.viewpoint.covariances[i] for view, i in zip(views, chosen, strict=True)])
@@ -208,7 +210,7 @@ def _fit_chosen(start: FloatArray, size: float, views: list[View], chosen: IntAr
     _, J, _ = linearise(camera, T_map_camera, np.broadcast_to(start, (n, 4, 4)), sizes)
     W, log_determinants = _whitening(views, J, camera_covariances)
     if not np.isfinite(log_determinants).all():
-        return _Fit(start, np.inf, np.inf, np.zeros((6, 6)), np.zeros((6, 6)))
+        return _MarkerFit(start, np.inf, np.inf, np.zeros((6, 6)), np.zeros((6, 6)))
 
     def evaluate(T: FloatArray) -> tuple[FloatArray, FloatArray]:
         uv, _, J = linearise(camera, T_map_camera, np.broadcast_to(T, (n, 4, 4)), sizes)
@@ -216,18 +218,18 @@ def _fit_chosen(start: FloatArray, size: float, views: list[View], chosen: IntAr
 
     T, chi2 = fit_pose(start, evaluate)
     if not np.isfinite(chi2):
-        return _Fit(T, np.inf, np.inf, np.zeros((6, 6)), np.zeros((6, 6)))
+        return _MarkerFit(T, np.inf, np.inf, np.zeros((6, 6)), np.zeros((6, 6)))
     _, J_camera, J_marker = linearise(camera, T_map_camera, np.broadcast_to(T, (n, 4, 4)), sizes)
     J_camera, J_marker = W @ J_camera, W @ J_marker
     noise = np.linalg.inv(np.einsum('vri,vrj->ij', J_marker, J_marker))
     gains = -noise @ np.einsum('vri,vrj->vij', J_marker, J_camera)
     common = np.stack([view.viewpoint.common for view in views])
     from_cameras = correlated_sum(gains, camera_covariances) + correlated_sum(gains, common)
-    return _Fit(T, chi2, chi2 + float(np.sum(log_determinants)), noise, from_cameras)
+    return _MarkerFit(T, chi2, chi2 + float(np.sum(log_determinants)), noise, from_cameras)
 
 
 def _whitening(
-    views: Sequence[View], J_camera: FloatArray, camera_covariances: FloatArray
+    views: Sequence[MarkerView], J_camera: FloatArray, camera_covariances: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Matrices (n, 8, 8) that make the residuals of n views unit white, and the logarithms of their determinants (n,).
 

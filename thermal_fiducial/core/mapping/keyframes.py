@@ -49,10 +49,9 @@ class Keyframe:
     T_odometry: FloatArray = field(default_factory=lambda: np.eye(4))
     information: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
-
-def in_moved_map(frame: Keyframe, T_new_old: FloatArray) -> Keyframe:
-    """``frame`` in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-    return replace(frame, T_map_rig=T_new_old @ frame.T_map_rig, T_odometry=T_new_old @ frame.T_odometry)
+    def moved(self, T_new_old: FloatArray) -> 'Keyframe':
+        """The keyframe in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
+        return replace(self, T_map_rig=T_new_old @ self.T_map_rig, T_odometry=T_new_old @ self.T_odometry)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from thermal_fiducial.core.detection.marker_rows import marker_rows
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
 from thermal_fiducial.core.geometry.se3 import rotation_angle
-from thermal_fiducial.core.mapping.bundle_adjustment import refine, Refinement, Snapshot
+from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine, Snapshot
 from thermal_fiducial.core.mapping.candidates import DECISIVE, SAME_FIT
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
@@ -29,7 +29,7 @@ class Built:
 
     map: MarkerMap
     #: the last joint adjustment; None: there was nothing to adjust
-    refinement: Refinement | None
+    refinement: AdjustedMap | None
     #: markers that were seen but could not be placed, with the reason in words
     unplaced: dict[int, str]
     #: frames that gave a camera pose in the end

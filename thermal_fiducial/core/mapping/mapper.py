@@ -19,10 +19,10 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise, reproject
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.bridging import link
-from thermal_fiducial.core.mapping.bundle_adjustment import prior_poses, refine, Refinement, Snapshot
-from thermal_fiducial.core.mapping.candidates import Candidate, View, Viewpoint
+from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, prior_poses, refine, Snapshot
+from thermal_fiducial.core.mapping.candidates import Candidate, MarkerView, Viewpoint
 from thermal_fiducial.core.mapping.correction import correction
-from thermal_fiducial.core.mapping.keyframes import in_moved_map, Keyframe, KeyframeStore, Rig
+from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore, Rig
 from thermal_fiducial.core.mapping.localization import locate, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.located import Located, LocatedFrame
 from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
@@ -265,7 +265,7 @@ class MarkerMapper:
         for i, marker_id in enumerate(int(key) for key in rows['id']):
             size = self._sizes.get(marker_id, self.config.marker_size)
             candidate = self._candidates.setdefault(marker_id, Candidate(marker_id, size))
-            candidate.add(View(frame.stamp_ns, viewpoint, corners[i], covariances[i], branches[i]))
+            candidate.add(MarkerView(frame.stamp_ns, viewpoint, corners[i], covariances[i], branches[i]))
             shown.append(candidate)
         placed = False
         for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:
@@ -364,7 +364,7 @@ class MarkerMapper:
             self._errors,
         )
 
-    def refine(self) -> Refinement | None:
+    def refine(self) -> AdjustedMap | None:
         """Refine here and now with all keyframes, and take it over: for tools, and wherever time doesn't press."""
         snapshot = self.snapshot(views=sys.maxsize)
         refinement = refine(snapshot) if snapshot is not None else None
@@ -372,7 +372,7 @@ class MarkerMapper:
             self.apply(refinement)
         return refinement
 
-    def apply(self, refinement: Refinement) -> MapJump | None:
+    def apply(self, refinement: AdjustedMap) -> MapJump | None:
         """Take over a refinement: markers, keyframes, candidates and the last pose move together.
 
         Returns
@@ -398,10 +398,10 @@ class MarkerMapper:
         T_new_old = np.eye(4)
         if self._last is not None and self._last_frame is not None:
             T_new_old = correction(tuple(self._recent)[::_EVERY], self._cameras, before, self.map.markers, self._belief)
-            self._recent = deque((in_moved_map(frame, T_new_old) for frame in self._recent), maxlen=_RECENT)
+            self._recent = deque((frame.moved(T_new_old) for frame in self._recent), maxlen=_RECENT)
             self._last = replace(self._last, T_map_camera=T_new_old @ self._last.T_map_camera)
             self._motion = CameraMotion()
-            self._last_frame = in_moved_map(self._last_frame, T_new_old)
+            self._last_frame = self._last_frame.moved(T_new_old)
         self.map.revision += 1
         self.resets += 1
         return MapJump(self.map.revision, self.resets, T_new_old)
