@@ -114,8 +114,8 @@ def test_the_better_of_two_poses_prevails(place, own, sigma):
     fused = together(markers, own**2 * np.eye(6), np.zeros((6, 6)), CameraPose(0, other, sigma**2 * np.eye(6)))
     np.testing.assert_allclose(fused.T_map_camera, (other, markers)[place], atol=1e-6)
     # Neither is counted for more than it is worth.
-    assert np.all(np.diagonal(fused.changing + fused.lasting) <= 1.01 * min(own, sigma) ** 2)
-    assert np.all(np.diagonal(fused.changing + fused.lasting) >= 0.99 * min(own, sigma) ** 2)
+    assert np.all(np.diagonal(fused.white + fused.systematic) <= 1.01 * min(own, sigma) ** 2)
+    assert np.all(np.diagonal(fused.white + fused.systematic) >= 0.99 * min(own, sigma) ** 2)
 
 
 def test_odometry_that_contradicts_the_markers_is_left_out():
@@ -123,4 +123,4 @@ def test_odometry_that_contradicts_the_markers_is_left_out():
     own = 1e-4 * np.eye(6)
     fused = together(markers, own, np.zeros((6, 6)), CameraPose(0, other, 1e-6 * np.eye(6)))
     np.testing.assert_array_equal(fused.T_map_camera, markers)
-    np.testing.assert_array_equal(fused.changing, own)
+    np.testing.assert_array_equal(fused.white, own)

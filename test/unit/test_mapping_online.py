@@ -11,7 +11,7 @@ from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_editing import transformed
-from thermal_fiducial.core.mapping.mapper import ASTRAY, MapMarker, MarkerMap, MarkerMapper
+from thermal_fiducial.core.mapping.mapper import CONTRADICTED, MapMarker, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import Odometry
 
 # The body is the camera: odometry and camera pose are one.
@@ -225,7 +225,7 @@ def test_a_marker_that_hangs_in_two_places_teaches_nothing():
         result = m.process(stamp(k), see(T, poses, 0.02, rng), CAMERA, odometry(k, away @ T, np.eye(4), covariance))
         assert result.pose is not None
     assert sorted(m.map.markers) == [0, 1]
-    assert set(result.candidates.values()) == {ASTRAY}
+    assert set(result.candidates.values()) == {CONTRADICTED}
     # Odometry that never was in this map, as another estimator's, is no reason.
     other = from_one_marker(poses, **AS_BODY)
     for k in range(60):

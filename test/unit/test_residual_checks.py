@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.mapping.residual_checks import correlation_time, hangs_twice
+from thermal_fiducial.core.mapping.residual_checks import correlation_time, two_places
 
 
 @pytest.mark.parametrize('memory', [0.0, 0.5, 0.9])
@@ -37,8 +37,8 @@ def test_outliers_that_agree_are_a_second_pose_and_others_are_not():
     noise = rng.normal(size=(views, 8))
     moved = noise + np.where(outlying[:, None], J @ np.array([0.05, 0.0, 0.02, 0.0, 0.1, 0.0]), 0.0)
     scattered = np.where(outlying[:, None], 20.0 * noise, noise)
-    assert hangs_twice(moved, J, outlying)
-    assert not hangs_twice(scattered, J, outlying)
+    assert two_places(moved, J, outlying)
+    assert not two_places(scattered, J, outlying)
     # A few frames, or a few in a hundred, are no evidence.
     few = np.arange(views) < 9
-    assert not hangs_twice(np.where(few[:, None], J @ np.full(6, 0.05), noise), J, few)
+    assert not two_places(np.where(few[:, None], J @ np.full(6, 0.05), noise), J, few)

@@ -22,7 +22,7 @@ from thermal_fiducial.core.geometry.se3 import inverse, skew
 from thermal_fiducial.core.mapping.keyframes import Keyframe, Link, packed, Rig, unpacked
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations, ReducedSystem
-from thermal_fiducial.core.mapping.residual_checks import correlation_time, hangs_twice
+from thermal_fiducial.core.mapping.residual_checks import correlation_time, two_places
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 #: Chi square of a view (8 residuals) up to which it counts in full: 99.9 % of honest ones.
@@ -293,7 +293,7 @@ class _Problem:
             after.cost / max(factor, 1.0),
             factor,
             dict(zip(self.ids, outlying.tolist(), strict=True)),
-            tuple(key for i, key in enumerate(self.ids) if not self.held[i] and self._hangs_twice(i, after)),
+            tuple(key for i, key in enumerate(self.ids) if not self.held[i] and self._two_places(i, after)),
             iterations,
             snapshot.map_version,
         )
@@ -321,9 +321,9 @@ class _Problem:
             covariances += steps @ np.swapaxes(steps, -1, -2) / _SAMPLES
         return covariances
 
-    def _hangs_twice(self, marker: int, after: _Evaluation) -> bool:
+    def _two_places(self, marker: int, after: _Evaluation) -> bool:
         own = self.marker == marker
-        return hangs_twice(after.r[own], after.J_marker[own], after.weights[own] < 1.0)
+        return two_places(after.r[own], after.J_marker[own], after.weights[own] < 1.0)
 
     def _blocks(self, state: _Poses, e: _Evaluation) -> Blocks:
         weighted_rig = np.swapaxes(e.J_rig, -1, -2) * e.weights[:, None, None]

@@ -135,8 +135,8 @@ class Candidate:
         if not best.chi2 <= INCONSISTENT * len(self.views):
             return Placement(None, nothing, f'marker {self.id}: its views contradict each other')
         scale = max(1.0, best.chi2 / (8 * len(self.views) - 6))
-        rivals = [fit for fit in fits[1:] if rotation_angle(fit.T[:3, :3].T @ best.T[:3, :3]) > SAME_FIT]
-        if rivals and rivals[0].cost - best.cost < DECISIVE * scale:
+        others = [fit for fit in fits[1:] if rotation_angle(fit.T[:3, :3].T @ best.T[:3, :3]) > SAME_FIT]
+        if others and others[0].cost - best.cost < DECISIVE * scale:
             return Placement(None, nothing, f'planar ambiguity of marker {self.id} unsettled')
         return Placement(best.T, scale * best.noise + best.from_cameras)
 

@@ -3,7 +3,7 @@
 Poses near the robot move like the localization of its last frames: the same corners, located in the old map and in the
 new one. Where fixed markers alone carry it nothing moves, however much the adjustment has changed its mind about where
 the frames were taken. A filter that the new map does not contradict is left alone: it never stood on what was poorly
-known, and weighs what it knows from gravity and inertia against the poses that follow. Else it is told the share of the
+known, and weighs what it knows from gravity and inertia against the poses that follow. Else it gets the share of the
 movement that brings it nearest to where the new map has those frames.
 """
 

@@ -10,7 +10,7 @@ from thermal_fiducial.core.mapping.odometry_prior import PredictedCamera
 from thermal_fiducial.core.measurements import CameraPose, Markers
 from thermal_fiducial.core.types import BoolArray
 
-#: Attitudes known no better than this [rad] are not told: their covariances, of first order, mean nothing.
+#: Attitudes known no better than this [rad] are not published: their covariances, of first order, mean nothing.
 VAGUE = 0.2
 
 
@@ -24,7 +24,7 @@ class Located:
 
     @property
     def reason(self) -> str:
-        """Why the pose is not to be told, in words; empty where it is."""
+        """Why the pose is not published, in words; empty where it is."""
         std = float(np.sqrt(np.trace(self.location.covariance[3:, 3:])))
         listed = ', '.join(str(key) for key in self.pose.marker_ids)
         return f'known to {np.rad2deg(std):.0f} degrees only, by marker {listed}' if std > VAGUE else ''
@@ -53,5 +53,5 @@ class LocatedFrame:
 
     @property
     def pose(self) -> CameraPose | None:
-        """The pose to be told; None where there is none, or one too vague."""
+        """The pose to publish; None where there is none, or one too vague."""
         return None if isinstance(self.outcome, Refusal) or self.outcome.reason else self.outcome.pose

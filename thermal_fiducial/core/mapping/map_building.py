@@ -19,7 +19,7 @@ from thermal_fiducial.core.types import FloatArray, IntArray
 
 # Passes over all frames: more than any chain of markers needs of which each is seen with the last alone.
 _MAX_PASSES = 50
-# What a rival pose starts its joint adjustment with: as good as unknown.
+# What an alternative pose starts its joint adjustment with: as good as unknown.
 _UNKNOWN = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 
 
@@ -52,7 +52,7 @@ def build_map(
     Parameters
     ----------
     frames : rows of MARKER_DTYPE of each frame
-    progress : is told the number of markers in the map after each pass
+    progress : receives the number of markers in the map after each pass
     """
     config = replace(config, mode='mapping', keyframe_budget=max(len(frames), config.keyframe_budget))
     mapper = MarkerMapper(config, marker_map)
@@ -92,7 +92,7 @@ def _stamp(k: int) -> int:
 
 
 def _settle(mapper: MarkerMapper, camera: Camera) -> bool:
-    """Decide between the rival poses of a candidate by adjusting the map jointly with either; whether one was."""
+    """Decide between the alternative poses of a candidate by adjusting the map jointly with either; whether one was."""
     snapshot = mapper.snapshot()
     if snapshot is None:
         return False
@@ -105,10 +105,10 @@ def _settle(mapper: MarkerMapper, camera: Camera) -> bool:
     return False
 
 
-def decide(snapshot: Snapshot, marker_id: int, size: float, rivals: Sequence[FloatArray]) -> MapMarker | None:
-    """The new marker at that one of the ``rivals``, poses (4, 4), which the joint adjustment prefers decisively."""
+def decide(snapshot: Snapshot, marker_id: int, size: float, alternatives: Sequence[FloatArray]) -> MapMarker | None:
+    """The new marker at that one of ``alternatives``, poses (4, 4), which the joint adjustment clearly prefers."""
     outcomes = []
-    for T in rivals:
+    for T in alternatives:
         trial = MapMarker(marker_id, size, False, T, _UNKNOWN)
         refinement = refine(replace(snapshot, markers={**snapshot.markers, marker_id: trial}))
         if refinement is not None and marker_id in refinement.markers:

@@ -114,7 +114,7 @@ class MapperResult:
 
 @dataclass(frozen=True)
 class MapJump:
-    """A refinement moved the map: poses told before and after don't compare as they are."""
+    """A refinement moved the map: poses published before and after don't compare as they are."""
 
     map_version: int
     #: how often this has happened

@@ -38,7 +38,7 @@ from thermal_fiducial.core.mapping.odometry_prior import (
     PredictedCamera,
     together,
 )
-from thermal_fiducial.core.mapping.trust import culprits, DISAGREEMENT, MEMORY, Trust
+from thermal_fiducial.core.mapping.trust import DISAGREEMENT, inconsistent, MEMORY, Trust
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray
@@ -51,7 +51,7 @@ CONTINUITY_NS = 300_000_000
 #: Why a marker is in quarantine that came so with the map.
 FROM_FILE = 'in quarantine since before the map was loaded'
 #: Why nothing is learned from a frame that has a pose.
-ASTRAY = 'the known markers in view contradict the odometry'
+CONTRADICTED = 'the known markers in view contradict the odometry'
 #: Candidates that are judged in one frame: bounds its time when many are new.
 TRIALS = 3
 # Last frames that tell how the map has moved where the robot is, each so many-th of them: neighbours tell the same.
@@ -158,11 +158,11 @@ class MarkerMapper:
             return self._result(frame, changed, waiting=waiting)
         location, pose = frame.outcome.location, frame.outcome.pose
         if predicted is not None:
-            astray = contradicts(pose.T_map_camera, pose.covariance, predicted.pose)
-            if astray and self._odometry_agreed:
+            contradicted = contradicts(pose.T_map_camera, pose.covariance, predicted.pose)
+            if contradicted and self._odometry_agreed:
                 # A marker that was moved, or that hangs in two places: what it teaches would spoil the map.
-                return self._result(frame, False, waiting=dict.fromkeys(frame.new['id'].tolist(), ASTRAY))
-            self._odometry_agreed |= not astray
+                return self._result(frame, False, waiting=dict.fromkeys(frame.new['id'].tolist(), CONTRADICTED))
+            self._odometry_agreed |= not contradicted
         self._last, self._gap = pose, None
         # Step 7: errors updated.
         errors = self._update_errors(frame, location)
@@ -241,7 +241,7 @@ class MarkerMapper:
         if len(known.markers) < 2:
             return False
         explained = _expected_errors(known, location, frame.camera)
-        blamed = culprits(errors > DISAGREEMENT * explained, frame.trusted, known.markers)
+        blamed = inconsistent(errors > DISAGREEMENT * explained, frame.trusted, known.markers)
         changes = self._trust.judge(known.markers, blamed.tolist())
         for marker, error, sigma in zip(known.markers, errors, explained, strict=True):
             if marker.id in changes:
@@ -377,7 +377,7 @@ class MarkerMapper:
 
         Returns
         -------
-        The jump, to be told to whoever holds poses in the map; None where the map is frozen, or was replaced since.
+        The jump, for whoever holds poses in the map; None where the map is frozen, or was replaced since.
         """
         if self.frozen or refinement.map_version < self._initial.revision:
             return None
@@ -389,7 +389,7 @@ class MarkerMapper:
                     marker, T_map_marker=adjusted.T_map_marker, covariance=adjusted.covariance
                 )
                 if marker_id in refinement.inconsistent:
-                    self._trust.accuse(marker)
+                    self._trust.flag(marker)
                     share = 100.0 * refinement.outliers[marker_id]
                     self._set_standing(marker_id, f'{share:.0f} % of its views contradict the joint refinement')
         displacement = self._keyframes.move(refinement.keyframes)
@@ -447,14 +447,14 @@ class MarkerMapper:
 
 
 def _fused(location: Location, predicted: PredictedCamera | None) -> Fused:
-    lasting = positive(location.covariance - location.errors.relative)
+    systematic = positive(location.covariance - location.errors.relative)
     if predicted is None:
-        return Fused(location.T_map_camera, location.errors.relative, lasting)
-    return together(location.T_map_camera, location.errors.relative, lasting, predicted.pose)
+        return Fused(location.T_map_camera, location.errors.relative, systematic)
+    return together(location.T_map_camera, location.errors.relative, systematic, predicted.pose)
 
 
 def _viewpoint(fused: Fused) -> Viewpoint:
-    return replace(Viewpoint.known(fused.T_map_camera, fused.changing), common=fused.lasting)
+    return replace(Viewpoint.known(fused.T_map_camera, fused.white), common=fused.systematic)
 
 
 def _keyframe(rows: Markers, pose: CameraPose, camera: int, predicted: PredictedCamera | None) -> Keyframe:

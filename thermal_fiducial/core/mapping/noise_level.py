@@ -24,9 +24,9 @@ _MEDIAN = 1.386
 class NoiseLevel:
     """Ratio of the corners' variance to the declared one, from what single-marker poses leave unexplained.
 
-    Decisions between rival poses rest on the noise. A detector may promise too much (photos, motion, a lens that the
-    calibration doesn't quite fit); four corners of a square over-determine its pose by two, which tells. The median
-    over many markers is blind to misdetections.
+    Decisions between alternative poses rest on the noise. A detector may promise too much (photos, motion, a lens that
+    the calibration doesn't quite fit); four corners of a square over-determine its pose by two, which shows it. The
+    median over many markers is blind to misdetections.
     """
 
     def __init__(self) -> None:

@@ -62,9 +62,9 @@ class Fused:
     """A camera pose from markers and odometry together."""
 
     T_map_camera: FloatArray
-    #: (6, 6) ROS convention, of errors that change from frame to frame, and of those that last
-    changing: FloatArray
-    lasting: FloatArray
+    #: (6, 6) ROS convention, of white errors, new in each frame, and of systematic ones
+    white: FloatArray
+    systematic: FloatArray
 
 
 def contradicts(T_map_camera: FloatArray, covariance: FloatArray, odometry: CameraPose) -> bool:
@@ -73,22 +73,22 @@ def contradicts(T_map_camera: FloatArray, covariance: FloatArray, odometry: Came
     return bool(apart @ np.linalg.solve(covariance + bounded_odometry(odometry.covariance), apart) > CONTRADICTION)
 
 
-def together(T_map_camera: FloatArray, changing: FloatArray, lasting: FloatArray, odometry: CameraPose) -> Fused:
+def together(T_map_camera: FloatArray, white: FloatArray, systematic: FloatArray, odometry: CameraPose) -> Fused:
     """The pose (4, 4) from the markers of a frame and that from the odometry, each by what it is worth.
 
     Markers alone count where the odometry contradicts them: it is lost, or in another map.
     """
     P = odometry.covariance
     apart = difference(odometry.T_map_camera, T_map_camera)
-    if apart @ np.linalg.solve(changing + lasting + P, apart) > CONTRADICTION:
-        return Fused(T_map_camera, changing, lasting)
-    gain = np.linalg.solve(changing + lasting + P, changing + lasting).T
+    if apart @ np.linalg.solve(white + systematic + P, apart) > CONTRADICTION:
+        return Fused(T_map_camera, white, systematic)
+    gain = np.linalg.solve(white + systematic + P, white + systematic).T
     rest = np.eye(6) - gain
     new, common = split_odometry(gain @ P @ gain.T)
     return Fused(
         np.asarray(retract(T_map_camera, gain @ apart)),
-        rest @ changing @ rest.T + new,
-        rest @ lasting @ rest.T + common,
+        rest @ white @ rest.T + new,
+        rest @ systematic @ rest.T + common,
     )
 
 

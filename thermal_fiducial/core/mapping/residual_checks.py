@@ -20,7 +20,7 @@ def correlation_time(residuals: FloatArray, marker: IntArray) -> float:
 
     Corner errors of a slow flight repeat themselves from frame to frame (of lag, optics, fixed pattern): N such views
     average as N / (1 + 2 sum rho_k) independent ones do, with rho_k the correlation at lag k (C. Geyer, "Practical
-    Markov chain Monte Carlo", 1992). The sum ends where a correlation is no longer told from none.
+    Markov chain Monte Carlo", 1992). The sum ends where a correlation can no longer be distinguished from none.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def correlation_time(residuals: FloatArray, marker: IntArray) -> float:
     return total
 
 
-def hangs_twice(residuals: FloatArray, J: FloatArray, outlying: BoolArray) -> bool:
+def two_places(residuals: FloatArray, J: FloatArray, outlying: BoolArray) -> bool:
     """Whether one other pose of a marker explains most of its outlying views: it was moved, or is there twice.
 
     Parameters

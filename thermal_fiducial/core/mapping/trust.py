@@ -65,7 +65,7 @@ class Trust:
                 changes[marker.id] = True
         return changes
 
-    def accuse(self, marker: MapMarker) -> None:
+    def flag(self, marker: MapMarker) -> None:
         """Take it from a joint adjustment that ``marker`` disagrees: it is trusted again when it has long agreed."""
         self._record(marker).disagreement = 1.0
 
@@ -83,7 +83,7 @@ class Trust:
         return record
 
 
-def culprits(disagrees: np.ndarray, trusted: np.ndarray, markers: list[MapMarker]) -> np.ndarray:
+def inconsistent(disagrees: np.ndarray, trusted: np.ndarray, markers: list[MapMarker]) -> np.ndarray:
     """Which of the disagreeing markers are to blame, (N,) bool.
 
     Among three or more the majority decides, which a robust pose already follows. Of two that disagree a fixed one
