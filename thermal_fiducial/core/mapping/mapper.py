@@ -62,8 +62,9 @@ _PATIENCE = 6
 _GROWTH, _FEW = 0.2, 15
 #: Views of markers that a refinement in flight takes: a second or two of a slow core.
 VIEWS = 10_000
-# Time between two refinements for each view of the last [s]: a view takes a tenth of it on a slow core.
-_PERIOD_A_VIEW = 1e-3
+# Time between two refinements for each view of the last [s]: a view takes half of it on a slow core. With three
+# times as much, poses from markers just placed along a chain were too vague to publish: 19 of 633 over a carpet.
+_PERIOD_A_VIEW = 3e-4
 
 
 class MarkerMapper:
