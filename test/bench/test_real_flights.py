@@ -3,6 +3,7 @@
 import pytest
 from support import corner_runs, real_flights
 from support.corner_runs import coast, fly
+from support.sim_flights import simulated
 
 pytestmark = pytest.mark.usefixtures('real_data')
 #: Seconds without frames, and what the error at their end should be at most [cm].
@@ -41,6 +42,13 @@ def test_fused_beside_markers_alone(benchmark, write_table):
     benchmark.pedantic(fly, args=(boards[0],), rounds=1)
     flights = [*boards, *map(real_flights.carpet, real_flights.CARPETS)]
     write_table('real_flights', [HEAD, *(cells(fly(flight)) for flight in flights)])
+
+
+def test_simulated_flights_made_like_them(benchmark, write_table):
+    """What the simulator says in the recordings' place: where it is kinder, it has to be made more like them."""
+    flights = [simulated(name, seed) for name in ('april', 'cheap_imu') for seed in range(3)]
+    benchmark.pedantic(fly, args=(flights[-1],), rounds=1)
+    write_table('flights_like_real', [HEAD, *(cells(fly(flight)) for flight in flights)])
 
 
 def test_maps_of_the_carpet(benchmark, write_table):

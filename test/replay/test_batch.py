@@ -98,3 +98,16 @@ def test_a_bad_bag_is_named_and_the_others_are_replayed(folder, capfd):
 def test_two_bags_of_one_name(folder, capfd):
     assert batch(folder, 'never', bags=('flight0', 'flight0')) == 2
     assert 'flight0' in capfd.readouterr().err
+
+
+def test_a_scheduler_that_is_not_there(folder, capfd):
+    assert batch(folder, 'nowhere', '--scheduler', 'nonsense://1', bags=('flight0',)) == 2
+    assert 'no scheduler at nonsense://1' in capfd.readouterr().err
+
+
+def test_a_cluster_that_is_there(folder, alone):
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+        assert batch(folder, 'cluster', '--scheduler', cluster.scheduler_address) == 0
+    assert contents(folder / 'cluster') == contents(alone)

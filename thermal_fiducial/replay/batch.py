@@ -29,8 +29,13 @@ from thermal_fiducial.replay.replay import MAP_FILE, Options, replay
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.ros import clouds, convert
 
-#: Workers that one bag may outlive: whatever ends more of them is in the bag.
-_DEATHS = 10
+#: Of a cluster on this machine: workers that one bag may outlive, as whatever ends more of them is in the bag; and a
+#: worker that the machine starves is not given up, as its end shows in its connection.
+_PATIENT = {
+    'distributed.scheduler.allowed-failures': 10,
+    'distributed.scheduler.worker-ttl': None,
+    'distributed.comm.timeouts.connect': '600s',
+}
 
 
 @dataclass(frozen=True)
@@ -80,15 +85,15 @@ def workers(count: int, scheduler: str = '') -> Iterator[Any]:
     import dask
     from distributed import Client, LocalCluster
 
-    with dask.config.set({'distributed.scheduler.allowed-failures': _DEATHS}):
-        if scheduler:
-            try:
-                client = Client(scheduler)
-            except (OSError, ValueError) as error:
-                raise InputError(f'no scheduler at {scheduler}: {error}') from None
-            with client:
-                yield client
-            return
+    if scheduler:
+        try:
+            client = Client(scheduler)
+        except (OSError, ValueError) as error:
+            raise InputError(f'no scheduler at {scheduler}: {error}') from None
+        with client:
+            yield client
+        return
+    with dask.config.set(_PATIENT):
         cluster = LocalCluster(
             n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=logging.CRITICAL
         )
