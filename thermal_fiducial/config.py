@@ -460,12 +460,30 @@ class ImuNoise(SelfChecked):
         minimum=0.0,
         maximum=0.1,
     )
+    accelerometer_scale_std: float = param(
+        0.005,
+        'Scale and cross-axis errors of the accelerometer, likewise; 0: none.',
+        minimum=0.0,
+        maximum=0.1,
+    )
+    gyroscope_nonlinearity: float = param(
+        0.001,
+        'What is left of the errors of the gyroscope in motion (nonlinearity, bandwidth), as a share of the rate.',
+        minimum=0.0,
+        maximum=0.1,
+    )
+    accelerometer_nonlinearity: float = param(
+        0.004,
+        'The same of the accelerometer (size effect too), as a share of the specific force beside gravity.',
+        minimum=0.0,
+        maximum=0.1,
+    )
     gyroscope_range: float = param(34.9, 'Readings beyond this are saturated.', unit='rad/s', minimum=0.1)
     accelerometer_range: float = param(156.0, 'Readings beyond this are saturated.', unit='m/s^2', minimum=10.0)
     vibration: float = param(
         1.0,
         'Share of the vibration that may count as white noise where it exceeds the densities: the floor of its '
-        'spectrum always, the rest as far as poses bear it out (half of it for the accelerometer); 0: none.',
+        'spectrum between the tones of the rotors; 0: none.',
         minimum=0.0,
         maximum=1.0,
     )
@@ -485,7 +503,7 @@ class PoseEkfConfig(SelfChecked):
     )
     stamp_jitter: float = param(
         0.0005,
-        'Jitter of the camera stamps to begin with; it is learned from the poses. 0: exact, nothing is learned.',
+        'Jitter of the camera stamps. 0: exact.',
         unit='s',
         minimum=0.0,
         maximum=0.05,
@@ -509,24 +527,20 @@ class PoseEkfConfig(SelfChecked):
     initial_accelerometer_bias_std: float = param(0.2, 'Accelerometer bias at the start.', unit='m/s^2', minimum=0.0)
     initial_poses: int = param(3, 'Poses that must agree before the filter starts.', minimum=1, maximum=100)
     pose_noise_scale: float = param(
-        2.0,
-        'Factor on the standard deviation of the camera poses: their errors last for about four frames, not one.',
+        1.0,
+        'Factor on the standard deviation of the camera poses to begin with; what they are worth is learned.',
         minimum=0.1,
         live=True,
     )
-    position_floor: float = param(
-        0.0003, 'Least standard deviation of a camera pose, position.', unit='m', minimum=0.0, live=True
+    systematic_pose_std: float = param(
+        1.0,
+        'Error of camera poses that lasts as long as the view (lens, corners, map), to begin with, in their own '
+        'standard deviations; it is learned.',
+        minimum=0.01,
+        maximum=100.0,
     )
-    attitude_floor: float = param(
-        0.0001, 'Least standard deviation of a camera pose, attitude.', unit='rad', minimum=0.0, live=True
-    )
-    motion_floor: float = param(
-        0.0005,
-        'What motion adds to these in all directions: so much of the speed and of the turn rate (smear, lag).',
-        unit='s',
-        minimum=0.0,
-        maximum=0.05,
-        live=True,
+    systematic_angle: float = param(
+        0.3, 'Change of the view after which that error is another.', unit='rad', minimum=0.001, maximum=10.0
     )
     gate: float = param(
         22.5,

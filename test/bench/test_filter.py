@@ -7,11 +7,10 @@ import numpy as np
 from numpy.polynomial import polynomial
 import pytest
 from scipy.stats import chi2
-from support.flights import config, errors, Flight, matched, rms, run, START_NS, timeline
+from support.flights import config, errors, Flight, matched, perfect, rms, run, START_NS, timeline
 
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.filter.coasting import coasting_variance
-from thermal_fiducial.core.filter.navigation_state import Layout
 from thermal_fiducial.core.filter.pose_ekf import PoseEkf
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.measurements import ImuSample
@@ -102,9 +101,9 @@ def test_error_beside_the_bounds(benchmark, write_table):
 
 GAP_BEGIN, GAPS = 7.0, (1.0, 2.0, 5.0)
 GOALS = ('4 cm', '10 cm', '50 cm')
-#: That of a cheap IMU, ten times the default; and one whose gyroscope's scale is known.
+#: That of a cheap IMU, ten times the default; and one without scale errors and nonlinearity.
 COASTING_IMU = ImuNoise(accelerometer_noise_density=2e-2)
-CALIBRATED_IMU = replace(COASTING_IMU, gyroscope_scale_std=0.0)
+CALIBRATED_IMU = perfect(COASTING_IMU)
 
 
 def coasted(seed, imu=COASTING_IMU):
@@ -122,14 +121,12 @@ def coasted(seed, imu=COASTING_IMU):
 def bounds(seed, imu):
     """95 % errors (2, 3) [m] of hover from a gap's beginning: the filter that knows the noise; white noise alone."""
     data = Flight(seed=seed, seconds=GAP_BEGIN, imu_noise=COASTING_IMU, **POSES['several markers'])
-    exact = matched(imu=replace(imu, vibration=0.0))
+    exact = matched(imu=perfect(imu))
     ekf = PoseEkf(exact)
     run(ekf, timeline(data.samples(), data.poses))
-    known = replace(ekf.state, covariance=np.zeros_like(ekf.state.covariance))
-    densities = COASTING_IMU.gyroscope_noise_density, COASTING_IMU.accelerometer_noise_density
-    variances = [
-        polynomial.polyval(GAPS, coasting_variance(state, Layout.of(exact), densities)) for state in (ekf.state, known)
-    ]
+    known = replace(ekf.estimate, covariance=np.zeros_like(ekf.estimate.covariance))
+    densities = np.repeat((COASTING_IMU.gyroscope_noise_density, COASTING_IMU.accelerometer_noise_density), 3)
+    variances = [polynomial.polyval(GAPS, coasting_variance(estimate, densities)) for estimate in (ekf.estimate, known)]
     return np.sqrt(np.array(variances) / 3.0 * chi2.ppf(0.95, 3))
 
 
@@ -137,7 +134,7 @@ def test_coasting_beside_its_bound(benchmark, write_table):
     """No filter can be better than the white noise of the IMU, nor than one that knows all densities."""
     benchmark.pedantic(coasted, args=(100,), rounds=1)
     rows = [['no markers for', 'goal', 'error (95 %)', 'inside 3 sigma', 'best possible', 'white noise alone']]
-    for words, imu in ('', COASTING_IMU), (', scale of the gyroscope known', CALIBRATED_IMU):
+    for words, imu in ('', COASTING_IMU), (', no scale errors', CALIBRATED_IMU):
         flights = [coasted(seed, imu) for seed in range(100, 160)]
         distances, squares = (np.array(values) for values in zip(*flights, strict=True))
         reached = np.percentile(distances, 95, axis=0)

@@ -30,7 +30,7 @@ def consistency(configuration, runs):
                 continue
             ekf.add_imu(item)
             if count % STRIDE == 0 and count >= FIRST:
-                row.append(squared_error(data, ekf.state, count))
+                row.append(squared_error(data, ekf.estimate, count))
             count += 1
         nees.append(row)
         last = [ekf.decided[pose.stamp_ns].nis for pose in data.poses if pose.stamp_ns in ekf.decided]
@@ -38,11 +38,11 @@ def consistency(configuration, runs):
     return np.array(nees), np.array(nis)
 
 
-def squared_error(data, state, index):
-    if state is None:
+def squared_error(data, estimate, index):
+    if estimate is None:
         return np.inf
-    error = state_error(data, state, data.t[index], index)
-    return error @ np.linalg.solve(state.covariance[:15, :15], error)
+    error = state_error(data, estimate.state, data.t[index], index)
+    return error @ np.linalg.solve(estimate.covariance[:15, :15], error)
 
 
 def band(freedom, runs):

@@ -10,9 +10,8 @@ import gtsam
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.error_state import ErrorStateFilter
-from thermal_fiducial.core.filter.initialisation import blank_state
-from thermal_fiducial.core.filter.navigation_state import Layout
+from thermal_fiducial.core.filter.initialization import blank_state
+from thermal_fiducial.core.filter.update import body_pose
 from thermal_fiducial.core.geometry.se3 import so3_exp
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 from thermal_fiducial.core.types import FloatArray, IntArray
@@ -46,14 +45,13 @@ class Flown:
 
     def nodes(self) -> Iterator[tuple[gtsam.NonlinearFactorGraph, gtsam.Values]]:
         """What each camera pose adds: its factors, and first values of its variables."""
-        config, filter_ = self.config, ErrorStateFilter(self.config)
-        T_body_camera = blank_state(config, Layout.of(config)).T_body_camera
-        floor = np.repeat((config.attitude_floor**2, config.position_floor**2), 3)
+        config = self.config
+        T_body_camera = blank_state(config).T_body_camera
         robust = gtsam.noiseModel.mEstimator.Huber.Create(5.0)
         for index, pose in enumerate(self.poses):
             graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-            body = filter_.body_pose(pose, T_body_camera)
-            noise = gtsam.noiseModel.Gaussian.Covariance(body.covariance + np.diag(floor))
+            body = body_pose(pose, T_body_camera, config.pose_noise_scale)
+            noise = gtsam.noiseModel.Gaussian.Covariance(body.shape)
             place = gtsam.Pose3(body.T_map_body)
             graph.add(gtsam.PriorFactorPose3(X(index), place, gtsam.noiseModel.Robust.Create(robust, noise)))
             values.insert(X(index), place)

@@ -132,15 +132,21 @@ def matched(**changes) -> PoseEkfConfig:
         'time_offset_std': 0.0,
         'stamp_jitter': 0.0,
         'map_tilt_std': 0.0,
-        'position_floor': 0.0,
-        'attitude_floor': 0.0,
-        'motion_floor': 0.0,
-        'pose_noise_scale': 1.0,
+        'systematic_pose_std': 0.01,
         'initial_gyroscope_bias_std': 0.005,
         'initial_accelerometer_bias_std': 0.05,
-        'imu': ImuNoise(vibration=0.0, gyroscope_scale_std=0.0),
+        'imu': MATCHED_IMU,
     }
     return config(**(exact | changes))
+
+
+def perfect(noise: ImuNoise) -> ImuNoise:
+    """An IMU of these densities and nothing else: no scale errors, no vibration, nothing that motion adds."""
+    without = ('gyroscope_scale_std', 'accelerometer_scale_std', 'gyroscope_nonlinearity', 'accelerometer_nonlinearity')
+    return replace(noise, vibration=0.0, **dict.fromkeys(without, 0.0))
+
+
+MATCHED_IMU = perfect(ImuNoise())
 
 
 def timeline(samples: Iterable[ImuSample], poses: Iterable[CameraPose], delay=0.0):

@@ -23,7 +23,8 @@ def info(camera=small_bag.CAMERA):
 
 def imu(k, rate=(0.0, 0.0, 0.0), force=(0.0, 0.0, 9.80665)):
     message = Imu(header=convert.header(START + k * IMU_NS, 'base_link'))
-    message.angular_velocity = convert.vector(np.array(rate))
+    # No sensor gives the same reading twice: its last digit moves.
+    message.angular_velocity = convert.vector(np.array(rate) + 1e-6 * np.sin(np.arange(3.0) + k))
     message.linear_acceleration = convert.vector(np.array(force))
     return message
 

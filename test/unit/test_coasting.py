@@ -1,17 +1,18 @@
 """The promise of how long the pose may be used, against the filter's own covariance while it coasts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from support.flights import config, Flight, Motion, run, timeline
+from support.flights import config, Flight, MATCHED_IMU, Motion, run, timeline
 
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.filter.coasting import coasting_variance, HORIZON, usable_seconds
-from thermal_fiducial.core.filter.gating import position_std
-from thermal_fiducial.core.filter.navigation_state import Layout
 from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.filter.state import POSITION
 
 IMU = config().imu
-DENSITIES = IMU.gyroscope_noise_density, IMU.accelerometer_noise_density
+DENSITIES = np.repeat((IMU.gyroscope_noise_density, IMU.accelerometer_noise_density), 3)
 
 
 @pytest.fixture(scope='module')
@@ -21,36 +22,36 @@ def hover():
     samples, ekf = data.samples(), PoseEkf(config())
     last = samples[800]
     run(ekf, timeline([s for s in samples if s.stamp_ns <= last.stamp_ns], data.poses[:114]))
-    then = ekf.state
+    then = ekf.estimate
     run(ekf, samples[801:])
-    return then, ekf.state, (samples[-1].stamp_ns - last.stamp_ns) * 1e-9
+    return then, ekf.estimate, (samples[-1].stamp_ns - last.stamp_ns) * 1e-9
 
 
 def test_the_variance_is_that_of_the_propagated_covariance(hover):
     then, now, seconds = hover
-    coefficients = coasting_variance(then, Layout.of(config()), DENSITIES)
+    coefficients = coasting_variance(then, DENSITIES)
     # the walks of the biases are left out: under 2 % of the standard deviation after 4 s
     assert np.sqrt(np.polynomial.polynomial.polyval(seconds, coefficients)) == pytest.approx(
-        position_std(now), rel=0.02
+        now.std(POSITION), rel=0.02
     )
 
 
 def test_usable_until_the_variance_is_too_large(hover):
     then, now, seconds = hover
-    layout, noise = Layout.of(config()), DENSITIES
     # the grid of 0.05 s and the 2 % above
-    assert usable_seconds(then, layout, noise, position_std(now)) == pytest.approx(seconds, abs=0.15)
-    assert usable_seconds(then, layout, noise, 0.0) == 0.0
-    assert usable_seconds(then, layout, noise, 1e6) == HORIZON
+    assert usable_seconds(then, DENSITIES, now.std(POSITION)) == pytest.approx(seconds, abs=0.15)
+    assert usable_seconds(then, DENSITIES, 0.0) == 0.0
+    assert usable_seconds(then, DENSITIES, 1e6) == HORIZON
 
 
 def test_the_promise_counts_the_noise_that_the_imu_has():
     """Thirty times that of the data sheet, as under rotors."""
-    noise = ImuNoise(gyroscope_noise_density=30.0 * DENSITIES[0], accelerometer_noise_density=30.0 * DENSITIES[1])
-    data = Flight(seed=4, seconds=9.0, motion=Motion.still(), imu_noise=noise)
-    samples, ekf = data.samples(), PoseEkf(config(lost_position_std=0.3))
+    noise = ImuNoise(gyroscope_noise_density=30.0 * DENSITIES[0], accelerometer_noise_density=30.0 * DENSITIES[3])
+    several_markers = {'rotation_std': (0.003, 0.003, 0.001), 'translation_std': (0.0003, 0.0003, 0.003)}
+    data = Flight(seed=4, seconds=9.0, motion=Motion.still(), imu_noise=noise, **several_markers)
+    samples, ekf = data.samples(), PoseEkf(config(lost_position_std=0.3, imu=replace(MATCHED_IMU, vibration=1.0)))
     run(ekf, timeline(samples[:1000], data.poses[:140]))
-    promised, by_data_sheet = ekf.usable_for, usable_seconds(ekf.state, Layout.of(config()), DENSITIES, 0.3)
+    promised, by_data_sheet = ekf.usable_for, usable_seconds(ekf.estimate, DENSITIES, 0.3)
     lost = next(seconds for seconds, sample in enumerate(samples[1000:]) if ekf.add_imu(sample) and ekf.lost) / 200.0
     # what vibration there is varies from sample to sample
     assert promised == pytest.approx(lost, rel=0.05)

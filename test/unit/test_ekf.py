@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.flights import config, errors, Flight, matched, Motion, rms, run, START_NS, timeline
 
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf, STEPS_AGAIN
+from thermal_fiducial.core.filter.pose_ekf import PoseEkf
 from thermal_fiducial.core.measurements import ImuSample
 
 
@@ -42,14 +42,15 @@ def test_late_and_out_of_order_poses_equal_in_order_processing(flight, delay):
     in_order, late = PoseEkf(config()), PoseEkf(config())
     run(in_order, timeline(flight.samples(), flight.poses))
     run(late, timeline(flight.samples(), flight.poses, delays))
-    late_now, now = late.state, in_order.state
+    late_now, now = late.estimate, in_order.estimate
     # the last pose is 0.13 s old, so a delay of up to 0.4 s needs the poses that haven't arrived
     if delay == 0.4:
         for pose in flight.poses:
             late.add_pose(pose)
-        late_now = late.state
-    for name in ('R_map_body', 'velocity', 'position', 'bias', 'time_offset', 'covariance'):
-        np.testing.assert_allclose(getattr(late_now, name), getattr(now, name), rtol=1e-9, atol=1e-12)
+        late_now = late.estimate
+    for name in ('R_map_body', 'velocity', 'position', 'bias', 'time_offset'):
+        np.testing.assert_allclose(getattr(late_now.state, name), getattr(now.state, name), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(late_now.covariance, now.covariance, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize('motion', [Motion.still(), None], ids=['still', 'flying'])
@@ -72,7 +73,7 @@ def test_live_parameters_hold_from_then_on(flight):
     half = len(arrivals) // 2
     _, before = run(ekf, arrivals[:half])
     # A gate of one where six are expected, of poses that claim a tenth of their errors: hardly one passes.
-    ekf.configure(config(gate=1.0, pose_noise_scale=0.1, position_floor=0.0, attitude_floor=0.0, motion_floor=0.0))
+    ekf.configure(config(gate=1.0, pose_noise_scale=0.1))
     _, after = run(ekf, arrivals[half:])
     assert all(update.accepted for update in before[3:])
     passed = [update for update in after if update.accepted and not update.reason]
@@ -131,7 +132,7 @@ def test_a_bad_sample_is_refused_and_the_next_one_goes_on(flight, change, word):
 
 
 @pytest.mark.parametrize('jump', [-5.0, -0.5, 30.0])
-def test_a_clock_that_jumps_starts_afresh(flight, jump):
+def test_a_clock_that_jumps_resets(flight, jump):
     ekf = PoseEkf(config())
     run(ekf, timeline(flight.samples(), flight.poses))
     shift = round((jump - 6.0 if jump < -1.0 else jump) * 1e9)
@@ -144,19 +145,19 @@ def test_a_clock_that_jumps_starts_afresh(flight, jump):
             statuses.add(ekf.status)
         else:
             ekf.add_pose(item)
-    assert any('started afresh' in status or 'waiting' in status for status in statuses)
+    assert any('reset' in status or 'waiting' in status for status in statuses)
     assert ekf.status == 'tracking'
     # a position that went on from the old clock would be off by the flight's extent, metres
     error = np.linalg.norm(ekf.state.position - flight.motion.pose(flight.t[-1])[:3, 3])
     assert error < 0.05
 
 
-@pytest.mark.parametrize(('patience', 'fresh_starts'), [(60.0, 0.0), (2.0, 1.0)])
-def test_after_long_enough_without_markers_it_starts_afresh(flight, patience, fresh_starts):
+@pytest.mark.parametrize(('patience', 'resets'), [(60.0, 0.0), (2.0, 1.0)])
+def test_after_long_enough_without_markers_it_resets(flight, patience, resets):
     poses = [pose for pose in flight.poses if not 1.0 < (pose.stamp_ns - START_NS) * 1e-9 < 4.0]
     ekf = PoseEkf(config(reinitialise_after=patience))
     states, _ = run(ekf, timeline(flight.samples(), poses, 0.03))
-    assert ekf.diagnostics()['starts afresh'] == fresh_starts
+    assert ekf.diagnostics()['resets'] == resets
     # Of poses that are good to some centimetres.
     assert errors(flight, states, 5.0)[0].max() < 0.1
 
@@ -188,7 +189,7 @@ def test_odometry_is_in_ros_frames():
     # 0.1 m/s, 0.01 rad/s: far above the filter's error, far below a wrong frame's
     np.testing.assert_allclose(last.velocity_body, T[:3, :3].T @ flight.motion.velocity(flight.t[-1]), atol=0.1)
     np.testing.assert_allclose(last.angular_velocity_body, flight.motion.imu(flight.t[-1])[:3], atol=0.01)
-    P, R = ekf.state.covariance, ekf.state.R_map_body
+    P, R = ekf.estimate.covariance, ekf.state.R_map_body
     np.testing.assert_allclose(last.pose_covariance[:3, :3], R @ P[6:9, 6:9] @ R.T, atol=1e-15)
     np.testing.assert_allclose(last.pose_covariance[:3, 3:], R @ P[6:9, :3] @ R.T, atol=1e-15)
     np.testing.assert_allclose(last.pose_covariance[3:, 3:], R @ P[:3, :3] @ R.T, atol=1e-15)
@@ -201,7 +202,7 @@ def test_at_rest_the_gyroscope_bias_is_known_from_the_start():
     run(ekf, timeline(flight.samples(), flight.poses[:3]))
     # RATE_STD, three sigma
     np.testing.assert_allclose(ekf.state.bias[:3], flight.bias[-1, :3], atol=0.015)
-    assert rms(np.sqrt(np.diag(ekf.state.covariance)[9:12])) < 0.006
+    assert rms(np.sqrt(np.diag(ekf.estimate.covariance)[9:12])) < 0.006
 
 
 @pytest.mark.parametrize(('turn', 'bias'), [(0.0, 0.02), (0.02, 0.0), (0.05, 0.01), (0.09, 0.0)])
@@ -214,7 +215,7 @@ def test_a_slow_flight_is_not_taken_for_rest(turn, bias):
     run(ekf, timeline(flight.samples(), flight.poses[:3]))
     error = ekf.state.bias[:3] - flight.bias[-1, :3]
     # Three sigma.
-    assert np.all(np.abs(error) < 3.0 * np.sqrt(np.diag(ekf.state.covariance)[9:12]))
+    assert np.all(np.abs(error) < 3.0 * np.sqrt(np.diag(ekf.estimate.covariance)[9:12]))
 
 
 def test_reset_forgets(flight):
@@ -226,22 +227,3 @@ def test_reset_forgets(flight):
     assert ekf.status == 'waiting for IMU'
     run(ekf, timeline(flight.samples(), flight.poses))
     assert ekf.status == 'tracking'
-
-
-def test_going_through_the_past_again_is_spread_over_many_samples(monkeypatch):
-    """An offset of 30 ms is found in turns: hundreds of steps once more, but no output waits for more than a few."""
-    steps, step = [], PoseEkf._step
-
-    def counted(self, *arguments):
-        steps[-1] += 1
-        return step(self, *arguments)
-
-    monkeypatch.setattr(PoseEkf, '_step', counted)
-    data, ekf = Flight(seed=3, seconds=4.0, offset=0.03), PoseEkf(config())
-    for item in timeline(data.samples(), data.poses):
-        steps.append(0)
-        run(ekf, [item])
-    samples = len(data.samples())
-    assert sum(steps) > 1.5 * samples
-    # Poses that come at once wait for the next sample, which goes through itself and its share of the past.
-    assert max(steps) <= 1 + STEPS_AGAIN

@@ -14,7 +14,7 @@ def test_what_is_written_is_read():
         PoseUpdate(STAMP, True, '', 5.4321),
         PoseUpdate(STAMP + 1, False, 'initialising', math.nan),
         PoseUpdate(STAMP + 2, False, 'refused: 1000.0 sigma', 1e6),
-        PoseUpdate(STAMP + 3, True, 'started afresh', 3e-7),
+        PoseUpdate(STAMP + 3, True, 'reset', 3e-7),
     ]
     told = innovations_of(innovations_text(updates))
     np.testing.assert_array_equal(told.stamps_ns, [STAMP, STAMP + 2, STAMP + 3])

@@ -3,13 +3,15 @@
 import numpy as np
 from numpy.polynomial import polynomial
 
-from thermal_fiducial.core.filter.navigation_state import (
+from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
+    ACCELEROMETER_MATRIX,
+    Estimate,
+    GRAVITY,
     GYROSCOPE_BIAS,
-    Layout,
-    NavigationState,
     POSITION,
     ROTATION,
+    SIZE,
     VELOCITY,
 )
 from thermal_fiducial.core.geometry.se3 import skew
@@ -19,36 +21,35 @@ from thermal_fiducial.core.types import FloatArray
 HORIZON, STEP = 60.0, 0.05
 
 
-def usable_seconds(
-    state: NavigationState, layout: Layout, densities: tuple[float, float], position_std: float
-) -> float:
+def usable_seconds(estimate: Estimate, densities: FloatArray, position_std: float) -> float:
     """Seconds [s] on the IMU alone until the position is worse than ``position_std`` [m]; at most ``HORIZON``."""
     times = np.arange(0.0, HORIZON + STEP, STEP)
-    beyond = polynomial.polyval(times, coasting_variance(state, layout, densities)) > position_std**2
+    beyond = polynomial.polyval(times, coasting_variance(estimate, densities)) > position_std**2
     return float(times[np.argmax(beyond)]) if beyond.any() else HORIZON
 
 
-def coasting_variance(state: NavigationState, layout: Layout, densities: tuple[float, float]) -> FloatArray:
+def coasting_variance(estimate: Estimate, densities: FloatArray) -> FloatArray:
     """Sum of the position variances [m^2] after t seconds of hover, coefficients of t^0 .. t^6.
 
     The error is rho + nu t + alpha t^2 / 2 + beta t^3 / 6 + noise, with alpha the acceleration that tilt and
-    accelerometer bias feign, and beta its growth by the gyroscope bias that is left. ``densities``: of the noise of
-    gyroscope and accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)].
+    accelerometer bias feign, and beta its growth by the gyroscope bias that is left. ``densities`` (6,): of the noise
+    of gyroscope and accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)].
     """
-    lift = skew(-state.gravity @ state.R_map_body)
-    n = layout.size
-    rho, nu, alpha, beta = (np.zeros((3, n)) for _ in range(4))
+    state = estimate.state
+    hovering = -state.gravity @ state.R_map_body
+    lift = skew(hovering)
+    rho, nu, alpha, beta = (np.zeros((3, SIZE)) for _ in range(4))
     rho[:, POSITION] = nu[:, VELOCITY] = np.eye(3)
     alpha[:, ROTATION], alpha[:, ACCELEROMETER_BIAS], beta[:, GYROSCOPE_BIAS] = -lift, -np.eye(3), lift
-    if layout.gravity:
-        alpha[:, layout.gravity] = state.R_map_body[:2].T
+    alpha[:, ACCELEROMETER_MATRIX] = -np.kron(np.eye(3), hovering)
+    alpha[:, GRAVITY] = state.R_map_body[:2].T
     terms = (rho, nu, alpha / 2.0, beta / 6.0)
     coefficients = np.zeros(7)
     for i, left in enumerate(terms):
         for j, right in enumerate(terms):
-            coefficients[i + j] += np.einsum('ik,kl,il', left, state.covariance, right)
+            coefficients[i + j] += np.einsum('ik,kl,il', left, estimate.covariance, right)
     # White accelerations on three axes, each sigma^2 t^3 / 3, and the tilt that white rates make of two.
-    rate, force = densities
+    rate, force = float(densities[0]), float(densities[3])
     coefficients[3] += force**2
     coefficients[5] += 2.0 * rate**2 * float(state.gravity @ state.gravity) / 20.0
     return coefficients

@@ -10,6 +10,9 @@ from thermal_fiducial.core.measurements import ImuSample
 CLOCK_EVIDENCE = 10
 #: A sensor saturates at its full scale; a reading so many times as large is a broken message.
 IMPOSSIBLE_RANGES = 2.0
+#: Noise makes no two samples equal, coarse quantisation of a still sensor a few: equal ones for so long [s], and
+#: so many of them, are one sample that is sent again and again.
+FROZEN_SECONDS, FROZEN_SAMPLES = 0.045, 4
 
 
 class Verdict(Enum):
@@ -18,10 +21,11 @@ class Verdict(Enum):
     USE = ''
     NOT_FINITE = 'IMU sample is not finite'
     IMPOSSIBLE = 'IMU sample far beyond the range of its sensors'
+    FROZEN = 'IMU is frozen: the same sample again and again'
     REPEATED = 'IMU stamp repeated'
     BACKWARD = 'IMU stamp went back'
     AHEAD = 'IMU stamp jumped ahead'
-    RESTART = 'IMU clock jumped: started afresh'
+    RESTART = 'IMU clock jumped: reset'
 
 
 class ImuInput:
@@ -38,6 +42,9 @@ class ImuInput:
         self._last_ns: int | None = None
         self._stray_ns = 0
         self._strays = 0
+        self._reading: bytes = b''
+        self._first_equal_ns = 0
+        self._equal = 0
 
     def judge(self, sample: ImuSample) -> Verdict:
         """Verdict on ``sample``; it is remembered."""
@@ -47,12 +54,22 @@ class ImuInput:
             return Verdict.IMPOSSIBLE
         if np.abs(sample.linear_acceleration).max() > self._limits[1]:
             return Verdict.IMPOSSIBLE
+        if self._is_frozen(sample):
+            return Verdict.FROZEN
         if self._last_ns is None or 0 < sample.stamp_ns - self._last_ns <= self._max_gap_ns:
             self._last_ns, self._strays = sample.stamp_ns, 0
             return Verdict.USE
         if sample.stamp_ns == self._last_ns:
             return Verdict.REPEATED
         return self._stray(sample.stamp_ns)
+
+    def _is_frozen(self, sample: ImuSample) -> bool:
+        reading = sample.angular_velocity.tobytes() + sample.linear_acceleration.tobytes()
+        if reading != self._reading or sample.stamp_ns < self._first_equal_ns:
+            self._reading, self._first_equal_ns, self._equal = reading, sample.stamp_ns, 0
+        self._equal += 1
+        lasting = sample.stamp_ns - self._first_equal_ns >= FROZEN_SECONDS * 1e9
+        return lasting and self._equal >= FROZEN_SAMPLES
 
     def _stray(self, stamp_ns: int) -> Verdict:
         assert self._last_ns is not None

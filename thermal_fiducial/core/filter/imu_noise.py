@@ -1,6 +1,5 @@
-"""How noisy the IMU is now: by its data sheet, under vibration, in gaps and at the end of its range."""
+"""How noisy the IMU is now: by its data sheet, under vibration, in motion, over gaps and at the end of its range."""
 
-from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -8,110 +7,87 @@ import numpy as np
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.types import FloatArray
 
-#: A step longer than this [s] is a gap: what happened in it isn't known from the samples at its ends.
-GAP = 0.03
-#: Standard deviation of rate [rad/s] and specific force [m/s^2] in a gap; of a saturated sample, hit or fault.
-UNKNOWN_RATE, UNKNOWN_FORCE, SATURATED_FORCE = 0.5, 3.0, 150.0
-#: How much less the force's shaking counts than the rate's: the position, its second integral, hardly feels tones above
-#: the bandwidth of the filter; the attitude, a first integral, feels more.
-FORCE_SHARE = 0.5
-#: Time constant of the running vibration level [s].
-VIBRATION_TIME = 0.3
-#: The floor of the spectrum is sought in so many bands between these frequencies [Hz]: above the motion, below what
-#: an IMU's own low-pass filter takes away. The tones of rotors leave at least one of them nearly alone.
-BANDS, LOWEST, HIGHEST = 4, 12.5, 50.0
+#: Motion is what differs from the mean over so long; how violent it is, the mean of its square over so long [s].
+_SLOW, _VIOLENCE_TIME = 0.2, 2.0
+#: An IMU at rest may begin to move in a gap: least standard deviations of that [rad/s, m/s^2].
+_LEAST_MOTION = np.array((0.03, 0.15))
+#: Errors of nonlinearity, bandwidth and internal lever arms last as long as the motion does that makes them [s].
+_MOTION_TIME = 1.0
+#: A saturated sample may hide a hit [m/s^2], or a spin as fast again as the range [rad/s].
+_SATURATED = np.array((5.0, 150.0))
+#: Longer steps than this [s] interrupt the spectrum.
+_INTERRUPTED = 0.03
+#: The floor of the spectrum is that of the quietest of so many bands between these frequencies [Hz]: above the motion,
+#: below what an IMU's own low-pass filter takes away. The tones of rotors leave at least one of them nearly alone.
+_BANDS, _LOWEST, _HIGHEST = 4, 12.5, 50.0
 #: Length of a window [s], windows that overlap, and windows in the running mean.
-WINDOW, OVERLAPPING, MEAN_OF = 0.32, 4, 12
+_WINDOW, _OVERLAPPING, _MEAN_OF = 0.32, 4, 12
 
 
-@dataclass(frozen=True, slots=True)
-class NoiseRange:
-    """Densities of gyroscope and accelerometer if all vibration stays tones, and if all of it is white noise.
+class ImuNoiseMonitor:
+    """Noise densities that hold now.
 
-    In rad/s/sqrt(Hz) and m/s^2/sqrt(Hz).
-    """
-
-    quiet: tuple[float, float] = (0.0, 0.0)
-    shaken: tuple[float, float] = (0.0, 0.0)
-
-    def at(self, share: float) -> tuple[float, float]:
-        """Densities where ``share`` of the vibration's variance is white noise."""
-        (rate, force), (shaken_rate, shaken_force) = self.quiet, self.shaken
-        return (
-            math.sqrt(rate * rate + share * (shaken_rate * shaken_rate - rate * rate)),
-            math.sqrt(force * force + share * (shaken_force * shaken_force - force * force)),
-        )
-
-    @property
-    def doubt(self) -> float:
-        """How far apart the two are for the gyroscope: share of its largest variance, 0 to 1."""
-        quiet, shaken = self.quiet[0], self.shaken[0]
-        return 1.0 - (quiet / shaken) ** 2 if shaken > 0.0 else 0.0
-
-
-class NoiseMonitor:
-    """Noise densities that hold now: those of the data sheet, more under vibration, saturation and in gaps.
-
-    Rotors shake an IMU by far more than its noise. Most of that are tones, which integrate to nothing; what counts are
-    the floor between them, and tones that alias to the frequencies of the motion. The second difference of samples
-    shows all vibration, as the motion itself hardly has any.
+    Each source adds its variance: the data sheet's noise or the floor of the vibration's spectrum; errors in proportion
+    to the motion; what the samples at the ends of a step don't show of what was between them; saturation.
     """
 
     def __init__(self, noise: ImuNoise) -> None:
         self._noise = noise
-        self._recent: list[FloatArray] = []
-        self._variance = np.zeros(2)
         self._floor = NoiseFloor()
-        self._beyond = (False, False)
+        self._mean: FloatArray | None = None
+        self._variance = _LEAST_MOTION**2
+        self._recent: list[FloatArray] = []
+        self._sheet = np.array((noise.gyroscope_noise_density, noise.accelerometer_noise_density))
+        self._nonlinearity = np.array((noise.gyroscope_nonlinearity, noise.accelerometer_nonlinearity))
+        self._ranges = np.array((noise.gyroscope_range, noise.accelerometer_range))
+        self._saturated = np.zeros(2)
 
     @property
     def vibration(self) -> tuple[float, float]:
-        """Running sample-to-sample standard deviations [rad/s, m/s^2], rms over the axes."""
-        rate, force = self._variance.tolist()
-        return math.sqrt(rate), math.sqrt(force)
+        """Densities of the floor of the vibration's spectrum [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]."""
+        return self._floor.densities
 
-    def densities(self, imu: FloatArray, seconds: float) -> NoiseRange:
-        """Densities for the step of ``seconds`` that ends with sample ``imu`` (6,)."""
-        self._watch(imu, seconds)
-        noise, (floor_rate, floor_force), (rate, force) = self._noise, self._floor.densities, self.vibration
-        lost_rate, lost_force = self._lost(imu.tolist(), seconds)
-        quiet_rate = max(noise.gyroscope_noise_density, noise.vibration * floor_rate, lost_rate)
-        quiet_force = max(noise.accelerometer_noise_density, noise.vibration * floor_force, lost_force)
-        share = noise.vibration * math.sqrt(min(seconds, GAP))
-        shaken = max(quiet_rate, share * rate), max(quiet_force, FORCE_SHARE * share * force)
-        return NoiseRange((quiet_rate, quiet_force), shaken)
+    def densities(self, imu: FloatArray, seconds: float) -> FloatArray:
+        """(6,) densities for the step of ``seconds`` that ends with sample ``imu`` (6,)."""
+        self._follow_spectrum(imu, seconds)
+        motion = self._follow_motion(imu, seconds)
+        white = np.maximum(self._sheet, self._noise.vibration * np.asarray(self._floor.densities)) ** 2
+        moving = (self._nonlinearity * motion) ** 2 * _MOTION_TIME
+        between = self._hidden_change(seconds) * seconds / 12.0
+        beyond = (np.abs(imu).reshape(2, 3).max(axis=1) >= self._ranges) * _SATURATED**2 * seconds
+        lost = np.maximum(beyond, self._saturated)
+        self._saturated = beyond
+        return np.repeat(np.sqrt(white + moving + between + lost), 3)
 
-    def _lost(self, imu: list[float], seconds: float) -> tuple[float, float]:
-        """Least densities of a step that a gap or saturation hides."""
-        rate_lost, force_lost = self._saturated(imu)
-        gap, unknown = seconds > GAP, math.sqrt(seconds)
-        rate = UNKNOWN_RATE * unknown if gap or rate_lost else 0.0
-        force = SATURATED_FORCE if force_lost else UNKNOWN_FORCE if gap else 0.0
-        return rate, force * unknown
+    def _follow_motion(self, imu: FloatArray, seconds: float) -> FloatArray:
+        """Size (2,) of the rate, and of the force beside its slow mean, which is gravity."""
+        if self._mean is None:
+            self._mean = imu
+        self._mean = self._mean + min(seconds / _SLOW, 1.0) * (imu - self._mean)
+        moved = ((imu - self._mean) ** 2).reshape(2, 3).sum(axis=1)
+        self._variance = self._variance + min(seconds / _VIOLENCE_TIME, 1.0) * (moved / 3.0 - self._variance)
+        self._variance = np.maximum(self._variance, _LEAST_MOTION**2)
+        return np.array((math.sqrt(float(imu[:3] @ imu[:3])), math.sqrt(float(moved[1]))))
 
-    def _saturated(self, imu: list[float]) -> tuple[bool, bool]:
-        """Whether rate and force are beyond their ranges at either end of the step."""
-        before = self._beyond
-        self._beyond = (
-            max(map(abs, imu[:3])) >= self._noise.gyroscope_range,
-            max(map(abs, imu[3:])) >= self._noise.accelerometer_range,
-        )
-        return before[0] or self._beyond[0], before[1] or self._beyond[1]
+    def _hidden_change(self, seconds: float) -> FloatArray:
+        """Variance (2,) by which rate and force may differ between two samples so many ``seconds`` apart.
 
-    def _watch(self, imu: FloatArray, seconds: float) -> None:
-        if seconds > GAP:
+        Over times as long as that of the running mean it is what the motion has shown, over longer ones it grows as of
+        a random walk, over shorter ones with the third power, as of a smooth motion. Of a Brownian bridge a twelfth
+        of it, times the length of the step, is the variance of the integral.
+        """
+        ratio = seconds / _SLOW
+        return np.asarray(2.0 * self._variance * ratio**3 / (1.0 + ratio**2))
+
+    def _follow_spectrum(self, imu: FloatArray, seconds: float) -> None:
+        if seconds > _INTERRUPTED:
             self._recent.clear()
             self._floor.interrupt()
         self._recent.append(imu)
-        if len(self._recent) < 3:
-            return
-        first, second, third = self._recent
-        difference = first - 2.0 * second + third
-        self._floor.add(difference, seconds)
-        # White noise of variance s^2 has second differences of variance 6 s^2.
-        variance = (difference * difference).reshape(2, 3).sum(axis=1) / 18.0
-        self._variance += min(seconds / VIBRATION_TIME, 1.0) * (variance - self._variance)
-        del self._recent[0]
+        if len(self._recent) == 3:
+            first, second, third = self._recent
+            self._floor.add(first - 2.0 * second + third, seconds)
+            del self._recent[0]
 
 
 class NoiseFloor:
@@ -139,18 +115,18 @@ class NoiseFloor:
         self._differences.append(difference)
         if not len(self._window):
             self._seconds += seconds
-            if self._seconds >= WINDOW:
+            if self._seconds >= _WINDOW:
                 self._prepare()
         if 0 < len(self._window) <= len(self._differences):
             self._measure()
-            del self._differences[: max(len(self._window) // OVERLAPPING, 1)]
+            del self._differences[: max(len(self._window) // _OVERLAPPING, 1)]
 
     def _prepare(self) -> None:
         """Window and bands for the rate that the samples turn out to have."""
         count = len(self._differences)
         seconds = self._seconds / count
         frequencies = np.fft.rfftfreq(count, seconds)
-        edges = np.linspace(LOWEST, min(HIGHEST, 0.5 / seconds), BANDS + 1)
+        edges = np.linspace(_LOWEST, min(_HIGHEST, 0.5 / seconds), _BANDS + 1)
         inside = (frequencies >= edges[:-1, None]) & (frequencies < edges[1:, None])
         inside = inside[inside.any(axis=1)]
         self._window = np.hanning(count + 1)[:-1, None]
@@ -162,7 +138,7 @@ class NoiseFloor:
     def _measure(self) -> None:
         spectrum = np.abs(np.fft.rfft(np.array(self._differences) * self._window, axis=0)) ** 2
         power = (self._bands @ spectrum).reshape(-1, 2, 3).mean(axis=2)
-        self._windows = min(self._windows + 1, MEAN_OF)
+        self._windows = min(self._windows + 1, _MEAN_OF)
         self._power = self._power + (power - self._power) / self._windows
         if len(power):
             rate, force = np.sqrt(self._power.min(axis=0)).tolist()

@@ -1,109 +1,71 @@
-"""The filter: IMU samples and camera poses in, in any order of arrival; the robot's state at every IMU sample out.
+"""The filter: IMU samples and camera poses in, in any order of arrival; the robot's state at every IMU sample out."""
 
-The belief at a sample is a function of the samples and poses up to it, ordered by time, never of the order in which
-they came: a pose that comes late goes where it belongs, and everything after it is computed again.
-"""
-
-from bisect import bisect_left, bisect_right, insort
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Mapping
+from dataclasses import replace
 from itertools import islice
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.coasting import usable_seconds
-from thermal_fiducial.core.filter.error_state import doubted
-from thermal_fiducial.core.filter.gating import Belief, NO_GRAVITY, PoseGate, position_std, Sighting, Track
+from thermal_fiducial.core.filter.history import History, Instant, Node
+from thermal_fiducial.core.filter.hypotheses import Hypotheses, NO_GRAVITY
 from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
-from thermal_fiducial.core.filter.imu_noise import NoiseMonitor, NoiseRange
-from thermal_fiducial.core.filter.initialisation import FEWEST_SAMPLES, WINDOW_SECONDS
+from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
+from thermal_fiducial.core.filter.initialization import FEWEST_SAMPLES, WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseUpdate
-from thermal_fiducial.core.filter.navigation_state import NavigationState
+from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.filter.smoothing import SmoothOutput
+from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
 from thermal_fiducial.core.filter.state_output import odometry
-from thermal_fiducial.core.measurements import CameraPose, ImuSample, in_moved_map, Odometry
+from thermal_fiducial.core.filter.update import MotionAtPose
+from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
 from thermal_fiducial.core.types import FloatArray
 
 _SECOND_NS = 1_000_000_000
-#: Farther than this [ns] an estimated time offset never goes: the history is searched from there.
-_LARGEST_OFFSET_NS = 200_000_000
 #: An offset known to this [s] moves a marker by a pixel or two in the fastest flights.
 _KNOWN_OFFSET_STD = 0.003
-#: Poses whose mean normalised innovation squared is told.
+#: Seconds of samples over which motion is averaged where noise matters.
+_GLANCE_SECONDS = 0.2
+#: Poses over which the normalised innovation squared is averaged for the diagnostics.
 _NIS_POSES = 30
-#: The last seconds that are linearised anew when the time offset has become known [s].
-AGAIN_SECONDS = 2.0
-#: Nodes that a second pass goes on for each node that comes.
-STEPS_AGAIN = 6
-
-
-@dataclass(slots=True)
-class _Node:
-    """An IMU sample, the noise of the step that ends with it, and the belief there."""
-
-    stamp_ns: int
-    imu: FloatArray
-    noise: NoiseRange
-    belief: Belief
-    #: the last seconds gone through again, if they are just now
-    again: '_Again | None' = None
-
-
-@dataclass(frozen=True, slots=True)
-class _Again:
-    """A second pass: its belief at the node of a stamp, the node it was begun at, and the start of its track [ns]."""
-
-    belief: Belief
-    stamp_ns: int
-    begun_ns: int
-    started_ns: int
-
-
-class _Due(NamedTuple):
-    """A pose, its instant in the clock of the IMU by one of the estimates, and by which."""
-
-    time_ns: int
-    pose: CameraPose
-    by_rival: bool
+#: Verdicts on poses that are kept.
+_VERDICTS = 300
 
 
 class PoseEkf:
     """Left-invariant error-state Kalman filter with delayed, gated corrections.
 
-    ``status`` says in words how it is; ``diagnostics()`` in numbers; ``decided`` has the latest words on the poses.
+    ``status`` says in words how it is; ``diagnostics()`` in numbers; ``decided`` has the latest verdicts on the poses.
     """
 
     def __init__(self, config: PoseEkfConfig) -> None:
         self._config = config
-        self._offset_ns = round(config.camera_time_offset * _SECOND_NS)
         self.reset()
 
     def configure(self, config: PoseEkfConfig) -> None:
-        """Take over the live parameters of ``config``."""
+        """Take over the dynamic parameters of ``config``."""
         self._config = config
-        self._gate.configure(config)
+        self._hypotheses.configure(config)
 
     def reset(self) -> None:
         """Forget everything."""
         config = self._config
-        self._gate = PoseGate(config)
+        self._hypotheses = Hypotheses(config)
         self._imu_refused = 0
         self._input = ImuInput(config.max_imu_gap, config.imu.gyroscope_range, config.imu.accelerometer_range)
         self._begin()
 
     def _begin(self) -> None:
-        self._noise = NoiseMonitor(self._config.imu)
-        self._nodes: list[_Node] = []
-        self._poses: list[CameraPose] = []
-        #: stamp of the camera to the latest word on its pose, for the poses in the buffer
-        self.decided: dict[int, PoseUpdate] = {}
+        config = self._config
+        self._noise = ImuNoiseMonitor(config.imu)
+        offset_ns = round(config.camera_time_offset * _SECOND_NS)
+        self._history = History(config.max_delay + WINDOW_SECONDS, offset_ns)
+        self._verdicts: dict[int, PoseUpdate] = {}
         self._accepted = self._refused = 0
         self._imu_fault = ''
-        seconds = self._config.smoothing_time
-        self._smoother = SmoothOutput(seconds) if seconds > 0.0 else None
+        self._smoother = SmoothOutput(config.smoothing_time) if config.smoothing_time > 0.0 else None
         #: the latest odometry without steps; None unless ``smoothing_time`` asks for it
         self.smooth: Odometry | None = None
 
@@ -125,15 +87,14 @@ class PoseEkf:
             self._imu_refused += 1
             return None
         imu = np.concatenate((sample.angular_velocity, sample.linear_acceleration))
-        if not self._nodes:
-            self._nodes.append(_Node(sample.stamp_ns, imu, NoiseRange(), Belief()))
+        nodes = self._history.nodes
+        if not nodes:
+            nodes.append(Node(sample.stamp_ns, imu, np.zeros(6), Belief()))
             return None
-        last = self._nodes[-1]
-        seconds = (sample.stamp_ns - last.stamp_ns) / _SECOND_NS
-        node = _Node(sample.stamp_ns, imu, self._noise.densities(imu, seconds), last.belief)
-        self._nodes.append(node)
-        self._advance(len(self._nodes) - 1)
-        self._prune()
+        seconds = (sample.stamp_ns - nodes[-1].stamp_ns) / _SECOND_NS
+        node = Node(sample.stamp_ns, imu, self._noise.densities(imu, seconds), nodes[-1].belief)
+        self._history.append(node)
+        self._advance(len(nodes) - 1)
         output = self._output(node)
         self.smooth = self._smoother.follow(output) if self._smoother and output else None
         return output
@@ -143,261 +104,242 @@ class PoseEkf:
 
         ``pose.stamp_ns`` is the camera's stamp; ``camera_time_offset`` and the estimated rest are applied here.
         """
-        update = self._unusable(pose)
-        if update is None:
-            insort(self._poses, pose, key=lambda item: item.stamp_ns)
-            first = self._first_node_after(pose)
-            for index in range(first, len(self._nodes)):
-                self._advance(index, self._nodes[first].stamp_ns)
-            waiting = PoseUpdate(pose.stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
-            update = self.decided.get(pose.stamp_ns, waiting)
-        return update
+        reason = self._unusable(pose)
+        if reason:
+            return PoseUpdate(pose.stamp_ns, False, reason, np.nan)
+        for index in range(self._history.insert(pose), len(self._history.nodes)):
+            self._advance(index)
+        waiting = PoseUpdate(pose.stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
+        return self._verdicts.get(pose.stamp_ns, waiting)
 
     def move_map(self, T_new_old: FloatArray) -> None:
         """Follow a correction of the map: estimates and buffered poses move with it, T_new = T_new_old @ T_old."""
-        for node in self._nodes:
-            node.belief = self._gate.in_moved_map(node.belief, T_new_old)
-            if node.again:
-                node.again = replace(node.again, belief=self._gate.in_moved_map(node.again.belief, T_new_old))
-        self._poses = [in_moved_map(pose, T_new_old) for pose in self._poses]
+        self._history.move_map(T_new_old)
 
-    def _unusable(self, pose: CameraPose) -> PoseUpdate | None:
-        reason = ''
+    def _unusable(self, pose: CameraPose) -> str:
+        """Why a pose cannot be used; empty if it can."""
+        nodes = self._history.nodes
         if not (np.isfinite(pose.T_map_camera).all() and np.isfinite(pose.covariance).all()):
-            reason = 'refused: not finite'
-        elif not self._nodes:
-            reason = 'refused: no IMU yet'
-        elif pose.stamp_ns + self._offset_ns - self._nodes[-1].stamp_ns > self._config.max_imu_gap * _SECOND_NS:
-            reason = 'refused: far ahead of the IMU'
-        elif self._is_too_late(pose):
-            reason = 'refused: too late'
-        else:
-            place = bisect_left(self._poses, pose.stamp_ns, key=lambda item: item.stamp_ns)
-            if place < len(self._poses) and self._poses[place].stamp_ns == pose.stamp_ns:
-                reason = 'refused: stamp repeated'
-        return PoseUpdate(pose.stamp_ns, False, reason, np.nan) if reason else None
+            return 'refused: not finite'
+        if not _is_covariance(pose.covariance):
+            return 'refused: covariance is not positive definite'
+        if not nodes:
+            return 'refused: no IMU yet'
+        newest = nodes[-1]
+        due_ns = self._history.due_ns(pose, newest.belief.main)
+        if due_ns - newest.stamp_ns > self._config.max_imu_gap * _SECOND_NS:
+            return 'refused: far ahead of the IMU'
+        oldest_ns = max(nodes[0].stamp_ns, newest.stamp_ns - round(self._config.max_delay * _SECOND_NS))
+        if due_ns <= oldest_ns:
+            return 'refused: too late'
+        return 'refused: stamp repeated' if self._history.holds(pose.stamp_ns) else ''
 
-    def _is_too_late(self, pose: CameraPose) -> bool:
-        first, last = self._nodes[0], self._nodes[-1]
-        oldest_ns = max(first.stamp_ns, last.stamp_ns - round(self._config.max_delay * _SECOND_NS))
-        return (
-            self._due_ns(last.belief.offset, pose) <= oldest_ns
-            or self._due_ns(first.belief.offset, pose) <= first.stamp_ns
-        )
+    # --- the belief at each sample --------------------------------------------------------------------
 
-    # --- the history ----------------------------------------------------------------------------------
+    def _advance(self, index: int) -> None:
+        """Compute the belief of node ``index`` from that of the node before, with the poses in between."""
+        belief = self._history.nodes[index - 1].belief
+        onward = self._through_step if belief.main or belief.alternative else self._begun
+        self._history.nodes[index].belief = onward(belief, index)
 
-    def _due_ns(self, time_offset: float, pose: CameraPose) -> int:
-        """Instant of a pose in the clock of the IMU, for what is left of the time offset [s]."""
-        return pose.stamp_ns + self._offset_ns + round(time_offset * _SECOND_NS)
-
-    def _first_node_after(self, pose: CameraPose) -> int:
-        """First node with a belief that ``pose`` takes part in."""
-        earliest = pose.stamp_ns + self._offset_ns - _LARGEST_OFFSET_NS
-        index = max(self._index_at(earliest), 1)
-        while index < len(self._nodes):
-            belief = self._nodes[index - 1].belief
-            offset = min(belief.offset, belief.rival.state.time_offset) if belief.rival else belief.offset
-            if self._due_ns(offset, pose) <= self._nodes[index].stamp_ns:
-                break
-            index += 1
-        return index
-
-    def _advance(self, index: int, change_ns: int = 0) -> None:
-        """Compute the belief of node ``index`` from the node before; once more if something changed at an instant."""
-        node = self._nodes[index]
-        belief = self._step(index, self._nodes[index - 1].belief, self._poses)
-        again = self._nodes[index - 1].again
-        if again is None and self._gate.outgrown(belief):
-            again = self._begin_again(index, belief)
-        if again and belief.main and belief.main.started_ns == again.started_ns:
-            done = node.again
-            # What was begun before the change, and has come nowhere near it by then, is what it would be now.
-            holds = done and max(done.begun_ns, done.stamp_ns + _LARGEST_OFFSET_NS) < change_ns
-            again = done if holds else self._go_on(again, index, belief)
-        else:
-            again = None
-        if again and again.stamp_ns == node.stamp_ns:
-            belief, again = self._gate.linearised(again.belief, belief), None
-        node.belief, node.again = belief, again
-
-    def _begin_again(self, index: int, belief: Belief) -> '_Again':
-        """Begin to go through the last seconds of ``belief`` at node ``index`` with the time offset they have shown.
-
-        An offset that is wrong by tens of milliseconds is more than the filter's first order can bear: in a turn it
-        would leave errors in the biases that last. That is work for tens of milliseconds, and spread over the nodes
-        that follow, a few steps each, until the second pass has caught up.
-        """
-        assert belief.main
-        first = self._nodes[self._first_to_linearise(index, belief.main)]
-        skipped_ns = first.stamp_ns - self._offset_ns - round(belief.main.state.time_offset * _SECOND_NS)
-        again = self._gate.at_offset(first.belief, belief.main, skipped_ns)
-        return _Again(again, first.stamp_ns, self._nodes[index].stamp_ns, belief.main.started_ns)
-
-    def _go_on(self, again: '_Again', index: int, belief: Belief) -> '_Again':
-        """A few more steps, with the poses that ``belief`` of node ``index`` has, as far as that."""
-        # Those that were not due yet are for the nodes that follow, as they will be if they come late.
-        poses = self._poses[: _place_after(belief.pose_stamp_ns, self._poses)]
-        begin = self._index_at(again.stamp_ns) + 1
-        end = min(begin + STEPS_AGAIN, index + 1)
-        state = again.belief
-        for i in range(begin, end):
-            state = self._step(i, state, poses)
-        return replace(again, belief=state, stamp_ns=self._nodes[end - 1].stamp_ns)
-
-    def _first_to_linearise(self, index: int, track: Track) -> int:
-        """Node to go back to: some seconds, but not to another track, whose poses are no more to be trusted now."""
-        first = self._index_at(self._nodes[index].stamp_ns - round(AGAIN_SECONDS * _SECOND_NS))
-        main = self._nodes[first].belief.main
-        return first if main is None or main.started_ns == track.started_ns else self._index_at(track.started_ns)
-
-    def _step(self, index: int, belief: Belief, poses: list[CameraPose]) -> Belief:
-        """Belief at node ``index`` after ``belief`` at the node before, with those of ``poses`` in between.
-
-        A pose is due at one instant by the main estimate's clock, and at another by the rival's.
-        """
-        before, node = self._nodes[index - 1], self._nodes[index]
-        time_ns, imu = before.stamp_ns, before.imu
-        while (due := self._next_due(belief, poses)) is not None and due.time_ns <= node.stamp_ns:
-            due_ns = max(due.time_ns, time_ns)
-            share = (due_ns - before.stamp_ns) / (node.stamp_ns - before.stamp_ns)
-            imu_there = before.imu + share * (node.imu - before.imu)
-            belief = self._propagate(belief, (imu, imu_there), due_ns - time_ns, node.noise)
-            time_ns, imu = due_ns, imu_there
-            late = (due_ns - due.time_ns) / _SECOND_NS
-            sighting = Sighting(due.pose, due_ns, late, partial(self._window, index, imu), node.noise)
-            weigh = self._gate.weigh_rival if due.by_rival else self._gate.weigh
-            belief, update = weigh(belief, sighting)
-            if update:
+    def _through_step(self, belief: Belief, index: int) -> Belief:
+        """Both hypotheses at the end of a step; each sees a pose at its instant by its own clock."""
+        refused: list[tuple[CameraPose, Instant, Hypothesis]] = []
+        main = belief.main
+        if main:
+            main, verdicts = self._hypothesis_through(main, index)
+            for pose, update, at_pose in verdicts:
                 self._decide(update)
-        return self._propagate(belief, (imu, node.imu), node.stamp_ns - time_ns, node.noise)
+                if not update.accepted:
+                    refused.append((pose, self._instant_of(pose, at_pose, index), at_pose))
+        alternative = belief.alternative
+        if alternative:
+            alternative, verdicts = self._hypothesis_through(alternative, index)
+            if main is None:
+                for pose, _, _ in verdicts:
+                    self._decide(PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan))
+        belief = replace(belief, main=main, alternative=alternative)
+        if alternative is None and refused:
+            belief = self._with_alternative(belief, *refused[0], index)
+        return self._settled(belief)
 
-    def _next_due(self, belief: Belief, poses: list[CameraPose]) -> _Due | None:
-        """The first pose that either estimate has to weigh."""
-        due = []
-        if belief.main or not belief.rival:
-            due += self._due(belief.pose_stamp_ns, belief.offset, poses, by_rival=False)
-        if belief.rival:
-            due += self._due(belief.rival.pose_stamp_ns, belief.rival.state.time_offset, poses, by_rival=True)
-        return min(due, key=lambda item: item.time_ns, default=None)
-
-    def _due(self, seen_ns: int, time_offset: float, poses: list[CameraPose], *, by_rival: bool) -> list[_Due]:
-        place = _place_after(seen_ns, poses)
-        return [_Due(self._due_ns(time_offset, pose), pose, by_rival) for pose in poses[place : place + 1]]
-
-    def _propagate(
-        self, belief: Belief, ends: tuple[FloatArray, FloatArray], nanoseconds: int, noise: NoiseRange
+    def _with_alternative(
+        self, belief: Belief, pose: CameraPose, instant: Instant, at_pose: Hypothesis, index: int
     ) -> Belief:
-        """Trapezoid: the mean of the samples at the ends holds over the step."""
-        if nanoseconds <= 0:
+        window = self._history.window(instant, WINDOW_SECONDS)
+        motion = self._motion(instant, at_pose)
+        begun = self._hypotheses.alternative_to(at_pose, pose, instant.time_ns, motion, window)
+        if begun is None:
             return belief
-        return self._gate.predict(belief, 0.5 * (ends[0] + ends[1]), nanoseconds / _SECOND_NS, noise)
+        alternative, _ = self._hypothesis_through(begun, index, instant)
+        return replace(belief, alternative=alternative, hits_before=at_pose.hits)
 
-    def _window(self, index: int, imu: FloatArray, seconds: float) -> FloatArray:
-        """Samples (N, 6) of the last ``seconds`` before node ``index``, then ``imu``."""
-        first = self._index_at(self._nodes[index].stamp_ns - round(seconds * _SECOND_NS))
-        return np.array([*(node.imu for node in self._nodes[first:index]), imu])
+    def _settled(self, belief: Belief) -> Belief:
+        settled = belief.settled(self._config)
+        if settled.alternative is None and belief.main is None and belief.alternative and belief.alternative.failed:
+            return Belief(pose_stamp_ns=belief.alternative.pose_stamp_ns, resets=belief.resets)
+        if settled.main is not belief.main and settled.main:
+            reason = 'reset' if belief.main else 'initialised'
+            self._decide(PoseUpdate(settled.main.pose_stamp_ns, True, reason, math.nan))
+        return settled
 
-    def _index_at(self, stamp_ns: int) -> int:
-        """First node at ``stamp_ns`` or later."""
-        return bisect_left(self._nodes, stamp_ns, key=lambda node: node.stamp_ns)
+    def _begun(self, belief: Belief, index: int) -> Belief:
+        """The belief after the poses of a step, the first usable of which begins a hypothesis."""
+        history = self._history
+        until_ns = history.nodes[index].stamp_ns
+        while (pose := history.next_pose(belief.pose_stamp_ns, None, until_ns)) is not None:
+            belief = replace(belief, pose_stamp_ns=pose.stamp_ns)
+            instant = history.instant(index, history.due_ns(pose, None))
+            window = history.window(instant, WINDOW_SECONDS)
+            begun = self._hypotheses.from_nothing(pose, instant.time_ns, window)
+            self._decide(PoseUpdate(pose.stamp_ns, False, 'initialising' if begun else NO_GRAVITY, math.nan))
+            if begun:
+                alternative, _ = self._hypothesis_through(begun, index, instant)
+                return self._settled(replace(belief, alternative=alternative))
+        return belief
+
+    def _hypothesis_through(
+        self, hypothesis: Hypothesis, index: int, begin: Instant | None = None
+    ) -> tuple[Hypothesis, list[tuple[CameraPose, PoseUpdate, Hypothesis]]]:
+        """A hypothesis at the end of a step, and what it says of the poses due in it, each with itself before it."""
+        history, node = self._history, self._history.nodes[index]
+        at = begin or history.instant(index, history.nodes[index - 1].stamp_ns)
+        verdicts = []
+        while (pose := history.next_pose(hypothesis.pose_stamp_ns, hypothesis, node.stamp_ns)) is not None:
+            then = self._instant_of(pose, hypothesis, index)
+            hypothesis, at = self._moved(hypothesis, at, then, node), then
+            motion = self._motion(then, hypothesis)
+            weighed, update = self._hypotheses.weigh(hypothesis, pose, motion)
+            verdicts.append((pose, update, hypothesis))
+            hypothesis = weighed
+        end = Instant(node.stamp_ns, node.imu, index)
+        return self._moved(hypothesis, at, end, node), verdicts
+
+    def _instant_of(self, pose: CameraPose, hypothesis: Hypothesis, index: int) -> Instant:
+        """Instant of a pose, not before what the hypothesis has gone through already."""
+        time_ns = max(self._history.due_ns(pose, hypothesis), hypothesis.prediction.stamp_ns)
+        return self._history.instant(index, time_ns)
+
+    def _moved(self, hypothesis: Hypothesis, begin: Instant, end: Instant, node: Node) -> Hypothesis:
+        """Trapezoid: the mean of the samples at the ends holds over the step."""
+        if end.time_ns <= begin.time_ns:
+            return hypothesis
+        return self._hypotheses.predicted(hypothesis, 0.5 * (begin.imu + end.imu), end.time_ns, node.densities)
+
+    def _motion(self, instant: Instant, hypothesis: Hypothesis) -> MotionAtPose:
+        before, after = self._history.nodes[instant.index - 1 : instant.index + 1]
+        return self._hypotheses.motion(hypothesis, self._history.window(instant, _GLANCE_SECONDS), before, after)
 
     def _decide(self, update: PoseUpdate) -> None:
-        if update.stamp_ns not in self.decided:
+        known = self._verdicts.pop(update.stamp_ns, None)
+        if known is None:
             self._accepted += update.accepted
             self._refused += not update.accepted
-        self.decided[update.stamp_ns] = update
-
-    def _prune(self) -> None:
-        """Forget what no pose may reach any more; in blocks, as deleting from a list's head moves the rest."""
-        kept_ns = round((self._config.max_delay + AGAIN_SECONDS + WINDOW_SECONDS) * _SECOND_NS)
-        horizon = self._nodes[-1].stamp_ns - kept_ns
-        if self._nodes[len(self._nodes) // 2].stamp_ns >= horizon:
-            return
-        del self._nodes[: self._index_at(horizon)]
-        stale = _place_after(self._nodes[0].belief.pose_stamp_ns, self._poses)
-        for pose in self._poses[:stale]:
-            self.decided.pop(pose.stamp_ns, None)
-        del self._poses[:stale]
+        self._verdicts[update.stamp_ns] = update
+        while len(self._verdicts) > _VERDICTS:
+            del self._verdicts[next(iter(self._verdicts))]
 
     # --- output ---------------------------------------------------------------------------------------
 
-    def _output(self, node: _Node) -> Odometry | None:
-        if node.belief.main is None:
+    def _output(self, node: Node) -> Odometry | None:
+        main = node.belief.main
+        if main is None:
             return None
-        state = self._gate.filter.in_clock_of_imu(node.belief.main.state, node.imu)
-        other = self._gate.contradicting(node.belief)
-        if other is not None:
-            state = doubted(state, other)
-        return odometry(node.stamp_ns, state, node.imu[:3], self._rate_variance(node))
+        covariance, with_bias = self._hypotheses.core_covariance(node.belief, node.imu)
+        return odometry(main.prediction, covariance, with_bias, node.imu, self._rate_variance(node))
 
-    def _rate_variance(self, node: _Node) -> float:
-        return node.noise.shaken[0] ** 2 * _SECOND_NS / (node.stamp_ns - self._nodes[-2].stamp_ns)
+    def _rate_variance(self, node: Node) -> float:
+        seconds = (node.stamp_ns - self._history.nodes[-2].stamp_ns) / _SECOND_NS
+        return float(node.densities[0]) ** 2 / seconds
+
+    @property
+    def decided(self) -> Mapping[int, PoseUpdate]:
+        """Stamp of the camera to the latest verdict on its pose, for the latest poses."""
+        return self._verdicts
+
+    @property
+    def _belief(self) -> Belief:
+        nodes = self._history.nodes
+        return nodes[-1].belief if nodes else Belief()
 
     @property
     def state(self) -> NavigationState | None:
         """Estimate at the newest IMU sample."""
-        main = self._nodes[-1].belief.main if self._nodes else None
-        return main.state if main else None
+        main = self._belief.main
+        return main.prediction.state if main else None
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """State and whole covariance at the newest IMU sample."""
+        main = self._belief.main
+        return self._hypotheses.estimate(main) if main else None
 
     @property
     def camera_time_offset(self) -> float | None:
         """Estimate of t_imu - t_camera [s]; None while it is not known well enough to rely on."""
-        if self.state is None or self._gate.filter.time_offset_std(self.state) > _KNOWN_OFFSET_STD:
+        main = self._belief.main
+        if main is None or self._time_offset_std(main) > _KNOWN_OFFSET_STD:
             return None
-        return self._config.camera_time_offset + self.state.time_offset
+        return self._config.camera_time_offset + main.prediction.state.time_offset
+
+    def _time_offset_std(self, main: Hypothesis) -> float:
+        """Of the estimate; before it is begun, and where there is none, what the parameter says [s]."""
+        origin = main.prediction.origin
+        return origin.std(TIME_OFFSET) if origin.clock_open else self._config.time_offset_std
 
     @property
     def resets(self) -> int:
-        """How often it has started afresh since it was begun."""
-        return self._nodes[-1].belief.resets if self._nodes else 0
+        """How often another estimate has replaced the present one since it was begun."""
+        return self._belief.resets
 
     @property
     def status(self) -> str:
         """How the filter is, in words."""
         if self._imu_fault:
             return self._imu_fault
-        if not self._nodes:
+        if not self._history.nodes:
             return 'waiting for IMU'
-        belief = self._nodes[-1].belief
-        if belief.main is None:
-            hits = belief.rival.hits if belief.rival else 0
-            return f'initialising: {hits} of {self._config.initial_poses} poses' if hits else self._why_waiting()
-        uncertainty = position_std(belief.main.state)
-        if uncertainty > self._config.lost_position_std:
-            return f'lost: position known to {uncertainty:.2f} m'
-        if self._gate.contradicting(belief) is not None:
-            return 'in doubt: poses agree on another place'
-        coasting = self._coasting(belief.main)
+        main, other = self._belief.main, self._belief.alternative
+        if main is None:
+            return f'initialising: {other.hits} of {self._config.initial_poses} poses' if other else self._why_waiting()
+        if main.position_std > self._config.lost_position_std:
+            return f'lost: position known to {main.position_std:.2f} m'
+        if main.in_doubt:
+            return f'in doubt: {main.refused_in_row} poses in a row contradict the estimate'
+        coasting = self._coasting(main)
         return f'coasting for {coasting:.1f} s' if coasting > 0.5 else 'tracking'
 
     def _why_waiting(self) -> str:
-        latest = next(reversed(self.decided.values()), None)
+        latest = next(reversed(self._verdicts.values()), None)
         if latest is None or latest.reason != NO_GRAVITY:
             return 'waiting for markers'
-        force = np.mean([node.imu[3:] for node in self._nodes[-FEWEST_SAMPLES:]], axis=0)
+        force = np.mean([node.imu[3:] for node in self._history.nodes[-FEWEST_SAMPLES:]], axis=0)
         words = ' '.join(f'{value:.1f}' for value in force)
         return f'poses contradict gravity: the IMU says {words} m/s^2; its axes, sign, units? camera_orientation?'
 
-    def _coasting(self, track: Track) -> float:
-        return (self._nodes[-1].stamp_ns - track.accepted_ns) / _SECOND_NS
+    def _coasting(self, main: Hypothesis) -> float:
+        return (self._history.nodes[-1].stamp_ns - main.accepted_ns) / _SECOND_NS
 
     @property
     def lost(self) -> bool:
-        """Whether there is no pose, or none as good as ``lost_position_std`` asks."""
-        return self.state is None or position_std(self.state) > self._config.lost_position_std
+        """Whether there is no pose to fly on: none as good as ``lost_position_std``, or poses and IMU contradict it."""
+        main = self._belief.main
+        if main is None or self._imu_fault == Verdict.FROZEN.value or main.in_doubt:
+            return True
+        return main.position_std > self._config.lost_position_std
 
     @property
     def usable_for(self) -> float:
         """Seconds [s] for which the pose stays as good as ``lost_position_std`` asks, if no marker comes any more."""
-        if self.state is None:
+        main = self._belief.main
+        if main is None:
             return 0.0
-        densities = self._nodes[-1].noise.at(self.state.aliasing.share)
-        return usable_seconds(self.state, self._gate.filter.layout, densities, self._config.lost_position_std)
+        estimate = self._hypotheses.estimate(main)
+        return usable_seconds(estimate, self._history.nodes[-1].densities, self._config.lost_position_std)
 
     def _mean_nis(self) -> float:
-        """Of the latest poses; 6 where their covariances are the truth, less where the parameters allow for more."""
-        values = [update.nis for update in islice(reversed(self.decided.values()), _NIS_POSES)]
+        """Of the latest poses; 6 where their covariances are right, less where the parameters allow for more."""
+        values = [update.nis for update in islice(reversed(self._verdicts.values()), _NIS_POSES)]
         return float(np.mean([value for value in values if not math.isnan(value)] or math.nan))
 
     def diagnostics(self) -> dict[str, float]:
@@ -408,30 +350,33 @@ class PoseEkf:
             'poses refused': float(self._refused),
             'IMU samples refused': float(self._imu_refused),
             'nis': self._mean_nis(),
-            'vibration rad/s': rate,
-            'vibration m/s^2': force,
+            'vibration rad/s/sqrt(Hz)': rate,
+            'vibration m/s^2/sqrt(Hz)': force,
         }
-        if self.state is not None:
-            belief = self._nodes[-1].belief
-            assert belief.main
-            numbers |= {
-                'seconds since accepted pose': self._coasting(belief.main),
-                'starts afresh': float(belief.resets),
-                'position std': position_std(self.state),
-                'usable for': self.usable_for,
-                'time offset': self._config.camera_time_offset + self.state.time_offset,
-                'time offset std': self._gate.filter.time_offset_std(self.state),
-                'clock steps': float(self.state.clock_steps.found),
-                'stamp jitter': math.sqrt(self.state.stamp_jitter.variance),
-                'vibration share': self.state.aliasing.share,
-                'gyroscope bias': float(np.linalg.norm(self.state.bias[:3])),
-                'accelerometer bias': float(np.linalg.norm(self.state.bias[3:])),
-                'gyroscope scale error': float(np.abs(self.state.gyroscope_scale).max()),
-                'map tilt': math.asin(float(np.hypot(*self.state.gravity[:2])) / self._config.gravity),
-            }
-        return numbers
+        main = self._belief.main
+        return numbers if main is None else numbers | self._figures_of(main)
+
+    def _figures_of(self, main: Hypothesis) -> dict[str, float]:
+        state, noise = main.prediction.state, main.prediction.origin.pose_noise
+        return {
+            'seconds since accepted pose': self._coasting(main),
+            'resets': float(self.resets),
+            'position std': main.position_std,
+            'usable for': self.usable_for,
+            'time offset': self._config.camera_time_offset + state.time_offset,
+            'time offset std': self._time_offset_std(main),
+            'white pose error': math.sqrt(noise.white),
+            'systematic pose error': math.sqrt(noise.systematic),
+            'gyroscope bias': float(np.linalg.norm(state.bias[:3])),
+            'accelerometer bias': float(np.linalg.norm(state.bias[3:])),
+            'gyroscope scale error': float(np.abs(state.scale[0]).max()),
+            'accelerometer scale error': float(np.abs(state.scale[1]).max()),
+            'map tilt': math.asin(float(np.hypot(*state.gravity[:2])) / self._config.gravity),
+        }
 
 
-def _place_after(stamp_ns: int, poses: list[CameraPose]) -> int:
-    """Index of the first pose that is later."""
-    return bisect_right(poses, stamp_ns, key=lambda pose: pose.stamp_ns)
+def _is_covariance(matrix: FloatArray) -> bool:
+    """Whether (6, 6) is symmetric, up to rounding, and positive definite."""
+    if not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-12):
+        return False
+    return bool(np.linalg.eigvalsh(matrix)[0] > 0.0)

@@ -2,32 +2,49 @@
 
 import numpy as np
 
-from thermal_fiducial.core.filter.navigation_state import GYROSCOPE_BIAS, NavigationState, POSITION, ROTATION, VELOCITY
+from thermal_fiducial.core.filter.prediction import Prediction
+from thermal_fiducial.core.filter.state import GYROSCOPE_BIAS, POSITION, ROTATION, VELOCITY
 from thermal_fiducial.core.geometry.se3 import skew
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray
 
-_ORDER = np.r_[POSITION, ROTATION, VELOCITY, GYROSCOPE_BIAS]
+_ORDER = np.r_[POSITION, ROTATION, VELOCITY]
 _ALL = np.ix_(_ORDER, _ORDER)
 
 
-def odometry(stamp_ns: int, state: NavigationState, rate: FloatArray, rate_variance: float) -> Odometry:
-    """State at an IMU sample whose ``rate`` (3,) has white noise of ``rate_variance`` [rad^2/s^2]."""
+def odometry(
+    prediction: Prediction, core: FloatArray, with_bias: FloatArray, imu: FloatArray, rate_variance: float
+) -> Odometry:
+    """State at an IMU sample.
+
+    Parameters
+    ----------
+    core : (9, 9) covariance of rotation, velocity and position errors
+    with_bias : (9, 3) of these with the gyroscope's bias
+    imu : (6,) the sample
+    rate_variance : of the white noise of its rate [rad^2/s^2]
+    """
+    state = prediction.state
     R, velocity_body = state.R_map_body, state.velocity_body
+    joint = np.empty((12, 12))
+    joint[:9, :9] = core[_ALL]
+    joint[:9, 9:] = with_bias[_ORDER]
+    joint[9:, :9] = joint[:9, 9:].T
+    joint[9:, 9:] = prediction.origin.covariance[GYROSCOPE_BIAS, GYROSCOPE_BIAS]
     # (p, theta) of the map are R times the error of the robot frame; v_body moves with both nu and phi.
     J = np.zeros((12, 12))
     J[0:3, 0:3] = J[3:6, 3:6] = R
     J[6:9, 3:6] = skew(velocity_body)
     J[6, 6] = J[7, 7] = J[8, 8] = 1.0
     J[9, 9] = J[10, 10] = J[11, 11] = -1.0
-    covariance = J @ state.covariance[_ALL] @ J.T
+    covariance = J @ joint @ J.T
     twist_covariance = covariance[6:, 6:]
     twist_covariance[(3, 4, 5), (3, 4, 5)] += rate_variance
     return Odometry(
-        stamp_ns,
+        prediction.stamp_ns,
         state.T_map_body,
         velocity_body,
-        rate - state.rate_error(rate),
+        state.corrected(imu)[:3],
         covariance[:6, :6],
         twist_covariance,
     )

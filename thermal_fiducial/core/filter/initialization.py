@@ -10,22 +10,27 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.clock_steps import ClockSteps
-from thermal_fiducial.core.filter.error_state import BodyPose, ErrorStateFilter
-from thermal_fiducial.core.filter.learned_noise import Aliasing, StampJitter
-from thermal_fiducial.core.filter.navigation_state import (
+from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise
+from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
+    ACCELEROMETER_MATRIX,
+    Estimate,
+    EXTRINSICS,
+    GRAVITY,
     GYROSCOPE_BIAS,
-    Layout,
+    GYROSCOPE_MATRIX,
     NavigationState,
     POSE,
-    POSITION,
-    ROTATION,
+    SIZE,
+    SYSTEMATIC,
     VELOCITY,
 )
+from thermal_fiducial.core.filter.update import PoseUpdater
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 
+#: White error of a camera pose in its own standard deviations, to begin with: the rest of what it claims is systematic.
+WHITE_STD = 0.7
 #: Seconds of samples that stillness is judged on, and the fewest of them.
 WINDOW_SECONDS, FEWEST_SAMPLES = 0.5, 20
 #: At rest the samples scatter less than this [rad/s, m/s^2] ...
@@ -65,33 +70,30 @@ def _quiet(imu: FloatArray) -> bool:
     return bool(quiet and np.linalg.norm(imu.mean(axis=0)[:3]) < STILL_RATE)
 
 
-def blank_state(config: PoseEkfConfig, layout: Layout) -> NavigationState:
+def blank_state(config: PoseEkfConfig) -> NavigationState:
     """What is known before the first pose: the parameters."""
     return NavigationState(
         R_map_body=np.eye(3),
         velocity=np.zeros(3),
         position=np.zeros(3),
         bias=np.zeros(6),
-        gyroscope_scale=np.zeros((3, 3)),
+        scale=np.zeros((2, 3, 3)),
         gravity=np.array([0.0, 0.0, -config.gravity]),
         time_offset=0.0,
-        clock_open=False,
         T_body_camera=transform_from_quaternion(config.camera_position, config.camera_orientation),
-        stamp_jitter=StampJitter.of(config.stamp_jitter),
-        aliasing=Aliasing(),
-        clock_steps=ClockSteps.none(layout.size),
-        covariance=np.zeros((layout.size, layout.size)),
+        systematic=np.zeros(6),
     )
 
 
 def start(
-    config: PoseEkfConfig, filter_: ErrorStateFilter, pose: BodyPose, prior: NavigationState, imu: FloatArray
-) -> NavigationState | None:
-    """State at a first pose, or None where the pose contradicts gravity, or there is none in what the IMU measures.
+    config: PoseEkfConfig, updater: PoseUpdater, pose: BodyPose, stamp_ns: int, prior: NavigationState, imu: FloatArray
+) -> Estimate | None:
+    """Estimate at a first pose, or None where the pose contradicts gravity, or there is none in what the IMU measures.
 
     Parameters
     ----------
-    prior : biases, gravity and offsets to begin with; its covariance doesn't count
+    stamp_ns : instant of the pose in the clock of the IMU
+    prior : biases, gravity and offsets to begin with
     imu : (N, 6) samples up to the pose's instant, the last one at that instant
     """
     up = pose.T_map_body[2, :3]
@@ -101,37 +103,40 @@ def start(
     off = abs(float(np.linalg.norm(force)) - config.gravity)
     if off > (NO_GRAVITY if _quiet(imu) else HARDLY_GRAVITY * config.gravity):
         return None
-    state = _unaligned(config, filter_.layout, pose, prior)
+    estimate = _unaligned(config, pose, stamp_ns, prior)
     still = rest(imu, config.gravity)
     if still:
         # A slow flight may be as quiet: the larger the mean rate, the rather it is one, and the less it says.
         doubt = max(float(np.linalg.norm(still.rate)) / RATE_STD, 1.0)
-        state, _ = filter_.align(state, still.force, doubt * FORCE_STD)
-        state, _ = filter_.settle(state, still.rate, doubt * RATE_STD)
-    return state
+        estimate = updater.align(estimate, still.force, doubt * FORCE_STD)
+        estimate = updater.settle(estimate, still.rate, doubt * RATE_STD)
+    return estimate
 
 
-def _unaligned(config: PoseEkfConfig, layout: Layout, pose: BodyPose, prior: NavigationState) -> NavigationState:
-    variances = np.zeros(layout.size)
-    variances[ROTATION], variances[POSITION] = config.attitude_floor**2, config.position_floor**2
-    variances[VELOCITY] = config.initial_velocity_std**2
-    variances[GYROSCOPE_BIAS] = config.initial_gyroscope_bias_std**2
-    variances[ACCELEROMETER_BIAS] = config.initial_accelerometer_bias_std**2
-    if layout.gravity:
-        variances[layout.gravity] = (config.gravity * config.map_tilt_std) ** 2
-    if layout.extrinsics:
-        stds = (config.extrinsics_orientation_std, config.extrinsics_position_std)
-        variances[layout.extrinsics] = np.repeat(np.square(stds), 3)
-    if layout.gyroscope_scale:
-        variances[layout.gyroscope_scale] = config.imu.gyroscope_scale_std**2
-    P = np.diag(variances)
-    P[np.ix_(POSE, POSE)] += pose.covariance
-    return replace(
+def _unaligned(config: PoseEkfConfig, pose: BodyPose, stamp_ns: int, prior: NavigationState) -> Estimate:
+    noise = PoseNoise.of(WHITE_STD, config.systematic_pose_std)
+    P = np.diag(_initial_variances(config))
+    P[np.ix_(POSE, POSE)] += (noise.white + noise.systematic) * pose.shape
+    state = replace(
         prior,
         R_map_body=pose.T_map_body[:3, :3],
         position=pose.T_map_body[:3, 3],
         velocity=np.zeros(3),
-        clock_open=False,
-        clock_steps=ClockSteps.none(layout.size, prior.clock_steps.found),
-        covariance=P,
+        systematic=np.zeros(6),
     )
+    return Estimate(stamp_ns, state, P, clock_open=False, pose_noise=noise)
+
+
+def _initial_variances(config: PoseEkfConfig) -> FloatArray:
+    """(48,) of all that the first pose does not say."""
+    stds = np.zeros(SIZE)
+    stds[VELOCITY] = config.initial_velocity_std
+    stds[GYROSCOPE_BIAS] = config.initial_gyroscope_bias_std
+    stds[ACCELEROMETER_BIAS] = config.initial_accelerometer_bias_std
+    stds[GYROSCOPE_MATRIX] = config.imu.gyroscope_scale_std
+    stds[ACCELEROMETER_MATRIX] = config.imu.accelerometer_scale_std
+    stds[GRAVITY] = config.gravity * config.map_tilt_std
+    if config.estimate_extrinsics:
+        stds[EXTRINSICS] = np.repeat((config.extrinsics_orientation_std, config.extrinsics_position_std), 3)
+    stds[SYSTEMATIC] = 1.0
+    return np.square(stds)

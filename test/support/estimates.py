@@ -1,0 +1,48 @@
+"""Estimates of the filter to test its matrices with."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from support.flights import config
+from thermal_fiducial.core.filter.initialization import blank_state
+from thermal_fiducial.core.filter.pose_noise import PoseNoise
+from thermal_fiducial.core.filter.state import Estimate, SIZE
+from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian, so3_log
+
+
+def difference(state, other):
+    """Error coordinates that carry ``state`` to ``other``."""
+    rotation = so3_log(state.R_map_body.T @ other.R_map_body)
+    J = np.linalg.inv(state.R_map_body @ so3_left_jacobian(rotation))
+    extrinsics = other.T_body_camera @ np.linalg.inv(state.T_body_camera)
+    phi = so3_log(extrinsics[:3, :3])
+    return np.concatenate(
+        (
+            rotation,
+            J @ (other.velocity - state.velocity),
+            J @ (other.position - state.position),
+            other.bias - state.bias,
+            (other.scale - state.scale).ravel(),
+            other.gravity[:2] - state.gravity[:2],
+            [other.time_offset - state.time_offset],
+            phi,
+            np.linalg.inv(so3_left_jacobian(phi)) @ extrinsics[:3, 3],
+            other.systematic - state.systematic,
+        )
+    )
+
+
+def any_estimate():
+    """Somewhere, turned and moving, with a dense covariance."""
+    rng = np.random.default_rng(5)
+    A = rng.normal(size=(SIZE, SIZE)) * 0.01
+    state = replace(
+        blank_state(config()),
+        R_map_body=so3_exp([0.3, -0.2, 1.9]),
+        velocity=np.array([1.0, -0.5, 0.2]),
+        position=np.array([4.0, 2.0, -1.0]),
+        bias=0.01 * rng.normal(size=6),
+        scale=0.01 * rng.normal(size=(2, 3, 3)),
+    )
+    return Estimate(1_000, state, A @ A.T, clock_open=True, pose_noise=PoseNoise.of(1.0, 1.0))

@@ -1,0 +1,153 @@
+"""The pose update's Jacobian against finite differences, and what it learns."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.estimates import any_estimate, difference
+from support.flights import CAMERA_POSITION, config
+
+from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise
+from thermal_fiducial.core.filter.state import EXTRINSICS, POSE, SIZE, SYSTEMATIC, TIME_OFFSET, VELOCITY
+from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_innovation, PoseUpdater
+from thermal_fiducial.core.geometry.se3 import so3_exp, so3_log, transform
+from thermal_fiducial.core.measurements import CameraPose
+
+FULL = config(estimate_extrinsics=True, stamp_jitter=0.0)
+RATE = np.array([0.5, -1.0, 0.7])
+MOTION = MotionAtPose(rate=RATE, rate_variance=0.0, mean_rate=RATE, acceleration=np.zeros(3), turning=0.0)
+STILL = MotionAtPose(rate=np.zeros(3), rate_variance=0.0, mean_rate=np.zeros(3), acceleration=np.zeros(3), turning=0.0)
+
+
+@pytest.fixture
+def estimate():
+    return any_estimate()
+
+
+def known(estimate, variance=1e-12):
+    """An estimate that knows its velocity, with a little left of the rest."""
+    return replace(estimate, covariance=variance * np.eye(SIZE))
+
+
+def test_the_innovation_is_the_error_itself(estimate):
+    error = np.zeros(SIZE)
+    error[POSE] = [0.4, -0.3, 0.8, 1.0, 2.0, -3.0]
+    truth = estimate.state.plus(error)
+    np.testing.assert_allclose(pose_innovation(estimate.state, truth.T_map_body), error[POSE], atol=1e-12)
+
+
+def test_covariance_of_the_body_pose_has_the_lever_arm(estimate):
+    """Samples of the camera pose in the ROS convention, carried to the body one by one."""
+    rng = np.random.default_rng(4)
+    A = 1e-4 * rng.normal(size=(6, 6))
+    T, T_body_camera = transform(so3_exp([0.5, 1.0, -2.0]), [1.0, 2.0, 3.0]), estimate.state.T_body_camera
+    pose = body_pose(CameraPose(0, T, A @ A.T), T_body_camera, 1.0)
+    columns = []
+    for d in 1e-6 * np.eye(6):
+        other = transform(so3_exp(d[3:]) @ T[:3, :3], T[:3, 3] + d[:3]) @ np.linalg.inv(T_body_camera)
+        inner = np.linalg.inv(pose.T_map_body) @ other
+        columns.append(np.concatenate((so3_log(inner[:3, :3]), inner[:3, 3])) / 1e-6)
+    J = np.transpose(columns)
+    assert np.linalg.norm(CAMERA_POSITION) > 0.1
+    # 1e-5 relative: finite differences of 1e-6
+    np.testing.assert_allclose(pose.covariance, J @ A @ A.T @ J.T, rtol=1e-4, atol=1e-5 * (A @ A.T).max())
+
+
+def test_time_offset_and_extrinsics_columns(estimate):
+    """A pose taken later, and one through other extrinsics, differ as the columns of H say."""
+    updater, state = PoseUpdater(FULL), estimate.state
+    later = transform(state.R_map_body @ so3_exp(1e-6 * RATE), state.position + 1e-6 * state.velocity)
+    innovation = updater.innovation(known(estimate), BodyPose(0, later, np.eye(6)), MOTION)
+    np.testing.assert_allclose(innovation.value, 1e-6 * innovation.H[:, TIME_OFFSET], atol=1e-11)
+    for axis, error in enumerate(1e-6 * np.eye(6)):
+        T_true = transform(so3_exp(error[:3]), error[3:]) @ state.T_body_camera
+        measured = body_pose(CameraPose(0, state.T_map_body @ T_true, np.eye(6)), state.T_body_camera, 1.0)
+        innovation = updater.innovation(known(estimate), measured, MOTION)
+        np.testing.assert_allclose(innovation.value, 1e-6 * innovation.H[:, EXTRINSICS][:, axis], atol=1e-11)
+
+
+def test_the_systematic_error_is_part_of_the_measurement(estimate):
+    """In its own standard deviations, it moves a pose by the root of the pose's covariance."""
+    updater = PoseUpdater(FULL)
+    A = np.random.default_rng(3).normal(size=(6, 6)) * 1e-3
+    pose = BodyPose(0, estimate.state.T_map_body, A @ A.T)
+    same_view = replace(known(estimate), pose_noise=replace(PoseNoise.of(1.0, 2.0), last=pose))
+    biased = replace(same_view, state=replace(estimate.state, systematic=np.arange(1.0, 7.0)))
+    innovation = updater.innovation(biased, pose, STILL)
+    np.testing.assert_allclose(innovation.value, -innovation.H[:, SYSTEMATIC] @ np.arange(1.0, 7.0), atol=1e-12)
+    root = innovation.H[:, SYSTEMATIC]
+    # twice the standard deviation
+    np.testing.assert_allclose(root @ root.T, 4.0 * pose.shape, rtol=1e-9, atol=1e-15)
+
+
+def test_a_motion_below_its_own_noise_says_nothing_of_the_clock(estimate):
+    updater = PoseUpdater(FULL)
+    pose = BodyPose(0, estimate.state.T_map_body, 1e-6 * np.eye(6))
+    unknown = known(estimate)
+    unknown.covariance[VELOCITY, VELOCITY] = np.eye(3)
+    noisy = replace(MOTION, rate_variance=1.0)
+    column = updater.innovation(unknown, pose, noisy).H[:, TIME_OFFSET]
+    assert not column.any()
+    sure = updater.innovation(known(estimate), pose, MOTION).H[:, TIME_OFFSET]
+    np.testing.assert_allclose(sure[:3], RATE, atol=1e-9)
+
+
+@pytest.mark.parametrize(('turning', 'push'), [(0.0, 0.0), (3.0, 0.0), (0.0, 2.0)])
+def test_an_uncertain_time_offset_costs_what_the_acceleration_makes_of_it(estimate, turning, push):
+    """Nothing at rest; in a turn half of the acceleration times the square of the offset, of variance 3/4 a^2 s^4."""
+    updater, std = PoseUpdater(FULL), 0.02
+    P = np.zeros((SIZE, SIZE))
+    P[TIME_OFFSET, TIME_OFFSET] = std**2
+    resting = replace(estimate, state=replace(estimate.state, velocity=np.zeros(3)), covariance=P)
+    motion = MotionAtPose(np.zeros(3), 0.0, np.zeros(3), np.array([push, 0.0, 0.0]), turning)
+    pose = BodyPose(0, resting.state.T_map_body, np.zeros((6, 6)))
+    innovation = updater.innovation(resting, pose, motion)
+    expected = 0.75 * std**4 * np.repeat((turning**2, push**2), 3) + np.diag(pose.shape)
+    np.testing.assert_allclose(np.diag(innovation.R), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize('place', [0, 1, 2, 12, 13, 14, 33, 34])
+def test_at_rest_the_force_shows_tilt_bias_and_gravity(estimate, place):
+    """Whichever of them alone is unknown is found from what it makes of the force."""
+    updater = PoseUpdater(FULL)
+    error = np.zeros(SIZE)
+    error[place] = 1e-3
+    truth = estimate.state.plus(error)
+    alone = np.zeros((SIZE, SIZE))
+    alone[place, place] = 1.0
+    found = updater.align(replace(estimate, covariance=alone), truth.bias[3:] - truth.gravity @ truth.R_map_body, 1e-3)
+    # second order of a tilt of 1e-3, under a prior of 1 against a noise of 1e-3
+    np.testing.assert_allclose(difference(estimate.state, found.state), error, atol=1e-5)
+
+
+def test_what_poses_are_worth_is_learned(estimate):
+    """White errors of a third of what the covariance claims, about a state that is known."""
+    rng, updater = np.random.default_rng(8), PoseUpdater(config(stamp_jitter=0.0, estimate_time_offset=False))
+    R = np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)
+    now = replace(known(estimate, 1e-14), clock_open=False, pose_noise=PoseNoise.of(1.0, 0.01))
+    for stamp in range(2000):
+        noise = np.linalg.cholesky(R) @ rng.normal(size=6) / 3.0
+        T = now.state.T_map_body @ transform(so3_exp(noise[:3]), noise[3:])
+        pose = BodyPose(stamp, T, R)
+        innovation = updater.innovation(replace(now, covariance=1e-14 * np.eye(SIZE)), pose, STILL)
+        noise_then = updater.correct(pose, innovation, STILL).pose_noise
+        now = replace(now, pose_noise=noise_then)
+    # the memory of 50 poses of 6 degrees of freedom: 12 % of the variance, 6 % of the deviation; three of that
+    assert np.sqrt(now.pose_noise.white) == pytest.approx(1.0 / 3.0, rel=0.2)
+
+
+def test_another_view_has_another_systematic_error():
+    noise = PoseNoise.of(1.0, 1.0)
+    R = np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)
+    here = BodyPose(0, np.eye(4), R)
+    assert noise.alike(here, 0.3) == 0.0
+    seen = replace(noise, last=here)
+    assert seen.alike(here, 0.3) == pytest.approx(1.0)
+    turned = BodyPose(1, transform(so3_exp([0.0, 0.3, 0.0]), np.zeros(3)), R)
+    assert seen.alike(turned, 0.3) == pytest.approx(np.exp(-1.0))
+    # 2 mm for 1 mrad: markers are 2 m away, so 0.6 m are 0.3 rad
+    moved = BodyPose(1, transform(np.eye(3), [0.6, 0.0, 0.0]), R)
+    assert seen.alike(moved, 0.3) == pytest.approx(np.exp(-1.0), rel=0.01)
+    other_markers = BodyPose(1, np.eye(4), 25.0 * R)
+    # Bhattacharyya's coefficient of variances 1 and 25 in six dimensions: (5 / 13)^3
+    assert seen.alike(other_markers, 0.3) == pytest.approx((5.0 / 13.0) ** 3, rel=0.01)

@@ -1,0 +1,178 @@
+"""How hypotheses begin, go on, and take in poses."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.history import Node
+from thermal_fiducial.core.filter.initialization import blank_state, start
+from thermal_fiducial.core.filter.innovations import PoseUpdate
+from thermal_fiducial.core.filter.prediction import Prediction
+from thermal_fiducial.core.filter.recovery import Belief, far_covariance, Hypothesis
+from thermal_fiducial.core.filter.state import (
+    ACCELEROMETER_BIAS,
+    Estimate,
+    GYROSCOPE_BIAS,
+    NavigationState,
+    POSE,
+    POSITION,
+    SIZE,
+    TIME_OFFSET,
+    VELOCITY,
+)
+from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_innovation, PoseUpdater
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.types import FloatArray
+
+_SECOND_NS = 1_000_000_000
+#: why a pose was refused that no attitude of a robot under gravity explains
+NO_GRAVITY = 'refused: contradicts gravity'
+#: The accumulated transition is folded into the covariance after so long [s].
+_FOLDED = 0.1
+#: A pose that is off even for an estimate that claims so many times too little, and by more than a few of these
+#: [rad, m], is a marker's fault, unless as many poses bear it out as have borne out the estimate, or so many. Nearer
+#: ones are believed earlier: coasting on for long would do more harm.
+_FAR_TOO_SURE, _FAR, _ENOUGH_POSES = 10.0, np.repeat([0.05, 0.2], 3), 300
+
+
+class Hypotheses:
+    """The rules of one filter: its parameters, inertial steps and pose updates."""
+
+    def __init__(self, config: PoseEkfConfig) -> None:
+        self._updater = PoseUpdater(config)
+        self._walks = _random_walks(config)
+        self.configure(config)
+
+    def configure(self, config: PoseEkfConfig) -> None:
+        """Take over the dynamic parameters of ``config``."""
+        self._config = config
+        self._updater.config = config
+
+    def predicted(self, hypothesis: Hypothesis, imu: FloatArray, stamp_ns: int, densities: FloatArray) -> Hypothesis:
+        """A hypothesis after a step to ``stamp_ns`` with mean sample ``imu`` (6,) and noise ``densities`` (6,)."""
+        prediction = hypothesis.prediction.after(imu, stamp_ns, densities)
+        if prediction.seconds > _FOLDED:
+            prediction = Prediction.begin(prediction.estimate(self._walks))
+        return hypothesis.moved(prediction)
+
+    def estimate(self, hypothesis: Hypothesis) -> Estimate:
+        """State and whole covariance at the hypothesis's instant."""
+        return hypothesis.prediction.estimate(self._walks)
+
+    def motion(self, hypothesis: Hypothesis, samples: FloatArray, before: Node, after: Node) -> MotionAtPose:
+        """Motion at an instant between two nodes, ``samples`` (N, 6) up to it.
+
+        Their mean counts while the clock offset is unknown: noise of a single sample would correlate it with velocity.
+        """
+        state = hypothesis.prediction.state
+        imu = samples[-1] if hypothesis.prediction.origin.clock_open else samples.mean(axis=0)
+        seconds = (after.stamp_ns - before.stamp_ns) / _SECOND_NS
+        return MotionAtPose(
+            rate=state.corrected(after.imu)[:3],
+            rate_variance=float(after.densities[0]) ** 2 / seconds,
+            mean_rate=state.corrected(imu)[:3],
+            acceleration=_acceleration(state, imu),
+            turning=float(np.linalg.norm(after.imu[:3] - before.imu[:3])) / seconds,
+        )
+
+    def weigh(self, hypothesis: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> tuple[Hypothesis, PoseUpdate]:
+        """A hypothesis after a pose at its instant, and the verdict on the pose."""
+        estimate = self.estimate(hypothesis)
+        measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
+        innovation = self._updater.innovation(estimate, measured, motion)
+        if innovation.nis <= self._config.gate and not self._is_stale(hypothesis):
+            corrected = self._updater.correct(measured, innovation, motion)
+            accepted = hypothesis.accepting(Prediction.begin(corrected), pose.stamp_ns)
+            return accepted, PoseUpdate(pose.stamp_ns, True, '', innovation.nis)
+        refusing = hypothesis.refusing(Prediction.begin(estimate), pose.stamp_ns)
+        return refusing, PoseUpdate(
+            pose.stamp_ns, False, f'refused: {math.sqrt(innovation.nis):.1f} sigma', innovation.nis
+        )
+
+    def _is_stale(self, hypothesis: Hypothesis) -> bool:
+        """Whether it has gone without poses for too long to be corrected."""
+        coasted_ns = hypothesis.prediction.stamp_ns - hypothesis.accepted_ns
+        return coasted_ns > self._config.reinitialise_after * _SECOND_NS
+
+    def from_nothing(self, pose: CameraPose, time_ns: int, window: FloatArray) -> Hypothesis | None:
+        """A hypothesis that begins with a pose; None where no robot under gravity could be there.
+
+        ``window`` (N, 6): the latest samples up to the instant.
+        """
+        return self._begun(pose, time_ns, window, blank_state(self._config))
+
+    def alternative_to(
+        self, main: Hypothesis, pose: CameraPose, time_ns: int, motion: MotionAtPose, window: FloatArray
+    ) -> Hypothesis | None:
+        """A hypothesis by which a pose is right that ``main``, which is at its instant, refuses.
+
+        The camera's clock may have stepped; else the pose is taken as it is, and what was known of the sensors stays.
+        """
+        estimate = self.estimate(main)
+        measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
+        if estimate.clock_open:
+            innovation = self._updater.innovation(self._updater.with_unknown_clock(estimate), measured, motion)
+            if innovation.nis <= self._config.gate:
+                corrected = self._updater.correct(measured, innovation, motion)
+                return Hypothesis(Prediction.begin(corrected), time_ns, time_ns, pose.stamp_ns)
+        begun = self._begun(pose, time_ns, window, estimate.state)
+        if begun is None:
+            return None
+        widened = far_covariance(estimate.covariance, _FAR_TOO_SURE, _FAR, POSE)
+        far = self._updater.innovation(replace(estimate, covariance=widened), measured, motion)
+        needed = 0 if far.nis <= self._config.gate else min(main.hits, _ENOUGH_POSES)
+        return replace(begun, needed=needed)
+
+    def _begun(self, pose: CameraPose, time_ns: int, window: FloatArray, prior: NavigationState) -> Hypothesis | None:
+        config = self._config
+        measured = body_pose(pose, prior.T_body_camera, config.pose_noise_scale)
+        estimate = start(config, self._updater, measured, time_ns, prior, window)
+        if estimate is None:
+            return None
+        return Hypothesis(Prediction.begin(estimate), time_ns, time_ns, pose.stamp_ns)
+
+    def core_covariance(self, belief: Belief, imu: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Covariance (9, 9) of the main estimate's core, and (9, 3) of it with the gyroscope's bias, to be published.
+
+        They count what the clock offset may be even before that is estimated, and an alternative that contradicts.
+        """
+        main, other = belief.main, belief.alternative
+        assert main
+        covariance, with_bias = main.prediction.core_covariance()
+        if self._config.estimate_time_offset and not main.prediction.origin.clock_open:
+            covariance = covariance + self._clock_covariance(main.prediction.state, covariance, imu)
+        if other and main.in_doubt and other.hits >= self._config.initial_poses:
+            apart = _difference(main.prediction.state, other.prediction.state)
+            covariance = covariance + other.prediction.core_covariance()[0] + np.outer(apart, apart)
+        return covariance, with_bias
+
+    def _clock_covariance(self, state: NavigationState, covariance: FloatArray, imu: FloatArray) -> FloatArray:
+        """What an unknown offset (9, 9) is worth: the state has followed the clock of the camera."""
+        moved = np.concatenate((state.corrected(imu)[:3], _acceleration(state, imu), state.velocity_body))
+        added = np.outer(moved, moved)
+        added[POSITION, POSITION] += covariance[VELOCITY, VELOCITY]
+        return np.asarray(self._config.time_offset_std**2 * added)
+
+
+def _acceleration(state: NavigationState, imu: FloatArray) -> FloatArray:
+    """Change (3,) of the velocity in the robot frame [m/s^2]."""
+    rate, force = np.split(state.corrected(imu), 2)
+    return np.asarray(force + state.gravity @ state.R_map_body - np.cross(rate, state.velocity_body))
+
+
+def _difference(state: NavigationState, other: NavigationState) -> FloatArray:
+    """Core error (9,) of ``state`` if ``other`` is true."""
+    apart = pose_innovation(state, other.T_map_body)
+    velocity = (other.velocity - state.velocity) @ state.R_map_body
+    return np.concatenate((apart[:3], velocity, apart[3:]))
+
+
+def _random_walks(config: PoseEkfConfig) -> FloatArray:
+    """Squared densities (48,) of the random walks."""
+    walks = np.zeros(SIZE)
+    walks[GYROSCOPE_BIAS] = config.imu.gyroscope_random_walk
+    walks[ACCELEROMETER_BIAS] = config.imu.accelerometer_random_walk
+    walks[TIME_OFFSET] = config.time_offset_random_walk
+    return np.square(walks)

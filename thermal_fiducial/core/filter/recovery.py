@@ -1,0 +1,160 @@
+"""Which poses count: chi-square against the present estimate, and recovery by evidence instead of lock-out.
+
+A pose that the estimate refuses begins an alternative hypothesis, a second estimate that the following poses support or
+not. One that many poses agree with, while the estimate accepts few, replaces it. The start of the filter is the same
+thing without an estimate to replace.
+"""
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.prediction import Prediction
+from thermal_fiducial.core.filter.state import POSITION
+from thermal_fiducial.core.types import FloatArray
+
+_SECOND_NS = 1_000_000_000
+#: An alternative must agree with so many times more poses than the estimate: one whose clock is wrong accepts some when
+#: the robot slows down.
+_PREFERRED = 4
+#: So many refused poses in a row, and the estimate is in doubt: a tenth of a second at 30 Hz.
+REFUSALS_OF_DOUBT = 3
+#: So many accepted ones in a row, and the alternative is forgotten.
+_REFUTED = 3
+_NEVER = -(1 << 62)
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """A prediction and the poses that speak for it, and against it."""
+
+    prediction: Prediction
+    #: instants of its first and of its last accepted pose, clock of the IMU
+    started_ns: int
+    accepted_ns: int
+    #: stamp of the last pose that it was compared with
+    pose_stamp_ns: int
+    hits: int = 1
+    misses: int = 0
+    #: latest poses that it accepted, refused, in a row
+    accepted_in_row: int = 1
+    refused_in_row: int = 0
+    #: of an alternative: poses that must agree on it
+    needed: int = 0
+
+    def moved(self, prediction: Prediction) -> 'Hypothesis':
+        """After an inertial step."""
+        return Hypothesis(
+            prediction,
+            self.started_ns,
+            self.accepted_ns,
+            self.pose_stamp_ns,
+            self.hits,
+            self.misses,
+            self.accepted_in_row,
+            self.refused_in_row,
+            self.needed,
+        )
+
+    def accepting(self, prediction: Prediction, pose_stamp_ns: int) -> 'Hypothesis':
+        """After a pose that it accepts."""
+        return replace(
+            self.moved(prediction),
+            accepted_ns=prediction.stamp_ns,
+            pose_stamp_ns=pose_stamp_ns,
+            hits=self.hits + 1,
+            accepted_in_row=self.accepted_in_row + 1,
+            refused_in_row=0,
+        )
+
+    def refusing(self, prediction: Prediction, pose_stamp_ns: int) -> 'Hypothesis':
+        """After a pose that it refuses."""
+        return replace(
+            self.moved(prediction),
+            pose_stamp_ns=pose_stamp_ns,
+            misses=self.misses + 1,
+            accepted_in_row=0,
+            refused_in_row=self.refused_in_row + 1,
+        )
+
+    @property
+    def position_std(self) -> float:
+        """Root of the sum of the position variances [m]."""
+        core, _ = self.prediction.core_covariance()
+        return math.sqrt(float(core[POSITION, POSITION].trace()))
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether the latest poses contradict it."""
+        return self.refused_in_row >= REFUSALS_OF_DOUBT
+
+    @property
+    def failed(self) -> bool:
+        """Whether an alternative fits too few of the poses since it began."""
+        return self.misses >= self.hits
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """Everything that the filter knows at one instant."""
+
+    main: Hypothesis | None = None
+    alternative: Hypothesis | None = None
+    #: stamp of the last camera pose that was looked at while there was no hypothesis
+    pose_stamp_ns: int = _NEVER
+    #: times that an alternative has replaced an estimate
+    resets: int = 0
+    #: hits of the estimate when the alternative began
+    hits_before: int = 0
+
+    @property
+    def time_offset(self) -> float | None:
+        """Clock offset that holds [s]; None where there is no estimate of it."""
+        hypothesis = self.main or self.alternative
+        return hypothesis.prediction.state.time_offset if hypothesis else None
+
+    def in_moved_map(self, T_new_old: FloatArray) -> 'Belief':
+        """The belief in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
+
+        def move(hypothesis: Hypothesis | None) -> Hypothesis | None:
+            if hypothesis is None:
+                return None
+            prediction = hypothesis.prediction
+            return hypothesis.moved(prediction.in_moved_map(prediction.origin.in_moved_map(T_new_old), T_new_old))
+
+        return replace(self, main=move(self.main), alternative=move(self.alternative))
+
+    def settled(self, config: PoseEkfConfig) -> 'Belief':
+        """The belief after the alternative was weighed against the estimate: it is forgotten, replaces it, or waits."""
+        main, other = self.main, self.alternative
+        if other is None:
+            return self
+        if main is None:
+            return self._promoted() if other.hits >= config.initial_poses else self
+        if main.accepted_in_row >= _REFUTED or other.failed:
+            return replace(self, alternative=None)
+        if other.hits < config.initial_poses:
+            return self
+        lasting = other.accepted_ns - other.started_ns >= config.reset_after * _SECOND_NS
+        against = main.hits - self.hits_before
+        agreed = other.hits >= max(2 * other.misses, _PREFERRED * against, other.needed)
+        stale = other.accepted_ns - main.accepted_ns > config.reinitialise_after * _SECOND_NS
+        lost = stale or main.position_std > config.lost_position_std
+        return self._promoted() if lost or (lasting and agreed) else self
+
+    def _promoted(self) -> 'Belief':
+        assert self.alternative
+        resets = self.resets + (self.main is not None)
+        fresh = replace(self.alternative, accepted_in_row=1, refused_in_row=0, needed=0)
+        return replace(self, main=fresh, alternative=None, pose_stamp_ns=self.alternative.pose_stamp_ns, resets=resets)
+
+
+def far_covariance(
+    covariance: FloatArray, claimed_too_little: float, distance: FloatArray, place: FloatArray
+) -> FloatArray:
+    """``covariance`` of an estimate that claims too little, and may besides be off by ``distance`` at ``place``."""
+    widened = claimed_too_little**2 * covariance
+    widened[place, place] += np.square(distance)
+    return widened

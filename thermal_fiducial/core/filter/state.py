@@ -1,0 +1,148 @@
+"""What the filter estimates, and the coordinates of its error.
+
+Pose and velocity are an element X = (R, v, p) of SE_2(3), the error is left-invariant, X_true = X Exp(xi): rotation,
+velocity and position errors are expressed in the robot frame. A measured pose then has a constant Jacobian, and the
+error's transition depends on the inertial increments alone.
+
+Sources: A. Barrau, S. Bonnabel, "The Invariant Extended Kalman Filter as a Stable Observer", IEEE TAC 2017;
+M. Brossard, A. Barrau, P. Chauchat, S. Bonnabel, "Associating Uncertainty to Extended Poses for on Lie Group IMU
+Preintegration", IEEE T-RO 2022.
+"""
+
+from dataclasses import dataclass, replace
+import math
+
+import numpy as np
+
+from thermal_fiducial.core.filter.increments import rotation_integrals
+from thermal_fiducial.core.filter.pose_noise import PoseNoise
+from thermal_fiducial.core.geometry.se3 import transform
+from thermal_fiducial.core.types import FloatArray
+
+#: Places of the error coordinates: in the robot frame [rad, m/s, m],
+ROTATION, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
+#: biases of the IMU [rad/s, m/s^2],
+GYROSCOPE_BIAS, ACCELEROMETER_BIAS, BIAS = slice(9, 12), slice(12, 15), slice(9, 15)
+#: matrices of scale and cross-axis errors of its two triads, row by row [1],
+GYROSCOPE_MATRIX, ACCELEROMETER_MATRIX = slice(15, 24), slice(24, 33)
+#: horizontal components of gravity in the map [m/s^2],
+GRAVITY = slice(33, 35)
+#: clock offset [s],
+TIME_OFFSET = 35
+#: T_body_camera, perturbed from the left [rad, m],
+EXTRINSICS = slice(36, 42)
+#: systematic error of the camera poses, in their standard deviations.
+SYSTEMATIC = slice(42, 48)
+SIZE = 48
+#: Those that an inertial step changes, and those that change it.
+CORE, MOVED_BY = slice(0, 9), slice(0, 35)
+#: A pose measures the rotation and the position error.
+POSE = np.r_[ROTATION, POSITION]
+
+
+@dataclass(frozen=True, slots=True)
+class NavigationState:
+    """Estimate at one instant."""
+
+    #: (3, 3)
+    R_map_body: FloatArray
+    #: (3,) in the map [m/s]
+    velocity: FloatArray
+    #: (3,) in the map [m]
+    position: FloatArray
+    #: (6,) gyroscope [rad/s], then accelerometer [m/s^2]
+    bias: FloatArray
+    #: (2, 3, 3) errors of the measured rate and of the measured force, in shares of them
+    scale: FloatArray
+    #: (3,) in the map [m/s^2]
+    gravity: FloatArray
+    #: [s], t_imu = t_camera + camera_time_offset + time_offset
+    time_offset: float
+    #: (4, 4)
+    T_body_camera: FloatArray
+    #: (6,) systematic error of the camera poses, in standard deviations
+    systematic: FloatArray
+
+    @property
+    def T_map_body(self) -> FloatArray:
+        """(4, 4)."""
+        return transform(self.R_map_body, self.position)
+
+    @property
+    def velocity_body(self) -> FloatArray:
+        """(3,) velocity in the robot frame [m/s]."""
+        return self.velocity @ self.R_map_body
+
+    def corrected(self, imu: FloatArray) -> FloatArray:
+        """(6,) a sample without the errors of the sensors [rad/s, m/s^2]."""
+        return imu - self.bias - (self.scale @ imu.reshape(2, 3, 1)).reshape(6)
+
+    def plus(self, error: FloatArray) -> 'NavigationState':
+        """The state moved by ``error`` (48,), X Exp(xi) for the group part."""
+        R, R_left = self.R_map_body @ rotation_integrals(error[ROTATION])[:2]
+        T_body_camera = self.T_body_camera
+        if error[EXTRINSICS].any():
+            rotation, left, _ = rotation_integrals(error[EXTRINSICS][:3])
+            T_body_camera = transform(rotation, left @ error[EXTRINSICS][3:]) @ T_body_camera
+        return NavigationState(
+            orthonormal(R),
+            self.velocity + R_left @ error[VELOCITY],
+            self.position + R_left @ error[POSITION],
+            self.bias + error[BIAS],
+            self.scale + error[15:33].reshape(2, 3, 3),
+            with_horizontal(self.gravity, self.gravity[:2] + error[GRAVITY]),
+            self.time_offset + float(error[TIME_OFFSET]),
+            T_body_camera,
+            self.systematic + error[SYSTEMATIC],
+        )
+
+    def in_moved_map(self, T_new_old: FloatArray) -> 'NavigationState':
+        """The state in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
+        R = T_new_old[:3, :3]
+        return replace(
+            self,
+            R_map_body=orthonormal(R @ self.R_map_body),
+            velocity=R @ self.velocity,
+            position=R @ self.position + T_new_old[:3, 3],
+            gravity=R @ self.gravity,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """State and covariance (48, 48) of its error at an instant in the clock of the IMU."""
+
+    stamp_ns: int
+    state: NavigationState
+    covariance: FloatArray
+    #: whether the clock offset is estimated: it is once the velocity is known
+    clock_open: bool
+    #: what the innovations have shown of the camera poses' error
+    pose_noise: PoseNoise
+
+    def in_moved_map(self, T_new_old: FloatArray) -> 'Estimate':
+        """The estimate in a map whose coordinates are moved: only the horizontal gravity's coordinates turn."""
+        turn = np.eye(SIZE)
+        turn[GRAVITY, GRAVITY] = T_new_old[:2, :2]
+        covariance = turn @ self.covariance @ turn.T
+        return replace(
+            self,
+            state=self.state.in_moved_map(T_new_old),
+            covariance=covariance,
+            pose_noise=self.pose_noise.in_moved_map(T_new_old),
+        )
+
+    def std(self, place: slice | int) -> float:
+        """Root of the sum of the variances of some coordinates."""
+        return math.sqrt(float(np.sum(self.covariance.diagonal()[place])))
+
+
+def with_horizontal(gravity: FloatArray, horizontal: FloatArray) -> FloatArray:
+    """Downward vector as long as ``gravity`` (3,) with the given horizontal components (2,) [m/s^2]."""
+    down = math.sqrt(max(float(gravity @ gravity - horizontal @ horizontal), 0.0))
+    return np.array([horizontal[0], horizontal[1], -down])
+
+
+def orthonormal(R: FloatArray) -> FloatArray:
+    """The rotation next to a matrix (3, 3) that rounding has moved: one Newton step of the polar decomposition."""
+    return np.asarray(1.5 * R - 0.5 * (R @ (R.T @ R)))

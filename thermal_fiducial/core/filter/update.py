@@ -1,0 +1,224 @@
+"""Correction of an estimate by a camera pose. The covariance algebra is filterpy's, the state on the group ours."""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+from filterpy.kalman import ExtendedKalmanFilter
+import numpy as np
+
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.increments import rotation_integrals
+from thermal_fiducial.core.filter.pose_noise import BodyPose
+from thermal_fiducial.core.filter.state import (
+    ACCELEROMETER_BIAS,
+    Estimate,
+    EXTRINSICS,
+    GRAVITY,
+    GYROSCOPE_BIAS,
+    NavigationState,
+    POSE,
+    POSITION,
+    ROTATION,
+    SIZE,
+    SYSTEMATIC,
+    TIME_OFFSET,
+    VELOCITY,
+)
+from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_log
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.types import FloatArray
+
+#: Root of the sum of the velocity variances [m/s] from which the clock offset is estimated, and by how much the rate
+#: [rad/s] and the velocity [m/s] may have changed until then.
+_KNOWN_VELOCITY, _UNKNOWN_CHANGE = 0.2, 0.5
+#: Motion shows a clock offset as far as it exceeds its own noise: the variance of a regressor's noise is taken off its
+#: square so many times (W. James, C. Stein 1961; once for the mean, the rest since the noise is in the innovation too).
+_SHRINKAGE = 4.0
+_TINY = 1e-12
+_SIX = np.arange(6)
+
+
+class Innovation(NamedTuple):
+    """Difference (6,) of a pose and the prediction, its covariance S (6, 6), Jacobian H (6, 48), noise R (6, 6)."""
+
+    value: FloatArray
+    S: FloatArray
+    H: FloatArray
+    R: FloatArray
+    nis: float
+    #: correlation of the pose's systematic error with that of the pose before
+    alike: float
+    #: the estimate that it was compared with, its systematic error as old as the pose's
+    prior: Estimate
+
+
+@dataclass(frozen=True, slots=True)
+class MotionAtPose:
+    """What the IMU shows of the motion at a pose's instant.
+
+    ``rate`` (3,) [rad/s], of a sample that the prediction hardly rests on: its noise would be in the innovation too;
+    ``rate_variance`` of one axis; ``mean_rate`` (3,) and ``acceleration`` (3,) of the velocity in the robot frame
+    [m/s^2], means over a while where one sample's noise would matter; ``turning`` [rad/s^2]: size of the angular
+    acceleration.
+    """
+
+    rate: FloatArray
+    rate_variance: float
+    mean_rate: FloatArray
+    acceleration: FloatArray
+    turning: float
+
+
+def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> BodyPose:
+    """Pose of the robot that a camera pose stands for; ``scale`` on its standard deviation."""
+    T_map_body = pose.T_map_camera @ inverse(T_body_camera)
+    R = T_map_body[:3, :3]
+    lever = T_map_body[:3, 3] - pose.T_map_camera[:3, 3]
+    # d p_body = d p_camera + d theta x lever, both in the map; then into the robot frame, rotation first.
+    J = np.zeros((6, 6))
+    J[:3, 3:] = R.T
+    J[3:, :3] = R.T
+    J[3:, 3:] = -R.T @ skew(lever)
+    return BodyPose(pose.stamp_ns, T_map_body, scale**2 * (J @ pose.covariance @ J.T))
+
+
+def pose_innovation(state: NavigationState, T_map_body: FloatArray) -> FloatArray:
+    """Rotation and position (6,) of Log(X^-1 Z) on SE(3): exactly the error of ``state`` if ``T_map_body`` is true."""
+    rotation = so3_log(state.R_map_body.T @ T_map_body[:3, :3])
+    offset = (T_map_body[:3, 3] - state.position) @ state.R_map_body
+    return np.concatenate((rotation, np.linalg.solve(rotation_integrals(rotation)[1], offset)))
+
+
+class PoseUpdater:
+    """Compares estimates with poses, and corrects them."""
+
+    def __init__(self, config: PoseEkfConfig) -> None:
+        self.config = config
+        self._algebra = ExtendedKalmanFilter(dim_x=SIZE, dim_z=6)
+
+    def innovation(self, estimate: Estimate, pose: BodyPose, motion: MotionAtPose) -> Innovation:
+        """What ``pose`` says beyond ``estimate`` at its instant."""
+        alike = estimate.pose_noise.alike(pose, self.config.systematic_angle)
+        prior = _with_new_view(estimate, alike)
+        # The systematic error in the axes of the pose's own: those of the triangular root of its covariance.
+        root = np.linalg.cholesky(prior.pose_noise.systematic * pose.shape)
+        H = np.zeros((6, SIZE))
+        H[_SIX, POSE] = 1.0
+        H[:, EXTRINSICS] = np.eye(6)
+        H[:, SYSTEMATIC] = root
+        R = prior.pose_noise.white * pose.shape
+        twist = np.concatenate((motion.rate, prior.state.velocity_body))
+        self._add_clock(prior, twist, motion, H, R)
+        value = pose_innovation(prior.state, pose.T_map_body) - root @ prior.state.systematic
+        S = H @ prior.covariance @ H.T + R
+        return Innovation(value, S, H, R, float(value @ np.linalg.solve(S, value)), alike, prior)
+
+    def _add_clock(
+        self, prior: Estimate, twist: FloatArray, motion: MotionAtPose, H: FloatArray, R: FloatArray
+    ) -> None:
+        """What errors of the camera's clock do to a pose: jitter and, where it isn't estimated, the offset."""
+        config = self.config
+        unknown = config.stamp_jitter**2 + (0.0 if config.estimate_time_offset else config.time_offset_std**2)
+        R += unknown * np.outer(twist, twist)
+        if not config.estimate_time_offset:
+            return
+        if not prior.clock_open:
+            R[_SIX, _SIX] += (config.time_offset_std * _UNKNOWN_CHANGE) ** 2
+            return
+        P = prior.covariance
+        velocity, variance = P[VELOCITY, VELOCITY], float(P[TIME_OFFSET, TIME_OFFSET])
+        H[:3, TIME_OFFSET] = _shrunk(twist[:3], 3.0 * motion.rate_variance)
+        H[3:, TIME_OFFSET] = _shrunk(twist[3:], float(np.trace(velocity)))
+        # Second order: offset times what is uncertain of the motion, and half the acceleration times its square.
+        square = 0.75 * variance**2
+        R[_SIX[:3], _SIX[:3]] += variance * motion.rate_variance + square * motion.turning**2
+        R[_SIX[3:], _SIX[3:]] += square * float(motion.acceleration @ motion.acceleration)
+        R[3:, 3:] += variance * velocity + np.outer(P[VELOCITY, TIME_OFFSET], P[VELOCITY, TIME_OFFSET])
+
+    def correct(self, pose: BodyPose, innovation: Innovation, motion: MotionAtPose) -> Estimate:
+        """The estimate after an accepted pose."""
+        prior = innovation.prior
+        error, covariance = self._gained(prior.covariance, innovation.value, innovation.H, innovation.R)
+        state = prior.state.plus(error)
+        variances = covariance.diagonal()[SYSTEMATIC]
+        second_moment = float(state.systematic @ state.systematic + variances.sum()) / 6.0
+        noise = prior.pose_noise.after(pose, innovation.value, innovation.S, second_moment, innovation.alike)
+        # The same systematic error in units of its new standard deviation.
+        unit = (prior.pose_noise.systematic / noise.systematic) ** 0.5
+        covariance[SYSTEMATIC] *= unit
+        covariance[:, SYSTEMATIC] *= unit
+        state = replace(state, systematic=unit * state.systematic)
+        return self._with_clock(replace(prior, state=state, covariance=covariance, pose_noise=noise), motion)
+
+    def _gained(
+        self, P: FloatArray, innovation: FloatArray, H: FloatArray, R: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Error (48,) that an innovation shows, and the covariance after it."""
+        algebra = self._algebra
+        algebra.x, algebra.P = np.zeros(SIZE), P
+        algebra.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R=R)
+        return algebra.x, 0.5 * (algebra.P + algebra.P.T)
+
+    def _with_clock(self, estimate: Estimate, motion: MotionAtPose) -> Estimate:
+        """Begin to estimate the clock offset once the velocity is known: before, it would multiply an unknown one.
+
+        Until then the state has followed the camera's clock. It is off by what moves in the meantime, fully correlated
+        with the offset s: X(t + s) = X(t) Exp((rate, acceleration, velocity) s).
+        """
+        if estimate.clock_open or not self.config.estimate_time_offset:
+            return estimate
+        if estimate.std(VELOCITY) > _KNOWN_VELOCITY:
+            return estimate
+        return replace(estimate, covariance=self._slid(estimate, motion), clock_open=True)
+
+    def _slid(self, estimate: Estimate, motion: MotionAtPose) -> FloatArray:
+        slide = np.zeros(SIZE)
+        slide[ROTATION] = -motion.mean_rate
+        slide[VELOCITY] = -motion.acceleration
+        slide[POSITION] = -estimate.state.velocity_body
+        slide[TIME_OFFSET] = 1.0
+        return np.asarray(estimate.covariance + self.config.time_offset_std**2 * np.outer(slide, slide))
+
+    def with_unknown_clock(self, estimate: Estimate) -> Estimate:
+        """The estimate as good as it is, its clock offset as unknown as after a step of the camera's clock."""
+        covariance = estimate.covariance.copy()
+        covariance[TIME_OFFSET], covariance[:, TIME_OFFSET] = 0.0, 0.0
+        covariance[TIME_OFFSET, TIME_OFFSET] = (2.0 * self.config.time_offset_std) ** 2
+        return replace(estimate, covariance=covariance)
+
+    def align(self, estimate: Estimate, force: FloatArray, std: float) -> Estimate:
+        """Estimate corrected by the specific force (3,) of a robot at rest, known to ``std`` [m/s^2]."""
+        state = estimate.state
+        expected = -state.gravity @ state.R_map_body
+        H = np.zeros((3, SIZE))
+        H[:, ROTATION] = skew(expected)
+        H[:, ACCELEROMETER_BIAS] = np.eye(3)
+        H[:, GRAVITY] = -state.R_map_body[:2].T
+        return self._at_rest(estimate, force - state.bias[3:] - expected, H, std)
+
+    def settle(self, estimate: Estimate, rate: FloatArray, std: float) -> Estimate:
+        """Estimate corrected by the angular rate (3,) of a robot at rest, known to ``std`` [rad/s]."""
+        H = np.zeros((3, SIZE))
+        H[:, GYROSCOPE_BIAS] = np.eye(3)
+        return self._at_rest(estimate, rate - estimate.state.bias[:3], H, std)
+
+    def _at_rest(self, estimate: Estimate, innovation: FloatArray, H: FloatArray, std: float) -> Estimate:
+        # The algebra is of six rows: three more that measure nothing.
+        H_six, R = np.vstack((H, np.zeros_like(H))), np.eye(6) * std**2
+        error, covariance = self._gained(estimate.covariance, np.append(innovation, np.zeros(3)), H_six, R)
+        return replace(estimate, state=estimate.state.plus(error), covariance=covariance)
+
+
+def _with_new_view(estimate: Estimate, alike: float) -> Estimate:
+    """The estimate whose systematic error is that of another view, correlated with the one before by ``alike``."""
+    P = estimate.covariance.copy()
+    P[SYSTEMATIC] *= alike
+    P[:, SYSTEMATIC] *= alike
+    P[SYSTEMATIC, SYSTEMATIC].flat[::7] += 1.0 - alike * alike
+    state = replace(estimate.state, systematic=alike * estimate.state.systematic)
+    return replace(estimate, state=state, covariance=P)
+
+
+def _shrunk(regressor: FloatArray, variance: float) -> FloatArray:
+    """(3,) shrunk towards zero as far as noise of ``variance`` on all axes may have made it."""
+    return np.asarray(max(1.0 - _SHRINKAGE * variance / max(float(regressor @ regressor), _TINY), 0.0) * regressor)
