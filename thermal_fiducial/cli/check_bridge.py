@@ -9,6 +9,7 @@ import textwrap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.bridge_check import check_bridge, Finding, Level
 from thermal_fiducial.report.bridge_record import BridgeRecord, read_bridge, Recorder
+from thermal_fiducial.report.landing_check import check_landing
 
 _WIDTH = 118
 
@@ -17,8 +18,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.description = (
         'Verify rate, stamps, frames (gravity of a still drone, a yaw turn), velocity and covariance of what a flight '
-        'controller would receive, and say what it would do with it. Without RECORDING it listens: keep the drone '
-        'still for some seconds, then turn it by hand to the left and back. Exit status 1 if there is a fault.'
+        'controller would receive, and the landing target where there is one, and say what it would do with it. '
+        'Without RECORDING it listens: keep the drone still for some seconds, then turn it by hand to the left and '
+        'back. Exit status 1 if there is a fault.'
     )
     parser.add_argument('recording', nargs='?', type=Path, metavar='RECORDING', help='bag or run folder; none: listen')
     parser.add_argument('--topic', default='', help='odometry to check (default: what pose_ekf sends, as remapped)')
@@ -36,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
         record = read_bridge(args.recording, args.topic, args.imu)
     else:
         record = _listen(args.topic, args.seconds, args.ros_args)
-    findings = check_bridge(record)
+    findings = check_bridge(record) + check_landing(record)
     if args.json:
         print(json.dumps([_as_json(finding) for finding in findings], indent=2))
     else:
@@ -72,7 +74,15 @@ def _listen(topic: str, seconds: float, ros_arguments: list[str]) -> BridgeRecor
             file=sys.stderr,
         )
 
-    listen(seconds, recorder.odometry, recorder.imu, topic=topic, announce=announce, ros_arguments=ros_arguments)
+    listen(
+        seconds,
+        recorder.odometry,
+        recorder.imu,
+        recorder.landing_target,
+        topic=topic,
+        announce=announce,
+        ros_arguments=ros_arguments,
+    )
     return recorder.record()
 
 

@@ -14,6 +14,20 @@ from thermal_fiducial.files.images import stamp_to_ns
 #: Topics that a bridge is looked for on, the first one that there is.
 ODOMETRY_TOPICS = ('bridge/odometry', 'mavros/odometry/out', 'odometry')
 
+LANDING_TOPIC = 'landing_target'
+
+
+@dataclass(frozen=True)
+class LandingRecord:
+    """Messages of ``landing_target`` (N of them): stamps, positions (N, 3) [m], and the frames that they name."""
+
+    stamps_ns: IntArray
+    positions: FloatArray
+    frames: tuple[str, ...]
+
+
+_NO_LANDING = LandingRecord(np.zeros(0, np.int64), np.zeros((0, 3)), ())
+
 
 @dataclass(frozen=True)
 class BridgeRecord:
@@ -35,6 +49,7 @@ class BridgeRecord:
     imu: FloatArray
     #: whether arrivals are of the clock that stamps are of
     live: bool = False
+    landing: LandingRecord = _NO_LANDING
 
     @property
     def rotations(self) -> FloatArray:
@@ -51,6 +66,7 @@ class Recorder:
     _odometry: list[tuple[Any, ...]] = field(default_factory=list)
     _imu: list[tuple[Any, ...]] = field(default_factory=list)
     _frames: set[tuple[str, str]] = field(default_factory=set)
+    _landing: list[tuple[int, tuple[float, ...], str]] = field(default_factory=list)
 
     def odometry(self, message: Any, arrival_ns: int) -> None:
         """Take a nav_msgs/Odometry."""
@@ -64,6 +80,11 @@ class Recorder:
         """Take a sensor_msgs/Imu."""
         w, a = message.angular_velocity, message.linear_acceleration
         self._imu.append((stamp_to_ns(message.header.stamp), (w.x, w.y, w.z, a.x, a.y, a.z)))
+
+    def landing_target(self, message: Any) -> None:
+        """Take a geometry_msgs/PoseStamped."""
+        p = message.pose.position
+        self._landing.append((stamp_to_ns(message.header.stamp), (p.x, p.y, p.z), message.header.frame_id))
 
     def record(self) -> BridgeRecord:
         """What was collected."""
@@ -80,6 +101,11 @@ class Recorder:
             imu_stamps_ns=np.array([entry[0] for entry in self._imu], dtype=np.int64),
             imu=np.array([entry[1] for entry in self._imu], dtype=np.float64).reshape(-1, 6),
             live=self.live,
+            landing=LandingRecord(
+                np.array([entry[0] for entry in self._landing], dtype=np.int64),
+                np.array([entry[1] for entry in self._landing], dtype=np.float64).reshape(-1, 3),
+                tuple(sorted({entry[2] for entry in self._landing})),
+            ),
         )
 
 
@@ -105,9 +131,12 @@ def read_bridge(path: Path, topic: str = '', imu_bag: Path | None = None) -> Bri
         if not wanted:
             raise InputError(f'{path}: no topic {topic or " or ".join(ODOMETRY_TOPICS)}')
         bag.require({wanted[0]: 'nav_msgs/msg/Odometry'})
-        for message in bag.messages([wanted[0], IMU_TOPIC]):
+        landing = LANDING_TOPIC if bag.topics.get(LANDING_TOPIC) == 'geometry_msgs/msg/PoseStamped' else wanted[0]
+        for message in bag.messages([wanted[0], IMU_TOPIC, landing]):
             if message.topic == IMU_TOPIC:
                 recorder.imu(message.message)
+            elif message.topic == LANDING_TOPIC:
+                recorder.landing_target(message.message)
             else:
                 recorder.odometry(message.message, message.stamp_ns)
     if imu_bag is not None:

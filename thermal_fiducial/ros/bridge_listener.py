@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import time
 from typing import Any
 
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
 from rclpy.node import Node
@@ -13,8 +14,8 @@ from sensor_msgs.msg import Imu
 from thermal_fiducial.ros import qos
 from thermal_fiducial.ros.run import initialise, make_executor
 
-_FILTER = 'pose_ekf'
-_ODOMETRY, _IMU = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu'
+_FILTER, _LANDING = 'pose_ekf', 'landing_target'
+_ODOMETRY, _IMU, _POSE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu', 'geometry_msgs/msg/PoseStamped'
 #: What the filter publishes for others than a flight controller.
 _NOT_FOR_IT = ('odometry', 'odometry_smooth')
 #: How long a filter is looked for [s].
@@ -27,19 +28,21 @@ class Topics:
 
     odometry: str
     imu: str
+    landing: str
 
 
 def listen(
     seconds: float,
     on_odometry: Callable[[Any, int], None],
     on_imu: Callable[[Any], None],
+    on_landing_target: Callable[[Any], None],
     *,
     topic: str = '',
     announce: Callable[[Topics], None] = lambda topics: None,
     ros_arguments: Sequence[str] = (),
     domain_id: int | None = None,
 ) -> None:
-    """Hand on odometry (with the time of arrival [ns]) and IMU messages for some seconds.
+    """Hand on odometry (with the time of arrival [ns]), IMU messages and landing targets for some seconds.
 
     Parameters
     ----------
@@ -59,6 +62,7 @@ def listen(
             Odometry, topics.odometry, lambda message: on_odometry(message, time.time_ns()), qos.IMU_INPUT
         )
         node.create_subscription(Imu, topics.imu, on_imu, qos.IMU_INPUT)
+        node.create_subscription(PoseStamped, topics.landing, on_landing_target, qos.RESULT)
         _spin(executor, seconds, lambda: False)
     finally:
         executor.shutdown()
@@ -77,8 +81,8 @@ def _find(node: Node, executor: Any, topic: str) -> Topics:
         return bool(found)
 
     _spin(executor, _DISCOVERY, look)
-    topics = found[0] if found else Topics('bridge/odometry', 'imu/data')
-    return Topics(topic or topics.odometry, topics.imu)
+    topics = found[0] if found else Topics('bridge/odometry', 'imu/data', _LANDING)
+    return Topics(topic or topics.odometry, topics.imu, _landing_topic(node) or topics.landing)
 
 
 def _topics_of_filter(node: Node, namespace: str) -> Topics | None:
@@ -90,7 +94,16 @@ def _topics_of_filter(node: Node, namespace: str) -> Topics | None:
         return None
     base = namespace.rstrip('/')
     bridge = [name for name in odometry if name not in {f'{base}/{own}' for own in _NOT_FOR_IT}]
-    return Topics((bridge or odometry)[0], imu[0])
+    return Topics((bridge or odometry)[0], imu[0], f'{base}/{_LANDING}')
+
+
+def _landing_topic(node: Node) -> str:
+    """What the node landing_target publishes, whatever it was remapped to; empty where there is none."""
+    for name, namespace in node.get_node_names_and_namespaces():
+        if name == _LANDING:
+            published = node.get_publisher_names_and_types_by_node(name, namespace)
+            return next((topic for topic, kinds in published if _POSE in kinds), '')
+    return ''
 
 
 def _spin(executor: Any, seconds: float, done: Callable[[], bool]) -> None:
