@@ -8,7 +8,7 @@ from support.scenes import camera_of
 
 from thermal_fiducial.calibration.batch import first_state, imu_errors, Problem
 from thermal_fiducial.calibration.camera_imu import calibrate_camera_imu, calibrate_rolling_camera_imu
-from thermal_fiducial.calibration.preintegration import ImuTrack, preintegrate
+from thermal_fiducial.calibration.preintegration import AXES, ImuTrack, preintegrate
 from thermal_fiducial.calibration.rolling import FrameCorners
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.geometry import se3
@@ -121,6 +121,53 @@ def test_bias_derivatives_against_differences():
         assert base.by_bias[:, :, column] == pytest.approx(difference, rel=2e-3, abs=2e-6)
 
 
+def test_derivatives_by_scale_and_misalignment_against_differences():
+    _, imu = recording(SCENARIO, 20.0, 1)
+    times = np.arange(5.0, 6.0, 1 / 30)
+    zero = np.zeros((len(times) - 1, 6))
+    base = preintegrate(imu, times, zero, ImuNoise())
+    h = 1e-5
+    for column in range(AXES):
+        step = np.zeros(AXES)
+        step[column] = h
+        moved = preintegrate(imu.corrected(step), times, zero, ImuNoise())
+        turn = se3.so3_log(np.swapaxes(base.R, 1, 2) @ moved.R)
+        difference = np.concatenate([turn, moved.v - base.v, moved.p - base.p], axis=1) / h
+        # Second order in the turn of a step and in h, as for the biases, times rates and forces of up to 20.
+        assert base.by_axes[:, :, column] == pytest.approx(difference, rel=2e-3, abs=4e-5)
+
+
+def test_scale_errors_and_misalignments_are_found():
+    poses, imu = recording(SCENARIO, 40.0, 1)
+    axes = 0.005 * np.random.default_rng(3).normal(size=AXES)
+    result = calibrate_camera_imu(poses, imu.corrected(axes), START_NS, ImuNoise())
+    # What takes away the errors of the samples: the negative of what was put in, but for its square.
+    assert np.all(np.abs(result.axes + axes) < 4.0 * result.axes_sigma + 5e-5)
+    # A level flight shows these; that it is level leaves most of the accelerometer's at their prior.
+    assert np.all(result.axes_sigma[[0, 4, 8, 14]] < 0.001)
+    error = error_of(result, SCENARIO)
+    # Chi-square of seven degrees of freedom, 99.9 %.
+    assert error @ np.linalg.solve(result.covariance, error) < 24.3
+    assert np.linalg.norm(error[3:6]) < 0.002
+
+
+def test_errors_that_last_for_seconds_widen_the_claim():
+    poses, imu = recording(SCENARIO, 24.0, 2)
+    white = calibrate_camera_imu(poses, imu, START_NS, ImuNoise())
+    rng = np.random.default_rng(6)
+    # A pose is off by the same for a second at a time, as much as the noise of a single one.
+    views = rng.normal(0.0, 1.0, (len(poses) // 30 + 1, 6)) * np.repeat([0.002, 0.0006], 3)
+    biased = []
+    for index, pose in enumerate(poses):
+        off, T = views[index // 30], pose.T_map_camera
+        biased.append(replace(pose, T_map_camera=se3.transform(se3.so3_exp(off[3:]) @ T[:3, :3], T[:3, 3] + off[:3])))
+    lasting = calibrate_camera_imu(biased, imu, START_NS, ImuNoise())
+    assert np.sqrt(np.trace(lasting.covariance[3:6, 3:6]) / np.trace(white.covariance[3:6, 3:6])) > 2.0
+    error = error_of(lasting, SCENARIO)
+    # Of eight groups the deviation itself is known to a quarter: t of seven degrees of freedom, 99.9 %, for each.
+    assert np.all(np.abs(error) < 5.4 * np.sqrt(np.diag(lasting.covariance)))
+
+
 def test_derivatives_of_the_batch_against_differences():
     poses, imu = recording(SCENARIO, 20.0, 3)
     chosen = poses[150:162]
@@ -145,14 +192,14 @@ def test_derivatives_of_the_batch_against_differences():
     for column in range(15):
         own = np.zeros((count, 15))
         own[:, column] = h
-        by_pose, by_imu = derivative(own, np.zeros(10))
+        by_pose, by_imu = derivative(own, np.zeros(25))
         # Rotation errors of noisy poses are up to 0.01 rad: their right and left derivatives differ by half of that.
         assert by_pose == pytest.approx(pose_own[:, :, column], abs=2e-2)
         if column < 9:
             expected = first[:, :, column] + second[:, :, column]
             assert by_imu == pytest.approx(expected, rel=1e-3, abs=1e-3 * np.abs(expected).max() + 1e-3)
     for column in (0, 1, 2, 3, 4, 5, 7, 8):
-        shared = np.zeros(10)
+        shared = np.zeros(25)
         shared[column] = h
         by_pose, by_imu = derivative(np.zeros((count, 15)), shared)
         assert by_pose == pytest.approx(pose_shared[:, :, column], abs=2e-2)

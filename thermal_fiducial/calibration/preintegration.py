@@ -15,6 +15,8 @@ from thermal_fiducial.core.types import FloatArray
 
 # Longest step of the integration [s]: the sampling interval of a 200 Hz IMU.
 _STEP = 0.005
+#: Number of scale errors and misalignments of an IMU.
+AXES = 15
 # Variance of the second difference of white noise of variance one.
 _SECOND_DIFFERENCE = 6.0
 
@@ -49,6 +51,11 @@ class ImuTrack:
         rate, force = (np.asarray(cv2.blur(signal, (1, width)), np.float64) for signal in (self.rate, self.force))
         return ImuTrack(self.seconds, rate, force)
 
+    def corrected(self, axes: FloatArray) -> 'ImuTrack':
+        """Samples without the scale errors and misalignments ``axes`` (15,), see :func:`axis_errors`."""
+        by_axes = axis_errors(self.rate, self.force) @ axes
+        return ImuTrack(self.seconds, self.rate - by_axes[:, :3], self.force - by_axes[:, 3:])
+
     def noise(self, known: ImuNoise) -> ImuNoise:
         """``known`` with the white noise that the samples show, where vibration makes it more."""
         root = float(np.median(np.diff(self.seconds))) ** 0.5
@@ -63,6 +70,20 @@ class ImuTrack:
         )
 
 
+def axis_errors(rate: FloatArray, force: FloatArray) -> FloatArray:
+    """Derivative (N, 6, 15) of samples (N, 3), (N, 3) by the IMU's scale errors and misalignments.
+
+    Those of the gyroscope are a whole matrix (nine, row by row). The accelerometer's first axis and its plane with the
+    second are the body's, which leaves a lower triangle (six, row by row). J. Rehder et al., "Extending kalibr".
+    """
+    J = np.zeros((len(rate), 6, AXES))
+    for row in range(3):
+        J[:, row, 3 * row : 3 * row + 3] = rate
+        first = 9 + row * (row + 1) // 2
+        J[:, 3 + row, first : first + row + 1] = force[:, : row + 1]
+    return J
+
+
 @dataclass(frozen=True)
 class Increments:
     """Between consecutive frames; leading dimension (K,).
@@ -72,6 +93,7 @@ class Increments:
     dt : [s]
     R, v, p : rotation (3, 3), velocity and position increments in the body frame at the interval's start
     by_bias : (9, 6) derivative of (rotation, velocity, position) by gyroscope and accelerometer bias
+    by_axes : (9, 15) by scale errors and misalignments
     covariance : (9, 9) of the same
     """
 
@@ -80,6 +102,7 @@ class Increments:
     v: FloatArray
     p: FloatArray
     by_bias: FloatArray
+    by_axes: FloatArray
     covariance: FloatArray
 
 
@@ -95,23 +118,25 @@ def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: ImuN
     steps = max(1, int(np.ceil(dt.max() / _STEP)))
     h = (dt / steps)[:, None]
     R, v, p = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros((count, 3))
-    by_bias, covariance = np.zeros((count, 9, 6)), np.zeros((count, 9, 9))
+    by_bias, by_axes, covariance = np.zeros((count, 9, 6)), np.zeros((count, 9, AXES)), np.zeros((count, 9, 9))
     density = np.array([noise.gyroscope_noise_density] * 3 + [noise.accelerometer_noise_density] * 3) ** 2
     for step in range(steps):
         rate, force = imu.at(times[:-1] + (step + 0.5) * h[:, 0])
+        axes = axis_errors(rate, force)
         rate, force = rate - bias[:, :3], force - bias[:, 3:]
         half = se3.so3_exp(0.5 * rate * h)
         middle = R @ half
         transition, inputs = _linearised(middle, force, half, h[:, :, None])
         # Noise and bias enter in the same way; a bias takes away from the sample.
         by_bias = transition @ by_bias - inputs
+        by_axes = transition @ by_axes - inputs @ axes
         covariance = transition @ covariance @ np.swapaxes(transition, 1, 2)
         covariance += inputs @ ((density / h)[:, :, None] * np.swapaxes(inputs, 1, 2))
         a = (middle @ force[:, :, None])[:, :, 0]
         p = p + v * h + 0.5 * a * h**2
         v = v + a * h
         R = middle @ half
-    return Increments(dt, R, v, p, by_bias, covariance)
+    return Increments(dt, R, v, p, by_bias, by_axes, covariance)
 
 
 def _linearised(

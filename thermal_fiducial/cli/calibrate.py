@@ -92,6 +92,10 @@ def _mapped_corners(frames: Iterable[Frame], marker_map: MarkerMap, camera: Came
         yield FrameCorners(frame.stamp_ns, corners_px(rows), corner_covariances(rows), T_map_marker, sizes)
 
 
+def _percent(result: CameraImuCalibration, places: tuple[int, ...]) -> str:
+    return ', '.join(f'{100.0 * result.axes[k]:.2f} +- {100.0 * result.axes_sigma[k]:.2f}' for k in places)
+
+
 def _extrinsics_text(result: CameraImuCalibration) -> str:
     """Parameter file of the nodes, with what is known of the errors as comments."""
     q = se3.quaternion_from_rotation(result.T_body_camera[:3, :3])
@@ -102,6 +106,8 @@ def _extrinsics_text(result: CameraImuCalibration) -> str:
     return '\n'.join(
         [
             f'# {result.poses} camera poses; position rms {1e3 * rms:.2f} mm; noise {result.scale:.2f} of the expected',
+            f'# scale errors of the gyroscope [%]: {_percent(result, (0, 4, 8))}',
+            f'# scale errors of the accelerometer [%]: {_percent(result, (9, 11, 14))}',
             f'# gravity in the map: {np.round(result.gravity_map, 4).tolist()} m/s^2',
             '/**:',
             '  ros__parameters:',
