@@ -503,7 +503,7 @@ class PoseEkfConfig(SelfChecked):
     )
     stamp_jitter: float = param(
         0.0005,
-        'Jitter of the camera stamps. 0: exact.',
+        'Jitter of the camera stamps to begin with; it is learned from the poses. 0: exact, nothing is learned.',
         unit='s',
         minimum=0.0,
         maximum=0.05,

@@ -151,3 +151,19 @@ def test_another_view_has_another_systematic_error():
     other_markers = BodyPose(1, np.eye(4), 25.0 * R)
     # Bhattacharyya's coefficient of variances 1 and 25 in six dimensions: (5 / 13)^3
     assert seen.alike(other_markers, 0.3) == pytest.approx((5.0 / 13.0) ** 3, rel=0.01)
+
+
+def test_the_jitter_of_the_stamps_is_learned(estimate):
+    """Stamps that scatter by 3 ms, about a state that is known and moves."""
+    rng, updater = np.random.default_rng(9), PoseUpdater(config(estimate_time_offset=False, time_offset_std=0.0))
+    R = np.diag(np.repeat((1e-5, 2e-5), 3) ** 2)
+    noise = PoseNoise.of(1.0, 0.01, stamp_jitter=5e-4)
+    velocity = estimate.state.velocity
+    for stamp in range(1000):
+        late = rng.normal(0.0, 3e-3)
+        R_late = estimate.state.R_map_body @ so3_exp(late * RATE)
+        pose = BodyPose(stamp, transform(R_late, estimate.state.position + late * velocity), R)
+        now = replace(known(estimate, 1e-14), clock_open=False, pose_noise=noise)
+        noise = updater.correct(pose, updater.innovation(now, pose, MOTION), MOTION).pose_noise
+    # the memory of 300 poses of one number: 6 % of the deviation; three of that
+    assert np.sqrt(noise.jitter) == pytest.approx(3e-3, rel=0.18)

@@ -114,7 +114,7 @@ def start(
 
 
 def _unaligned(config: PoseEkfConfig, pose: BodyPose, stamp_ns: int, prior: NavigationState) -> Estimate:
-    noise = PoseNoise.of(WHITE_STD, config.systematic_pose_std)
+    noise = PoseNoise.of(WHITE_STD, config.systematic_pose_std, config.stamp_jitter)
     P = np.diag(_initial_variances(config))
     P[np.ix_(POSE, POSE)] += (noise.white + noise.systematic) * pose.shape
     state = replace(

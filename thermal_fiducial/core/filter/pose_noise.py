@@ -23,6 +23,9 @@ _PRIOR_POSES, _PRIOR_VIEWS = 50.0, 20.0
 _LEAST, _LARGEST, _LARGEST_STEP = 0.02, 30.0, 0.2
 #: An innovation counts no more than one of the 95 % limit of chi square with 6 degrees of freedom.
 _LARGEST_NIS = 12.6
+#: Stamps: poses that count as much as the parameter, poses over which their jitter may change, its range [s], and the
+#: largest square of an innovation along the motion, normalised.
+_PRIOR_STAMPS, _MEMORY, _STAMP_RANGE, _LARGEST_SQUARE = 10.0, 300.0, (1e-4, 5e-3), 9.0
 #: What the covariance of a pose never is below: rounding of float32 corners [rad, m].
 _ROUNDING = np.repeat([1e-5, 3e-5], 3) ** 2
 
@@ -49,14 +52,17 @@ class PoseNoise:
     systematic: float
     #: what they were before the first pose
     initial: tuple[float, float]
+    #: variance of the jitter of the camera's stamps [s^2], 0: they are exact; information about its logarithm
+    jitter: float = 0.0
+    jitter_information: float = 0.0
     #: the last pose that was compared with the estimate
     last: BodyPose | None = None
 
     @classmethod
-    def of(cls, white_std: float, systematic_std: float) -> 'PoseNoise':
-        """Standard deviations to begin with, in units of a pose's own."""
+    def of(cls, white_std: float, systematic_std: float, stamp_jitter: float = 0.0) -> 'PoseNoise':
+        """Standard deviations to begin with, in units of a pose's own; ``stamp_jitter`` [s]."""
         variances = white_std**2, systematic_std**2
-        return cls(*variances, variances)
+        return cls(*variances, variances, jitter=stamp_jitter**2)
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'PoseNoise':
         """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
@@ -102,6 +108,23 @@ class PoseNoise:
             systematic=_within(systematic, self.initial[1]),
             last=pose,
         )
+
+    def with_stamps(self, twist: FloatArray, innovation: FloatArray, S: FloatArray) -> 'PoseNoise':
+        """What is known of the stamps' jitter after an innovation: a step of Fisher scoring on its likelihood.
+
+        ``twist`` (6,): by which a late stamp moves the pose [1/s].
+        """
+        if not self.jitter:
+            return self
+        weighted = np.linalg.solve(S, twist)
+        precision = float(twist @ weighted)
+        square = min(float(innovation @ weighted) ** 2, _LARGEST_SQUARE * precision)
+        share = self.jitter * precision
+        information = (1.0 - 1.0 / _MEMORY) * self.jitter_information + 0.5 * share**2
+        step = 0.5 * (self.jitter * square - share) / (0.5 * _PRIOR_STAMPS + information)
+        low, high = _STAMP_RANGE
+        jitter = min(max(self.jitter * math.exp(step), low**2), high**2)
+        return replace(self, jitter=jitter, jitter_information=information)
 
     def _white_step(self, pose: BodyPose, innovation: FloatArray, S: FloatArray) -> float:
         """Factor on the white variance: a step of Fisher scoring on the likelihood of an innovation."""

@@ -118,7 +118,7 @@ class PoseUpdater:
     ) -> None:
         """What errors of the camera's clock do to a pose: jitter and, where it isn't estimated, the offset."""
         config = self.config
-        unknown = config.stamp_jitter**2 + (0.0 if config.estimate_time_offset else config.time_offset_std**2)
+        unknown = prior.pose_noise.jitter + (0.0 if config.estimate_time_offset else config.time_offset_std**2)
         R += unknown * np.outer(twist, twist)
         if not config.estimate_time_offset:
             return
@@ -143,6 +143,8 @@ class PoseUpdater:
         variances = covariance.diagonal()[SYSTEMATIC]
         second_moment = float(state.systematic @ state.systematic + variances.sum()) / 6.0
         noise = prior.pose_noise.after(pose, innovation.value, innovation.S, second_moment, innovation.alike)
+        twist = np.concatenate((motion.rate, prior.state.velocity_body))
+        noise = noise.with_stamps(twist, innovation.value, innovation.S)
         # The same systematic error in units of its new standard deviation.
         unit = (prior.pose_noise.systematic / noise.systematic) ** 0.5
         covariance[SYSTEMATIC] *= unit
