@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from support.flights import config, errors, Flight, matched, Motion, perfect, rms, run, START_NS, timeline
+from support.flights import config, errors, Flight, matched, Motion, perfect, rms, run, START_NS, timeline, white_poses
 
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.filter.pose_ekf import PoseEkf
@@ -159,7 +159,7 @@ def first_seconds():
     for seed in range(6):
         motion = Motion.random(np.random.default_rng(seed), turn=1.0)
         data = Flight(seed, 3.0, motion, offset=0.03 * (-1) ** seed, **GOOD_POSES)
-        ekf = PoseEkf(config())
+        ekf = PoseEkf(white_poses())
         states, _ = run(ekf, timeline(data.samples(), data.poses, 0.03))
         T_true = data.motion.pose([seconds_of(state) for state in states])
         for state, T in zip(states, T_true, strict=True):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
+from thermal_fiducial.core.filter.initialization import WHITE_STD
 from thermal_fiducial.core.filter.pose_ekf import PoseEkf
 from thermal_fiducial.core.geometry.se3 import rotation_angle, skew, so3_exp, so3_left_jacobian, so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
@@ -133,11 +134,17 @@ def matched(**changes) -> PoseEkfConfig:
         'stamp_jitter': 0.0,
         'map_tilt_std': 0.0,
         'systematic_pose_std': 0.01,
+        'pose_noise_scale': 1.0 / WHITE_STD,
         'initial_gyroscope_bias_std': 0.005,
         'initial_accelerometer_bias_std': 0.05,
         'imu': MATCHED_IMU,
     }
     return config(**(exact | changes))
+
+
+def white_poses(**changes) -> PoseEkfConfig:
+    """The shipped parameters for poses whose covariance is that of their white error alone, as these flights' is."""
+    return config(**({'pose_noise_scale': 1.0 / WHITE_STD} | changes))
 
 
 def perfect(noise: ImuNoise) -> ImuNoise:

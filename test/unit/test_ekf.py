@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.flights import config, errors, Flight, matched, Motion, rms, run, START_NS, timeline
+from support.flights import config, errors, Flight, matched, Motion, rms, run, START_NS, timeline, white_poses
 
 from thermal_fiducial.core.filter.pose_ekf import PoseEkf
 from thermal_fiducial.core.measurements import ImuSample
@@ -68,7 +68,7 @@ def test_an_imu_that_measures_no_gravity_is_named(motion, factor):
 
 
 def test_live_parameters_hold_from_then_on(flight):
-    ekf = PoseEkf(config())
+    ekf = PoseEkf(white_poses())
     arrivals = timeline(flight.samples(), flight.poses, 0.03)
     half = len(arrivals) // 2
     _, before = run(ekf, arrivals[:half])
