@@ -23,14 +23,25 @@ def test_markers_alone_are_as_good_as_the_reference(camera):
     # The reference is good to 3 mm and 0.2 deg, and rests on the same corners.
     assert score.rms_mm < 5.0
     assert score.rms_deg < 0.25
-    # Five per cent of a chi-square of 6 d.o.f. are above 2.1 of one; these are means over a flight.
-    assert 0.5 < score.nees < 2.0
+    # The reference shares lens and board with the markers. With both estimated from the recording the markers are 8.7
+    # and 7.0 mm off (rms), and that is what they have to claim: at least as much, and at most twice.
+    assert 7.0 < score.claimed_mm < 17.5
 
 
 @pytest.mark.parametrize('camera', ['cam0', 'cam1'])
-def test_half_of_the_fused_poses_are_within_a_centimetre(camera):
+def test_the_filter_goes_through_without_a_reset(camera):
     run = board_run(camera)
-    # The median of markers alone is 2.4 mm; resets and refusals make the fused pose worse.
-    assert run.published.score(run.flight).median_mm < 10.0
+    assert run.resets == 0
+    assert run.refused < 0.01
     # Every IMU sample after the start has a pose.
     assert len(run.published) > 0.97 * len(run.flight.samples)
+
+
+@pytest.mark.parametrize('camera', ['cam0', 'cam1'])
+def test_the_fused_pose_stays_with_the_markers_by_their_systematic_error(camera):
+    score = board_run(camera).published.score(board_run(camera).flight)
+    # What the lens makes of the reference: 8.7 mm and 0.39 deg (rms), 29 mm at the most, as of the markers alone
+    # against poses with lens and board estimated; a third more for what the fused pose adds.
+    assert score.rms_mm < 1.33 * 8.7
+    assert score.rms_deg < 1.33 * 0.39
+    assert score.peak_mm < 1.33 * 29.0
