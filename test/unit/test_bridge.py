@@ -86,7 +86,7 @@ def fly(graph, samples, poses_until=10**9, step=0.0):
     for k in samples:
         message = Imu(header=convert.header(START + k * 5_000_000, 'base_link'))
         # No sensor gives the same reading twice: its last digit moves.
-        message.linear_acceleration.z = 9.80665 + 1e-6 * float(np.sin(k))
+        message.linear_acceleration.z = 9.80665 + 1e-9 * float(np.sin(k))
         graph.send('imu/data', message)
         if k % 6 == 5 and k < poses_until:
             head = convert.header(START + (k - 4) * 5_000_000, 'map')

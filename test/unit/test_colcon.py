@@ -134,7 +134,7 @@ KEYS = {
     'tf2_ros': 'tf2_ros_py',
 }
 #: Not in Ubuntu: from pip, for those who replay bags, cut markers, align clouds or show trajectories.
-FROM_PIP = {'rosbags', 'ezdxf', 'small_gicp', 'plyfile', 'pypcd4', 'usb', 'allantools', 'distributed'}
+FROM_PIP = {'rosbags', 'ezdxf', 'small_gicp', 'plyfile', 'pypcd4', 'usb', 'allantools', 'dask', 'distributed'}
 #: Of the user's workspace, where they are asked for.
 OPTIONAL = {'px4_msgs', 'aruco_opencv_msgs', 'apriltag_msgs', 'vision_msgs'}
 
