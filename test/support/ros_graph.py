@@ -60,6 +60,11 @@ class Graph:
         (status,) = heard[-1].status
         return status.level, status.message, {item.key: item.value for item in status.values}
 
+    def published(self, node, topic):
+        """How many messages a node has published on a topic."""
+        (output,) = [output for output in node.outputs if output.topic == f'/{topic}']
+        return output.count
+
     def spin_until(self, condition, seconds=10.0):
         deadline = time.monotonic() + seconds
         while not condition():

@@ -138,7 +138,7 @@ def test_the_smooth_topic_is_another_one_and_feeds_the_bridge():
         graph.spin_until(lambda: all(output.listeners for output in node.outputs if 'odometry' in output.topic))
         fly(graph, range(60))
         fly(graph, range(60, 80), step=0.004)
-        graph.spin_until(lambda: len(graph.heard['bridge/odometry']) == node._odometry.count)
+        graph.spin_until(lambda: len(graph.heard['bridge/odometry']) == graph.published(node, 'odometry'))
         honest, smooth, bridged = (graph.heard[topic] for topic in ('odometry', 'odometry_smooth', 'bridge/odometry'))
     assert len(honest) == len(smooth) == len(bridged) > 20
     assert [message.pose.pose for message in smooth] == [message.pose.pose for message in bridged]
@@ -177,7 +177,7 @@ def test_transforms_are_broadcast_where_tf2_is(monkeypatch):
         graph.listen(PoseWithCovarianceStamped, 'pose')
         node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], publish_tf=True)
         fly(graph, range(60))
-        assert len(Broadcaster.sent) == node._pose.count > 20
+        assert len(Broadcaster.sent) == graph.published(node, 'pose') > 20
     (static,) = StaticBroadcaster.sent
     assert (static.header.frame_id, static.child_frame_id) == ('base_link', 'thermal_camera_optical')
     assert static.transform.translation.x == 0.1

@@ -215,7 +215,7 @@ def test_a_snapshot_goes_to_another_process_and_back_unchanged(count):
         for name in ('T_map_rig', 'ids', 'corners', 'covariances', 'cameras'):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     assert there.markers.keys() == s.markers.keys()
-    assert there.map_version == s.map_version
+    assert there.map_revision == s.map_revision
 
 
 def test_what_has_lost_its_connection_stays_and_the_rest_is_adjusted():

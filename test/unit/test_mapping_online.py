@@ -50,8 +50,8 @@ def test_a_flight_ends_with_a_map_of_a_millimetre():
             jump = m.apply(refine(snapshot))
             resets += 1
             assert jump.resets == resets
-            assert jump.map_version == m.map.revision
-        versions.append(result.map_version)
+            assert jump.map_revision == m.map.revision
+        versions.append(result.map_revision)
         if k > 300:
             assert rms(position_errors(m, poses)) < 1e-3
             assert rms(rotation_errors(m, poses)) < np.deg2rad(0.05)
@@ -131,8 +131,8 @@ def test_another_map_is_taken_over_and_the_jump_told():
     T_new_old = transform(so3_exp([0.0, 0.0, 0.4]), [3.0, -1.0, 0.2])
     jump = m.load(transformed(m.map, T_new_old))
     np.testing.assert_allclose(jump.T_new_old, T_new_old, atol=1e-9)
-    assert (jump.resets, jump.map_version) == (2, m.map.revision)
-    assert m.map.revision > before.map_version
+    assert (jump.resets, jump.map_revision) == (2, m.map.revision)
+    assert m.map.revision > before.map_revision
     # A refinement that was under way knows nothing of the new map.
     assert m.apply(late) is None
     after = m.process(stamp(k) + 2, rows, CAMERA)

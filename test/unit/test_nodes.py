@@ -361,10 +361,10 @@ def test_one_pose_and_one_odometry_for_each_imu_message(graph):
     for kind, topic in ((PoseWithCovarianceStamped, 'pose'), (Odometry, 'odometry')):
         graph.listen(kind, topic)
     fly(graph, [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
-    started = node._pose.count
+    started = graph.published(node, 'pose')
     assert 30 < started < 60
     fly(graph, [imu(k) for k in range(60, 80)])
-    assert node._pose.count == node._odometry.count == started + 20
+    assert graph.published(node, 'pose') == graph.published(node, 'odometry') == started + 20
     graph.spin_until(lambda: len(graph.heard['pose']) == len(graph.heard['odometry']) == started + 20)
     message = graph.heard['odometry'][-1]
     assert convert.stamp_ns(message.header.stamp) == START + 79 * 5_000_000
@@ -464,12 +464,12 @@ def test_a_lost_pose_is_not_published_unless_asked_for(graph):
     quiet = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], lost_position_std=0.001)
     fly(graph, [m for k in range(60) for m in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
     assert quiet.filter.lost
-    assert (quiet._pose.count, quiet._odometry.count > 20) == (0, True)
+    assert (graph.published(quiet, 'pose'), graph.published(quiet, 'odometry') > 20) == (0, True)
     with ros_graph('-r', '__ns:=/aside') as other:
         node = other.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], lost_position_std=0.001, publish_lost=True)
         for message in [m for k in range(60) for m in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])]:
             other.send('imu/data' if isinstance(message, Imu) else 'camera_pose', message)
-        assert node._pose.count == node._odometry.count > 20
+        assert other.published(node, 'aside/pose') == other.published(node, 'aside/odometry') > 20
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@ from sensor_msgs.msg import Image, PointCloud2
 
 from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
@@ -57,8 +56,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
             return
         stamp = convert.stamp_ns(message.header.stamp)
         counts = image_to_array(message)
-        camera = self.camera()
-        _check_size(counts, camera)
+        camera = self.camera_of(counts)
         markers = self.detector.detect(stamp, counts, camera, self.odometry)
         self._seen = len(markers)
         self._markers.send(clouds.cloud(markers, message.header))
@@ -87,12 +85,6 @@ def _require_opencv() -> None:
     if tuple(int(part) for part in cv2.__version__.split('.')[:2]) < _OPENCV:
         needed = '.'.join(map(str, _OPENCV))
         raise InputError(f"OpenCV {cv2.__version__}: {needed} or newer is needed, pip's opencv-python-headless")
-
-
-def _check_size(counts: Counts | Gray, camera: Camera) -> None:
-    if counts.shape != (camera.height, camera.width):
-        size = f'{counts.shape[1]}x{counts.shape[0]}'
-        raise InputError(f'image of {size}, camera_info of {camera.width}x{camera.height} pixels')
 
 
 def main() -> int:

@@ -10,6 +10,7 @@ from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
+from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros import convert, odometry_bytes, qos
 from thermal_fiducial.ros.node import StageNode
@@ -44,6 +45,20 @@ class CameraStageNode(StageNode[Config]):
         if self._camera is None:
             raise InputError('no camera_info')
         return self._camera
+
+    def camera_of(self, image: Counts | Gray) -> Camera:
+        """The calibration, which must be that of ``image`` (H, W).
+
+        Raises
+        ------
+        InputError
+            None has come yet, or one of another size.
+        """
+        camera = self.camera()
+        if image.shape != (camera.height, camera.width):
+            size = f'{image.shape[1]}x{image.shape[0]}'
+            raise InputError(f'image of {size}, camera_info of {camera.width}x{camera.height} pixels')
+        return camera
 
     def figures(self) -> dict[str, object]:
         """How many different calibrations came."""

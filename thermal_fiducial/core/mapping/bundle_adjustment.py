@@ -56,12 +56,12 @@ class Snapshot:
     links: tuple[Link, ...] = ()
     #: pose and covariance (6, 6) by ID of markers that were known beforehand; see :func:`prior_poses`
     priors: Mapping[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
-    map_version: int = 0
+    map_revision: int = 0
     #: what the covariances are to allow for beside the noise
     errors: SystematicErrors = NO_SYSTEMATIC_ERRORS
 
     def __reduce__(self) -> tuple[Any, ...]:
-        rest = (self.rig, self.links, self.priors, self.map_version, self.errors)
+        rest = (self.rig, self.links, self.priors, self.map_revision, self.errors)
         return _snapshot, (self.markers, packed(self.keyframes), *rest)
 
 
@@ -89,7 +89,7 @@ class AdjustedMap:
     #: adjusted markers whose views don't belong to one marker that hangs still
     inconsistent: tuple[int, ...]
     iterations: int
-    map_version: int
+    map_revision: int
 
 
 def refine(snapshot: Snapshot) -> AdjustedMap | None:
@@ -295,7 +295,7 @@ class _Problem:
             dict(zip(self.ids, outlying.tolist(), strict=True)),
             tuple(key for i, key in enumerate(self.ids) if not self.held[i] and self._two_places(i, after)),
             iterations,
-            snapshot.map_version,
+            snapshot.map_revision,
         )
 
     def _shape_covariances(self, system: ReducedSystem, e: _Evaluation, errors: SystematicErrors) -> FloatArray:

@@ -98,7 +98,7 @@ class MapperResult:
     candidates: dict[int, str] = field(default_factory=dict)
     #: all markers in quarantine
     quarantined: tuple[int, ...] = ()
-    map_version: int = 0
+    map_revision: int = 0
     #: how often a refinement has moved the map
     map_resets: int = 0
     #: why each of them is there, with numbers
@@ -116,7 +116,7 @@ class MapperResult:
 class MapJump:
     """A refinement moved the map: poses published before and after don't compare as they are."""
 
-    map_version: int
+    map_revision: int
     #: how often this has happened
     resets: int
     #: (4, 4) moves poses near the robot from the old map to the new: T_new = T_new_old @ T_old

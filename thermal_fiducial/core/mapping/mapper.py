@@ -380,7 +380,7 @@ class MarkerMapper:
         -------
         The jump, for whoever holds poses in the map; None where the map is frozen, or was replaced since.
         """
-        if self.frozen or refinement.map_version < self._initial.revision:
+        if self.frozen or refinement.map_revision < self._initial.revision:
             return None
         before = dict(self.map.markers)
         for marker_id, adjusted in refinement.markers.items():

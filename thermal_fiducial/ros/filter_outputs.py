@@ -1,0 +1,79 @@
+"""What the filter publishes for every IMU message: pose, odometry, the bridge's messages, TF, and the path."""
+
+from collections import deque
+from collections.abc import Callable
+
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry as OdometryMessage
+from nav_msgs.msg import Path
+
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.bridge import FlightControllerBridge
+from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.transforms import TransformBroadcaster
+
+_PATH_STEP_NS = 200_000_000
+_PATH_LENGTH = 3000
+
+
+class FilterOutputs:
+    """The outputs of a filter's node.
+
+    Parameters
+    ----------
+    node : whose outputs they are
+    config : frames, rates, what is asked for
+    fault : called in words with what was asked for and cannot be had
+    """
+
+    def __init__(self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None]) -> None:
+        self._config = config
+        #: one message that is filled again and again, seen as two
+        self._message = convert.odometry_frames(config.map_frame, config.base_frame)
+        self._pose_message = PoseWithCovarianceStamped(header=self._message.header, pose=self._message.pose)
+        self._path: deque[tuple[int, Pose]] = deque(maxlen=_PATH_LENGTH)
+        self._pose = node.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
+        self._odometry = node.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
+        self._path_output = node.advertise(Path, 'path')
+        if config.smoothing_time > 0.0:
+            self._smooth_odometry = node.advertise(OdometryMessage, 'odometry_smooth', qos.IMU_RATE_RESULT)
+        self._bridge = FlightControllerBridge(node, config, fault)
+        self._transforms = TransformBroadcaster(node, config, fault) if config.publish_tf else None
+
+    def send(self, odometry: Odometry, smooth: Odometry | None, *, lost: bool, jumps: int) -> None:
+        """Publish the state after an IMU message.
+
+        Parameters
+        ----------
+        smooth : the same without steps, where it is asked for
+        lost : whether nobody may fly on it
+        jumps : how often the pose has jumped so far
+        """
+        convert.fill_odometry(self._message, odometry)
+        if self._config.publish_lost or not lost:
+            self._pose.send(self._pose_message)
+        self._odometry.send(self._message)
+        if self._transforms is not None and not lost:
+            self._transforms.send(odometry, smooth)
+        if smooth is not None:
+            convert.fill_odometry(self._message, smooth)
+            self._smooth_odometry.send(self._message)
+        if not lost:
+            self._bridge.send(smooth or odometry, jumps)
+        self._extend_path(odometry)
+
+    def _extend_path(self, odometry: Odometry) -> None:
+        if not self._path or not 0 <= odometry.stamp_ns - self._path[-1][0] < _PATH_STEP_NS:
+            self._path.append((odometry.stamp_ns, convert.pose(odometry.T_map_body)))
+
+    def clear_path(self) -> None:
+        """What follows does not continue what was."""
+        self._path.clear()
+
+    def send_path(self) -> None:
+        """Publish the path so far where someone listens."""
+        if self._path and self._path_output.listeners:
+            head = convert.header(self._path[-1][0], self._config.map_frame)
+            self._path_output.send(convert.path(self._path, head))
