@@ -24,7 +24,7 @@ os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(1 << 25))
 
 if TYPE_CHECKING:
     from thermal_fiducial.core.detection.detector import MarkerDetector
-    from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+    from thermal_fiducial.core.filter.ekf import PoseEkf
     from thermal_fiducial.core.geometry.camera import Camera
     from thermal_fiducial.core.mapping.map_data import MarkerMap
     from thermal_fiducial.core.mapping.mapper import MarkerMapper
@@ -64,7 +64,7 @@ __all__ = [
 
 _MODULES = {
     'core.detection.detector': ('MarkerDetector',),
-    'core.filter.pose_ekf': ('PoseEkf',),
+    'core.filter.ekf': ('PoseEkf',),
     'core.geometry.camera': ('Camera',),
     'core.mapping.map_data': ('MarkerMap',),
     'core.mapping.mapper': ('MarkerMapper',),

@@ -11,7 +11,7 @@ import numpy as np
 
 from thermal_fiducial import CameraPose, ImuSample, load_config, PoseEkf, read_bag
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
-from thermal_fiducial.files.trajectory import load_tum, tum_line
+from thermal_fiducial.files.trajectory_file import load_tum, tum_line
 
 COVARIANCE = np.diag([0.005**2] * 3 + [0.005**2] * 3)  # of each pose: 5 mm, 5 mrad
 

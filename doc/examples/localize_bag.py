@@ -5,7 +5,7 @@ import sys
 
 from thermal_fiducial import Camera, ImuSample, load_config, load_dictionary, load_map, Pipeline, read_bag
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
-from thermal_fiducial.files.trajectory import tum_line
+from thermal_fiducial.files.trajectory_file import tum_line
 
 
 def main(bag: str, parameters: str, marker_map: str, out: str) -> None:

@@ -5,7 +5,7 @@ import sys
 
 from matplotlib.figure import Figure
 
-from thermal_fiducial.files.trajectory import load_tum
+from thermal_fiducial.files.trajectory_file import load_tum
 
 
 def main(run: str, out: str) -> None:

@@ -18,9 +18,9 @@ from support.scenes import camera_of, detector_of, motion_prior
 
 from thermal_fiducial.core.detection import detector as detection
 from thermal_fiducial.core.measurements import corners_px, Odometry
-from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.render import Quality
 from thermal_fiducial.sim.scenario import named
+from thermal_fiducial.sim.thermal_camera import render_frames
 
 PLOT = Path(__file__).resolve().parents[2] / 'doc' / 'figures' / 'detection.png'
 SECONDS, SEED = 20.0, 21

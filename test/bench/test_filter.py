@@ -11,7 +11,7 @@ from support.flights import config, errors, Flight, matched, perfect, rms, run, 
 
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.filter.coasting import coasting_variance
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.measurements import ImuSample
 

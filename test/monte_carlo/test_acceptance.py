@@ -11,7 +11,7 @@ import pytest
 from support.flights import config, errors, Flight, matched, Motion, perfect, rms, run, START_NS, timeline, white_poses
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.geometry.se3 import so3_exp, so3_log, transform
 
 pytestmark = pytest.mark.slow

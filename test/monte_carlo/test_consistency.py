@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 from support.flights import CAMERA_POSITION, config, Flight, matched, state_error, timeline
 
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.measurements import ImuSample
 
 SETS, RUNS = 4, 50

@@ -6,7 +6,7 @@ from support.corner_runs import fly
 from support.sim_flights import simulated
 
 from thermal_fiducial.core.measurements import corners_px
-from thermal_fiducial.sim.camera import render_frames, simulate_imu
+from thermal_fiducial.sim.thermal_camera import render_frames, simulate_imu
 
 pytestmark = pytest.mark.slow
 

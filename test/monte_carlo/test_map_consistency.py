@@ -6,7 +6,7 @@ import pytest
 from test.support.walls import CAMERA, flight, see, SIZE, wall
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.mapping.bundle_adjustment import refine, Snapshot
-from thermal_fiducial.core.mapping.keyframes import Keyframe, Rig
+from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
 
@@ -31,7 +31,7 @@ def one_map(seed):
         i: MapMarker(i, SIZE, i == 0, T if i == 0 else retract(T, 0.01 * rng.normal(size=6)), (i > 0) * np.eye(6))
         for i, T in poses.items()
     }
-    refinement = refine(Snapshot(markers, tuple(frames), Rig.single(CAMERA)))
+    refinement = refine(Snapshot(markers, tuple(frames), CameraRig.single(CAMERA)))
     nees = []
     for i in range(1, 8):
         d = difference(poses[i], refinement.markers[i].T_map_marker)

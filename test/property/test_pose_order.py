@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 import numpy as np
 from support.flights import config, Flight, run, timeline
 
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.filter.ekf import PoseEkf
 
 POSES = 20
 SEVERAL_MARKERS = {'rotation_std': (0.003, 0.003, 0.001), 'translation_std': (0.0003, 0.0003, 0.003)}

@@ -2,7 +2,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 
-from thermal_fiducial.files.trajectory import load_tum, save_tum
+from thermal_fiducial.files.trajectory_file import load_tum, save_tum
 
 numbers = st.floats(-1e4, 1e4)
 

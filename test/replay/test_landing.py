@@ -5,7 +5,7 @@ import pytest
 from support import approach
 
 from thermal_fiducial.core.geometry.se3 import so3_log
-from thermal_fiducial.sim.camera import START_NS
+from thermal_fiducial.sim.thermal_camera import START_NS
 
 SECONDS, SEED = 6.0, 5
 

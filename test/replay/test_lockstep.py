@@ -16,7 +16,7 @@ from thermal_fiducial.core.pipeline import Pipeline, PipelineConfig
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map, save_map
-from thermal_fiducial.files.trajectory import load_tum, tum_line
+from thermal_fiducial.files.trajectory_file import load_tum, tum_line
 from thermal_fiducial.replay import lockstep, waiting
 from thermal_fiducial.ros import convert
 

@@ -10,11 +10,11 @@ from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, Pos
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import ImuSample
 from thermal_fiducial.core.pipeline import Pipeline, PipelineConfig
-from thermal_fiducial.sim.camera import render_frames, simulate_imu
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.scenario import named, Scenario, with_contrast
 from thermal_fiducial.sim.scene import Marker
-from thermal_fiducial.sim.trajectory import Flight, smooth_step, Trajectory
+from thermal_fiducial.sim.spline_trajectory import Flight, smooth_step, SplineTrajectory
+from thermal_fiducial.sim.thermal_camera import render_frames, simulate_imu
 
 __all__ = ['Approach', 'camera_of', 'detector_of', 'fly', 'scenario']
 
@@ -41,7 +41,7 @@ class Approach(Flight):
     lasts: float = 3.0
     drift: float = 0.15
 
-    def trajectory(self, seconds: float, seed: int) -> Trajectory:
+    def trajectory(self, seconds: float, seed: int) -> SplineTrajectory:
         """The flight of this seed."""
         t = np.linspace(-0.5, seconds + 0.5, round(20 * (seconds + 1)) + 1)
         phase = np.random.default_rng([seed, 1]).uniform(0.0, 2.0 * np.pi, 6)
@@ -50,7 +50,7 @@ class Approach(Flight):
         sway = np.array([0.02, 0.04, 0.03]) * waves[:, :3] * distance[:, None]
         position = np.stack([self.wall - distance, np.zeros_like(t), np.full_like(t, 1.25)], axis=1) + sway
         position[:, 1] += self.drift * smooth_step(t, seconds - 2.0, 1.5)
-        return Trajectory(t, position, Rotation.from_rotvec(np.array([0.06, 0.05, 0.05]) * waves[:, 3:]))
+        return SplineTrajectory(t, position, Rotation.from_rotvec(np.array([0.06, 0.05, 0.05]) * waves[:, 3:]))
 
 
 def scenario(contrast: float = 8.0, lens: Lens = LENS, **flight: float) -> Scenario:

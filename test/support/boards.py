@@ -8,12 +8,12 @@ from scipy.spatial.transform import Rotation
 from thermal_fiducial.sim.render import Quality, Renderer
 from thermal_fiducial.sim.scene import Acrylic, Fog, Plate, Room
 from thermal_fiducial.sim.sensor import Sensor
-from thermal_fiducial.sim.trajectory import Trajectory
+from thermal_fiducial.sim.spline_trajectory import SplineTrajectory
 
 #: A Tau 2 six seconds after its shutter closed.
 TIME = 13.0
 SENSOR = replace(Sensor(), lag=0.0)
-STILL = Trajectory(np.arange(20.0), np.zeros((20, 3)), Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (20, 1))))
+STILL = SplineTrajectory(np.arange(20.0), np.zeros((20, 3)), Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (20, 1))))
 
 
 def chessboard_levels(columns, rows):

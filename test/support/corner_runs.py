@@ -9,8 +9,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from thermal_fiducial.config import ImuNoise, MarkerMapperConfig, PoseEkfConfig
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.innovations import PoseUpdate
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import (
     inverse,

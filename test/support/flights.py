@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.initialization import WHITE_STD
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf
 from thermal_fiducial.core.geometry.se3 import rotation_angle, skew, so3_exp, so3_left_jacobian, so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 

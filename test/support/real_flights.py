@@ -25,7 +25,7 @@ from thermal_fiducial.core.mapping.map_building import build_map, rows_from_corn
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, ImuSample
 from thermal_fiducial.files.marker_map import load_map, save_map
-from thermal_fiducial.files.trajectory import load_tum
+from thermal_fiducial.files.trajectory_file import load_tum
 
 CARPETS = ('carpet_mountain', 'carpet_slow_circle')
 #: Corner noise [px]: what re-projection leaves of the board's corners, and the median that it leaves of the carpet's

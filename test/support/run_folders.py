@@ -12,7 +12,7 @@ from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, so3_exp
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.files.bags import BagWriter, TRUTH_TOPIC
 from thermal_fiducial.files.marker_map import save_map
-from thermal_fiducial.files.trajectory import save_tum
+from thermal_fiducial.files.trajectory_file import save_tum
 
 START_NS = 1_700_000_000_000_000_000
 FUSED_SIGMA = np.array([2e-3, 2e-3, 2e-3, 3e-4, 3e-4, 3e-4])

@@ -9,8 +9,8 @@ from thermal_fiducial.cli.simulate_corners import simulated_recording
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.mapping.map_building import rows_from_corners
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.sim.camera import plan
 from thermal_fiducial.sim.scenario import named
+from thermal_fiducial.sim.thermal_camera import plan
 
 
 @cache

@@ -13,7 +13,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform, transform_from_quaternion
 from thermal_fiducial.core.mapping.bundle_adjustment import refine, Snapshot
-from thermal_fiducial.core.mapping.keyframes import Keyframe, Rig
+from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe
 from thermal_fiducial.core.mapping.map_building import decide, rows_from_corners
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
@@ -31,7 +31,7 @@ _SPEED_SIGMA, _TURN_SIGMA = 0.02, 0.01
 class Recording:
     """One recorded set: corners by stamp and camera, and the solution of the reference."""
 
-    rig: Rig
+    rig: CameraRig
     sizes: defaultdict[int, float]
     #: stamp -> list of (marker, camera, corners (4, 2))
     views: dict[int, list[tuple[int, int, np.ndarray]]]
@@ -87,7 +87,7 @@ def load(folder):
     body = next(child for parent, child in transforms if parent == 'map')
     rig = next(parent for parent, child in transforms if child == 'cam0')
     recording = Recording(
-        Rig(tuple(_camera(c) for c in cameras.values()), np.stack([transforms[rig, name] for name in cameras])),
+        CameraRig(tuple(_camera(c) for c in cameras.values()), np.stack([transforms[rig, name] for name in cameras])),
         sizes,
         dict(sorted(views.items())),
         [tag['id'] for tag in static['tags']],

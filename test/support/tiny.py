@@ -3,7 +3,7 @@
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.scenario import Scenario
 from thermal_fiducial.sim.scene import Marker
-from thermal_fiducial.sim.trajectory import Flight
+from thermal_fiducial.sim.spline_trajectory import Flight
 
 LENS = Lens((190.0, 189.0), (81.3, 62.4), 'plumb_bob', (-0.25, 0.09, 4e-4, -3e-4, 0.0), 160, 128)
 

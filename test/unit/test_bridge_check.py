@@ -15,7 +15,7 @@ from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, so3_exp
 from thermal_fiducial.files.bags import BagWriter
 from thermal_fiducial.report.bridge_check import check_bridge, Level
-from thermal_fiducial.report.bridge_record import BridgeRecord, Recorder
+from thermal_fiducial.report.bridge_record import BridgeRecord, BridgeRecorder
 
 RATE = 40.0
 
@@ -148,7 +148,7 @@ def test_smaller_flaws_are_warnings(flying):
 
 
 def test_silence_is_a_fault():
-    (finding,) = check_bridge(Recorder().record())
+    (finding,) = check_bridge(BridgeRecorder().record())
     assert finding.level is Level.FAULT
     assert 'nothing' in finding.consequence
 
@@ -167,7 +167,7 @@ def message(record, index):
 
 
 def test_messages_become_the_record(flying):
-    recorder = Recorder(live=True)
+    recorder = BridgeRecorder(live=True)
     for index in range(len(flying.stamps_ns)):
         recorder.odometry(message(flying, index), int(flying.arrivals_ns[index]))
     record = recorder.record()

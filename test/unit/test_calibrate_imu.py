@@ -5,7 +5,7 @@ import pytest
 from support import small_bag
 import yaml
 
-from thermal_fiducial.calibration.imu_noise import fit_noise
+from thermal_fiducial.calibration.allan_deviation import fit_noise
 from thermal_fiducial.calibration.preintegration import ImuTrack
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from support.heated_boards import Heat, picture
 
-from thermal_fiducial.calibration.placement import BoardNodes, Refusal
+from thermal_fiducial.calibration.placement import BoardNodes, GridRefusal
 from thermal_fiducial.calibration.targets import BoardNotFound, Chessboard, CircleGrid
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
@@ -190,7 +190,7 @@ def test_place_needs_the_rows_at_the_rim():
     was = nodes[::-1][rows]
     assert np.array_equal(placed, was) or np.array_equal(placed, (7, 5) - was)
     # Without a column it could as well lie a column further.
-    assert isinstance(board.place(nodes[column > 0]), Refusal)
+    assert isinstance(board.place(nodes[column > 0]), GridRefusal)
     # A half-hidden column tells.
-    assert not isinstance(board.place(nodes[(column > 0) | (row < 4)]), Refusal)
-    assert isinstance(board.place(nodes[:20]), Refusal)
+    assert not isinstance(board.place(nodes[(column > 0) | (row < 4)]), GridRefusal)
+    assert isinstance(board.place(nodes[:20]), GridRefusal)

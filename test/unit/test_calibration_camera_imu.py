@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.scenes import camera_of
 
-from thermal_fiducial.calibration.batch import first_state, imu_errors, Problem
+from thermal_fiducial.calibration.batch_adjustment import first_state, imu_errors, Problem
 from thermal_fiducial.calibration.camera_imu import calibrate_camera_imu, calibrate_rolling_camera_imu
 from thermal_fiducial.calibration.preintegration import AXES, ImuTrack, preintegrate
 from thermal_fiducial.calibration.rolling import FrameCorners
@@ -14,11 +14,10 @@ from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.sim.camera import plan, simulate_imu, START_NS
-from thermal_fiducial.sim.imu import ImuModel
-from thermal_fiducial.sim.imu import ImuNoise as SimulatedNoise
+from thermal_fiducial.sim.imu import ImuModel, SimulatedNoise
 from thermal_fiducial.sim.scenario import named
-from thermal_fiducial.sim.trajectory import GRAVITY
+from thermal_fiducial.sim.spline_trajectory import GRAVITY
+from thermal_fiducial.sim.thermal_camera import plan, simulate_imu, START_NS
 from thermal_fiducial.sim.vibration import Vibration
 
 OFFSET = 0.024

@@ -6,7 +6,7 @@ import yaml
 
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bad_pixels import load_bad_pixels, save_bad_pixels
+from thermal_fiducial.files.bad_pixel_list import load_bad_pixels, save_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera, save_camera
 
 K = [[529.1, 0.0, 317.2], [0.0, 528.4, 259.9], [0.0, 0.0, 1.0]]

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.fabrication.contrast import Mounting, remaining_contrast
+from thermal_fiducial.fabrication.contrast_decay import Mounting, remaining_contrast
 
 SECONDS = [30.0, 60.0, 120.0, 300.0, 1e6]
 

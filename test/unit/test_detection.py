@@ -12,8 +12,8 @@ from thermal_fiducial.core.detection.displayed import DisplayedSides
 from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, MARKER_DTYPE
 from thermal_fiducial.files.dictionary import load_dictionary
-from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.scenario import named
+from thermal_fiducial.sim.thermal_camera import render_frames
 
 
 @pytest.fixture(scope='module')

@@ -6,9 +6,9 @@ import pytest
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.fabrication.bit_patterns import cuttable, pack, rotate, unpack, weight
 from thermal_fiducial.fabrication.cuttability import examine
 from thermal_fiducial.fabrication.dictionary_search import distances, random_code, search
-from thermal_fiducial.fabrication.patterns import cuttable, pack, rotate, unpack, weight
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.dictionary import PACKAGED as FOLDER
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.flights import config, errors, Flight, matched, Motion, rms, run, START_NS, timeline, white_poses
 
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.measurements import ImuSample
 
 

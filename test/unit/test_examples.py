@@ -11,7 +11,7 @@ from support import small_bag
 from thermal_fiducial import load_map
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
 from thermal_fiducial.files.camera_info import save_camera
-from thermal_fiducial.files.trajectory import load_tum, save_tum
+from thermal_fiducial.files.trajectory_file import load_tum, save_tum
 
 FOLDER = Path(__file__).resolve().parents[2] / 'doc' / 'examples'
 SCRIPTS = sorted(path.stem for path in FOLDER.glob('*.py'))

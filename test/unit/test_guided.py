@@ -16,8 +16,8 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corners_px, Odometry
 from thermal_fiducial.files.dictionary import load_dictionary
-from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.scenario import named, with_contrast
+from thermal_fiducial.sim.thermal_camera import render_frames
 
 SCENARIO = named('wall')
 LENS = SCENARIO.lens

@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bad_pixels import load_bad_pixels
+from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.point_cloud import load_alignment, load_cloud
-from thermal_fiducial.files.trajectory import load_tum
+from thermal_fiducial.files.trajectory_file import load_tum
 from thermal_fiducial.replay.domain import own_domain
 
 YAML_LOADERS = (load_map, load_camera, load_dictionary, load_alignment)

@@ -12,7 +12,7 @@ from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
 from thermal_fiducial.core.mapping import bundle_adjustment
 from thermal_fiducial.core.mapping.bundle_adjustment import prior_poses, refine, Snapshot
-from thermal_fiducial.core.mapping.keyframes import Keyframe, Link, Rig
+from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe, Link
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
 
@@ -35,7 +35,7 @@ def snapshot(rng, poses, sigma=0.02, count=30, disturbance=0.01, fixed=(0,)):
         else MapMarker(i, SIZE, False, retract(T, disturbance * rng.normal(size=6)), 1e-2 * np.eye(6))
         for i, T in poses.items()
     }
-    return Snapshot(markers, tuple(frames), Rig.single(CAMERA))
+    return Snapshot(markers, tuple(frames), CameraRig.single(CAMERA))
 
 
 def errors(refinement, poses):
@@ -254,7 +254,7 @@ def test_two_cameras_of_a_rig_are_one():
             )
         )
     s = snapshot(rng, poses, count=1)
-    refinement = refine(replace(s, keyframes=tuple(frames), rig=Rig((CAMERA, CAMERA), T_rig_camera)))
+    refinement = refine(replace(s, keyframes=tuple(frames), rig=CameraRig((CAMERA, CAMERA), T_rig_camera)))
     assert refinement is not None
     assert np.max(np.abs(errors(refinement, poses))) < 2e-5
 
@@ -286,7 +286,7 @@ def test_odometry_holds_keyframes_that_a_marker_leaves_loose():
         i: MapMarker(i, SIZE, i == 0, T if i == 0 else retract(T, 0.02 * rng.normal(size=6)), (i > 0) * np.eye(6))
         for i, T in poses.items()
     }
-    loose = Snapshot(markers, tuple(frames), Rig.single(CAMERA))
+    loose = Snapshot(markers, tuple(frames), CameraRig.single(CAMERA))
     sigma = np.diag([5e-3] * 3 + [1e-3] * 3)
     known = [
         replace(

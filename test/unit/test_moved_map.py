@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.flights import config, Flight
 
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import in_moved_map
 

@@ -18,8 +18,8 @@ from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_camera_pose
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, Odometry
-from thermal_fiducial.sim.camera import render_frames
-from thermal_fiducial.sim.trajectory import Trajectory
+from thermal_fiducial.sim.spline_trajectory import SplineTrajectory
+from thermal_fiducial.sim.thermal_camera import render_frames
 
 SIZE, ID, CELLS = 0.3, 8, BITS.shape[1] + 2
 #: Side [px], direction of the middle, and rotation: a side outside, a corner, all four, a small one at the border, one
@@ -159,6 +159,6 @@ def test_a_detector_with_odometry_sees_it():
 
 def still(scenario, frame):
     """Velocity and turn rate of the body."""
-    path: Trajectory = scenario.flight.trajectory(7.0, 3)
+    path: SplineTrajectory = scenario.flight.trajectory(7.0, 3)
     motion = path(frame.seconds)
     return motion.rotation.as_matrix()[0].T @ motion.velocity[0], motion.angular_velocity_body[0]

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from support.scenes import camera_of, detector_of, motion_prior
 
-from thermal_fiducial.core.detection.prediction import Predictor
+from thermal_fiducial.core.detection.frame_prediction import Predictor
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.measurements import Odometry
-from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.scenario import named
+from thermal_fiducial.sim.thermal_camera import render_frames
 
 STAMP_NS, PERIOD_NS = 10**9, 5_000_000
 VELOCITY, ACCELERATION = np.array([0.0, 2.0, 0.0]), np.array([3.0, 0.0, 0.0])

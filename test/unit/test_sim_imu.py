@@ -3,12 +3,12 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from thermal_fiducial.sim.camera import plan, simulate_imu
-from thermal_fiducial.sim.imu import Delivery, ImuModel, ImuNoise
+from thermal_fiducial.sim.imu import Delivery, ImuModel, SimulatedNoise
 from thermal_fiducial.sim.scenario import SCENARIOS
-from thermal_fiducial.sim.trajectory import GRAVITY
+from thermal_fiducial.sim.spline_trajectory import GRAVITY
+from thermal_fiducial.sim.thermal_camera import plan, simulate_imu
 
-SILENT = ImuModel(ImuNoise(0.0, 0.0, 0.0, 0.0), 400.0, 0.0, 0.0)
+SILENT = ImuModel(SimulatedNoise(0.0, 0.0, 0.0, 0.0), 400.0, 0.0, 0.0)
 
 
 def test_noiseless_imu_integrates_to_the_flight():
@@ -38,7 +38,7 @@ def test_at_rest_it_feels_gravity():
 
 def test_noise_has_the_densities():
     rate, seconds = 200.0, 500.0
-    noise = ImuNoise(2e-3, 3e-2, 1e-3, 2e-3)
+    noise = SimulatedNoise(2e-3, 3e-2, 1e-3, 2e-3)
     t = np.arange(0.0, seconds, 1 / rate)
     trajectory = SCENARIOS['wall'].trajectory(20.0, 0)
     stamps = (t * 1e9).astype(np.int64)

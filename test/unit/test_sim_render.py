@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from support.tiny import LENS, TINY
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.sim.camera import CHUNK, render_frames
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.render import LATTICES, Quality, Renderer
 from thermal_fiducial.sim.scene import Acrylic, Clutter, clutter_plate, facing, Fog, Marker, marker_plate, Plate, Room
-from thermal_fiducial.sim.trajectory import Motion, pose_matrix
+from thermal_fiducial.sim.spline_trajectory import Motion, pose_matrix
+from thermal_fiducial.sim.thermal_camera import CHUNK, render_frames
 
 EMPTY_ROOM = Room(excess=(0.0,) * 6, texture=0.0)
 ACRYLIC = Acrylic(contrast=1.0, gradient=0.0, steady=0.0)

@@ -6,8 +6,8 @@ import pytest
 from support.tiny import TINY
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.sim.camera import render_frames
 from thermal_fiducial.sim.sensor import FULL_SCALE, IDEAL, Sensor
+from thermal_fiducial.sim.thermal_camera import render_frames
 
 FLAT = np.zeros((128, 160), np.float32)
 FFC = replace(TINY.sensor, ffc_first=1.0, ffc_period=5.0, ffc_duration=0.3)

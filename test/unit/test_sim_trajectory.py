@@ -3,11 +3,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.trajectory import save_tum
-from thermal_fiducial.sim.camera import plan, true_corners
+from thermal_fiducial.files.trajectory_file import save_tum
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.scenario import SCENARIOS
-from thermal_fiducial.sim.trajectory import Flight, Trajectory
+from thermal_fiducial.sim.spline_trajectory import Flight, SplineTrajectory
+from thermal_fiducial.sim.thermal_camera import plan, true_corners
 
 STEP = 1e-4
 
@@ -100,6 +100,6 @@ def test_refuses_too_few_poses(tmp_path):
     with pytest.raises(InputError, match='too few'):
         RecordedFlight.load(tmp_path / 'a.tum')
     with pytest.raises(InputError, match='more than'):
-        Trajectory(np.arange(3.0), np.zeros((3, 3)), Rotation.identity(3))
+        SplineTrajectory(np.arange(3.0), np.zeros((3, 3)), Rotation.identity(3))
     with pytest.raises(InputError, match='increasing'):
-        Trajectory(np.zeros(8), np.zeros((8, 3)), Rotation.identity(8))
+        SplineTrajectory(np.zeros(8), np.zeros((8, 3)), Rotation.identity(8))

@@ -14,9 +14,9 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 from thermal_fiducial.files.marker_map import load_map
-from thermal_fiducial.files.trajectory import load_tum
-from thermal_fiducial.sim.camera import plan, render_frames, simulate_imu
+from thermal_fiducial.files.trajectory_file import load_tum
 from thermal_fiducial.sim.scenario import LENSES, SCENARIOS
+from thermal_fiducial.sim.thermal_camera import plan, render_frames, simulate_imu
 from thermal_fiducial.sim.writer import IMAGE_DELAY_NS, write_flight
 
 SECONDS = 2.0

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.trajectory import load_tum, save_tum, tum_line
+from thermal_fiducial.files.trajectory_file import load_tum, save_tum, tum_line
 
 STAMPS = [1_700_000_000_000_000_001, 1_700_000_000_005_000_000, 1_700_000_001_999_999_999]
 

@@ -14,7 +14,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.calibration.batch import first_state, LARGEST_OFFSET, Problem, root_information, Solution, State
+from thermal_fiducial.calibration.batch_adjustment import (
+    first_state,
+    LARGEST_OFFSET,
+    Problem,
+    root_information,
+    Solution,
+    State,
+)
 from thermal_fiducial.calibration.preintegration import AXES, ImuTrack
 from thermal_fiducial.calibration.rolling import FrameCorners, RowMoments, SolvedFrame
 from thermal_fiducial.config import ImuNoise

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from thermal_fiducial.calibration.keypoints import Keypoints
-from thermal_fiducial.calibration.placement import BoardNodes, Refusal
+from thermal_fiducial.calibration.placement import BoardNodes, GridRefusal
 from thermal_fiducial.calibration.surface import local_surface, REACH
 from thermal_fiducial.core.types import FloatArray, IntArray
 
@@ -47,16 +47,16 @@ class BoardPoints:
     beyond_pixels: FloatArray
 
 
-def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | Refusal:
+def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | GridRefusal:
     """Most complete sighting of a board among several sets of keypoints, or why there is none."""
     best: BoardPoints | None = None
-    refusal = Refusal('no regular grid of points')
+    refusal = GridRefusal('no regular grid of points')
     for keypoints in views:
         for grid in Grower(keypoints).grids():
             nodes = np.array(list(grid), dtype=np.int64)
             pixels = keypoints.pixels[list(grid.values())]
             placed = board.place(_facing(nodes, pixels))
-            if isinstance(placed, Refusal):
+            if isinstance(placed, GridRefusal):
                 refusal = max(refusal, placed, key=lambda other: other.points)
             elif best is None or len(placed.points) > len(best.points):
                 best = BoardPoints(placed.points, pixels[placed.rows], placed.beyond_nodes, pixels[placed.beyond])

@@ -19,7 +19,7 @@ _QUARTER = np.array([[0, -1], [1, 0]])
 
 
 @dataclass(frozen=True)
-class Refusal:
+class GridRefusal:
     """Why a grid is not the board, in words, and how many points it has: of several the largest says most."""
 
     reason: str
@@ -27,7 +27,7 @@ class Refusal:
 
 
 @dataclass(frozen=True)
-class Placement:
+class GridPlacement:
     """Where a board lies in a grid.
 
     Parameters
@@ -59,7 +59,7 @@ class BoardNodes:
         self._views = _views(self._outline)
         self._margin = len(self._outline) - _largest_two(self._overlaps(self._outline))[1]
 
-    def place(self, grid: IntArray) -> Placement | Refusal:
+    def place(self, grid: IntArray) -> GridPlacement | GridRefusal:
         """Where the board lies in ``grid``.
 
         Parameters
@@ -68,16 +68,16 @@ class BoardNodes:
         """
         count = len(self._outline)
         if len(grid) < _LEAST_SHARE * count:
-            return Refusal(f'only {len(grid)} points in a regular grid, the board has {len(self.nodes)}', len(grid))
+            return GridRefusal(f'only {len(grid)} points in a regular grid, the board has {len(self.nodes)}', len(grid))
         overlaps = self._overlaps(grid)
         most, second = _largest_two(overlaps)
         beyond = len(grid) - int(most)
         if most < _LEAST_SHARE * count:
-            return Refusal(f'a grid of {len(grid)} points that is not like the board', len(grid))
+            return GridRefusal(f'a grid of {len(grid)} points that is not like the board', len(grid))
         if beyond > _BEYOND * count + 1.0 or (beyond > 0 and most - second < _CLEAR * self._margin):
-            return Refusal(goes_on(beyond), len(grid))
+            return GridRefusal(goes_on(beyond), len(grid))
         if most - second < _CLEAR * self._margin:
-            return Refusal(f'{most:.0f} of {count} points found, which may lie in more than one place', len(grid))
+            return GridRefusal(f'{most:.0f} of {count} points found, which may lie in more than one place', len(grid))
         best = int(np.argmax([overlap.max() for overlap in overlaps]))
         view, overlap = self._views[best], overlaps[best]
         pattern = view.nodes(self._outline)
@@ -85,7 +85,7 @@ class BoardNodes:
         placements = [self._placement(matrix, view.origin(matrix, self._outline), shift, grid) for matrix in view.ways]
         return max(placements, key=lambda placement: len(placement.points))
 
-    def _placement(self, matrix: IntArray, origin: IntArray, shift: IntArray, grid: IntArray) -> Placement:
+    def _placement(self, matrix: IntArray, origin: IntArray, shift: IntArray, grid: IntArray) -> GridPlacement:
         inverse = np.rint(np.linalg.inv(matrix)).astype(np.int64)
         on_board = (grid - grid.min(axis=0) - shift + origin) @ inverse
         index = {node: point for point, node in enumerate(map(tuple, self._outline.tolist()))}
@@ -93,7 +93,7 @@ class BoardNodes:
         shown = np.flatnonzero((point >= 0) & (point < len(self.nodes)))
         shown = shown[np.argsort(point[shown])]
         outside = np.flatnonzero(point < 0)
-        return Placement(point[shown], shown, outside, on_board[outside])
+        return GridPlacement(point[shown], shown, outside, on_board[outside])
 
     def _overlaps(self, grid: IntArray) -> list[FloatArray]:
         """Points that each view of the board has in common with a grid, for each shift."""

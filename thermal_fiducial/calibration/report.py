@@ -35,7 +35,7 @@ svg{width:100%;height:auto;background:#ddd}
 
 
 @dataclass(frozen=True)
-class View:
+class BoardView:
     """A frame that shows the board.
 
     Parameters
@@ -60,7 +60,7 @@ def coverage(pixels: FloatArray, width: int, height: int) -> IntArray:
 def write_report(
     path: Path,
     calibration: Calibration,
-    views: Sequence[View],
+    views: Sequence[BoardView],
     fits: Mapping[str, Calibration],
     error: ImageError,
     unusable: Sequence[tuple[str, str]] = (),
@@ -115,7 +115,7 @@ def _numbers(calibration: Calibration, fits: Mapping[str, Calibration]) -> str:
     )
 
 
-def _left_out(calibration: Calibration, views: Sequence[View], unusable: Sequence[tuple[str, str]]) -> str:
+def _left_out(calibration: Calibration, views: Sequence[BoardView], unusable: Sequence[tuple[str, str]]) -> str:
     rows = [(views[index].name, 'fits far worse than the other views') for index in calibration.dropped]
     rows += list(unusable)
     return '<h2>Not used</h2>' + (_table(('frame', 'reason'), rows) if rows else '<p>Every frame was used.</p>')
@@ -129,7 +129,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 # --- each view ----------------------------------------------------------------------------------------
 
 
-def _view_figures(calibration: Calibration, views: Sequence[View]) -> str:
+def _view_figures(calibration: Calibration, views: Sequence[BoardView]) -> str:
     """Every view with its points, and residuals as enlarged lines."""
     every = np.concatenate(calibration.residuals)
     longest = float(np.percentile(np.linalg.norm(every, axis=1), 99.0))
@@ -142,7 +142,7 @@ def _view_figures(calibration: Calibration, views: Sequence[View]) -> str:
     return f'{text}<div class="views">{"".join(figures)}</div>'
 
 
-def _view_figure(view: View, residual: FloatArray, enlarged: float, calibration: Calibration) -> str:
+def _view_figure(view: BoardView, residual: FloatArray, enlarged: float, calibration: Calibration) -> str:
     width, height = calibration.camera.width, calibration.camera.height
     rms = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
     worst = float(np.linalg.norm(residual, axis=1).max())
@@ -159,7 +159,7 @@ def _view_figure(view: View, residual: FloatArray, enlarged: float, calibration:
     )
 
 
-def _thumbnail(view: View) -> str:
+def _thumbnail(view: BoardView) -> str:
     if view.counts is None:
         return ''
     low, high = np.percentile(view.counts, (0.5, 99.5))
@@ -173,7 +173,7 @@ def _thumbnail(view: View) -> str:
 # --- all views together -------------------------------------------------------------------------------
 
 
-def _picture(calibration: Calibration, views: Sequence[View], error: ImageError) -> str:
+def _picture(calibration: Calibration, views: Sequence[BoardView], error: ImageError) -> str:
     """Residual field, coverage, error over the image and rms a view as an embedded PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

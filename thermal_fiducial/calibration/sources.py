@@ -27,7 +27,7 @@ _COMPRESSED_TYPE = 'sensor_msgs/msg/CompressedImage'
 
 
 @dataclass(frozen=True)
-class Frame:
+class RawFrame:
     """One raw frame.
 
     Parameters
@@ -116,7 +116,7 @@ def _flat_sighting(values: FloatArray) -> Sighting:
     return Sighting(np.column_stack([values[:, 2:], np.zeros(len(values))]), values[:, :2])
 
 
-def clean_frames(bag: BagReader) -> Iterator[Frame]:
+def clean_frames(bag: BagReader) -> Iterator[RawFrame]:
     """Frames of a bag as the detector gets them: without those that the shutter or the driver froze."""
     bag.require({bag.image_topic: _COMPRESSED_TYPE if bag.image_topic == COMPRESSED_TOPIC else _IMAGE_TYPE})
     cleaner = FrameCleaner(Tau2CameraConfig())
@@ -124,7 +124,7 @@ def clean_frames(bag: BagReader) -> Iterator[Frame]:
         stamp_ns = stamp_to_ns(entry.message.header.stamp)
         frame = cleaner.process(stamp_ns, image_to_array(entry.message))
         if frame.counts is not None:
-            yield Frame(str(index), stamp_ns, frame.counts)
+            yield RawFrame(str(index), stamp_ns, frame.counts)
 
 
 def recorded_camera(bag: BagReader) -> Camera:

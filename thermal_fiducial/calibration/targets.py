@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.calibration.appearance import Appearance, Disc, SquaresMeet
 from thermal_fiducial.calibration.keypoints import blobs, Keypoints, saddles, without_speckles
 from thermal_fiducial.calibration.lattice import find_board
-from thermal_fiducial.calibration.placement import BoardNodes, goes_on, Refusal
+from thermal_fiducial.calibration.placement import BoardNodes, goes_on, GridRefusal
 from thermal_fiducial.calibration.subpixel import refine
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
@@ -171,7 +171,7 @@ def _sighting(
     With ``another`` points of its kind beyond it, it is another board.
     """
     found = find_board(keypoints, board)
-    if isinstance(found, Refusal):
+    if isinstance(found, GridRefusal):
         raise BoardNotFound(found.reason)
     # What continues the grid is looked at as closely as the board: clutter is no point of it, another board's is.
     nodes = np.concatenate([board.nodes[found.points], found.beyond_nodes]).astype(np.float64)
@@ -183,8 +183,8 @@ def _sighting(
         raise BoardNotFound(goes_on(beyond))
     kept = found.points[good[:count]]
     # What turns out to be no point of the board may have been all that showed where in the grid it lies.
-    placed = board.place(board.nodes[kept]) if len(kept) else Refusal('none of its points is sharp enough')
-    if isinstance(placed, Refusal):
+    placed = board.place(board.nodes[kept]) if len(kept) else GridRefusal('none of its points is sharp enough')
+    if isinstance(placed, GridRefusal):
         raise BoardNotFound(placed.reason)
     return Sighting(points[kept], pixels[:count][good[:count]])
 

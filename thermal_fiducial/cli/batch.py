@@ -35,8 +35,8 @@ def run(args: argparse.Namespace) -> int:
         import distributed  # noqa: F401
     except ImportError:
         raise InputError("needs the extra 'batch': pip install thermal_fiducial[batch]") from None
-    from thermal_fiducial.replay.batch import Batch, run_batch, workers
-    from thermal_fiducial.replay.replay import Options
+    from thermal_fiducial.replay.many_bags import Batch, run_batch, workers
+    from thermal_fiducial.replay.session import Options
 
     options = Options(
         bag=args.bags[0],

@@ -9,7 +9,7 @@ from rich.progress import track
 
 from thermal_fiducial.calibration.camera_imu import calibrate_rolling_camera_imu, CameraImuCalibration
 from thermal_fiducial.calibration.rolling import FrameCorners
-from thermal_fiducial.calibration.sources import clean_frames, Frame, imu_track, recorded_camera
+from thermal_fiducial.calibration.sources import clean_frames, imu_track, RawFrame, recorded_camera
 from thermal_fiducial.cli import calibrate_intrinsics
 from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
@@ -78,7 +78,7 @@ def _camera_imu(args: argparse.Namespace) -> int:
     return 0
 
 
-def _mapped_corners(frames: Iterable[Frame], marker_map: MarkerMap, camera: Camera) -> Iterator[FrameCorners]:
+def _mapped_corners(frames: Iterable[RawFrame], marker_map: MarkerMap, camera: Camera) -> Iterator[FrameCorners]:
     """Markers of the map in each frame that shows any."""
     detector = mapped_detector(marker_map)
     for frame in frames:

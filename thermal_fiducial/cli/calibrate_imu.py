@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from thermal_fiducial.calibration.imu_noise import AllanFit, fit_noise, ImuNoiseFit
+from thermal_fiducial.calibration.allan_deviation import AllanFit, fit_noise, ImuNoiseFit
 from thermal_fiducial.calibration.sources import imu_track
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError

@@ -12,13 +12,13 @@ import yaml
 from thermal_fiducial.calibration.intrinsics import Calibration, LEAST_VIEWS
 from thermal_fiducial.calibration.lens_check import image_error, ImageError
 from thermal_fiducial.calibration.lens_choice import CANDIDATES, choose_model
-from thermal_fiducial.calibration.report import coverage, View, write_report
+from thermal_fiducial.calibration.report import BoardView, coverage, write_report
 from thermal_fiducial.calibration.sources import (
     clean_frames,
-    Frame,
     is_folder_of_pictures,
     measured_points,
     pictures,
+    RawFrame,
     read_picture,
 )
 from thermal_fiducial.calibration.targets import BoardNotFound, Chessboard, CircleGrid, MarkerBoard, Sighting, Target
@@ -113,11 +113,11 @@ class _Views:
     """
 
     target: Target | None = None
-    kept: list[View] = field(default_factory=list)
+    kept: list[BoardView] = field(default_factory=list)
     unusable: list[tuple[str, str]] = field(default_factory=list)
     size: tuple[int, int] = (0, 0)
 
-    def find(self, frame: Frame, camera: Camera) -> Sighting | None:
+    def find(self, frame: RawFrame, camera: Camera) -> Sighting | None:
         """The board in a frame; None, with the reason noted, where there is none.
 
         Raises
@@ -136,9 +136,9 @@ class _Views:
             self.unusable.append((frame.name, str(reason)))
             return None
 
-    def keep(self, frame: Frame, sighting: Sighting) -> None:
+    def keep(self, frame: RawFrame, sighting: Sighting) -> None:
         """Use a view, and say how much of the image is covered by now."""
-        self.kept.append(View(frame.name, sighting, frame.counts))
+        self.kept.append(BoardView(frame.name, sighting, frame.counts))
         cells = self.covered()
         print(f'{frame.name}: {len(sighting.pixels)} points; {np.sum(cells > 0)} of {cells.size} cells covered')
 
@@ -170,7 +170,7 @@ class _Views:
             if view.counts is None:
                 continue
             try:
-                self.kept[index] = View(view.name, self.target.find(view.counts, camera), view.counts)
+                self.kept[index] = BoardView(view.name, self.target.find(view.counts, camera), view.counts)
             except BoardNotFound:
                 continue
 
@@ -185,7 +185,7 @@ def _views(args: argparse.Namespace) -> _Views:
     if args.source.suffix.lower() == '.csv':
         if args.size is None or min(args.size) < 32:
             raise InputError(f'{args.source}: points without pictures need --size WIDTH HEIGHT')
-        named = [View(name, sighting) for name, sighting in measured_points(args.source, *args.size)]
+        named = [BoardView(name, sighting) for name, sighting in measured_points(args.source, *args.size)]
         return _Views(None, named, size=tuple(args.size))
     views = _Views(_target(args))
     if is_folder_of_pictures(args.source):
@@ -227,7 +227,7 @@ def mapped_detector(board: MarkerMap) -> MarkerDetector:
     return detector
 
 
-def _guess(frame: Frame, focal_px: float) -> Camera:
+def _guess(frame: RawFrame, focal_px: float) -> Camera:
     height, width = frame.counts.shape
     K = np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
     return Camera(width, height, K)
@@ -237,7 +237,7 @@ def _look_at_pictures(args: argparse.Namespace, views: _Views) -> None:
     for index, path in enumerate(pictures(args.source)):
         if len(views.kept) == args.most_views:
             return
-        frame = Frame(path.name, index * 10_000_000_000, read_picture(path))
+        frame = RawFrame(path.name, index * 10_000_000_000, read_picture(path))
         sighting = views.find(frame, _guess(frame, args.focal_px))
         if sighting is None:
             print(f'{frame.name}: not used: {views.unusable[-1][1]}')
@@ -248,7 +248,7 @@ def _look_at_pictures(args: argparse.Namespace, views: _Views) -> None:
 def _look_at_bag(args: argparse.Namespace, views: _Views) -> None:
     """Every n-th frame where the board stands still and elsewhere than before."""
     with BagReader(args.source, parse_remaps(args.remap)) as bag:
-        pending: tuple[Frame, Sighting] | None = None
+        pending: tuple[RawFrame, Sighting] | None = None
         for index, frame in enumerate(clean_frames(bag)):
             if pending is None and index % args.every:
                 continue
@@ -265,7 +265,7 @@ def _look_at_bag(args: argparse.Namespace, views: _Views) -> None:
                 return
 
 
-def _is_new(sighting: Sighting, kept: Sequence[View]) -> bool:
+def _is_new(sighting: Sighting, kept: Sequence[BoardView]) -> bool:
     return all(_distance(sighting, view.sighting) > _NEW_VIEW_PX for view in kept)
 
 

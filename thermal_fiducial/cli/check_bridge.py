@@ -8,7 +8,7 @@ import textwrap
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.bridge_check import check_bridge, Finding, Level
-from thermal_fiducial.report.bridge_record import BridgeRecord, read_bridge, Recorder
+from thermal_fiducial.report.bridge_record import BridgeRecord, BridgeRecorder, read_bridge
 from thermal_fiducial.report.landing_check import check_landing
 
 _WIDTH = 118
@@ -65,7 +65,7 @@ def _listen(topic: str, seconds: float, ros_arguments: list[str]) -> BridgeRecor
         from thermal_fiducial.ros.bridge_listener import listen, Topics
     except ImportError as error:
         raise InputError(f'listening needs ROS 2 ({error.name} is missing); name a recording instead') from None
-    recorder = Recorder(live=True)
+    recorder = BridgeRecorder(live=True)
 
     def announce(topics: Topics) -> None:
         print(

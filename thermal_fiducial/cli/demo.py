@@ -65,7 +65,7 @@ def _make_room(out: Path) -> None:
 
 
 def _simulate(bag: Path, seconds: float, seed: int) -> None:
-    from thermal_fiducial.sim.camera import plan
+    from thermal_fiducial.sim.thermal_camera import plan
     from thermal_fiducial.sim.writer import write_flight
 
     flight = plan(SCENARIO, seconds, seed)
@@ -82,7 +82,7 @@ def _simulate(bag: Path, seconds: float, seed: int) -> None:
 
 def _replay(bag: Path, out: Path) -> None:
     try:
-        from thermal_fiducial.replay.replay import Options, replay
+        from thermal_fiducial.replay.session import Options, replay
     except ImportError as error:
         raise InputError(f'the demo runs the ROS 2 nodes and finds no {error.name}: install the extra "ros"') from None
     options = Options(bag=bag, run=out, params=bag / 'params.yaml', map_file=bag / 'map_one.yaml')

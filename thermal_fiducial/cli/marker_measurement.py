@@ -20,7 +20,7 @@ from thermal_fiducial.sim.render import Quality, Renderer
 from thermal_fiducial.sim.scenario import LENSES
 from thermal_fiducial.sim.scene import Acrylic, Fog, Plate, Room
 from thermal_fiducial.sim.sensor import Sensor
-from thermal_fiducial.sim.trajectory import Trajectory
+from thermal_fiducial.sim.spline_trajectory import SplineTrajectory
 
 DICTIONARY = 'STENCIL_4X4_100'
 LENS = '13mm'
@@ -69,7 +69,9 @@ def render_view(side_px: float, contrast: float, tilt_deg: float, rng: np.random
     T = np.stack([_place(lens, pixel, side_px, np.radians(tilt_deg), rng) for pixel in _places(lens, side_px, rng)])
     ids = rng.choice(len(bits), len(T), replace=False).tolist()
     plates = [_plate(pose, bits[marker_id], contrast) for pose, marker_id in zip(T, ids, strict=True)]
-    still = Trajectory(np.arange(8.0), np.zeros((8, 3)), Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (8, 1))))
+    still = SplineTrajectory(
+        np.arange(8.0), np.zeros((8, 3)), Rotation.from_quat(np.tile([0.0, 0.0, 0.0, 1.0], (8, 1)))
+    )
     room = Room((-30.0, -30.0, -30.0), (30.0, 30.0, 30.0))
     quality = Quality(samples=97, warm_up=0)
     renderer = Renderer(lens, plates, room, Fog(), Acrylic(), still, np.eye(4), lag=0.0, quality=quality)

@@ -11,7 +11,7 @@ from rich.table import Table
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.fabrication.contrast import Mounting, remaining_contrast
+from thermal_fiducial.fabrication.contrast_decay import Mounting, remaining_contrast
 from thermal_fiducial.fabrication.planning import (
     DETECTED,
     expect,

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     """Replay, write the run folder, say how fast it went."""
     if not 0.0 < args.rate <= 100.0:
         raise InputError(f'--rate {args.rate:g} is not between 0 and 100')
-    replay = importlib.import_module('thermal_fiducial.replay.replay')
+    replay = importlib.import_module('thermal_fiducial.replay.session')
     options = replay.Options(
         bag=args.bag,
         run=args.out,

@@ -12,10 +12,10 @@ from rich.progress import Progress, TimeElapsedColumn
 from thermal_fiducial.cli.simulate_corners import write_corner_flight
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import STORAGES
-from thermal_fiducial.sim.camera import FlightPlan, plan
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.scenario import LENSES, named, Scenario, SCENARIOS, with_contrast, with_lens
 from thermal_fiducial.sim.sensor import FFC_BEHAVIOURS, Sensor
+from thermal_fiducial.sim.thermal_camera import FlightPlan, plan
 from thermal_fiducial.sim.writer import write_flight
 
 #: Inclusive ranges of the numbers.

@@ -10,9 +10,9 @@ from thermal_fiducial.core.measurements import ImuSample
 from thermal_fiducial.files.flight_bags import write_recording
 from thermal_fiducial.files.recordings import Corners, Recording
 from thermal_fiducial.files.rig_files import Rig
-from thermal_fiducial.sim.camera import FlightPlan
 from thermal_fiducial.sim.corner_flight import corner_frames
 from thermal_fiducial.sim.corner_noise import CornerNoise
+from thermal_fiducial.sim.thermal_camera import FlightPlan
 from thermal_fiducial.sim.writer import IMAGE_DELAY_NS, write_side_files
 
 

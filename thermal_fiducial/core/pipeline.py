@@ -20,8 +20,8 @@ from thermal_fiducial.config import (
     Tau2CameraConfig,
 )
 from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.innovations import PoseUpdate
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner

@@ -18,8 +18,8 @@ import numpy as np
 
 from thermal_fiducial.core.types import Gray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.fabrication.bit_patterns import cuttable, rotate, rotations, unpack, weight, Words
 from thermal_fiducial.fabrication.cuttability import examine
-from thermal_fiducial.fabrication.patterns import cuttable, rotate, rotations, unpack, weight, Words
 
 
 @dataclass

@@ -13,7 +13,7 @@ from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
 from thermal_fiducial.core.mapping.map_building import rows_from_corners
 from thermal_fiducial.core.measurements import Markers
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files import messages
+from thermal_fiducial.files import bag_messages
 from thermal_fiducial.files.bags import (
     BagWriter,
     CAMERA_INFO_TOPIC,
@@ -80,21 +80,21 @@ def _imu(recording: Recording) -> Iterator[_Event]:
     arrival_ns = 0
     for sample in recording.samples:
         arrival_ns = max(arrival_ns, sample.stamp_ns)
-        yield arrival_ns, IMU_TOPIC, messages.imu(sample)
+        yield arrival_ns, IMU_TOPIC, bag_messages.imu(sample)
 
 
 def _frames(recording: Recording, sigma_px: float, late_ns: int) -> Iterator[_Event]:
     camera = recording.rig.camera
     for picture in recording.pictures:
         arrival = picture.stamp_ns + late_ns
-        yield arrival, CAMERA_INFO_TOPIC, messages.camera_info(picture.stamp_ns, camera)
-        yield arrival, IMAGE_TOPIC, messages.image(picture.stamp_ns, picture.pixels())
+        yield arrival, CAMERA_INFO_TOPIC, bag_messages.camera_info(picture.stamp_ns, camera)
+        yield arrival, IMAGE_TOPIC, bag_messages.image(picture.stamp_ns, picture.pixels())
     for frame in recording.corners:
         arrival = frame.stamp_ns + late_ns
-        yield arrival, CAMERA_INFO_TOPIC, messages.camera_info(frame.stamp_ns, camera)
-        yield arrival, MARKERS_TOPIC, messages.markers(frame.stamp_ns, _rows(frame, recording.rig, sigma_px))
+        yield arrival, CAMERA_INFO_TOPIC, bag_messages.camera_info(frame.stamp_ns, camera)
+        yield arrival, MARKERS_TOPIC, bag_messages.markers(frame.stamp_ns, _rows(frame, recording.rig, sigma_px))
     for pose in recording.poses:
-        yield pose.stamp_ns + late_ns, CAMERA_POSE_TOPIC, messages.camera_pose(pose)
+        yield pose.stamp_ns + late_ns, CAMERA_POSE_TOPIC, bag_messages.camera_pose(pose)
 
 
 def _rows(frame: Corners, rig: Rig, sigma_px: float) -> Markers:
@@ -107,7 +107,7 @@ def _rows(frame: Corners, rig: Rig, sigma_px: float) -> Markers:
 def _truth(recording: Recording) -> Iterator[_Event]:
     if recording.truth is not None:
         for stamp_ns, T_map_body in zip(*recording.truth, strict=True):
-            yield int(stamp_ns), TRUTH_TOPIC, messages.truth(int(stamp_ns), T_map_body)
+            yield int(stamp_ns), TRUTH_TOPIC, bag_messages.truth(int(stamp_ns), T_map_body)
 
 
 def _parameters(rig: Rig) -> dict[str, Any]:

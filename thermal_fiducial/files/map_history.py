@@ -30,7 +30,7 @@ class ChangedMeanwhileError(InputError):
 
 
 @dataclass(frozen=True)
-class Entry:
+class MapVersion:
     """An earlier version."""
 
     number: int
@@ -115,19 +115,19 @@ def keep(path: Path, text: str, action: str) -> None:
         file.unlink(missing_ok=True)
 
 
-def entries(path: Path) -> list[Entry]:
+def entries(path: Path) -> list[MapVersion]:
     """Earlier versions of the map at ``path``, the oldest first; those that cannot be read say why."""
     return [_entry(file) for file in _files(path)]
 
 
-def _entry(file: Path) -> Entry:
+def _entry(file: Path) -> MapVersion:
     number = int(file.stem)
     try:
         text = read_text(file)
         document = parse_document(str(file), text)
     except InputError as error:
-        return Entry(number, file, '', problem=str(error))
-    return Entry(number, file, _action(text), document.revision, len(document.markers))
+        return MapVersion(number, file, '', problem=str(error))
+    return MapVersion(number, file, _action(text), document.revision, len(document.markers))
 
 
 def _action(text: str) -> str:
@@ -143,7 +143,7 @@ def _files(path: Path) -> list[Path]:
     return sorted(found, key=lambda file: int(file.stem))
 
 
-def undo(path: Path) -> Entry:
+def undo(path: Path) -> MapVersion:
     """Put the latest earlier version that can be read back in place, byte for byte.
 
     Raises
@@ -166,7 +166,7 @@ def undo(path: Path) -> Entry:
         return last
 
 
-def autosaved(path: Path) -> Entry | None:
+def autosaved(path: Path) -> MapVersion | None:
     """The copy of a mapper that ended without saving, if it is newer than the map itself."""
     file = autosave_file(path)
     try:
@@ -175,7 +175,7 @@ def autosaved(path: Path) -> Entry | None:
         document = parse_document(str(file), read_text(file))
     except (OSError, InputError):
         return None
-    return Entry(0, file, TAKE_UP, document.revision, len(document.markers))
+    return MapVersion(0, file, TAKE_UP, document.revision, len(document.markers))
 
 
 def take_up_autosave(path: Path) -> None:

@@ -21,7 +21,7 @@ from thermal_fiducial.core.measurements import CameraPose, ImuSample
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.rig_files import NOISE_NAMES, of_camchain, of_rig, of_sensor, read_yaml, Rig
-from thermal_fiducial.files.trajectory import load_tum
+from thermal_fiducial.files.trajectory_file import load_tum
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from sensor_msgs.msg import Imu, TimeReference
 from std_srvs.srv import Trigger
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.map_corrections import MapCorrections
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.filter_outputs import FilterOutputs
 from thermal_fiducial.ros.filter_status import FilterStatus

@@ -11,7 +11,7 @@ from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
-from thermal_fiducial.files.bad_pixels import load_bad_pixels
+from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.ros import convert, qos

@@ -17,7 +17,7 @@ from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternio
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagWriter
-from thermal_fiducial.files.trajectory import tum_line
+from thermal_fiducial.files.trajectory_file import tum_line
 from thermal_fiducial.replay.topics import Topics, type_name
 from thermal_fiducial.ros import clouds, convert
 from thermal_fiducial.ros.node import CountingNode

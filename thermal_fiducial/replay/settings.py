@@ -20,7 +20,7 @@ from thermal_fiducial.config import (
 )
 from thermal_fiducial.core.pipeline import PipelineConfig
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bad_pixels import load_bad_pixels
+from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns
 from thermal_fiducial.files.marker_map import load_map

@@ -59,7 +59,7 @@ class BridgeRecord:
 
 
 @dataclass
-class Recorder:
+class BridgeRecorder:
     """Collects messages of rclpy or of a bag."""
 
     live: bool = False
@@ -125,7 +125,7 @@ def read_bridge(path: Path, topic: str = '', imu_bag: Path | None = None) -> Bri
     # Only a recording needs what reads recordings.
     from thermal_fiducial.files.bags import BagReader, IMU_TOPIC
 
-    recorder = Recorder()
+    recorder = BridgeRecorder()
     with BagReader(path / 'output' if (path / 'output').is_dir() else path) as bag:
         wanted = [name for name in ([topic] if topic else ODOMETRY_TOPICS) if name in bag.topics]
         if not wanted:

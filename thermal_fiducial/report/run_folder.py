@@ -52,7 +52,7 @@ class Diagnostic:
 
 
 @dataclass(frozen=True)
-class Output:
+class RecordedOutput:
     """What the recorded messages of the nodes tell beyond the text files.
 
     Parameters
@@ -81,7 +81,7 @@ class Run:
     detections: Detections
     #: kind of latency to stamps (N,) [ns] and values (N,) [ms]; only a run in real time has any
     latencies: dict[str, tuple[IntArray, FloatArray]]
-    output: Output
+    output: RecordedOutput
     marker_map: MarkerMap | None
     summary: dict[str, Any]
     truth: Trajectory | None
@@ -172,12 +172,12 @@ def _latencies(path: Path) -> dict[str, tuple[IntArray, FloatArray]]:
     return {kind: (stamp[kind_of == kind], value[kind_of == kind]) for kind in dict.fromkeys(kinds)}
 
 
-def _output(path: Path, offset_ns: int) -> Output:
+def _output(path: Path, offset_ns: int) -> RecordedOutput:
     if not path.is_dir():
-        return Output()
+        return RecordedOutput()
     with BagReader(path) as bag:
         statuses = [status for item in bag.messages(['diagnostics']) for status in item.message.status]
-        return Output(*_covariances(bag), _diagnostics(statuses), _innovations(statuses, offset_ns))
+        return RecordedOutput(*_covariances(bag), _diagnostics(statuses), _innovations(statuses, offset_ns))
 
 
 def _covariances(bag: BagReader) -> tuple[IntArray, FloatArray]:

@@ -9,7 +9,7 @@ from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, TRUTH_TOPIC
-from thermal_fiducial.files.trajectory import load_tum
+from thermal_fiducial.files.trajectory_file import load_tum
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 import re
 
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_text, PoseUpdate
-from thermal_fiducial.core.filter.pose_ekf import PoseEkf
 from thermal_fiducial.ros.node import ERROR, OK, WARN
 
 

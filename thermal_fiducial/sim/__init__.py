@@ -2,7 +2,7 @@
 
 Frames with their truth, without any file::
 
-    from thermal_fiducial.sim.camera import render_frames, simulate_imu
+    from thermal_fiducial.sim.thermal_camera import render_frames, simulate_imu
     from thermal_fiducial.sim.scenario import named, SCENARIOS, with_contrast, with_lens
 
     for frame in render_frames('wall', seconds=12, seed=3):

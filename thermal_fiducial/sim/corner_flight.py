@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core.types import FloatArray, IntArray
-from thermal_fiducial.sim.camera import FlightPlan, true_corners
 from thermal_fiducial.sim.corner_noise import CornerNoise
+from thermal_fiducial.sim.thermal_camera import FlightPlan, true_corners
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from thermal_fiducial.core.types import FloatArray, IntArray
-from thermal_fiducial.sim.trajectory import GRAVITY, Path
+from thermal_fiducial.sim.spline_trajectory import GRAVITY, Path
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class ImuRecord:
 
 
 @dataclass(frozen=True)
-class ImuNoise:
+class SimulatedNoise:
     """Continuous densities, under Kalibr's names: [rad/s/sqrt(Hz)], [m/s^2/sqrt(Hz)], walks per second more."""
 
     gyroscope_noise_density: float = 1.7e-4
@@ -99,7 +99,7 @@ class ImuModel:
     delivery : how stamps come; None: each with its own
     """
 
-    noise: ImuNoise = ImuNoise()
+    noise: SimulatedNoise = SimulatedNoise()
     rate: float = 200.0
     gyroscope_bias_sigma: float = 0.003
     accelerometer_bias_sigma: float = 0.04

@@ -6,9 +6,9 @@ import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.sim.camera import SimFrame
 from thermal_fiducial.sim.imu import ImuModel
 from thermal_fiducial.sim.lens import Lens
+from thermal_fiducial.sim.thermal_camera import SimFrame
 
 CAMERA_FRAME, BODY_FRAME, MAP_FRAME = 'thermal_camera_optical', 'base_link', 'map'
 

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.trajectory import load_tum
-from thermal_fiducial.sim.trajectory import Trajectory
+from thermal_fiducial.files.trajectory_file import load_tum
+from thermal_fiducial.sim.spline_trajectory import SplineTrajectory
 
 # Ten poses a second carry what a drone or a hand does, and little of the noise of the poses' source: at a millimetre
 # it becomes 0.1 m/s^2 in the simulated accelerometer.
@@ -52,7 +52,7 @@ class RecordedFlight:
         """Length [s]."""
         return float(self.times[-1])
 
-    def trajectory(self, seconds: float, seed: int) -> Trajectory:
+    def trajectory(self, seconds: float, seed: int) -> SplineTrajectory:
         """The flight; afterwards it stands still, the seed changes nothing.
 
         Raises
@@ -62,4 +62,4 @@ class RecordedFlight:
         """
         knots = np.linspace(0.0, self.seconds, round(self.seconds * _KNOTS_PER_SECOND) + 1)
         positions = np.stack([np.interp(knots, self.times, column) for column in self.positions.T], axis=1)
-        return Trajectory(knots, positions, Slerp(self.times, Rotation.from_quat(self.quaternions))(knots))
+        return SplineTrajectory(knots, positions, Slerp(self.times, Rotation.from_quat(self.quaternions))(knots))

@@ -22,7 +22,7 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.scene import Acrylic, Fog, Plate, Room
-from thermal_fiducial.sim.trajectory import Path
+from thermal_fiducial.sim.spline_trajectory import Path
 
 #: Points of a pixel and sub-frame -> generators of the lattice (column, row, time), found by exhaustive search for
 #: the largest distance between points in each projection.

@@ -8,12 +8,12 @@ from scipy.spatial.transform import Rotation
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.sim.corner_noise import CornerNoise
-from thermal_fiducial.sim.imu import Delivery, ImuModel, ImuNoise
+from thermal_fiducial.sim.imu import Delivery, ImuModel, SimulatedNoise
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.scene import Acrylic, Clutter, clutter_plate, Fog, Marker, marker_plate, Plate, Room
 from thermal_fiducial.sim.sensor import IDEAL, Sensor
-from thermal_fiducial.sim.trajectory import Flight, Path, pose_matrix
+from thermal_fiducial.sim.spline_trajectory import Flight, Path, pose_matrix
 from thermal_fiducial.sim.vibration import Shaken, Vibration
 from thermal_fiducial.sim.waving import Waving
 
@@ -155,7 +155,7 @@ _WIDE_TRUE = Lens((460.2, 459.2), (370.1, 244.9), 'plumb_bob', (-0.2805, 0.0708,
 _DOWNWARD = Lens((364.0, 364.0), (288.0, 290.0), width=576, height=576)
 #: Published densities of a tactical-grade MEMS IMU, and what readings against a reference show beside them.
 _MEMS = ImuModel(
-    ImuNoise(1.7e-4, 2.0e-3, 2.0e-5, 3.0e-3),
+    SimulatedNoise(1.7e-4, 2.0e-3, 2.0e-5, 3.0e-3),
     gyroscope_bias_sigma=0.04,
     accelerometer_bias_sigma=0.1,
     gyroscope_axes=0.008,
@@ -245,7 +245,7 @@ _SCENARIOS = (
             full_scale=255,
         ),
         imu=ImuModel(
-            ImuNoise(1e-3, 1e-2, 5e-5, 5e-4),
+            SimulatedNoise(1e-3, 1e-2, 5e-5, 5e-4),
             rate=80.0,
             delivery=Delivery(gaps=((4.0, 0.3), (8.0, 0.8)), steps_back=(6.0,)),
         ),
@@ -258,7 +258,7 @@ _SCENARIOS = (
         corner_noise=CornerNoise(0.05, 0.05),
         sensor=Sensor(lag=0.0),
         imu=ImuModel(
-            ImuNoise(2e-3, 2e-2, 2e-4, 2e-3),
+            SimulatedNoise(2e-3, 2e-2, 2e-4, 2e-3),
             gyroscope_bias_sigma=0.02,
             accelerometer_bias_sigma=0.2,
             gyroscope_axes=0.01,

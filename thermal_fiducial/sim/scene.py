@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
-from thermal_fiducial.sim.trajectory import pose_matrix
+from thermal_fiducial.sim.spline_trajectory import pose_matrix
 
 
 def facing(yaw_deg: float, tilt_deg: float = 0.0, roll_deg: float = 0.0) -> Rotation:

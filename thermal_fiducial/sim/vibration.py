@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.sim.trajectory import Motion, Path
+from thermal_fiducial.sim.spline_trajectory import Motion, Path
 
 
 @dataclass(frozen=True)

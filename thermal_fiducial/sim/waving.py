@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.sim.trajectory import smooth_step, Trajectory
+from thermal_fiducial.sim.spline_trajectory import smooth_step, SplineTrajectory
 
 _KNOTS_PER_SECOND = 20
 #: Time to come into motion and out of it [s].
@@ -34,7 +34,7 @@ class Waving:
     frequencies: tuple[float, float] = (0.25, 1.0)
     rest: float = 0.5
 
-    def trajectory(self, seconds: float, seed: int) -> Trajectory:
+    def trajectory(self, seconds: float, seed: int) -> SplineTrajectory:
         """The flight of this seed.
 
         Raises
@@ -49,7 +49,7 @@ class Waving:
         away = envelope * self._sines(t, rng, self.speed)
         positions = np.array(self.centre) + away
         turned = Rotation.from_rotvec(envelope * self._sines(t, rng, self.turn))
-        return Trajectory(t, positions, self._looking(positions) * turned)
+        return SplineTrajectory(t, positions, self._looking(positions) * turned)
 
     def _sines(self, t: FloatArray, rng: np.random.Generator, rate: float) -> FloatArray:
         """(N, 3) of rms derivative ``rate`` in each axis."""

@@ -20,12 +20,12 @@ from thermal_fiducial.core.types import IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, TRUTH_TOPIC
 from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry
-from thermal_fiducial.files.trajectory import save_tum
+from thermal_fiducial.files.trajectory_file import save_tum
 from thermal_fiducial.sim import messages
-from thermal_fiducial.sim.camera import CHUNK, FlightPlan, plan, SimFrame, START_NS, ThermalCamera
 from thermal_fiducial.sim.imu import ImuRecord
 from thermal_fiducial.sim.scenario import Scenario
 from thermal_fiducial.sim.scene import Marker
+from thermal_fiducial.sim.thermal_camera import CHUNK, FlightPlan, plan, SimFrame, START_NS, ThermalCamera
 
 #: A frame reaches the recorder this long after its read-out, an IMU sample and the truth sooner [ns].
 IMAGE_DELAY_NS = 25_000_000

@@ -12,14 +12,14 @@ from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.decoding import Decoder
 from thermal_fiducial.core.detection.finding import Findings, MarkerFinder
 from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.history import History
+from thermal_fiducial.core.detection.frame_history import FrameHistory
+from thermal_fiducial.core.detection.frame_prediction import FramePrediction, Predictor
 from thermal_fiducial.core.detection.ids import among
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes
 from thermal_fiducial.core.detection.marker_rows import marker_rows
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.detection.places import depths
-from thermal_fiducial.core.detection.prediction import Prediction, Predictor
 from thermal_fiducial.core.detection.tracking import MotionTrack, TrackedMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -67,7 +67,7 @@ class MarkerDetector:
         self._estimator = CornerEstimator(decoder, bits)
         self._partial = PartialMarkerSearch(decoder, bits)
         self._known = KnownMarkers({})
-        self._history = History(MotionTrack.of_rig(T_body_camera, config.bolometer_lag))
+        self._history = FrameHistory(MotionTrack.of_rig(T_body_camera, config.bolometer_lag))
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
         """Markers that are known: ID to (T_map_marker, side [m])."""
@@ -111,7 +111,7 @@ class MarkerDetector:
         T_camera_map = T_camera_map if len(self._known.ids) else None
         return choose_branches(poses, at, corners.covariances, self._known.entries(ids), T_camera_map)
 
-    def _with_partial(self, rows: Markers, frame: Frame, prediction: Prediction) -> Markers:
+    def _with_partial(self, rows: Markers, frame: Frame, prediction: FramePrediction) -> Markers:
         """The rows of whole markers; where few of them are known, those of known ones partially visible as well."""
         seen, T_camera_map = rows['id'].astype(np.int64), prediction.T_camera_map
         if T_camera_map is None or among(seen, self._known.ids).sum() >= _ENOUGH_WHOLE:
@@ -127,14 +127,14 @@ class MarkerDetector:
 
     def _after(
         self, frame: Frame, findings: Findings, estimates: MarkerEstimates, poses: PlanarPoses, *, saw_partial: bool
-    ) -> History:
+    ) -> FrameHistory:
         """What the next frame starts from."""
         ids, history = estimates.ids, self._history
         # Motion that came from what turned out to be no markers is none.
         twist = estimates.twist if len(ids) else frame.twist
         depth = depths(poses.T_camera_marker[:, 0], self._sizes.of(ids, self._known))
         markers = TrackedMarkers(ids, estimates.x, depth, estimates.corners.contrast / frame.noise)
-        return History(
+        return FrameHistory(
             history.track.after(frame.stamp_ns, twist, markers),
             history.polarity.after(estimates.corners.contrast),
             float(depth.mean()) if len(ids) else history.depth_m,
@@ -145,7 +145,7 @@ class MarkerDetector:
 
 
 def _expected(
-    known: KnownMarkers, prediction: Prediction, camera: Camera, config: ArucoDetectorConfig
+    known: KnownMarkers, prediction: FramePrediction, camera: Camera, config: ArucoDetectorConfig
 ) -> ExpectedMarkers | None:
     """Markers of the map where they should be; None where nothing says so."""
     if prediction.T_camera_map is None or len(known.ids) == 0 or not config.guided:

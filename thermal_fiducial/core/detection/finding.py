@@ -9,8 +9,8 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.decoding import Decoder
 from thermal_fiducial.core.detection.following import Followed
 from thermal_fiducial.core.detection.frame import Frame
+from thermal_fiducial.core.detection.frame_history import FrameHistory
 from thermal_fiducial.core.detection.guided import common_shift, near_prediction
-from thermal_fiducial.core.detection.history import History
 from thermal_fiducial.core.detection.ids import among
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes
 from thermal_fiducial.core.detection.lag import LagField, without_lag
@@ -39,7 +39,7 @@ class Findings(NamedTuple):
     found: Found
     #: those of the last frame that are observed again
     followed: Followed
-    #: of :class:`History`
+    #: of :class:`FrameHistory`
     since_blind: int
     scales: SearchScales
 
@@ -71,7 +71,7 @@ class MarkerFinder:
     def find(
         self,
         frame: Frame,
-        history: History,
+        history: FrameHistory,
         in_map: ExpectedMarkers | None,
         known: KnownMarkers,
         config: ArucoDetectorConfig,
@@ -96,7 +96,7 @@ class MarkerFinder:
     def _near(
         self,
         frame: Frame,
-        history: History,
+        history: FrameHistory,
         in_map: ExpectedMarkers | None,
         known: KnownMarkers,
         config: ArucoDetectorConfig,
@@ -120,7 +120,7 @@ class MarkerFinder:
     def _blind(
         self,
         frame: Frame,
-        history: History,
+        history: FrameHistory,
         found: Found,
         scales: SearchScales,
         known: KnownMarkers,
@@ -161,7 +161,7 @@ class MarkerFinder:
         return replace(found, corners_px=found.corners_px - rolling)
 
 
-def _next_scales(history: History, *, complete: bool) -> SearchScales:
+def _next_scales(history: FrameHistory, *, complete: bool) -> SearchScales:
     """Both resolutions; where all that is expected is seen, so clearly that either shows it, only one, in turn."""
     if not (complete and history.track.all_clearer_than(_CLEAR)):
         return SearchScales.ALL

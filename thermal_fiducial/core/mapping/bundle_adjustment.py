@@ -19,7 +19,7 @@ import numpy.typing as npt
 from thermal_fiducial.core.error_model import NO_SYSTEMATIC_ERRORS, scale_of_map, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
 from thermal_fiducial.core.geometry.se3 import inverse, skew
-from thermal_fiducial.core.mapping.keyframes import Keyframe, Link, packed, Rig, unpacked
+from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe, Link, packed, unpacked
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations, ReducedSystem
 from thermal_fiducial.core.mapping.residual_checks import correlation_time, two_places
@@ -52,7 +52,7 @@ class Snapshot:
     #: the markers to adjust
     markers: Mapping[int, MapMarker]
     keyframes: tuple[Keyframe, ...]
-    rig: Rig
+    rig: CameraRig
     links: tuple[Link, ...] = ()
     #: pose and covariance (6, 6) by ID of markers that were known beforehand; see :func:`prior_poses`
     priors: Mapping[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
@@ -168,7 +168,7 @@ class _Problem:
     stamps: list[int]
     sizes: FloatArray
     held: BoolArray
-    rig: Rig
+    rig: CameraRig
     frame: IntArray
     marker: IntArray
     camera: IntArray

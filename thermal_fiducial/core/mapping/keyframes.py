@@ -18,7 +18,7 @@ _THINNED = 0.85
 
 
 @dataclass(frozen=True)
-class Rig:
+class CameraRig:
     """Cameras that move as one; a single camera is its own rig."""
 
     cameras: tuple[Camera, ...]
@@ -26,7 +26,7 @@ class Rig:
     T_rig_camera: FloatArray
 
     @classmethod
-    def single(cls, camera: Camera) -> 'Rig':
+    def single(cls, camera: Camera) -> 'CameraRig':
         """A rig of one camera."""
         return cls((camera,), np.eye(4)[None])
 

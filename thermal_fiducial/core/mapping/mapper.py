@@ -22,7 +22,7 @@ from thermal_fiducial.core.mapping.bridging import link
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, prior_poses, refine, Snapshot
 from thermal_fiducial.core.mapping.candidates import Candidate, MarkerView, Viewpoint
 from thermal_fiducial.core.mapping.correction import correction
-from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore, Rig
+from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe, KeyframeStore
 from thermal_fiducial.core.mapping.localization import locate, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.located import Located, LocatedFrame
 from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
@@ -358,7 +358,7 @@ class MarkerMapper:
         return Snapshot(
             {key: marker for key, marker in self.map.markers.items() if marker.trusted},
             frames,
-            Rig(tuple(self._cameras), np.broadcast_to(np.eye(4), (len(self._cameras), 4, 4))),
+            CameraRig(tuple(self._cameras), np.broadcast_to(np.eye(4), (len(self._cameras), 4, 4))),
             tuple(self._keyframes.links),
             prior_poses(self._initial.markers),
             self.map.revision,

@@ -25,7 +25,7 @@ from thermal_fiducial.errors import InputError, RunError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.marker_map import load_map, save_map
-from thermal_fiducial.replay.replay import MAP_FILE, Options, replay
+from thermal_fiducial.replay.session import MAP_FILE, Options, replay
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.ros import clouds, convert
 

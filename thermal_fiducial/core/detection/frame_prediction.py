@@ -21,7 +21,7 @@ _UNKNOWN_CLOCK_S = 0.03
 
 
 @dataclass(frozen=True, slots=True)
-class Prediction:
+class FramePrediction:
     """What is known of a frame before it is looked at."""
 
     #: of the camera; None: nothing is known
@@ -45,21 +45,23 @@ class Predictor:
         self._T_body_camera = T_body_camera
         self._lag_ns = round(1e9 * max(lag, _SHORTEST_LAG_S))
 
-    def predict(self, stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, max_age_s: float) -> Prediction:
+    def predict(
+        self, stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, max_age_s: float
+    ) -> FramePrediction:
         """Of a frame at ``stamp_ns`` in the camera's clock; odometry older than ``max_age_s`` says no pose."""
         if prior is None:
-            return Prediction(track.predict(stamp_ns, []), None, math.inf)
+            return FramePrediction(track.predict(stamp_ns, []), None, math.inf)
         odometry_ns = prior.in_odometry_clock(stamp_ns)
         clock_std_s = 0.0 if prior.clock_is_known else _UNKNOWN_CLOCK_S
         states = self._states(odometry_ns, prior)
         twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)
         nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
         if nearest is None or twist is None or abs(odometry_ns - nearest.stamp_ns) * 1e-9 > max_age_s:
-            return Prediction(twist, None, math.inf)
+            return FramePrediction(twist, None, math.inf)
         T_map_camera = _carried_on(odometry_ns, nearest, self._T_body_camera, twist)
         moved = clock_std_s * float(np.linalg.norm(nearest.velocity_body))
         position_std_m = math.sqrt(np.trace(nearest.pose_covariance[:3, :3]) + moved**2)
-        return Prediction(twist, se3.inverse(T_map_camera), position_std_m)
+        return FramePrediction(twist, se3.inverse(T_map_camera), position_std_m)
 
     def _states(self, odometry_ns: int, prior: MotionPrior) -> list[Odometry]:
         """The filter's states while a frame came about, or the nearest."""

@@ -47,7 +47,7 @@ class Path(Protocol):
         """The motion at times ``t`` (N,) [s]."""
 
 
-class Trajectory:
+class SplineTrajectory:
     """Quintic splines through poses: position, and the four-vector whose direction is the quaternion.
 
     Parameters
@@ -131,7 +131,7 @@ class Flight:
     climb_time: float = 2.5
     hover_time: float = 1.0
 
-    def trajectory(self, seconds: float, seed: int) -> Trajectory:
+    def trajectory(self, seconds: float, seed: int) -> SplineTrajectory:
         """The flight of this seed, squeezed into ``seconds``.
 
         Raises
@@ -144,7 +144,7 @@ class Flight:
             raise InputError(f'{seconds:g} s is too short for take-off and landing: at least {2 * margin:g} s')
         t = np.linspace(-0.5, seconds + 0.5, round(_KNOTS_PER_SECOND * (seconds + 1)) + 1)
         positions = self._positions(t, seconds, np.random.default_rng([seed, 1]))
-        return Trajectory(t, positions, _hover_attitude(t, positions, self._yaw(t, seconds)))
+        return SplineTrajectory(t, positions, _hover_attitude(t, positions, self._yaw(t, seconds)))
 
     def _envelope(self, t: FloatArray, seconds: float) -> FloatArray:
         start = self.ground_time + self.climb_time

@@ -11,7 +11,7 @@ _TYPICAL_DEPTH_M = 3.0
 
 
 @dataclass(frozen=True, slots=True)
-class History:
+class FrameHistory:
     """What the frames so far have shown."""
 
     track: MotionTrack
