@@ -214,6 +214,11 @@ def _time_offset_std() -> Any:
     )
 
 
+def _image_rate() -> Any:
+    text = 'Rate of the images, by which the diagnostics judge them; 0: that of the first seconds.'
+    return param(0.0, text, unit='Hz', minimum=0.0, maximum=1000.0)
+
+
 def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
     """Marker ID to side [m] from strings "ID:SIZE".
 
@@ -285,6 +290,7 @@ class Tau2CameraConfig(SelfChecked):
         live=True,
     )
     frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
+    image_rate: float = _image_rate()
 
 
 @dataclass(frozen=True)
@@ -395,6 +401,7 @@ class ArucoDetectorConfig(SelfChecked):
         choices=('drop', 'best'),
         live=True,
     )
+    image_rate: float = _image_rate()
 
 
 @dataclass(frozen=True)
@@ -441,6 +448,7 @@ class MarkerMapperConfig(SelfChecked):
     refinement_period: float = param(
         2.0, 'Shortest time between two joint refinements; 0: never.', unit='s', minimum=0.0, maximum=3600.0, live=True
     )
+    image_rate: float = _image_rate()
 
 
 @dataclass(frozen=True)
@@ -570,6 +578,13 @@ class PoseEkfConfig(SelfChecked):
     )
     smoothing_time: float = param(
         0.0, 'Spread corrections of the smooth output over this time; 0: no smooth output.', unit='s', minimum=0.0
+    )
+    imu_rate: float = param(
+        0.0,
+        'Rate of imu/data, by which the diagnostics judge it; 0: that of the first seconds.',
+        unit='Hz',
+        minimum=0.0,
+        maximum=10000.0,
     )
     map_frame: str = param('map', 'Frame of the pose.')
     base_frame: str = param('base_link', 'Frame of the robot: that of the IMU.')

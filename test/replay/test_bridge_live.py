@@ -21,7 +21,7 @@ from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.measurements import ImuSample
 from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.ros import convert, qos
-from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.counting import CountingNode
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 

@@ -8,7 +8,7 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 
 from thermal_fiducial.ros import qos
-from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.counting import CountingNode
 from thermal_fiducial.ros.run import make_executor
 
 

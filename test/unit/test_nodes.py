@@ -3,7 +3,6 @@
 from copy import deepcopy
 from dataclasses import replace
 import time
-from types import SimpleNamespace
 
 import cv2
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
@@ -296,6 +295,25 @@ def test_the_map_is_latched_and_the_camera_found(graph, map_file):
     assert graph.diagnose(node)[2]['markers in map'] == '1'
 
 
+def test_a_mapper_that_cannot_keep_up_takes_the_newest_frame_and_counts_the_others(graph, map_file):
+    node = graph.add(MarkerMapperNode, map_file=str(map_file))
+    graph.listen(PointCloud2, 'markers', qos.RESULT)
+    graph.listen(PoseWithCovarianceStamped, 'camera_pose')
+    graph.send('thermal/camera_info', info())
+    seen = markers()
+    output = graph.tester.advertise(PointCloud2, 'markers')
+    graph.spin_until(lambda: output.listeners == 2 and all(source.publishers for source in node.inputs[:1]))
+    for k in range(6):
+        output.send(restamped(seen, k))
+    time.sleep(0.3)  # all have arrived, none has been looked at
+    graph.spin_until(lambda: graph.heard['camera_pose'])
+    graph.spin_until(lambda: len(graph.heard['markers']) == 6)
+    assert convert.stamp_ns(graph.heard['camera_pose'][0].header.stamp) == START + 5 * 33_333_333
+    _, reason, figures = graph.diagnose(node)
+    assert (len(graph.heard['camera_pose']), figures['left /markers']) == (1, '5')
+    assert reason == '5 older frames left'
+
+
 def test_services_save_freeze_and_reset(graph, map_file):
     node = graph.add(MarkerMapperNode, map_file=str(map_file))
     before = map_file.read_bytes()
@@ -439,11 +457,8 @@ def test_an_input_that_stops_is_an_error_after_two_seconds(graph):
     assert graph.diagnose(node)[1] == levels[0][1] == 'waiting for markers'
 
 
-def test_the_console_has_a_line_for_each_change_that_a_pilot_must_know(graph, monkeypatch):
+def test_the_console_has_a_line_for_each_change_that_a_pilot_must_know(graph, capfd):
     node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
-    said = []
-    log = SimpleNamespace(info=said.append, warning=said.append)
-    monkeypatch.setattr(node, 'get_logger', lambda: log)
     graph.diagnose(node)
     flight = [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])]
     for message in flight:
@@ -455,9 +470,44 @@ def test_the_console_has_a_line_for_each_change_that_a_pilot_must_know(graph, mo
     fly(graph, [imu(k) for k in range(60, 240)])
     for _ in range(3):
         graph.diagnose(node)
+    said = [line.partition('[pose_ekf]: ')[2] for line in capfd.readouterr().err.splitlines()]
     assert [line for k, line in enumerate(said) if line not in said[:k]] == [
-        'waiting for imu/data', 'waiting for markers', 'initialising', 'tracking', 'coasting', 'imu/data has stopped',
+        'waiting for imu/data', 'waiting for markers', 'initialising', 'initialised: tracking', 'coasting',
+        'imu/data has stopped',
     ]  # fmt: skip
+
+
+def test_a_reset_is_said_with_its_reason_and_then_that_the_pose_is_back(graph, capfd):
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], reset_after=0.1)
+    moved = transform(np.eye(3), [0.5, 0.0, 0.0]) @ small_bag.T_BODY_CAMERA
+    for begin, T in ((0, None), (60, moved)):
+        flight = range(begin, begin + 60)
+        fly(graph, [m for k in flight for m in ([imu(k), pose(k - 4, T)] if k % 6 == 5 else [imu(k)])])
+        graph.diagnose(node)
+    assert graph.call(Trigger, 'pose_ekf/reset', Trigger.Request()).success
+    fly(graph, [imu(120)])
+    graph.diagnose(node)
+    fly(graph, [m for k in range(121, 180) for m in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
+    graph.diagnose(node)
+    lines = [line.partition('[pose_ekf]: ')[2] for line in capfd.readouterr().err.splitlines()]
+    assert lines == [
+        'initialised: tracking',
+        'reset: the poses contradict the estimate and agree with each other',
+        'reset: it was asked for',
+        'waiting for markers',
+        'recovered: tracking',
+    ]
+
+
+def test_a_camera_that_sends_the_same_frame_again_and_again_is_said_to_be_stalled(graph, capfd):
+    node = graph.add(Tau2Camera)
+    (first,) = frames(1)
+    same = [convert.image(image_to_array(first), convert.header(START + k * 33_333_333, 'camera')) for k in range(1, 7)]
+    for message in (first, *same):
+        graph.send('thermal/image_raw', message)
+        graph.diagnose(node)
+    (line,) = [line for line in capfd.readouterr().err.splitlines() if 'stalled' in line]
+    assert line.endswith('camera stalled: frozen')
 
 
 def test_a_lost_pose_is_not_published_unless_asked_for(graph):

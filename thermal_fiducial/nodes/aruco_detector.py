@@ -33,7 +33,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         super().__init__('aruco_detector', ArucoDetectorConfig, **kwargs)
         self.detector = self.attempt(self._make_detector, None)
         self.view = EightBitView(Tau2CameraConfig())
-        self._seen = self._left = 0
+        self._seen = 0
         self._markers = self.advertise(PointCloud2, 'markers')
         self._marker_poses = self.advertise(PoseArray, 'marker_poses')
         self._others = OtherDetections(self, self.config, self.fault)
@@ -74,8 +74,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
 
     def state(self) -> tuple[bytes, str]:
         """Number of markers in the last frame, and of images that there was no time for since the last word."""
-        left, self._left = self._images.left - self._left, self._images.left
-        if left:
+        if left := self._images.left_since():
             return WARN, f'{self._seen} markers; {left} older images left'
         return OK, f'{self._seen} markers'
 

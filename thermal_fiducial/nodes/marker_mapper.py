@@ -27,7 +27,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._late = LatePoses()
         self._camera_pose = self.advertise(PoseWithCovarianceStamped, 'camera_pose')
         self._topics = MapTopics(self, self.config.map_frame)
-        self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT)
+        self._frames = self.subscribe_newest(PointCloud2, 'markers', self._on_markers, qos.RESULT)
         self.follow_hints()
         self._publish_map()
         self._topics.draw(self.mapper.map, self._result.in_view, 0)
@@ -49,8 +49,8 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             self._camera_pose.send(convert.pose_with_covariance(pose.T_map_camera, pose.covariance, head))
         # The pose is on its way by now.
         before, self._result = self._result, self.mapper.learn(frame)
-        for line in map_status.news(before, self._result):
-            self.get_logger().warning(line)
+        for marker_id, line in map_status.news(before, self._result).items():
+            self.console.event(f'marker {marker_id}', line)
         if self._result.learned:
             self._map.note_learned()
         jump = self._map.refinement.step(stamp)
@@ -79,8 +79,9 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._map.close()
 
     def state(self) -> tuple[bytes, str]:
-        """Why the last frame gave no pose, whether the map is meant, and which markers are not trusted."""
-        return map_status.state(self._result, self._map.other_dictionary, frozen=self.mapper.frozen)
+        """Why the last frame gave no pose, whether the map is meant, which markers are not trusted, frames left."""
+        left = self._frames.left_since()
+        return map_status.state(self._result, self._map.other_dictionary, frozen=self.mapper.frozen, left=left)
 
     def figures(self) -> dict[str, object]:
         """The map in numbers, and what waits to enter it."""

@@ -24,7 +24,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         super().__init__('pose_ekf', PoseEkfConfig, **kwargs)
         self.realtime_priority = self.config.realtime_priority
         self.filter = PoseEkf(self.config)
-        self._status = FilterStatus(self.filter)
+        self._status = FilterStatus(self.filter, self.console)
         self._corrections = MapCorrections(self.config.max_delay)
         self._camera_clock = self.advertise(TimeReference, 'camera_clock', qos.RESULT)
         self._outputs = FilterOutputs(self, self.config, self.fault)

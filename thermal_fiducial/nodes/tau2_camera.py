@@ -37,7 +37,7 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
         self._image = self.advertise(Image, 'thermal/image', qos.IMAGE_OUTPUT)
         self._image_mono8 = self.advertise(Image, 'thermal/image_mono8', qos.IMAGE_OUTPUT)
         self._withheld: Counter[str] = Counter()
-        self._late = 0
+        self._late = self._sent_before = 0
         self._reason = ''
         self._displayed = False
         if config.image_transport == 'compressed':
@@ -74,6 +74,11 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
         if self._reason:
             return WARN, self._reason
         return OK, 'ok, but of 8 bits: raw counts tell corners ten times as well' if self._displayed else 'ok'
+
+    def headline(self) -> str:
+        """That the camera gives nothing new, though frames come: one shutter event is over within a second."""
+        sent_before, self._sent_before = self._sent_before, self._image.count
+        return f'camera stalled: {self._reason}' if self._reason and self._image.count == sent_before else ''
 
     def figures(self) -> dict[str, object]:
         """Withheld frames by reason, those that came out of order, and bad pixels."""

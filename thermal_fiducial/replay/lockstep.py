@@ -22,7 +22,8 @@ from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.replay.recorder import Recorder, RunFiles
 from thermal_fiducial.replay.topics import PLAYED, Topics
 from thermal_fiducial.replay.waiting import Wait
-from thermal_fiducial.ros.node import CountingNode, StageNode
+from thermal_fiducial.ros.counting import CountingNode
+from thermal_fiducial.ros.node import StageNode
 from thermal_fiducial.ros.run import initialise, make_executor
 
 _SECOND_NS = 1_000_000_000

@@ -22,7 +22,7 @@ from thermal_fiducial.replay.latency import header_stamp_ns, LatencyMeter
 from thermal_fiducial.replay.recorder import Recorder, RunFiles
 from thermal_fiducial.replay.topics import PLAYED, Topics
 from thermal_fiducial.replay.waiting import Wait
-from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.counting import CountingNode
 from thermal_fiducial.ros.promptness import prompt
 from thermal_fiducial.ros.run import initialise, make_executor
 

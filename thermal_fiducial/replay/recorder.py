@@ -20,7 +20,7 @@ from thermal_fiducial.files.bags import BagWriter
 from thermal_fiducial.files.trajectory_file import tum_line
 from thermal_fiducial.replay.topics import Topics, type_name
 from thermal_fiducial.ros import clouds, convert
-from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.counting import CountingNode
 
 
 class RunFiles:

@@ -16,7 +16,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros import convert, qos
-from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.counting import CountingNode
 
 #: Turns forward-left-up axes into forward-right-down ones, and back.
 FLU_TO_FRD = np.array([1.0, -1.0, -1.0])

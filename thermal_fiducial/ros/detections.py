@@ -15,7 +15,7 @@ from std_msgs.msg import Header
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.measurements import corners_px, Markers
-from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.counting import CountingNode
 
 #: Value of the parameter ``detections`` to package and message.
 KINDS = {

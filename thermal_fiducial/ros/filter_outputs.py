@@ -11,7 +11,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.bridge import FlightControllerBridge
-from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.counting import CountingNode
 from thermal_fiducial.ros.transforms import TransformBroadcaster
 
 _PATH_STEP_NS = 200_000_000

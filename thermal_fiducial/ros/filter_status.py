@@ -4,17 +4,20 @@ import re
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_text, PoseUpdate
+from thermal_fiducial.ros.console import Console
 from thermal_fiducial.ros.node import ERROR, OK, WARN
 
 
 class FilterStatus:
-    """Watches ``filter_``."""
+    """Watches ``filter_``; its resets are lines of ``console``."""
 
-    def __init__(self, filter_: PoseEkf) -> None:
-        self._filter = filter_
+    def __init__(self, filter_: PoseEkf, console: Console) -> None:
+        self._filter, self._console = filter_, console
         #: how often the pose has jumped: starts, resets and corrections of the map
         self.jumps = 0
         self._resets: int | None = None
+        #: the status without numbers and what was said of it, whether it was lost then, and ever not
+        self._words, self._headline, self._was_lost, self._initialised = '', '', True, False
         self._last_refusal = ''
         #: stamps of the poses whose innovations were published
         self._published: set[int] = set()
@@ -22,7 +25,11 @@ class FilterStatus:
     def after_imu(self) -> None:
         """Count a start or a reset."""
         resets = None if self._filter.state is None else self._filter.resets
-        self.jumps += resets is not None and resets != self._resets
+        if resets == self._resets:
+            return
+        self.jumps += resets is not None
+        if self._resets is not None:
+            self._console.event('reset', f'reset: {self._filter.reset_reason}')
         self._resets = resets
 
     def after_pose(self, update: PoseUpdate) -> None:
@@ -37,8 +44,14 @@ class FilterStatus:
         return ERROR if lost else OK if status == 'tracking' else WARN, status
 
     def headline(self) -> str:
-        """What the filter does, without numbers."""
-        return re.split(r'[:\d]', self._filter.status)[0].removesuffix(' for ')
+        """What the filter does, without numbers, and what has changed if it has a pose again."""
+        words, lost = re.split(r'[:\d]', self._filter.status)[0].removesuffix(' for '), self._filter.lost
+        if words != self._words:
+            again = 'recovered' if self._initialised else 'initialised'
+            self._headline = f'{again}: {words}' if self._was_lost and not lost else words
+            self._words, self._was_lost = words, lost
+            self._initialised |= not lost
+        return self._headline
 
     def figures(self) -> dict[str, object]:
         """The filter in numbers."""

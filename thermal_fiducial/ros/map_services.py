@@ -94,7 +94,9 @@ class MapServices:
         """Back to the map that was loaded last."""
         self._refuse_frozen()
         self._publish_jump(self.mapper.reset())
-        return f'{len(self.mapper.map.markers)} markers left'
+        left = f'{len(self.mapper.map.markers)} markers left'
+        self._node.console.event('map', f'map reset, as it was asked for: {left}')
+        return left
 
     def refine(self) -> str:
         """Start a joint refinement now."""

@@ -6,12 +6,17 @@ from thermal_fiducial.core.mapping.map_data import MapperResult, MarkerMap
 from thermal_fiducial.ros.node import OK, WARN
 
 
-def state(result: MapperResult, other_dictionary: str, *, frozen: bool) -> tuple[bytes, str]:
-    """Level and words: why the last frame gave no pose, whether the map is meant, which markers are not trusted."""
+def state(result: MapperResult, other_dictionary: str, *, frozen: bool, left: int = 0) -> tuple[bytes, str]:
+    """Level and words: why the last frame gave no pose, whether the map is meant, which markers are not trusted.
+
+    ``left``: frames that were left for newer ones since the last time.
+    """
     if result.reason or other_dictionary:
         return WARN, '; '.join(filter(None, (result.reason, other_dictionary)))
     if result.quarantined:
         return WARN, f'quarantined: {_listed(result.quarantined)}'
+    if left:
+        return WARN, f'{left} older frames left'
     return OK, 'map frozen' if frozen else 'ok'
 
 
@@ -28,12 +33,12 @@ def figures(marker_map: MarkerMap, corrections: int, result: MapperResult) -> di
     }
 
 
-def news(before: MapperResult, now: MapperResult) -> list[str]:
-    """Lines for the console: markers that went into quarantine, with the reason, and those that came out."""
-    reasons = now.quarantine_reasons
-    into = [f'marker {key} quarantined: {reasons[key]}' for key in now.quarantined if key not in before.quarantined]
-    out = [f'marker {key} is trusted again' for key in before.quarantined if key not in now.quarantined]
-    return into + out
+def news(before: MapperResult, now: MapperResult) -> dict[int, str]:
+    """Lines for the console by marker: it went into quarantine, with the reason, or came out."""
+    new = set(now.quarantined) - set(before.quarantined)
+    into = {key: f'marker {key} quarantined: {now.quarantine_reasons[key]}' for key in sorted(new)}
+    out = {key: f'marker {key} is trusted again' for key in before.quarantined if key not in now.quarantined}
+    return into | out
 
 
 def _listed(ids: Iterable[int]) -> str:

@@ -13,7 +13,7 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.point_cloud import load_alignment, load_cloud, thinned
 from thermal_fiducial.ros import clouds, convert, display, qos
-from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.counting import CountingNode
 
 # Points of the cloud that is shown: 0.7 MB, which goes through shared memory in one piece.
 _CLOUD_POINTS = 60_000

@@ -1,22 +1,23 @@
-"""Base of the four nodes: topics that count, parameters, a guard round each callback, diagnostics once a second.
+"""Base of the nodes: parameters, a guard round each callback, diagnostics and console lines once a second.
 
 A node lives on whatever it is given: a message that cannot be used raises :class:`InputError` in the conversion or in
-the core, the guard turns it into a warning and a diagnostic. The counts make diagnostics, and tell a lock-step replay
-when everything that was published has been received.
+the core, the guard turns it into a warning and a diagnostic.
 """
 
 from collections.abc import Callable
+import time
 import traceback
 from typing import Any, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
-from rclpy.node import Node
-from rclpy.qos import QoSProfile
 
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
-from thermal_fiducial.ros import convert, params, qos
+from thermal_fiducial.ros import convert, params
+from thermal_fiducial.ros.console import Console
+from thermal_fiducial.ros.counting import CountingNode
+from thermal_fiducial.ros.input_rates import InputRates
 
 Config = TypeVar('Config')
 Made = TypeVar('Made')
@@ -24,106 +25,8 @@ Made = TypeVar('Made')
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
-class Output:
-    """A publisher that counts."""
-
-    def __init__(self, publisher: Any) -> None:
-        self.topic: str = publisher.topic_name
-        self.count = 0
-        self._publisher = publisher
-
-    def send(self, message: Any) -> None:
-        """Publish a message, or the bytes of one."""
-        self.count += 1
-        self._publisher.publish(message)
-
-    @property
-    def listeners(self) -> int:
-        """Number of matched subscriptions."""
-        return int(self._publisher.get_subscription_count())
-
-
-class Input:
-    """A subscription that counts."""
-
-    def __init__(self, topic: str) -> None:
-        self.topic = topic
-        #: messages that were taken, or left for newer ones
-        self.count = 0
-        #: messages that were left because a newer one had come when their turn was
-        self.left = 0
-        self._subscription: Any = None
-
-    def attach(self, subscription: Any) -> None:
-        """Remember the subscription that counts here."""
-        self._subscription = subscription
-
-    @property
-    def publishers(self) -> int:
-        """Number of matched publishers."""
-        return int(self._subscription.get_publisher_count())
-
-
-class CountingNode(Node):
-    """A node that knows how much came in and went out on each of its topics."""
-
-    def __init__(self, name: str, **kwargs: Any) -> None:
-        super().__init__(name, **kwargs)
-        self.inputs: list[Input] = []
-        self.outputs: list[Output] = []
-
-    def advertise(self, kind: type, topic: str, profile: QoSProfile = qos.RESULT) -> Output:
-        """A publisher of messages of ``kind``."""
-        output = Output(self.create_publisher(kind, topic, profile))
-        self.outputs.append(output)
-        return output
-
-    def subscribe(
-        self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile, *, raw: bool = False
-    ) -> Input:
-        """Call ``callback`` with every message (its bytes if ``raw``)."""
-        source = Input(self.resolve_topic_name(topic))
-
-        def receive(message: Any) -> None:
-            source.count += 1
-            self.guard(callback, message)
-
-        source.attach(self.create_subscription(kind, topic, receive, profile, raw=raw))
-        self.inputs.append(source)
-        return source
-
-    def subscribe_newest(self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile) -> Input:
-        """Call ``callback`` with the newest message that has come; what is older by then is left and counted.
-
-        The executor takes a task after the messages that were waiting before it, so the task finds the last of them.
-        Executors that take turns otherwise go through all that ``profile`` keeps.
-        """
-        waiting: list[Any] = []
-
-        def work() -> None:
-            source.count += 1
-            self.guard(callback, waiting.pop())
-
-        def receive(message: Any) -> None:
-            if waiting:
-                source.count += 1
-                source.left += 1
-                waiting[:] = [message]
-                return
-            waiting.append(message)
-            if self.executor is None:
-                work()
-            else:
-                self.executor.create_task(work)
-
-        source = Input(self.resolve_topic_name(topic))
-        source.attach(self.create_subscription(kind, topic, receive, profile))
-        self.inputs.append(source)
-        return source
-
-    def guard(self, callback: Callable[[Any], None], message: Any) -> None:
-        """Call ``callback``; what a node makes of unusable input is its own matter."""
-        callback(message)
+#: Parameters that say how often the main input of a node comes.
+_RATES = ('image_rate', 'imu_rate')
 
 
 class StageNode(CountingNode, Generic[Config]):
@@ -157,10 +60,10 @@ class StageNode(CountingNode, Generic[Config]):
         self.faults: list[str] = []
         self._refused = 0
         self._refusal = ''
-        self._diagnosed_inputs: dict[str, int] = {}
         self._diagnosed_refused = 0
-        #: times in a row that the main input was silent, and what the console had last
-        self._silent, self._said = 0, ''
+        self._rates = InputRates(self.inputs, _expected_rate(self.config))
+        #: lines for a pilot
+        self.console = Console(self.get_logger())
         self._diagnostics = self.advertise(DiagnosticArray, '/diagnostics')
         params.follow(self, kind, self.configure)
         if live:
@@ -238,52 +141,36 @@ class StageNode(CountingNode, Generic[Config]):
         """Last work before the node is destroyed: save what must be saved."""
 
     def diagnose(self, stamp_ns: int) -> None:
-        """Publish the diagnostics of the time since the last call."""
+        """Publish the diagnostics of the time since the last call, and what a pilot must know of it."""
+        self._rates.look(time.monotonic_ns() if self.live else stamp_ns)
         level, reason = self._level()
-        self._say(level)
+        self.console.say(self._rates.trouble() or self.headline(), calm=level == OK)
         counts: dict[str, object] = {f'received {source.topic}': source.count for source in self.inputs}
         counts |= {f'left {source.topic}': source.left for source in self.inputs if source.left}
         counts |= {
             f'published {output.topic}': output.count for output in self.outputs if output.topic != '/diagnostics'
         }
-        values = {**self.figures(), 'refused messages': self._refused, 'last refusal': self._refusal, **counts}
+        refusals = {'refused messages': self._refused, 'last refusal': self._refusal}
+        values = {**self.figures(), **refusals, **self._rates.figures(), **counts}
         name = self.get_fully_qualified_name().lstrip('/')
         self._diagnostics.send(convert.diagnostics(name, level, reason, values, stamp_ns))
-        self._diagnosed_inputs = {source.topic: source.count for source in self.inputs}
         self._diagnosed_refused = self._refused
 
     def _level(self) -> tuple[bytes, str]:
+        """What is worst: something configured, unusable input, none, what the stage says, its rate."""
         if self.faults:
             return ERROR, '; '.join(self.faults)
         if self._refused > self._diagnosed_refused:
             return WARN, self._refusal
-        source = self.inputs[0] if self.inputs else None
-        if source is not None and source.count == self._diagnosed_inputs.get(source.topic, 0):
-            # A shutter takes half a second; whoever gets nothing for two, and had something, does nothing any more.
-            self._silent += 1
-            return ERROR if self._stopped else WARN, f'no {source.topic.lstrip("/")}'
-        self._silent = 0
-        return self.state()
-
-    @property
-    def _stopped(self) -> bool:
-        return self._silent > 1 and self.inputs[0].count > 0
-
-    def _say(self, level: bytes) -> None:
-        """A line on the console where what a pilot must know has changed: one a second at most, as it is looked at."""
-        words, topic = self.headline(), self.inputs[0].topic.lstrip('/') if self.inputs else ''
-        if topic and not self.inputs[0].count:
-            words = f'waiting for {topic}'
-        elif topic and self._stopped:
-            words = f'{topic} has stopped'
-        if words == self._said:
-            return
-        self._said = words
-        # Two lines of code, as rclpy takes no two severities from one.
-        if words and level == OK:
-            self.get_logger().info(words)
-        elif words:
-            self.get_logger().warning(words)
+        if self._rates.silent:
+            return ERROR if self._rates.stopped else WARN, f'no {self._rates.main}'
+        level, reason = self.state()
+        doubt = self._rates.doubt()
+        return (max(level, WARN), f'{reason}; {doubt}') if doubt else (level, reason)
 
     def _on_timer(self) -> None:
         self.guard(self.diagnose, self.get_clock().now().nanoseconds)
+
+
+def _expected_rate(config: object) -> float:
+    return next((float(getattr(config, name)) for name in _RATES if hasattr(config, name)), 0.0)

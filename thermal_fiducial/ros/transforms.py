@@ -8,7 +8,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.ros import convert
-from thermal_fiducial.ros.node import CountingNode
+from thermal_fiducial.ros.counting import CountingNode
 
 
 class TransformBroadcaster:

@@ -42,6 +42,7 @@ class PoseEkf:
 
     def __init__(self, config: PoseEkfConfig) -> None:
         self._config = config
+        self._restart_reason = ''
         self.reset()
 
     def configure(self, config: PoseEkfConfig) -> None:
@@ -49,9 +50,9 @@ class PoseEkf:
         self._config = config
         self._hypotheses.configure(config)
 
-    def reset(self) -> None:
-        """Forget everything."""
-        config = self._config
+    def reset(self, reason: str = 'it was asked for') -> None:
+        """Forget everything, for a ``reason`` in words."""
+        config, self._restart_reason = self._config, reason
         self._hypotheses = Hypotheses(config)
         self._imu_refused = 0
         self._input = ImuInput(config.max_imu_gap, config.imu.gyroscope_range, config.imu.accelerometer_range)
@@ -81,6 +82,7 @@ class PoseEkf:
         """
         verdict = self._input.judge(sample)
         if verdict is Verdict.RESTART:
+            self._restart_reason = "the IMU's clock has jumped"
             self._begin()
         self._imu_fault = verdict.value
         if verdict not in (Verdict.USE, Verdict.RESTART):
@@ -291,6 +293,11 @@ class PoseEkf:
     def resets(self) -> int:
         """How often another estimate has replaced the present one since it was begun."""
         return self._belief.resets
+
+    @property
+    def reset_reason(self) -> str:
+        """Why the estimate was replaced, or given up, the last time."""
+        return self._belief.reset_reason or self._restart_reason
 
     @property
     def status(self) -> str:

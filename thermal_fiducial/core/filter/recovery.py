@@ -108,6 +108,8 @@ class Belief:
     resets: int = 0
     #: hits of the estimate when the alternative began
     hits_before: int = 0
+    #: why that happened the last time
+    reset_reason: str = ''
 
     @property
     def time_offset(self) -> float | None:
@@ -132,23 +134,38 @@ class Belief:
         if other is None:
             return self
         if main is None:
-            return self._promoted() if other.hits >= config.initial_poses else self
+            return self._promoted('') if other.hits >= config.initial_poses else self
         if main.accepted_in_row >= _REFUTED or other.failed:
             return replace(self, alternative=None)
         if other.hits < config.initial_poses:
             return self
+        reason = self._why_reset(main, other, config)
+        return self._promoted(reason) if reason else self
+
+    def _why_reset(self, main: Hypothesis, other: Hypothesis, config: PoseEkfConfig) -> str:
+        """Why the alternative ``other`` should replace ``main``, in words; empty: it should not."""
+        if other.accepted_ns - main.accepted_ns > config.reinitialise_after * _SECOND_NS:
+            return f'no pose was accepted for {config.reinitialise_after:.0f} s'
+        if main.position_std > config.lost_position_std:
+            return 'the pose was lost, and markers are seen again'
         lasting = other.accepted_ns - other.started_ns >= config.reset_after * _SECOND_NS
         against = main.hits - self.hits_before
         agreed = other.hits >= max(2 * other.misses, _PREFERRED * against, other.needed)
-        stale = other.accepted_ns - main.accepted_ns > config.reinitialise_after * _SECOND_NS
-        lost = stale or main.position_std > config.lost_position_std
-        return self._promoted() if lost or (lasting and agreed) else self
+        return 'the poses contradict the estimate and agree with each other' if lasting and agreed else ''
 
-    def _promoted(self) -> 'Belief':
+    def _promoted(self, reason: str) -> 'Belief':
+        """With the alternative as the estimate, for a ``reason`` in words where there was one."""
         assert self.alternative
         resets = self.resets + (self.main is not None)
         fresh = replace(self.alternative, accepted_in_row=1, refused_in_row=0, needed=0)
-        return replace(self, main=fresh, alternative=None, pose_stamp_ns=self.alternative.pose_stamp_ns, resets=resets)
+        return replace(
+            self,
+            main=fresh,
+            alternative=None,
+            pose_stamp_ns=self.alternative.pose_stamp_ns,
+            resets=resets,
+            reset_reason=reason,
+        )
 
 
 def far_covariance(

@@ -1,0 +1,68 @@
+"""Rates of inputs: what is expected, what is off, what has stopped."""
+
+import pytest
+
+from thermal_fiducial.ros.counting import Input
+from thermal_fiducial.ros.input_rates import InputRates
+
+SECOND = 1_000_000_000
+
+
+def watched(*hertz, expected=0.0):
+    """Rates of inputs ``main``, ``other``, ..., whose messages of each second are ``hertz``."""
+    inputs = [Input(f'/{name}') for name, _ in zip(('main', 'other', 'third'), hertz, strict=False)]
+    rates = InputRates(inputs, expected)
+    for second in range(len(hertz[0])):
+        for source, counts in zip(inputs, hertz, strict=True):
+            source.count += counts[second]
+        rates.look((second + 1) * SECOND)
+    return rates
+
+
+def test_the_rate_of_the_first_seconds_is_expected_from_there_on():
+    rates = watched([12] + [30] * 19)
+    assert (rates.expected, rates.doubt()) == (pytest.approx(30.0), '')
+    assert rates.figures()['expected rate [Hz]'] == '30 (24 to 36)'
+    assert rates.figures()['rate /main [Hz]'] == '30'
+
+
+@pytest.mark.parametrize(
+    ('later', 'words'),
+    [(60, 'main at 60 Hz, 30 expected'), (20, 'main at 20 Hz, 30 expected'), (27, ''), (33, '')],
+)
+def test_a_rate_that_changes_is_named(later, words):
+    assert watched([30] * 10 + [later] * 10).doubt() == words
+
+
+def test_a_rate_that_was_given_counts_from_the_first_full_window():
+    assert watched([100] * 10, expected=200.0).doubt() == ''
+    assert watched([100] * 12, expected=200.0).doubt() == 'main at 100 Hz, 200 expected'
+
+
+def test_a_shutter_event_is_no_doubt():
+    assert watched([30] * 10 + [14] + [30] * 5).doubt() == ''
+
+
+def test_other_inputs_are_missed_only_if_they_came_all_the_time():
+    rates = watched([30] * 12, [200] * 8 + [0] * 4, [0, 1] + [0] * 10)
+    assert (rates.stale, rates.doubt()) == (['other'], 'no other any more')
+    assert rates.figures()['stale inputs'] == 'other'
+    assert 'rate /third [Hz]' in rates.figures()
+
+
+def test_the_main_input_is_waited_for_and_missed():
+    assert watched([0, 0, 0]).trouble() == 'waiting for main'
+    one = watched([30, 30, 0])
+    assert (one.silent, one.stopped, one.trouble()) == (True, False, '')
+    two = watched([30, 30, 0, 0])
+    assert (two.silent, two.stopped, two.trouble()) == (True, True, 'main has stopped')
+    assert watched([30, 0, 0, 30]).trouble() == ''
+
+
+def test_a_clock_that_stands_still_or_goes_back_is_survived():
+    source = Input('/main')
+    rates = InputRates([source], 30.0)
+    for time_ns in (5 * SECOND, 5 * SECOND, 3 * SECOND, 4 * SECOND):
+        source.count += 30
+        rates.look(time_ns)
+    assert (rates.doubt(), rates.figures()['rate /main [Hz]']) == ('', '30')

@@ -1,0 +1,119 @@
+"""A node that counts what comes in and what goes out.
+
+From the counts a lock-step replay knows when everything that was published has been received.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from thermal_fiducial.ros import qos
+
+
+class Output:
+    """A publisher that counts."""
+
+    def __init__(self, publisher: Any) -> None:
+        self.topic: str = publisher.topic_name
+        self.count = 0
+        self._publisher = publisher
+
+    def send(self, message: Any) -> None:
+        """Publish a message, or the bytes of one."""
+        self.count += 1
+        self._publisher.publish(message)
+
+    @property
+    def listeners(self) -> int:
+        """Number of matched subscriptions."""
+        return int(self._publisher.get_subscription_count())
+
+
+class Input:
+    """A subscription that counts."""
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+        #: messages that were taken, or left for newer ones
+        self.count = 0
+        #: messages that were left because a newer one had come when their turn was
+        self.left = self._left_before = 0
+        self._subscription: Any = None
+
+    def left_since(self) -> int:
+        """Messages that were left since the last time that this was asked."""
+        left, self._left_before = self.left - self._left_before, self.left
+        return left
+
+    def attach(self, subscription: Any) -> None:
+        """Remember the subscription that counts here."""
+        self._subscription = subscription
+
+    @property
+    def publishers(self) -> int:
+        """Number of matched publishers."""
+        return int(self._subscription.get_publisher_count())
+
+
+class CountingNode(Node):
+    """A node that knows how much came in and went out on each of its topics."""
+
+    def __init__(self, name: str, **kwargs: Any) -> None:
+        super().__init__(name, **kwargs)
+        self.inputs: list[Input] = []
+        self.outputs: list[Output] = []
+
+    def advertise(self, kind: type, topic: str, profile: QoSProfile = qos.RESULT) -> Output:
+        """A publisher of messages of ``kind``."""
+        output = Output(self.create_publisher(kind, topic, profile))
+        self.outputs.append(output)
+        return output
+
+    def subscribe(
+        self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile, *, raw: bool = False
+    ) -> Input:
+        """Call ``callback`` with every message (its bytes if ``raw``)."""
+        source = Input(self.resolve_topic_name(topic))
+
+        def receive(message: Any) -> None:
+            source.count += 1
+            self.guard(callback, message)
+
+        source.attach(self.create_subscription(kind, topic, receive, profile, raw=raw))
+        self.inputs.append(source)
+        return source
+
+    def subscribe_newest(self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile) -> Input:
+        """Call ``callback`` with the newest message that has come; what is older by then is left and counted.
+
+        The executor takes a task after the messages that were waiting before it, so the task finds the last of them.
+        Executors that take turns otherwise go through all that ``profile`` keeps.
+        """
+        waiting: list[Any] = []
+
+        def work() -> None:
+            source.count += 1
+            self.guard(callback, waiting.pop())
+
+        def receive(message: Any) -> None:
+            if waiting:
+                source.count += 1
+                source.left += 1
+                waiting[:] = [message]
+                return
+            waiting.append(message)
+            if self.executor is None:
+                work()
+            else:
+                self.executor.create_task(work)
+
+        source = Input(self.resolve_topic_name(topic))
+        source.attach(self.create_subscription(kind, topic, receive, profile))
+        self.inputs.append(source)
+        return source
+
+    def guard(self, callback: Callable[[Any], None], message: Any) -> None:
+        """Call ``callback``; what a node makes of unusable input is its own matter."""
+        callback(message)

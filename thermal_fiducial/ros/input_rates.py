@@ -1,0 +1,147 @@
+"""How often the inputs of a node come, and which have stopped: what diagnostic_updater checks in C++ nodes.
+
+The main input is the first that the node subscribed to. Its rate is compared with the one that is expected, which is a
+parameter or what the first seconds showed; any other input that came all the time is missed when it stops.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from statistics import median
+
+from thermal_fiducial.ros.counting import Input
+
+_SECOND_NS = 1_000_000_000
+#: Looks, a second apart, over which a rate is averaged: a shutter event of half a second is 5 % of it.
+_WINDOW = 10
+#: Looks in a row with messages that make an input a steady one, and the first of them that show its rate.
+_STEADY = 5
+#: Share by which a rate may be off: more than a shutter event takes, less than a second publisher adds.
+_TOLERANCE = 0.2
+#: A shutter event takes half a second; an input that gives nothing for two looks has stopped.
+_STOPPED = 2
+
+
+class _Watch:
+    """One input."""
+
+    def __init__(self, source: Input) -> None:
+        self.topic = source.topic.lstrip('/')
+        self.source = source
+        self.silent = 0
+        self._steady = 0
+        self._looks: deque[tuple[int, int]] = deque(maxlen=_WINDOW + 1)
+        self._first_rates: list[float] = []
+
+    def look(self, time_ns: int) -> None:
+        """Take in the count at a time; one that does not advance (a paused clock) says nothing of the rate."""
+        count = self.source.count
+        before_ns, before = self._looks[-1] if self._looks else (time_ns - _SECOND_NS, 0)
+        came = count > before
+        self.silent = 0 if came else self.silent + 1
+        if not self.is_steady:
+            self._steady = self._steady + 1 if came else 0
+        if time_ns < before_ns:
+            self._looks.clear()
+        elif time_ns > before_ns and came and len(self._first_rates) < _STEADY:
+            self._first_rates.append((count - before) / (time_ns - before_ns) * _SECOND_NS)
+        self._looks.append((time_ns, count))
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether it has come all the time."""
+        return self._steady >= _STEADY
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it came, and does so no more."""
+        return self.source.count > 0 and self.silent >= _STOPPED
+
+    @property
+    def rate(self) -> float:
+        """Over the window [Hz]; 0 before there is one."""
+        (first_ns, first), (last_ns, last) = (self._looks[0], self._looks[-1]) if self._looks else ((0, 0), (0, 0))
+        return (last - first) / (last_ns - first_ns) * _SECOND_NS if last_ns > first_ns else 0.0
+
+    @property
+    def first_rate(self) -> float:
+        """Of the first seconds [Hz]; 0 before they are over."""
+        return median(self._first_rates) if len(self._first_rates) == _STEADY else 0.0
+
+    @property
+    def has_rate(self) -> bool:
+        """Whether the window is full."""
+        return len(self._looks) > _WINDOW
+
+
+class InputRates:
+    """Watches the ``inputs`` of a node, a list that may still grow.
+
+    Parameters
+    ----------
+    expected : rate of the main one [Hz]; 0: that of its first seconds
+    """
+
+    def __init__(self, inputs: Sequence[Input], expected: float = 0.0) -> None:
+        self._inputs = inputs
+        self._expected = expected
+        self._watches: dict[str, _Watch] = {}
+
+    def look(self, time_ns: int) -> None:
+        """Once a second."""
+        for source in self._inputs:
+            self._watches.setdefault(source.topic, _Watch(source)).look(time_ns)
+
+    @property
+    def _main(self) -> _Watch | None:
+        return next(iter(self._watches.values()), None)
+
+    @property
+    def main(self) -> str:
+        """Topic of the main input."""
+        return self._main.topic if self._main else ''
+
+    @property
+    def silent(self) -> bool:
+        """Whether the main input gave nothing since the last look."""
+        return self._main is not None and self._main.silent > 0
+
+    @property
+    def stopped(self) -> bool:
+        """Whether the main input came, and does so no more."""
+        return self._main is not None and self._main.stopped
+
+    @property
+    def expected(self) -> float:
+        """Rate of the main input [Hz]; 0: not known yet."""
+        return self._expected or (self._main.first_rate if self._main else 0.0)
+
+    @property
+    def stale(self) -> list[str]:
+        """Topics of the other inputs that came all the time and have stopped."""
+        return [watch.topic for watch in list(self._watches.values())[1:] if watch.is_steady and watch.stopped]
+
+    def trouble(self) -> str:
+        """What a pilot must know: that the main input is waited for, or has stopped."""
+        main = self._main
+        if main is not None and not main.source.count:
+            return f'waiting for {main.topic}'
+        return f'{main.topic} has stopped' if main is not None and main.stopped else ''
+
+    def doubt(self) -> str:
+        """In words what is wrong with inputs while the main one comes: its rate, others that have stopped."""
+        words = [f'no {topic} any more' for topic in self.stale]
+        main = self._main
+        if main is not None and main.has_rate and self.expected and abs(main.rate / self.expected - 1.0) > _TOLERANCE:
+            words.append(f'{main.topic} at {main.rate:.3g} Hz, {self.expected:.3g} expected')
+        return '; '.join(words)
+
+    def figures(self) -> dict[str, object]:
+        """Rate of each input that comes, what is expected of the main one, and which have stopped."""
+        if not self._watches:
+            return {}
+        rates: dict[str, object] = {
+            f'rate /{watch.topic} [Hz]': f'{watch.rate:.4g}' for watch in self._watches.values() if watch.source.count
+        }
+        low, high = (1.0 - _TOLERANCE) * self.expected, (1.0 + _TOLERANCE) * self.expected
+        limits = f'{self.expected:.4g} ({low:.4g} to {high:.4g})' if self.expected else 'not known yet'
+        return rates | {'expected rate [Hz]': limits, 'stale inputs': ', '.join(self.stale)}
