@@ -35,8 +35,7 @@ _LONGEST = 0.6
 class _Grid(NamedTuple):
     """The P samples of a marker with m x m cells."""
 
-    #: (4, P) of :func:`bilinear`, and the same as by how much each sample moves with each corner
-    places: FloatArray
+    #: (4, P) of :func:`bilinear`: where they are, and by how much each moves with each corner
     weights: Float32Array
     #: (6, P) background: constant, slopes, curvatures
     smooth: Float32Array
@@ -50,8 +49,7 @@ def _grid(cells: int) -> _Grid:
     a, b = (axis.ravel() / cells for axis in np.meshgrid(share, share))
     x, y = a - 0.5, b - 0.5
     smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).astype(np.float32)
-    places = bilinear(a, b)
-    return _Grid(places, places.astype(np.float32), smooth, _blur(share, cells))
+    return _Grid(bilinear(a, b).astype(np.float32), smooth, _blur(share, cells))
 
 
 def aligned(
@@ -70,7 +68,7 @@ def aligned(
     grid = _grid(decoder.cells)
     cells = np.ones((len(ids), decoder.cells + 2, decoder.cells + 2))
     cells[:, 1:-1, 1:-1] = decoder.seen(ids, turns)
-    J = np.empty((len(ids), 15, grid.places.shape[1]), dtype=np.float32)
+    J = np.empty((len(ids), 15, grid.weights.shape[1]), dtype=np.float32)
     J[:, 8:14] = grid.smooth
     J[:, 14] = (grid.blur @ cells @ grid.blur.T).reshape(len(ids), -1)
     cell = float(np.median(np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1))) / (math.sqrt(2.0) * decoder.cells)
@@ -82,7 +80,7 @@ def aligned(
     slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.125)
     planes: list[Float32Array] = [np.asarray(plane) for plane in (picture, slope_u, slope_v)]
     for _ in range(_STEPS):
-        places = seen_between(quads, grid.places).astype(np.float32)
+        places = seen_between(quads, grid.weights)
         value, du, dv = (sampled(plane, places)[:, None] for plane in planes)
         np.multiply(du, grid.weights, out=J[:, :4])
         np.multiply(dv, grid.weights, out=J[:, 4:8])

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.geometry.se3 import bilinear, in_quadrilaterals, seen_between
+from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
 
 # How far off a side black and white are compared: in cells, and at most in pixels.
@@ -50,7 +50,7 @@ class PatternMatch(NamedTuple):
     """Which patterns Q quadrilaterals look most like."""
 
     #: (Q, m * m) contrast of the cells, without background
-    values: FloatArray
+    values: Float32Array
     #: (Q,) four times the most similar ID, and the quarter turns
     best: IntArray
     #: (Q,) its correlation, and that of the most similar other ID
@@ -81,13 +81,15 @@ class Decoder:
         # A background that rises or bends across the marker is no pattern: it is projected out of both.
         self._detrend = np.eye(x.size) - smooth @ smooth.T
         detrended = flat @ self._detrend
-        self._patterns = detrended / np.maximum(np.linalg.norm(detrended, axis=1, keepdims=True), 1e-9)
-        likeness = np.abs(self._patterns[::4] @ self._patterns.T).reshape(self.count, -1, 4).max(axis=-1)
+        patterns = detrended / np.maximum(np.linalg.norm(detrended, axis=1, keepdims=True), 1e-9)
+        likeness = np.abs(patterns[::4] @ patterns.T).reshape(self.count, -1, 4).max(axis=-1)
         np.fill_diagonal(likeness, 0.0)
         #: (M,) by how much a perfect view of each marker correlates better with itself than with any other
         self.isolation = 1.0 - likeness.max(axis=1)
+        self._patterns = patterns.astype(np.float32)
         share = ((np.arange(self.cells)[:, None] + _SAMPLES) / self.cells).ravel()
-        self._samples = bilinear(*(axis.ravel() for axis in np.meshgrid(share, share)))
+        self._samples = bilinear(*(axis.ravel() for axis in np.meshgrid(share, share))).astype(np.float32)
+        self._along_sides, self._away = _beside_sides(self.cells)
         mean = np.kron(np.eye(self.cells), np.full((len(_SAMPLES), 1), 1.0 / len(_SAMPLES)))
         self._cells_of_samples = (np.kron(mean, mean) @ self._detrend).astype(np.float32)
 
@@ -110,28 +112,27 @@ class Decoder:
         """Most similar patterns of quadrilaterals (Q, 4, 2) among those ``allowed`` (M,), or all."""
         values = self._contrasts(image, quads)
         spread = np.sqrt((values * values).sum(axis=1, keepdims=True))
-        similar = (values / np.maximum(spread, 1e-9)) @ self._patterns.T
-        if allowed is not None:
-            similar = np.where(np.repeat(allowed, 4), similar, 0.0)
+        similar = (values / np.maximum(spread, np.float32(1e-9))) @ self._patterns.T
+        if allowed is not None and not allowed.all():
+            similar[:, np.repeat(~allowed, 4)] = 0.0
         size = np.abs(similar)
         best, rows = size.argmax(axis=1), np.arange(len(quads))
-        correlation = similar[rows, best]
-        by_id = size.reshape(len(quads), -1, 4)
-        by_id[rows, best // 4] = 0.0
-        return PatternMatch(values, best, correlation, by_id.max(axis=(1, 2)))
+        correlation = similar[rows, best].astype(np.float64)
+        size.reshape(len(quads), -1, 4)[rows, best // 4] = 0.0
+        return PatternMatch(values, best, correlation, size.max(axis=1).astype(np.float64))
 
     def match(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
         """Correlation (Q,) of quadrilaterals (Q, 4, 2) with the upright patterns of ``ids`` (Q,)."""
         values = self._contrasts(image, quads)
-        spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), 1e-9)
-        return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread)
+        spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), np.float32(1e-9))
+        return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread, dtype=np.float64)
 
     def seen(self, ids: IntArray, turns: IntArray) -> FloatArray:
         """Cells (Q, m, m), 1 for white, as quadrilaterals show markers whose corners they name ``turns`` late."""
         return np.asarray(self._grids[ids, turns])
 
     def _judged(
-        self, values: FloatArray, best: IntArray, correlation: FloatArray, runner_up: FloatArray, steps: FloatArray
+        self, values: Float32Array, best: IntArray, correlation: FloatArray, runner_up: FloatArray, steps: FloatArray
     ) -> Reading:
         expected = self._grids.reshape(-1, self.cells**2)[best]
         shape = expected @ self._detrend
@@ -154,25 +155,30 @@ class Decoder:
     def _steps(self, image: Float32Array, quads: FloatArray) -> FloatArray:
         """Mean counts just outside the sides (Q, 4) less those just inside."""
         side = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1) / np.sqrt(2.0)
-        near = np.minimum(_OUTSIDE / self.cells, _OUTSIDE_PX / np.maximum(side, 1.0))[:, None]
-        t = np.broadcast_to((np.arange(self.cells) + 0.5) / self.cells, (len(quads), self.cells))
-        low, high = np.broadcast_to(-near, t.shape), np.broadcast_to(1.0 + near, t.shape)
-        inner_low, inner_high = np.broadcast_to(near, t.shape), np.broadcast_to(1.0 - near, t.shape)
-        a = np.concatenate([t, t, low, high, t, t, inner_low, inner_high], axis=1)
-        b = np.concatenate([low, high, t, t, inner_low, inner_high, t, t], axis=1)
-        places = in_quadrilaterals(quads, a, b).astype(np.float32)
-        means = sampled(image, places).reshape(len(quads), 2, 4, -1).mean(axis=-1, dtype=np.float64)
-        return np.asarray(means[:, 0] - means[:, 1])
+        near = np.minimum(_OUTSIDE / self.cells, _OUTSIDE_PX / np.maximum(side, 1.0))[:, None, None]
+        weights = self._along_sides + near.astype(np.float32) * self._away
+        means = sampled(image, seen_between(quads, weights)).reshape(len(quads), 2, 4, -1).mean(axis=-1)
+        return np.asarray(means[:, 0] - means[:, 1], dtype=np.float64)
 
-    def _contrasts(self, image: Counts | Float32Array, quads: FloatArray) -> FloatArray:
+    def _contrasts(self, image: Counts | Float32Array, quads: FloatArray) -> Float32Array:
         """Mean counts (Q, m * m) of the cells without the background."""
-        values = sampled(image, seen_between(quads, self._samples).astype(np.float32))
-        return np.asarray((values - values[:, :1]) @ self._cells_of_samples, dtype=np.float64)
+        values = sampled(image, seen_between(quads, self._samples))
+        values -= values[:, :1].copy()
+        return np.asarray(values @ self._cells_of_samples)
 
 
 def shrunk(quads: FloatArray, cells: int) -> FloatArray:
     """The markers (Q, 4, 2) in plates (Q, 4, 2) that surround them with a white margin of one cell."""
     return seen_between(quads, _in_plate(cells)).transpose(1, 2, 0)
+
+
+def _beside_sides(cells: int) -> tuple[Float32Array, Float32Array]:
+    """Of :func:`bilinear`, (4, 8 m): places along the sides, and how they move outward, then inward, with distance."""
+    t, low, high = (np.arange(cells) + 0.5) / cells, np.zeros(cells), np.ones(cells)
+    a, b = np.concatenate([t, t, low, high]), np.concatenate([low, high, t, t])
+    outward = bilinear(a + (a == 1.0) - (a == 0.0), b + (b == 1.0) - (b == 0.0)) - bilinear(a, b)
+    at, away = np.tile(bilinear(a, b), 2), np.concatenate([outward, -outward], axis=-1)
+    return at.astype(np.float32), away.astype(np.float32)
 
 
 @cache

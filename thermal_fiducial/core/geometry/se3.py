@@ -8,11 +8,15 @@ robotics", 2018, appendices B and D.
 """
 
 import math
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import Float32Array, FloatArray
+
+#: Numbers in either precision.
+Real = TypeVar('Real', FloatArray, Float32Array)
 
 # Below this angle [rad] the Taylor series is exact to double precision (the next term is angle^6 / 5040).
 SMALL_ANGLE = 1e-2
@@ -215,8 +219,10 @@ def bilinear(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), a * b, (1.0 - a) * b], axis=-2)
 
 
-def seen_between(c: FloatArray, weights: FloatArray) -> FloatArray:
+def seen_between(c: FloatArray, weights: Real) -> Real:
     """Points (2, Q, P) that have ``weights`` (4, P) or (Q, 4, P) in a square, of its views with corners (Q, 4, 2).
+
+    In the precision of the weights.
 
     In homogeneous coordinates, which leave straight what is straight, they are the same means of the corners (the
     projective map of the unit square: P. Heckbert, "Fundamentals of texture mapping and image warping", 1989).
@@ -224,8 +230,10 @@ def seen_between(c: FloatArray, weights: FloatArray) -> FloatArray:
     corners = np.empty((3, *c.shape[:2]))
     corners[2] = perspective(c)
     np.multiply(c.transpose(2, 0, 1), corners[2], out=corners[:2])
+    corners = corners.astype(weights.dtype, copy=False)
     points = corners @ weights if weights.ndim == 2 else (corners[:, :, None] @ weights)[:, :, 0]
-    return np.asarray(points[:2] / points[2])
+    points[:2] /= points[2]
+    return points[:2]
 
 
 def perspective(c: FloatArray) -> FloatArray:
