@@ -36,9 +36,18 @@ setup(
         'cloud': ['small_gicp', 'plyfile', 'pypcd4', 'scipy', 'rich', 'matplotlib'],
         'cameras': ['pyusb'],  # and libusb-1.0-0, for a ThermalGrabber
         'smoother': ['gtsam>=4.3'],  # the reference of the filter's benchmark; brings pytest 9
-        'tools': ['scipy', 'rich', 'matplotlib', 'ezdxf', 'jinja2', 'allantools'],
+        'tools': ['scipy', 'rich', 'matplotlib', 'ezdxf', 'svgwrite', 'reportlab', 'shapely', 'jinja2', 'allantools'],
         'batch': ['distributed>=2024.4'],
-        'test': ['pytest', 'shapely', 'hypothesis', 'pytest-benchmark', 'pytest-xdist', 'pytest-cov', 'evo'],
+        'test': [
+            'pytest',
+            'svgpathtools',
+            'pypdfium2',
+            'hypothesis',
+            'pytest-benchmark',
+            'pytest-xdist',
+            'pytest-cov',
+            'evo',
+        ],
         # Pinned: a new version of a linter must not turn an untouched commit red.
         'lint': ['ruff==0.17.6', 'mypy==2.4.1', 'import-linter==2.16', 'types-PyYAML==6.0.12.20261113'],
         'docs': ['mkdocs-material==9.8.1', 'mkdocstrings[python]==1.0.8'],

@@ -2,20 +2,26 @@
 
 from pathlib import Path
 import re
+import shutil
+import subprocess
+from xml.etree import ElementTree
 
 import cv2
 import ezdxf
 import numpy as np
+import pypdfium2
 import pytest
 from shapely import affinity
 from shapely.geometry import box, Point, Polygon
 from shapely.ops import unary_union
+import svgpathtools
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import circle_board
 from thermal_fiducial.fabrication.drawing import Circle, Contour, Drawing
+from thermal_fiducial.fabrication.paper import tiling
 from thermal_fiducial.fabrication.plate import marker_drawing, pattern_origin, PlateOptions
 from thermal_fiducial.fabrication.sheet import nest
 from thermal_fiducial.fabrication.verification import acrylic_at, agree, problems, read_dxf
@@ -26,12 +32,13 @@ from thermal_fiducial.files.marker_map import load_map
 BITS = marker_bits(load_dictionary('STENCIL_4X4_100'))
 # Geometry in a file is the pattern to this: DXF holds 16 digits, SVG 9 decimals.
 TOLERANCE_MM = 1e-6
+SVG, INKSCAPE = '{http://www.w3.org/2000/svg}', '{http://www.inkscape.org/namespaces/inkscape}'
 
 
 def polygons_of(path):
-    """All closed polylines of layer CUT as one shapely shape."""
+    """All closed polylines of the layers PATTERN and OUTLINE as one shapely shape."""
     shape = Polygon()
-    for entity in ezdxf.readfile(path).modelspace().query('LWPOLYLINE[layer=="CUT"]'):
+    for entity in ezdxf.readfile(path).modelspace().query('LWPOLYLINE[layer!="ENGRAVE"]'):
         assert entity.closed
         shape = shape.symmetric_difference(Polygon([(x, y) for x, y, *_ in entity.get_points()]))
     return shape
@@ -91,25 +98,115 @@ def test_corner_radius_rounds_only_where_cracks_start():
     assert abs(Polygon(inner.flattened(2000)).area + inner.area) < 1e-5
 
 
-def svg_paths(text, layer):
-    group = re.search(rf'<g id="{layer}".*?</g>', text, re.DOTALL).group()
-    return [
-        np.array([[float(x), float(y)] for x, y in re.findall(r'[ML]([-\d.]+) ([-\d.]+)', path)])
-        for path in re.findall(r'<path d="([^"]+) Z"/>', group)
-    ]
+def svg_of(path):
+    """Root of an SVG, and its layers: label to the elements in them."""
+    root = ElementTree.parse(path).getroot()
+    groups = [group for group in root.iter(f'{SVG}g') if group.get(f'{INKSCAPE}groupmode') == 'layer']
+    return root, {group.get(f'{INKSCAPE}label'): group for group in groups}
+
+
+def svg_polygons(group):
+    """Each path of a group (N, 2), arcs sampled, with another library than the one that wrote it."""
+    paths = [svgpathtools.parse_path(element.get('d')) for element in group.iter(f'{SVG}path')]
+    assert all(path.isclosed() for path in paths)
+    ends = [np.array([segment.point(t) for segment in path for t in (0.0, 0.5)]) for path in paths]
+    return [np.stack([points.real, points.imag], axis=1) for points in ends]
 
 
 def test_svg_is_the_pattern(tmp_path):
     options = PlateOptions(size=120.0, mount='none', kerf=0.0, corner_radius=0.0)
     path = tmp_path / 'marker.svg'
     write(marker_drawing(BITS[7], '7', options), path)
-    text = path.read_text()
-    assert 'width="120mm" height="120mm" viewBox="0 0 120 120"' in text
+    root, layers = svg_of(path)
+    assert (root.get('width'), root.get('height'), root.get('viewBox')) == ('120mm', '120mm', '0 0 120 120')
     shape = Polygon()
-    for points in svg_paths(text, 'CUT'):
-        assert np.array_equal(points[0], points[-1])
+    for points in svg_polygons(layers['PATTERN']) + svg_polygons(layers['OUTLINE']):
         shape = shape.symmetric_difference(Polygon(points * (1, -1) + (0, 120)))
     assert shape.symmetric_difference(pattern_of(BITS[7], 120.0, (0, 0))).area < TOLERANCE_MM
+
+
+LAYERS = ['ENGRAVE', 'HOLES', 'PATTERN', 'OUTLINE']
+DRAWINGS = {
+    'ears': marker_drawing(BITS[5], '5', PlateOptions(size=120.0, kerf=0.4)),
+    'frame': marker_drawing(BITS[5], '5', PlateOptions(size=120.0, kerf=0.4, mount='frame')),
+    'circles': circle_board(4, 5, 25.0, 20.0, PlateOptions(kerf=0.4)),
+    'sheet': nest(
+        [marker_drawing(BITS[index], str(index), PlateOptions(size=100.0)) for index in range(2)],
+        320.0,
+        200.0,
+        spacing=5.0,
+        margin=10.0,
+    )[0],
+}
+
+
+def code_holes(bits):
+    """White cells that touch are one hole."""
+    return cv2.connectedComponents(bits, connectivity=4)[0] - 1
+
+
+# A frame has four parts of a ring besides.
+HOLES_OF_A_PATTERN = {
+    'ears': code_holes(BITS[5]),
+    'frame': code_holes(BITS[5]) + 4,
+    'circles': 20,
+    'sheet': code_holes(BITS[0]) + code_holes(BITS[1]),
+}
+
+
+@pytest.mark.parametrize('kind', DRAWINGS)
+def test_all_drawings_have_the_same_layers_and_the_outline_is_cut_last(tmp_path, kind):
+    drawing = DRAWINGS[kind]
+    write(drawing, tmp_path / 'it.svg')
+    write(drawing, tmp_path / 'it.dxf')
+    _, layers = svg_of(tmp_path / 'it.svg')
+    assert list(layers) == LAYERS
+    order = [entity.dxf.layer for entity in ezdxf.readfile(tmp_path / 'it.dxf').modelspace()]
+    assert order == sorted(order, key=LAYERS.index)
+    for layer in LAYERS:
+        assert len(list(layers[layer])) == order.count(layer)
+    assert order.count('PATTERN') == HOLES_OF_A_PATTERN[kind]
+    assert order.count('OUTLINE') == drawing.parts
+
+
+@pytest.mark.parametrize('kind', DRAWINGS)
+def test_the_page_is_as_large_as_the_paths(tmp_path, kind):
+    drawing = DRAWINGS[kind]
+    path = tmp_path / 'it.svg'
+    write(drawing, path)
+    root, layers = svg_of(path)
+    _, _, width, height = map(float, root.get('viewBox').split())
+    assert (root.get('width'), root.get('height')) == (f'{width:g}mm', f'{height:g}mm')
+    points = np.concatenate([points for layer in LAYERS for points in svg_polygons(layers[layer])])
+    low, high = points.min(axis=0), points.max(axis=0)
+    if kind == 'sheet':
+        assert (width, height) == (320.0, 200.0)
+        assert low.min() > 9.9
+    else:
+        assert np.allclose(low, 0.0, atol=TOLERANCE_MM)
+        assert np.allclose(high, (width, height), atol=TOLERANCE_MM)
+    assert np.all(high - (width, height) <= TOLERANCE_MM)
+
+
+def test_svg_shows_in_a_browser(tmp_path):
+    # 96 pixels an inch: a line of half a pixel is seen, one of 0.04 as it was is not.
+    write(DRAWINGS['ears'], tmp_path / 'it.svg')
+    _, layers = svg_of(tmp_path / 'it.svg')
+    assert all(float(group.get('stroke-width')) * 96 / 25.4 > 0.5 for group in layers.values())
+    if shutil.which('chromium') is None:
+        pytest.skip('no browser')
+    picture = tmp_path / 'it.png'
+    options = '--headless', '--no-sandbox', '--disable-gpu', '--hide-scrollbars', '--window-size=700,700'
+    subprocess.run(
+        ['chromium', *options, f'--screenshot={picture}', str(tmp_path / 'it.svg')],
+        capture_output=True,
+        check=True,
+        timeout=60,
+    )
+    pixels = cv2.imread(str(picture)).astype(int)
+    spread = pixels.max(axis=2) - pixels.min(axis=2)
+    # A third of a saturated colour at least, on paths of 0.9 m at 3.8 pixels a millimetre.
+    assert np.count_nonzero(spread > 85) > 3000
 
 
 def test_svg_arcs_bend_to_the_right_side(tmp_path):
@@ -127,13 +224,67 @@ def test_svg_arcs_bend_to_the_right_side(tmp_path):
         assert (left @ away > 0) == (sweep == '1')
 
 
+def pdf_pages(path, scale=3.0):
+    """Sizes [mm] of a PDF's pages, and pictures of them of ``scale`` pixels a millimetre."""
+    pages = list(pypdfium2.PdfDocument(path))
+    sizes = [np.array(page.get_size()) * 25.4 / 72.0 for page in pages]
+    return sizes, [page.render(scale=scale * 25.4 / 72.0).to_numpy()[..., :3] for page in pages]
+
+
+def inked(picture):
+    """Pixels (row, column) of any colour, black aside."""
+    spread = picture.max(axis=2).astype(int) - picture.min(axis=2)
+    return np.argwhere(spread > 15)
+
+
 def test_pdf_has_true_size(tmp_path):
     path = tmp_path / 'marker.pdf'
-    write(marker_drawing(BITS[3], '3', PlateOptions(size=200.0, mount='none')), path)
-    page = re.search(rb'/MediaBox \[ *([\d. ]+)\]', path.read_bytes())
-    _, _, width, height = map(float, page.group(1).split())
-    # Points of 1/72 inch; the page is rounded to whole points or finer.
-    assert (width * 25.4 / 72, height * 25.4 / 72) == pytest.approx((200.0, 200.0), abs=0.2)
+    drawing = marker_drawing(BITS[3], '3', PlateOptions(size=200.0, mount='none', kerf=0.5))
+    write(drawing, path)
+    (size,), (picture,) = pdf_pages(path)
+    assert size == pytest.approx((200.5, 200.5), abs=1e-3)
+    # The paths fill the page to the pixel, of a third of a millimetre.
+    lines = inked(picture)
+    assert lines.min() <= 1
+    assert lines.max() >= max(picture.shape[:2]) - 2
+    write(drawing, tmp_path / 'again.pdf')
+    assert path.read_bytes() == (tmp_path / 'again.pdf').read_bytes()
+
+
+@pytest.mark.parametrize(('paper', 'sheet'), [('A4', (210.0, 297.0)), ('letter', (215.9, 279.4))])
+def test_pdf_in_tiles_is_the_drawing_again(tmp_path, paper, sheet):
+    drawing = marker_drawing(BITS[3], '3', PlateOptions(size=300.0))
+    path = tmp_path / 'tiles.pdf'
+    write(drawing, path, paper)
+    write(drawing, tmp_path / 'whole.pdf')
+    sizes, pictures = pdf_pages(path)
+    tiles = tiling(drawing, paper)
+    assert len(sizes) == tiles.columns * tiles.rows == 4
+    assert all(sorted(size) == pytest.approx(sheet, abs=1e-3) for size in sizes)
+    # Glue: each pixel with ink on a tile goes to its place in the drawing, and all of the drawing comes out.
+    low, high = drawing.page
+    _, (whole,) = pdf_pages(tmp_path / 'whole.pdf')
+    glued = np.zeros((2, *whole.shape[:2]), bool)
+    for index, picture in enumerate(pictures):
+        row, column = divmod(index, tiles.columns)
+        below = tiles.corner(column, row) - low
+        rows, columns = inked(picture).T
+        x = below[0] + (columns + 0.5) / 3.0 - 12.0
+        y = high[1] - low[1] - below[1] - tiles.sheet[1] + 12.0 + (rows + 0.5) / 3.0
+        place = np.rint(np.stack([y, x]) * 3.0 - 0.5).astype(int)
+        glued[(0, *np.clip(place, 0, np.array(whole.shape[:2])[:, None] - 1))] = True
+    glued[(1, *inked(whole).T)] = True
+    # To a pixel, a third of a millimetre, in both directions.
+    near = np.ones((3, 3), np.uint8)
+    assert not np.any(glued[1] & (cv2.dilate(glued[0].astype(np.uint8), near) == 0))
+    assert not np.any(glued[0] & (cv2.dilate(glued[1].astype(np.uint8), near) == 0))
+
+
+def test_marks_of_neighbouring_tiles_lie_on_one_another():
+    tiles = tiling(marker_drawing(BITS[3], '3', PlateOptions(size=300.0)), 'A4')
+    right = tiles.corner(0, 0) + tiles.tile - 5.0
+    assert right[0] == pytest.approx(tiles.corner(1, 0)[0] + 5.0)
+    assert tiles.corner(0, 0)[1] + 5.0 == pytest.approx(tiles.corner(0, 1)[1] + tiles.tile[1] - 5.0)
 
 
 def test_preview_is_detected_as_the_marker(tmp_path):
@@ -205,7 +356,7 @@ def test_shapely_agrees_about_round_holes():
 
 def test_open_polyline_is_refused(tmp_path):
     document = ezdxf.new(units=ezdxf.units.MM)
-    document.modelspace().add_lwpolyline([(0, 0), (1, 0), (1, 1)], dxfattribs={'layer': 'CUT'})
+    document.modelspace().add_lwpolyline([(0, 0), (1, 0), (1, 1)], dxfattribs={'layer': 'OUTLINE'})
     document.saveas(tmp_path / 'open.dxf')
     with pytest.raises(InputError, match='open polyline'):
         read_dxf(tmp_path / 'open.dxf')
@@ -217,6 +368,7 @@ def test_open_polyline_is_refused(tmp_path):
         ['make', '--ids', '200'],
         ['make', '--ids', 'x'],
         ['make', '--formats', 'doc'],
+        ['make', '--ids', '1', '--paper', 'B9'],
         ['make', '--size', '-1'],
         ['make', '--dictionary', 'NONE'],
         ['make', '--dictionary', 'DICT_5X5_50', '--size', '20', '--bridge-width', '4'],
@@ -230,6 +382,25 @@ def test_open_polyline_is_refused(tmp_path):
 def test_unusable_input_is_one_line(wrong, tmp_path, capsys):
     assert main(['markers', *wrong, '--out', str(tmp_path)]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize('command', [['make', '--ids', '2'], ['sheet', '--ids', '2'], ['board', 'circles']])
+def test_files_that_exist_are_kept_unless_forced(tmp_path, capsys, command):
+    arguments = ['markers', *command, '--size', '120', '--formats', 'dxf', '--out', str(tmp_path)]
+    assert main(arguments) == 0
+    (made,) = tmp_path.iterdir()
+    made.write_text('mine')
+    assert main(arguments) == 2
+    assert f'{made}: the file exists; --force overwrites it' in capsys.readouterr().err
+    assert made.read_text() == 'mine'
+    assert main([*arguments, '--force']) == 0
+    assert made.read_text() != 'mine'
+
+
+def test_nothing_is_written_where_one_file_exists(tmp_path):
+    (tmp_path / 'marker-3.dxf').write_text('mine')
+    assert main(['markers', 'make', '--ids', '2-3', '--formats', 'dxf', '--out', str(tmp_path)]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ['marker-3.dxf']
 
 
 def test_commands_write_what_they_say(tmp_path, capsys):

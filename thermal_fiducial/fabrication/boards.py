@@ -43,7 +43,8 @@ def circle_board(columns: int, rows: int, spacing: float, diameter: float, optio
         width=float(width),
         height=float(height),
         cuts=_outline(float(width), float(height), options),
-        holes=(*circles, *_corner_holes(float(width), float(height), options)),
+        holes=tuple(_corner_holes(float(width), float(height), options)),
+        dots=tuple(circles),
         engraving=(
             *text(label, 0.5 * width, height - 0.5 * spacing, 0.4 * width, 0.5 * spacing),
             *arrow(0.8 * width, height - 0.5 * spacing, 0.5 * spacing, 0.5 * spacing),

@@ -1,9 +1,11 @@
 """What a laser cutter gets: closed contours of straight lines and arcs, circles, and engraved outlines.
 
-Millimetres, x to the right, y up, the origin at the lower left.
+Millimetres, x to the right, y up, the origin at the lower left of the acrylic. The paths reach half a kerf beyond it.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -81,6 +83,9 @@ class Circle:
         return Circle(self.x + dx, self.y + dy, self.radius)
 
 
+Shape: TypeAlias = Contour | Circle
+
+
 @dataclass(frozen=True)
 class Drawing:
     """One drawing: what to cut, drill and engrave on a sheet of ``width`` times ``height`` [mm]."""
@@ -88,9 +93,13 @@ class Drawing:
     name: str
     width: float
     height: float
+    #: round acrylic (counter-clockwise) and round the holes of a pattern (clockwise)
     cuts: tuple[Contour, ...]
+    #: mounting holes
     holes: tuple[Circle, ...] = ()
     engraving: tuple[Contour, ...] = ()
+    #: round holes of a pattern: the dots of a calibration board
+    dots: tuple[Circle, ...] = ()
     #: number of separate pieces of acrylic that must come out
     parts: int = 1
     #: what to cut and how to mount it, one line a part
@@ -98,13 +107,45 @@ class Drawing:
 
     def moved(self, dx: float, dy: float) -> 'Drawing':
         """The same drawing with everything on it shifted."""
-        return Drawing(
-            self.name,
-            self.width,
-            self.height,
-            tuple(contour.moved(dx, dy) for contour in self.cuts),
-            tuple(circle.moved(dx, dy) for circle in self.holes),
-            tuple(contour.moved(dx, dy) for contour in self.engraving),
-            self.parts,
-            self.notes,
+        return replace(
+            self,
+            cuts=tuple(contour.moved(dx, dy) for contour in self.cuts),
+            holes=tuple(circle.moved(dx, dy) for circle in self.holes),
+            engraving=tuple(contour.moved(dx, dy) for contour in self.engraving),
+            dots=tuple(circle.moved(dx, dy) for circle in self.dots),
         )
+
+    @property
+    def layers(self) -> dict[str, tuple[Shape, ...]]:
+        """What to do, in this order: a piece that has come loose is neither engraved nor cut into.
+
+        ``ENGRAVE``, ``HOLES`` (mounting), ``PATTERN`` (what the camera sees through), ``OUTLINE``.
+        """
+        return {
+            'ENGRAVE': self.engraving,
+            'HOLES': self.holes,
+            'PATTERN': (*(cut for cut in self.cuts if cut.area < 0.0), *self.dots),
+            'OUTLINE': tuple(cut for cut in self.cuts if cut.area >= 0.0),
+        }
+
+    @property
+    def page(self) -> tuple[FloatArray, FloatArray]:
+        """Lower left and upper right corner (2,) [mm] of the sheet, or of the paths where these reach beyond it."""
+        corners = [contour.points for contour in self.cuts]
+        ends = np.concatenate([*corners, np.zeros((1, 2)), np.array([[self.width, self.height]])])
+        return ends.min(axis=0), ends.max(axis=0)
+
+
+def combined(name: str, width: float, height: float, drawings: Sequence[Drawing]) -> Drawing:
+    """All ``drawings``, where they are, as one on a sheet of ``width`` times ``height`` [mm]."""
+    return Drawing(
+        name,
+        width,
+        height,
+        cuts=tuple(contour for drawing in drawings for contour in drawing.cuts),
+        holes=tuple(circle for drawing in drawings for circle in drawing.holes),
+        engraving=tuple(contour for drawing in drawings for contour in drawing.engraving),
+        dots=tuple(circle for drawing in drawings for circle in drawing.dots),
+        parts=sum(drawing.parts for drawing in drawings),
+        notes=tuple(note for drawing in drawings for note in drawing.notes),
+    )

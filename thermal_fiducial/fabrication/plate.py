@@ -34,6 +34,8 @@ class PlateOptions:
     #: side of the black square
     size: float = 300.0
     mount: str = 'ears'
+    #: of the acrylic
+    thickness: float = 3.0
     #: diameter of the mounting holes (4.3: M4)
     hole_diameter: float = 4.3
     #: length of the spacers between warm surface and plate
@@ -56,6 +58,7 @@ class PlateOptions:
             raise InputError(f'mount {self.mount!r} is not one of {", ".join(MOUNTS)}')
         positive = (
             self.size,
+            self.thickness,
             self.hole_diameter,
             self.bridge_width,
             self.quiet_cells,

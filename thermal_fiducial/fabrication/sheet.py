@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.fabrication.drawing import Drawing
+from thermal_fiducial.fabrication.drawing import combined, Drawing
 
 
 @dataclass
@@ -71,18 +71,4 @@ def nest(drawings: Sequence[Drawing], width: float, height: float, *, spacing: f
                 f'{drawing.name} of {drawing.width:g} x {drawing.height:g} mm does not fit on a sheet of '
                 f'{width:g} x {height:g} mm with a margin of {margin:g} mm'
             )
-    return [_combined(f'sheet-{index}', sheet) for index, sheet in enumerate(sheets, 1)]
-
-
-def _combined(name: str, sheet: _Sheet) -> Drawing:
-    placed = sheet.placed
-    return Drawing(
-        name,
-        sheet.width,
-        sheet.height,
-        tuple(contour for drawing in placed for contour in drawing.cuts),
-        tuple(circle for drawing in placed for circle in drawing.holes),
-        tuple(contour for drawing in placed for contour in drawing.engraving),
-        sum(drawing.parts for drawing in placed),
-        tuple(note for drawing in placed for note in drawing.notes),
-    )
+    return [combined(f'sheet-{index}', width, height, sheet.placed) for index, sheet in enumerate(sheets, 1)]

@@ -1,9 +1,11 @@
 """Checks of drawings as they stand in the file: read back, not trusted."""
 
-from itertools import pairwise
+from itertools import combinations
 import os
 
 import numpy as np
+import shapely
+from shapely.geometry import LinearRing, Point, Polygon
 
 from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
@@ -14,7 +16,7 @@ TOLERANCE_MM = 1e-6
 
 
 def read_dxf(path: str | os.PathLike[str]) -> Drawing:
-    """Drawing from the layers CUT, HOLES and ENGRAVE of a DXF file in millimetres.
+    """Drawing from the layers of a DXF file in millimetres.
 
     Raises
     ------
@@ -33,8 +35,8 @@ def read_dxf(path: str | os.PathLike[str]) -> Drawing:
         raise InputError(f'{path}: not a readable DXF file: {error}') from None
     if document.units != units.MM:
         raise InputError(f'{path}: not in millimetres')
-    contours: dict[str, list[Contour]] = {'CUT': [], 'ENGRAVE': []}
-    holes = []
+    contours: dict[str, list[Contour]] = {'ENGRAVE': [], 'PATTERN': [], 'OUTLINE': []}
+    circles: dict[str, list[Circle]] = {'HOLES': [], 'PATTERN': []}
     for entity in document.modelspace():
         layer = entity.dxf.layer
         if isinstance(entity, LWPolyline) and layer in contours:
@@ -42,13 +44,20 @@ def read_dxf(path: str | os.PathLike[str]) -> Drawing:
                 raise InputError(f'{path}: open polyline on layer {layer}')
             rows = np.array(entity.get_points('xyb'), dtype=np.float64)
             contours[layer].append(Contour(rows[:, :2], rows[:, 2]))
-        elif isinstance(entity, DxfCircle) and layer == 'HOLES':
-            holes.append(Circle(entity.dxf.center.x, entity.dxf.center.y, entity.dxf.radius))
+        elif isinstance(entity, DxfCircle) and layer in circles:
+            circles[layer].append(Circle(entity.dxf.center.x, entity.dxf.center.y, entity.dxf.radius))
         else:
             raise InputError(f'{path}: {entity.dxftype()} on layer {layer}')
-    extent = np.concatenate([c.points for c in contours['CUT']] or [np.zeros((1, 2))]).max(axis=0)
+    cuts = (*contours['PATTERN'], *contours['OUTLINE'])
+    extent = np.concatenate([c.points for c in cuts] or [np.zeros((1, 2))]).max(axis=0)
     return Drawing(
-        str(path), float(extent[0]), float(extent[1]), tuple(contours['CUT']), tuple(holes), tuple(contours['ENGRAVE'])
+        str(path),
+        float(extent[0]),
+        float(extent[1]),
+        cuts,
+        tuple(circles['HOLES']),
+        tuple(contours['ENGRAVE']),
+        tuple(circles['PATTERN']),
     )
 
 
@@ -56,85 +65,50 @@ def problems(drawing: Drawing, parts: int) -> list[str]:
     """What is wrong with a drawing from which ``parts`` pieces of acrylic shall come out; empty when nothing is."""
     found = []
     polygons = [contour.flattened() for contour in drawing.cuts]
-    crossings = _crossings(polygons)
+    rings = [LinearRing(polygon) for polygon in polygons]
+    crossings = sum(not ring.is_simple for ring in rings) + sum(a.intersects(b) for a, b in combinations(rings, 2))
     if crossings:
         found.append(f'{crossings} crossings of cut lines')
-    outer = [p for p, contour in zip(polygons, drawing.cuts, strict=True) if contour.area > 0]
+    outer = [Polygon(ring) for ring, contour in zip(rings, drawing.cuts, strict=True) if contour.area > 0]
     if len(outer) != parts:
         found.append(f'{len(outer)} pieces, not {parts}')
     for contour, polygon in zip(drawing.cuts, polygons, strict=True):
-        owners = sum(bool(inside(other, polygon[:1])[0]) for other in outer if other is not polygon)
+        owners = sum(other.contains(Point(polygon[0])) for other in outer)
         if owners != int(contour.area < 0):
             found.append(f'a contour at {np.round(polygon[0], 2).tolist()} mm is nested the wrong way')
-    for circle in drawing.holes:
-        rim = np.array([[circle.x + circle.radius * x, circle.y + circle.radius * y] for x, y in _OCTAGON])
-        if not np.all(acrylic_at(drawing, rim)):
+    sheet = sheet_of(drawing)
+    for circle in (*drawing.holes, *drawing.dots):
+        if not sheet.contains(Point(circle.x, circle.y).buffer(circle.radius)):
             found.append(f'the hole at ({circle.x:.2f}, {circle.y:.2f}) mm leaves the acrylic')
     return found
 
 
-_OCTAGON = [(np.cos(angle), np.sin(angle)) for angle in np.arange(8) * np.pi / 4]
-
-
 def agree(drawing: Drawing, other: Drawing) -> bool:
-    """Whether two drawings are the same to :data:`TOLERANCE_MM`."""
-    pairs = [*zip(drawing.cuts, other.cuts, strict=False), *zip(drawing.engraving, other.engraving, strict=False)]
-    return (
-        len(drawing.cuts) == len(other.cuts)
-        and len(drawing.engraving) == len(other.engraving)
-        and len(drawing.holes) == len(other.holes)
-        and all(_same(a.points, b.points) and _same(a.bulges, b.bulges) for a, b in pairs)
-        and all(
-            _same(np.array([a.x, a.y, a.radius]), np.array([b.x, b.y, b.radius]))
-            for a, b in zip(drawing.holes, other.holes, strict=True)
-        )
+    """Whether two drawings are the same to :data:`TOLERANCE_MM`, layer by layer."""
+    return all(
+        len(shapes) == len(theirs) and all(_same(a, b) for a, b in zip(shapes, theirs, strict=True))
+        for shapes, theirs in zip(drawing.layers.values(), other.layers.values(), strict=True)
     )
 
 
-def _same(a: FloatArray, b: FloatArray) -> bool:
-    return a.shape == b.shape and bool(np.all(np.abs(a - b) <= TOLERANCE_MM))
+def _same(a: Contour | Circle, b: Contour | Circle) -> bool:
+    mine, its = _numbers(a), _numbers(b)
+    return type(a) is type(b) and mine.shape == its.shape and bool(np.all(np.abs(mine - its) <= TOLERANCE_MM))
+
+
+def _numbers(shape: Contour | Circle) -> FloatArray:
+    if isinstance(shape, Circle):
+        return np.array([shape.x, shape.y, shape.radius])
+    return np.column_stack([shape.points, shape.bulges])
 
 
 def acrylic_at(drawing: Drawing, points: FloatArray) -> BoolArray:
-    """Whether points (N, 2) [mm] lie on acrylic (even-odd rule over all contours; drilled holes left out)."""
-    crossed = np.zeros(len(points), dtype=np.int64)
-    for contour in drawing.cuts:
-        crossed += inside(contour.flattened(), points)
-    return np.asarray(crossed % 2 == 1)
+    """Whether points (N, 2) [mm] lie on acrylic; round holes are left out."""
+    return np.asarray(shapely.contains(sheet_of(drawing), shapely.points(points)), dtype=np.bool_)
 
 
-def inside(polygon: FloatArray, points: FloatArray) -> BoolArray:
-    """Whether points (N, 2) lie in a polygon (M, 2): parity of the crossings of a ray to the right."""
-    ends = np.roll(polygon, -1, axis=0)
-    x, y = points[:, :1], points[:, 1:]
-    straddles = (polygon[:, 1] > y) != (ends[:, 1] > y)
-    height = np.where(ends[:, 1] == polygon[:, 1], 1.0, ends[:, 1] - polygon[:, 1])
-    reach = polygon[:, 0] + (y - polygon[:, 1]) / height * (ends[:, 0] - polygon[:, 0])
-    return np.asarray(np.sum(straddles & (x < reach), axis=1) % 2 == 1)
-
-
-def _crossings(polygons: list[FloatArray]) -> int:
-    """Pairs of segments of the polygons that cross or touch, neighbours along a polygon left out."""
-    starts = np.concatenate(polygons)
-    ends = np.concatenate([np.roll(p, -1, axis=0) for p in polygons])
-    index = np.arange(len(starts))
-    following = np.concatenate(
-        [np.roll(index[a:b], -1) for a, b in pairwise(np.cumsum([0, *(len(p) for p in polygons)]))]
-    )
-    count = 0
-    for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        later = slice(i + 1, None)
-        a, b = starts[later], ends[later]
-        near = np.all(
-            (np.minimum(a, b) <= np.maximum(start, end)) & (np.maximum(a, b) >= np.minimum(start, end)), axis=1
-        )
-        near &= (index[later] != following[i]) & (following[later] != i)
-        sides = _side(start, end, a) * _side(start, end, b) <= 0.0
-        count += int(np.sum(near & sides & (_side(a, b, start) * _side(a, b, end) <= 0.0)))
-    return count
-
-
-def _side(start: FloatArray, end: FloatArray, point: FloatArray) -> FloatArray:
-    """Twice the signed area of the triangle start, end, point."""
-    along, to = end - start, point - start
-    return np.asarray(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
+def sheet_of(drawing: Drawing) -> Polygon:
+    """What lies between the contours, round holes not taken out; arcs are chords."""
+    outlines = [Polygon(cut.flattened()) for cut in drawing.cuts if cut.area > 0]
+    openings = [Polygon(cut.flattened()) for cut in drawing.cuts if cut.area < 0]
+    return shapely.difference(shapely.union_all(outlines), shapely.union_all(openings))

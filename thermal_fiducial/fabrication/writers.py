@@ -1,10 +1,9 @@
 """Drawings as files: SVG and DXF for the cutter, PDF for checking on paper at true size, PNG to look at.
 
-ezdxf and matplotlib (extra ``tools``) are imported when they are needed.
+svgwrite, ezdxf, reportlab and matplotlib (extra ``tools``) are imported when they are needed.
 """
 
 from collections.abc import Iterable
-from html import escape
 import os
 from pathlib import Path
 from typing import Any
@@ -12,52 +11,69 @@ from typing import Any
 import numpy as np
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.fabrication.drawing import Contour, Drawing
+from thermal_fiducial.fabrication.drawing import Circle, Contour, Drawing
+from thermal_fiducial.fabrication.paper import write_pdf
 
 #: Layer to its colour: AutoCAD index and SVG.
-LAYERS = {'CUT': (1, '#ff0000'), 'HOLES': (3, '#00a000'), 'ENGRAVE': (5, '#0000ff')}
+LAYERS = {
+    'ENGRAVE': (5, '#0000ff'),
+    'HOLES': (3, '#00a000'),
+    'PATTERN': (6, '#d000d0'),
+    'OUTLINE': (1, '#ff0000'),
+}
 
 FORMATS = ('svg', 'dxf', 'pdf', 'png')
 
 _MM_PER_INCH = 25.4
 _ACRYLIC, _WARM = '#26465a', '#ffb347'
+# Width of the lines [mm]: wide enough for a screen, where a millimetre is four pixels or so.
+_LINE_MM = 0.2
 
 
-def write(drawing: Drawing, path: str | os.PathLike[str]) -> None:
-    """Write ``drawing`` in the format that the name of ``path`` ends in.
+def write(drawing: Drawing, path: str | os.PathLike[str], paper: str | None = None) -> None:
+    """Write ``drawing`` in the format that the name of ``path`` ends in; a PDF on sheets of ``paper``, where given.
 
     Raises
     ------
     InputError
         Another ending than those of :data:`FORMATS`, or a folder that can't be written to.
     """
-    writers = {'svg': write_svg, 'dxf': write_dxf, 'pdf': write_pdf, 'png': write_png}
     path = Path(path)
     kind = path.suffix.lower().lstrip('.')
-    if kind not in writers:
+    if kind not in FORMATS:
         raise InputError(f'{path}: drawings are written as {", ".join(FORMATS)}')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        writers[kind](drawing, path)
+        if kind == 'pdf':
+            write_pdf(drawing, path, {layer: colour for layer, (_, colour) in LAYERS.items()}, paper)
+        else:
+            {'svg': write_svg, 'dxf': write_dxf, 'png': write_png}[kind](drawing, path)
     except OSError as error:
         raise InputError(f'{path}: {error.strerror or error}') from None
 
 
 def write_svg(drawing: Drawing, path: Path) -> None:
-    """SVG in millimetres, a group a layer, hair lines."""
-    height = drawing.height
-    groups = {
-        'CUT': [_svg_path(contour, height) for contour in drawing.cuts],
-        'HOLES': [f'<circle cx="{_n(c.x)}" cy="{_n(height - c.y)}" r="{_n(c.radius)}"/>' for c in drawing.holes],
-        'ENGRAVE': [_svg_path(contour, height) for contour in drawing.engraving],
-    }
-    size = f'width="{_n(drawing.width)}mm" height="{_n(height)}mm" viewBox="0 0 {_n(drawing.width)} {_n(height)}"'
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<svg xmlns="http://www.w3.org/2000/svg" {size}>']
-    lines += [f'<title>{escape(drawing.name)}</title>', f'<desc>{escape("; ".join(drawing.notes))}</desc>']
-    for layer, elements in groups.items():
-        lines.append(f'<g id="{layer}" fill="none" stroke="{LAYERS[layer][1]}" stroke-width="0.01">')
-        lines += [*elements, '</g>']
-    path.write_text('\n'.join([*lines, '</svg>', '']), encoding='utf-8')
+    """SVG in millimetres, each layer one of Inkscape's, on a page as large as the paths."""
+    import svgwrite
+    from svgwrite.extensions import Inkscape
+
+    low, high = drawing.page
+    width, height = map(_n, high - low)
+    file = svgwrite.Drawing(size=(f'{width}mm', f'{height}mm'), viewBox=f'0 0 {width} {height}', debug=False)
+    file.set_desc(title=drawing.name, desc='; '.join(drawing.notes))
+    inkscape = Inkscape(file)
+    for layer, shapes in drawing.layers.items():
+        style = {'fill': 'none', 'stroke': LAYERS[layer][1], 'stroke_width': _n(_LINE_MM)}
+        group = inkscape.layer(label=layer, locked=False, id=layer, **style)
+        for shape in shapes:
+            moved = shape.moved(-low[0], -low[1])
+            if isinstance(moved, Circle):
+                centre = _n(moved.x), _n(high[1] - low[1] - moved.y)
+                group.add(file.circle(center=centre, r=_n(moved.radius)))
+            else:
+                group.add(file.path(d=_svg_path(moved, high[1] - low[1])))
+        file.add(group)
+    file.saveas(path, pretty=True)
 
 
 def _n(value: float) -> str:
@@ -76,72 +92,52 @@ def _svg_path(contour: Contour, height: float) -> str:
         else:
             radius = _n(float(np.linalg.norm(end - start)) * (1.0 + bulge**2) / (4.0 * abs(bulge)))
             steps.append(f'A{radius} {radius} 0 0 {int(bulge < 0.0)} {target}')
-    return f'<path d="{" ".join(steps)} Z"/>'
+    return f'{" ".join(steps)} Z'
 
 
 def write_dxf(drawing: Drawing, path: Path) -> None:
-    """DXF R2010 in millimetres: closed polylines and circles on the layers CUT, HOLES and ENGRAVE."""
+    """DXF R2010 in millimetres: closed polylines and circles, layer after layer."""
     from ezdxf import units
     from ezdxf.filemanagement import new
 
     document = new('R2010', units=units.MM)
-    for name, (color, _) in LAYERS.items():
-        document.layers.add(name, color=color)
     space = document.modelspace()
-    for layer, contours in (('CUT', drawing.cuts), ('ENGRAVE', drawing.engraving)):
-        for contour in contours:
-            rows = np.column_stack([contour.points, contour.bulges]).tolist()
-            space.add_lwpolyline(rows, format='xyb', close=True, dxfattribs={'layer': layer})
-    for circle in drawing.holes:
-        space.add_circle((circle.x, circle.y), circle.radius, dxfattribs={'layer': 'HOLES'})
+    for layer, shapes in drawing.layers.items():
+        document.layers.add(layer, color=LAYERS[layer][0])
+        for shape in shapes:
+            if isinstance(shape, Circle):
+                space.add_circle((shape.x, shape.y), shape.radius, dxfattribs={'layer': layer})
+            else:
+                rows = np.column_stack([shape.points, shape.bulges]).tolist()
+                space.add_lwpolyline(rows, format='xyb', close=True, dxfattribs={'layer': layer})
     document.saveas(path)
-
-
-def write_pdf(drawing: Drawing, path: Path) -> None:
-    """PDF whose page is the drawing: printed at 100 % a millimetre is a millimetre."""
-    figure, axes = _page(drawing)
-    _stroke(axes, drawing.cuts, LAYERS['CUT'][1])
-    _stroke(axes, drawing.engraving, LAYERS['ENGRAVE'][1])
-    _stroke(axes, _hole_contours(drawing), LAYERS['HOLES'][1])
-    figure.savefig(path, metadata={'Title': drawing.name, 'CreationDate': None})
 
 
 def write_png(drawing: Drawing, path: Path, width_px: int = 800) -> None:
     """Preview: dark acrylic in front of a warm background, as the camera sees it."""
-    from matplotlib.patches import PathPatch
-
-    figure, axes = _page(drawing)
-    axes.set_facecolor(_WARM)
-    axes.add_patch(PathPatch(_path([*drawing.cuts, *_hole_contours(drawing)]), facecolor=_ACRYLIC, linewidth=0.0))
-    if drawing.engraving:
-        axes.add_patch(PathPatch(_path(drawing.engraving), facecolor='white', linewidth=0.0))
-    figure.savefig(path, dpi=width_px * _MM_PER_INCH / drawing.width)
-
-
-def _page(drawing: Drawing) -> tuple[Any, Any]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.patches import PathPatch
 
-    figure = Figure(figsize=(drawing.width / _MM_PER_INCH, drawing.height / _MM_PER_INCH))
+    low, high = drawing.page
+    width, height = ((high - low) / _MM_PER_INCH).tolist()
+    figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(0.0, drawing.width), ylim=(0.0, drawing.height), xticks=[], yticks=[])
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(low[0], high[0]), ylim=(low[1], high[1]), facecolor=_WARM)
+    axes.set(xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_visible(False)
-    return figure, axes
+    openings = [*drawing.cuts, *map(_half_arcs, (*drawing.holes, *drawing.dots))]
+    axes.add_patch(PathPatch(_path(openings), facecolor=_ACRYLIC, linewidth=0.0))
+    if drawing.engraving:
+        axes.add_patch(PathPatch(_path(drawing.engraving), facecolor='white', linewidth=0.0))
+    figure.savefig(path, dpi=width_px / width)
 
 
-def _stroke(axes: Any, contours: Iterable[Contour], color: str) -> None:
-    for contour in contours:
-        points = contour.flattened()
-        axes.plot(*np.concatenate([points, points[:1]]).T, color=color, linewidth=0.3)
-
-
-def _hole_contours(drawing: Drawing) -> list[Contour]:
-    """Circles as pairs of half arcs, clockwise."""
-    return [
-        Contour(np.array([[c.x - c.radius, c.y], [c.x + c.radius, c.y]]), np.array([-1.0, -1.0])) for c in drawing.holes
-    ]
+def _half_arcs(circle: Circle) -> Contour:
+    """A circle as a pair of half arcs, clockwise."""
+    ends = np.array([[circle.x - circle.radius, circle.y], [circle.x + circle.radius, circle.y]])
+    return Contour(ends, np.array([-1.0, -1.0]))
 
 
 def _path(contours: Iterable[Contour]) -> Any:

@@ -1,0 +1,181 @@
+"""``markers make``, ``sheet`` and ``board``: files for the cutter and for the printer."""
+
+import argparse
+from collections.abc import Iterable, Sequence
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from thermal_fiducial.cli.marker_choice import add_choice, chosen
+from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.fabrication.boards import base_plate, circle_board, marker_grid
+from thermal_fiducial.fabrication.drawing import Drawing
+from thermal_fiducial.fabrication.paper import PAPERS
+from thermal_fiducial.fabrication.plate import marker_drawing, MOUNTS, PlateOptions
+from thermal_fiducial.fabrication.sheet import nest
+from thermal_fiducial.fabrication.verification import agree, problems, read_dxf
+from thermal_fiducial.fabrication.writers import FORMATS, write
+from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.marker_map import save_map
+
+_OPTION_HELP = {
+    'size': 'side of the black square',
+    'thickness': 'of the acrylic',
+    'hole_diameter': 'mounting holes (4.3: M4)',
+    'stand_off': 'spacers between warm surface and plate',
+    'kerf': 'width of the cut',
+    'corner_radius': 'radius of re-entrant corners',
+    'bridge_width': 'webs that hold islands of standard dictionaries',
+    'frame_width': 'width of the frame (--mount frame)',
+    'tie_width': 'necks of the ears, or ties to the frame',
+}
+
+
+def add_make(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``markers make``."""
+    parser.set_defaults(do=_make)
+    add_choice(parser)
+    add_plate_options(parser)
+    _add_output(parser)
+
+
+def _make(args: argparse.Namespace) -> int:
+    _write_all(list(_markers(args)), args)
+    return 0
+
+
+def add_sheet(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``markers sheet``."""
+    parser.set_defaults(do=_sheet)
+    add_choice(parser)
+    add_plate_options(parser)
+    parser.add_argument('--sheet', type=float, nargs=2, default=(1000.0, 600.0), metavar=('WIDTH', 'HEIGHT'), help='mm')
+    parser.add_argument('--spacing', type=float, default=5.0, metavar='MM', help='between markers')
+    parser.add_argument('--margin', type=float, default=10.0, metavar='MM', help='along the border of the sheet')
+    _add_output(parser)
+
+
+def _sheet(args: argparse.Namespace) -> int:
+    width, height = args.sheet
+    _write_all(nest(list(_markers(args)), width, height, spacing=args.spacing, margin=args.margin), args)
+    return 0
+
+
+def add_board(parser: argparse.ArgumentParser) -> None:
+    """Arguments of ``markers board``."""
+    parser.set_defaults(do=_board)
+    parser.add_argument('kind', choices=('circles', 'markers'), help='one stencil of holes, or markers on a base plate')
+    parser.add_argument(
+        '--grid', type=int, nargs=2, metavar=('COLUMNS', 'ROWS'), help='default: 4 11 circles, 4 3 markers'
+    )
+    parser.add_argument(
+        '--spacing', type=float, metavar='MM', help='default: 25 between rows of circles, 40 between markers'
+    )
+    parser.add_argument('--diameter', type=float, default=20.0, metavar='MM', help='of the circles')
+    parser.add_argument('--dictionary', default='STENCIL_4X4_100', help='of the markers')
+    add_plate_options(parser, size=80.0)
+    _add_output(parser)
+
+
+def _board(args: argparse.Namespace) -> int:
+    options = plate_options(args)
+    columns, rows = args.grid or ((4, 11) if args.kind == 'circles' else (4, 3))
+    if args.kind == 'circles':
+        _write_all([circle_board(columns, rows, args.spacing or 25.0, args.diameter, options)], args)
+        return 0
+    bits = marker_bits(load_dictionary(args.dictionary))
+    if columns < 1 or rows < 1 or columns * rows > len(bits):
+        raise InputError(f'a board of {columns} x {rows} markers: {args.dictionary} has {len(bits)}')
+    labels = [str(index) for index in range(columns * rows)]
+    centres = marker_grid(columns, rows, options.size, args.spacing or 40.0)
+    base = base_plate(centres, labels, bits.shape[1] + 2, options)
+    board = args.out / 'board.yaml'
+    _write_all([*(marker_drawing(bits[int(label)], label, options) for label in labels), base], args, [board])
+    save_map(board, _board_map(centres, options, args.dictionary))
+    return 0
+
+
+def _board_map(centres: FloatArray, options: PlateOptions, dictionary: str) -> MarkerMap:
+    """Map of a board's markers, the origin in its middle; what ``calibrate intrinsics --board`` takes."""
+    metres = 1e-3 * np.column_stack([centres, np.zeros(len(centres))])
+    markers = {
+        index: MapMarker(index, 1e-3 * options.size, True, se3.transform(np.eye(3), centre))
+        for index, centre in enumerate(metres)
+    }
+    return MarkerMap(markers, dictionary=dictionary)
+
+
+def add_plate_options(parser: argparse.ArgumentParser, size: float = PlateOptions.size) -> None:
+    """Arguments that say how a plate is cut; ``size`` is the default side of the black square [mm]."""
+    group = parser.add_argument_group('plate', 'all lengths in millimetres')
+    group.add_argument('--mount', choices=MOUNTS, default='ears', help='what holds the pattern')
+    for name, description in _OPTION_HELP.items():
+        default = size if name == 'size' else getattr(PlateOptions, name)
+        group.add_argument('--' + name.replace('_', '-'), type=float, default=default, metavar='MM', help=description)
+    group.add_argument('--quiet-cells', type=float, default=1.0, metavar='CELLS', help='warm ring around the pattern')
+
+
+def plate_options(args: argparse.Namespace) -> PlateOptions:
+    """What :func:`add_plate_options` has read."""
+    return PlateOptions(**{item.name: getattr(args, item.name) for item in fields(PlateOptions)})
+
+
+def _add_output(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument('--out', type=Path, default=Path('markers'), metavar='FOLDER', help='where the files go')
+    parser.add_argument('--formats', default='svg,dxf,pdf,png', help='of these, separated by commas')
+    parser.add_argument(
+        '--paper', metavar='PAPER', help=f'PDF in tiles for a printer: {", ".join(PAPERS)} (default: one page)'
+    )
+    add_force(parser)
+
+
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """Argument that allows to overwrite files."""
+    parser.add_argument('--force', action='store_true', help='overwrite files that exist')
+
+
+def refuse_to_overwrite(paths: Iterable[Path], force: bool) -> None:
+    """Stop before anything is written.
+
+    Raises
+    ------
+    InputError
+        One of ``paths`` exists, and nobody has said ``force``.
+    """
+    existing = [] if force else [path for path in paths if path.exists()]
+    if existing:
+        others = f' and {len(existing) - 1} more' if len(existing) > 1 else ''
+        raise InputError(f'{existing[0]}{others}: the file exists; --force overwrites it')
+
+
+def _markers(args: argparse.Namespace) -> Iterable[Drawing]:
+    bits, ids = chosen(args)
+    options = plate_options(args)
+    for marker_id in ids:
+        yield marker_drawing(bits[marker_id], str(marker_id), options)
+
+
+def _write_all(drawings: Sequence[Drawing], args: argparse.Namespace, others: Sequence[Path] = ()) -> None:
+    """Write drawings in all formats, read each DXF back and compare; ``others`` will be written besides."""
+    formats = args.formats.split(',')
+    unknown = set(formats) - set(FORMATS)
+    if unknown:
+        raise InputError(f'--formats: {", ".join(sorted(unknown))} is not among {", ".join(FORMATS)}')
+    stems = [f'marker-{drawing.name}' if drawing.name.isdigit() else drawing.name for drawing in drawings]
+    refuse_to_overwrite([*(args.out / f'{stem}.{kind}' for stem in stems for kind in formats), *others], args.force)
+    for stem, drawing in zip(stems, drawings, strict=True):
+        wrong = problems(drawing, drawing.parts)
+        if wrong:
+            raise InputError(f'{drawing.name}: {"; ".join(wrong)}')
+        for kind in formats:
+            path = args.out / f'{stem}.{kind}'
+            write(drawing, path, args.paper)
+            if kind == 'dxf' and not agree(read_dxf(path), drawing):
+                raise InputError(f'{path}: what was read back is not what was written')
+        notes = '\n  '.join(('', *drawing.notes))
+        print(f'{args.out / stem}: {drawing.width:.1f} x {drawing.height:.1f} mm, {drawing.parts} parts{notes}')
