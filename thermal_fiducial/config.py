@@ -200,6 +200,27 @@ def _camera_orientation() -> Any:
     )
 
 
+def _base_frame() -> Any:
+    return param('base_link', 'Frame of the robot: that of the IMU, unless TF or a URDF say otherwise.')
+
+
+def _camera_frame() -> Any:
+    return param('thermal_camera_optical', 'Optical frame of the camera in TF and URDF.')
+
+
+def _extrinsics() -> Any:
+    return param(
+        'auto',
+        'auto: camera_position and camera_orientation from /tf_static (needs tf2_msgs) or robot_description, where '
+        'they connect camera_frame with the robot; parameters: always as set.',
+        choices=('auto', 'parameters'),
+    )
+
+
+def _prefix_frames() -> Any:
+    return param(False, "Put the node's namespace before the frames of the robot, not before that of the map.")
+
+
 def _camera_time_offset() -> Any:
     return param(0.0, 'Clock offset of the camera, t_imu = t_camera + offset.', unit='s', minimum=-1.0, maximum=1.0)
 
@@ -290,6 +311,7 @@ class Tau2CameraConfig(SelfChecked):
         live=True,
     )
     frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
+    prefix_frames: bool = _prefix_frames()
     image_rate: float = _image_rate()
 
 
@@ -302,6 +324,10 @@ class ArucoDetectorConfig(SelfChecked):
     marker_size_overrides: tuple[str, ...] = _marker_size_overrides()
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
+    extrinsics: str = _extrinsics()
+    base_frame: str = _base_frame()
+    camera_frame: str = _camera_frame()
+    prefix_frames: bool = _prefix_frames()
     camera_time_offset: float = _camera_time_offset()
     bolometer_lag: float = param(
         0.010,
@@ -420,6 +446,10 @@ class MarkerMapperConfig(SelfChecked):
     )
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
+    extrinsics: str = _extrinsics()
+    base_frame: str = _base_frame()
+    camera_frame: str = _camera_frame()
+    prefix_frames: bool = _prefix_frames()
     camera_time_offset: float = _camera_time_offset()
     time_offset_std: float = _time_offset_std()
     marker_size_std: float = param(
@@ -503,6 +533,10 @@ class PoseEkfConfig(SelfChecked):
 
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
+    extrinsics: str = _extrinsics()
+    base_frame: str = _base_frame()
+    camera_frame: str = _camera_frame()
+    prefix_frames: bool = _prefix_frames()
     camera_time_offset: float = _camera_time_offset()
     estimate_time_offset: bool = param(True, 'Estimate what is left of the time offset while running.')
     time_offset_std: float = _time_offset_std()
@@ -587,8 +621,6 @@ class PoseEkfConfig(SelfChecked):
         maximum=10000.0,
     )
     map_frame: str = param('map', 'Frame of the pose.')
-    base_frame: str = param('base_link', 'Frame of the robot: that of the IMU.')
-    camera_frame: str = param('thermal_camera_optical', 'Frame of the camera, for publish_tf.')
     odom_frame: str = param(
         '',
         'With publish_tf and smoothing_time, as REP-105: the smooth output from here to base_frame, the rest from '
@@ -634,6 +666,7 @@ class ThermalSourceConfig(SelfChecked):
     repeat: bool = param(True, 'Show a folder or video again when it ends.')
     calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
     frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
+    prefix_frames: bool = _prefix_frames()
 
 
 @dataclass(frozen=True)
@@ -650,8 +683,11 @@ class LandingTargetConfig(SelfChecked):
     )
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
+    extrinsics: str = _extrinsics()
+    base_frame: str = _base_frame()
+    camera_frame: str = _camera_frame()
+    prefix_frames: bool = _prefix_frames()
     map_frame: str = param('map', 'Frame of the map.')
-    base_frame: str = param('base_link', 'Frame of the robot: that of the IMU.')
 
 
 #: Node to its parameters: the pipeline.

@@ -26,7 +26,7 @@ PARAMETER_FILE = '/share/thermal_fiducial/config/thermal_fiducial.yaml'
 ARGUMENTS = {
     'params_file': '', 'map_file': '', 'camera': '', 'landing_pad': '', 'image_topic': 'thermal/image_raw',
     'camera_info_topic': 'thermal/camera_info', 'imu_topic': 'imu/data', 'namespace': '', 'use_sim_time': 'false',
-    'log_level': 'info', 'rviz': 'false',
+    'log_level': 'info', 'rviz': 'false', 'prefix_frames': 'false',
 }  # fmt: skip
 
 
@@ -124,6 +124,7 @@ def test_arguments_reach_the_nodes(launched, tmp_path):
         params_file=str(rig),
         map_file='hall.yaml',
         namespace='drone',
+        prefix_frames='true',
         use_sim_time='True',
         image_topic='tau2/image_raw',
         imu_topic='/mavros/imu/data',
@@ -134,7 +135,12 @@ def test_arguments_reach_the_nodes(launched, tmp_path):
     assert {node.namespace for node in nodes} == {'drone'}
     for node in nodes[:4]:
         assert node.parameters[0] == str(rig)
-        assert node.parameters[1] == {'mode': 'localization', 'use_sim_time': True, 'map_file': 'hall.yaml'}
+        assert node.parameters[1] == {
+            'mode': 'localization',
+            'use_sim_time': True,
+            'map_file': 'hall.yaml',
+            'prefix_frames': True,
+        }
         assert node.remappings == [('thermal/image_raw', 'tau2/image_raw'), ('imu/data', '/mavros/imu/data')]
         assert node.ros_arguments == ['--log-level', 'warn']
     view = Path(nodes[4].arguments[1])

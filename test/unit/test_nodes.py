@@ -585,7 +585,7 @@ def test_names_are_relative(graph):
         topics = {output.topic for output in node.outputs} | {source.topic for source in node.inputs}
     assert topics == {
         '/diagnostics', '/drone/vision/pose', '/drone/odometry', '/drone/path', '/drone/imu/data', '/drone/camera_pose',
-        '/drone/camera_clock', '/drone/map_correction',
+        '/drone/camera_clock', '/drone/map_correction', '/drone/robot_description',
     }  # fmt: skip
 
 

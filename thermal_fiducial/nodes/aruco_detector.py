@@ -49,7 +49,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         """Take over live parameters."""
         super().configure(config)
         if self.detector is not None:
-            self.detector.config = config
+            self.detector.configure(config)
 
     def _on_image(self, message: Image) -> None:
         if self.detector is None:

@@ -15,10 +15,10 @@ from thermal_fiducial.core.measurements import Markers
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros import clouds, convert, qos
 from thermal_fiducial.ros.node import OK, StageNode, WARN
+from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.run import run
 
-#: Frames that may wait for their pose.
-_WAITING = 10
+_WAITING = 10  # frames that may wait for their pose
 
 
 class LandingTarget(StageNode[LandingTargetConfig]):
@@ -26,10 +26,8 @@ class LandingTarget(StageNode[LandingTargetConfig]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('landing_target', LandingTargetConfig, **kwargs)
-        config = self.config
-        if not config.landing_pad:
+        if not self.config.landing_pad:
             self.fault('parameter landing_pad: name the markers of the pad')
-        self._T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
         self._T_map_pad: FloatArray | None = None
         #: stamps of frames that show the pad, whose pose is still to come
         self._frames: OrderedDict[int, None] = OrderedDict()
@@ -38,10 +36,15 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
         self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
+        RobotFrames(self, lambda: None)
+
+    @property
+    def _T_body_camera(self) -> FloatArray:
+        return transform_from_quaternion(self.config.camera_position, self.config.camera_orientation)
 
     def _on_map(self, message: PointCloud2) -> None:
-        poses = {marker_id: T_map_marker for marker_id, (T_map_marker, _) in clouds.map_poses(message).items()}
-        self._T_map_pad = pad_in_map(poses, self.config.landing_pad)
+        poses = clouds.map_poses(message)
+        self._T_map_pad = pad_in_map({key: pose for key, (pose, _) in poses.items()}, self.config.landing_pad)
 
     def _on_markers(self, message: PointCloud2) -> None:
         stamp, rows = convert.stamp_ns(message.header.stamp), usable(clouds.markers(message))

@@ -38,7 +38,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     def configure(self, config: MarkerMapperConfig) -> None:
         """Take over live parameters."""
         super().configure(config)
-        self.mapper.config = config
+        self.mapper.configure(config)
 
     def _on_markers(self, message: PointCloud2) -> None:
         stamp = convert.stamp_ns(message.header.stamp)

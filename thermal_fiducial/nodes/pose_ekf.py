@@ -14,6 +14,7 @@ from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.filter_outputs import FilterOutputs
 from thermal_fiducial.ros.filter_status import FilterStatus
 from thermal_fiducial.ros.node import StageNode
+from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.run import run
 
 
@@ -27,10 +28,11 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._status = FilterStatus(self.filter, self.console)
         self._corrections = MapCorrections(self.config.max_delay)
         self._camera_clock = self.advertise(TimeReference, 'camera_clock', qos.RESULT)
-        self._outputs = FilterOutputs(self, self.config, self.fault)
         self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
         self.subscribe(TransformStamped, 'map_correction', self._on_map_correction, qos.RESULT)
+        self._frames = RobotFrames(self, self._mount)
+        self._outputs = FilterOutputs(self, self.config, self.fault, self._frames)
         self.serve(Trigger, '~/reset', self._on_reset)
 
     def configure(self, config: PoseEkfConfig) -> None:
@@ -38,7 +40,13 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         super().configure(config)
         self.filter.configure(config)
 
+    def _mount(self) -> None:
+        """Begin anew with the camera where TF has it."""
+        self.filter.configure(self.config)
+        self.filter.reset('the camera is elsewhere on the robot')
+
     def _on_imu(self, message: Imu) -> None:
+        self._frames.note_imu_frame(message.header.frame_id)
         odometry = self.filter.add_imu(convert.imu_sample(message))
         self._status.after_imu()
         if odometry is not None:

@@ -14,6 +14,7 @@ from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros import convert, odometry_bytes, qos
 from thermal_fiducial.ros.node import StageNode
+from thermal_fiducial.ros.robot_frames import RobotFrames
 
 Config = TypeVar('Config', bound=ArucoDetectorConfig | MarkerMapperConfig)
 
@@ -32,6 +33,7 @@ class CameraStageNode(StageNode[Config]):
         """Subscribe to calibration and odometry; after the node's main input."""
         self.subscribe(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
         self.subscribe(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT, raw=True)
+        RobotFrames(self, lambda: self.configure(self.config))
         self.subscribe(TimeReference, 'camera_clock', self._on_camera_clock, qos.RESULT)
 
     def camera(self) -> Camera:

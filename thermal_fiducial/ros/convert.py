@@ -204,9 +204,19 @@ def correction_of(message: TransformStamped) -> tuple[int, FloatArray]:
     InputError
         A value that is not finite, or a quaternion that is none.
     """
+    return stamp_ns(message.header.stamp), transform_of_message(message, 'map_correction')
+
+
+def transform_of_message(message: TransformStamped, what: str) -> FloatArray:
+    """T_a_b (4, 4) of a transform's message.
+
+    Raises
+    ------
+    InputError
+        As :func:`transform_of`.
+    """
     p = message.transform.translation
-    place = Pose(position=Point(x=p.x, y=p.y, z=p.z), orientation=message.transform.rotation)
-    return stamp_ns(message.header.stamp), transform_of(place, 'map_correction')
+    return transform_of(Pose(position=Point(x=p.x, y=p.y, z=p.z), orientation=message.transform.rotation), what)
 
 
 def path(poses: Iterable[tuple[int, Pose]], head: Header) -> Path:

@@ -15,7 +15,7 @@ from std_msgs.msg import Header
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.measurements import corners_px, Markers
-from thermal_fiducial.ros.counting import CountingNode
+from thermal_fiducial.ros.node import StageNode
 
 #: Value of the parameter ``detections`` to package and message.
 KINDS = {
@@ -34,12 +34,12 @@ class OtherDetections:
 
     Parameters
     ----------
-    node : whose outputs they are
+    node : whose outputs they are; its prefix stands before the frames of the markers
     fault : called in words with what was asked for and cannot be had
     """
 
-    def __init__(self, node: CountingNode, config: ArucoDetectorConfig, fault: Callable[[str], None]) -> None:
-        self._config = config
+    def __init__(self, node: StageNode[Any], config: ArucoDetectorConfig, fault: Callable[[str], None]) -> None:
+        self._config, self._prefix = config, node.frame_prefix
         self._sizes = size_overrides(config.marker_size_overrides)
         self._messages: Any = None
         self._broadcaster: Any = None
@@ -62,7 +62,7 @@ class OtherDetections:
         if self._messages is not None:
             self._output.send(self._message(markers, head))
         if self._broadcaster is not None and len(markers):
-            self._broadcaster.sendTransform([_transform(row, head) for row in markers])
+            self._broadcaster.sendTransform([_transform(row, head, self._prefix) for row in markers])
 
     def _message(self, markers: Markers, head: Header) -> Any:
         if self._config.detections == 'aruco_opencv':
@@ -121,9 +121,9 @@ def _pose(row: Any) -> Pose:
     return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
 
 
-def _transform(row: Any, head: Header) -> TransformStamped:
+def _transform(row: Any, head: Header, prefix: str) -> TransformStamped:
     place = _pose(row)
-    transform = TransformStamped(header=head, child_frame_id=f'marker_{row["id"]}')
+    transform = TransformStamped(header=head, child_frame_id=f'{prefix}marker_{row["id"]}')
     p = place.position
     transform.transform.translation = Vector3(x=p.x, y=p.y, z=p.z)
     transform.transform.rotation = place.orientation

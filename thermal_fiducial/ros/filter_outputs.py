@@ -8,10 +8,12 @@ from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.body_frame import in_frame
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.bridge import FlightControllerBridge
 from thermal_fiducial.ros.counting import CountingNode
+from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.transforms import TransformBroadcaster
 
 _PATH_STEP_NS = 200_000_000
@@ -26,10 +28,13 @@ class FilterOutputs:
     node : whose outputs they are
     config : frames, rates, what is asked for
     fault : called in words with what was asked for and cannot be had
+    frames : where the robot is in the frame of the IMU
     """
 
-    def __init__(self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None]) -> None:
-        self._config = config
+    def __init__(
+        self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None], frames: RobotFrames
+    ) -> None:
+        self._config, self._frames = config, frames
         #: one message that is filled again and again, seen as two
         self._message = convert.odometry_frames(config.map_frame, config.base_frame)
         self._pose_message = PoseWithCovarianceStamped(header=self._message.header, pose=self._message.pose)
@@ -40,10 +45,10 @@ class FilterOutputs:
         if config.smoothing_time > 0.0:
             self._smooth_odometry = node.advertise(OdometryMessage, 'odometry_smooth', qos.IMU_RATE_RESULT)
         self._bridge = FlightControllerBridge(node, config, fault)
-        self._transforms = TransformBroadcaster(node, config, fault) if config.publish_tf else None
+        self._transforms = TransformBroadcaster(node, config, frames, fault) if config.publish_tf else None
 
     def send(self, odometry: Odometry, smooth: Odometry | None, *, lost: bool, jumps: int) -> None:
-        """Publish the state after an IMU message.
+        """Publish the state, which the filter has of the IMU's frame, after an IMU message.
 
         Parameters
         ----------
@@ -51,6 +56,9 @@ class FilterOutputs:
         lost : whether nobody may fly on it
         jumps : how often the pose has jumped so far
         """
+        if (T_imu_base := self._frames.T_imu_base) is not None:
+            odometry = in_frame(odometry, T_imu_base)
+            smooth = None if smooth is None else in_frame(smooth, T_imu_base)
         convert.fill_odometry(self._message, odometry)
         if self._config.publish_lost or not lost:
             self._pose.send(self._pose_message)

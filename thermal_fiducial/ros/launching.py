@@ -31,6 +31,7 @@ _ARGUMENTS = {
     'camera_info_topic': ('thermal/camera_info', 'calibration of the camera'),
     'imu_topic': ('imu/data', 'IMU, in the frame of the robot'),
     'namespace': ('', 'namespace of all nodes and topics'),
+    'prefix_frames': ('false', 'put the namespace before the frames of the robot'),
     'use_sim_time': ('false', 'time from /clock; only diagnostics use it'),
     'log_level': ('info', f'one of {", ".join(_LEVELS)}'),
     'rviz': ('false', 'start RViz with the view of the package'),
@@ -71,6 +72,7 @@ def _actions(
     actions: list[Any] = _unknown_arguments(context)
     share = Path(get_package_share_directory(PACKAGE))
     overrides = {'mode': mode, 'use_sim_time': _is_true('use_sim_time', given), **parameters}
+    overrides |= {'prefix_frames': True} if _is_true('prefix_frames', given) else {}
     overrides |= {name: given[name] for name in ('map_file', 'camera') if given[name]}
     settings = {
         'package': PACKAGE,

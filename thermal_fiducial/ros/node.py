@@ -5,6 +5,7 @@ the core, the guard turns it into a warning and a diagnostic.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 import time
 import traceback
 from typing import Any, Generic, TypeVar
@@ -25,6 +26,8 @@ Made = TypeVar('Made')
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
+#: Parameters with names of frames that are on the robot; the map is nobody's.
+_ROBOT_FRAMES = ('base_frame', 'camera_frame', 'odom_frame', 'frame_id')
 #: Parameters that say how often the main input of a node comes.
 _RATES = ('image_rate', 'imu_rate')
 
@@ -56,6 +59,14 @@ class StageNode(CountingNode, Generic[Config]):
         except InputError:
             self.destroy_node()
             raise
+        #: parameters that something else decides than their values
+        self._derived: dict[str, Any] = {}
+        #: before the names of the robot's frames
+        self.frame_prefix = ''
+        if getattr(self.config, 'prefix_frames', False):
+            self.frame_prefix = f'{self.get_namespace()}/'.lstrip('/')
+            frames = {name: getattr(self.config, name, '') for name in _ROBOT_FRAMES}
+            self.derive(**{name: self.frame_prefix + frame for name, frame in frames.items() if frame})
         #: what was configured and cannot be used, in words; the node does without it
         self.faults: list[str] = []
         self._refused = 0
@@ -65,9 +76,17 @@ class StageNode(CountingNode, Generic[Config]):
         #: lines for a pilot
         self.console = Console(self.get_logger())
         self._diagnostics = self.advertise(DiagnosticArray, '/diagnostics')
-        params.follow(self, kind, self.configure)
+        params.follow(self, kind, lambda config: self.configure(self._with_derived(config)))
         if live:
             self.create_timer(1.0, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def derive(self, **values: Any) -> None:
+        """Have parameters at other ``values`` than they were set to, from now on and whatever is set."""
+        self._derived |= values
+        self.config = self._with_derived(self.config)
+
+    def _with_derived(self, config: Config) -> Config:
+        return replace(config, **self._derived)  # type: ignore[type-var]
 
     def configure(self, config: Config) -> None:
         """Take over a config with other live parameters."""

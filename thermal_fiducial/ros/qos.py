@@ -28,5 +28,7 @@ IMAGE_OUTPUT = _profile(5)
 RESULT = _profile(30)
 #: results at IMU rate
 IMU_RATE_RESULT = _profile(400)
+#: /tf_static of several publishers, each with what a late subscriber must get too
+STATIC_TF = _profile(100, latched=True)
 #: what a late subscriber must get too: the map
 LATCHED = _profile(1, latched=True)

@@ -9,6 +9,7 @@ from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternio
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.ros import convert
 from thermal_fiducial.ros.counting import CountingNode
+from thermal_fiducial.ros.robot_frames import RobotFrames
 
 
 class TransformBroadcaster:
@@ -20,11 +21,14 @@ class TransformBroadcaster:
     ----------
     node : that broadcasts
     config : names of the frames, pose of the camera
+    frames : where that pose is from: one that TF has is not broadcast again
     fault : called in words with what is missing
     """
 
-    def __init__(self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None]) -> None:
-        self._config = config
+    def __init__(
+        self, node: CountingNode, config: PoseEkfConfig, frames: RobotFrames, fault: Callable[[str], None]
+    ) -> None:
+        self._config, self._frames = config, frames
         self._broadcaster: Any = None
         try:
             tf2_ros = importlib.import_module('tf2_ros')
@@ -33,15 +37,15 @@ class TransformBroadcaster:
             return
         if config.odom_frame and not config.smoothing_time:
             fault('parameter odom_frame: without smoothing_time nothing is smooth')
-        T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
         self._broadcaster = tf2_ros.TransformBroadcaster(node)
-        self._static = tf2_ros.StaticTransformBroadcaster(node)
-        self._static.sendTransform(convert.transform_message(T_body_camera, 0, config.base_frame, config.camera_frame))
+        self._static: Any = tf2_ros.StaticTransformBroadcaster(node)
 
     def send(self, odometry: Odometry, smooth: Odometry | None) -> None:
         """Broadcast the robot's pose, and with ``odom_frame`` the smooth one of the same stamp."""
         if self._broadcaster is None:
             return
+        if self._static is not None and self._frames.parameters_hold:
+            self._send_camera()
         config, stamp, T_map_body = self._config, odometry.stamp_ns, odometry.T_map_body
         if not config.odom_frame or smooth is None:
             self._broadcaster.sendTransform(
@@ -56,3 +60,10 @@ class TransformBroadcaster:
                 convert.transform_message(T_odom_body, stamp, config.odom_frame, config.base_frame),
             ]
         )
+
+    def _send_camera(self) -> None:
+        """Once: it is latched."""
+        config = self._config
+        T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
+        self._static.sendTransform(convert.transform_message(T_body_camera, 0, config.base_frame, config.camera_frame))
+        self._static = None

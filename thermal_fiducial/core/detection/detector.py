@@ -58,15 +58,23 @@ class MarkerDetector:
         self.config = config
         bits = marker_bits(dictionary)
         decoder = Decoder(bits, int(dictionary.maxCorrectionBits))
-        turn = se3.rotation_from_quaternion(config.camera_orientation)
-        T_body_camera = se3.transform(turn, config.camera_position)
         self._count = decoder.count
         self._sizes = MarkerSizes(config.marker_size, size_overrides(config.marker_size_overrides))
-        self._predictor = Predictor(T_body_camera, config.bolometer_lag)
         self._finder = MarkerFinder(decoder, self._sizes)
         self._estimator = CornerEstimator(decoder, bits)
         self._partial = PartialMarkerSearch(decoder, bits)
         self._known = KnownMarkers({})
+        self._mount(config)
+
+    def configure(self, config: ArucoDetectorConfig) -> None:
+        """Take over the dynamic parameters of ``config``, and where the camera is on the robot."""
+        before, self.config = self.config, config
+        if (config.camera_position, config.camera_orientation) != (before.camera_position, before.camera_orientation):
+            self._mount(config)
+
+    def _mount(self, config: ArucoDetectorConfig) -> None:
+        T_body_camera = se3.transform_from_quaternion(config.camera_position, config.camera_orientation)
+        self._predictor = Predictor(T_body_camera, config.bolometer_lag)
         self._history = FrameHistory(MotionTrack.of_rig(T_body_camera, config.bolometer_lag))
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:

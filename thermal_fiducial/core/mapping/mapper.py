@@ -85,6 +85,11 @@ class MarkerMapper:
         self.resets = 0
         self._begin(marker_map)
 
+    def configure(self, config: MarkerMapperConfig) -> None:
+        """Take over the dynamic parameters of ``config``, and where the camera is on the robot."""
+        self.config = config
+        self._T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
+
     def reset(self) -> MapJump | None:
         """Back to the map that it was started with; see :meth:`load`."""
         return self.load(self._initial)
