@@ -626,6 +626,11 @@ class PoseEkfConfig(SelfChecked):
         'With publish_tf and smoothing_time, as REP-105: the smooth output from here to base_frame, the rest from '
         'map_frame to here. Empty: map_frame to base_frame.',
     )
+    resume: bool = param(
+        True,
+        'After a crash in flight: the last pose and clock offset of before, which are kept in ~/.ros (ROS_HOME), are a '
+        'hint to the first poses.',
+    )
     publish_lost: bool = param(False, 'Publish `pose` also while it counts as lost; `odometry` is always published.')
     publish_tf: bool = param(False, 'Publish map to base_frame and base_frame to camera_frame on /tf (needs tf2_ros).')
     bridge_rate: float = param(

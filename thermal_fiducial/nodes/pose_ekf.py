@@ -4,13 +4,14 @@ import sys
 from typing import Any
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
-from sensor_msgs.msg import Imu, TimeReference
+from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.map_corrections import MapCorrections
 from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.filter_memory import FilterMemory
 from thermal_fiducial.ros.filter_outputs import FilterOutputs
 from thermal_fiducial.ros.filter_status import FilterStatus
 from thermal_fiducial.ros.node import StageNode
@@ -24,10 +25,10 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('pose_ekf', PoseEkfConfig, **kwargs)
         self.realtime_priority = self.config.realtime_priority
+        self._memory = FilterMemory(self)
         self.filter = PoseEkf(self.config)
         self._status = FilterStatus(self.filter, self.console)
         self._corrections = MapCorrections(self.config.max_delay)
-        self._camera_clock = self.advertise(TimeReference, 'camera_clock', qos.RESULT)
         self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
         self.subscribe(TransformStamped, 'map_correction', self._on_map_correction, qos.RESULT)
@@ -54,10 +55,10 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
             self._outputs.send(odometry, self.filter.smooth, lost=lost, jumps=jumps)
 
     def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
-        update = self.filter.add_pose(self._corrections.in_present_map(convert.camera_pose(message)))
+        pose = self._corrections.in_present_map(convert.camera_pose(message))
+        update = self._memory.refusal(self.filter, pose) or self.filter.add_pose(pose)
         self._status.after_pose(update)
-        if (offset := self.filter.camera_time_offset) is not None:
-            self._camera_clock.send(convert.clock_reference(update.stamp_ns, offset))
+        self._outputs.send_clock(update.stamp_ns, self.filter.camera_time_offset)
 
     def _on_map_correction(self, message: TransformStamped) -> None:
         stamp_ns, T_new_old = convert.correction_of(message)
@@ -75,6 +76,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         """Publish the diagnostics and, while someone listens, the path."""
         super().diagnose(stamp_ns)
         self._outputs.send_path()
+        self._memory.save(self.filter, self._outputs.stamp_ns)
 
     def state(self) -> tuple[bytes, str]:
         """What the filter says of itself, and why it refused the last pose."""

@@ -110,7 +110,8 @@ def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[
     except OSError as error:
         raise InputError(f'run folder {options.run}: {error.strerror}') from None
     run_map, given = options.run / MAP_FILE, settings.marker_mapper.map_file
-    arguments = ['--params-file', str(options.run / 'parameters.yaml')]
+    # One recording after the other is no flight that goes on.
+    arguments = ['--params-file', str(options.run / 'parameters.yaml'), '-p', 'resume:=false']
     if not given:
         run_map.unlink(missing_ok=True)
         if 'marker_mapper' in entry.nodes:

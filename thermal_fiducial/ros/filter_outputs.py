@@ -6,6 +6,7 @@ from collections.abc import Callable
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
+from sensor_msgs.msg import TimeReference
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.body_frame import in_frame
@@ -41,6 +42,7 @@ class FilterOutputs:
         self._path: deque[tuple[int, Pose]] = deque(maxlen=_PATH_LENGTH)
         self._pose = node.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
         self._odometry = node.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
+        self._camera_clock = node.advertise(TimeReference, 'camera_clock')
         self._path_output = node.advertise(Path, 'path')
         if config.smoothing_time > 0.0:
             self._smooth_odometry = node.advertise(OdometryMessage, 'odometry_smooth', qos.IMU_RATE_RESULT)
@@ -71,6 +73,17 @@ class FilterOutputs:
         if not lost:
             self._bridge.send(smooth or odometry, jumps)
         self._extend_path(odometry)
+
+    @property
+    def stamp_ns(self) -> int:
+        """Of the latest state; 0 before there is one."""
+        stamp = self._message.header.stamp
+        return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+    def send_clock(self, camera_stamp_ns: int, offset: float | None) -> None:
+        """Publish the offset [s] of the camera's clock at a frame, where it is known."""
+        if offset is not None:
+            self._camera_clock.send(convert.clock_reference(camera_stamp_ns, offset))
 
     def _extend_path(self, odometry: Odometry) -> None:
         if not self._path or not 0 <= odometry.stamp_ns - self._path[-1][0] < _PATH_STEP_NS:

@@ -39,8 +39,8 @@ class FilterStatus:
     def state(self) -> tuple[bytes, str]:
         """Level, and in words what the filter does and why it refused the last pose."""
         status, lost = self._filter.status, self._filter.lost
-        if self._last_refusal and not lost:
-            return WARN, f'{status}; pose {self._last_refusal}'
+        if self._last_refusal and (not lost or status == 'waiting for markers'):
+            return ERROR if lost else WARN, f'{status}; pose {self._last_refusal}'
         return ERROR if lost else OK if status == 'tracking' else WARN, status
 
     def headline(self) -> str:

@@ -59,6 +59,8 @@ class StageNode(CountingNode, Generic[Config]):
         except InputError:
             self.destroy_node()
             raise
+        #: last work of its parts before the node is destroyed
+        self.endings: list[Callable[[], None]] = []
         #: parameters that something else decides than their values
         self._derived: dict[str, Any] = {}
         #: before the names of the robot's frames
@@ -158,6 +160,8 @@ class StageNode(CountingNode, Generic[Config]):
 
     def close(self) -> None:
         """Last work before the node is destroyed: save what must be saved."""
+        for end in self.endings:
+            end()
 
     def diagnose(self, stamp_ns: int) -> None:
         """Publish the diagnostics of the time since the last call, and what a pilot must know of it."""

@@ -1,0 +1,93 @@
+"""A filter that crashed in flight goes on with what it knew last."""
+
+import os
+import time
+
+import numpy as np
+import pytest
+from support import small_bag
+from support.messages import imu, pose
+from support.ros_graph import ros_graph
+
+from thermal_fiducial.core.filter.restart import LastPose, RestartHint
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.last_pose import recent_pose, save_last_pose
+from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
+
+SECOND = 1_000_000_000
+LAST = LastPose(5 * SECOND, transform(so3_exp([0.0, 0.0, 0.3]), [1.0, 2.0, 3.0]), 0.004)
+
+
+def camera_pose(seconds, x):
+    return CameraPose(LAST.stamp_ns + round(seconds * SECOND), transform(np.eye(3), [x, 2.0, 3.0]), np.eye(6))
+
+
+def test_a_pose_that_no_flight_could_have_reached_is_kept_out_for_a_second():
+    hint = RestartHint(LAST, np.eye(4))
+    assert hint.contradiction(camera_pose(1.0, 1.2)) == 0.0
+    assert hint.contradiction(camera_pose(1.0, 9.0)) == pytest.approx(8.0)
+    # Three metres a second, not more.
+    assert hint.contradiction(camera_pose(2.0, 7.0)) == 0.0
+    frames = [hint.contradiction(camera_pose(1.0 + k / 30, 40.0)) > 0.0 for k in range(40)]
+    assert frames == [True] * 30 + [False] * 10
+
+
+@pytest.mark.parametrize('seconds', [-1.0, 11.0])
+def test_of_other_times_it_says_nothing(seconds):
+    assert RestartHint(LAST, np.eye(4)).contradiction(camera_pose(seconds, 900.0)) == 0.0
+
+
+def test_the_file_holds_it_for_ten_seconds(tmp_path):
+    path = tmp_path / 'folder' / 'pose_ekf.json'
+    save_last_pose(path, LAST)
+    found = recent_pose(path)
+    np.testing.assert_array_equal(found.T_map_body, LAST.T_map_body)
+    assert (found.stamp_ns, found.camera_time_offset) == (LAST.stamp_ns, 0.004)
+    os.utime(path, (0, time.time() - 11.0))
+    assert recent_pose(path) is None
+
+
+@pytest.mark.parametrize(
+    'text', ['', '{', '[]', '{"stamp_ns": 1}', '{"stamp_ns": 1, "T_map_body": [[1.0]], "camera_time_offset": null}']
+)
+def test_a_file_that_is_none_is_no_hint(tmp_path, text):
+    (tmp_path / 'pose.json').write_text(text)
+    assert recent_pose(tmp_path / 'pose.json') is None
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / 'file').touch()
+    with pytest.raises(InputError, match='file'):
+        save_last_pose(tmp_path / 'file' / 'pose.json', LAST)
+
+
+def fly(graph, first, last, T=None):
+    for k in range(first, last):
+        graph.send('imu/data', imu(k))
+        if k % 6 == 5:
+            graph.send('camera_pose', pose(k - 4, T))
+
+
+@pytest.mark.ros
+def test_a_filter_that_is_started_again_says_so_and_refuses_what_cannot_be(tmp_path, monkeypatch, capfd):
+    monkeypatch.setenv('ROS_HOME', str(tmp_path))
+    far = transform(np.eye(3), [20.0, 0.0, 0.0]) @ small_bag.T_BODY_CAMERA
+    with ros_graph() as graph:
+        node = graph.add(PoseEkfNode, live=True, camera_position=[0.1, 0.0, 0.0])
+        fly(graph, 0, 60)
+        node.diagnose(0)
+    # It was killed: nothing was closed.
+    with ros_graph() as graph:
+        again = graph.add(PoseEkfNode, live=True, camera_position=[0.1, 0.0, 0.0])
+        fly(graph, 100, 130, far)
+        assert again.filter.state is None
+        assert 'from the last pose before the restart' in again.state()[1]
+        fly(graph, 130, 160)
+        assert again.filter.state is not None
+        again.close()
+    assert 'started again in flight: the last pose before, at ' in capfd.readouterr().err
+    with ros_graph() as graph:
+        graph.add(PoseEkfNode, live=True, camera_position=[0.1, 0.0, 0.0])
+    assert 'started again' not in capfd.readouterr().err

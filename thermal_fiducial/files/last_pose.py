@@ -1,0 +1,53 @@
+"""The file with the last pose of a running filter, for the one that is started after it crashed."""
+
+import json
+from pathlib import Path
+import time
+
+import numpy as np
+
+from thermal_fiducial.core.filter.restart import HINT_SECONDS, LastPose
+from thermal_fiducial.errors import InputError
+
+_FORMAT = {'format': 'thermal_fiducial/last_pose', 'version': 1}
+#: Of the parameter camera_time_offset [s].
+_LARGEST_OFFSET = 1.0
+
+
+def save_last_pose(path: Path, last: LastPose) -> None:
+    """Replace the file; whoever reads it sees the old pose or the new one. It need not outlive a power cut.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    document = _FORMAT | {
+        'stamp_ns': last.stamp_ns,
+        'T_map_body': last.T_map_body.tolist(),
+        'camera_time_offset': last.camera_time_offset,
+    }
+    new = path.with_name(path.name + '.new')
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        new.write_text(json.dumps(document), encoding='utf-8')
+        new.replace(path)
+    except OSError as error:
+        raise InputError(f'{path}: {error.strerror}') from None
+
+
+def recent_pose(path: Path) -> LastPose | None:
+    """The pose of a filter that ended without order within the last seconds; None where there is none.
+
+    A file that is not of this form is as good as none: it is a hint.
+    """
+    try:
+        if not 0.0 <= time.time() - path.stat().st_mtime <= HINT_SECONDS:
+            return None
+        document = json.loads(path.read_text(encoding='utf-8'))
+        T_map_body, offset = np.array(document['T_map_body'], dtype=np.float64), document['camera_time_offset']
+        last = LastPose(int(document['stamp_ns']), T_map_body, None if offset is None else float(offset))
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+    usable = T_map_body.shape == (4, 4) and np.isfinite(T_map_body).all() and abs(offset or 0.0) <= _LARGEST_OFFSET
+    return last if usable and document.items() >= _FORMAT.items() else None

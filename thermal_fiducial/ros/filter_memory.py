@@ -1,0 +1,77 @@
+"""What outlives a filter that crashes in flight: its last pose and clock offset, in a file, once a second."""
+
+import math
+import os
+from pathlib import Path
+
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.filter.innovations import PoseUpdate
+from thermal_fiducial.core.filter.restart import LastPose, RestartHint
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.files.last_pose import recent_pose, save_last_pose
+from thermal_fiducial.ros.node import StageNode
+
+#: What a clock offset of before may be wrong by [s]: the filter had it to 3 ms or better.
+_OFFSET_STD = 0.003
+
+
+class FilterMemory:
+    """Remembers for the next filter of this name, and takes up what the last one left; only where nodes are ``live``.
+
+    Parameters
+    ----------
+    node : of the filter; its config may get the clock offset of before
+    """
+
+    def __init__(self, node: StageNode[PoseEkfConfig]) -> None:
+        self._node = node
+        self._hint: RestartHint | None = None
+        self._active = node.live and node.config.resume
+        name = node.get_fully_qualified_name().strip('/').replace('/', '_')
+        home = os.environ.get('ROS_HOME', '~/.ros')
+        domain = os.environ.get('ROS_DOMAIN_ID', '0')
+        self._path = Path(home).expanduser() / 'thermal_fiducial' / f'{name}_{domain}.json'
+        node.endings.append(self._close)
+        last = recent_pose(self._path) if self._active else None
+        if last is not None:
+            self._take_up(last)
+
+    def _take_up(self, last: LastPose) -> None:
+        config = self._node.config
+        self._hint = RestartHint(last, transform_from_quaternion(config.camera_position, config.camera_orientation))
+        place = ' '.join(f'{value:.2f}' for value in last.T_map_body[:3, 3])
+        line = f'started again in flight: the last pose before, at {place} m, is a hint to the first poses'
+        if (offset := last.camera_time_offset) is not None and config.estimate_time_offset:
+            std = min(config.time_offset_std, _OFFSET_STD)
+            self._node.derive(camera_time_offset=offset, time_offset_std=std)
+            line += f'; the clock offset of {1e3 * offset:.1f} ms is kept'
+        self._node.get_logger().warning(line)
+
+    def refusal(self, filter_: PoseEkf, pose: CameraPose) -> PoseUpdate | None:
+        """The verdict on a pose that should not start the filter, by where it was before; None: it may."""
+        if self._hint is None or filter_.state is not None:
+            return None
+        distance = self._hint.contradiction(pose)
+        reason = f'refused: {distance:.1f} m from the last pose before the restart'
+        return PoseUpdate(pose.stamp_ns, False, reason, math.nan) if distance else None
+
+    def save(self, filter_: PoseEkf, stamp_ns: int) -> None:
+        """Leave the pose at the IMU's ``stamp_ns`` for the next filter.
+
+        Raises
+        ------
+        InputError
+            It cannot be written; this is said once.
+        """
+        if not self._active or filter_.lost or filter_.state is None:
+            return
+        self._active = False
+        save_last_pose(self._path, LastPose(stamp_ns, filter_.state.T_map_body, filter_.camera_time_offset))
+        self._active = True
+
+    def _close(self) -> None:
+        """Ended in order: the next start is none in flight."""
+        if self._active:
+            self._path.unlink(missing_ok=True)
