@@ -22,7 +22,7 @@ setup(
     name=PACKAGE,
     version=VERSION,
     packages=find_packages(include=[PACKAGE, f'{PACKAGE}.*']),
-    package_data={PACKAGE: ['py.typed', '**/*.xml', '**/*.yaml', '**/*.html', '**/*.json']},
+    package_data={PACKAGE: ['py.typed', '**/*.xml', '**/*.yaml', '**/*.html', '**/*.css', '**/*.js', '**/*.json']},
     data_files=[
         *ON_PATH,
         ('share/ament_index/resource_index/packages', [f'resource/{PACKAGE}']),
@@ -36,7 +36,20 @@ setup(
         'cloud': ['small_gicp', 'plyfile', 'pypcd4', 'scipy', 'rich', 'matplotlib'],
         'cameras': ['pyusb'],  # and libusb-1.0-0, for a ThermalGrabber
         'smoother': ['gtsam>=4.3'],  # the reference of the filter's benchmark; brings pytest 9
-        'tools': ['scipy', 'rich', 'matplotlib', 'ezdxf', 'svgwrite', 'reportlab', 'shapely', 'jinja2', 'allantools'],
+        'tools': [
+            'scipy',
+            'rich',
+            'matplotlib',
+            'plotly>=6',
+            'jinja2',
+            'evo',
+            'ezdxf',
+            'svgwrite',
+            'reportlab',
+            'shapely',
+            'allantools',
+        ],
+        'video': ['av'],  # or ffmpeg: evaluate --video
         'batch': ['distributed>=2024.4'],
         'test': [
             'pytest',
@@ -46,7 +59,7 @@ setup(
             'pytest-benchmark',
             'pytest-xdist',
             'pytest-cov',
-            'evo',
+            'av',
         ],
         # Pinned: a new version of a linter must not turn an untouched commit red.
         'lint': ['ruff==0.17.6', 'mypy==2.4.1', 'import-linter==2.16', 'types-PyYAML==6.0.12.20261113'],

@@ -7,9 +7,10 @@ import pytest
 from support import small_bag
 
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.files.images import header_stamp_ns
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.trajectory_file import load_tum
-from thermal_fiducial.replay.latency import header_stamp_ns, IMAGE_TO_CORRECTED_POSE, IMU_TO_POSE, LatencyMeter
+from thermal_fiducial.replay.latency import IMAGE_TO_CORRECTED_POSE, IMU_TO_POSE, LatencyMeter
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 

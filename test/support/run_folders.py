@@ -17,6 +17,7 @@ from thermal_fiducial.files.trajectory_file import save_tum
 START_NS = 1_700_000_000_000_000_000
 FUSED_SIGMA = np.array([2e-3, 2e-3, 2e-3, 3e-4, 3e-4, 3e-4])
 FIDUCIAL_SIGMA = 5.0 * FUSED_SIGMA
+FUSED_DELAY_NS, CAMERA_DELAY_NS = 1_000_000, 25_000_000
 
 
 def true_pose(t):
@@ -36,13 +37,16 @@ def write_poses(path, stamps, T):
     save_tum(path, stamps.tolist(), T[:, :3, 3], quaternion_from_rotation(T[:, :3, :3]))
 
 
-def make_run(folder: Path, seconds=20.0, seed=0, gap=(8.0, 10.0), with_output=True, with_truth=True):
-    """Write a run folder; markers are out of view in ``gap`` [s]."""
+def make_run(
+    folder: Path, seconds=20.0, seed=0, gap=(8.0, 10.0), shutter=(14.2, 14.7), with_output=True, with_truth=True
+):
+    """Write a run folder; markers are out of view in ``gap``, the camera's shutter is closed in ``shutter`` [s]."""
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True)
     stamps = START_NS + np.arange(0, int(seconds * 1e9), 5_000_000)
     frames = START_NS + np.arange(0, int(seconds * 1e9), 33_333_333)
-    frames = frames[~((frames - START_NS > gap[0] * 1e9) & (frames - START_NS < gap[1] * 1e9))]
+    frames = outside(frames, shutter)
+    looked_at, frames = frames, outside(frames, gap)
     fused = disturbed(true_pose((stamps - START_NS) * 1e-9), FUSED_SIGMA, rng)
     write_poses(folder / 'fused.tum', stamps, fused)
     fiducial = disturbed(true_pose((frames - START_NS) * 1e-9), FIDUCIAL_SIGMA, rng)
@@ -64,8 +68,14 @@ def make_run(folder: Path, seconds=20.0, seed=0, gap=(8.0, 10.0), with_output=Tr
         json.dumps({'bag': 'made_up', 'transport': 'processes', 'mode': 'mapping', 'duration_s': seconds})
     )
     if with_output:
-        write_output(folder / 'output', stamps, fused)
+        write_output(folder / 'output', stamps, fused, looked_at, frames, shutter)
     return folder
+
+
+def outside(stamps, span):
+    """The stamps that do not lie in ``span`` [s]."""
+    t = (stamps - START_NS) * 1e-9
+    return stamps[~((t > span[0]) & (t < span[1]))]
 
 
 def wall():
@@ -90,8 +100,12 @@ def write_detections(path, frames, rng):
                     writer.writerow([stamp, marker, *np.round(rng.uniform(0, 500, 8), 3), 0.03])
 
 
-def write_output(path, stamps, fused):
-    """``pose`` with the right covariance, and diagnostics, with the innovations of 30 poses in each, one refused."""
+def write_output(path, stamps, fused, looked_at, frames, shutter):
+    """What nodes published.
+
+    ``pose`` a millisecond late with the right covariance; ``markers`` and ``camera_pose`` 25 ms late; diagnostics with
+    the innovations of 30 poses in each, one refused, and the frames that the shutter withheld.
+    """
     types = get_typestore(Stores.ROS2_JAZZY).types
     header, time = types['std_msgs/msg/Header'], types['builtin_interfaces/msg/Time']
     covariance = np.diag(FUSED_SIGMA**2).ravel()
@@ -104,17 +118,33 @@ def write_output(path, stamps, fused):
             pose = types['geometry_msgs/msg/Pose'](point, types['geometry_msgs/msg/Quaternion'](*q[k]))
             with_covariance = types['geometry_msgs/msg/PoseWithCovariance'](pose, covariance)
             message = types['geometry_msgs/msg/PoseWithCovarianceStamped'](head, with_covariance)
-            bag.write('pose', stamp, message)
+            bag.write('pose', stamp + FUSED_DELAY_NS, message)
+            if k == 0:
+                write_frames(bag, types, looked_at, frames, message)
             if k % 200 == 0:
                 status = types['diagnostic_msgs/msg/DiagnosticStatus']
                 pairs = types['diagnostic_msgs/msg/KeyValue']
                 values = [pairs(key='lost', value='False'), pairs(key='innovations', value=next(innovations))]
                 words = f'running for {k / 200:.1f} s'
+                withheld = 12 if stamp - START_NS > shutter[1] * 1e9 else 0
+                shut = [pairs(key='withheld: settling after FFC', value=str(withheld))]
                 items = [
                     status(level=0, name='pose_ekf', message=words, hardware_id='', values=values),
-                    status(level=1, name='tau2_camera', message='FFC', hardware_id='', values=[]),
+                    status(level=1, name='tau2_camera', message='FFC', hardware_id='', values=shut),
                 ]
                 bag.write('/diagnostics', stamp, types['diagnostic_msgs/msg/DiagnosticArray'](head, items))
+
+
+def write_frames(bag, types, looked_at, frames, pose):
+    """``markers`` of each frame, empty clouds, and ``camera_pose`` of those that gave one."""
+    time, header = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
+    for stamp in looked_at.tolist():
+        head = header(stamp=time(*divmod(stamp, 1_000_000_000)), frame_id='thermal_camera_optical')
+        nothing = np.zeros(0, np.uint8)
+        bag.write('markers', stamp + CAMERA_DELAY_NS, types['sensor_msgs/msg/PointCloud2'](
+            head, 1, 0, [], False, 16, 0, nothing, True))  # fmt: skip
+        if stamp in frames:
+            bag.write('camera_pose', stamp + CAMERA_DELAY_NS, type(pose)(head, pose.pose))
 
 
 def made_up_innovations():

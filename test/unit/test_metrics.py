@@ -151,23 +151,6 @@ def test_nees_sees_missing_cross_terms():
     assert metrics.consistency(e, np.tile(wrong_sign, (len(t), 1, 1)))['pose_nees_per_dof'] > 5.0
 
 
-def test_gaps_with_their_error_and_the_step_at_the_end():
-    fused, fiducial = trajectory(), trajectory(30.0)
-    seconds = (fiducial.stamps_ns - START_NS) * 1e-9
-    fiducial = fiducial.take((seconds < 8.0) | (seconds > 10.0))
-    t = (fused.stamps_ns - START_NS) * 1e-9
-    wandering = fused.T_map_body.copy()
-    wandering[:, 1, 3] += np.where((t > 8.0) & (t < 10.0334), 0.02 * (t - 8.0), 0.0)
-    fused = Trajectory(fused.stamps_ns, wandering)
-    (gap,) = metrics.gaps(fused, fiducial, metrics.errors(fused, TRUTH))
-    assert gap.seconds == pytest.approx(2.03, abs=0.04)
-    assert gap.fused_poses == pytest.approx(200 * gap.seconds, abs=1)
-    assert gap.error_mm == pytest.approx(40.3, abs=0.5)
-    assert gap.step_mm == pytest.approx(40.6, abs=0.7)
-    assert metrics.gaps(fused, fiducial, None)[0].error_mm is None
-    assert metrics.gaps(fused, trajectory(30.0), None) == []
-
-
 def test_output_rate_pauses_and_steps():
     t = trajectory(200.0, 10.0)
     T = t.T_map_body.copy()
@@ -181,11 +164,11 @@ def test_output_rate_pauses_and_steps():
     assert result['poses'] == 1980
 
 
-def test_way_is_the_length_of_the_path():
+def test_path_length_is_that_of_the_path():
     stamps = START_NS + np.arange(0, 10**10 + 1, 5_000_000)
     angle = (stamps - START_NS) * 1e-9
     p = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=-1)
-    assert metrics.way(Trajectory(stamps, transform(np.eye(3), p))) == pytest.approx(10.0, rel=0.012)
+    assert metrics.path_length(Trajectory(stamps, transform(np.eye(3), p))) == pytest.approx(10.0, rel=0.012)
 
 
 def test_latency():
@@ -200,7 +183,6 @@ def test_runs_of_almost_nothing_have_measures_of_almost_nothing(count):
     assert metrics.output(few) == {'poses': count}
     assert metrics.jitter(e) == {}
     assert metrics.relative_pose_error(e) == {}
-    assert metrics.gaps(few, few, e) == []
     assert (metrics.accuracy(e) == {}) == (count == 0)
 
 

@@ -10,7 +10,7 @@ from support.run_folders import make_run
 import thermal_fiducial.core
 
 WITHOUT_ROS = ('rclpy', 'sensor_msgs', 'geometry_msgs', 'rosbags', 'yaml')
-TOOLS = ('matplotlib', 'jinja2', 'rich', 'scipy', 'ezdxf', 'PIL')
+TOOLS = ('matplotlib', 'jinja2', 'plotly', 'evo', 'rich', 'scipy', 'ezdxf', 'PIL')
 
 # filterpy itself imports scipy and matplotlib, so in the core only ROS and files are hidden.
 BLOCK = """
@@ -59,6 +59,23 @@ def test_a_missing_tool_is_named_in_one_line(run_folder, options):
     assert result.returncode == 2
     assert 'install the extra "tools"' in result.stderr
     assert result.stderr.count('\n') == 1
+
+
+@pytest.mark.parametrize(
+    ('options', 'hidden', 'words'),
+    [
+        ((), ('plotly',), 'the report needs plotly: install the extra "tools", or replay with --no-report'),
+        (('--no-report', '--video'), ('av',), '--video needs ffmpeg (apt install ffmpeg) or PyAV'),
+    ],
+)
+def test_a_replay_says_what_is_missing_before_it_begins(tmp_path, monkeypatch, options, hidden, words):
+    monkeypatch.setenv('PATH', '')
+    arguments = ('replay', str(tmp_path / 'no_bag'), '--out', str(tmp_path / 'run'), *options)
+    result = python(COMMAND, hidden, *arguments)
+    assert result.returncode == 2
+    assert words in result.stderr
+    assert result.stderr.count('\n') == 1
+    assert not (tmp_path / 'run').exists()
 
 
 def test_the_demo_without_ros_says_what_is_missing(tmp_path):

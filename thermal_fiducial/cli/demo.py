@@ -8,10 +8,10 @@ import sys
 import time
 from typing import Any
 
-from thermal_fiducial.cli.evaluate import print_tables
+from thermal_fiducial.cli.evaluate import make_video, print_tables
 from thermal_fiducial.cli.replay import progress_bar
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.report.page import evaluate_run, Evaluation, write_page
+from thermal_fiducial.report.page import evaluate_run, Evaluation, require_packages, write_page
 from thermal_fiducial.report.tables import tables
 
 SCENARIO = 'fog'
@@ -29,19 +29,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--seconds', type=float, default=30.0, help='length of the flight [s] (default: 30)')
     parser.add_argument('--seed', type=int, default=0, help='of path and noise (default: 0)')
     parser.add_argument('--picture', type=Path, metavar='PNG', help='also draw frame, map and error into one picture')
+    parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
 
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, replay, score, report."""
     if not 0.0 < args.seconds <= LONGEST_S:
         raise InputError(f'--seconds {args.seconds:g} is not between 0 and {LONGEST_S:g}')
+    require_packages(tables=True)
+    if args.video:
+        from thermal_fiducial.report.video import require_encoder
+
+        require_encoder()
     started = time.monotonic()
     _make_room(args.out)
     bag = args.out / BAG
     _simulate(bag, args.seconds, args.seed)
     _replay(bag, args.out)
     evaluation, numbers = evaluate_run(args.out, bag)
-    page = write_page(evaluation, numbers)
+    if args.video:
+        make_video(evaluation.run, bag)
+    page = write_page(evaluation, numbers, bag)
     if args.picture is not None:
         from thermal_fiducial.report.picture import draw_picture
 
@@ -98,5 +106,5 @@ def _step(title: str) -> Any:
 
 
 def _say(evaluation: Evaluation, numbers: dict[str, Any]) -> None:
-    wanted = ('Accuracy', 'Output', 'Drop-outs')
-    print_tables([table for table in tables(evaluation, numbers) if table.title.startswith(wanted)])
+    made = tables(evaluation, numbers)
+    print_tables(made[name] for name in ('pilot', 'accuracy', 'interruptions') if name in made)

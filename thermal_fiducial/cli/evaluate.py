@@ -1,38 +1,86 @@
-"""``evaluate RUN``: errors, jitter, consistency and latency of a run, as tables and as a page."""
+"""``evaluate RUN``: errors, jitter, consistency and latency of a run, as tables and as a page; or several compared."""
 
 import argparse
+from collections.abc import Iterable
 import json
 from pathlib import Path
 
+from thermal_fiducial.cli.replay import progress_bar
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.report.page import evaluate_run, write_page
+from thermal_fiducial.report.page import evaluate_run, require_packages, VIDEO, write_page
+from thermal_fiducial.report.run_folder import Run
 from thermal_fiducial.report.tables import Table, tables
+
+COMPARISON = Path('comparison.html')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument('folder', type=Path, metavar='RUN', help='run folder, as replay leaves it')
+    parser.add_argument('folders', type=Path, nargs='+', metavar='RUN', help='run folder, as replay leaves it')
     parser.add_argument(
         '--truth', type=Path, metavar='BAG-or-TUM', help='ground truth: a TUM file, or a bag with ground_truth/odometry'
     )
+    parser.add_argument(
+        '--truth-map', type=Path, metavar='FILE', help='the map as it really is (default: map_true.yaml at the truth)'
+    )
+    parser.add_argument('--bag', type=Path, help='the bag with the frames (default: where it was when it was replayed)')
+    parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
     parser.add_argument('--json', action='store_true', help='print the measures as JSON instead of tables')
     parser.add_argument('--no-report', action='store_true', help='write no report.html')
+    parser.add_argument(
+        '--compare', action='store_true', help="several runs side by side, with evo's conventions and numbers"
+    )
+    parser.add_argument(
+        '--out', type=Path, default=COMPARISON, metavar='HTML', help=f'page of --compare (default: {COMPARISON})'
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print, write ``summary.json`` and ``report.html``."""
-    evaluation, numbers = evaluate_run(args.folder, args.truth)
-    page = None if args.no_report else write_page(evaluation, numbers)
+    if args.compare:
+        return _compare(args)
+    if len(args.folders) > 1:
+        raise InputError('several runs are shown side by side with --compare')
+    if not args.no_report:
+        require_packages()
+    evaluation, numbers = evaluate_run(args.folders[0], args.truth, args.truth_map)
+    if args.video:
+        make_video(evaluation.run, args.bag)
+    page = None if args.no_report else write_page(evaluation, numbers, args.bag)
     if args.json:
         print(json.dumps(numbers, indent=2))
         return 0
-    print_tables(tables(evaluation, numbers))
+    print_tables(tables(evaluation, numbers).values())
     if page is not None:
         print(f'report: {page}')
     return 0
 
 
-def print_tables(shown: list[Table]) -> None:
+def make_video(run: Run, bag: Path | None = None) -> None:
+    """Write the video of a run into its folder."""
+    from thermal_fiducial.report.video import write_video
+
+    with progress_bar('video') as progress:
+        write_video(run, run.path / VIDEO, bag, progress)
+
+
+def _compare(args: argparse.Namespace) -> int:
+    try:
+        from thermal_fiducial.report.comparison import compare
+    except ImportError as error:
+        raise InputError(f'--compare needs {error.name}: install the extra "tools"') from None
+    comparison = compare(args.folders, args.truth)
+    if args.json:
+        print(json.dumps(comparison.numbers, indent=2))
+    else:
+        print_tables(comparison.tables)
+    if not args.no_report:
+        comparison.write(args.out)
+        print(f'comparison: {args.out}')
+    return 0
+
+
+def print_tables(shown: Iterable[Table]) -> None:
     """Print tables to the terminal.
 
     Raises
@@ -51,8 +99,10 @@ def print_tables(shown: list[Table]) -> None:
     for entry in shown:
         table = rich.table.Table(title=entry.title, title_justify='left', box=box.SIMPLE_HEAD, title_style='bold')
         for index, head in enumerate(entry.heads):
-            style = {'fused': 'blue', 'fiducial': 'red'}.get(head, '')
-            table.add_column(Text(head), justify='left' if index == 0 or entry.textual else 'right', header_style=style)
+            style = 'blue' if head.startswith('fused') else 'red' if head.startswith('markers alone') else ''
+            table.add_column(
+                Text(head), justify='left' if entry.is_text(index) else 'right', header_style=style, overflow='fold'
+            )
         for row in entry.rows:
             table.add_row(*map(Text, row))
         console.print(table)

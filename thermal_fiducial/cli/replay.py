@@ -37,12 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '(default: the earliest of these that it has)',
     )
     parser.add_argument('--no-report', action='store_true', help='write no report.html')
+    parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
 
 
 def run(args: argparse.Namespace) -> int:
     """Replay, write the run folder, say how fast it went."""
     if not 0.0 < args.rate <= 100.0:
         raise InputError(f'--rate {args.rate:g} is not between 0 and 100')
+    _check_packages(report=not args.no_report, video=args.video)
     replay = importlib.import_module('thermal_fiducial.replay.session')
     options = replay.Options(
         bag=args.bag,
@@ -65,12 +67,27 @@ def run(args: argparse.Namespace) -> int:
         f'{args.out}: {out.get("pose", 0)} poses, {out.get("camera_pose", 0)} camera poses, '
         f'{summary["markers_in_map"]} markers in the map; {summary["duration_s"]:.1f} s of bag in {seconds:.1f} s'
     )
+    if args.video:
+        importlib.import_module('thermal_fiducial.cli.evaluate').make_video(
+            importlib.import_module('thermal_fiducial.report.run_folder').read_run(args.out)
+        )
     if not args.no_report:
         importlib.import_module('thermal_fiducial.report.page').write_report(args.out, truth=None)
     errors = _internal_errors(summary['diagnostics'])
     for error in errors:
         print(error, file=sys.stderr)
     return 1 if errors else 0
+
+
+def _check_packages(*, report: bool, video: bool) -> None:
+    """Say what is missing before the replay, not after minutes of it."""
+    if report:
+        try:
+            importlib.import_module('thermal_fiducial.report.page').require_packages()
+        except InputError as error:
+            raise InputError(f'{error}, or replay with --no-report') from None
+    if video:
+        importlib.import_module('thermal_fiducial.report.video').require_encoder()
 
 
 def _internal_errors(diagnostics: Mapping[str, Mapping[str, str]]) -> list[str]:

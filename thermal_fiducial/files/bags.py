@@ -211,8 +211,10 @@ class BagReader:
         """Number of messages on ``topics`` (default: all)."""
         return sum(connection.msgcount for connection in self._connections(topics))
 
-    def messages(self, topics: Iterable[str] | None = None) -> Iterator[BagMessage]:
-        """Messages on ``topics`` (default: all) in recorded order.
+    def messages(
+        self, topics: Iterable[str] | None = None, between_ns: tuple[int, int] | None = None
+    ) -> Iterator[BagMessage]:
+        """Messages on ``topics`` (default: all) in recorded order, whose bag stamps are ``between_ns`` (default: any).
 
         Raises
         ------
@@ -223,7 +225,7 @@ class BagReader:
         if not connections:
             return
         with self._readable():
-            for connection, stamp_ns, raw in self._open.messages(connections):
+            for connection, stamp_ns, raw in self._open.messages(connections, *(between_ns or (None, None))):
                 name = self._names[connection.topic]
                 yield BagMessage(name, connection.msgtype, stamp_ns, self._cdr(connection, raw), self._typestore)
 

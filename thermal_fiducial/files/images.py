@@ -1,6 +1,7 @@
 """Pixels of ``sensor_msgs/msg/Image`` and ``CompressedImage``, from rclpy or from a bag."""
 
 from pathlib import Path
+import struct
 from typing import Any
 
 import cv2
@@ -90,3 +91,9 @@ def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
 def stamp_to_ns(stamp: Any) -> int:
     """Integer nanoseconds of a builtin_interfaces/msg/Time."""
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def header_stamp_ns(cdr: bytes) -> int:
+    """Stamp of a serialised message that begins with a header (4 bytes of encapsulation before it)."""
+    seconds, nanoseconds = struct.unpack_from('<iI' if cdr[1] else '>iI', cdr, 4)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)

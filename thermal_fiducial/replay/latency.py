@@ -2,19 +2,12 @@
 
 import csv
 from pathlib import Path
-import struct
 
 import numpy as np
 
 IMU_TO_POSE = 'imu_to_pose'
 IMAGE_TO_CAMERA_POSE = 'image_to_camera_pose'
 IMAGE_TO_CORRECTED_POSE = 'image_to_corrected_pose'
-
-
-def header_stamp_ns(cdr: bytes) -> int:
-    """Stamp of a serialised message that begins with a header (4 bytes of encapsulation before it)."""
-    seconds, nanoseconds = struct.unpack_from('<iI' if cdr[1] else '>iI', cdr, 4)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
 class LatencyMeter:

@@ -16,9 +16,10 @@ from thermal_fiducial.files.bags import (
     IMAGE_TOPIC,
     IMU_TOPIC,
 )
+from thermal_fiducial.files.images import header_stamp_ns
 from thermal_fiducial.replay.children import NodeProcesses
 from thermal_fiducial.replay.domain import own_domain
-from thermal_fiducial.replay.latency import header_stamp_ns, LatencyMeter
+from thermal_fiducial.replay.latency import LatencyMeter
 from thermal_fiducial.replay.recorder import Recorder, RunFiles
 from thermal_fiducial.replay.topics import PLAYED, Topics
 from thermal_fiducial.replay.waiting import Wait

@@ -105,7 +105,7 @@ def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[
     try:
         options.run.mkdir(parents=True, exist_ok=True)
         settings.write(options.run / 'parameters.yaml')
-        for name in ('latency.csv', 'report.html'):
+        for name in ('latency.csv', 'report.html', 'flight.mp4'):
             (options.run / name).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f'run folder {options.run}: {error.strerror}') from None
@@ -161,6 +161,8 @@ def _summary(options: Options, settings: Settings, bag: BagReader, files: RunFil
         'format': 'thermal_fiducial/run',
         'version': 1,
         'bag': options.bag.resolve().name,
+        'bag_path': str(options.bag.resolve()),
+        'remaps': dict(options.remaps),
         'transport': options.transport,
         'mode': settings.marker_mapper.mode,
         'start_ns': bag.start_ns,

@@ -1,13 +1,18 @@
 """The measures of one run, as one nested dictionary: what ``summary.json`` and the tables show."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.report import metrics
+from thermal_fiducial.report.availability import at_frames, Available, available
+from thermal_fiducial.report.interruptions import Interruption, interruptions
+from thermal_fiducial.report.map_error import map_accuracy
 from thermal_fiducial.report.run_folder import Run
+from thermal_fiducial.report.tags import Tag, tags
 
 #: NEES looks at one pose in this time: its errors change slowly, so more are no more evidence [ns].
 CONSISTENCY_NS = 100_000_000
@@ -20,7 +25,17 @@ class Evaluation:
     run: Run
     fused_errors: metrics.Errors | None
     fiducial_errors: metrics.Errors | None
-    gaps: list[metrics.Gap]
+    interruptions: list[Interruption]
+
+    @cached_property
+    def available(self) -> Available | None:
+        """What a controller would have had; None where that is unknown."""
+        return available(self.run)
+
+    @cached_property
+    def tags(self) -> list[Tag]:
+        """One row a marker."""
+        return tags(self.run)
 
     @property
     def start_ns(self) -> int:
@@ -53,8 +68,8 @@ class Evaluation:
         return metrics.Errors(e.stamps_ns[at], e.d[at], e.estimate[at], e.truth[at]), output.covariances[same]
 
     @property
-    def strangers(self) -> BoolArray:
-        """Which detections are of markers that never entered the map: false ones, or seen too seldom."""
+    def unmapped(self) -> BoolArray:
+        """Which detections are of markers that never entered the map: false positives, or seen too seldom."""
         known = self.run.marker_map
         ids = self.run.detections.ids
         return np.zeros(len(ids), np.bool_) if known is None else ~np.isin(ids, list(known.markers))
@@ -63,9 +78,9 @@ class Evaluation:
         """All measures; what can't be known is left out."""
         result: dict[str, Any] = {
             'fused': metrics.output(self.run.fused),
-            'fiducial': {'poses': len(self.run.fiducial), 'way_m': metrics.way(self.run.fiducial)},
+            'fiducial': {'poses': len(self.run.fiducial), 'path_length_m': metrics.path_length(self.run.fiducial)},
             'markers': self._markers(),
-            'gaps': [_gap_numbers(gap) for gap in self.gaps],
+            'interruptions': [_interruption_numbers(entry) for entry in self.interruptions],
         }
         if self.run.latencies:
             result['latency'] = {kind: metrics.latency(ms) for kind, (_, ms) in self.run.latencies.items()}
@@ -74,6 +89,12 @@ class Evaluation:
                 result[name]['error'] = metrics.accuracy(e)
                 result[name]['jitter'] = metrics.jitter(e)
                 result[name]['relative_error'] = metrics.relative_pose_error(e)
+        if (frames := at_frames(self.run)) is not None:
+            result['at_frames'] = frames
+        if self.available is not None:
+            result['as_available'] = self.available.numbers()
+        if self.run.marker_map is not None and self.run.true_map is not None:
+            result['map'] = map_accuracy(self.run.marker_map, self.run.true_map)
         if (known := self.covariances) is not None:
             result['fused']['consistency'] = _consistency(*known)
         if len(self.run.output.innovations.nis):
@@ -90,7 +111,7 @@ class Evaluation:
             'different': len(np.unique(detections.ids)),
             'corner_sigma_median_px': float(np.median(detections.sigma_px)) if len(detections.ids) else None,
             'in_map': None if marker_map is None else len(marker_map.markers),
-            'detections_not_in_map': int(np.sum(self.strangers)),
+            'detections_not_in_map': int(np.sum(self.unmapped)),
         }
 
 
@@ -98,12 +119,21 @@ def evaluate(run: Run) -> Evaluation:
     """Measure a run."""
     fused_errors = None if run.truth is None else metrics.errors(run.fused, run.truth)
     fiducial_errors = None if run.truth is None else metrics.errors(run.fiducial, run.truth)
-    return Evaluation(run, fused_errors, fiducial_errors, metrics.gaps(run.fused, run.fiducial, fused_errors))
+    return Evaluation(run, fused_errors, fiducial_errors, interruptions(run, fused_errors))
 
 
-def _gap_numbers(gap: metrics.Gap) -> dict[str, float]:
-    numbers = {key: value for key, value in asdict(gap).items() if value is not None}
-    return {'seconds': gap.seconds, **numbers}
+def _interruption_numbers(entry: Interruption) -> dict[str, Any]:
+    numbers = {
+        'cause': entry.cause.value,
+        'seconds': entry.seconds,
+        'start_ns': entry.start_ns,
+        'end_ns': entry.end_ns,
+        'fused_poses': entry.fused_poses,
+        'step_mm': entry.step_mm,
+        'error_mm': entry.error_mm,
+        'error_deg': entry.error_deg,
+    }
+    return {name: value for name, value in numbers.items() if value is not None}
 
 
 def _consistency(e: metrics.Errors, covariances: FloatArray) -> dict[str, float]:

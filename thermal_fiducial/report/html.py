@@ -1,43 +1,125 @@
-"""The report as one self-contained page."""
+"""Pages that stand alone: one file each, with its plots' library in it, that needs no network."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jinja2
+import plotly.offline
 
 from thermal_fiducial import __version__
-from thermal_fiducial.report import plots
+from thermal_fiducial.report import charts
 from thermal_fiducial.report.evaluation import Evaluation
-from thermal_fiducial.report.tables import cards, tables
+from thermal_fiducial.report.frames import FramePicture
+from thermal_fiducial.report.overview import Card, cards, facts
+from thermal_fiducial.report.space import scene_chart
+from thermal_fiducial.report.tables import Table, tables
+from thermal_fiducial.report.time_plots import Chart
+from thermal_fiducial.report.verdict import judge, RunVerdict
+
+_HERE = Path(__file__).parent
+_FOOTER = (
+    'Errors are in the frame of the map, without any alignment, against truth interpolated at each stamp. Jitter is '
+    'the change of the error over 1/30 s. NEES and NIS are per degree of freedom: 1 is consistent, less is cautious. '
+    'A refused pose is one that the filter compared with its estimate and found beyond its gate.'
+)
 
 
 @dataclass(frozen=True)
-class Figure:
-    """A picture with its heading."""
+class Section:
+    """A part of a page, to which its navigation leads."""
+
+    name: str
+    title: str
+    charts: tuple[Chart, ...] = ()
+    tables: tuple[Table, ...] = ()
+    pictures: tuple[FramePicture, ...] = ()
+    #: what stands in place of pictures that are missing
+    note: str = ''
+    #: file name of a video beside the page
+    video: str = ''
+
+    def __bool__(self) -> bool:
+        return bool(self.charts or self.tables or self.pictures or self.note or self.video)
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a page shows: first the verdict and the key figures, then sections."""
 
     title: str
-    text: str
-    svg: str
+    lead: str
+    sections: tuple[Section, ...]
+    facts: tuple[tuple[str, str], ...] = ()
+    cards: tuple[Card, ...] = ()
+    verdict: RunVerdict | None = None
+    footer: str = _FOOTER
 
 
-def render(evaluation: Evaluation, numbers: dict[str, Any]) -> str:
-    """HTML of a run; ``numbers`` are :meth:`Evaluation.numbers`."""
+def render(page: Page) -> str:
+    """HTML of a page."""
     environment = jinja2.Environment(
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    template = environment.from_string(Path(__file__).with_name('report.html').read_text(encoding='utf-8'))
-    bag = str(evaluation.run.summary.get('bag', evaluation.run.path.name))
-    page: str = template.render(
-        title=bag,
-        lead=_lead(evaluation),
-        facts=_facts(evaluation, numbers),
-        cards=cards(evaluation, numbers),
-        figures=_figures(evaluation),
-        tables=tables(evaluation, numbers),
+    template = environment.from_string(_text('report.html'))
+    sections = [section for section in page.sections if section]
+    shown = [chart for section in sections for chart in section.charts]
+    html: str = template.render(
+        page=page,
+        sections=sections,
+        style=_text('report.css'),
+        script=_text('report.js'),
+        library=plotly.offline.get_plotlyjs() if shown else '',
+        figures=[(chart, _json(chart)) for chart in shown],
         version=__version__,
     )
-    return page
+    return html
+
+
+def _text(name: str) -> str:
+    return (_HERE / name).read_text(encoding='utf-8')
+
+
+def _json(chart: Chart) -> str:
+    """The figure, in a form that may stand within a script element."""
+    text: str = chart.figure.to_json(engine='json')
+    return text.replace('<', '\\u003c')
+
+
+def report_page(evaluation: Evaluation, numbers: dict[str, Any], pictures: list[FramePicture], video: str) -> Page:
+    """The report on a run; ``numbers`` are :meth:`Evaluation.numbers`, ``video`` a file beside the page or empty."""
+    made = tables(evaluation, numbers)
+
+    def some(*names: str) -> tuple[Table, ...]:
+        return tuple(made[name] for name in names if name in made)
+
+    no_bag = '' if pictures else 'No frames are shown: the bag is not where it was (--bag names it).'
+    sections = (
+        Section('errors', 'Errors', _errors(evaluation), some('pilot', 'accuracy', 'consistency')),
+        Section('space', 'Path and map', tuple(scene_chart(evaluation)), some('map', 'tags')),
+        Section('pose', 'Pose', tuple(charts.pose_charts(evaluation)), some('output')),
+        Section('frames', 'Frames', pictures=tuple(pictures), note=no_bag, video=video),
+        Section('markers', 'Markers', tuple(charts.detections_chart(evaluation)), some('markers', 'interruptions')),
+        Section('filter', 'Filter', _filter(evaluation), some('innovations')),
+        Section('speed', 'Latency', tuple(charts.latency_chart(evaluation)), some('latency', 'load')),
+        Section('nodes', 'Nodes', tables=some('diagnostics', 'figures')),
+    )
+    return Page(
+        title=str(evaluation.run.summary.get('bag', evaluation.run.path.name)),
+        lead=_lead(evaluation),
+        sections=sections,
+        facts=tuple(facts(evaluation, numbers)),
+        cards=tuple(cards(evaluation, numbers)),
+        verdict=judge(evaluation, numbers),
+    )
+
+
+def _errors(evaluation: Evaluation) -> tuple[Chart, ...]:
+    return (*charts.available_chart(evaluation), *charts.error_charts(evaluation))
+
+
+def _filter(evaluation: Evaluation) -> tuple[Chart, ...]:
+    return (*charts.innovation_chart(evaluation), *charts.clock_chart(evaluation))
 
 
 def _lead(evaluation: Evaluation) -> str:
@@ -50,45 +132,3 @@ def _lead(evaluation: Evaluation) -> str:
         'Thermal frames and IMU of one flight, turned into the pose of the robot in a map of acrylic markers: '
         f'from the markers alone (red) and fused with the IMU (blue), {truth}.'
     )
-
-
-def _facts(evaluation: Evaluation, numbers: dict[str, Any]) -> list[tuple[str, str]]:
-    summary = evaluation.run.summary
-    known = [
-        ('flight', f'{summary["duration_s"]:.1f} s' if 'duration_s' in summary else ''),
-        ('way', f'{numbers["fused"]["way_m"]:.1f} m' if 'way_m' in numbers['fused'] else ''),
-        ('mode', str(summary.get('mode', ''))),
-        ('transport', str(summary.get('transport', ''))),
-        ('dictionary', evaluation.run.marker_map.dictionary if evaluation.run.marker_map else ''),
-        ('markers in the map', str(len(evaluation.run.marker_map.markers)) if evaluation.run.marker_map else ''),
-    ]
-    return [(name, value) for name, value in known if value]
-
-
-def _figures(evaluation: Evaluation) -> list[Figure]:
-    made = [
-        Figure(
-            'Pose',
-            'Red dots: one frame of markers each. Blue: the filter, at IMU rate.',
-            plots.pose_over_time(evaluation),
-        ),
-        Figure('Map', 'The markers of the map, red where they were seen, and the flight.', plots.map_views(evaluation)),
-        Figure(
-            'Error',
-            'Estimate against truth, with three standard deviations as the filter states them (shaded).',
-            plots.errors_over_time(evaluation) or '',
-        ),
-        Figure(
-            'Innovations',
-            'How far each camera pose lay from what the filter expected, squared, in its standard deviations: 6 on '
-            'average where the covariances are right, less where the parameters allow for more.',
-            plots.innovations_over_time(evaluation) or '',
-        ),
-        Figure(
-            'Detections',
-            'Bars: a marker in view. Amber: no marker for over 0.3 s.',
-            plots.detections_over_time(evaluation),
-        ),
-        Figure('Latency', 'From the arrival of a message to the result.', plots.latency_over_time(evaluation) or ''),
-    ]
-    return [figure for figure in made if figure.svg]

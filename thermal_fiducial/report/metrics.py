@@ -1,4 +1,4 @@
-"""How good a trajectory is: errors against ground truth, jitter, consistency, gaps, latency.
+"""How good a trajectory is: errors against ground truth, jitter, consistency, latency.
 
 Truth is interpolated at the stamps of the estimate (nearest neighbours within 10 ms, as some tools take them, are a
 phantom error of 10 mm at 1 m/s). Errors are ``d`` of the package's covariance convention: the true pose is
@@ -22,8 +22,6 @@ from thermal_fiducial.report.trajectory import Trajectory
 FRAME_NS = 33_333_333
 #: Interval of the relative pose error [ns].
 RELATIVE_NS = 1_000_000_000
-#: Two fiducial poses farther apart than this have a gap between them [ns].
-GAP_NS = 300_000_000
 #: Truth is not interpolated over holes longer than this [ns].
 TRUTH_HOLE_NS = 200_000_000
 #: 95 % point of chi-square, by degrees of freedom; and where 95 % lie of a pose's, as much below as above.
@@ -114,7 +112,11 @@ def _rms(values: FloatArray) -> float:
 
 def aligned_residuals(e: Errors) -> FloatArray:
     """Position residuals (N, 3) [m] after the best rigid alignment of the estimate to the truth (no scale)."""
-    p_hat, p_true = e.estimate[:, :3, 3], e.truth[:, :3, 3]
+    return rigid_residuals(e.estimate[:, :3, 3], e.truth[:, :3, 3])
+
+
+def rigid_residuals(p_hat: FloatArray, p_true: FloatArray) -> FloatArray:
+    """Residuals (N, 3) [m] of points (N, 3) after the rigid motion that fits them best to ``p_true`` (N, 3)."""
     centre_hat, centre_true = p_hat.mean(axis=0), p_true.mean(axis=0)
     U, _, Vt = np.linalg.svd((p_true - centre_true).T @ (p_hat - centre_hat))
     R = U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
@@ -199,50 +201,7 @@ def innovation_consistency(innovations: Innovations) -> dict[str, float]:
     return result
 
 
-@dataclass(frozen=True)
-class Gap:
-    """A time without a fiducial pose."""
-
-    start_ns: int
-    end_ns: int
-    #: poses that the filter gave in it
-    fused_poses: int
-    #: change of the fused position at its end, when markers are seen again [mm]
-    step_mm: float
-    #: error at its end [mm, deg], where truth is known
-    error_mm: float | None = None
-    error_deg: float | None = None
-
-    @property
-    def seconds(self) -> float:
-        """Its length."""
-        return (self.end_ns - self.start_ns) * 1e-9
-
-
-def gaps(fused: Trajectory, fiducial: Trajectory, fused_errors: Errors | None) -> list[Gap]:
-    """The times without fiducial poses, and what the filter made of them."""
-    ends = np.flatnonzero(np.diff(fiducial.stamps_ns) > GAP_NS)
-    return [
-        _gap(fused, int(fiducial.stamps_ns[i]), int(fiducial.stamps_ns[i + 1]), fused_errors)
-        for i in ends
-        if len(fused)
-    ]
-
-
-def _gap(fused: Trajectory, start_ns: int, end_ns: int, e: Errors | None) -> Gap:
-    inside = (fused.stamps_ns > start_ns) & (fused.stamps_ns <= end_ns)
-    # The frame that ends the gap corrects the filter a few tens of milliseconds later, when it has been worked on.
-    after = (fused.stamps_ns > end_ns) & (fused.stamps_ns <= end_ns + 3 * FRAME_NS)
-    steps = (
-        _steps(fused.take(after | (fused.stamps_ns == fused.stamps_ns[inside][-1]))) if inside.any() else np.zeros(0)
-    )
-    error_mm = error_deg = None
-    if e is not None and np.any(at := (e.stamps_ns > start_ns) & (e.stamps_ns <= end_ns)):
-        error_mm, error_deg = 1e3 * float(e.position_m[at][-1]), float(e.attitude_deg[at][-1])
-    return Gap(start_ns, end_ns, int(inside.sum()), 1e3 * float(steps.max(initial=0.0)), error_mm, error_deg)
-
-
-def _steps(trajectory: Trajectory) -> FloatArray:
+def steps(trajectory: Trajectory) -> FloatArray:
     """How far each position lies from where the two before it led to [m]: the steps that corrections make."""
     p = trajectory.positions
     if len(p) < 3:
@@ -257,19 +216,19 @@ def output(trajectory: Trajectory) -> dict[str, float]:
     if len(trajectory) < 3:
         return {'poses': len(trajectory)}
     dt = np.diff(trajectory.stamps_ns)
-    steps = 1e3 * _steps(trajectory)
+    step_mm = 1e3 * steps(trajectory)
     return {
         'poses': len(trajectory),
         'rate_hz': 1e9 / float(np.median(dt)),
         'longest_pause_ms': 1e-6 * float(dt.max()),
-        'step_p95_mm': float(np.percentile(steps, 95)),
-        'step_max_mm': float(steps.max()),
-        'way_m': way(trajectory),
+        'step_p95_mm': float(np.percentile(step_mm, 95)),
+        'step_max_mm': float(step_mm.max()),
+        'path_length_m': path_length(trajectory),
     }
 
 
-def way(trajectory: Trajectory) -> float:
-    """Way flown [m], from positions a tenth of a second apart, so that noise adds little."""
+def path_length(trajectory: Trajectory) -> float:
+    """Path length flown [m], from positions a tenth of a second apart, so that noise adds little."""
     if not len(trajectory):
         return 0.0
     stamps = trajectory.stamps_ns

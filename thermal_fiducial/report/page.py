@@ -1,5 +1,6 @@
 """Measures of a run folder, and its page."""
 
+from importlib.util import find_spec
 import json
 from pathlib import Path
 from typing import Any
@@ -10,23 +11,48 @@ from thermal_fiducial.report.run_folder import read_run, SUMMARY
 
 __all__ = ['Evaluation', 'evaluate_run', 'write_report']
 
-REPORT = 'report.html'
+REPORT, VIDEO = 'report.html', 'flight.mp4'
 
 
-def evaluate_run(run_dir: Path, truth: Path | None = None) -> tuple[Evaluation, dict[str, Any]]:
+def is_installed(package: str) -> bool:
+    """Whether a package could be imported; it is not, as that may take a second."""
+    try:
+        return find_spec(package) is not None
+    except ImportError:
+        return False
+
+
+def require_packages(*, tables: bool = False) -> None:
+    """Check, before minutes of work, that what the report (and ``tables`` on the terminal) needs is installed.
+
+    Raises
+    ------
+    InputError
+        A package is missing; the message names it.
+    """
+    needed = ('jinja2', 'plotly', *(('rich',) if tables else ()))
+    missing = [name for name in needed if not is_installed(name)]
+    if missing:
+        raise InputError(f'the report needs {", ".join(missing)}: install the extra "tools"')
+
+
+def evaluate_run(
+    run_dir: Path, truth: Path | None = None, true_map: Path | None = None
+) -> tuple[Evaluation, dict[str, Any]]:
     """Measure a run folder and write the measures into its summary, under ``evaluation``.
 
     Parameters
     ----------
     run_dir : the run folder
     truth : TUM file or bag with ground truth; default: the folder's own, where it has one
+    true_map : the map as it really is; default: ``map_true.yaml`` beside the truth, where there is one
 
     Raises
     ------
     InputError
         No run folder, a broken file in it, or truth that doesn't cover the run.
     """
-    evaluation = evaluate(read_run(Path(run_dir), truth))
+    evaluation = evaluate(read_run(Path(run_dir), truth, true_map))
     run = evaluation.run
     if (
         run.truth is not None
@@ -37,11 +63,11 @@ def evaluate_run(run_dir: Path, truth: Path | None = None) -> tuple[Evaluation, 
         raise InputError(f'{truth}: ground truth and run {run_dir} have no time in common')
     numbers = evaluation.numbers()
     text = json.dumps(run.summary | {'evaluation': numbers}, indent=2)
-    _write(Path(run_dir) / SUMMARY, text + '\n')
+    write_text(Path(run_dir) / SUMMARY, text + '\n')
     return evaluation, numbers
 
 
-def write_report(run_dir: Path, truth: Path | None = None) -> Path:
+def write_report(run_dir: Path, truth: Path | None = None, bag: Path | None = None) -> Path:
     """Measure a run folder and write ``report.html`` into it; the path of that page.
 
     Raises
@@ -49,21 +75,30 @@ def write_report(run_dir: Path, truth: Path | None = None) -> Path:
     InputError
         As :func:`evaluate_run`; or without the libraries that draw (extra ``tools``).
     """
-    return write_page(*evaluate_run(run_dir, truth))
+    return write_page(*evaluate_run(run_dir, truth), bag)
 
 
-def write_page(evaluation: Evaluation, numbers: dict[str, Any]) -> Path:
-    """Write ``report.html`` of a run that has been measured."""
-    try:
-        from thermal_fiducial.report.html import render
-    except ImportError as error:
-        raise InputError(f'the report needs {error.name}: install the extra "tools"') from None
-    path = evaluation.run.path / REPORT
-    _write(path, render(evaluation, numbers))
+def write_page(evaluation: Evaluation, numbers: dict[str, Any], bag: Path | None = None) -> Path:
+    """Write ``report.html`` of a run that has been measured, with frames of ``bag`` (default: where it came from)."""
+    require_packages()
+    from thermal_fiducial.report.frames import strip
+    from thermal_fiducial.report.html import render, report_page
+
+    run = evaluation.run
+    video = VIDEO if (run.path / VIDEO).is_file() else ''
+    path = run.path / REPORT
+    write_text(path, render(report_page(evaluation, numbers, strip(run, bag), video)))
     return path
 
 
-def _write(path: Path, text: str) -> None:
+def write_text(path: Path, text: str) -> None:
+    """Write a file.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
     try:
         path.write_text(text, encoding='utf-8')
     except OSError as error:

@@ -1,34 +1,25 @@
 """What a run folder holds, read into arrays."""
 
-from collections import Counter
-from collections.abc import Iterable
 import csv
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 import json
 from pathlib import Path
-import re
 from typing import Any
 
 import numpy as np
 import yaml
 
-from thermal_fiducial.core.filter.innovations import INNOVATIONS, Innovations, innovations_of
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.report.output_bag import read_output, RecordedOutput
 from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
 
 FUSED, FIDUCIAL, TRUTH = 'fused.tum', 'fiducial.tum', 'truth.tum'
 DETECTIONS, LATENCY, PARAMETERS = 'detections.csv', 'latency.csv', 'parameters.yaml'
-MARKER_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'summary.json', 'output'
-#: Covariances are read from no more than so many messages, evenly over the run.
-MOST_COVARIANCES = 6000
-# "coasting for 0.6 s" and "coasting for 0.8 s" are one thing to say.
-_NUMBER = re.compile(r'\d+(\.\d+)?')
-_LEVELS = ('ok', 'warning', 'error', 'stale')
+MARKER_MAP, TRUE_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'map_true.yaml', 'summary.json', 'output'
 
 
 @dataclass(frozen=True)
@@ -39,33 +30,6 @@ class Detections:
     ids: IntArray
     corners_px: FloatArray
     sigma_px: FloatArray
-
-
-@dataclass(frozen=True)
-class Diagnostic:
-    """How often a node said something."""
-
-    node: str
-    level: str
-    message: str
-    count: int
-
-
-@dataclass(frozen=True)
-class RecordedOutput:
-    """What the recorded messages of the nodes tell beyond the text files.
-
-    Parameters
-    ----------
-    stamps_ns, covariances : (N,), (N, 6, 6) of some of the ``pose`` messages
-    diagnostics : what the nodes said, most frequent first
-    innovations : how well each camera pose fitted what the filter expected, at the IMU's stamps
-    """
-
-    stamps_ns: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
-    covariances: FloatArray = field(default_factory=lambda: np.zeros((0, 6, 6)))
-    diagnostics: tuple[Diagnostic, ...] = ()
-    innovations: Innovations = field(default_factory=Innovations)
 
 
 @dataclass(frozen=True)
@@ -85,15 +49,20 @@ class Run:
     marker_map: MarkerMap | None
     summary: dict[str, Any]
     truth: Trajectory | None
+    #: the map as it really is; None where nobody knows
+    true_map: MarkerMap | None = None
+    #: t_imu - t_camera as configured
+    offset_ns: int = 0
 
 
-def read_run(path: Path, truth: Path | None = None) -> Run:
+def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None) -> Run:
     """Read a run folder.
 
     Parameters
     ----------
     path : the folder
     truth : a TUM file or a bag; default: the folder's own ``truth.tum``, where it has one
+    true_map : a marker map; default: ``map_true.yaml`` in the truth's bag or beside its file, where there is one
 
     Raises
     ------
@@ -108,6 +77,9 @@ def read_run(path: Path, truth: Path | None = None) -> Run:
     own_truth = path / TRUTH
     if truth is None and own_truth.is_file():
         truth = own_truth
+    if true_map is None and truth is not None:
+        beside = (truth if truth.is_dir() else truth.parent) / TRUE_MAP
+        true_map = beside if beside.is_file() else None
     offset_ns = _camera_time_offset_ns(path / PARAMETERS)
     return Run(
         path=path,
@@ -115,10 +87,12 @@ def read_run(path: Path, truth: Path | None = None) -> Run:
         fiducial=read_tum(path / FIDUCIAL).delayed(offset_ns),
         detections=_detections(path / DETECTIONS),
         latencies=_latencies(path / LATENCY),
-        output=_output(path / OUTPUT, offset_ns),
+        output=read_output(path / OUTPUT, offset_ns),
         marker_map=load_map(path / MARKER_MAP) if (path / MARKER_MAP).is_file() else None,
         summary=_summary(path / SUMMARY),
         truth=None if truth is None else read_truth(truth),
+        true_map=None if true_map is None else load_map(true_map),
+        offset_ns=offset_ns,
     )
 
 
@@ -170,34 +144,3 @@ def _latencies(path: Path) -> dict[str, tuple[IntArray, FloatArray]]:
     kinds, stamps, values = _rows(path, {'kind': str, 'stamp_ns': int, 'latency_ms': float})
     kind_of, stamp, value = np.array(kinds), np.array(stamps, np.int64), np.array(values, np.float64)
     return {kind: (stamp[kind_of == kind], value[kind_of == kind]) for kind in dict.fromkeys(kinds)}
-
-
-def _output(path: Path, offset_ns: int) -> RecordedOutput:
-    if not path.is_dir():
-        return RecordedOutput()
-    with BagReader(path) as bag:
-        statuses = [status for item in bag.messages(['diagnostics']) for status in item.message.status]
-        return RecordedOutput(*_covariances(bag), _diagnostics(statuses), _innovations(statuses, offset_ns))
-
-
-def _covariances(bag: BagReader) -> tuple[IntArray, FloatArray]:
-    every = 1 + bag.message_count(['pose']) // MOST_COVARIANCES
-    messages = [item.message for index, item in enumerate(bag.messages(['pose'])) if index % every == 0]
-    stamps = [message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec for message in messages]
-    covariances = [message.pose.covariance for message in messages]
-    return np.array(stamps, np.int64), np.array(covariances, np.float64).reshape(-1, 6, 6)
-
-
-def _diagnostics(statuses: Iterable[Any]) -> tuple[Diagnostic, ...]:
-    said: Counter[tuple[str, str, str]] = Counter()
-    for status in statuses:
-        level = status.level[0] if isinstance(status.level, (bytes, np.ndarray)) else status.level
-        said[status.name, _LEVELS[min(int(level), 3)], _NUMBER.sub('…', status.message)] += 1
-    return tuple(Diagnostic(*key, count) for key, count in said.most_common())
-
-
-def _innovations(statuses: Iterable[Any], offset_ns: int) -> Innovations:
-    told = innovations_of(
-        ' '.join(item.value for status in statuses for item in status.values if item.key == INNOVATIONS)
-    )
-    return replace(told, stamps_ns=told.stamps_ns + offset_ns)

@@ -7,26 +7,27 @@ from typing import Any
 from thermal_fiducial.core.filter.innovations import INNOVATIONS
 from thermal_fiducial.report.evaluation import Evaluation
 
+#: Tables of more columns stand alone.
+_NARROW = 4
+
 
 @dataclass(frozen=True)
 class Table:
-    """A title, column heads and rows of cells; ``textual``: cells are words, not numbers."""
+    """A title, column heads with units, and rows of cells; ``words``: columns of words, which begin at the left."""
 
     title: str
     heads: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
-    textual: bool = False
+    words: tuple[str, ...] = ('unit', 'status', 'why')
 
+    def is_text(self, column: int) -> bool:
+        """Whether a column holds words; the first one always does."""
+        return column == 0 or self.heads[column] in self.words
 
-@dataclass(frozen=True)
-class Card:
-    """One number of the top of the page, with the same from the markers alone, or a note."""
-
-    name: str
-    value: str
-    unit: str = ''
-    fiducial: str = ''
-    note: str = ''
+    @property
+    def is_wide(self) -> bool:
+        """Whether it takes the width of a page."""
+        return len(self.heads) > _NARROW
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -40,90 +41,160 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 _BOTH = (
-    ('position error, rms [mm]', 'error', 'position_rms_mm'),
-    ('position error, median [mm]', 'error', 'position_median_mm'),
-    ('position error, 95 % [mm]', 'error', 'position_p95_mm'),
-    ('position error, largest [mm]', 'error', 'position_max_mm'),
-    ('position error after rigid alignment, rms [mm]', 'error', 'position_aligned_rms_mm'),
-    ('attitude error, rms [deg]', 'error', 'attitude_rms_deg'),
-    ('attitude error, 95 % [deg]', 'error', 'attitude_p95_deg'),
-    ('attitude error, largest [deg]', 'error', 'attitude_max_deg'),
-    ('jitter over 1/30 s, position, rms [mm]', 'jitter', 'position_mm'),
-    ('jitter over 1/30 s, attitude, rms [deg]', 'jitter', 'attitude_deg'),
-    ('relative error over 1 s, position, rms [mm]', 'relative_error', 'position_mm'),
-    ('relative error over 1 s, attitude, rms [deg]', 'relative_error', 'attitude_deg'),
+    ('position error, rms', 'mm', 'error', 'position_rms_mm'),
+    ('position error, median', 'mm', 'error', 'position_median_mm'),
+    ('position error, 95 %', 'mm', 'error', 'position_p95_mm'),
+    ('position error, largest', 'mm', 'error', 'position_max_mm'),
+    ('position error after rigid alignment, rms', 'mm', 'error', 'position_aligned_rms_mm'),
+    ('attitude error, rms', 'deg', 'error', 'attitude_rms_deg'),
+    ('attitude error, 95 %', 'deg', 'error', 'attitude_p95_deg'),
+    ('attitude error, largest', 'deg', 'error', 'attitude_max_deg'),
+    ('jitter over 1/30 s, position, rms', 'mm', 'jitter', 'position_mm'),
+    ('jitter over 1/30 s, attitude, rms', 'deg', 'jitter', 'attitude_deg'),
+    ('relative error over 1 s, position, rms', 'mm', 'relative_error', 'position_mm'),
+    ('relative error over 1 s, attitude, rms', 'deg', 'relative_error', 'attitude_deg'),
 )
 
 _OUTPUT = (
-    ('poses', 'poses'),
-    ('rate [Hz]', 'rate_hz'),
-    ('longest pause [ms]', 'longest_pause_ms'),
-    ('step at a correction, 95 % [mm]', 'step_p95_mm'),
-    ('step at a correction, largest [mm]', 'step_max_mm'),
-    ('way [m]', 'way_m'),
+    ('poses', 'count', 'poses'),
+    ('rate', 'Hz', 'rate_hz'),
+    ('longest pause', 'ms', 'longest_pause_ms'),
+    ('step at a correction, 95 %', 'mm', 'step_p95_mm'),
+    ('step at a correction, largest', 'mm', 'step_max_mm'),
+    ('path length', 'm', 'path_length_m'),
 )
 
 _MARKERS = (
-    ('detections', 'detections'),
-    ('frames with markers', 'frames_with_markers'),
-    ('markers in such a frame, mean', 'seen_in_a_frame'),
-    ('different markers', 'different'),
-    ('corner sigma, median [px]', 'corner_sigma_median_px'),
-    ('markers in the map', 'in_map'),
-    ('detections of markers that are not in it', 'detections_not_in_map'),
+    ('detections', 'count', 'detections'),
+    ('frames with markers', 'count', 'frames_with_markers'),
+    ('markers in such a frame, mean', 'count', 'seen_in_a_frame'),
+    ('different markers', 'count', 'different'),
+    ('corner sigma, median', 'px', 'corner_sigma_median_px'),
+    ('markers in the map', 'count', 'in_map'),
+    ('detections of markers that are not in it', 'count', 'detections_not_in_map'),
 )
 
+_MAP = (
+    ('markers that both maps have', 'count', 'markers'),
+    ('of these, not fixed', 'count', 'not_fixed'),
+    ('position error, rms', 'mm', 'position_rms_mm'),
+    ('position error, largest', 'mm', 'position_max_mm'),
+    ('position error after rigid alignment, rms', 'mm', 'position_aligned_rms_mm'),
+    ('attitude error, rms', 'deg', 'attitude_rms_deg'),
+    ('attitude error, largest', 'deg', 'attitude_max_deg'),
+    ('NEES (consistent: 1)', 'per d.o.f.', 'nees_per_dof'),
+)
 
-def tables(evaluation: Evaluation, numbers: dict[str, Any]) -> list[Table]:
-    """All tables that the run has something for."""
-    made = [
-        _accuracy(numbers),
-        _consistency(numbers),
-        _innovations(numbers),
-        Table('Output', ('', 'fused'), _pick(numbers['fused'], _OUTPUT)),
-        _latency(numbers),
-        Table('Markers', ('', ''), _pick(numbers['markers'], _MARKERS)),
-        _gaps(evaluation),
-        _load(evaluation),
-        _diagnostics(evaluation),
-        _figures(evaluation),
-    ]
-    return [table for table in made if table.rows]
+_SPREAD = (
+    ('position error, rms', 'mm', 'position_rms_mm'),
+    ('position error, 95 %', 'mm', 'position_p95_mm'),
+    ('position error, largest', 'mm', 'position_max_mm'),
+    ('attitude error, rms', 'deg', 'attitude_rms_deg'),
+    ('attitude error, 95 %', 'deg', 'attitude_p95_deg'),
+)
+
+#: What the nodes count has no unit but these.
+_UNITS = {
+    'seconds since accepted pose': 's',
+    'position std': 'm',
+    'usable for': 's',
+    'time offset': 's',
+    'time offset std': 's',
+    'white pose error': 'sigma',
+    'systematic pose error': 'sigma',
+    'stamp jitter': 's',
+    'gyroscope bias': 'rad/s',
+    'accelerometer bias': 'm/s^2',
+    'gyroscope scale error': '1',
+    'accelerometer scale error': '1',
+    'map tilt': 'rad',
+}
+#: Of all poses of the run, these stand in the table of the innovations; the nodes' own are of the latest ones.
+_ELSEWHERE = ('received ', 'published ', 'poses accepted', 'poses refused', 'nis', INNOVATIONS)
 
 
-def _pick(values: dict[str, Any], rows: tuple[tuple[str, str], ...]) -> list[tuple[str, ...]]:
-    return [(name, number(values[key], 4)) for name, key in rows if values.get(key) is not None]
+def tables(evaluation: Evaluation, numbers: dict[str, Any]) -> dict[str, Table]:
+    """All tables that the run has something for, by what they are about."""
+    made = {
+        'pilot': _pilot(numbers),
+        'accuracy': _accuracy(numbers),
+        'consistency': _consistency(numbers),
+        'innovations': _innovations(numbers),
+        'output': Table('Output', ('', 'unit', 'fused'), _pick(numbers['fused'], _OUTPUT)),
+        'latency': _latency(numbers),
+        'interruptions': _interruptions(evaluation),
+        'markers': Table('Markers', ('', 'unit', ''), _pick(numbers['markers'], _MARKERS)),
+        'map': Table('Error of the map', ('', 'unit', ''), _pick(numbers.get('map', {}), _MAP)),
+        'tags': _tags(evaluation),
+        'load': _load(evaluation),
+        'diagnostics': _diagnostics(evaluation),
+        'figures': _figures(evaluation),
+    }
+    return {name: table for name, table in made.items() if table.rows}
+
+
+def _pick(values: dict[str, Any], rows: tuple[tuple[str, str, str], ...]) -> list[tuple[str, ...]]:
+    return [(name, unit, number(values[key], 4)) for name, unit, key in rows if values.get(key) is not None]
 
 
 def _accuracy(numbers: dict[str, Any]) -> Table:
     rows = []
-    for name, part, key in _BOTH:
+    for name, unit, part, key in _BOTH:
         fused, fiducial = (numbers[source].get(part, {}).get(key) for source in ('fused', 'fiducial'))
         if fused is not None or fiducial is not None:
-            rows.append((name, number(fused), number(fiducial)))
-    return Table('Accuracy', ('', 'fused', 'fiducial'), rows)
+            rows.append((name, unit, number(fused), number(fiducial)))
+    return Table('Accuracy of each pose at its own stamp', ('', 'unit', 'fused', 'markers alone'), rows)
+
+
+def _pilot(numbers: dict[str, Any]) -> Table:
+    """Errors as a controller has them beside those at the instants of frames, which flatter the markers."""
+    held = numbers.get('as_available', {})
+    cases = {
+        'markers in view': held.get('in_view', {}),
+        'always': held.get('always', {}),
+        "at frames' instants": numbers.get('at_frames', {}),
+    }
+    shown = {name: both for name, both in cases.items() if both}
+    rows = [
+        (name, unit, *(number(both[source].get(key)) for both in shown.values() for source in ('fused', 'markers')))
+        for name, unit, key in _SPREAD
+        if shown
+    ]
+    if held:
+        ages = [number(held['age_ms'][source]) for source in ('fused', 'markers')]
+        rows.append(
+            ('age of the newest pose, median', 'ms', *ages, *ages, *('0' for _ in ages if 'at_frames' in numbers))
+        )
+    heads = [f'{source}, {name}' for name in shown for source in ('fused', 'markers alone')]
+    return Table('What a controller has: the newest pose that had come, at each instant', ('', 'unit', *heads), rows)
 
 
 def _consistency(numbers: dict[str, Any]) -> Table:
     values = numbers['fused'].get('consistency', {})
     rows = [
-        (name, number(values[f'{name}_nees_per_dof']), f'{100 * values[f"{name}_within_95"]:.1f} %')
+        (name, number(values[f'{name}_nees_per_dof']), f'{100 * values[f"{name}_within_95"]:.1f}')
         for name in ('pose', 'position', 'attitude')
         if f'{name}_nees_per_dof' in values
     ]
-    return Table('Consistency of the covariance', ('', 'NEES per degree of freedom', 'within the 95 % region'), rows)
+    heads = ('', 'NEES, consistent: 1 [per d.o.f.]', 'within the 95 % region [%]')
+    return Table('Consistency of the covariance with the errors', heads, rows)
 
 
 def _innovations(numbers: dict[str, Any]) -> Table:
     values = numbers.get('innovations', {})
-    rows = [('camera poses compared', str(values['poses'])), ('refused', str(values['refused']))] if values else []
+    if not values:
+        return Table('', (), ())
+    rows: list[tuple[str, ...]] = [
+        ('camera poses compared with the estimate', 'count', str(values['poses'])),
+        ('of these, refused: beyond the gate', 'count', str(values['refused'])),
+    ]
     if 'nis_per_dof' in values:
         rows += [
-            ('NIS per degree of freedom', number(values['nis_per_dof'])),
-            ('within the 95 % band', f'{100 * values["within_95"]:.1f} %'),
-            ('above it', f'{100 * values["above_95"]:.1f} %'),
+            ('NIS of those accepted (consistent: 1)', 'per d.o.f.', number(values['nis_per_dof'])),
+            ('of these, within the 95 % band', '%', f'{100 * values["within_95"]:.1f}'),
+            ('above it', '%', f'{100 * values["above_95"]:.1f}'),
         ]
-    return Table('Innovations of the filter', ('', ''), rows)
+    return Table('Innovations of the filter', ('', 'unit', ''), rows)
 
 
 def _latency(numbers: dict[str, Any]) -> Table:
@@ -134,32 +205,57 @@ def _latency(numbers: dict[str, Any]) -> Table:
     return Table('Latency', ('', 'median [ms]', '99 % [ms]', 'largest [ms]'), rows)
 
 
-def _gaps(evaluation: Evaluation) -> Table:
+def _interruptions(evaluation: Evaluation) -> Table:
     rows = [
         (
-            f'{evaluation.seconds_at(gap.start_ns):.2f} s',
-            f'{gap.seconds:.2f}',
-            str(gap.fused_poses),
-            number(gap.error_mm),
-            number(gap.error_deg),
-            number(gap.step_mm),
+            entry.cause.value,
+            f'{evaluation.seconds_at(entry.start_ns):.2f}',
+            f'{entry.seconds:.2f}',
+            str(entry.fused_poses),
+            number(entry.error_mm),
+            number(entry.error_deg),
+            number(entry.step_mm),
         )
-        for gap in evaluation.gaps
+        for entry in evaluation.interruptions
     ]
     heads = (
-        'from',
+        'cause',
+        'from [s]',
         'length [s]',
-        'fused poses',
+        'fused poses [count]',
         'error at its end [mm]',
         'error [deg]',
         'step when markers return [mm]',
     )
-    return Table('Drop-outs: times without a fiducial pose', heads, rows)
+    return Table('Times without a pose from the markers', heads, rows)
+
+
+def _tags(evaluation: Evaluation) -> Table:
+    heads = (
+        'marker',
+        'views [frames]',
+        'first view [s]',
+        'corner sigma [px]',
+        'residual [px]',
+        'sigma [mm]',
+        'sigma [deg]',
+    )
+    with_errors = any(tag.error for tag in evaluation.tags)
+    rows = []
+    for tag in evaluation.tags:
+        first = '–' if tag.first_view_ns is None else f'{evaluation.seconds_at(tag.first_view_ns):.2f}'
+        values = (tag.corner_sigma_px, tag.residual_px, tag.sigma_mm, tag.sigma_deg)
+        error = (tag.error.position_mm, tag.error.attitude_deg) if tag.error else (None, None)
+        row = (str(tag.id), str(tag.views), first, *map(number, values))
+        rows.append((*row, *(map(number, error) if with_errors else ()), tag.status, tag.why))
+    errors = ('error [mm]', 'error [deg]') if with_errors else ()
+    return Table('Markers, one by one', (*heads, *errors, 'status', 'why'), rows)
 
 
 def _diagnostics(evaluation: Evaluation) -> Table:
-    rows = [(said.node, said.level, said.message, f'{said.count} x') for said in evaluation.run.output.diagnostics]
-    return Table('What the nodes said, once a second', ('node', 'level', 'message', 'times'), rows, textual=True)
+    rows = [(said.node, said.level, said.message, str(said.count)) for said in evaluation.run.output.diagnostics]
+    heads = ('node', 'level', 'message', 'times [count]')
+    return Table('What the nodes said, once a second', heads, rows, heads[:3])
 
 
 def _load(evaluation: Evaluation) -> Table:
@@ -168,57 +264,19 @@ def _load(evaluation: Evaluation) -> Table:
 
 
 def _figures(evaluation: Evaluation) -> Table:
-    """What the nodes counted, but for the traffic on their topics."""
+    """What the nodes counted, but for the traffic on their topics and what stands in other tables."""
     said = evaluation.run.summary.get('diagnostics', {})
     rows = [
-        (node, name, str(value))
+        (node, name, str(value), _unit(name, str(value)))
         for node, figures in said.items()
         for name, value in figures.items()
-        if value not in ('', '0') and not name.startswith(('received ', 'published ', INNOVATIONS))
+        if value not in ('', '0') and not name.startswith(_ELSEWHERE)
     ]
-    return Table('What the nodes counted, at the end', ('node', 'figure', 'value'), rows, textual=True)
+    heads = ('node', 'figure', 'value', 'unit')
+    return Table('What the nodes counted, at the end', heads, rows, heads)
 
 
-def cards(evaluation: Evaluation, numbers: dict[str, Any]) -> list[Card]:
-    """The numbers that a stranger looks for first."""
-    fused, fiducial, markers = numbers['fused'], numbers['fiducial'], numbers['markers']
-    made = [
-        _compared('Position error', 'mm', fused, fiducial, 'error', 'position_rms_mm'),
-        _compared('Attitude error', 'deg', fused, fiducial, 'error', 'attitude_rms_deg'),
-        _compared('Jitter from frame to frame', 'mm', fused, fiducial, 'jitter', 'position_mm'),
-        Card(
-            'Output',
-            number(fused.get('rate_hz')),
-            'Hz',
-            note=f'{fused["poses"]} poses, {fiducial["poses"]} from markers',
-        ),
-        Card(
-            'Markers', str(markers['different']), 'seen', note=f'{markers["seen_in_a_frame"]:.1f} in a frame with any'
-        ),
-        _gap_card(evaluation),
-    ]
-    if 'imu_to_pose' in numbers.get('latency', {}):
-        values = numbers['latency']['imu_to_pose']
-        made.append(
-            Card('Latency, IMU to pose', number(values['p50_ms']), 'ms', note=f'{number(values["p99_ms"])} ms at 99 %')
-        )
-    return [card for card in made if card is not None]
-
-
-def _compared(
-    name: str, unit: str, fused: dict[str, Any], fiducial: dict[str, Any], part: str, key: str
-) -> Card | None:
-    value, other = fused.get(part, {}).get(key), fiducial.get(part, {}).get(key)
-    if value is None:
-        return None
-    return Card(name, number(value), unit, fiducial='' if other is None else f'{number(other)} {unit}', note='rms')
-
-
-def _gap_card(evaluation: Evaluation) -> Card:
-    longest = max((gap.seconds for gap in evaluation.gaps), default=0.0)
-    if not evaluation.gaps:
-        return Card('Without markers', '0', 's', note='no drop-out over 0.3 s')
-    worst = max((gap.error_mm for gap in evaluation.gaps if gap.error_mm is not None), default=None)
-    times = f'{len(evaluation.gaps)} drop-out{"s" if len(evaluation.gaps) > 1 else ""}'
-    note = times if worst is None else f'{times}, at worst {number(worst)} mm off'
-    return Card('Longest time without markers', f'{longest:.1f}', 's', note=note)
+def _unit(name: str, value: str) -> str:
+    if name.startswith('vibration '):
+        return name.removeprefix('vibration ')
+    return _UNITS.get(name, 'count' if value.isdigit() else '')

@@ -1,0 +1,225 @@
+"""Parts of the report: interruptions, what a controller has, errors of the map, markers one by one, the verdict."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.run_folders import CAMERA_DELAY_NS, FUSED_DELAY_NS, make_run, START_NS, true_pose, wall
+
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.mapping.map_data import MarkerMap
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.marker_map import save_map
+from thermal_fiducial.report import interruptions as breaks
+from thermal_fiducial.report.availability import at_frames, available
+from thermal_fiducial.report.evaluation import evaluate
+from thermal_fiducial.report.map_error import map_accuracy, marker_errors
+from thermal_fiducial.report.metrics import errors
+from thermal_fiducial.report.output_bag import Arrivals, RecordedOutput
+from thermal_fiducial.report.run_folder import Detections, read_run, Run
+from thermal_fiducial.report.tags import tags
+from thermal_fiducial.report.trajectory import Trajectory
+from thermal_fiducial.report.verdict import HEADLINES, judge, Weight
+
+SECONDS = 12.0
+NOTHING = Detections(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 4, 2)), np.zeros(0))
+
+
+def trajectory(rate_hz, seconds=SECONDS):
+    stamps = START_NS + np.arange(0, round(seconds * 1e9), round(1e9 / rate_hz))
+    return Trajectory(stamps, true_pose((stamps - START_NS) * 1e-9))
+
+
+def run_of(tmp_path, fused, fiducial, **more):
+    empty = {'latencies': {}, 'output': RecordedOutput(), 'marker_map': None, 'summary': {}, 'truth': trajectory(100.0)}
+    return Run(tmp_path, fused, fiducial, **({'detections': NOTHING} | empty | more))
+
+
+# --- interruptions -----------------------------------------------------------------------------------
+
+
+def test_an_interruption_with_its_error_and_the_step_at_its_end(tmp_path):
+    fused, fiducial = trajectory(200.0), trajectory(30.0)
+    seconds = (fiducial.stamps_ns - START_NS) * 1e-9
+    fiducial = fiducial.take((seconds < 8.0) | (seconds > 10.0))
+    t = (fused.stamps_ns - START_NS) * 1e-9
+    wandering = fused.T_map_body.copy()
+    wandering[:, 1, 3] += np.where((t > 8.0) & (t < 10.0334), 0.02 * (t - 8.0), 0.0)
+    run = run_of(tmp_path, Trajectory(fused.stamps_ns, wandering), fiducial)
+    (entry,) = breaks.interruptions(run, errors(run.fused, run.truth))
+    assert entry.seconds == pytest.approx(2.03, abs=0.04)
+    assert entry.fused_poses == pytest.approx(200 * entry.seconds, abs=1)
+    # 2 cm/s for 2 s; the flight itself adds less than a millimetre of curvature in a sample.
+    assert entry.error_mm == pytest.approx(40.3, abs=0.5)
+    assert entry.step_mm == pytest.approx(40.6, abs=0.7)
+    assert breaks.interruptions(run, None)[0].error_mm is None
+    assert breaks.interruptions(run_of(tmp_path, fused, trajectory(30.0)), None) == []
+
+
+CASES = {
+    'shutter (FFC)': ({'settling after FFC': 3, 'frozen': 9}, False, False),
+    'frames withheld': ({'frozen': 9}, False, False),
+    'no image': ({}, False, False),
+    'no marker in view': ({}, True, False),
+    'markers in view, no pose': ({}, True, True),
+}
+
+
+@pytest.mark.parametrize('cause', CASES)
+def test_why_there_was_no_pose(tmp_path, cause):
+    withheld, frames_come, seen = CASES[cause]
+    every = trajectory(30.0)
+    t = (every.stamps_ns - START_NS) * 1e-9
+    inside = (t > 5.0) & (t < 5.5)
+    output = RecordedOutput(
+        frames_ns=every.stamps_ns if frames_come else every.stamps_ns[~inside],
+        withheld=((START_NS + 5_000_000_000, {}), (START_NS + 6_000_000_000, withheld)),
+    )
+    stamps = every.stamps_ns[inside if seen else ~inside]
+    detections = Detections(
+        stamps, np.zeros(len(stamps), np.int64), np.zeros((len(stamps), 4, 2)), np.ones(len(stamps))
+    )
+    run = run_of(tmp_path, trajectory(200.0), every.take(~inside), output=output, detections=detections)
+    (entry,) = breaks.interruptions(run, None)
+    assert entry.cause.value == cause
+    assert entry.is_shutter == (cause == 'shutter (FFC)')
+
+
+# --- as available ------------------------------------------------------------------------------------
+
+
+def straight(rate_hz, speed=1.5):
+    stamps = START_NS + np.arange(0, round(SECONDS * 1e9), round(1e9 / rate_hz))
+    t = (stamps - START_NS) * 1e-9
+    return Trajectory(stamps, transform(np.tile(np.eye(3), (len(t), 1, 1)), np.outer(t, [speed, 0.0, 0.0])))
+
+
+def test_a_held_pose_is_wrong_by_what_was_flown_since(tmp_path):
+    """Perfect poses in straight flight: the error as available is the speed times the age, of both."""
+    fused, markers = straight(200.0), straight(30.0)
+    output = RecordedOutput(
+        fused_arrivals=Arrivals(fused.stamps_ns, fused.stamps_ns + FUSED_DELAY_NS),
+        camera_arrivals=Arrivals(markers.stamps_ns, markers.stamps_ns + CAMERA_DELAY_NS),
+    )
+    run = run_of(tmp_path, fused, markers, truth=straight(100.0), output=output)
+    numbers = available(run).numbers()
+    for name, delay, period in (('fused', 1.0, 5.0), ('markers', 25.0, 33.3)):
+        # Ages from the delay to a period more, evenly; instants every 1.7 ms see that to a fiftieth.
+        ages = np.linspace(delay, delay + period, 1000)
+        assert numbers['in_view'][name]['position_rms_mm'] == pytest.approx(1.5 * np.sqrt(np.mean(ages**2)), rel=0.02)
+        assert numbers['age_ms'][name] == pytest.approx(delay + period / 2.0, abs=1.0)
+    # At the frames' instants both are perfect, which no controller ever sees.
+    assert at_frames(run)['markers']['position_rms_mm'] < 1e-6
+    assert at_frames(run)['fused']['position_rms_mm'] < 1e-6
+
+
+def test_arrivals_by_another_clock_count_from_the_soonest(tmp_path):
+    fused, markers = straight(200.0), straight(30.0)
+    apart = 7_000_000_000_000
+    here, there = (
+        RecordedOutput(
+            fused_arrivals=Arrivals(fused.stamps_ns, fused.stamps_ns + shift),
+            camera_arrivals=Arrivals(markers.stamps_ns, markers.stamps_ns + shift + CAMERA_DELAY_NS),
+        )
+        for shift in (0, apart)
+    )
+    results = [available(run_of(tmp_path, fused, markers, truth=straight(100.0), output=o)) for o in (here, there)]
+    assert results[0].numbers() == results[1].numbers()
+
+
+def test_nothing_is_said_of_availability_without_truth_or_arrivals(tmp_path):
+    fused, markers = straight(200.0), straight(30.0)
+    assert available(run_of(tmp_path, fused, markers)) is None
+    output = RecordedOutput(fused_arrivals=Arrivals(fused.stamps_ns, fused.stamps_ns))
+    assert available(run_of(tmp_path, fused, markers, output=output, truth=None)) is None
+
+
+# --- map and markers ---------------------------------------------------------------------------------
+
+
+def moved(marker_map, d, covariance):
+    """Markers that are not fixed, off by ``d`` (6,) in the convention of the covariances."""
+    return MarkerMap({
+        key: m if m.fixed else replace(m, covariance=covariance, T_map_marker=transform(
+            so3_exp(-d[3:]) @ m.T_map_marker[:3, :3], m.T_map_marker[:3, 3] - d[:3]))
+        for key, m in marker_map.markers.items()
+    })  # fmt: skip
+
+
+def test_errors_of_a_map():
+    d = np.array([0.003, 0.0, 0.004, 0.0, 0.01, 0.0])
+    estimate = moved(wall(), d, np.diag(d**2 + 1e-12))
+    found = map_accuracy(estimate, wall())
+    assert (found['markers'], found['not_fixed']) == (8, 7)
+    assert found['position_rms_mm'] == pytest.approx(5.0)
+    assert found['attitude_max_deg'] == pytest.approx(np.rad2deg(0.01))
+    # Three of six degrees of freedom are one sigma off.
+    assert found['nees_per_dof'] == pytest.approx(0.5, abs=1e-6)
+    assert found['position_aligned_rms_mm'] < 2.0
+    assert marker_errors(estimate, wall())[2].nees is None
+
+
+def test_maps_without_a_common_marker_cannot_be_compared():
+    with pytest.raises(InputError, match='no marker in common'):
+        map_accuracy(wall(), MarkerMap())
+
+
+def test_the_true_map_beside_the_truth_is_found(tmp_path):
+    run = make_run(tmp_path / 'run', seconds=2.0, gap=(1.0, 1.4), with_output=False)
+    assert 'map' not in evaluate(read_run(run)).numbers()
+    save_map(run / 'map_true.yaml', wall())
+    assert evaluate(read_run(run)).numbers()['map']['position_rms_mm'] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_markers_one_by_one_with_status_and_reason(tmp_path):
+    run = read_run(make_run(tmp_path / 'run', seconds=3.0, gap=(1.0, 1.4), with_output=False))
+    known = dict(run.marker_map.markers)
+    known[5] = replace(known[5], trusted=False)
+    del known[6], known[7]
+    said = {'marker_mapper': {'quarantine': '5: 9.1 px off in 30 views; 4: gone', 'candidates': '6: too oblique'}}
+    rows = tags(replace(run, marker_map=MarkerMap(known), summary={'diagnostics': said}))
+    standing = {tag.id: (tag.status, tag.why) for tag in rows}
+    assert standing[2] == ('fixed', 'surveyed, never moves')
+    assert standing[4] == ('used', '9 observations fit')
+    assert standing[5] == ('quarantined', '9.1 px off in 30 views')
+    assert standing[6] == ('on trial', 'too oblique')
+    assert standing[7][0] == 'not in the map'
+    assert standing[9] == ('used', 'from an earlier run; not seen in this one')
+    views = {tag.id: tag.views for tag in rows}
+    assert views[4] == len(np.unique(run.detections.stamps_ns[run.detections.ids == 4])) > 0
+    assert views[9] == 0
+
+
+# --- verdict -----------------------------------------------------------------------------------------
+
+GOOD = {
+    'fused': {'poses': 900, 'rate_hz': 200.0, 'longest_pause_ms': 5.0, 'step_max_mm': 1.0},
+    'innovations': {'poses': 300, 'refused': 0},
+}
+
+
+def with_value(numbers, path, value):
+    first, *rest = path
+    return numbers | {first: with_value(numbers.get(first, {}), rest, value) if rest else value}
+
+
+DOUBTS = [
+    (('fused', 'poses'), 0, Weight.FAULT, 'no pose'),
+    (('fused', 'longest_pause_ms'), 200.0, Weight.DOUBT, 'pause of 200 ms'),
+    (('fused', 'longest_pause_ms'), 900.0, Weight.FAULT, 'none for 900 ms'),
+    (('fused', 'consistency', 'pose_nees_per_dof'), 3.0, Weight.DOUBT, 'claims less error'),
+    (('fused', 'consistency', 'pose_nees_per_dof'), 9.0, Weight.FAULT, 'far less error'),
+    (('innovations', 'refused'), 6, Weight.DOUBT, '6 of 300'),
+    (('innovations', 'refused'), 60, Weight.FAULT, '60 of 300'),
+    (('fused', 'step_max_mm'), 80.0, Weight.DOUBT, 'jumps by up to 80 mm'),
+    (('latency', 'imu_to_pose', 'p99_ms'), 45.0, Weight.DOUBT, '45.0 ms'),
+]
+
+
+@pytest.mark.parametrize(('path', 'value', 'weight', 'words'), DOUBTS)
+def test_what_speaks_against_a_run(tmp_path, path, value, weight, words):
+    evaluation = evaluate(run_of(tmp_path, trajectory(200.0), trajectory(30.0), truth=None))
+    assert judge(evaluation, GOOD).weight == Weight.NOTE  # that there is no truth
+    verdict = judge(evaluation, with_value(GOOD, path, value))
+    assert (verdict.weight, verdict.headline) == (weight, HEADLINES[weight])
+    assert words in verdict.remarks[0].text

@@ -1,0 +1,137 @@
+"""What a controller has: the errors of the newest pose at each instant, fused and from the markers alone.
+
+Poses from markers come at the camera's rate and late; fused ones at the IMU's rate and nearly at once. Compared at the
+instants of frames alone, markers look better than a controller would find them. Here, the newest pose that had come
+counts at each instant until the next one comes, as it is, for both alike.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from thermal_fiducial.core.geometry.se3 import so3_log
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.report import metrics
+from thermal_fiducial.report.interruptions import GAP_NS
+from thermal_fiducial.report.output_bag import Arrivals
+from thermal_fiducial.report.run_folder import Run
+from thermal_fiducial.report.trajectory import Trajectory
+
+#: Instants are this far apart [ns], so that they fall in no step with poses, and no more than so many.
+STEP_NS = 1_730_000
+MOST_INSTANTS = 200_000
+#: Stamps and arrivals of one clock differ by no more than this [ns].
+_ONE_CLOCK_NS = 500_000_000
+
+
+@dataclass(frozen=True)
+class Available:
+    """Errors at instants (N,) [ns] of the newest pose that had come: (N, 2) position [m] and attitude [rad]."""
+
+    instants_ns: IntArray
+    fused: FloatArray
+    markers: FloatArray
+    #: (N,) the newest pose from markers is not older than an interruption is long
+    in_view: BoolArray
+    #: median age of the newest pose [ms]
+    fused_age_ms: float
+    markers_age_ms: float
+
+    def numbers(self) -> dict[str, Any]:
+        """Errors while markers are in view, and at all instants."""
+        return {
+            'age_ms': {'fused': self.fused_age_ms, 'markers': self.markers_age_ms},
+            'in_view': self._spread(self.in_view),
+            'always': self._spread(np.ones(len(self.in_view), np.bool_)),
+        }
+
+    def _spread(self, chosen: BoolArray) -> dict[str, dict[str, float]]:
+        return {
+            name: spread(errors[chosen])
+            for name, errors in (('fused', self.fused), ('markers', self.markers))
+            if chosen.any()
+        }
+
+
+def spread(errors: FloatArray) -> dict[str, float]:
+    """Root mean square, 95 % and largest of errors (N, 2) [m, rad], in mm and deg."""
+    result = {}
+    for name, values in (('position_{}_mm', 1e3 * errors[:, 0]), ('attitude_{}_deg', np.rad2deg(errors[:, 1]))):
+        result[name.format('rms')] = float(np.sqrt(np.mean(values**2)))
+        result[name.format('p95')] = float(np.percentile(values, 95))
+        result[name.format('max')] = float(values.max())
+    return result
+
+
+def available(run: Run) -> Available | None:
+    """Errors as a controller would have had them; None without truth or without the times of arrival."""
+    fused, markers = run.output.fused_arrivals, run.output.camera_arrivals
+    if run.truth is None or not (len(fused.stamps_ns) and len(markers.stamps_ns)):
+        return None
+    shift_ns = _clock_shift_ns(fused)
+    fused_times, markers_times = _times_of(run.fused, fused, shift_ns), _times_of(run.fiducial, markers, shift_ns)
+    if not (len(fused_times) and len(markers_times)):
+        return None
+    first, last = max(fused_times[0], markers_times[0]), min(fused_times[-1], run.truth.stamps_ns[-1])
+    instants = np.arange(first, last, max(STEP_NS, (last - first) // MOST_INSTANTS), dtype=np.int64)
+    T_true, exists = metrics.interpolate(run.truth, instants)
+    instants, T_true = instants[exists], T_true[exists]
+    if not len(instants):
+        return None
+    fused_errors, fused_age = _held(run.fused, fused_times, instants, T_true)
+    markers_errors, markers_age = _held(run.fiducial, markers_times, instants, T_true)
+    return Available(
+        instants_ns=instants,
+        fused=fused_errors,
+        markers=markers_errors,
+        in_view=np.asarray(markers_age < GAP_NS),
+        fused_age_ms=1e-6 * float(np.median(fused_age)),
+        markers_age_ms=1e-6 * float(np.median(markers_age)),
+    )
+
+
+def at_frames(run: Run) -> dict[str, dict[str, float]] | None:
+    """Errors at the instants of the frames that gave a pose, of both; None without truth."""
+    if run.truth is None or not (len(run.fused) and len(run.fiducial)):
+        return None
+    stamps = run.fiducial.stamps_ns
+    T_true, exists = metrics.interpolate(run.truth, stamps)
+    T_fused, known = metrics.interpolate(run.fused, stamps)
+    both = exists & known
+    if not both.any():
+        return None
+    return {
+        'fused': spread(_errors(T_fused[both], T_true[both])),
+        'markers': spread(_errors(run.fiducial.T_map_body[both], T_true[both])),
+    }
+
+
+def _clock_shift_ns(fused: Arrivals) -> int:
+    """What to take off times of arrival that are of another clock than the stamps; 0 when they are of the same."""
+    least = int(np.min(fused.times_ns - fused.stamps_ns))
+    return least if not 0 <= least < _ONE_CLOCK_NS else 0
+
+
+def _times_of(trajectory: Trajectory, arrivals: Arrivals, shift_ns: int) -> IntArray:
+    """When each pose of a trajectory had come, and no sooner than those before it; empty where that is unknown."""
+    at = np.searchsorted(arrivals.stamps_ns, trajectory.stamps_ns)
+    at = np.clip(at, 0, len(arrivals.stamps_ns) - 1)
+    if np.mean(arrivals.stamps_ns[at] == trajectory.stamps_ns) < 0.99:
+        return np.zeros(0, np.int64)
+    return np.maximum.accumulate(arrivals.times_ns[at] - shift_ns)
+
+
+def _held(
+    trajectory: Trajectory, times_ns: IntArray, instants_ns: IntArray, T_true: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Errors (N, 2) of the newest pose at each instant, and how old it is (N,) [ns]."""
+    newest = np.maximum(np.searchsorted(times_ns, instants_ns, side='right') - 1, 0)
+    age = instants_ns - trajectory.stamps_ns[newest]
+    return _errors(trajectory.T_map_body[newest], T_true), age
+
+
+def _errors(T: FloatArray, T_true: FloatArray) -> FloatArray:
+    position = np.linalg.norm(T[:, :3, 3] - T_true[:, :3, 3], axis=1)
+    attitude = np.linalg.norm(so3_log(np.swapaxes(T[:, :3, :3], 1, 2) @ T_true[:, :3, :3]), axis=1)
+    return np.stack([position, attitude], axis=1)

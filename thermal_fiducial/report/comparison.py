@@ -1,0 +1,184 @@
+"""Several runs side by side, with the measures of evo, computed by evo (M. Grupp, github.com/MichaelGrupp/evo).
+
+As ``evo_ape`` and ``evo_rpe`` do: poses are paired with the nearest of the truth within 10 ms; the absolute pose error
+is that of the translation, as it is and after a rigid alignment (``--align``), and of the rotation angle; the relative
+pose error is over 1 m of path (``--delta 1 --delta_unit m``).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from evo.core import metrics as evo_metrics
+from evo.core import sync
+from evo.core.filters import FilterException
+from evo.core.trajectory import PoseTrajectory3D
+import numpy as np
+
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.report.evaluation import Evaluation
+from thermal_fiducial.report.page import evaluate_run, write_text
+from thermal_fiducial.report.tables import number, Table
+from thermal_fiducial.report.trajectory import Trajectory
+
+#: evo's own default [s].
+MOST_APART_S = 0.01
+_STATISTICS = ('rmse', 'mean', 'median', 'std', 'min', 'max')
+_COLOURS = ('#3b82f6', '#ef4444', '#22c55e', '#f59e0b', '#a855f7', '#14b8a6', '#ec4899', '#84cc16')
+#: Of our own measures: name, unit, path in the numbers of a run.
+_OWN = (
+    ('jitter over 1/30 s, position, rms', 'mm', ('fused', 'jitter', 'position_mm')),
+    ('NEES of the pose (consistent: 1)', 'per d.o.f.', ('fused', 'consistency', 'pose_nees_per_dof')),
+    ('position error as available, rms', 'mm', ('as_available', 'in_view', 'fused', 'position_rms_mm')),
+    ('map, position error, rms', 'mm', ('map', 'position_rms_mm')),
+    ('camera poses compared', 'count', ('innovations', 'poses')),
+    ('of these, refused', 'count', ('innovations', 'refused')),
+    ('NIS (consistent: 1)', 'per d.o.f.', ('innovations', 'nis_per_dof')),
+    ('rate', 'Hz', ('fused', 'rate_hz')),
+    ('longest pause', 'ms', ('fused', 'longest_pause_ms')),
+    ('path length', 'm', ('fused', 'path_length_m')),
+    ('latency, IMU to pose, 99 %', 'ms', ('latency', 'imu_to_pose', 'p99_ms')),
+)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Runs by name, and what they come to."""
+
+    names: tuple[str, ...]
+    evaluations: tuple[Evaluation, ...]
+    #: name of the run to evo's measures and ours
+    numbers: dict[str, dict[str, Any]]
+
+    @property
+    def tables(self) -> list[Table]:
+        """Measures as rows, runs as columns."""
+        heads = ('', 'unit', *self.names)
+        made = [Table(title, heads, self._rows(part, unit)) for part, (title, unit) in _EVO.items()]
+        own = [(name, unit, *(number(_at(self.numbers[run], keys)) for run in self.names)) for name, unit, keys in _OWN]
+        made.append(Table('Of the filter', heads, [row for row in own if any(cell != '–' for cell in row[2:])]))
+        return [table for table in made if table.rows]
+
+    def _rows(self, part: str, unit: str) -> list[tuple[str, ...]]:
+        every = [self.numbers[name]['evo'].get(part, {}) for name in self.names]
+        if not any(every):
+            return []
+        return [(key, unit, *(number(values.get(key), 4) for values in every)) for key in _STATISTICS]
+
+    def write(self, path: Path) -> None:
+        """Write the comparison as a page that stands alone."""
+        from thermal_fiducial.report.html import Page, render, Section
+
+        wide = Section('measures', 'Measures', tables=tuple(self.tables))
+        charts = Section('errors', 'Errors over time', charts=tuple(_charts(self)))
+        lead = f'Fused poses of {len(self.names)} runs, with the conventions of evo.'
+        write_text(path, render(Page(' · '.join(self.names), lead, (charts, wide), footer=_FOOTER)))
+
+
+_EVO = {
+    'ape_translation': ('APE, translation, not aligned', 'mm'),
+    'ape_translation_aligned': ('APE, translation, after rigid alignment', 'mm'),
+    'ape_rotation': ('APE, rotation angle', 'deg'),
+    'rpe_translation': ('RPE, translation, over 1 m', 'mm'),
+    'rpe_rotation': ('RPE, rotation angle, over 1 m', 'deg'),
+}
+_FOOTER = (
+    'APE and RPE are computed by evo: poses paired with the nearest true one within 10 ms. The own report of a run '
+    'interpolates the truth instead, which makes a difference where stamps differ.'
+)
+
+
+def compare(folders: Sequence[Path], truth: Path | None = None) -> Comparison:
+    """Evaluate runs and put them beside each other.
+
+    Raises
+    ------
+    InputError
+        As :func:`evaluate_run`; or fewer than two runs.
+    """
+    if len(folders) < 2:
+        raise InputError('--compare wants two runs or more')
+    evaluations, numbers = [], {}
+    names = _names(folders)
+    for name, folder in zip(names, folders, strict=True):
+        evaluation, measured = evaluate_run(folder, truth)
+        evaluations.append(evaluation)
+        run = evaluation.run
+        numbers[name] = measured | {'evo': {} if run.truth is None else evo_numbers(run.fused, run.truth)}
+    return Comparison(names, tuple(evaluations), numbers)
+
+
+def _names(folders: Sequence[Path]) -> tuple[str, ...]:
+    """What the folders are called; with what stands above where two are called alike."""
+    paths = [folder.resolve() for folder in folders]
+    short = [path.name for path in paths]
+    names = [
+        name if short.count(name) == 1 else f'{path.parent.name}/{name}'
+        for name, path in zip(short, paths, strict=True)
+    ]
+    if len(set(names)) < len(names):
+        raise InputError('--compare: a run is given twice')
+    return tuple(names)
+
+
+def evo_numbers(estimate: Trajectory, truth: Trajectory) -> dict[str, dict[str, float]]:
+    """Statistics of evo's errors [mm, deg]; empty where nothing can be paired.
+
+    Parameters
+    ----------
+    estimate, truth : in one frame
+    """
+    if not (len(estimate) and len(truth)):
+        return {}
+    try:
+        true, found = sync.associate_trajectories(_of_evo(truth), _of_evo(estimate), max_diff=MOST_APART_S)
+    except sync.SyncException:
+        return {}
+    aligned = PoseTrajectory3D(poses_se3=list(found.poses_se3), timestamps=found.timestamps)
+    aligned.align(true)
+    translation, angle = evo_metrics.PoseRelation.translation_part, evo_metrics.PoseRelation.rotation_angle_deg
+    result = {
+        'ape_translation': _statistics(evo_metrics.APE(translation), true, found, 1e3),
+        'ape_translation_aligned': _statistics(evo_metrics.APE(translation), true, aligned, 1e3),
+        'ape_rotation': _statistics(evo_metrics.APE(angle), true, found, 1.0),
+    }
+    for name, relation, scale in (('rpe_translation', translation, 1e3), ('rpe_rotation', angle, 1.0)):
+        try:
+            result[name] = _statistics(evo_metrics.RPE(relation, 1.0, evo_metrics.Unit.meters), true, found, scale)
+        except FilterException:  # less than a metre of path
+            continue
+    return result
+
+
+def _of_evo(trajectory: Trajectory) -> PoseTrajectory3D:
+    return PoseTrajectory3D(poses_se3=list(trajectory.T_map_body), timestamps=trajectory.stamps_ns * 1e-9)
+
+
+def _statistics(metric: Any, truth: PoseTrajectory3D, estimate: PoseTrajectory3D, scale: float) -> dict[str, float]:
+    metric.process_data((truth, estimate))
+    return {name: scale * float(value) for name, value in metric.get_all_statistics().items() if name in _STATISTICS}
+
+
+def _at(numbers: dict[str, Any], keys: Sequence[str]) -> float | None:
+    value: Any = numbers
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return None if value is None else float(value)
+
+
+def _charts(comparison: Comparison) -> list[Any]:
+    from thermal_fiducial.report.time_plots import Chart, TimePlots
+
+    plots = TimePlots(('position [mm]', 'attitude [deg]'))
+    shown = False
+    for index, (name, evaluation) in enumerate(zip(comparison.names, comparison.evaluations, strict=True)):
+        e = evaluation.fused_errors
+        if e is None or not len(e):
+            continue
+        shown, colour = True, _COLOURS[index % len(_COLOURS)]
+        plots.line(1, evaluation.seconds(e.stamps_ns), np.maximum(1e3 * e.position_m, 0.01), name, colour)
+        plots.line(2, evaluation.seconds(e.stamps_ns), np.maximum(e.attitude_deg, 1e-4), name, colour)
+    plots.figure.update_yaxes(type='log')
+    text = 'Fused poses, each at its own stamp, from the beginning of each run.'
+    return [Chart('errors', 'Error against ground truth', text, plots.figure, wide=True)] if shown else []

@@ -1,0 +1,145 @@
+"""Thermal frames with the detections drawn on them: a strip for the page, and all of them for a video."""
+
+import base64
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from thermal_fiducial.config import Tau2CameraConfig
+from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
+from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
+from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.files.bags import BagReader
+from thermal_fiducial.files.images import image_to_array, stamp_to_ns
+from thermal_fiducial.report.run_folder import Detections, Run
+
+#: Pictures of a strip, and how wide each is [px].
+STRIP, STRIP_WIDTH = 12, 480
+#: Frames are read from so long before the one that is shown, for its bad pixels and its scale [ns].
+_BEFORE_NS, _AFTER_NS = 300_000_000, 100_000_000
+_QUALITY = 72
+_CYAN, _YELLOW, _WHITE = (238, 211, 34), (0, 255, 255), (255, 255, 255)
+#: Corners are drawn to a sixteenth of a pixel.
+_SHIFT = 4
+
+
+@dataclass(frozen=True)
+class ThermalView:
+    """A frame in false colours: pixels (H, W, 3) BGR; None: it was withheld, for ``reason``."""
+
+    stamp_ns: int
+    pixels: npt.NDArray[np.uint8] | None
+    reason: str
+
+
+@dataclass(frozen=True)
+class FramePicture:
+    """A picture of the page, as a data URI, with what stands below it."""
+
+    uri: str
+    caption: str
+
+
+def bag_of(run: Run, bag: Path | None = None) -> tuple[Path, Mapping[str, str]] | None:
+    """The bag that a run was replayed from, with its remaps; None where it cannot be found any more."""
+    remaps = run.summary.get('remaps', {})
+    remaps = remaps if isinstance(remaps, dict) else {}
+    if bag is not None:
+        return bag, remaps
+    known = run.summary.get('bag_path')
+    places = [Path(known)] if isinstance(known, str) else []
+    name = run.summary.get('bag')
+    # A run folder may have been moved, with the bag in it or beside it.
+    places += [run.path / name, run.path.parent / name] if isinstance(name, str) and name else []
+    return next(((place, remaps) for place in places if place.exists()), None)
+
+
+def strip(run: Run, bag: Path | None = None) -> list[FramePicture]:
+    """Pictures at even intervals over the run; none where the bag is gone."""
+    found = bag_of(run, bag)
+    stamps = run.detections.stamps_ns
+    if found is None or not len(stamps):
+        return []
+    start = int(stamps[0])
+    pictures = []
+    with BagReader(*found) as reader:
+        for wanted in _even(np.unique(stamps)):
+            view = view_at(reader, int(wanted))
+            if view is not None and view.pixels is not None:
+                drawn = annotated(view.pixels, run.detections, view.stamp_ns)
+                count = int(np.sum(stamps == view.stamp_ns))
+                seconds = (view.stamp_ns - start) * 1e-9
+                pictures.append(
+                    FramePicture(_uri(drawn), f'{seconds:.1f} s, {count} marker{"s" if count != 1 else ""}')
+                )
+    return pictures
+
+
+def _even(stamps_ns: IntArray) -> IntArray:
+    """Stamps of :data:`STRIP` frames, evenly over the time (not over the frames)."""
+    wanted = np.linspace(stamps_ns[0], stamps_ns[-1], STRIP)
+    return np.unique(stamps_ns[np.clip(np.searchsorted(stamps_ns, wanted), 0, len(stamps_ns) - 1)])
+
+
+def view_at(reader: BagReader, stamp_ns: int) -> ThermalView | None:
+    """The frame of a stamp; None where the bag has none."""
+    first = next(reader.messages([reader.image_topic]), None)
+    if first is None:
+        return None
+    # What stamps and the recorder's clock are apart, which may be years.
+    apart = first.stamp_ns - stamp_to_ns(first.message.header.stamp)
+    between = stamp_ns + apart - _BEFORE_NS, stamp_ns + apart + _AFTER_NS
+    for view in views(reader, between):
+        if view.stamp_ns == stamp_ns:
+            return view
+    return None
+
+
+def views(reader: BagReader, between_ns: tuple[int, int] | None = None) -> Iterator[ThermalView]:
+    """Frames of an open bag in false colours, in recorded order; ``between_ns``: of bag stamps."""
+    cleaner, scale = FrameCleaner(Tau2CameraConfig()), EightBitView(Tau2CameraConfig())
+    for item in reader.messages([reader.image_topic], between_ns):
+        stamp = stamp_to_ns(item.message.header.stamp)
+        clean = cleaner.process(stamp, image_to_array(item.message))
+        if clean.counts is None:
+            yield ThermalView(stamp, None, clean.reason)
+        else:
+            coloured = cv2.applyColorMap(scale(clean.counts), cv2.COLORMAP_INFERNO)
+            yield ThermalView(stamp, np.asarray(coloured, np.uint8), '')
+
+
+def annotated(pixels: npt.NDArray[np.uint8], detections: Detections, stamp_ns: int) -> npt.NDArray[np.uint8]:
+    """A copy of a frame with the outlines and IDs of its markers."""
+    picture = pixels.copy()
+    here = detections.stamps_ns == stamp_ns
+    for marker, corners in zip(detections.ids[here].tolist(), detections.corners_px[here], strict=True):
+        _draw_marker(picture, marker, corners)
+    return picture
+
+
+def _draw_marker(picture: npt.NDArray[np.uint8], marker: int, corners: FloatArray) -> None:
+    fine = np.rint(corners * 2**_SHIFT).astype(np.int32)
+    cv2.polylines(picture, [fine], isClosed=True, color=_CYAN, thickness=2, lineType=cv2.LINE_AA, shift=_SHIFT)
+    first = (int(fine[0, 0]), int(fine[0, 1]))
+    cv2.circle(picture, first, 4 << _SHIFT, _YELLOW, -1, cv2.LINE_AA, _SHIFT)
+    write(picture, str(marker), (int(corners[:, 0].max()) + 4, int(corners[:, 1].min()) + 8), _CYAN)
+
+
+def write(
+    picture: npt.NDArray[np.uint8], text: str, place: tuple[int, int], colour: tuple[int, int, int] = _WHITE
+) -> None:
+    """Write into a picture so that it can be read on any ground."""
+    for ink, thickness in (((0, 0, 0), 4), (colour, 1)):
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, ink, thickness, cv2.LINE_AA)
+
+
+def _uri(picture: npt.NDArray[np.uint8]) -> str:
+    height, width = picture.shape[:2]
+    size = (STRIP_WIDTH, round(height * STRIP_WIDTH / width))
+    small = cv2.resize(picture, size, interpolation=cv2.INTER_AREA) if width > STRIP_WIDTH else picture
+    _, encoded = cv2.imencode('.webp', small, [cv2.IMWRITE_WEBP_QUALITY, _QUALITY])
+    return 'data:image/webp;base64,' + base64.b64encode(encoded.tobytes()).decode('ascii')

@@ -1,0 +1,124 @@
+"""Times without a pose from the markers, and why: the shutter, no image, no marker in view."""
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from thermal_fiducial.core.imaging.frame_cleaner import SHUTTER
+from thermal_fiducial.core.types import BoolArray, IntArray
+from thermal_fiducial.report.metrics import Errors, FRAME_NS, steps
+from thermal_fiducial.report.run_folder import Run
+from thermal_fiducial.report.trajectory import Trajectory
+
+#: Two poses from markers farther apart than this have an interruption between them [ns].
+GAP_NS = 300_000_000
+#: So many periods of the camera without a frame are no late frame any more: the shutter stops several.
+_HOLE_PERIODS = 2.5
+
+
+class Cause(Enum):
+    """Why there was no pose from the markers."""
+
+    SHUTTER = 'shutter (FFC)'
+    WITHHELD = 'frames withheld'
+    NO_IMAGE = 'no image'
+    NO_MARKERS = 'no marker in view'
+    UNUSED = 'markers in view, no pose'
+
+
+@dataclass(frozen=True)
+class Interruption:
+    """A time without a pose from the markers."""
+
+    start_ns: int
+    end_ns: int
+    cause: Cause
+    #: poses that the filter gave in it
+    fused_poses: int
+    #: change of the fused position at its end, when markers are seen again [mm]
+    step_mm: float
+    #: error at its end [mm, deg], where truth is known
+    error_mm: float | None = None
+    error_deg: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        """Its length."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def is_shutter(self) -> bool:
+        """Whether the camera calibrated itself: that is as it should be, and no drop-out."""
+        return self.cause is Cause.SHUTTER
+
+
+def interruptions(run: Run, fused_errors: Errors | None) -> list[Interruption]:
+    """Breaks of the poses from markers of more than :data:`GAP_NS`, and shorter ones that the shutter made."""
+    stamps = run.fiducial.stamps_ns
+    ends = np.flatnonzero(np.diff(stamps) > GAP_NS)
+    spans = [(int(stamps[i]), int(stamps[i + 1])) for i in ends]
+    spans += [hole for hole in _shutter_holes(run) if not any(a < hole[1] and hole[0] < b for a, b in spans)]
+    return [_described(run, start, end, fused_errors) for start, end in sorted(spans) if len(run.fused)]
+
+
+def frame_holes(frames_ns: IntArray) -> list[tuple[int, int]]:
+    """Stamps of the frames before and after each time in which the camera gave none."""
+    if len(frames_ns) < 3:
+        return []
+    between = np.diff(frames_ns)
+    at = np.flatnonzero(between > _HOLE_PERIODS * np.median(between))
+    return [(int(frames_ns[i]), int(frames_ns[i + 1])) for i in at]
+
+
+def _shutter_holes(run: Run) -> list[tuple[int, int]]:
+    return [hole for hole in frame_holes(run.output.frames_ns) if _names_shutter(run, *hole)]
+
+
+def _names_shutter(run: Run, start_ns: int, end_ns: int) -> bool:
+    return any(SHUTTER in reason for reason in run.output.withheld_between(start_ns, end_ns))
+
+
+def _cause(run: Run, start_ns: int, end_ns: int) -> Cause:
+    frames = run.output.frames_ns
+    if len(frames):
+        inside = frames[(frames > start_ns) & (frames < end_ns)]
+        edges = np.concatenate([[start_ns], inside, [end_ns]])
+        longest = int(np.argmax(np.diff(edges)))
+        hole = int(edges[longest]), int(edges[longest + 1])
+        if hole[1] - hole[0] > (end_ns - start_ns) / 2:
+            if _names_shutter(run, *hole):
+                return Cause.SHUTTER
+            return Cause.WITHHELD if run.output.withheld_between(*hole) else Cause.NO_IMAGE
+    stamps = run.detections.stamps_ns + run.offset_ns
+    return Cause.UNUSED if np.any(_strictly_between(stamps, start_ns, end_ns)) else Cause.NO_MARKERS
+
+
+def _strictly_between(stamps_ns: IntArray, start_ns: int, end_ns: int) -> BoolArray:
+    return np.asarray((stamps_ns > start_ns) & (stamps_ns < end_ns))
+
+
+def _described(run: Run, start_ns: int, end_ns: int, e: Errors | None) -> Interruption:
+    fused = run.fused
+    inside = (fused.stamps_ns > start_ns) & (fused.stamps_ns <= end_ns)
+    error_mm = error_deg = None
+    if e is not None and np.any(at := (e.stamps_ns > start_ns) & (e.stamps_ns <= end_ns)):
+        error_mm, error_deg = 1e3 * float(e.position_m[at][-1]), float(e.attitude_deg[at][-1])
+    return Interruption(
+        start_ns=start_ns,
+        end_ns=end_ns,
+        cause=_cause(run, start_ns, end_ns),
+        fused_poses=int(inside.sum()),
+        step_mm=_step_mm(fused, inside, end_ns),
+        error_mm=error_mm,
+        error_deg=error_deg,
+    )
+
+
+def _step_mm(fused: Trajectory, inside: BoolArray, end_ns: int) -> float:
+    if not inside.any():
+        return 0.0
+    # The frame that ends the interruption corrects the filter a few tens of milliseconds later, when it is worked on.
+    after = (fused.stamps_ns > end_ns) & (fused.stamps_ns <= end_ns + 3 * FRAME_NS)
+    last = fused.stamps_ns == fused.stamps_ns[inside][-1]
+    return 1e3 * float(steps(fused.take(after | last)).max(initial=0.0))

@@ -1,0 +1,174 @@
+"""What the recorded messages of the nodes say beyond the text files of a run folder."""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+import re
+from typing import Any
+
+import numpy as np
+
+from thermal_fiducial.core.filter.innovations import INNOVATIONS, Innovations, innovations_of
+from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.files.bags import BagReader, CAMERA_POSE_TOPIC, MARKERS_TOPIC
+from thermal_fiducial.files.images import header_stamp_ns, stamp_to_ns
+
+#: Covariances are read from no more than so many messages, evenly over the run.
+MOST_COVARIANCES = 6000
+_POSE, _DIAGNOSTICS = 'pose', 'diagnostics'
+_WITHHELD = 'withheld: '
+# "coasting for 0.6 s" and "coasting for 0.8 s" are one thing to say.
+_NUMBER = re.compile(r'\d+(\.\d+)?')
+_LEVELS = ('ok', 'warning', 'error', 'stale')
+
+
+@dataclass(frozen=True)
+class Diagnostic:
+    """How often a node said something."""
+
+    node: str
+    level: str
+    message: str
+    count: int
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """Stamps (N,) of messages and when each reached its readers (N,) [ns], in the order of the stamps."""
+
+    stamps_ns: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    times_ns: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+
+
+@dataclass(frozen=True)
+class RecordedOutput:
+    """What the recorded messages of the nodes say beyond the text files.
+
+    Parameters
+    ----------
+    stamps_ns, covariances : (N,), (N, 6, 6) of some of the ``pose`` messages
+    diagnostics : what the nodes said, most frequent first
+    innovations : how well each camera pose fitted what the filter expected, at the IMU's stamps
+    frames_ns : (F,) IMU's stamps of the frames in which markers were looked for; withheld ones are missing
+    withheld : time of a diagnostic [ns] and frames withheld until then, by reason
+    figures : name of a number of the filter to times (D,) [ns] and values (D,), once a second
+    fused_arrivals, camera_arrivals : of ``pose`` and ``camera_pose``, at the IMU's stamps
+    """
+
+    stamps_ns: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    covariances: FloatArray = field(default_factory=lambda: np.zeros((0, 6, 6)))
+    diagnostics: tuple[Diagnostic, ...] = ()
+    innovations: Innovations = field(default_factory=Innovations)
+    frames_ns: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    withheld: tuple[tuple[int, dict[str, int]], ...] = ()
+    figures: dict[str, tuple[IntArray, FloatArray]] = field(default_factory=dict)
+    fused_arrivals: Arrivals = field(default_factory=Arrivals)
+    camera_arrivals: Arrivals = field(default_factory=Arrivals)
+
+    def withheld_between(self, start_ns: int, end_ns: int) -> dict[str, int]:
+        """Frames withheld between two times by reason; as it is counted once a second, up to a second more."""
+        before: dict[str, int] = {}
+        for time_ns, counts in self.withheld:
+            if time_ns <= start_ns:
+                before = counts
+            elif time_ns >= end_ns:
+                return {reason: n - before.get(reason, 0) for reason, n in counts.items() if n > before.get(reason, 0)}
+        return {}
+
+
+def read_output(path: Path, offset_ns: int) -> RecordedOutput:
+    """What the ``output`` of a run folder holds; nothing where there is none.
+
+    Parameters
+    ----------
+    path : the bag
+    offset_ns : t_imu - t_camera
+
+    Raises
+    ------
+    InputError
+        A bag that cannot be read.
+    """
+    if not path.is_dir():
+        return RecordedOutput()
+    with BagReader(path) as bag:
+        arrays = [item.message for item in bag.messages([_DIAGNOSTICS])]
+        statuses = [status for array in arrays for status in array.status]
+        stamps, covariances = _covariances(bag)
+        return RecordedOutput(
+            stamps_ns=stamps,
+            covariances=covariances,
+            diagnostics=_diagnostics(statuses),
+            innovations=_innovations(statuses, offset_ns),
+            frames_ns=_arrivals(bag, MARKERS_TOPIC, offset_ns).stamps_ns,
+            withheld=_withheld(arrays),
+            figures=_figures(arrays),
+            fused_arrivals=_arrivals(bag, _POSE, 0),
+            camera_arrivals=_arrivals(bag, CAMERA_POSE_TOPIC, offset_ns),
+        )
+
+
+def _covariances(bag: BagReader) -> tuple[IntArray, FloatArray]:
+    every = 1 + bag.message_count([_POSE]) // MOST_COVARIANCES
+    messages = [item.message for index, item in enumerate(bag.messages([_POSE])) if index % every == 0]
+    stamps = [stamp_to_ns(message.header.stamp) for message in messages]
+    covariances = [message.pose.covariance for message in messages]
+    return np.array(stamps, np.int64), np.array(covariances, np.float64).reshape(-1, 6, 6)
+
+
+def _arrivals(bag: BagReader, topic: str, offset_ns: int) -> Arrivals:
+    rows = [(header_stamp_ns(item.cdr) + offset_ns, item.stamp_ns) for item in bag.messages([topic])]
+    stamps, times = np.array(sorted(rows), np.int64).reshape(-1, 2).T
+    return Arrivals(stamps, times)
+
+
+def _diagnostics(statuses: Iterable[Any]) -> tuple[Diagnostic, ...]:
+    said: Counter[tuple[str, str, str]] = Counter()
+    for status in statuses:
+        level = status.level[0] if isinstance(status.level, (bytes, np.ndarray)) else status.level
+        said[status.name, _LEVELS[min(int(level), 3)], _NUMBER.sub('…', status.message)] += 1
+    return tuple(Diagnostic(*key, count) for key, count in said.most_common())
+
+
+def _innovations(statuses: Iterable[Any], offset_ns: int) -> Innovations:
+    said = innovations_of(
+        ' '.join(item.value for status in statuses for item in status.values if item.key == INNOVATIONS)
+    )
+    return replace(said, stamps_ns=said.stamps_ns + offset_ns)
+
+
+def _withheld(arrays: Sequence[Any]) -> tuple[tuple[int, dict[str, int]], ...]:
+    found = []
+    for array in arrays:
+        for status in array.status:
+            if status.name.rpartition('/')[2] == 'tau2_camera':
+                counts = {
+                    item.key.removeprefix(_WITHHELD): int(item.value)
+                    for item in status.values
+                    if item.key.startswith(_WITHHELD) and item.value.isdigit()
+                }
+                found.append((stamp_to_ns(array.header.stamp), counts))
+    return tuple(found)
+
+
+def _figures(arrays: Sequence[Any]) -> dict[str, tuple[IntArray, FloatArray]]:
+    found: defaultdict[str, list[tuple[int, float]]] = defaultdict(list)
+    for array in arrays:
+        for status in array.status:
+            if status.name.rpartition('/')[2] == 'pose_ekf':
+                for item in status.values:
+                    if (value := _number(item.value)) is not None:
+                        found[item.key].append((stamp_to_ns(array.header.stamp), value))
+    return {
+        key: (np.array([time for time, _ in rows], np.int64), np.array([value for _, value in rows]))
+        for key, rows in found.items()
+    }
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if np.isfinite(value) else None

@@ -1,0 +1,89 @@
+"""One row a marker: how often it was seen, how well it fits, where it stands and why."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.report.map_error import marker_errors, MarkerError, sigmas
+from thermal_fiducial.report.run_folder import Run
+
+_ON_TRIAL, _QUARANTINED = 'candidates', 'quarantine'
+
+
+@dataclass(frozen=True)
+class Tag:
+    """What a run knows of a marker; None: nothing."""
+
+    id: int
+    #: frames in which it was detected
+    views: int
+    first_view_ns: int | None
+    corner_sigma_px: float | None
+    residual_px: float | None
+    sigma_mm: float | None
+    sigma_deg: float | None
+    status: str
+    why: str
+    error: MarkerError | None = None
+
+    @property
+    def is_doubtful(self) -> bool:
+        """Whether it was measured and is not used."""
+        return self.status in ('quarantined', 'on trial', 'not in the map')
+
+
+def tags(run: Run) -> list[Tag]:
+    """All markers of the map and of the detections, by ID."""
+    known = {} if run.marker_map is None else run.marker_map.markers
+    errors = {} if run.marker_map is None or run.true_map is None else marker_errors(run.marker_map, run.true_map)
+    reasons = {name: _reasons(run, name) for name in (_ON_TRIAL, _QUARANTINED)}
+    ids = sorted(set(known) | set(np.unique(run.detections.ids).tolist()))
+    return [_tag(run, key, reasons, errors.get(key)) for key in ids]
+
+
+def _tag(run: Run, key: int, reasons: dict[str, dict[int, str]], error: MarkerError | None) -> Tag:
+    marker = None if run.marker_map is None else run.marker_map.markers.get(key)
+    seen = run.detections.ids == key
+    stamps = run.detections.stamps_ns[seen]
+    status, why = _standing(run, key, len(stamps), reasons)
+    sigma_mm, sigma_deg = (None, None) if marker is None else sigmas(marker)
+    return Tag(
+        id=key,
+        views=len(np.unique(stamps)),
+        first_view_ns=int(stamps.min()) if len(stamps) else None,
+        corner_sigma_px=float(np.median(run.detections.sigma_px[seen])) if len(stamps) else None,
+        residual_px=marker.reprojection_error_px if marker is not None and marker.observations else None,
+        sigma_mm=sigma_mm,
+        sigma_deg=sigma_deg,
+        status=status,
+        why=why,
+        error=error,
+    )
+
+
+def _standing(run: Run, key: int, views: int, reasons: dict[str, dict[int, str]]) -> tuple[str, str]:
+    marker = None if run.marker_map is None else run.marker_map.markers.get(key)
+    if marker is None:
+        if key in reasons[_ON_TRIAL]:
+            return 'on trial', reasons[_ON_TRIAL][key]
+        localizing = run.summary.get('mode') == 'localization'
+        return 'not in the map', 'no marker enters the map in this mode' if localizing else f'seen in {views} frames'
+    if not marker.trusted:
+        return 'quarantined', reasons[_QUARANTINED].get(key, 'contradicted the others')
+    if marker.fixed:
+        return 'fixed', 'surveyed, never moves'
+    if not views:
+        return 'used', 'from an earlier run; not seen in this one'
+    return 'used', f'{marker.observations} observations fit'
+
+
+def _reasons(run: Run, name: str) -> dict[int, str]:
+    """What the mapper said last of markers, from its figures ``ID: reason; ID: reason``."""
+    found: dict[int, str] = {}
+    for node, figures in run.summary.get('diagnostics', {}).items():
+        if node.rpartition('/')[2] == 'marker_mapper':
+            for entry in str(figures.get(name, '')).split('; '):
+                key, separator, reason = entry.partition(': ')
+                if separator and key.isdigit():
+                    found[int(key)] = reason
+    return found

@@ -1,0 +1,108 @@
+"""Plots over each other with one time axis (Plotly): markers alone red, fused blue, truth grey, on any ground."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
+from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.report.evaluation import Evaluation
+from thermal_fiducial.report.interruptions import Cause
+
+FUSED, FIDUCIAL, TRUTH, GOOD = '#3b82f6', '#ef4444', '#94a3b8', '#22c55e'
+BAND = 'rgba(59, 130, 246, 0.18)'
+CAUSES = {
+    Cause.SHUTTER: 'rgba(139, 92, 246, 0.20)',
+    Cause.WITHHELD: 'rgba(236, 72, 153, 0.18)',
+    Cause.NO_IMAGE: 'rgba(236, 72, 153, 0.18)',
+    Cause.NO_MARKERS: 'rgba(245, 158, 11, 0.20)',
+    Cause.UNUSED: 'rgba(239, 68, 68, 0.18)',
+}
+#: Points of a line and of a cloud of dots: half a minute at 400 Hz is shown whole, more than that slows a phone down.
+MOST_POINTS, MOST_DOTS = 12_000, 3_000
+#: Height of one of the plots that lie over each other [px], and of what stands round them.
+ROW_PX, AROUND_PX = 128, 92
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A plot of the page; ``timed`` ones share their time axis. ``wide``: as wide as the page."""
+
+    name: str
+    title: str
+    text: str
+    figure: Any
+    timed: bool = True
+    wide: bool = False
+
+
+def thinned(length: int, most: int = MOST_POINTS) -> IntArray:
+    """Indices of at most ``most`` of ``length`` samples, evenly."""
+    if not length:
+        return np.zeros(0, np.int64)
+    return np.unique(np.linspace(0, length - 1, min(length, most)).round().astype(np.int64))
+
+
+class TimePlots:
+    """Plots over each other with one time axis, a trace at a time.
+
+    Parameters
+    ----------
+    labels : what stands at each vertical axis, from the top
+    heights : relative; default: alike
+    """
+
+    def __init__(self, labels: Sequence[str], heights: Sequence[float] | None = None) -> None:
+        rows = len(labels)
+        self.figure = make_subplots(rows, 1, shared_xaxes=True, vertical_spacing=0.16 / rows, row_heights=heights)
+        self.figure.update_layout(
+            template='none',
+            height=ROW_PX * max(rows, 2) + AROUND_PX,
+            margin={'l': 62, 'r': 14, 't': 30, 'b': 44},
+            legend={'orientation': 'h', 'yanchor': 'bottom', 'y': 1.0, 'x': 0.0},
+            hovermode='x unified',
+        )
+        for row, label in enumerate(labels, 1):
+            self.figure.update_yaxes(title_text=label, title_standoff=6, row=row, col=1)
+        self.figure.update_xaxes(title_text='time [s]', row=rows, col=1)
+        self._named: set[str] = set()
+
+    def add(self, row: int, x: FloatArray, y: FloatArray, name: str, **look: Any) -> None:
+        """A trace; of several of one name the first stands in the legend and switches them all."""
+        first = name not in self._named
+        self._named.add(name)
+        values = {'x': np.asarray(x, np.float32), 'y': np.asarray(y, np.float32)}
+        trace = go.Scatter(**values, name=name, legendgroup=name, showlegend=first, **look)
+        self.figure.add_trace(trace, row=row, col=1)
+
+    def line(self, row: int, x: FloatArray, y: FloatArray, name: str, colour: str, width: float = 1.3) -> None:
+        """A line of at most :data:`MOST_POINTS`."""
+        shown = thinned(len(x))
+        self.add(row, x[shown], y[shown], name, mode='lines', line={'color': colour, 'width': width})
+
+    def dots(self, row: int, x: FloatArray, y: FloatArray, name: str, colour: str, symbol: str = 'circle') -> None:
+        """Dots, at most :data:`MOST_DOTS` of them."""
+        shown = thinned(len(x), MOST_DOTS)
+        marker = {'color': colour, 'size': 3.5 if symbol == 'circle' else 7, 'symbol': symbol}
+        self.add(row, x[shown], y[shown], name, mode='markers', marker=marker)
+
+    def band(self, row: int, x: FloatArray, half: FloatArray, name: str) -> None:
+        """An area from ``-half`` to ``half``."""
+        shown = thinned(len(x), MOST_DOTS)
+        both = np.concatenate([half[shown], -half[shown][::-1]])
+        look = {'fill': 'toself', 'fillcolor': BAND, 'line': {'width': 0}, 'mode': 'lines', 'hoverinfo': 'skip'}
+        self.add(row, np.concatenate([x[shown], x[shown][::-1]]), both, name, **look)
+
+    def shade(self, evaluation: Evaluation) -> None:
+        """Mark the times without a pose from markers, a colour for each cause."""
+        for entry in evaluation.interruptions:
+            start, end = evaluation.seconds_at(entry.start_ns), evaluation.seconds_at(entry.end_ns)
+            place = {'x0': start, 'x1': end, 'y0': 0, 'y1': 1, 'xref': 'x', 'yref': 'paper'}
+            look = {'fillcolor': CAUSES[entry.cause], 'line': {'width': 0}, 'layer': 'below'}
+            self.figure.add_shape(type='rect', **place, **look)
+        for cause in dict.fromkeys(entry.cause for entry in evaluation.interruptions):
+            square = {'symbol': 'square', 'size': 12, 'color': CAUSES[cause]}
+            self.figure.add_trace(go.Scatter(x=[None], y=[None], mode='markers', marker=square, name=cause.value))

@@ -1,0 +1,175 @@
+"""What a run comes to, in words: remarks, each with a weight, and one headline of them all."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from thermal_fiducial.report.evaluation import Evaluation
+
+#: NEES per degree of freedom up to which covariances are consistent, and beyond which they claim far too little error.
+CONSISTENT_NEES, INCONSISTENT_NEES = 2.0, 4.0
+#: Below this, covariances claim much more error than there is.
+CAUTIOUS_NEES = 0.2
+#: Shares of refused poses that are worth a look, and that say something is wrong.
+FEW_REFUSED, MANY_REFUSED = 0.01, 0.1
+#: Without a pose for longer than this, a controller notices [ms]; and than this, a drone drifts off.
+SHORT_PAUSE_MS, LONG_PAUSE_MS = 100.0, 500.0
+#: Coasting for longer than this is worth a look [s].
+LONG_COAST_S = 2.0
+#: A step of the pose that a position controller answers with a jerk [mm].
+LARGE_STEP_MM = 50.0
+#: A pose that comes later than this is of little use to an autopilot [ms].
+LATE_MS = 20.0
+
+
+class Weight(IntEnum):
+    """How much a remark weighs."""
+
+    GOOD = 0
+    NOTE = 1
+    DOUBT = 2
+    FAULT = 3
+
+
+HEADLINES = {
+    Weight.GOOD: 'The pose of this run can be flown on.',
+    Weight.NOTE: 'The pose of this run can be flown on.',
+    Weight.DOUBT: 'The pose of this run can be flown on, with reservations.',
+    Weight.FAULT: 'The pose of this run must not be flown on.',
+}
+
+
+@dataclass(frozen=True)
+class Remark:
+    """One sentence of the verdict."""
+
+    weight: Weight
+    text: str
+
+
+@dataclass(frozen=True)
+class RunVerdict:
+    """All remarks, the weightiest first."""
+
+    remarks: tuple[Remark, ...]
+
+    @property
+    def weight(self) -> Weight:
+        """That of the weightiest remark."""
+        return max((remark.weight for remark in self.remarks), default=Weight.GOOD)
+
+    @property
+    def headline(self) -> str:
+        """The verdict in a sentence."""
+        return HEADLINES[self.weight]
+
+
+def judge(evaluation: Evaluation, numbers: dict[str, Any]) -> RunVerdict:
+    """The verdict on a run; ``numbers`` are :meth:`Evaluation.numbers`."""
+    made = [
+        _output(numbers),
+        _error(numbers),
+        _consistency(numbers),
+        _refused(numbers),
+        _steps(numbers),
+        *_interruptions(evaluation),
+        _latency(numbers),
+        _resets(evaluation),
+        _markers(evaluation),
+    ]
+    remarks = sorted((remark for remark in made if remark), key=lambda remark: -remark.weight)
+    return RunVerdict(tuple(remarks))
+
+
+def _output(numbers: dict[str, Any]) -> Remark:
+    fused = numbers['fused']
+    if fused['poses'] < 3:
+        return Remark(Weight.FAULT, 'The filter gave no pose.')
+    pause, rate = fused['longest_pause_ms'], f'{fused["rate_hz"]:.0f} poses a second'
+    if pause > LONG_PAUSE_MS:
+        return Remark(Weight.FAULT, f'{rate}, but none for {pause:.0f} ms at the longest.')
+    if pause > SHORT_PAUSE_MS:
+        return Remark(Weight.DOUBT, f'{rate}, with a pause of {pause:.0f} ms.')
+    return Remark(Weight.GOOD, f'{rate}, without a pause.')
+
+
+def _error(numbers: dict[str, Any]) -> Remark | None:
+    error = numbers['fused'].get('error')
+    if error is None:
+        return Remark(Weight.NOTE, 'No ground truth: how large the errors are is not known.')
+    return Remark(
+        Weight.GOOD,
+        f'Errors against ground truth: {error["position_rms_mm"]:.1f} mm and {error["attitude_rms_deg"]:.2f} deg rms, '
+        f'{error["position_max_mm"]:.0f} mm at the worst.',
+    )
+
+
+def _consistency(numbers: dict[str, Any]) -> Remark | None:
+    nees = numbers['fused'].get('consistency', {}).get('pose_nees_per_dof')
+    if nees is None:
+        return None
+    words = f'NEES {nees:.2g} a degree of freedom'
+    if nees > INCONSISTENT_NEES:
+        return Remark(Weight.FAULT, f'The covariance claims far less error than there is ({words}).')
+    if nees > CONSISTENT_NEES:
+        return Remark(Weight.DOUBT, f'The covariance claims less error than there is ({words}).')
+    if nees < CAUTIOUS_NEES:
+        return Remark(Weight.NOTE, f'The covariance claims more error than there is ({words}).')
+    return Remark(Weight.GOOD, f'The covariance is consistent with the errors ({words}).')
+
+
+def _refused(numbers: dict[str, Any]) -> Remark | None:
+    values = numbers.get('innovations')
+    if not values or not values['poses']:
+        return None
+    share = values['refused'] / values['poses']
+    weight = Weight.FAULT if share > MANY_REFUSED else Weight.DOUBT if share > FEW_REFUSED else Weight.GOOD
+    return Remark(weight, f'{values["refused"]} of {values["poses"]} camera poses were refused by the filter.')
+
+
+def _steps(numbers: dict[str, Any]) -> Remark | None:
+    step = numbers['fused'].get('step_max_mm')
+    if step is None or step <= LARGE_STEP_MM:
+        return None
+    return Remark(Weight.DOUBT, f'The pose jumps by up to {step:.0f} mm at corrections.')
+
+
+def _interruptions(evaluation: Evaluation) -> list[Remark]:
+    shutter = [entry for entry in evaluation.interruptions if entry.is_shutter]
+    others = [entry for entry in evaluation.interruptions if not entry.is_shutter]
+    remarks = []
+    if shutter:
+        longest = max(entry.seconds for entry in shutter)
+        remarks.append(Remark(Weight.GOOD, f'{_times(len(shutter), "shutter event")}, the longest {longest:.1f} s.'))
+    if others:
+        longest = max(entry.seconds for entry in others)
+        weight = Weight.DOUBT if longest > LONG_COAST_S else Weight.NOTE
+        causes = ', '.join(sorted({entry.cause.value for entry in others}))
+        remarks.append(Remark(weight, f'{_times(len(others), "drop-out")} of up to {longest:.1f} s ({causes}).'))
+    else:
+        remarks.append(Remark(Weight.GOOD, 'No drop-out of the markers.'))
+    return remarks
+
+
+def _times(count: int, noun: str) -> str:
+    return f'{count} {noun}{"s" if count > 1 else ""}'
+
+
+def _latency(numbers: dict[str, Any]) -> Remark | None:
+    p99 = numbers.get('latency', {}).get('imu_to_pose', {}).get('p99_ms')
+    if p99 is None:
+        return None
+    return Remark(Weight.DOUBT if p99 > LATE_MS else Weight.GOOD, f'99 % of the poses came within {p99:.1f} ms.')
+
+
+def _resets(evaluation: Evaluation) -> Remark | None:
+    values = evaluation.run.output.figures.get('resets')
+    resets = 0 if values is None else int(values[1].max())
+    return Remark(Weight.DOUBT, f'The filter was reset {_times(resets, "time")}.') if resets else None
+
+
+def _markers(evaluation: Evaluation) -> Remark | None:
+    quarantined = [str(tag.id) for tag in evaluation.tags if tag.status == 'quarantined']
+    if quarantined:
+        return Remark(Weight.DOUBT, f'Markers {", ".join(quarantined)} contradict the map.')
+    return None

@@ -1,0 +1,157 @@
+"""A video of a run: thermal frames with their markers, time, state and height, by ffmpeg or PyAV."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+import shutil
+import subprocess
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import BagReader
+from thermal_fiducial.report.frames import annotated, bag_of, views, write
+from thermal_fiducial.report.page import is_installed
+from thermal_fiducial.report.run_folder import Run
+
+#: Frames a second of the video where the bag has fewer than three.
+_FALLBACK_RATE = 30.0
+#: A fused pose within this [ns] of a frame stands in its caption.
+_NEAR_NS = 20_000_000
+_LINE_PX = 22
+
+Frame = npt.NDArray[np.uint8]
+
+
+def require_encoder() -> str:
+    """``ffmpeg`` or ``av``, whichever is installed, ffmpeg first.
+
+    Raises
+    ------
+    InputError
+        Neither is.
+    """
+    if shutil.which('ffmpeg'):
+        return 'ffmpeg'
+    if is_installed('av'):
+        return 'av'
+    raise InputError('--video needs ffmpeg (apt install ffmpeg) or PyAV (install the extra "video")')
+
+
+def write_video(
+    run: Run, path: Path, bag: Path | None = None, progress: Callable[[float], None] = lambda share: None
+) -> None:
+    """Write the video of a run.
+
+    Parameters
+    ----------
+    run : the run
+    path : an ``.mp4`` file, H.264, that browsers play
+    bag : what the run was replayed from; default: where it was
+    progress : called with the share done, 0 to 1
+
+    Raises
+    ------
+    InputError
+        No encoder, no bag, or a file that cannot be written.
+    """
+    encoder = require_encoder()
+    found = bag_of(run, bag)
+    if found is None:
+        raise InputError(f'{run.path}: no video: the bag is not where it was (--bag names it)')
+    with BagReader(*found) as reader:
+        count = max(1, reader.message_count([reader.image_topic]))
+        rate = _rate(reader, count)
+        frames = _captioned(run, reader)
+        first = next(frames, None)
+        if first is None:
+            raise InputError(f'{found[0]}: no video: the bag has no usable frame')
+        with (_ffmpeg if encoder == 'ffmpeg' else _pyav)(path, first, rate) as take:
+            take(first)
+            for index, frame in enumerate(frames, 2):
+                take(frame)
+                progress(min(1.0, index / count))
+
+
+def _rate(reader: BagReader, count: int) -> float:
+    seconds = reader.duration_ns * 1e-9
+    return round(count / seconds, 2) if count > 2 and seconds > 0.0 else _FALLBACK_RATE
+
+
+def _captioned(run: Run, reader: BagReader) -> Iterator[Frame]:
+    """The frames with markers and captions; a withheld one stays as it was, with the reason on it."""
+    last: Frame | None = None
+    start_ns: int | None = None
+    for view in views(reader):
+        start_ns = view.stamp_ns if start_ns is None else start_ns
+        if view.pixels is not None:
+            last = view.pixels
+        if last is None:
+            continue
+        picture = annotated(last, run.detections, view.stamp_ns) if view.pixels is not None else last.copy()
+        lines = [f'{(view.stamp_ns - start_ns) * 1e-9:6.2f} s  {view.reason}', _place(run, view.stamp_ns)]
+        for row, line in enumerate(lines):
+            write(picture, line, (8, picture.shape[0] - 10 - _LINE_PX * (len(lines) - 1 - row)))
+        # H.264 with halved colours wants even sizes.
+        yield picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+
+
+def _place(run: Run, stamp_ns: int) -> str:
+    """Where the filter had the robot at a frame."""
+    fused = run.fused
+    if not len(fused):
+        return 'no pose'
+    at = min(int(np.searchsorted(fused.stamps_ns, stamp_ns + run.offset_ns)), len(fused) - 1)
+    if abs(int(fused.stamps_ns[at]) - stamp_ns - run.offset_ns) > _NEAR_NS:
+        return 'no pose'
+    p: FloatArray = fused.positions[at]
+    return f'x {p[0]:.2f}  y {p[1]:.2f}  z {p[2]:.2f} m'
+
+
+@contextmanager
+def _ffmpeg(path: Path, first: Frame, rate: float) -> Iterator[Callable[[Frame], None]]:
+    height, width = first.shape[:2]
+    source = ['-f', 'rawvideo', '-pix_fmt', 'bgr24', '-s', f'{width}x{height}', '-r', str(rate), '-i', '-']
+    sink = ['-c:v', 'libx264', '-crf', '24', '-pix_fmt', 'yuv420p', '-movflags', '+faststart', str(path)]
+    command = ['ffmpeg', '-y', '-loglevel', 'error', *source, *sink]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        assert process.stderr is not None
+        try:
+            yield lambda frame: _feed(process.stdin, frame)
+        except BrokenPipeError:
+            pass
+        finally:
+            process.stdin.close()
+        said = process.stderr.read().decode(errors='replace').strip()
+        if process.wait():
+            raise InputError(f'{path}: ffmpeg cannot write the video: {said.splitlines()[-1] if said else "no reason"}')
+
+
+def _feed(pipe: Any, frame: Frame) -> None:
+    pipe.write(np.ascontiguousarray(frame).tobytes())
+
+
+@contextmanager
+def _pyav(path: Path, first: Frame, rate: float) -> Iterator[Callable[[Frame], None]]:
+    from fractions import Fraction
+
+    import av
+
+    height, width = first.shape[:2]
+    try:
+        container = av.open(str(path), 'w')
+    except OSError as error:
+        raise InputError(f'{path}: {error.strerror}') from None
+    with container:
+        stream = container.add_stream('libx264', rate=Fraction(rate).limit_denominator(1000), options={'crf': '24'})
+        stream.width, stream.height, stream.pix_fmt = width, height, 'yuv420p'
+
+        def take(frame: Frame) -> None:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format='bgr24')))
+
+        yield take
+        container.mux(stream.encode())
