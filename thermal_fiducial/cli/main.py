@@ -24,6 +24,7 @@ COMMANDS = {
     'map': 'show, check, edit, merge, refine and align marker maps',
     'markers': 'make markers that can be cut: dictionaries, drawings, planning',
     'calibrate': 'calibrate the thermal camera, camera against IMU, and noise of the IMU',
+    'watch': 'whether the pose may be flown on, live in a terminal',
     'check-bridge': 'verify what a flight controller would receive',
 }
 

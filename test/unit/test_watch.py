@@ -1,0 +1,192 @@
+"""The live view: what it says of each state, and that it hears real messages."""
+
+import io
+import threading
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from nav_msgs.msg import Odometry
+import numpy as np
+import pytest
+from rclpy.context import Context
+from rclpy.node import Node
+from sensor_msgs.msg import PointCloud2
+
+from thermal_fiducial.cli import watch as command
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.measurements import MARKER_DTYPE
+from thermal_fiducial.replay.domain import own_domain
+from thermal_fiducial.ros import clouds, convert, qos
+from thermal_fiducial.ros.live_status import Advice, LiveStatus, STAGES
+from thermal_fiducial.ros.watcher import watch
+
+FIGURES = {'time offset': '0.0182', 'time offset std': '0.0004', 'usable for': '9.75', 'lost': 'False'}
+
+
+def flying(seconds=4.0, **said):
+    """A status after ``seconds`` of healthy flight; ``said``: node to its last level and words."""
+    status = LiveStatus()
+    for k in range(round(200 * seconds)):
+        status.odometry(k * 0.005, 0.002, 0.004, 0.05)
+    for k in range(round(30 * seconds)):
+        status.camera_pose(k / 30, 0.04)
+        status.markers(k / 30, [7, 3])
+    words = dict.fromkeys(STAGES, (0, 'ok')) | said
+    for node, (level, message) in words.items():
+        status.diagnostic(seconds - 0.5, node, level, message, FIGURES if node == 'pose_ekf' else {})
+    return status
+
+
+def test_all_is_well():
+    snapshot = flying().snapshot(4.0)
+    assert (snapshot.advice, snapshot.headline) == (Advice.FLY, 'The pose may be flown on')
+    readings = {reading.name: (reading.value, reading.unit) for reading in snapshot.readings}
+    assert readings == {
+        'markers in view': ('2 (3 7)', ''),
+        'poses': ('200', 'Hz'),
+        'camera poses': ('30', 'Hz'),
+        'latency': ('2', 'ms'),
+        'camera latency': ('40', 'ms'),
+        'sigma': ('4.0', 'mm'),
+        'sigma of attitude': ('0.05', 'deg'),
+        'clock offset': ('18.2 +- 0.4', 'ms'),
+        'usable without markers': ('9.8', 's'),
+    }
+    assert 'clock offset 18.2 +- 0.4 ms' in snapshot.line
+    assert '\n' not in snapshot.line
+
+
+STATES = [
+    ({'tau2_camera': (1, 'FFC')}, Advice.FLY, ''),
+    ({'pose_ekf': (1, 'coasting for 1.2 s')}, Advice.CARE, 'coasting for 1.2 s'),
+    ({'marker_mapper': (1, 'quarantined: 7')}, Advice.CARE, 'marker_mapper: quarantined: 7'),
+    ({'tau2_camera': (2, 'no thermal/image_raw')}, Advice.CARE, 'tau2_camera: no thermal/image_raw'),
+    ({'pose_ekf': (2, 'lost: position known to 0.41 m')}, Advice.STOP, 'lost: position known to 0.41 m'),
+]
+
+
+@pytest.mark.parametrize(('said', 'advice', 'words'), STATES)
+def test_what_the_nodes_say_decides(said, advice, words):
+    snapshot = flying(**said).snapshot(4.0)
+    assert snapshot.advice is advice
+    assert words in snapshot.headline
+
+
+def test_silence_is_no_pose():
+    assert LiveStatus().snapshot(1.0).headline == 'The pose must not be flown on: nothing is heard of pose_ekf'
+    snapshot = flying().snapshot(5.0)
+    assert (snapshot.advice, snapshot.reasons) == (Advice.STOP, ('no odometry for 1.0 s',))
+    waiting = LiveStatus()
+    waiting.diagnostic(0.0, 'pose_ekf', 1, 'waiting for markers', {})
+    assert waiting.snapshot(0.5).reasons == ('waiting for markers',)
+
+
+def test_stamps_of_another_clock_give_no_latency():
+    status = LiveStatus()
+    for k in range(100):
+        status.odometry(k * 0.005, 86_400.0, 0.004, 0.05)
+    assert {r.name: r.value for r in status.snapshot(0.5).readings}['latency'] == ''
+
+
+def test_the_last_refusals_come_first_and_grow_old():
+    status = flying()
+    for second, words in ((4.0, '7.1 sigma'), (5.0, '9.3 sigma')):
+        status.diagnostic(second, 'pose_ekf', 1, f'tracking; pose refused: {words}', FIGURES)
+    for count in ('1', '2'):
+        figures = {'refused messages': count, 'last refusal': 'encoding rgb8'}
+        status.diagnostic(6.0, 'tau2_camera', 1, 'encoding rgb8', figures)
+    assert status.snapshot(6.0).refusals == (
+        (0.0, 'tau2_camera: encoding rgb8'),
+        (1.0, 'pose refused: 9.3 sigma'),
+        (2.0, 'pose refused: 7.1 sigma'),
+    )
+    assert status.snapshot(500.0).refusals == ()
+
+
+def test_other_robots_do_not_count():
+    status = LiveStatus('/drone1')
+    status.diagnostic(0.0, 'drone2/pose_ekf', 0, 'tracking', {})
+    status.diagnostic(0.0, 'pose_ekf', 0, 'tracking', {})
+    assert status.snapshot(0.1).reasons == ('nothing is heard of pose_ekf',)
+    status.diagnostic(0.0, 'drone1/pose_ekf', 1, 'waiting for IMU', {})
+    assert status.snapshot(0.1).reasons == ('waiting for IMU',)
+
+
+def test_the_screen_says_what_the_line_says():
+    from rich.console import Console
+
+    status = flying(pose_ekf=(1, 'coasting for 1.2 s; pose refused: 7.1 sigma'))
+    console = Console(width=100, file=io.StringIO())
+    console.print(command.screen(status.snapshot(4.0)))
+    text = console.file.getvalue()
+    for words in ('with care', 'coasting for 1.2 s', '2 (3 7)', '18.2 +- 0.4', 'marker_mapper', 'pose refused: 7.1'):
+        assert words in text
+
+
+@pytest.mark.ros
+def test_messages_of_real_nodes_are_heard_in_their_namespace():
+    with own_domain() as domain:
+        context = Context()
+        context.init(args=['--ros-args', '-r', '__ns:=/drone1'], domain_id=domain)
+        robot = Node('robot', context=context, enable_rosout=False, start_parameter_services=False)
+        ending = threading.Event()
+        speaking = threading.Thread(target=speak, args=(robot, ending))
+        speaking.start()
+        seen = []
+
+        def show(status):
+            seen.append(status.snapshot(time.monotonic()))
+            return seen[-1].advice is Advice.FLY or len(seen) > 100
+
+        try:
+            watch(show, 0.1, ['-r', '__ns:=/drone1', '-r', 'odometry:=state'], domain)
+        finally:
+            ending.set()
+            speaking.join()
+            robot.destroy_node()
+            context.try_shutdown()
+    assert seen[-1].headline == 'The pose may be flown on'
+    readings = {reading.name: reading.value for reading in seen[-1].readings}
+    assert readings['markers in view'] == '1 (5)'
+    assert readings['sigma'] == '17.3'
+    assert float(readings['latency']) < 1000.0
+
+
+def speak(node, ending):
+    """What the nodes of a healthy robot publish, its odometry under another name."""
+    odometry = node.create_publisher(Odometry, 'state', qos.IMU_RATE_RESULT)
+    markers = node.create_publisher(PointCloud2, 'markers', qos.RESULT)
+    diagnostics = node.create_publisher(DiagnosticArray, '/diagnostics', qos.IMU_RATE_RESULT)
+    rows = np.zeros(1, MARKER_DTYPE)
+    rows['id'], rows['qw'], rows['aqw'], rows['z'], rows['az'], rows['sigma_px'] = 5, 1.0, 1.0, 2.0, 2.0, 0.05
+    for corner, (u, v) in enumerate(((10, 10), (50, 10), (50, 50), (10, 50))):
+        rows[f'u{corner}'], rows[f'v{corner}'] = u, v
+        rows[f'c{corner}uu'] = rows[f'c{corner}vv'] = 0.01
+    while not ending.wait(0.02):
+        now = node.get_clock().now().nanoseconds
+        message = Odometry(header=convert.header(now, 'map'))
+        message.pose.covariance[0] = message.pose.covariance[7] = message.pose.covariance[14] = 1e-4
+        odometry.publish(message)
+        markers.publish(clouds.cloud(rows, convert.header(now, 'camera')))
+        figures = [KeyValue(key=key, value=value) for key, value in FIGURES.items()]
+        status = [
+            DiagnosticStatus(level=DiagnosticStatus.OK, name=f'drone1/{name}', message='ok', values=figures)
+            for name in STAGES
+        ]
+        diagnostics.publish(DiagnosticArray(header=convert.header(now, ''), status=status))
+
+
+@pytest.mark.ros
+def test_once_says_in_a_line_that_there_is_nothing(capfd, monkeypatch):
+    with own_domain() as domain:
+        monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
+        assert main(['watch', '--once', '--wait', '0.3']) == 1
+    printed = capfd.readouterr().out
+    assert printed.startswith('The pose must not be flown on: nothing is heard of pose_ekf')
+    assert printed.count('\n') == 1
+
+
+@pytest.mark.parametrize('wait', ['0', '-1', 'nan'])
+def test_an_impossible_wait_is_refused(capsys, wait):
+    assert main(['watch', '--once', f'--wait={wait}']) == 2
+    assert capsys.readouterr().err.count('\n') == 1

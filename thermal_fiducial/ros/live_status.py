@@ -1,0 +1,242 @@
+"""What a pilot wants to know while flying, from messages as they come: may the pose be flown on, and if not, why.
+
+Nothing here needs ROS or a display; times are seconds of one monotonic clock.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+import re
+
+from thermal_fiducial.core.imaging.frame_cleaner import SHUTTER
+
+#: Without odometry for longer than this there is no pose to fly on; without diagnostics, nobody who says so [s].
+SILENT_S, MUTE_S = 0.5, 3.0
+#: Rates are those of the last seconds; a topic of which nothing came in this time has none.
+WINDOW_S = 2.0
+#: Older refusals are of no interest to a pilot any more [s], and more of them no help.
+REFUSAL_S, MOST_REFUSALS = 60.0, 5
+#: Stamps that differ more than this from the time are of another clock [s].
+_ONE_CLOCK_S = 5.0
+_FILTER, _CAMERA, _DETECTOR, _MAPPER = 'pose_ekf', 'tau2_camera', 'aruco_detector', 'marker_mapper'
+STAGES = (_CAMERA, _DETECTOR, _MAPPER, _FILTER)
+_REFUSED = re.compile(r'; pose (refused: .*)')
+_OK, _WARNING = 0, 1
+
+
+class Advice(Enum):
+    """Whether the pose may be flown on."""
+
+    FLY = 'may be flown on'
+    CARE = 'may be flown on, with care'
+    STOP = 'must not be flown on'
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One figure with its unit; empty when unknown."""
+
+    name: str
+    value: str
+    unit: str = ''
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The state at one time."""
+
+    advice: Advice
+    reasons: tuple[str, ...]
+    readings: tuple[Reading, ...]
+    #: node, level (0 ok, 1 warning, 2 error) and what it says
+    nodes: tuple[tuple[str, int, str], ...]
+    #: how long ago [s] and what
+    refusals: tuple[tuple[float, str], ...]
+
+    @property
+    def headline(self) -> str:
+        """The advice with its reasons, in one line."""
+        reasons = f': {"; ".join(self.reasons)}' if self.reasons else ''
+        return f'The pose {self.advice.value}{reasons}'
+
+    @property
+    def line(self) -> str:
+        """All in one line of plain text."""
+        figures = [f'{r.name} {r.value} {r.unit}'.strip() for r in self.readings if r.value]
+        return ' | '.join(
+            [self.headline, *figures, *(f'refused {age:.0f} s ago: {why}' for age, why in self.refusals[:1])]
+        )
+
+
+@dataclass
+class _Topic:
+    """Arrivals of a topic in the last seconds, and how late each was."""
+
+    arrivals: deque[float] = field(default_factory=deque)
+    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=50))
+
+    def add(self, now: float, age: float) -> None:
+        self.arrivals.append(now)
+        while self.arrivals and self.arrivals[0] < now - WINDOW_S:
+            self.arrivals.popleft()
+        if 0.0 <= age < _ONE_CLOCK_S:
+            self.latencies.append(age)
+
+    def silent(self, now: float) -> float:
+        """Since the last message [s]."""
+        return now - self.arrivals[-1] if self.arrivals else float('inf')
+
+    def rate(self, now: float) -> str:
+        recent = [time for time in self.arrivals if time >= now - WINDOW_S]
+        if len(recent) < 2 or recent[-1] <= recent[0]:
+            return ''
+        return f'{(len(recent) - 1) / (recent[-1] - recent[0]):.0f}'
+
+    @property
+    def latency(self) -> str:
+        """Median [ms]; empty where stamps are of another clock."""
+        if not self.latencies:
+            return ''
+        return f'{1e3 * sorted(self.latencies)[len(self.latencies) // 2]:.0f}'
+
+
+@dataclass
+class _Node:
+    time: float
+    level: int
+    message: str
+    figures: Mapping[str, str]
+
+
+class LiveStatus:
+    """Gathers messages; :meth:`snapshot` says what they come to.
+
+    Parameters
+    ----------
+    namespace : of the robot; what nodes elsewhere say does not count
+    """
+
+    def __init__(self, namespace: str = '') -> None:
+        self._prefix = f'{namespace.strip("/")}/'.lstrip('/')
+        self._odometry, self._camera_pose, self._frames = _Topic(), _Topic(), _Topic()
+        self._markers: tuple[int, ...] = ()
+        self._sigma: tuple[float, float] | None = None
+        self._nodes: dict[str, _Node] = {}
+        self._refusals: deque[tuple[float, str]] = deque(maxlen=MOST_REFUSALS)
+
+    def odometry(self, now: float, age: float, sigma_m: float, sigma_deg: float) -> None:
+        """Odometry came, ``age`` [s] after its stamp; its standard deviations, three axes together."""
+        self._odometry.add(now, age)
+        self._sigma = (sigma_m, sigma_deg)
+
+    def camera_pose(self, now: float, age: float) -> None:
+        """A pose from markers came."""
+        self._camera_pose.add(now, age)
+
+    def markers(self, now: float, ids: Iterable[int]) -> None:
+        """The markers of a frame came."""
+        self._frames.add(now, -1.0)
+        self._markers = tuple(sorted(ids))
+
+    def diagnostic(self, now: float, name: str, level: int, message: str, figures: Mapping[str, str]) -> None:
+        """A node said something of itself."""
+        if not name.startswith(self._prefix):
+            return
+        node = name.removeprefix(self._prefix)
+        if node not in STAGES:
+            return
+        before = self._nodes.get(node)
+        self._nodes[node] = _Node(now, level, message, figures)
+        refusal = _REFUSED.search(message)
+        if refusal:
+            self._refuse(now, f'pose {refusal[1]}')
+        counted = figures.get('refused messages', '0')
+        if before is not None and counted != before.figures.get('refused messages', '0'):
+            self._refuse(now, f'{node}: {figures.get("last refusal", "")}')
+
+    def _refuse(self, now: float, words: str) -> None:
+        if self._refusals and self._refusals[0][1] == words:
+            self._refusals.popleft()
+        self._refusals.appendleft((now, words))
+
+    def snapshot(self, now: float) -> Snapshot:
+        """The state at a time."""
+        stops, cares = self._stops(now), self._cares(now)
+        advice = Advice.STOP if stops else Advice.CARE if cares else Advice.FLY
+        return Snapshot(
+            advice=advice,
+            reasons=tuple(stops or cares),
+            readings=self._readings(now),
+            nodes=tuple(self._said(node, now) for node in STAGES),
+            refusals=tuple((now - time, why) for time, why in self._refusals if now - time < REFUSAL_S),
+        )
+
+    def _stops(self, now: float) -> list[str]:
+        """Why the pose must not be flown on."""
+        filter_ = self._nodes.get(_FILTER)
+        if not self._odometry.arrivals:
+            if filter_ is None:
+                return ['nothing is heard of pose_ekf']
+            return [filter_.message]
+        reasons = []
+        if (silent := self._odometry.silent(now)) > SILENT_S:
+            reasons.append(f'no odometry for {silent:.1f} s')
+        if filter_ is not None and (filter_.level > _WARNING or filter_.figures.get('lost') == 'True'):
+            reasons.append(filter_.message)
+        return reasons
+
+    def _cares(self, now: float) -> list[str]:
+        """Why it may be flown on with care only."""
+        reasons = []
+        for node in STAGES:
+            said = self._nodes.get(node)
+            if said is None or now - said.time > MUTE_S:
+                reasons.append(f'{node} says nothing')
+            elif said.level != _OK and not self._is_shutter(node, said):
+                reasons.append(said.message if node == _FILTER else f'{node}: {said.message}')
+        return reasons
+
+    def _is_shutter(self, node: str, said: _Node) -> bool:
+        """Whether it is the camera's shutter, which is as it should be."""
+        return node == _CAMERA and SHUTTER in said.message and said.level == _WARNING
+
+    def _said(self, node: str, now: float) -> tuple[str, int, str]:
+        said = self._nodes.get(node)
+        if said is None:
+            return node, _WARNING, 'not heard'
+        if now - said.time > MUTE_S:
+            return node, _WARNING, f'silent for {now - said.time:.0f} s'
+        return node, said.level, said.message
+
+    def _readings(self, now: float) -> tuple[Reading, ...]:
+        in_view = self._markers if self._frames.silent(now) < WINDOW_S else ()
+        listed = ' '.join(str(marker) for marker in in_view)
+        sigma_m, sigma_deg = self._sigma if self._sigma and self._odometry.silent(now) < WINDOW_S else (None, None)
+        figures: Mapping[str, str] = self._nodes[_FILTER].figures if _FILTER in self._nodes else {}
+        offset, offset_std = _milliseconds(figures, 'time offset'), _milliseconds(figures, 'time offset std')
+        return (
+            Reading('markers in view', f'{len(in_view)}' + (f' ({listed})' if listed else '')),
+            Reading('poses', self._odometry.rate(now), 'Hz'),
+            Reading('camera poses', self._camera_pose.rate(now), 'Hz'),
+            Reading('latency', self._odometry.latency, 'ms'),
+            Reading('camera latency', self._camera_pose.latency, 'ms'),
+            Reading('sigma', '' if sigma_m is None else f'{1e3 * sigma_m:.1f}', 'mm'),
+            Reading('sigma of attitude', '' if sigma_deg is None else f'{sigma_deg:.2f}', 'deg'),
+            Reading('clock offset', f'{offset:.1f} +- {offset_std:.1f}' if offset and offset_std else '', 'ms'),
+            Reading('usable without markers', _rounded(figures, 'usable for'), 's'),
+        )
+
+
+def _milliseconds(figures: Mapping[str, str], name: str) -> float | None:
+    try:
+        return 1e3 * float(figures[name])
+    except (KeyError, ValueError):
+        return None
+
+
+def _rounded(figures: Mapping[str, str], name: str) -> str:
+    try:
+        return f'{float(figures[name]):.1f}'
+    except (KeyError, ValueError):
+        return ''
