@@ -420,6 +420,9 @@ class ArucoDetectorConfig(SelfChecked):
         'apriltag_msgs or vision_msgs. Empty: none.',
         choices=('', 'aruco_opencv', 'apriltag', 'vision'),
     )
+    image_annotations: bool = param(
+        False, 'Publish thermal/image_annotations for Foxglove (needs foxglove_msgs) while someone subscribes.'
+    )
     publish_marker_tf: bool = param(False, 'Publish each marker as marker_ID on /tf (needs tf2_ros).')
     duplicates: str = param(
         'drop',

@@ -15,6 +15,7 @@ from support.ros_graph import ros_graph
 from thermal_fiducial.core.measurements import corners_px, MARKER_DTYPE
 from thermal_fiducial.nodes.aruco_detector import ArucoDetector
 from thermal_fiducial.ros import convert, detections
+from thermal_fiducial.ros.annotations import image_annotations
 
 HEAD = convert.header(START, 'thermal_camera_optical')
 CORNERS = np.array([[100.0, 80.0], [160.0, 82.0], [158.0, 141.0], [99.0, 140.0]])
@@ -40,6 +41,16 @@ VISION = SimpleNamespace(
     Detection3DArray=stand_in(detections=list),
     Detection3D=stand_in(results=list, bbox=SimpleNamespace),
     ObjectHypothesisWithPose=stand_in(hypothesis=SimpleNamespace, pose=PoseWithCovariance),
+)
+
+
+FOXGLOVE = SimpleNamespace(
+    ImageAnnotations=lambda: SimpleNamespace(timestamp=None, circles=[], points=[], texts=[]),
+    PointsAnnotation=type('PointsAnnotation', (SimpleNamespace,), {'LINE_LOOP': 2}),
+    CircleAnnotation=SimpleNamespace,
+    TextAnnotation=SimpleNamespace,
+    Point2=SimpleNamespace,
+    Color=SimpleNamespace,
 )
 
 
@@ -80,6 +91,26 @@ def test_vision():
     assert (detection.id, result.hypothesis.class_id, result.hypothesis.score) == ('7', '7', 1.0)
     assert result.pose.pose.position.z == detection.bbox.center.position.z == 2.5
     assert (detection.bbox.size.x, detection.bbox.size.y) == (0.3, 0.3)
+
+
+def test_image_annotations():
+    message = image_annotations(FOXGLOVE, rows(), HEAD)
+    ((outline,), (circle,), (text,)) = (message.points, message.circles, message.texts)
+    assert message.timestamp == outline.timestamp == HEAD.stamp
+    assert outline.type == 2
+    assert np.allclose([(point.x, point.y) for point in outline.points], CORNERS)
+    assert (circle.position.x, circle.position.y) == tuple(CORNERS[0])
+    assert (text.text, text.position.x, text.position.y) == ('7', 160.0, 141.0)
+    nothing = image_annotations(FOXGLOVE, rows()[:0], HEAD)
+    assert (nothing.points, nothing.circles, nothing.texts) == ([], [], [])
+
+
+@pytest.mark.ros
+def test_annotations_without_foxglove_msgs_are_a_fault_that_names_the_picture():
+    with ros_graph() as graph:
+        node = graph.add(ArucoDetector, marker_size=small_bag.SIZE, image_annotations=True)
+        (fault,) = node.faults
+    assert 'foxglove_msgs is not installed; thermal/image_markers' in fault
 
 
 @pytest.mark.ros

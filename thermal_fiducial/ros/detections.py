@@ -15,6 +15,7 @@ from std_msgs.msg import Header
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.measurements import corners_px, Markers
+from thermal_fiducial.ros.annotations import image_annotations
 from thermal_fiducial.ros.node import StageNode
 
 #: Value of the parameter ``detections`` to package and message.
@@ -51,6 +52,14 @@ class OtherDetections:
                 fault(f'parameter detections: {package} is not installed')
             else:
                 self._output = node.advertise(getattr(self._messages, name), 'detections')
+        self._foxglove: Any = None
+        if config.image_annotations:
+            try:
+                self._foxglove = importlib.import_module('foxglove_msgs.msg')
+            except ImportError:
+                fault('parameter image_annotations: foxglove_msgs is not installed; thermal/image_markers is the same')
+            else:
+                self._annotations = node.advertise(self._foxglove.ImageAnnotations, 'thermal/image_annotations')
         if config.publish_marker_tf:
             try:
                 self._broadcaster = importlib.import_module('tf2_ros').TransformBroadcaster(node)
@@ -61,6 +70,8 @@ class OtherDetections:
         """Publish the markers of a frame, also when there are none."""
         if self._messages is not None:
             self._output.send(self._message(markers, head))
+        if self._foxglove is not None and self._annotations.listeners:
+            self._annotations.send(image_annotations(self._foxglove, markers, head))
         if self._broadcaster is not None and len(markers):
             self._broadcaster.sendTransform([_transform(row, head, self._prefix) for row in markers])
 
