@@ -8,7 +8,7 @@ from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.bit_patterns import cuttable, pack, rotate, unpack, weight
 from thermal_fiducial.fabrication.cuttability import examine
-from thermal_fiducial.fabrication.dictionary_search import distances, random_code, search
+from thermal_fiducial.fabrication.dictionary_search import distances, negatives, random_code, search
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.dictionary import PACKAGED as FOLDER
 
@@ -18,6 +18,8 @@ PACKAGED = {
     'STENCIL_4X4_100': (4, 80, 4),
     'STENCIL_5X5_100': (5, 72, 8),
     'STENCIL_6X6_100': (6, 50, 12),
+    'STENCIL_4X4_80_SIGNED': (4, 80, 4),
+    'STENCIL_5X5_100_SIGNED': (5, 100, 8),
 }
 
 
@@ -62,6 +64,34 @@ def test_packaged_dictionary_keeps_its_promise(name):
         assert min(differing(rows, other) for other in turns[1:]) >= distance
         all_turns.append(turns)
     assert min(differing(a[0], turn) for a, b in combinations(all_turns, 2) for turn in b) >= distance
+
+
+def negative(rows):
+    return [''.join('10'[int(bit)] for bit in row) for row in rows]
+
+
+@pytest.mark.parametrize(('name', 'distance'), [('STENCIL_4X4_80_SIGNED', 4), ('STENCIL_5X5_100_SIGNED', 8)])
+def test_bits_of_signed_markers_tell_warm_from_cold(name, distance):
+    markers = [[''.join(map(str, row)) for row in bits] for bits in marker_bits(load_dictionary(name)).tolist()]
+    for rows in markers:
+        turns = [negative(rows)]
+        for _ in range(3):
+            turns.append(turned(turns[-1]))
+        assert min(differing(other, turn) for other in markers for turn in turns) >= distance
+
+
+def test_check_names_markers_that_are_negatives_of_one_another(capsys):
+    # Marker 0 turned by no, one, two or three quarters and inverted: one of the 100 is that.
+    bits = marker_bits(load_dictionary('STENCIL_4X4_100'))
+    inverted = [1 - np.rot90(bits[0], turns) for turns in range(4)]
+    partners = [key for key, other in enumerate(bits) if any(np.array_equal(other, turn) for turn in inverted)]
+    pairs = negatives(bits, 4)
+    assert [b for a, b, apart in pairs if a == 0 and apart == 0] == partners
+    first = pairs[0][:2]
+    assert main(['markers', 'check', '--mount', 'none', '--ids', ','.join(map(str, first))]) == 0
+    assert f'marker {first[0]} and the negative of {first[1]} differ in 0 bits' in capsys.readouterr().out
+    assert main(['markers', 'check', '--mount', 'none', '--dictionary', 'STENCIL_4X4_80_SIGNED', '--ids', '0-5']) == 0
+    assert 'negative' not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize('name', ['STENCIL_4X4_16', 'STENCIL_4X4_100'])

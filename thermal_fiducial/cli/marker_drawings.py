@@ -4,10 +4,12 @@ import argparse
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from pathlib import Path
+import sys
 
 import numpy as np
 
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
+from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
@@ -18,6 +20,7 @@ from thermal_fiducial.fabrication.drawing import Drawing
 from thermal_fiducial.fabrication.paper import PAPERS
 from thermal_fiducial.fabrication.plate import marker_drawing, MOUNTS, PlateOptions
 from thermal_fiducial.fabrication.sheet import nest
+from thermal_fiducial.fabrication.strength import strength_of
 from thermal_fiducial.fabrication.verification import agree, problems, read_dxf
 from thermal_fiducial.fabrication.writers import FORMATS, write
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -45,7 +48,9 @@ def add_make(parser: argparse.ArgumentParser) -> None:
 
 
 def _make(args: argparse.Namespace) -> int:
-    _write_all(list(_markers(args)), args)
+    drawings = list(_markers(args))
+    _write_all(drawings, args)
+    _say_what_is_weak(drawings, args)
     return 0
 
 
@@ -62,7 +67,9 @@ def add_sheet(parser: argparse.ArgumentParser) -> None:
 
 def _sheet(args: argparse.Namespace) -> int:
     width, height = args.sheet
-    _write_all(nest(list(_markers(args)), width, height, spacing=args.spacing, margin=args.margin), args)
+    drawings = list(_markers(args))
+    _write_all(nest(drawings, width, height, spacing=args.spacing, margin=args.margin), args)
+    _say_what_is_weak(drawings, args)
     return 0
 
 
@@ -78,7 +85,7 @@ def add_board(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--diameter', type=float, default=20.0, metavar='MM', help='of the circles')
     parser.add_argument('--dictionary', default='STENCIL_4X4_100', help='of the markers')
-    add_plate_options(parser, size=80.0)
+    add_plate_options(parser, size=130.0)
     _add_output(parser)
 
 
@@ -95,7 +102,9 @@ def _board(args: argparse.Namespace) -> int:
     centres = marker_grid(columns, rows, options.size, args.spacing or 40.0)
     base = base_plate(centres, labels, bits.shape[1] + 2, options)
     board = args.out / 'board.yaml'
-    _write_all([*(marker_drawing(bits[int(label)], label, options) for label in labels), base], args, [board])
+    markers = [marker_drawing(bits[int(label)], label, options) for label in labels]
+    _write_all([*markers, base], args, [board])
+    _say_what_is_weak(markers, args, bits.shape[1] + 2)
     save_map(board, _board_map(centres, options, args.dictionary))
     return 0
 
@@ -118,6 +127,7 @@ def add_plate_options(parser: argparse.ArgumentParser, size: float = PlateOption
         default = size if name == 'size' else getattr(PlateOptions, name)
         group.add_argument('--' + name.replace('_', '-'), type=float, default=default, metavar='MM', help=description)
     group.add_argument('--quiet-cells', type=float, default=1.0, metavar='CELLS', help='warm ring around the pattern')
+    group.add_argument('--min-web', type=float, default=3.0, metavar='MM', help='least width of acrylic between holes')
 
 
 def plate_options(args: argparse.Namespace) -> PlateOptions:
@@ -132,6 +142,19 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
         '--paper', metavar='PAPER', help=f'PDF in tiles for a printer: {", ".join(PAPERS)} (default: one page)'
     )
     add_force(parser)
+
+
+def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cells: int | None = None) -> None:
+    """Width of the narrowest web of each marker, and what speaks against cutting it so."""
+    options = plate_options(args)
+    cells = cells or chosen(args)[0].shape[1] + 2
+    with progress_bar('measuring webs') as progress:
+        for done, drawing in enumerate(drawings, 1):
+            strength = strength_of(drawing, options, cells, args.min_web)
+            print(f'marker {drawing.name}: narrowest web {strength.web_mm:.1f} mm ({strength.kind})')
+            for complaint in strength.complaints:
+                print(f'warning: marker {drawing.name}: {complaint}', file=sys.stderr)
+            progress(done / len(drawings))
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:

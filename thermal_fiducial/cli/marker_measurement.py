@@ -155,8 +155,16 @@ class Tally:
 
     @property
     def sigma_px(self) -> float:
-        """Noise of a corner coordinate, from the median: poses do not suffer from the one corner that went astray."""
+        """Noise of a corner coordinate, from the median: poses do not suffer from one corner that is far off."""
         return 1.4826 * float(np.median(np.abs(self.corner_errors))) if len(self.best) >= 3 else np.nan
+
+    @property
+    def distance_error(self) -> float:
+        """Median error of the distance in its share of the distance."""
+        if len(self.best) < 3:
+            return np.nan
+        measured, true = (np.linalg.norm(T[:, :3, 3], axis=1) for T in (self.best, self.T_true))
+        return float(np.median(np.abs(measured / true - 1.0)))
 
 
 def show(
@@ -202,15 +210,15 @@ def measure(
     """Show about ``markers`` markers of every side, contrast (in NETD) and tilt to the detector."""
     camera, detector = camera_and_detector()
     shape = (len(side_px), len(contrast), len(tilt_deg))
-    found, sigma, factor = np.zeros(shape), np.full(shape, np.nan), np.full(shape, np.nan)
+    found, (sigma, off, factor) = np.zeros(shape), np.full((3, *shape), np.nan)
     for node in np.ndindex(*shape):
         side, kelvin, tilt = float(side_px[node[0]]), float(contrast[node[1]]) * _SENSOR.netd, float(tilt_deg[node[2]])
         tally = show(detector, camera, side, kelvin, tilt, markers, [seed, *node])
-        found[node], sigma[node] = tally.found, tally.sigma_px
+        found[node], sigma[node], off[node] = tally.found, tally.sigma_px, tally.distance_error
         factor[node] = _pose_factor(tally, camera, side, tilt)
         if progress is not None:
             progress()
-    return Measurements(side_px, contrast, tilt_deg, found, sigma, _over_sides(factor))
+    return Measurements(side_px, contrast, tilt_deg, found, sigma, off, _over_sides(factor))
 
 
 def _over_sides(factor: FloatArray) -> FloatArray:

@@ -1,6 +1,7 @@
 """``markers``: dictionaries, drawings and planning of markers that can be cut."""
 
 import argparse
+from collections import Counter
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,9 @@ from thermal_fiducial.cli.tables import show, table_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.bridges import darkest_white, find_bridges
 from thermal_fiducial.fabrication.cuttability import examine
-from thermal_fiducial.fabrication.dictionary_search import distances, search
+from thermal_fiducial.fabrication.dictionary_search import distances, negatives, search
+from thermal_fiducial.fabrication.plate import marker_drawing
+from thermal_fiducial.fabrication.strength import strength_of
 from thermal_fiducial.files.dictionary import save_dictionary
 
 
@@ -44,24 +47,33 @@ def run(args: argparse.Namespace) -> int:
 def _add_check(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(do=_check)
     add_choice(parser)
-    parser.add_argument('--size', type=float, default=300.0, metavar='MM', help='side of the black square')
-    parser.add_argument('--min-web', type=float, default=3.0, metavar='MM', help='least width of acrylic between holes')
+    marker_drawings.add_plate_options(parser)
 
 
 def _check(args: argparse.Namespace) -> int:
     bits, ids = chosen(args)
-    cell = args.size / (bits.shape[1] + 2)
-    table = table_of('', ('ID', 'one piece', 'islands', 'point contacts', 'narrowest web mm', 'longest arm cells'))
-    good = 0
-    for marker_id in ids:
-        found = examine(bits[marker_id])
-        web = found.narrowest_web_cells * cell
-        fine = found.cuttable and web >= args.min_web
-        good += fine
-        row = (found.islands, found.point_contacts, f'{web:.1f}', found.longest_arm)
-        table.add_row(str(marker_id), 'yes' if fine else 'no', *map(str, row))
+    options = marker_drawings.plate_options(args)
+    cells = bits.shape[1] + 2
+    table = table_of(
+        '', ('ID', 'one piece', 'islands', 'point contacts', 'narrowest web mm', 'of', 'longest arm cells'), left=['of']
+    )
+    good, against = 0, Counter[str]()
+    with progress_bar('measuring webs') as progress:
+        for done, marker_id in enumerate(ids, 1):
+            found = examine(bits[marker_id])
+            drawing = marker_drawing(bits[marker_id], str(marker_id), options)
+            strength = strength_of(drawing, options, cells, args.min_web)
+            against.update(strength.complaints)
+            good += found.cuttable and not strength.complaints
+            row = found.islands, found.point_contacts, f'{strength.web_mm:.1f}', strength.kind
+            table.add_row(str(marker_id), 'yes' if found.cuttable else 'no', *map(str, row), str(found.longest_arm))
+            progress(done / len(ids))
     show(table)
+    for complaint, times in against.items():
+        print(f'{times} of {len(ids)} markers: {complaint}')
     between, own = distances(bits[ids])
+    for a, b, apart in negatives(bits[ids], between):
+        print(f'marker {ids[a]} and the negative of {ids[b]} differ in {apart} bits')
     print(f'{good} of {len(ids)} markers can be cut; distance between markers {between}, to own rotations {own}')
     return 0
 
@@ -95,6 +107,7 @@ def _add_dictionary(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--count', type=int, help='keep this many, the stiffest (default: all)')
     parser.add_argument('--seed', type=int, default=1, help='the same seed and restarts give the same file')
     parser.add_argument('--restarts', type=int, default=1000, help='codes to try')
+    parser.add_argument('--signed', action='store_true', help='no marker is like the negative of another')
     marker_drawings.add_force(parser)
 
 
@@ -106,6 +119,7 @@ def _dictionary(args: argparse.Namespace) -> int:
             args.distance,
             seed=args.seed,
             restarts=args.restarts,
+            signed=args.signed,
             progress=lambda done, most: progress(done / args.restarts, f'{most} markers'),
         )
     found = len(bits)
@@ -115,7 +129,7 @@ def _dictionary(args: argparse.Namespace) -> int:
     packed = np.concatenate([cv2.aruco.Dictionary.getByteListFromBits(marker) for marker in kept])
     dictionary = cv2.aruco.Dictionary(packed, args.bits, (args.distance - 1) // 2)
     save_dictionary(args.out, args.out.stem, dictionary)
-    count = '' if args.count is None else f' --count {args.count}'
+    count = ('' if args.count is None else f' --count {args.count}') + ' --signed' * args.signed
     command = f'--bits {args.bits} --distance {args.distance} --seed {args.seed} --restarts {args.restarts}{count}'
     text = args.out.read_text(encoding='utf-8')
     args.out.write_text(f'# thermal-fiducial markers dictionary {args.out.name} {command}\n{text}', encoding='utf-8')

@@ -105,8 +105,30 @@ def best_coset(code: LinearCode, distance: int) -> Words:
     return np.unique(turned.min(axis=0)[own >= distance])
 
 
+def apart_from_negatives(markers: Words, n: int, distance: int) -> Words:
+    """The ``markers`` that are left when none may differ in less than ``distance`` bits from the negative of another.
+
+    Those with the fewest such partners are kept first.
+    """
+    full = np.uint64((1 << n * n) - 1)
+    turned = rotations(markers, n)
+    bits_apart = np.min(weight(turned[:, :, None] ^ full ^ markers[None, None]), axis=0)
+    close = bits_apart < distance
+    kept: list[int] = []
+    for index in np.argsort(close.sum(axis=1), kind='stable').tolist():
+        if not close[index, index] and not np.any(close[index, kept]):
+            kept.append(index)
+    return markers[np.sort(np.array(kept, dtype=np.int64))]
+
+
 def search(
-    n: int, distance: int, *, seed: int, restarts: int, progress: Callable[[int, int], None] | None = None
+    n: int,
+    distance: int,
+    *,
+    seed: int,
+    restarts: int,
+    signed: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Gray:
     """Markers of n x n bits that can be cut, any two (and any marker and itself turned) ``distance`` bits apart.
 
@@ -115,6 +137,7 @@ def search(
     n : bits along a side, 3 to 8
     distance : least Hamming distance
     seed, restarts : the same numbers give the same markers
+    signed : any marker is as far from the negatives of all, so that the bits tell warm from cold
     progress : called with the number of restarts done and the most markers found so far
 
     Returns
@@ -132,6 +155,7 @@ def search(
     best = np.zeros(0, np.uint64)
     for done in range(1, restarts + 1):
         markers = best_coset(random_code(n, distance, rng), distance)
+        markers = apart_from_negatives(markers, n, distance) if signed else markers
         best = markers if len(markers) > len(best) else best
         if progress is not None:
             progress(done, len(best))
@@ -157,3 +181,17 @@ def distances(bits: Gray) -> tuple[int, int]:
         if len(bits) > 1:
             between = min(between, int(np.min(differing[~np.eye(len(bits), dtype=bool)])))
     return between, own
+
+
+def negatives(bits: Gray, closer_than: int) -> list[tuple[int, int, int]]:
+    """Pairs of markers, and in how many bits one differs from the negative of the other, in any rotation.
+
+    Parameters
+    ----------
+    bits : (M, n, n)
+    closer_than : only pairs that differ in fewer bits
+    """
+    turned = np.stack([np.rot90(1 - bits, turns, axes=(1, 2)) for turns in range(4)])
+    differing = np.min(np.sum(bits[:, None] != turned[:, None], axis=(3, 4)), axis=0)
+    pairs = np.argwhere(np.triu(differing < closer_than))
+    return [(int(a), int(b), int(differing[a, b])) for a, b in pairs]

@@ -1,9 +1,11 @@
 """What a camera will make of a marker: whether it is found, and how good its pose is.
 
 Nothing is guessed: ``measured.yaml`` holds what the detector of this package did with rendered frames over marker
-side in pixels, contrast and tilt (``thermal-fiducial markers measure`` makes it anew). The share of markers found and
-the noise of the corners are read from it; the pose error follows by running the pose solver on corners with that
-noise, both planar branches included, because near front-parallel views no linear propagation holds.
+side in pixels, contrast and tilt (``thermal-fiducial markers measure`` makes it anew). The share of markers found, the
+noise of the corners and the error of the distance are read from it; the other errors of the pose follow by running the
+pose solver on corners with that noise, both planar branches included, because near front-parallel views no linear
+propagation holds. The distance is another matter: corners of small markers are not only noisy but displaced alike,
+which no solver makes good.
 """
 
 from dataclasses import dataclass
@@ -15,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 
+from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_marker_poses
@@ -27,7 +30,7 @@ PACKAGED = Path(__file__).resolve().parent / 'measured.yaml'
 #: A marker is planned as detected when so many of the measured ones were: four frames of five, 24 times a second.
 DETECTED = 0.8
 
-_TABLES = ('side_px', 'contrast', 'tilt_deg', 'found', 'sigma_px', 'pose_factor')
+_TABLES = ('side_px', 'contrast', 'tilt_deg', 'found', 'sigma_px', 'distance_error', 'pose_factor')
 _SAMPLES = 200
 # Bits along a side of the markers that were measured: what counts for reading them is the size of a cell.
 _MEASURED_BITS = 4
@@ -44,6 +47,7 @@ class Measurements:
     tilt_deg : (T,) between the marker's normal and the line of sight
     found : (S, C, T) share of the markers that were found
     sigma_px : (S, C, T) noise of a corner coordinate; NaN where nothing was found
+    distance_error : (S, C, T) median error of the distance in its share of the distance; NaN where nothing was found
     pose_factor : (C, T) median error of the poses in that of poses from four corners with independent noise: the
         corners of a marker lie on common lines, so their errors have much in common, the more the fainter it is
     """
@@ -53,6 +57,7 @@ class Measurements:
     tilt_deg: FloatArray
     found: FloatArray
     sigma_px: FloatArray
+    distance_error: FloatArray
     pose_factor: FloatArray
 
     def look_up(self, side_px: float, contrast: float, tilt_deg: float, bits: int = 4) -> tuple[float, float]:
@@ -61,9 +66,11 @@ class Measurements:
         The share is linear over the logarithms of side and contrast. The noise is a power of the side in pixels as the
         camera sees it, so its logarithm is linear over those of side and of the tilt's cosine; and its square is a
         floor, from optics and from the fixed pattern, plus a part that falls with the square of the contrast. Beyond
-        the measured range the nearest end counts, except that nothing smaller or fainter than measured is found.
+        the measured range the nearest end counts, except that nothing smaller or fainter than measured is found, and
+        nothing of which a side is shorter than the detector's ``min_side_px`` however it is turned.
         """
-        if contrast < self.contrast[0]:
+        shortest = side_px * np.sqrt(0.5 + 0.5 * np.cos(np.radians(tilt_deg)) ** 2)
+        if contrast < self.contrast[0] or shortest < ArucoDetectorConfig().min_side_px:
             return 0.0, np.nan
         faint, tilted = _position(np.log(self.contrast), np.log(contrast)), self._tilted(tilt_deg)
         readable = side_px * (_MEASURED_BITS + 2) / (bits + 2)
@@ -79,6 +86,12 @@ class Measurements:
             return found, float(np.exp(_interpolate(np.log(self.sigma_px), (large, faint, tilted))))
         variances = np.exp(2.0 * np.array(ends))
         return found, float(np.sqrt((1.0 - share) * variances[0] + share * variances[1]))
+
+    def distance_share(self, side_px: float, contrast: float, tilt_deg: float) -> float:
+        """``distance_error`` between the measured points; its logarithm is linear over those of the axes."""
+        large = _position(np.log(self.side_px), np.log(side_px))
+        faint = _position(np.log(self.contrast), np.log(contrast))
+        return float(np.exp(_interpolate(np.log(self.distance_error), (large, faint, self._tilted(tilt_deg)))))
 
     def factor(self, contrast: float, tilt_deg: float) -> float:
         """``pose_factor`` between the measured points."""
@@ -126,18 +139,19 @@ def load_measurements(path: str | os.PathLike[str] = PACKAGED) -> Measurements:
         tables = [np.array(document[name], dtype=np.float64) for name in _TABLES]
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f'{path}: {error} is missing or no table') from None
-    side, contrast, tilt, found, sigma, factor = tables
-    shape = len(side), len(contrast), len(tilt)
-    if found.shape != shape or sigma.shape != shape or factor.shape != shape[1:] or min(shape) < 2:
-        raise InputError(f'{path}: tables of {found.shape} and {sigma.shape} do not fit axes of {shape}')
-    return Measurements(side, contrast, tilt, found, sigma, factor)
+    measurements = Measurements(*tables)
+    shape = len(measurements.side_px), len(measurements.contrast), len(measurements.tilt_deg)
+    sized = (measurements.found, measurements.sigma_px, measurements.distance_error)
+    if any(table.shape != shape for table in sized) or tables[-1].shape != shape[1:] or min(shape) < 2:
+        raise InputError(f'{path}: tables of {[table.shape for table in tables[3:]]} do not fit axes of {shape}')
+    return measurements
 
 
 def save_measurements(path: str | os.PathLike[str], measurements: Measurements, notes: dict[str, Any]) -> None:
     """Write ``measurements``, with ``notes`` on how they were made."""
     document: dict[str, Any] = {'format': FORMAT, **notes}
     for name in _TABLES:
-        document[name] = np.round(getattr(measurements, name), 4).tolist()
+        document[name] = np.round(getattr(measurements, name), 6).tolist()
     Path(path).write_text(
         yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120), encoding='utf-8'
     )
@@ -201,8 +215,9 @@ def expect(
         return Expectation(side_px, found, sigma)
     errors = expected_errors(camera, size, distance, tilt_deg, sigma, seed)
     factor = measurements.factor(contrast, tilt_deg)
-    position, along, rotation = (factor * error for error in errors[:3])
-    return Expectation(side_px, found, sigma, position, along, rotation, errors[3])
+    along = distance * measurements.distance_share(side_px, contrast, tilt_deg)
+    position, rotation = factor * errors[0], factor * errors[2]
+    return Expectation(side_px, found, sigma, max(position, along), along, rotation, errors[3])
 
 
 def expected_errors(

@@ -141,7 +141,7 @@ def pattern_origin(options: PlateOptions, cells: int) -> FloatArray:
     """Lower left corner (2,) of the black square in a drawing [mm]."""
     if options.mount == 'frame':
         return np.full(2, options.frame_width + options.quiet_cells * options.size / cells)
-    return np.full(2, _ear_length(options) if options.mount == 'ears' else 0.0)
+    return np.full(2, ear_length(options) if options.mount == 'ears' else 0.0)
 
 
 def _moved(r: Rectangle, offset: FloatArray) -> Rectangle:
@@ -151,11 +151,19 @@ def _moved(r: Rectangle, offset: FloatArray) -> Rectangle:
 Mounted = tuple[list[Rectangle], list[Contour]]
 
 
+def neck_arm(options: PlateOptions, cells: int) -> float:
+    """Over what length a neck or tie is bent [mm]: from the black square to the mounting hole, or across the ring."""
+    if options.mount == 'frame':
+        return options.quiet_cells * options.size / cells
+    return _NECK * options.size + 0.5 * _tab_length(options)
+
+
 def _tab_length(options: PlateOptions) -> float:
     return options.hole_diameter + 2.0 * _WALL_MM
 
 
-def _ear_length(options: PlateOptions) -> float:
+def ear_length(options: PlateOptions) -> float:
+    """Length of neck and tab of an ear [mm]."""
     return _NECK * options.size + _tab_length(options)
 
 
