@@ -416,6 +416,6 @@ def test_commands_write_what_they_say(tmp_path, capsys):
     )
     assert (Path(tmp_path) / 'b' / 'base-plate.dxf').is_file()
     board = load_map(tmp_path / 'b' / 'board.yaml')
-    # Two markers of 80 mm with 40 mm between them.
-    assert [marker.T_map_marker[0, 3] for marker in board.markers.values()] == pytest.approx([-0.06, 0.06])
-    assert board.markers[0].size == pytest.approx(0.08)
+    # Two markers of 130 mm with 40 mm between them.
+    assert [marker.T_map_marker[0, 3] for marker in board.markers.values()] == pytest.approx([-0.085, 0.085])
+    assert board.markers[0].size == pytest.approx(0.13)

@@ -2,6 +2,8 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.cli.marker_measurement import camera_and_detector, show
+from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.planning import (
@@ -13,10 +15,10 @@ from thermal_fiducial.fabrication.planning import (
 )
 
 CAMERA = Camera(640, 512, np.array([[765.0, 0.0, 319.5], [0.0, 765.0, 255.5], [0.0, 0.0, 1.0]]))
-SIDES, CONTRASTS, TILTS = np.array([10.0, 40.0]), np.array([1.0, 100.0]), np.array([0.0, 60.0])
+SIDES, CONTRASTS, TILTS = np.array([16.0, 64.0]), np.array([1.0, 100.0]), np.array([0.0, 60.0])
 
 
-def table(found, sigma):
+def table(found, sigma, distance=0.001):
     shape = (2, 2, 2)
     return Measurements(
         SIDES,
@@ -24,6 +26,7 @@ def table(found, sigma):
         TILTS,
         np.broadcast_to(found, shape),
         np.broadcast_to(sigma, shape),
+        np.broadcast_to(distance, shape),
         np.array([[1.0, 0.5], [1.0, 0.5]]),
     )
 
@@ -39,16 +42,46 @@ def test_looks_up_what_was_measured():
                 assert share == pytest.approx(found[s, c, t])
                 assert noise == pytest.approx(sigma[s, c, t])
     # Half-way in the logarithms, where noise is a power of side and contrast.
-    assert measurements.look_up(20.0, 1.0, 0.0)[1] == pytest.approx(np.sqrt(sigma[0, 0, 0] * sigma[1, 0, 0]))
+    assert measurements.look_up(32.0, 1.0, 0.0)[1] == pytest.approx(np.sqrt(sigma[0, 0, 0] * sigma[1, 0, 0]))
 
 
 def test_nothing_smaller_or_fainter_than_measured_is_found():
     measurements = table(1.0, 0.05)
-    assert measurements.look_up(9.0, 10.0, 0.0)[0] == 0.0
+    assert measurements.look_up(15.0, 10.0, 0.0)[0] == 0.0
     assert measurements.look_up(20.0, 0.9, 0.0)[0] == 0.0
     # Cells of 6 x 6 bits are smaller: 8 cells in the place of 6.
-    assert measurements.look_up(13.0, 10.0, 0.0, bits=6)[0] == 0.0
-    assert measurements.look_up(13.4, 10.0, 0.0, bits=6)[0] == 1.0
+    assert measurements.look_up(21.3, 10.0, 0.0, bits=6)[0] == 0.0
+    assert measurements.look_up(21.4, 10.0, 0.0, bits=6)[0] == 1.0
+
+
+def test_nothing_is_promised_below_the_shortest_side_that_the_detector_takes():
+    smallest = ArucoDetectorConfig().min_side_px
+    packaged, any_side = load_measurements(), table(1.0, 0.05)
+    for tilt in (0.0, 30.0, 60.0):
+        # Tilted about its diagonal, a square keeps this share of all its sides; about any other axis less of two.
+        kept = np.sqrt(0.5 * (1.0 + np.cos(np.radians(tilt)) ** 2))
+        for measurements in (packaged, any_side):
+            assert measurements.look_up(0.99 * smallest / kept, 100.0, tilt)[0] == 0.0
+    assert packaged.look_up(1.3 * smallest, 200.0, 0.0)[0] > 0.8
+
+
+def test_error_of_the_distance_is_what_was_measured():
+    measured = np.full((2, 2, 2), 0.001)
+    measured[0] = 0.01
+    plan = expect(table(1.0, 0.02, measured), CAMERA, size=0.3, distance=8.0, tilt_deg=30.0, contrast=50.0)
+    # 28.7 px: not half-way between 16 and 64 in the logarithm, where the error is 0.01 and 0.001 of the distance.
+    assert plan.distance == pytest.approx(8.0 * 10.0 ** (-2.0 - np.log(765.0 * 0.3 / 8.0 / 16.0) / np.log(4.0)))
+    assert plan.position >= plan.distance
+
+
+@pytest.mark.parametrize('side', [15.3, 19.1])
+def test_promised_distance_is_what_markers_show(side):
+    """Rendered markers of 0.3 m at 15 and 12 m, other ones than those of the tables."""
+    camera, detector = camera_and_detector()
+    shown = show(detector, camera, side, 11.0, 30.0, 24, [99, int(side)])
+    promised = load_measurements().distance_share(side, 11.0 / 0.05, 30.0)
+    # Medians of 24 errors between those of the tables, each of 24: 0.5 is two and a half standard deviations.
+    assert shown.distance_error == pytest.approx(promised, rel=0.5)
 
 
 def test_unmeasured_noise_is_left_out():
@@ -56,7 +89,7 @@ def test_unmeasured_noise_is_left_out():
     sigma[0] = np.nan
     measurements = table(1.0, sigma)
     assert measurements.look_up(20.0, 10.0, 0.0)[1] == pytest.approx(0.05)
-    assert np.isnan(measurements.look_up(10.0, 1.0, 0.0)[1])
+    assert np.isnan(measurements.look_up(16.0, 1.0, 0.0)[1])
 
 
 def test_errors_grow_with_distance_squared_and_noise():
@@ -83,9 +116,9 @@ def test_branches_that_meet_are_no_flips():
 
 
 def test_pose_factor_scales_the_errors():
-    plain = expect(table(1.0, 0.02), CAMERA, size=0.3, distance=3.0, tilt_deg=60.0, contrast=50.0)
+    plain = expect(table(1.0, 0.02, 1e-6), CAMERA, size=0.3, distance=3.0, tilt_deg=60.0, contrast=50.0)
     errors = expected_errors(CAMERA, 0.3, 3.0, 60.0, 0.02, 1)
-    assert (plain.position, plain.distance, plain.rotation_deg) == pytest.approx(np.multiply(0.5, errors[:3]))
+    assert (plain.position, plain.rotation_deg) == pytest.approx((0.5 * errors[0], 0.5 * errors[2]))
     assert plain.side_px == pytest.approx(76.5)
     assert plain.detected
 

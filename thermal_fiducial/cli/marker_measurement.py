@@ -205,19 +205,19 @@ def measure(
     *,
     markers: int,
     seed: int,
-    progress: Callable[[], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Measurements:
     """Show about ``markers`` markers of every side, contrast (in NETD) and tilt to the detector."""
     camera, detector = camera_and_detector()
     shape = (len(side_px), len(contrast), len(tilt_deg))
     found, (sigma, off, factor) = np.zeros(shape), np.full((3, *shape), np.nan)
-    for node in np.ndindex(*shape):
+    for done, node in enumerate(np.ndindex(*shape), 1):
         side, kelvin, tilt = float(side_px[node[0]]), float(contrast[node[1]]) * _SENSOR.netd, float(tilt_deg[node[2]])
         tally = show(detector, camera, side, kelvin, tilt, markers, [seed, *node])
         found[node], sigma[node], off[node] = tally.found, tally.sigma_px, tally.distance_error
         factor[node] = _pose_factor(tally, camera, side, tilt)
         if progress is not None:
-            progress()
+            progress(done / found.size)
     return Measurements(side_px, contrast, tilt_deg, found, sigma, off, _over_sides(factor))
 
 

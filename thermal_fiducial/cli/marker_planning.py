@@ -4,10 +4,11 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
+from thermal_fiducial.cli.marker_drawings import add_force, refuse_to_overwrite
+from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.tables import show, table_of
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
@@ -65,16 +66,15 @@ def _plan(args: argparse.Namespace) -> int:
     contrast = args.contrast * share
     measurements = load_measurements(args.tables)
     views = [_expectation(args, measurements, distance, contrast) for distance in distances]
-    console = Console()
-    console.print(
+    print(
         f'{args.contrast:g} K in front of the room; {100 * share:.0f} % of it, {contrast:.2g} K, left after '
         f'{args.after:g} s with {args.thickness:g} mm of acrylic and {args.stand_off:g} mm of stand-off.'
     )
-    console.print(_view_table(distances, views))
-    console.print(_fade_table(args))
+    show(_view_table(distances, views))
+    show(_fade_table(args))
     if args.plot is not None:
         _draw(args, measurements, distances, views)
-        console.print(f'{args.plot}')
+        print(f'{args.plot} written')
     return 0
 
 
@@ -113,18 +113,20 @@ def _expectation(args: argparse.Namespace, measurements: Measurements, distance:
 
 
 def _view_table(distances: list[float], views: list[Expectation]) -> Table:
-    table = Table(
-        'distance m', 'side px', 'detected', 'corner px', 'position mm', 'distance mm', 'rotation deg', 'flips'
-    )
+    headers = 'at m', 'side px', 'found', 'corner px', 'position mm', 'distance mm', 'rotation deg', 'flips'
+    table = table_of('One view of one marker (median errors; position: of the camera as seen from the marker)', headers)
     for distance, view in zip(distances, views, strict=True):
-        verdict = f'{"yes" if view.detected else "no"} ({100 * view.found:.0f} %)'
+        verdict = f'{100 * view.found:.0f} %{"" if view.detected else ", no"}'
         numbers = ['-'] * 5
         if view.found > 0.0 and np.isfinite(view.position):
-            errors = f'{1e3 * view.position:.2g}', f'{1e3 * view.distance:.2g}', f'{view.rotation_deg:.2g}'
+            errors = _two_digits(1e3 * view.position), _two_digits(1e3 * view.distance), f'{view.rotation_deg:.2g}'
             numbers = [f'{view.sigma_px:.3f}', *errors, f'{100 * view.wrong_branch:.0f} %']
         table.add_row(f'{distance:g}', f'{view.side_px:.0f}', verdict, *numbers)
-    table.title = 'One view of one marker (median errors; position: of the camera as seen from the marker)'
     return table
+
+
+def _two_digits(value: float) -> str:
+    return f'{value:.0f}' if value >= 10.0 else f'{value:.2g}'
 
 
 def _fade(args: argparse.Namespace, stand_off_mm: float, seconds: FloatArray) -> FloatArray:
@@ -132,12 +134,12 @@ def _fade(args: argparse.Namespace, stand_off_mm: float, seconds: FloatArray) ->
 
 
 def _fade_table(args: argparse.Namespace) -> Table:
-    table = Table('stand-off mm', *(f'{seconds:g} s' for seconds in _FADE_SECONDS))
+    headers = 'stand-off mm', *(f'{seconds:g} s' for seconds in _FADE_SECONDS)
+    table = table_of(f'Contrast left with {args.thickness:g} mm of acrylic', headers)
     for stand_off in sorted({*_STAND_OFFS_MM, args.stand_off}):
         shares = _fade(args, stand_off, np.array(_FADE_SECONDS))
         label = 'in contact' if stand_off == 0.0 else f'{stand_off:g}'
         table.add_row(label, *(f'{100 * share:.0f} %' for share in shares))
-    table.title = f'Contrast left with {args.thickness:g} mm of acrylic'
     return table
 
 
@@ -175,15 +177,16 @@ def add_measure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('out', type=Path, help='file to write (YAML)')
     parser.add_argument('--markers', type=int, default=16, help='markers to show for every side, contrast and tilt')
     parser.add_argument('--seed', type=int, default=1, help='of the rendering')
+    add_force(parser)
 
 
 def _measure(args: argparse.Namespace) -> int:
     from thermal_fiducial.cli.marker_measurement import DICTIONARY, LENS, measure
 
+    refuse_to_overwrite([args.out], args.force)
     axes = np.array(_SIDES_PX), np.array(_CONTRASTS), np.array(_TILTS_DEG)
-    with Progress(transient=True) as bar:
-        task = bar.add_task('showing markers', total=int(np.prod([len(axis) for axis in axes])))
-        measurements = measure(*axes, markers=args.markers, seed=args.seed, progress=lambda: bar.advance(task))
+    with progress_bar('showing markers') as progress:
+        measurements = measure(*axes, markers=args.markers, seed=args.seed, progress=progress)
     notes = {'dictionary': DICTIONARY, 'lens': LENS, 'markers': args.markers, 'seed': args.seed}
     save_measurements(args.out, measurements, notes)
     print(
