@@ -1,5 +1,6 @@
 # make demo      set everything up and run the main job: simulate, replay through the four nodes, score, report
 # make test      set everything up, check the code and run all tests
+# make nightly   the long studies that "make test" has in a short form: many seeds, views and recordings
 # make coverage  all tests, with the branch coverage of the core: less than 95 % fails
 # make bench     accuracy and speed against OpenCV and a batch smoother, in the same run
 # make tables    put measured tables and parameters into the documents
@@ -18,7 +19,7 @@ export OMP_NUM_THREADS := 1
 # A notice of the theme about its successor.
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help demo test lint coverage bench tables structure docs format clean
+.PHONY: help demo test lint nightly coverage bench tables structure docs format clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -46,6 +47,10 @@ test: lint
 	@echo '== Tests (real data are used where THERMAL_FIDUCIAL_DATA names their folder)'
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --durations 15 $(PYTEST_ARGS)
 
+nightly: $(READY)
+	@echo '== Studies of many flights, views and recordings, beside what make test runs'
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal -m nightly --durations 15 $(PYTEST_ARGS)
+
 coverage: $(READY)
 	@echo '== Tests with the branch coverage of the core'
 	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --cov thermal_fiducial.core --cov-branch \
@@ -56,7 +61,7 @@ bench: $(READY)
 	$(BIN)/python -m pytest test/bench --benchmark-only --benchmark-columns=median,min,max,rounds $(PYTEST_ARGS)
 
 tables: $(READY)
-	THERMAL_FIDUCIAL_TABLES=1 $(BIN)/python -m pytest --quiet test/real
+	THERMAL_FIDUCIAL_TABLES=1 $(BIN)/python -m pytest --quiet -m '' test/real
 	$(BIN)/python test/documents.py
 
 $(DOCS): setup.py $(READY)

@@ -16,7 +16,7 @@ BOARD = Chessboard(8, 6, SQUARE)
 GUESS = Camera(640, 512, np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 255.5], [0.0, 0.0, 1.0]]))
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.parametrize('name', ['13mm', '7.5mm'])
 def test_forty_views_at_eight_kelvin(name):
     lens = LENSES[name]

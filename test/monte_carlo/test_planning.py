@@ -13,22 +13,33 @@ SIZE = 0.30
 SEEDS = (901, 902, 903)
 
 
-@pytest.mark.slow
-def test_planned_pose_errors_are_the_measured_ones():
+def ratios_of_errors(views, seeds):
+    """Planned over measured errors (views, 2) of position and rotation, of views (side, tilt, kelvin)."""
     camera, detector = camera_and_detector()
     tables = load_measurements()
     ratios = []
-    for side, tilt, kelvin in product((34.0, 50.0, 80.0), (20.0, 40.0, 58.0), (1.0, 6.0)):
-        tallies = [show(detector, camera, side, kelvin, tilt, 72, [seed, int(side), int(tilt)]) for seed in SEEDS]
+    for side, tilt, kelvin in views:
+        tallies = [show(detector, camera, side, kelvin, tilt, 72, [seed, int(side), int(tilt)]) for seed in seeds]
         measured = np.mean([pose_errors(tally.best, tally.other, tally.T_true) for tally in tallies], axis=0)
         planned = expect(
             tables, camera, size=SIZE, distance=camera.focal_px * SIZE / side, tilt_deg=tilt, contrast=kelvin / NETD
         )
-        if not planned.detected:
-            continue
+        assert planned.detected
         # 72 markers: a share of 0.8 scatters by 0.05.
         assert min(tally.found for tally in tallies) >= 0.65
         ratios.append((planned.position / measured[0], planned.rotation_deg / measured[2]))
+    return np.array(ratios)
+
+
+def test_planned_pose_errors_are_the_measured_ones():
+    ratios = ratios_of_errors([(34.0, 20.0, 1.0), (50.0, 40.0, 6.0), (50.0, 58.0, 1.0)], SEEDS[:1])
+    # As below: of one median each, an eighth, beside the tables' tenth.
+    assert np.all(np.abs(np.log(ratios)) < np.log(1.5))
+
+
+@pytest.mark.nightly
+def test_planned_pose_errors_are_the_measured_ones_in_all_views():
+    ratios = ratios_of_errors(product((34.0, 50.0, 80.0), (20.0, 40.0, 58.0), (1.0, 6.0)), SEEDS)
     assert len(ratios) == 18
     # Medians of 72 errors scatter by an eighth, three of them together by a fourteenth; the tables scatter by a tenth.
     # The goal holds for each view.

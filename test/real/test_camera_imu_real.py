@@ -1,5 +1,6 @@
 """Camera against IMU on a real rig before a board: both cameras, against each other and what is published."""
 
+from functools import cache
 import os
 
 import numpy as np
@@ -16,6 +17,7 @@ from thermal_fiducial.core.measurements import CameraPose, corner_covariances, c
 pytestmark = pytest.mark.skipif('THERMAL_FIDUCIAL_DATA' not in os.environ, reason='no real data at hand')
 
 
+@cache
 def calibrated(camera):
     """Calibration of a camera, and T_body_camera as published."""
     flight = april_board(camera)
@@ -39,22 +41,26 @@ def difference(T, T_other):
     return np.concatenate([se3.so3_log(T[:3, :3].T @ T_other[:3, :3]), T_other[:3, 3] - T[:3, 3]])
 
 
-def test_extrinsics_are_as_good_as_they_say():
-    results, published = zip(*(calibrated(camera) for camera in ('cam0', 'cam1')), strict=True)
-    errors = [difference(found.T_body_camera, T) for found, T in zip(results, published, strict=True)]
-    sigmas = [np.sqrt(np.diag(found.covariance))[:6] for found in results]
-    for error, sigma in zip(errors, sigmas, strict=True):
-        assert np.all(np.abs(error) < 3.0 * sigma)
-        # Measured 0.10 deg and 4.2 mm, 0.09 deg and 1.8 mm; without scale and misalignment 0.19 deg and 7.5 mm.
-        assert np.degrees(np.linalg.norm(error[:3])) < 0.13
-        assert np.linalg.norm(error[3:]) < 0.005
-        # And the claim is of that order: 0.09 deg and 2 mm.
-        assert np.degrees(sigma[:3].max()) < 0.2
-        assert sigma[3:].max() < 0.004
-    # The two cameras are known against each other far better than either against the IMU.
-    assert np.all(np.abs(errors[0] - errors[1]) < 3.0 * np.hypot(*sigmas))
+@pytest.mark.parametrize('camera', ['cam1', pytest.param('cam0', marks=pytest.mark.nightly)])
+def test_extrinsics_are_as_good_as_they_say(camera):
+    found, published = calibrated(camera)
+    error, sigma = difference(found.T_body_camera, published), np.sqrt(np.diag(found.covariance))[:6]
+    assert np.all(np.abs(error) < 3.0 * sigma)
+    # Measured 0.10 deg and 4.2 mm, 0.09 deg and 1.8 mm; without scale and misalignment 0.19 deg and 7.5 mm.
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.13
+    assert np.linalg.norm(error[3:]) < 0.005
+    # And the claim is of that order: 0.09 deg and 2 mm.
+    assert np.degrees(sigma[:3].max()) < 0.2
+    assert sigma[3:].max() < 0.004
     # Every gyroscope axis reads half a per cent too little or too much: what a board or two can show.
-    for found in results:
-        scale = found.axes[[0, 4, 8]]
-        assert np.all(np.abs(scale) < 0.015)
-        assert np.any(np.abs(scale) > 3.0 * found.axes_sigma[[0, 4, 8]])
+    scale = found.axes[[0, 4, 8]]
+    assert np.all(np.abs(scale) < 0.015)
+    assert np.any(np.abs(scale) > 3.0 * found.axes_sigma[[0, 4, 8]])
+
+
+@pytest.mark.nightly
+def test_cameras_are_known_against_each_other_better_than_against_the_imu():
+    (one, T_one), (other, T_other) = (calibrated(camera) for camera in ('cam0', 'cam1'))
+    apart = difference(one.T_body_camera, T_one) - difference(other.T_body_camera, T_other)
+    sigmas = [np.sqrt(np.diag(found.covariance))[:6] for found in (one, other)]
+    assert np.all(np.abs(apart) < 3.0 * np.hypot(*sigmas))

@@ -9,13 +9,17 @@ from support.corner_runs import fly
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('real_data')]
 
 
+#: The other camera of the rig sees the same flight.
+each_camera = pytest.mark.parametrize('camera', ['cam0', pytest.param('cam1', marks=pytest.mark.nightly)])
+
+
 @cache
 def board_run(camera):
     """The board with published densities and default parameters, poses 30 ms late."""
     return fly(real_flights.april_board(camera))
 
 
-@pytest.mark.parametrize('camera', ['cam0', 'cam1'])
+@each_camera
 def test_markers_alone_are_as_good_as_the_reference(camera):
     run = board_run(camera)
     score = run.markers.score(run.flight)
@@ -28,7 +32,7 @@ def test_markers_alone_are_as_good_as_the_reference(camera):
     assert 7.0 < score.claimed_mm < 17.5
 
 
-@pytest.mark.parametrize('camera', ['cam0', 'cam1'])
+@each_camera
 def test_the_filter_goes_through_without_a_reset(camera):
     run = board_run(camera)
     assert run.resets == 0
@@ -37,7 +41,7 @@ def test_the_filter_goes_through_without_a_reset(camera):
     assert len(run.published) > 0.97 * len(run.flight.samples)
 
 
-@pytest.mark.parametrize('camera', ['cam0', 'cam1'])
+@each_camera
 def test_the_fused_pose_stays_with_the_markers_by_their_systematic_error(camera):
     score = board_run(camera).published.score(board_run(camera).flight)
     # What the lens makes of the reference: 8.7 mm and 0.39 deg (rms), 29 mm at the most, as of the markers alone

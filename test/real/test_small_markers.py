@@ -104,8 +104,11 @@ def test_never_fewer_than_opencv_at_any_size_and_none_false(pictures, real_data,
     assert {name: each for name, each in counts.items() if each[0] < each[1]} == {}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('name', ['DICT_4X4_50', 'DICT_5X5_1000', 'DICT_ARUCO_ORIGINAL', 'DICT_APRILTAG_16h5'])
+@pytest.mark.parametrize(
+    'name',
+    ['DICT_4X4_50', 'DICT_APRILTAG_16h5']
+    + [pytest.param(name, marks=pytest.mark.nightly) for name in ('DICT_5X5_1000', 'DICT_ARUCO_ORIGINAL')],
+)
 def test_pictures_of_other_markers_show_none_of_few_bits(name, real_data, measured):
     """Tags of another dictionary, rooms and carpets: everything that is found is false."""
     detector, found = MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.0), load_dictionary(name)), 0

@@ -55,12 +55,7 @@ def test_runs_and_a_joint_map(alone):
     assert (alone / 'flight1' / 'fused.tum').read_text()
 
 
-def test_two_workers_write_the_same_bytes(folder, alone):
-    assert batch(folder, 'two', '--workers', '2') == 0
-    assert contents(folder / 'two') == contents(alone)
-
-
-def test_a_killed_worker_costs_time_only(folder, alone):
+def test_two_workers_of_which_one_is_killed_write_the_same_bytes(folder, alone):
     killed = []
 
     def kill_the_first():
@@ -74,7 +69,7 @@ def test_a_killed_worker_costs_time_only(folder, alone):
 
     thread = threading.Thread(target=kill_the_first, daemon=True)
     thread.start()
-    assert batch(folder, 'killed') == 0
+    assert batch(folder, 'killed', '--workers', '2') == 0
     assert killed
     assert contents(folder / 'killed') == contents(alone)
 
@@ -84,15 +79,6 @@ def _workers_of(pid):
     children = Path(f'/proc/{pid}/task').glob('*/children')
     below = [int(word) for path in children for word in path.read_text().split()]
     return [child for child in below if b'spawn_main' in Path(f'/proc/{child}/cmdline').read_bytes()]
-
-
-def test_a_bad_bag_is_named_and_the_others_are_replayed(folder, capfd):
-    (folder / 'broken').mkdir(exist_ok=True)
-    assert batch(folder, 'partly', bags=('flight0', 'broken')) == 2
-    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith('thermal-fiducial')]
-    assert len(lines) == 1
-    assert 'broken' in lines[0]
-    assert (folder / 'partly' / 'flight0' / 'summary.json').exists()
 
 
 def test_two_bags_of_one_name(folder, capfd):
@@ -105,9 +91,14 @@ def test_a_scheduler_that_is_not_there(folder, capfd):
     assert 'no scheduler at nonsense://1' in capfd.readouterr().err
 
 
-def test_a_cluster_that_is_there(folder, alone):
+def test_a_bad_bag_is_named_and_the_others_are_replayed_by_a_cluster_that_is_there(folder, alone, capfd):
     from distributed import LocalCluster
 
+    (folder / 'broken').mkdir(exist_ok=True)
+    bags = ('flight0', 'broken')
     with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
-        assert batch(folder, 'cluster', '--scheduler', cluster.scheduler_address) == 0
-    assert contents(folder / 'cluster') == contents(alone)
+        assert batch(folder, 'cluster', '--scheduler', cluster.scheduler_address, bags=bags) == 2
+    lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith('thermal-fiducial')]
+    assert len(lines) == 1
+    assert 'broken' in lines[0]
+    assert contents(folder / 'cluster' / 'flight0') == contents(alone / 'flight0')

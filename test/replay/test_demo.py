@@ -1,18 +1,32 @@
 """The demo from start to end, and the folders that it refuses."""
 
+from dataclasses import replace
 import json
 
 import numpy as np
 from PIL import Image
 import pytest
 
+from thermal_fiducial.cli import demo
 from thermal_fiducial.cli.demo import MARK
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.sim.scenario import named
+
+
+def quick():
+    """The demo's flight as a camera of a quarter of the pixels and half of the frames sees it."""
+    fog = named(demo.SCENARIO)
+    half = {name: tuple(0.5 * value for value in getattr(fog.lens, name)) for name in ('focal', 'centre')}
+    lens = replace(fog.lens, width=320, height=256, **half)
+    return replace(fog, lens=lens, sensor=replace(fog.sensor, frame_rate=15.0))
 
 
 @pytest.mark.ros
-@pytest.mark.slow
-def test_a_short_demo(tmp_path, capfd):
+@pytest.mark.parametrize(
+    'scenario', [quick(), pytest.param(demo.SCENARIO, marks=pytest.mark.nightly)], ids=['quick', 'whole']
+)
+def test_a_short_demo(tmp_path, capfd, monkeypatch, scenario):
+    monkeypatch.setattr(demo, 'SCENARIO', scenario)
     out, picture = tmp_path / 'demo', tmp_path / 'picture.png'
     out.mkdir()
     for name in (MARK, 'old'):
