@@ -28,6 +28,8 @@ _ENOUGH = 0.5
 _CLEAR = 20.0
 # Nearer to the border of the image than this a marker is not expected to be observed [px].
 _BORDER_PX = 2.0
+# Of so many expected markers or more some are looked for before the others.
+_MANY, _SOME = 12, 6
 # Where not all markers are known, or not all observed that should be, a blind search follows at least every so many
 # frames.
 _INCOMPLETE = 2
@@ -108,11 +110,12 @@ class MarkerFinder:
         expected = _expected(frame.camera, last, in_map, known)
         followed = last.only(among(last.ids, expected.ids)).seen(frame, frame.twist, self._decoder, config)
         found = followed.found()
-        new = ~among(expected.ids, followed.ids)
-        if new.any():
-            shift = common_shift(expected.ids, expected.corners_px, found)
-            others = expected.only(new).shifted(shift)
-            found = merged(found, near_prediction(frame, frame.twist, others, self._decoder, config))
+        new = np.flatnonzero(~among(expected.ids, followed.ids))
+        # Where none is followed, some show by how much all the others are off.
+        for some in (new,) if len(found.ids) or len(new) < _MANY else (new[:_SOME], new[_SOME:]):
+            if len(some):
+                others = expected.only(some).shifted(common_shift(expected.ids, expected.corners_px, found))
+                found = merged(found, near_prediction(frame, frame.twist, others, self._decoder, config))
         number = len(expected.ids)
         complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
         return _Near(found, followed, complete, number > 0 and len(found.ids) >= _ENOUGH * number)

@@ -29,8 +29,8 @@ class ExpectedMarkers(NamedTuple):
     #: (N, 4) of the corners [m]
     depth: FloatArray
 
-    def only(self, keep: BoolArray) -> 'ExpectedMarkers':
-        """Those of the markers ``keep`` (N,)."""
+    def only(self, keep: BoolArray | IntArray) -> 'ExpectedMarkers':
+        """Those of the markers ``keep``."""
         return ExpectedMarkers(self.ids[keep], self.corners_px[keep], self.x[keep], self.depth[keep])
 
     def shifted(self, shift_px: FloatArray) -> 'ExpectedMarkers':

@@ -120,12 +120,16 @@ def measure(
     np.subtract(counts, counts[counts.shape[0] // 2, counts.shape[1] // 2], out=X[3])
     X[3] *= weight
     X = X.reshape(_PLANES, -1, cells * len(reach))
-    fit = _fit(_by_marker(_moments(X), cells, sides))
+    moments = _moments(X)
+    fit = _fit(_by_marker(moments, cells, sides))
     noise = _noise(fit)
     inliers = np.abs(_residuals(fit, X, cells, sides)) <= _by_segment(_PIXEL_OUTLIER * np.sqrt(noise), cells, sides)
-    if not inliers.all():
-        X[:4] *= inliers.astype(np.float32)
-        fit = _fit(_by_marker(_moments(X), cells, sides))
+    touched = np.flatnonzero(~inliers.all(axis=0))
+    if len(touched):
+        part = X[..., touched]
+        part[:4] *= inliers[:, touched]
+        moments[:, touched] = _moments(part)
+        fit = _fit(_by_marker(moments, cells, sides))
         noise = _noise(fit)
     farthest = np.empty((len(reach) // sides, cells, sides))
     farthest[:] = reach.reshape(-1, 1, sides)
