@@ -80,11 +80,15 @@ def test_live_parameters_hold_from_then_on(flight):
     assert len(passed) < 0.05 * len(after)
 
 
-def test_innovations_are_told_in_the_diagnostics(flight):
+def test_innovations_stand_in_the_diagnostics(flight):
     ekf = PoseEkf(matched())
     run(ekf, timeline(flight.samples(), flight.poses, 0.03))
     # 30 poses of 6 degrees of freedom: the mean is known to sqrt(12 / 30); four of that
-    assert ekf.diagnostics()['nis'] == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / 30.0))
+    said = ekf.diagnostics()
+    assert said['NIS per d.o.f.'] == pytest.approx(1.0, abs=4.0 * np.sqrt(12.0 / 30.0) / 6.0)
+    # Those with which it began were compared with nothing: they are no refused ones.
+    assert said['poses refused'] == sum(update.refused for update in ekf.decided.values())
+    assert said['poses refused'] < 3
 
 
 def test_a_pose_ahead_of_the_imu_waits(flight):

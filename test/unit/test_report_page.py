@@ -139,7 +139,7 @@ def test_units_stand_in_every_table(page):
 def test_nothing_is_said_twice_in_two_ways(run_folder):
     """What the nodes say of their latest poses must not stand beside the figures of all, under the same names."""
     summary = json.loads((run_folder / 'summary.json').read_text())
-    said = {'pose_ekf': {'poses refused': '7', 'nis': '0.81', 'position std': '0.004'}}
+    said = {'pose_ekf': {'poses refused': '7', 'NIS per d.o.f.': '0.81', 'position std': '0.004'}}
     (run_folder / 'summary.json').write_text(json.dumps(summary | {'diagnostics': said}))
     evaluation, numbers = evaluate_run(run_folder)
     page = without_library(write_page(evaluation, numbers).read_text())

@@ -1,11 +1,13 @@
 """Parts of the report: interruptions, what a controller has, errors of the map, markers one by one, the verdict."""
 
 from dataclasses import replace
+import re
 
 import numpy as np
 import pytest
 from support.run_folders import CAMERA_DELAY_NS, FUSED_DELAY_NS, make_run, START_NS, true_pose, wall
 
+from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
@@ -162,6 +164,23 @@ def test_errors_of_a_map():
 def test_maps_without_a_common_marker_cannot_be_compared():
     with pytest.raises(InputError, match='no marker in common'):
         map_accuracy(wall(), MarkerMap())
+
+
+def test_error_of_a_map_against_the_true_one(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv('COLUMNS', '120')
+    true = wall()
+    save_map(tmp_path / 'true.yaml', true)
+    marker = true.markers[5]
+    T = marker.T_map_marker.copy()
+    T[:3, 3] += (0.003, 0.0, 0.004)
+    save_map(tmp_path / 'map.yaml', MarkerMap(true.markers | {5: replace(marker, T_map_marker=T)}))
+    assert main(['map', 'error', str(tmp_path / 'map.yaml'), str(tmp_path / 'true.yaml')]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r'position error, largest +mm +5 ', printed)
+    assert re.search(r'\n +5 +5 +0 ', printed)
+    save_map(tmp_path / 'other.yaml', MarkerMap({1: replace(marker, id=1)}))
+    assert main(['map', 'error', str(tmp_path / 'map.yaml'), str(tmp_path / 'other.yaml')]) == 2
+    assert 'no marker in common' in capsys.readouterr().err
 
 
 def test_the_true_map_beside_the_truth_is_found(tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from thermal_fiducial.cli import map_cloud, map_sources
+from thermal_fiducial.cli import map_cloud, map_comparison, map_sources
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
@@ -49,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _command(commands, 'upgrade', 'rewrite a map from before 0.2, whose version counted its changes', _upgrade)
     map_sources.add_build(commands.add_parser('build', help='a map from a folder of photos in any order'))
     map_sources.add_refine(commands.add_parser('refine', help='adjust a map to the detections of a run'))
+    map_comparison.add_error(commands.add_parser('error', help='how far a map lies from the true one'))
     map_cloud.add_align(commands.add_parser('align', help='hold a map against a point cloud of the place'))
 
 

@@ -20,7 +20,7 @@ from thermal_fiducial.report.run_folder import Detections, Run
 #: Pictures of a strip, and how wide each is [px].
 STRIP, STRIP_WIDTH = 12, 480
 #: Frames are read from so long before the one that is shown, for its bad pixels and its scale [ns].
-_BEFORE_NS, _AFTER_NS = 300_000_000, 100_000_000
+_BEFORE_NS, _AFTER_NS = 150_000_000, 100_000_000
 _QUALITY = 72
 _CYAN, _YELLOW, _WHITE = (238, 211, 34), (0, 255, 255), (255, 255, 255)
 #: Corners are drawn to a sixteenth of a pixel.

@@ -110,7 +110,7 @@ _UNITS = {
     'map tilt': 'rad',
 }
 #: Of all poses of the run, these stand in the table of the innovations; the nodes' own are of the latest ones.
-_ELSEWHERE = ('received ', 'published ', 'poses accepted', 'poses refused', 'nis', INNOVATIONS)
+_ELSEWHERE = ('received ', 'published ', 'poses accepted', 'poses refused', 'NIS per d.o.f.', INNOVATIONS)
 
 
 def tables(evaluation: Evaluation, numbers: dict[str, Any]) -> dict[str, Table]:
@@ -124,7 +124,7 @@ def tables(evaluation: Evaluation, numbers: dict[str, Any]) -> dict[str, Table]:
         'latency': _latency(numbers),
         'interruptions': _interruptions(evaluation),
         'markers': Table('Markers', ('', 'unit', ''), _pick(numbers['markers'], _MARKERS)),
-        'map': Table('Error of the map', ('', 'unit', ''), _pick(numbers.get('map', {}), _MAP)),
+        'map': map_error_table(numbers.get('map', {})),
         'tags': _tags(evaluation),
         'load': _load(evaluation),
         'diagnostics': _diagnostics(evaluation),
@@ -135,6 +135,11 @@ def tables(evaluation: Evaluation, numbers: dict[str, Any]) -> dict[str, Table]:
 
 def _pick(values: dict[str, Any], rows: tuple[tuple[str, str, str], ...]) -> list[tuple[str, ...]]:
     return [(name, unit, number(values[key], 4)) for name, unit, key in rows if values.get(key) is not None]
+
+
+def map_error_table(values: dict[str, Any]) -> Table:
+    """Errors of a map, as :func:`map_accuracy` gives them."""
+    return Table('Error of the map', ('', 'unit', ''), _pick(values, _MAP))
 
 
 def _accuracy(numbers: dict[str, Any]) -> Table:
@@ -279,4 +284,6 @@ def _figures(evaluation: Evaluation) -> Table:
 def _unit(name: str, value: str) -> str:
     if name.startswith('vibration '):
         return name.removeprefix('vibration ')
+    if name.endswith(']'):
+        return name[name.rindex('[') + 1 : -1]
     return _UNITS.get(name, 'count' if value.isdigit() else '')

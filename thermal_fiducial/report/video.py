@@ -143,15 +143,15 @@ def _pyav(path: Path, first: Frame, rate: float) -> Iterator[Callable[[Frame], N
 
     height, width = first.shape[:2]
     try:
-        container = av.open(str(path), 'w')
-    except OSError as error:
-        raise InputError(f'{path}: {error.strerror}') from None
-    with container:
-        stream = container.add_stream('libx264', rate=Fraction(rate).limit_denominator(1000), options={'crf': '24'})
-        stream.width, stream.height, stream.pix_fmt = width, height, 'yuv420p'
+        with av.open(str(path), 'w') as container:
+            stream = container.add_stream('libx264', rate=Fraction(rate).limit_denominator(1000), options={'crf': '24'})
+            stream.width, stream.height, stream.pix_fmt = width, height, 'yuv420p'
 
-        def take(frame: Frame) -> None:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format='bgr24')))
+            def take(frame: Frame) -> None:
+                picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format='bgr24')
+                container.mux(stream.encode(picture))
 
-        yield take
-        container.mux(stream.encode())
+            yield take
+            container.mux(stream.encode())
+    except (OSError, av.error.FFmpegError) as error:
+        raise InputError(f'{path}: PyAV cannot write the video: {error.strerror or error}') from None

@@ -236,7 +236,7 @@ class PoseEkf:
         known = self._verdicts.pop(update.stamp_ns, None)
         if known is None:
             self._accepted += update.accepted
-            self._refused += not update.accepted
+            self._refused += update.refused
         self._verdicts[update.stamp_ns] = update
         while len(self._verdicts) > _VERDICTS:
             del self._verdicts[next(iter(self._verdicts))]
@@ -345,9 +345,10 @@ class PoseEkf:
         return usable_seconds(estimate, self._history.nodes[-1].densities, self._config.lost_position_std)
 
     def _mean_nis(self) -> float:
-        """Of the latest poses; 6 where their covariances are right, less where the parameters allow for more."""
-        values = [update.nis for update in islice(reversed(self._verdicts.values()), _NIS_POSES)]
-        return float(np.mean([value for value in values if not math.isnan(value)] or math.nan))
+        """Of the latest accepted poses, per degree of freedom: 1 is consistent, less is cautious."""
+        latest = islice(reversed(self._verdicts.values()), _NIS_POSES)
+        values = [update.nis / 6.0 for update in latest if update.accepted and not math.isnan(update.nis)]
+        return float(np.mean(values or math.nan))
 
     def diagnostics(self) -> dict[str, float]:
         """How the filter is, in numbers (SI units)."""
@@ -356,7 +357,7 @@ class PoseEkf:
             'poses accepted': float(self._accepted),
             'poses refused': float(self._refused),
             'IMU samples refused': float(self._imu_refused),
-            'nis': self._mean_nis(),
+            'NIS per d.o.f.': self._mean_nis(),
             'vibration rad/s/sqrt(Hz)': rate,
             'vibration m/s^2/sqrt(Hz)': force,
         }

@@ -30,6 +30,11 @@ class PoseUpdate:
     #: whether it waits for the IMU samples of its instant; the final word is in ``PoseEkf.decided``
     pending: bool = False
 
+    @property
+    def refused(self) -> bool:
+        """Whether it was compared with the estimate and found beyond the gate."""
+        return not self.accepted and not math.isnan(self.nis)
+
 
 @dataclass(frozen=True)
 class Innovations:

@@ -1,0 +1,147 @@
+"""Frames with their markers in the report and in a video, from a small bag; where bag or encoder are missing."""
+
+import base64
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from support import small_bag
+from support.run_folders import write_poses
+
+from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.se3 import apply, inverse, transform
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import IMAGE_TOPIC
+from thermal_fiducial.files.images import stamp_to_ns
+from thermal_fiducial.report import video
+from thermal_fiducial.report.frames import bag_of, strip
+from thermal_fiducial.report.page import write_report
+from thermal_fiducial.report.run_folder import read_run
+
+SECONDS = 0.4
+
+
+@pytest.fixture(scope='module')
+def flight(tmp_path_factory):
+    """A folder with ``bag``, and ``run`` with the true corners as its detections."""
+    folder = tmp_path_factory.mktemp('frames')
+    recording = small_bag.recording(SECONDS)
+    recording.write(folder / 'bag')
+    run = folder / 'run'
+    run.mkdir()
+    stamps = np.array([stamp_to_ns(message.header.stamp) for message in recording.of(IMAGE_TOPIC)])
+    T = np.array([small_bag.true_pose((stamp - small_bag.START_NS) * 1e-9) for stamp in stamps])
+    for name in ('fused.tum', 'fiducial.tum'):
+        write_poses(run / name, stamps, T)
+    rows = ['stamp_ns,id,u0,v0,u1,v1,u2,v2,u3,v3,sigma_px']
+    for stamp, pose in zip(stamps, T, strict=True):
+        for marker, corners in true_corners(pose).items():
+            rows.append(','.join(map(str, [stamp, marker, *corners.ravel().round(4), 0.03])))
+    (run / 'detections.csv').write_text('\n'.join(rows) + '\n')
+    (run / 'summary.json').write_text(json.dumps({'bag': 'bag', 'bag_path': str(folder / 'bag')}))
+    return folder
+
+
+def true_corners(T_map_body):
+    T_camera_map = inverse(T_map_body @ small_bag.T_BODY_CAMERA)
+    return {
+        marker: small_bag.CAMERA.project(
+            apply(T_camera_map @ transform(small_bag.R_MAP_MARKER, centre), marker_corners(small_bag.SIZE))
+        )
+        for marker, centre in small_bag.CENTRES.items()
+    }
+
+
+def is_cyan(pixels):
+    """(H, W) pixels (BGR) of the colour of an outline; false colours have none like it."""
+    b, g, r = (pixels[..., channel].astype(int) for channel in range(3))
+    return (b > 150) & (g > 130) & (r < 110)
+
+
+def test_a_strip_shows_frames_with_their_markers(flight):
+    run = read_run(flight / 'run')
+    pictures = strip(run)
+    assert len(pictures) == 12
+    assert pictures[0].caption == '0.0 s, 4 markers'
+    data = base64.b64decode(pictures[0].uri.partition('base64,')[2])
+    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (384, 480, 3)
+    cyan = is_cyan(picture)
+    for corners in true_corners(small_bag.true_pose(0.002)).values():
+        # Along each side there is the outline, within two pixels of where the side is.
+        for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+            x, y = np.rint(0.75 * (0.5 * (a + b))).astype(int)
+            assert cyan[y - 2 : y + 3, x - 2 : x + 3].any()
+    assert np.mean(cyan) < 0.05
+
+
+def test_the_page_holds_the_strip(flight):
+    page = write_report(flight / 'run').read_text()
+    assert page.count('<img src="data:image/webp;base64,') == len(strip(read_run(flight / 'run')))
+    assert '4 markers</figcaption>' in page
+
+
+def test_a_bag_that_is_gone_is_said_and_may_be_named(flight, tmp_path, capsys):
+    shutil.copytree(flight / 'run', tmp_path / 'run')
+    run = read_run(tmp_path / 'run')
+    assert bag_of(run)[0] == flight / 'bag'
+    (tmp_path / 'run' / 'summary.json').write_text(json.dumps({'bag': 'nowhere', 'bag_path': '/nowhere'}))
+    moved = read_run(tmp_path / 'run')
+    assert (bag_of(moved), strip(moved)) == (None, [])
+    assert 'the bag is not where it was (--bag names it)' in write_report(tmp_path / 'run').read_text()
+    assert len(strip(moved, flight / 'bag')) > 5
+    assert main(['evaluate', str(tmp_path / 'run'), '--video', '--no-report']) == 2
+    assert '--bag names it' in capsys.readouterr().err
+
+
+def test_a_bag_beside_a_moved_run_is_found(flight, tmp_path):
+    shutil.copytree(flight / 'run', tmp_path / 'run')
+    (tmp_path / 'run' / 'summary.json').write_text(json.dumps({'bag': 'bag', 'bag_path': '/nowhere'}))
+    (tmp_path / 'bag').mkdir()
+    assert bag_of(read_run(tmp_path / 'run'))[0] == tmp_path / 'bag'
+
+
+def test_a_recorder_with_another_clock_shows_the_same_frames(flight, tmp_path):
+    recording = small_bag.recording(SECONDS)
+    late = small_bag.Recording([(stamp + 10**15, topic, message) for stamp, topic, message in recording.events])
+    run = read_run(flight / 'run')
+    assert [p.uri for p in strip(run, late.write(tmp_path / 'late'))] == [p.uri for p in strip(run)]
+
+
+@pytest.mark.parametrize('encoder', ['ffmpeg', 'av'])
+def test_a_video_of_all_frames(flight, encoder, monkeypatch):
+    av = pytest.importorskip('av')
+    if encoder == 'ffmpeg' and not shutil.which('ffmpeg'):
+        pytest.skip('no ffmpeg')
+    monkeypatch.setattr(video, 'require_encoder', lambda: encoder)
+    path = flight / f'{encoder}.mp4'
+    shares = []
+    video.write_video(read_run(flight / 'run'), path, progress=shares.append)
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        frames = [frame.to_ndarray(format='bgr24') for frame in container.decode(stream)]
+        assert stream.codec_context.name == 'h264'
+        # 12 frames, the IMU before the first of them and after the last.
+        assert float(stream.average_rate) == pytest.approx(30.0, rel=0.15)
+    assert len(frames) == round(30 * SECONDS)
+    assert frames[0].shape == (512, 640, 3)
+    assert is_cyan(frames[-1]).any()
+    # The caption: white on black.
+    assert (frames[0][450:].min(axis=2) > 200).any()
+    assert shares[-1] == 1.0
+
+
+def test_without_an_encoder_it_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(video.shutil, 'which', lambda name: None)
+    monkeypatch.setattr(video, 'is_installed', lambda name: False)
+    with pytest.raises(InputError, match=r'apt install ffmpeg.*extra "video"'):
+        video.require_encoder()
+
+
+def test_a_video_that_cannot_be_written_is_one_line(flight, tmp_path):
+    pytest.importorskip('av')
+    with pytest.raises(InputError, match=r'flight\.mp4'):
+        video.write_video(read_run(flight / 'run'), tmp_path / 'none' / 'flight.mp4')
