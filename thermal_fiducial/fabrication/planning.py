@@ -23,6 +23,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_marker_poses
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.plain_yaml import load_plain
 
 FORMAT = 'thermal_fiducial/marker_measurements'
 #: What the package ships.
@@ -129,15 +130,12 @@ def load_measurements(path: str | os.PathLike[str] = PACKAGED) -> Measurements:
     InputError
         Not a file of measurements.
     """
-    try:
-        document: Any = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f'{path}: not a readable YAML file: {" ".join(str(error).split())}') from None
+    document: Any = load_plain(os.fspath(path))
     if not isinstance(document, dict) or document.get('format') != FORMAT:
         raise InputError(f'{path}: not of format {FORMAT}')
     try:
         tables = [np.array(document[name], dtype=np.float64) for name in _TABLES]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f'{path}: {error} is missing or no table') from None
     measurements = Measurements(*tables)
     shape = len(measurements.side_px), len(measurements.contrast), len(measurements.tilt_deg)

@@ -6,13 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import MODEL_SYNONYMS
+from thermal_fiducial.files.plain_yaml import load_plain
 
 #: Kalibr's names of the densities, which are ours.
 NOISE_NAMES = (
@@ -47,14 +47,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     InputError
         Unreadable, or not a mapping.
     """
-    try:
-        # OpenCV's head, as some of EuRoC's files have it, is no YAML of version 1.1.
-        text = path.read_text(encoding='utf-8').removeprefix('%YAML:1.0')
-        document = yaml.safe_load(text)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'{path}: {getattr(error, "strerror", None) or "no text"}') from None
-    except yaml.YAMLError as error:
-        raise InputError(f'{path} is not YAML: {" ".join(str(error).split())}') from None
+    # OpenCV's head, as some of EuRoC's files have it, is no YAML of version 1.1.
+    document = load_plain(path, head='%YAML:1.0')
     if not isinstance(document, dict):
         raise InputError(f'{path}: no names with values')
     return document

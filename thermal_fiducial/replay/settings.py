@@ -24,6 +24,7 @@ from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.plain_yaml import load_plain
 
 
 @dataclass(frozen=True)
@@ -104,13 +105,7 @@ def _check_files(settings: Settings) -> list[str]:
 
 def _document(path: Path) -> dict[str, dict[str, Any]]:
     """Node pattern to its parameters, names joined by dots."""
-    try:
-        document = yaml.safe_load(path.read_text(encoding='utf-8'))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else 'not a text file'
-        raise InputError(f'parameter file {path}: {reason}') from None
-    except yaml.YAMLError as error:
-        raise InputError(f'parameter file {path} is not YAML: {" ".join(str(error).split())}') from None
+    document = load_plain(path)
     sections = document if isinstance(document, dict) else {}
     if not sections or not all(
         isinstance(s, dict) and isinstance(s.get('ros__parameters'), dict) for s in sections.values()

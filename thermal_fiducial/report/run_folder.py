@@ -2,24 +2,28 @@
 
 import csv
 from dataclasses import dataclass
+import io
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.files.reading import read_text
 from thermal_fiducial.report.output_bag import read_output, RecordedOutput
 from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
 
 FUSED, FIDUCIAL, TRUTH = 'fused.tum', 'fiducial.tum', 'truth.tum'
 DETECTIONS, LATENCY, PARAMETERS = 'detections.csv', 'latency.csv', 'parameters.yaml'
 MARKER_MAP, TRUE_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'map_true.yaml', 'summary.json', 'output'
+#: Bytes of a table: half a day of frames with eight markers each.
+LARGEST_TABLE = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -100,10 +104,10 @@ def _camera_time_offset_ns(path: Path) -> int:
     """t_imu - t_camera that the filter was told."""
     if not path.is_file():
         return 0
+    nodes = load_plain(path)
     try:
-        nodes = yaml.safe_load(path.read_text(encoding='utf-8'))
         return round(float(nodes['/pose_ekf']['ros__parameters']['camera_time_offset']) * 1e9)
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError):
+    except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(f'{path}: no camera_time_offset of pose_ekf in it') from None
 
 
@@ -111,8 +115,8 @@ def _summary(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        content = json.loads(path.read_text(encoding='utf-8'))
-    except (OSError, ValueError) as error:
+        content = json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
         raise InputError(f'{path}: {error}') from None
     if not isinstance(content, dict):
         raise InputError(f'{path}: not a JSON object')
@@ -123,13 +127,13 @@ def _rows(path: Path, kinds: dict[str, type]) -> list[list[Any]]:
     """Columns ``kinds`` (name to type) of a CSV file, empty where there is no file."""
     if not path.is_file():
         return [[] for _ in kinds]
-    rows = []
-    with path.open(encoding='utf-8', newline='') as file:
-        for number, row in enumerate(csv.DictReader(file), 2):
-            try:
-                rows.append([kind(row[name]) for name, kind in kinds.items()])
-            except (KeyError, TypeError, ValueError):
-                raise InputError(f'{path}, line {number}: no {", ".join(kinds)}') from None
+    rows: list[list[Any]] = []
+    lines = csv.DictReader(io.StringIO(read_text(path, limit=LARGEST_TABLE)))
+    try:
+        for row in lines:
+            rows.append([kind(row[name]) for name, kind in kinds.items()])
+    except (KeyError, TypeError, ValueError, csv.Error):
+        raise InputError(f'{path}, line {lines.line_num}: no {", ".join(kinds)}') from None
     return [list(column) for column in zip(*rows, strict=True)] or [[] for _ in kinds]
 
 

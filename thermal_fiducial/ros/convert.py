@@ -94,7 +94,9 @@ def transform_of(message: Pose, what: str = 'pose') -> FloatArray:
 
 def transform_of_values(values: FloatArray, what: str = 'pose') -> FloatArray:
     """:func:`transform_of` of position and quaternion x y z w (7,)."""
-    if not np.isfinite(values).all() or abs(math.sqrt(values[3:] @ values[3:]) - 1.0) > NORM_TOLERANCE:
+    # Before the norm: squares of what is far from one overflow.
+    sound = np.isfinite(values).all() and np.abs(values[3:]).max() < 2.0
+    if not sound or abs(math.sqrt(values[3:] @ values[3:]) - 1.0) > NORM_TOLERANCE:
         raise InputError(f'{what} that is not finite or has no unit quaternion')
     if not np.abs(values[:3]).max() < LARGEST_COORDINATE:
         raise InputError(f'{what} {np.abs(values[:3]).max():.3g} m away')

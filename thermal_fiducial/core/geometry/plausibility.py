@@ -32,7 +32,7 @@ def checked_covariance(values: FloatArray, what: str) -> FloatArray:
     InputError
         Not finite, not positive definite, or with a variance beyond the bounds.
     """
-    P = 0.5 * (values + np.swapaxes(values, -1, -2))
+    P = 0.5 * values + 0.5 * np.swapaxes(values, -1, -2)
     if not np.isfinite(P).all():
         raise InputError(f'{what} that is not finite')
     variances = np.diagonal(P, axis1=-2, axis2=-1)
@@ -51,7 +51,11 @@ def _most_extreme(variances: FloatArray) -> float:
 def positive_definite(P: FloatArray) -> BoolArray:
     """(...) which of symmetric matrices (..., n, n) with positive diagonals are, in any units of their components."""
     scale = 1.0 / np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
-    correlations = P * scale[..., :, None] * scale[..., None, :]
+    with np.errstate(over='ignore'):
+        correlations = P * scale[..., :, None] * scale[..., None, :]
+    # What is correlated by more than one is not, and may be infinite by now.
+    possible = np.abs(correlations).max(axis=(-2, -1)) < 2.0
+    correlations = np.where(possible[..., None, None], correlations, 0.0)
     return np.asarray(np.linalg.eigvalsh(correlations)[..., 0] > _LEAST_INDEPENDENT)
 
 
