@@ -3,6 +3,8 @@
 # make nightly   the long studies that "make test" has in a short form: many seeds, views and recordings
 # make coverage  all tests, with the branch coverage of the core: less than 95 % fails
 # make bench     accuracy and speed against OpenCV and a batch smoother, in the same run
+# make faults    faults of IMU, camera, markers and nodes in flights of eight seeds, as a table for the documents
+# make fuzz      10,000 mutated messages, files and bags for the nodes and commands; anything found is an error
 # make tables    put measured tables and parameters into the documents
 # make structure print how large and how deep the package is, beside what it aims at
 # make docs      build the documentation as a web site in build/site; a link that leads nowhere fails it
@@ -19,7 +21,7 @@ export OMP_NUM_THREADS := 1
 # A notice of the theme about its successor.
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help demo test lint nightly coverage bench tables structure docs format clean
+.PHONY: help demo test lint nightly coverage bench faults fuzz tables structure docs format clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -59,6 +61,15 @@ coverage: $(READY)
 bench: $(READY)
 	@echo '== Benchmarks, one thread'
 	$(BIN)/python -m pytest test/bench --benchmark-only --benchmark-columns=median,min,max,rounds $(PYTEST_ARGS)
+
+faults: $(READY)
+	@echo '== Faults in flight: half an hour on two cores; fewer flights: make faults FAULTS_ARGS="--seeds 1"'
+	PYTHONPATH=test $(BIN)/python -m faults $(FAULTS_ARGS)
+	$(BIN)/python test/documents.py
+
+fuzz: $(READY)
+	@echo '== Mutated messages, files and bags'
+	PYTHONPATH=test $(BIN)/python -m fuzz $(FUZZ_ARGS)
 
 tables: $(READY)
 	THERMAL_FIDUCIAL_TABLES=1 $(BIN)/python -m pytest --quiet -m '' test/real

@@ -27,7 +27,7 @@ from thermal_fiducial.ros.node import StageNode
 from thermal_fiducial.ros.parameter_file import parameter_file
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = (ROOT / 'doc' / 'accuracy.md', ROOT / 'doc' / 'nodes.md')
+PAGES = tuple(ROOT / 'doc' / f'{page}.md' for page in ('accuracy', 'faults', 'nodes'))
 INTERFACES = ROOT / 'doc' / 'interfaces.yaml'
 CALIBRATION = 'CALIBRATION'
 #: Parameters that switch the optional topics of a node on, a start for each set; CALIBRATION becomes a file.

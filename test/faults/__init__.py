@@ -1,0 +1,1 @@
+"""Faults in flight, one after another, and what the nodes make of each."""

@@ -1,0 +1,171 @@
+"""Mutated messages for the four nodes, and a good flight after every few of them."""
+
+from collections.abc import Callable, Iterator
+from copy import deepcopy
+from pathlib import Path
+from random import Random
+import tempfile
+from typing import Any
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
+from rclpy.context import Context
+from rclpy.serialization import serialize_message
+from sensor_msgs.msg import TimeReference
+from support import small_bag
+from support.direct_graph import DirectGraph
+from support.messages import FRAME_NS, frames, imu, IMU_NS, info, pose, START
+
+from fuzz.findings import Finding, timed
+from fuzz.mutations import mutate_message
+from thermal_fiducial.core.measurements import Odometry as State
+from thermal_fiducial.errors import INTERNAL_ERROR
+from thermal_fiducial.nodes.aruco_detector import ArucoDetector
+from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
+from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
+from thermal_fiducial.nodes.tau2_camera import Tau2Camera
+from thermal_fiducial.ros import convert
+
+#: After so many mutated messages a good flight must give good poses ...
+AT_ONCE = 50
+#: ... within this [s]: as many good poses as bear out a pose that jumps far, see ``reset_after``.
+PATIENCE = 15.0
+#: The robot at rest is known to the floor of made-up poses [m].
+GOOD = 0.05
+#: Topic to how often it is mutated: images take long.
+_TOPICS = {
+    '/imu/data': 10,
+    '/camera_pose': 10,
+    '/markers': 5,
+    '/odometry': 5,
+    '/map_correction': 2,
+    '/camera_clock': 2,
+    '/thermal/camera_info': 2,
+    '/marker_map': 2,
+    '/thermal/image_raw': 1,
+    '/thermal/image': 1,
+}
+
+
+class Nodes:
+    """The four nodes, fed with mutated messages in a flight at rest."""
+
+    def __init__(self, context: Context, folder: Path) -> None:
+        self._graph = DirectGraph(context)
+        self._samples = 0
+        self._latest: np.ndarray | None = None
+        self._poses = 0
+        self.not_finite: list[str] = []
+        map_file = small_bag.side_files(folder, ids=(0, 1, 2, 3))[0]
+        camera = {name: small_bag.PARAMETERS[name] for name in ('camera_position', 'camera_orientation')}
+        self._graph.start(Tau2Camera)
+        self._graph.start(ArucoDetector, **small_bag.PARAMETERS)
+        self._graph.start(MarkerMapperNode, **small_bag.PARAMETERS, map_file=str(map_file), mode='mapping')
+        self._graph.start(PoseEkfNode, **camera, bridge_rate=50.0)
+        self._graph.listen('/pose', self._on_pose)
+        for topic in ('/pose', '/odometry', '/bridge/odometry', '/camera_pose', '/camera_clock'):
+            self._graph.listen(topic, lambda message, topic=topic: self._check(topic, message))
+        self._good = _good_messages(self._graph)
+
+    def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
+        self._poses += 1
+        self._latest = np.array([message.pose.pose.position.x, message.pose.pose.position.y])
+
+    def _check(self, topic: str, message: Any) -> None:
+        """Whatever the nodes publish themselves is finite."""
+        if not all(np.isfinite(value).all() for value in _numbers(message)):
+            self.not_finite.append(topic)
+
+    def send_mutated(self, rng: Random) -> str:
+        """Send one; its topic."""
+        topic = rng.choices(list(_TOPICS), list(_TOPICS.values()))[0]
+        message = mutate_message(deepcopy(rng.choice(self._good[topic])), rng)
+        # What no encoding can carry never arrives.
+        self._graph.send_encoded(topic, type(message), serialize_message(message))
+        return topic
+
+    def internal_errors(self) -> list[str]:
+        """Refusals for reasons that nobody foresaw since the last call."""
+        found = [node._refusal for node in self._graph.nodes.values() if INTERNAL_ERROR in node._refusal]
+        for node in self._graph.nodes.values():
+            node.refuse('')
+        return found
+
+    def good_flight(self) -> str:
+        """Fly until the pose is good; why it is not, in the end."""
+        good = 0
+        for _ in range(round(PATIENCE / 0.03)):
+            self._thirty_milliseconds()
+            good = good + 1 if self._latest is not None and np.abs(self._latest).max() < GOOD else 0
+            if good == 10:
+                return '' if self._poses >= 6 else 'samples of the IMU without a pose'
+            self._poses, self._latest = 0, None
+        return self._graph.nodes['pose_ekf'].headline()
+
+    def _thirty_milliseconds(self) -> None:
+        for _ in range(6):
+            self._graph.send('/imu/data', imu(self._samples))
+            self._samples += 1
+        self._graph.send('/camera_pose', pose(self._samples - 4))
+
+    def close(self) -> None:
+        """End the nodes."""
+        self._graph.close()
+
+
+def _numbers(message: Any) -> Iterator[Any]:
+    for name in message.get_fields_and_field_types():
+        held = getattr(message, name)
+        if hasattr(held, 'get_fields_and_field_types'):
+            yield from _numbers(held)
+        elif isinstance(held, (float, np.ndarray)):
+            yield held
+
+
+def _good_messages(graph: DirectGraph) -> dict[str, list[Any]]:
+    """Of each topic a few as the nodes get them."""
+    found: dict[str, list[Any]] = {topic: [] for topic in _TOPICS}
+    graph.listen('/markers', lambda message: found['/markers'].append(deepcopy(message)))
+    graph.listen('/marker_map', lambda message: found['/marker_map'].append(deepcopy(message)))
+    graph.send('/thermal/camera_info', info())
+    for message in frames(3):
+        graph.send('/thermal/image_raw', message)
+        found['/thermal/image_raw'].append(message)
+    state = State(START, np.eye(4), np.zeros(3), np.zeros(3), 1e-6 * np.eye(6), 1e-6 * np.eye(6))
+    odometry = convert.odometry_frames('map', 'base_link')
+    convert.fill_odometry(odometry, state)
+    found['/thermal/image'] = found['/thermal/image_raw']
+    found['/thermal/camera_info'] = [info()]
+    found['/imu/data'] = [imu(k) for k in range(5)]
+    found['/camera_pose'] = [pose(k) for k in range(5)]
+    found['/odometry'] = [odometry]
+    found['/map_correction'] = [convert.transform_message(np.eye(4), START, 'map', 'map_before')]
+    clock = convert.header(START + FRAME_NS, 'camera')
+    found['/camera_clock'] = [
+        TimeReference(header=clock, time_ref=convert.header(START + IMU_NS, '').stamp, source='camera')
+    ]
+    missing = [topic for topic, messages in found.items() if not messages]
+    assert not missing, missing
+    return found
+
+
+def run(numbers: range, begin: Callable[[str, int], None]) -> list[Finding]:
+    """Findings of inputs ``numbers``; ``begin`` is called before each."""
+    findings: list[Finding] = []
+    context = Context()
+    context.init(args=['--ros-args', '--log-level', 'FATAL'])
+    with tempfile.TemporaryDirectory() as folder:
+        nodes = Nodes(context, Path(folder))
+        nodes.good_flight()
+        for number in numbers:
+            begin('messages', number)
+            with timed('messages', number, findings):
+                topic = nodes.send_mutated(Random(number))
+            findings += [Finding('messages', number, 'internal error', line) for line in nodes.internal_errors()]
+            findings += [Finding('messages', number, 'not finite', f'{bad} after {topic}') for bad in nodes.not_finite]
+            nodes.not_finite.clear()
+            if (number + 1) % AT_ONCE == 0 and (reason := nodes.good_flight()):
+                findings.append(Finding('messages', number, 'poisoned', reason))
+        nodes.close()
+    context.try_shutdown()
+    return findings

@@ -1,0 +1,46 @@
+"""A short run of ``make fuzz``, and inputs that once found something."""
+
+from random import Random
+
+from fuzz import files, messages
+from fuzz.jobs import batches
+from fuzz.mutations import mutated_bytes
+import pytest
+
+#: Inputs by number: other ones than those of the long run begin with.
+FIRST = 1_000_000
+#: Inputs that have found something once.
+FOUND = (11,)
+
+
+def nothing(target, number):
+    pass
+
+
+@pytest.mark.ros
+# Their own complaints are the libraries' matter: what counts is what comes of them.
+@pytest.mark.filterwarnings('ignore')
+def test_mutated_messages_harm_nothing():
+    assert messages.run(range(FIRST, FIRST + 40), nothing) == []
+
+
+@pytest.mark.filterwarnings('ignore')
+def test_mutated_files_harm_nothing():
+    assert files.run(range(FIRST, FIRST + 40), nothing) == []
+
+
+@pytest.mark.filterwarnings('ignore')
+@pytest.mark.parametrize('number', FOUND)
+def test_what_was_found_once_is_mended(number):
+    assert files.run(range(number, number + 1), nothing) == []
+
+
+def test_an_input_follows_from_its_number():
+    data = b'format: a\nvalue: 12.5\n' * 20
+    assert mutated_bytes(data, Random(5)) == mutated_bytes(data, Random(5))
+    assert len({mutated_bytes(data, Random(number)) for number in range(50)}) > 40
+
+
+def test_every_input_is_in_one_batch():
+    numbers = [number for _, batch in batches('messages', 7, 450) for number in batch]
+    assert numbers == list(range(7, 457))
