@@ -105,10 +105,10 @@ def test_space_holds_path_markers_and_ellipsoids(page):
     assert len(values(traces['marker seen'], 'x')) == 4 * 6
     labels = [text for trace in figures(page)['scene']['data'] for text in trace.get('text', [])]
     assert sorted(labels, key=int) == [str(marker) for marker in range(2, 10)]
-    # Of 40 poses, each an ellipsoid of 2 mm times three sigma times the factor that the text names.
+    # Of 16 poses, each an ellipsoid of 2 mm times three sigma times the factor that the text names.
     factor = float(re.search(r'enlarged (\d+) times', page)[1])
     ball, path = traces['uncertainty of the pose'], traces['fused']
-    x = values(ball, 'x').reshape(40, -1)
+    x = values(ball, 'x').reshape(16, -1)
     assert np.allclose(np.ptp(x, axis=1), 2 * 3 * 0.002 * factor, rtol=0.02)
     assert values(path, 'x').min() < x.mean() < values(path, 'x').max()
 

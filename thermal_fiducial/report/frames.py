@@ -126,15 +126,13 @@ def _draw_marker(picture: npt.NDArray[np.uint8], marker: int, corners: FloatArra
     cv2.polylines(picture, [fine], isClosed=True, color=_CYAN, thickness=2, lineType=cv2.LINE_AA, shift=_SHIFT)
     first = (int(fine[0, 0]), int(fine[0, 1]))
     cv2.circle(picture, first, 4 << _SHIFT, _YELLOW, -1, cv2.LINE_AA, _SHIFT)
-    write(picture, str(marker), (int(corners[:, 0].max()) + 4, int(corners[:, 1].min()) + 8), _CYAN)
+    write(picture, str(marker), (int(corners[:, 0].max()) + 6, int(corners[:, 1].min()) + 10))
 
 
-def write(
-    picture: npt.NDArray[np.uint8], text: str, place: tuple[int, int], colour: tuple[int, int, int] = _WHITE
-) -> None:
+def write(picture: npt.NDArray[np.uint8], text: str, place: tuple[int, int]) -> None:
     """Write into a picture so that it can be read on any ground."""
-    for ink, thickness in (((0, 0, 0), 4), (colour, 1)):
-        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, ink, thickness, cv2.LINE_AA)
+    for ink, thickness in (((0, 0, 0), 6), (_WHITE, 2)):
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.7, ink, thickness, cv2.LINE_AA)
 
 
 def _uri(picture: npt.NDArray[np.uint8]) -> str:

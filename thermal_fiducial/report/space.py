@@ -16,9 +16,9 @@ from thermal_fiducial.report.trajectory import Trajectory
 #: Points of a path in space.
 MOST_PATH_POINTS = 4_000
 #: Ellipsoids of markers and along the path: more of them only hide each other.
-MOST_MARKERS, MOST_POSES = 300, 40
+MOST_MARKERS, MOST_POSES = 300, 16
 #: A typical ellipsoid is drawn about this large [m]; millimetres would not be seen in a picture of metres.
-_TYPICAL_M = 0.12
+_TYPICAL_M = 0.1
 _LARGEST_FACTOR = 500.0
 #: Larger ones, before the filter has settled, would hide everything else [m].
 _LARGEST_M = 0.4
@@ -144,7 +144,7 @@ def _ellipsoid_mesh(centres: FloatArray, covariances: FloatArray, factor: float,
     axes = _SIGMAS * factor * vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     points = centres[:, None, :] + np.einsum('nij,pj->npi', axes, sphere)
     every = faces[None] + (len(sphere) * np.arange(len(centres)))[:, None, None]
-    return _mesh(points.reshape(-1, 3), every.reshape(-1, 3), colour, 0.28, name)
+    return _mesh(points.reshape(-1, 3), every.reshape(-1, 3), colour, 0.2, name)
 
 
 def _mesh(points: FloatArray, faces: IntArray, colour: str, opacity: float, name: str) -> Any:

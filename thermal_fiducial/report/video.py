@@ -21,7 +21,7 @@ from thermal_fiducial.report.run_folder import Run
 _FALLBACK_RATE = 30.0
 #: A fused pose within this [ns] of a frame stands in its caption.
 _NEAR_NS = 20_000_000
-_LINE_PX = 22
+_LINE_PX = 26
 
 Frame = npt.NDArray[np.uint8]
 
