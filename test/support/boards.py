@@ -33,13 +33,13 @@ def circle_levels(columns, rows, spacing, diameter, cell):
     return near, width, height
 
 
-def render(lens, T_camera_plate, levels, width, height, contrast, seed, *, opaque=None):
+def render(lens, T_camera_plate, levels, width, height, contrast, seed, *, opaque=None, samples=97):
     """Counts of a plate (x right, y up, z out of its face) ``contrast`` [K] warmer where ``levels`` is set."""
     opaque = np.ones_like(levels, dtype=bool) if opaque is None else opaque
     cold, hot = (0.0, contrast) if contrast > 0 else (-contrast, 0.0)
     plate = Plate(T_camera_plate, width, height, levels.astype(float), opaque, hot, cold)
     room = Room((-30.0, -30.0, -30.0), (30.0, 30.0, 30.0))
-    quality = Quality(samples=97, warm_up=0)
+    quality = Quality(samples=samples, warm_up=0)
     renderer = Renderer(lens, [plate], room, Fog(), Acrylic(), STILL, np.eye(4), lag=0.0, quality=quality)
     return SENSOR.counts(renderer.frame(TIME), TIME, 0, seed)
 

@@ -139,7 +139,7 @@ def test_derivatives_by_scale_and_misalignment_against_differences():
 def test_scale_errors_and_misalignments_are_found():
     poses, imu = recording(SCENARIO, 40.0, 1)
     axes = 0.005 * np.random.default_rng(3).normal(size=AXES)
-    result = calibrate_camera_imu(poses, imu.corrected(axes), START_NS, ImuNoise())
+    result = calibrate_camera_imu(poses[::2], imu.corrected(axes), START_NS, ImuNoise())
     # What takes away the errors of the samples: the negative of what was put in, but for its square.
     assert np.all(np.abs(result.axes + axes) < 4.0 * result.axes_sigma + 5e-5)
     # A level flight shows these; that it is level leaves most of the accelerometer's at their prior.
@@ -152,13 +152,14 @@ def test_scale_errors_and_misalignments_are_found():
 
 def test_errors_that_last_for_seconds_widen_the_claim():
     poses, imu = recording(SCENARIO, 24.0, 2)
+    poses = poses[::2]
     white = calibrate_camera_imu(poses, imu, START_NS, ImuNoise())
     rng = np.random.default_rng(6)
     # A pose is off by the same for a second at a time, as much as the noise of a single one.
-    views = rng.normal(0.0, 1.0, (len(poses) // 30 + 1, 6)) * np.repeat([0.002, 0.0006], 3)
+    views = rng.normal(0.0, 1.0, (len(poses) // 15 + 1, 6)) * np.repeat([0.002, 0.0006], 3)
     biased = []
     for index, pose in enumerate(poses):
-        off, T = views[index // 30], pose.T_map_camera
+        off, T = views[index // 15], pose.T_map_camera
         biased.append(replace(pose, T_map_camera=se3.transform(se3.so3_exp(off[3:]) @ T[:3, :3], T[:3, 3] + off[:3])))
     lasting = calibrate_camera_imu(biased, imu, START_NS, ImuNoise())
     assert np.sqrt(np.trace(lasting.covariance[3:6, 3:6]) / np.trace(white.covariance[3:6, 3:6])) > 2.0
@@ -216,10 +217,11 @@ def test_noiseless_recording_gives_the_extrinsics_back():
     assert error[6] < 2e-5
 
 
-@pytest.mark.parametrize('seed', [1, 2, 3])
+@pytest.mark.parametrize('seed', [1, *(pytest.param(seed, marks=pytest.mark.nightly) for seed in (2, 3))])
 def test_a_minute_is_enough(seed):
+    """Of every second pose: half as much as a camera gives."""
     poses, imu = recording(SCENARIO, 60.0, seed)
-    result = calibrate_camera_imu(poses, imu, START_NS, ImuNoise())
+    result = calibrate_camera_imu(poses[::2], imu, START_NS, ImuNoise())
     error = error_of(result, SCENARIO)
     assert np.degrees(np.linalg.norm(error[:3])) < 0.05
     assert np.linalg.norm(error[3:6]) < 0.002
@@ -231,8 +233,9 @@ def test_a_minute_is_enough(seed):
 
 def test_wrong_poses_hardly_matter():
     poses, imu = recording(SCENARIO, 30.0, 4)
+    poses = poses[::2]
     rng = np.random.default_rng(5)
-    for index in rng.choice(len(poses), 20, replace=False).tolist():
+    for index in rng.choice(len(poses), 10, replace=False).tolist():
         T = poses[index].T_map_camera @ se3.transform(se3.so3_exp([0.0, 0.3, 0.0]), [0.3, 0.0, 0.1])
         poses[index] = replace(poses[index], T_map_camera=T)
     error = error_of(calibrate_camera_imu(poses, imu, START_NS, ImuNoise()), SCENARIO)
