@@ -8,7 +8,7 @@ from rich.table import Table
 
 from thermal_fiducial.cli.marker_drawings import add_force, refuse_to_overwrite
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.tables import show, table_of
+from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError

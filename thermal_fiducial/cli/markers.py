@@ -10,7 +10,7 @@ import numpy as np
 from thermal_fiducial.cli import marker_drawings, marker_planning
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.tables import show, table_of
+from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.bridges import darkest_white, find_bridges
 from thermal_fiducial.fabrication.cuttability import examine

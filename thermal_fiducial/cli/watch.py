@@ -8,7 +8,7 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.ros.live_status import Advice, LiveStatus, Snapshot
+from thermal_fiducial.ros.live_status import Advice, LiveState, LiveStatus
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     except ImportError as error:
         raise InputError(f'watching needs ROS 2 ({error.name} is missing)') from None
     if args.once:
-        last: list[Snapshot] = []
+        last: list[LiveState] = []
 
         def keep(status: LiveStatus) -> bool:
             last.append(status.snapshot(time.monotonic()))
@@ -80,7 +80,7 @@ def _print_line(status: LiveStatus) -> bool:
     return False
 
 
-def _show_once(snapshot: Snapshot, *, plain: bool) -> None:
+def _show_once(snapshot: LiveState, *, plain: bool) -> None:
     if not plain and sys.stdout.isatty():
         try:
             from rich.console import Console
@@ -101,7 +101,7 @@ def _live_screen() -> Any:
     return Live(auto_refresh=False, screen=True)
 
 
-def screen(snapshot: Snapshot) -> 'RenderableType':
+def screen(snapshot: LiveState) -> 'RenderableType':
     """The state as a screen of the terminal."""
     from rich.console import Group
     from rich.panel import Panel

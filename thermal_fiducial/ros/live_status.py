@@ -34,7 +34,7 @@ class Advice(Enum):
 
 
 @dataclass(frozen=True)
-class Reading:
+class LiveFigure:
     """One figure with its unit; empty when unknown."""
 
     name: str
@@ -43,12 +43,12 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Snapshot:
+class LiveState:
     """The state at one time."""
 
     advice: Advice
     reasons: tuple[str, ...]
-    readings: tuple[Reading, ...]
+    readings: tuple[LiveFigure, ...]
     #: node, level (0 ok, 1 warning, 2 error) and what it says
     nodes: tuple[tuple[str, int, str], ...]
     #: how long ago [s] and what
@@ -160,11 +160,11 @@ class LiveStatus:
             self._refusals.popleft()
         self._refusals.appendleft((now, words))
 
-    def snapshot(self, now: float) -> Snapshot:
+    def snapshot(self, now: float) -> LiveState:
         """The state at a time."""
         stops, cares = self._stops(now), self._cares(now)
         advice = Advice.STOP if stops else Advice.CARE if cares else Advice.FLY
-        return Snapshot(
+        return LiveState(
             advice=advice,
             reasons=tuple(stops or cares),
             readings=self._readings(now),
@@ -209,22 +209,22 @@ class LiveStatus:
             return node, _WARNING, f'silent for {now - said.time:.0f} s'
         return node, said.level, said.message
 
-    def _readings(self, now: float) -> tuple[Reading, ...]:
+    def _readings(self, now: float) -> tuple[LiveFigure, ...]:
         in_view = self._markers if self._frames.silent(now) < WINDOW_S else ()
         listed = ' '.join(str(marker) for marker in in_view)
         sigma_m, sigma_deg = self._sigma if self._sigma and self._odometry.silent(now) < WINDOW_S else (None, None)
         figures: Mapping[str, str] = self._nodes[_FILTER].figures if _FILTER in self._nodes else {}
         offset, offset_std = _milliseconds(figures, 'time offset'), _milliseconds(figures, 'time offset std')
         return (
-            Reading('markers in view', f'{len(in_view)}' + (f' ({listed})' if listed else '')),
-            Reading('poses', self._odometry.rate(now), 'Hz'),
-            Reading('camera poses', self._camera_pose.rate(now), 'Hz'),
-            Reading('latency', self._odometry.latency, 'ms'),
-            Reading('camera latency', self._camera_pose.latency, 'ms'),
-            Reading('sigma', '' if sigma_m is None else f'{1e3 * sigma_m:.1f}', 'mm'),
-            Reading('sigma of attitude', '' if sigma_deg is None else f'{sigma_deg:.2f}', 'deg'),
-            Reading('clock offset', f'{offset:.1f} +- {offset_std:.1f}' if offset and offset_std else '', 'ms'),
-            Reading('usable without markers', _rounded(figures, 'usable for'), 's'),
+            LiveFigure('markers in view', f'{len(in_view)}' + (f' ({listed})' if listed else '')),
+            LiveFigure('poses', self._odometry.rate(now), 'Hz'),
+            LiveFigure('camera poses', self._camera_pose.rate(now), 'Hz'),
+            LiveFigure('latency', self._odometry.latency, 'ms'),
+            LiveFigure('camera latency', self._camera_pose.latency, 'ms'),
+            LiveFigure('sigma', '' if sigma_m is None else f'{1e3 * sigma_m:.1f}', 'mm'),
+            LiveFigure('sigma of attitude', '' if sigma_deg is None else f'{sigma_deg:.2f}', 'deg'),
+            LiveFigure('clock offset', f'{offset:.1f} +- {offset_std:.1f}' if offset and offset_std else '', 'ms'),
+            LiveFigure('usable without markers', _rounded(figures, 'usable for'), 's'),
         )
 
 
