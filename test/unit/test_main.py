@@ -1,5 +1,7 @@
 """The entry point: usage, unusable input, missing extras."""
 
+import argparse
+
 import pytest
 
 from thermal_fiducial.cli.main import COMMANDS, main
@@ -35,3 +37,43 @@ def test_a_missing_extra_is_named(capsys, monkeypatch):
     monkeypatch.setattr('thermal_fiducial.cli.main.import_module', without_rich)
     assert main(['simulate', 'somewhere']) == 2
     assert 'thermal-fiducial simulate: needs the Python package rich' in capsys.readouterr().err
+
+
+class CaughtError(Exception):
+    """Carries a parser that is complete."""
+
+
+def parsers_of(command, monkeypatch):
+    """The parser of a command and those of all its actions."""
+
+    def catch(parser, argv):
+        raise CaughtError(parser)
+
+    monkeypatch.setattr(argparse.ArgumentParser, 'parse_args', catch)
+    with pytest.raises(CaughtError) as caught:
+        main([command])
+    waiting, found = [caught.value.args[0]], []
+    while waiting:
+        parser = waiting.pop()
+        found.append(parser)
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                waiting += [
+                    choice for name, choice in action.choices.items() if parser is not found[0] or name == command
+                ]
+    return found
+
+
+@pytest.mark.parametrize('command', COMMANDS)
+def test_help_says_what_every_option_does_and_is_when_left_out(command, monkeypatch):
+    for parser in parsers_of(command, monkeypatch):
+        text = ' '.join(parser.format_help().split())
+        for action in parser._actions:
+            if not action.option_strings or action.default is argparse.SUPPRESS:
+                continue
+            assert action.help, f'{parser.prog} {action.option_strings}'
+            said = ' '.join(parser._get_formatter()._expand_help(action).split())
+            assert said in text
+            if action.default not in (None, False, '', []) or (action.default == 0 and action.nargs != 0):
+                assert 'default' in said, f'{parser.prog} {action.option_strings}'
+                assert said.count('default') == 1, f'{parser.prog} {action.option_strings}'

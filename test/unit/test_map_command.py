@@ -9,6 +9,7 @@ from thermal_fiducial.cli.map_plot import draw_map
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference
 from thermal_fiducial.core.geometry.se3 import apply, inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_doubts import doubts
 from thermal_fiducial.core.mapping.map_editing import transformed
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.files.camera_info import save_camera
@@ -149,6 +150,65 @@ def test_refine_adjusts_a_map_to_the_detections_of_a_run(path, poses):
         # 30 frames of corners of 0.02 px: tenths of a millimetre; ten times that would be a fault.
         assert np.linalg.norm(difference(refined.markers[i].T_map_marker, pose)[:3]) < 2e-3
     assert run('refine', path, path, '--calibration', path.with_name('camera.yaml')) == 2
+
+
+@pytest.fixture
+def photographed(path, poses):
+    """Detections of a flight past the wall, and the calibration of its camera."""
+    rng = np.random.default_rng(4)
+    rows = [(stamp(k), row) for k in range(0, 300, 10) for row in see(flight(k / 30), poses, 0.02, rng)]
+    lines = [f'{t},{row["id"]},{",".join(str(row[n]) for n in CORNER_FIELDS)},{row["sigma_px"]}' for t, row in rows]
+    file = path.with_name('detections.csv')
+    file.write_text(f'stamp_ns,id,{",".join(CORNER_FIELDS)},sigma_px\n' + '\n'.join(lines))
+    save_camera(path.with_name('camera.yaml'), CAMERA)
+    return [file, '--calibration', path.with_name('camera.yaml')]
+
+
+def test_refine_moves_entries_that_somebody_wrote_by_hand(path, poses, photographed, capsys):
+    rng = np.random.default_rng(5)
+    entries = {}
+    for i, pose in poses.items():
+        T = pose.copy()
+        T[:3, 3] += rng.normal(0.0, 0.05, 3) if i else 0.0
+        entries[i] = MapMarker(i, SIZE, i == 0, T)
+    save_map(path, MarkerMap(entries))
+    assert run('check', path) == 1
+    assert run('refine', path, *photographed) == 0
+    refined = load_map(path)
+    for i, pose in poses.items():
+        # As above: tenths of a millimetre, where by hand they were some 90 mm off.
+        assert np.linalg.norm(difference(refined.markers[i].T_map_marker, pose)[:3]) < 2e-3
+        assert i == 0 or np.any(refined.markers[i].covariance)
+    assert f'{path}: sound' in capsys.readouterr().out
+
+
+def test_refine_ends_with_what_check_says_and_with_2_where_that_spoils_the_map(path, poses, photographed, capsys):
+    save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0]), 40: MapMarker(40, SIZE, True, poses[0])}))
+    assert run('--marker-size', SIZE, 'refine', path, *photographed) == 2
+    said = capsys.readouterr().out
+    assert 'markers 0 and 40 overlap' in said
+    assert run('check', path) == 1
+    assert said.endswith(capsys.readouterr().out)
+    # Not seen once and far from all others: doubtful, but nobody flies worse by it.
+    away = poses[0].copy()
+    away[:3, 3] += 5.0
+    start = {0: MapMarker(0, SIZE, True, poses[0]), 41: MapMarker(41, SIZE, False, away)}
+    save_map(path, MarkerMap(start))
+    assert run('--marker-size', SIZE, 'refine', path, *photographed) == 0
+    assert 'marker 41: known to 0.17 m only' in capsys.readouterr().out
+
+
+def test_large_residuals_of_all_markers_name_the_calibration(poses):
+    def said(errors):
+        markers = {
+            i: MapMarker(i, SIZE, i == 0, T, 1e-6 * np.eye(6), reprojection_error_px=error)
+            for (i, T), error in zip(poses.items(), errors, strict=True)
+        }
+        return [doubt.text for doubt in doubts(MarkerMap(markers)) if 'calibration' in doubt.text]
+
+    assert 'errors of 0.9 px or more: the likely cause is a calibration' in said([0.9] * 7 + [3.0])[0]
+    # One or two markers with wrong views are no fault of the camera.
+    assert said([0.1] * 6 + [3.0] * 2) == []
 
 
 def room_cloud(rng, count=60_000):

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 import sys
 
-from thermal_fiducial.cli.replay import progress_bar
+from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import parse_remaps
 

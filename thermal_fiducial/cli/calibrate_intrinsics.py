@@ -247,6 +247,8 @@ def _look_at_pictures(args: argparse.Namespace, views: _Views) -> None:
 
 def _look_at_bag(args: argparse.Namespace, views: _Views) -> None:
     """Every n-th frame where the board stands still and elsewhere than before."""
+    if not args.source.exists():
+        raise InputError(f'{args.source}: no such folder of pictures, bag or CSV file')
     with BagReader(args.source, parse_remaps(args.remap)) as bag:
         pending: tuple[RawFrame, Sighting] | None = None
         for index, frame in enumerate(clean_frames(bag)):

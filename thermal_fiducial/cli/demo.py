@@ -9,7 +9,7 @@ import time
 from typing import Any
 
 from thermal_fiducial.cli.evaluate import make_video, print_tables
-from thermal_fiducial.cli.replay import progress_bar
+from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.page import evaluate_run, Evaluation, require_packages, write_page
 from thermal_fiducial.report.tables import tables
@@ -23,11 +23,9 @@ MARK = '.thermal_fiducial_demo'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument(
-        '--out', type=Path, default=Path('runs/demo'), metavar='RUN', help='folder (default: runs/demo)'
-    )
-    parser.add_argument('--seconds', type=float, default=30.0, help='length of the flight [s] (default: 30)')
-    parser.add_argument('--seed', type=int, default=0, help='of path and noise (default: 0)')
+    parser.add_argument('--out', type=Path, default=Path('runs/demo'), metavar='RUN', help='folder')
+    parser.add_argument('--seconds', type=float, default=30.0, help='length of the flight [s]')
+    parser.add_argument('--seed', type=int, default=0, help='of path and noise')
     parser.add_argument('--picture', type=Path, metavar='PNG', help='also draw frame, map and error into one picture')
     parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
 

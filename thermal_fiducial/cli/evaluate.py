@@ -5,7 +5,7 @@ from collections.abc import Iterable
 import json
 from pathlib import Path
 
-from thermal_fiducial.cli.replay import progress_bar
+from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.page import evaluate_run, require_packages, VIDEO, write_page
 from thermal_fiducial.report.run_folder import Run

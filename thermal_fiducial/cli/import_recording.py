@@ -4,7 +4,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from thermal_fiducial.cli.replay import progress_bar
+from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import STORAGES
 from thermal_fiducial.files.dictionary import load_dictionary

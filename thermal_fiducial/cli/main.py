@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from importlib import import_module
 import os
 import sys
+from typing import Any
 
 from thermal_fiducial import __version__
 from thermal_fiducial.errors import InputError, RunError
@@ -32,6 +33,26 @@ COMMANDS = {
 MODULES = {'import': 'import_recording'}
 
 
+class _Help(argparse.HelpFormatter):
+    """Says what every option is when it is left out, unless its text does."""
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        default = action.default
+        nothing = default is None or default is False or default in ('', [], argparse.SUPPRESS)
+        if nothing or not action.option_strings or 'default' in (action.help or ''):
+            return action.help
+        values = default if isinstance(default, (list, tuple)) else [default]
+        text = ' '.join(f'{value:g}' if isinstance(value, float) else str(value) for value in values)
+        return f'{action.help or ""} (default: {text.replace("%", "%%")})'.lstrip()
+
+
+class _Parser(argparse.ArgumentParser):
+    """Parser of the program, and of each of its commands, since argparse makes those of the same class."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**{'formatter_class': _Help, **options})
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command.
 
@@ -45,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     argv = sys.argv[1:] if argv is None else list(argv)
     command = argv[0] if argv else ''
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=PROGRAM, description='Thermal-inertial localization from acrylic markers, for drones in smoke and fog.'
     )
     parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')

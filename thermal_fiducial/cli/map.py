@@ -8,10 +8,9 @@ import re
 from typing import TypeAlias
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from thermal_fiducial.cli import map_cloud, map_comparison, map_sources
+from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
@@ -36,8 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--marker-size-override', action='append', default=[], metavar='ID:M', help='side of one marker [m]'
     )
     commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
-    show = _command(commands, 'show', 'table of the markers, and a plot', _show)
-    show.add_argument('--plot', type=Path, metavar='PNG', help='top and side view with uncertainties')
+    shown = _command(commands, 'show', 'table of the markers, and a plot', _show)
+    shown.add_argument('--plot', type=Path, metavar='PNG', help='top and side view with uncertainties')
     _command(commands, 'check', 'what is doubtful about a map; exit status 1 if anything is', _check)
     for name, fixed in (('fix', True), ('unfix', False)):
         action = _command(commands, name, f'declare markers {"fixed: they never move" if fixed else "free"}', _fix)
@@ -70,10 +69,12 @@ def _command(
 def _add_editing(commands: Commands) -> None:
     move = _command(commands, 'move', 'put a marker somewhere else', _move)
     move.add_argument('id', type=int, metavar='ID')
-    move.add_argument('--position', type=float, nargs=3, required=True, metavar=('X', 'Y', 'Z'))
+    move.add_argument(
+        '--position', type=float, nargs=3, required=True, metavar=('X', 'Y', 'Z'), help='of its centre [m]'
+    )
     move.add_argument('--orientation', type=float, nargs=4, metavar=('QX', 'QY', 'QZ', 'QW'), help='default: as it is')
-    move.add_argument('--sigma', type=float, default=0.005, metavar='M', help='how well that is known (0.005 m)')
-    move.add_argument('--sigma-deg', type=float, default=1.0, metavar='DEG', help='and its orientation (1 deg)')
+    move.add_argument('--sigma', type=float, default=0.005, metavar='M', help='how well that is known')
+    move.add_argument('--sigma-deg', type=float, default=1.0, metavar='DEG', help='and its orientation')
     rename = _command(commands, 'rename', 'give a marker another ID', _rename)
     rename.add_argument('old', type=int, metavar='OLD')
     rename.add_argument('new', type=int, metavar='NEW')
@@ -111,11 +112,9 @@ def _edit(args: argparse.Namespace, action: str, change: Callable[[MarkerMap], M
 
 def _show(args: argparse.Namespace) -> int:
     marker_map = _load(args)
-    table = Table(
-        title=f'{args.map}: {marker_map.dictionary}, frame {marker_map.frame_id}, revision {marker_map.revision}'
-    )
-    for name in ('ID', 'size m', 'x m', 'y m', 'z m', 'faces', 'sigma mm', 'deg', 'error px', 'seen', 'standing'):
-        table.add_column(name, justify='right' if name not in ('faces', 'standing') else 'left')
+    title = f'{args.map}: {marker_map.dictionary}, frame {marker_map.frame_id}, revision {marker_map.revision}'
+    headers = 'ID', 'size m', 'x m', 'y m', 'z m', 'faces', 'sigma mm', 'deg', 'error px', 'seen', 'standing'
+    table = table_of(title, headers, left=['faces', 'standing'])
     for key in sorted(marker_map.markers):
         m = marker_map.markers[key]
         x, y, z = m.T_map_marker[:3, 3]
@@ -126,10 +125,7 @@ def _show(args: argparse.Namespace) -> int:
             f'{1e3 * sigma[0]:.2f}', f'{np.rad2deg(sigma[1]):.3f}', f'{m.reprojection_error_px:.3f}',
             str(m.observations), standing,
         )  # fmt: skip
-    # Eleven columns: in a narrower window lines wrap, but no number is cut.
-    console = Console()
-    console.width = max(console.width, 110)
-    console.print(table)
+    show(table)
     if args.plot:
         from thermal_fiducial.cli.map_plot import plot_map
 
@@ -146,14 +142,7 @@ def _facing(normal: FloatArray) -> str:
 
 
 def _check(args: argparse.Namespace) -> int:
-    marker_map = _load(args)
-    found = map_editing.problems(marker_map)
-    for key in not_in_dictionary(marker_map.markers, marker_map.dictionary, args.map.parent):
-        found.append(f'marker {key}: not in {marker_map.dictionary}')
-    for line in found:
-        print(line)
-    print(f'{args.map}: {len(found)} doubts' if found else f'{args.map}: sound')
-    return 1 if found else 0
+    return 1 if map_sources.say_doubts(_load(args), args.map) else 0
 
 
 def _fix(args: argparse.Namespace) -> int:

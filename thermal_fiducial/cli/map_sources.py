@@ -6,18 +6,20 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from rich.progress import Progress
 
+from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.mapping import map_editing
 from thermal_fiducial.core.mapping.map_building import build_map, Built, rows_from_corners
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_doubts import Doubt, doubts
 from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE, Markers
 from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import load_camera
-from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.dictionary import load_dictionary, not_in_dictionary
 from thermal_fiducial.files.images import read_picture
 from thermal_fiducial.files.map_history import save_with_history
 from thermal_fiducial.files.marker_map import load_map
@@ -30,6 +32,8 @@ PHOTO_SIGMA_PX = 0.2
 _DETECTIONS_BYTES = 400_000_000
 # Beyond any stamp [ns] and any corner [px]; and any ID of a dictionary.
 _LARGEST_VALUE, _LARGEST_ID = 9.2e18, 100_000
+# How far entries may be off that somebody has written by hand, without a covariance.
+_HAND_STD_M, _HAND_STD_DEG = 0.1, 5.0
 # Between unordered pictures the detector shall see no motion.
 _APART_NS = 100_000_000_000
 
@@ -40,7 +44,7 @@ def add_build(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--calibration', type=Path, required=True, metavar='FILE', help='camera_info YAML of the camera'
     )
-    parser.add_argument('--dictionary', default='DICT_4X4_50', help='dictionary or dictionary file (DICT_4X4_50)')
+    parser.add_argument('--dictionary', default='DICT_4X4_50', help='dictionary or dictionary file')
     start = parser.add_mutually_exclusive_group(required=True)
     start.add_argument('--origin', type=int, metavar='ID', help='marker that becomes the origin of the map')
     start.add_argument('--map', type=Path, metavar='MAP', help='map with known markers to start from')
@@ -55,7 +59,7 @@ def add_refine(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--calibration', type=Path, required=True, metavar='FILE', help='camera_info YAML of the camera'
     )
-    parser.add_argument('--max-frames', type=int, default=1500, metavar='N', help='frames used, evenly chosen (1500)')
+    parser.add_argument('--max-frames', type=int, default=1500, metavar='N', help='frames used, evenly chosen')
     parser.add_argument('--out', type=Path, metavar='FILE', help='default: MAP itself')
     parser.set_defaults(do=_refine)
 
@@ -82,22 +86,28 @@ def _refine(args: argparse.Namespace) -> int:
 def _grow(
     args: argparse.Namespace, frames: list[Markers], camera: Camera, start: MarkerMap, out: Path, action: str
 ) -> int:
-    with Progress(transient=True) as progress:
-        task = progress.add_task('mapping', total=None)
-        built = build_map(
-            frames,
-            camera,
-            start,
-            _mapper_config(args, start.dictionary),
-            lambda markers: progress.update(task, description=f'mapping: {markers} markers'),
-        )
-    _tell(built, len(frames))
+    start = map_editing.with_covariances(start, _HAND_STD_M, np.deg2rad(_HAND_STD_DEG))
+    config = _mapper_config(args, start.dictionary)
+    with progress_bar('mapping') as progress:
+        built = build_map(frames, camera, start, config, lambda markers, share: progress(share, f'{markers} markers'))
+    _print_what_was_used(built, len(frames))
     save_with_history(out, built.map, action)
     print(f'{out}: {len(built.map.markers)} markers')
-    return 0
+    return 2 if any(doubt.spoils for doubt in say_doubts(built.map, out)) else 0
 
 
-def _tell(built: Built, frames: int) -> None:
+def say_doubts(marker_map: MarkerMap, path: Path) -> list[Doubt]:
+    """Print what is doubtful about the map in the file ``path``; returns it."""
+    found = doubts(marker_map)
+    for key in not_in_dictionary(marker_map.markers, marker_map.dictionary, path.parent):
+        found.append(Doubt(f'marker {key}: not in {marker_map.dictionary}', True))
+    for doubt in found:
+        print(doubt.text)
+    print(f'{path}: {len(found)} doubts' if found else f'{path}: sound')
+    return found
+
+
+def _print_what_was_used(built: Built, frames: int) -> None:
     print(f'{built.frames_used} of {frames} frames used')
     if built.refinement is not None:
         print(f're-projection error {built.refinement.rms_px:.3f} px rms')
@@ -150,8 +160,9 @@ def _photos(folder: Path) -> list[Path]:
 def _detect(photos: list[Path], camera: Camera, args: argparse.Namespace) -> list[Markers]:
     detector, photo_detector = _detector(args), _photo_detector(args)
     frames = []
-    with Progress(transient=True) as progress:
-        for k, photo in enumerate(progress.track(photos, description='detecting')):
+    with progress_bar('detecting') as progress:
+        for k, photo in enumerate(photos):
+            progress(k / len(photos))
             counts = read_picture(photo, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
             if counts.shape != (camera.height, camera.width):
                 raise InputError(

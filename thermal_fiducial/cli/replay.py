@@ -1,13 +1,13 @@
 """Command ``replay``: play a recorded bag through the nodes."""
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 import importlib
 from pathlib import Path
 import sys
 import time
 
+from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import parse_remaps
 
@@ -23,9 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--transport',
         choices=('lockstep', 'processes'),
         default='lockstep',
-        help='one process, deterministic, as fast as it goes (default); or one process a node, in real time',
+        help='one process, deterministic, as fast as it goes; or one process a node, in real time',
     )
-    parser.add_argument('--rate', type=float, default=1.0, metavar='X', help='processes: times real time (default 1)')
+    parser.add_argument('--rate', type=float, default=1.0, metavar='X', help='processes: times real time')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bag')
     parser.add_argument('--images', action='store_true', help='record the cleaned images too (as large as the bag)')
     parser.add_argument(
@@ -44,6 +44,7 @@ def run(args: argparse.Namespace) -> int:
     """Replay, write the run folder, say how fast it went."""
     if not 0.0 < args.rate <= 100.0:
         raise InputError(f'--rate {args.rate:g} is not between 0 and 100')
+    _refuse_other_folder(args.out)
     _check_packages(report=not args.no_report, video=args.video)
     replay = importlib.import_module('thermal_fiducial.replay.session')
     options = replay.Options(
@@ -79,6 +80,13 @@ def run(args: argparse.Namespace) -> int:
     return 1 if errors else 0
 
 
+def _refuse_other_folder(out: Path) -> None:
+    """Only an empty folder, or what an earlier replay has left, is written to."""
+    earlier = (out / 'parameters.yaml').is_file() and (out / 'output').is_dir()
+    if out.exists() and not earlier and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f'{out} exists and is no earlier run: choose another folder with --out')
+
+
 def _check_packages(*, report: bool, video: bool) -> None:
     """Say what is missing before the replay, not after minutes of it."""
     if report:
@@ -94,21 +102,6 @@ def _internal_errors(diagnostics: Mapping[str, Mapping[str, str]]) -> list[str]:
     """Errors of the nodes themselves, which they live on through: no replay with one is as it should be."""
     last = {node: figures.get('last refusal', '') for node, figures in diagnostics.items()}
     return [f'{node}: {reason}' for node, reason in last.items() if reason.startswith(INTERNAL_ERROR)]
-
-
-@contextmanager
-def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
-    """A progress bar on a terminal; elsewhere, or without rich, nothing. Yields what takes the share done."""
-    try:
-        from rich.console import Console
-        from rich.progress import Progress
-    except ImportError:
-        yield lambda share: None
-        return
-    with Progress(console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task(title, total=1.0)
-        yield lambda share: bar.update(task, completed=share)
-        bar.update(task, completed=1.0)
 
 
 def _warn(line: str) -> None:

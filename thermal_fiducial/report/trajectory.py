@@ -70,6 +70,8 @@ def read_truth(path: Path) -> Trajectory:
     InputError
         Neither, or a bag without that topic.
     """
+    if not path.exists():
+        raise InputError(f'{path}: no such ground truth (a TUM file or a bag)')
     if path.is_file() and path.suffix not in ('.mcap', '.db3', '.bag'):
         return read_tum(path)
     with BagReader(path) as bag:

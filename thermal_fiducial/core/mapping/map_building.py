@@ -1,6 +1,7 @@
 """A map from frames in any order: photos of a place, or the detections of a whole run at once."""
 
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,12 +10,13 @@ from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.detection.marker_rows import marker_rows
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine, Snapshot
 from thermal_fiducial.core.mapping.candidates import DECISIVE, SAME_FIT
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
-from thermal_fiducial.core.measurements import Markers
+from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import FloatArray, IntArray
 
 # Passes over all frames: more than any chain of markers needs of which each is seen with the last alone.
@@ -41,7 +43,7 @@ def build_map(
     camera: Camera,
     marker_map: MarkerMap,
     config: MarkerMapperConfig,
-    progress: Callable[[int], None] = lambda markers: None,
+    progress: Callable[[int, float], None] = lambda markers, share: None,
 ) -> Built:
     """Grow ``marker_map`` by all markers that hang together with it, and adjust all jointly.
 
@@ -52,25 +54,24 @@ def build_map(
     Parameters
     ----------
     frames : rows of MARKER_DTYPE of each frame
-    progress : receives the number of markers in the map after each pass
+    progress : receives the number of markers in the map and the share of the frames that this pass has done
     """
     config = replace(config, mode='mapping', keyframe_budget=max(len(frames), config.keyframe_budget))
     mapper = MarkerMapper(config, marker_map)
-    used, refinement = 0, None
+    refinement = None
     waiting: dict[int, str] = {}
     for _ in range(_MAX_PASSES):
         before = len(mapper.map.markers)
-        used = 0
         for k, rows in enumerate(frames):
             result = mapper.process(_stamp(k), rows, camera)
             waiting |= result.candidates
-            used += result.pose is not None
+            progress(len(mapper.map.markers), (k + 1) / len(frames))
         refinement = mapper.refine() or refinement
-        progress(len(mapper.map.markers))
         if len(mapper.map.markers) == before and not _settle(mapper, camera):
             break
     unplaced = {key: why for key, why in waiting.items() if key not in mapper.map.markers}
-    return Built(_with_statistics(mapper.map, frames, marker_map), refinement, unplaced, used)
+    used, errors = _residuals(mapper.map, frames, camera, config)
+    return Built(_with_statistics(mapper.map, frames, marker_map, errors), refinement, unplaced, used)
 
 
 def rows_from_corners(
@@ -124,14 +125,40 @@ def decide(snapshot: Snapshot, marker_id: int, size: float, alternatives: Sequen
     return best
 
 
-def _with_statistics(built: MarkerMap, frames: Sequence[Markers], start: MarkerMap) -> MarkerMap:
-    """Observations counted once, however often the frames were shown; stamps of made-up times left out."""
+def _residuals(
+    built: MarkerMap, frames: Sequence[Markers], camera: Camera, config: MarkerMapperConfig
+) -> tuple[int, dict[int, float]]:
+    """In how many frames the camera is found with the map, and each marker's re-projection error in them [px].
+
+    The mapper's own is a running mean that begins before the map is adjusted. This is the median of its views.
+    """
+    mapper = MarkerMapper(replace(config, mode='localization'), built)
+    used, errors = 0, defaultdict[int, list[float]](list)
+    for k, rows in enumerate(frames):
+        pose = mapper.process(_stamp(k), rows, camera).pose
+        if pose is None:
+            continue
+        used += 1
+        for marker_id, seen in zip(rows['id'].tolist(), corners_px(rows), strict=True):
+            marker = built.markers.get(marker_id)
+            if marker is not None:
+                corners = corners_in_map(marker.T_map_marker, marker.size)
+                off = reproject(camera, pose.T_map_camera, corners) - seen
+                errors[marker_id].append(float(np.sqrt(np.mean(off**2))))
+    return used, {marker_id: float(np.median(values)) for marker_id, values in errors.items()}
+
+
+def _with_statistics(
+    built: MarkerMap, frames: Sequence[Markers], start: MarkerMap, errors: Mapping[int, float]
+) -> MarkerMap:
+    """Errors of the finished map; observations counted once, however often frames were shown; no made-up stamps."""
     ids, counts = np.unique(np.concatenate([rows['id'] for rows in frames]), return_counts=True)
     seen = dict(zip(ids.tolist(), counts.tolist(), strict=True))
     for key, marker in built.markers.items():
         earlier = start.markers.get(key)
         built.markers[key] = replace(
             marker,
+            reprojection_error_px=errors.get(key, marker.reprojection_error_px),
             observations=seen.get(key, 0) + (earlier.observations if earlier else 0),
             first_seen_ns=earlier.first_seen_ns if earlier else 0,
             last_seen_ns=earlier.last_seen_ns if earlier else 0,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
-from thermal_fiducial.core.geometry.se3 import apply, rotation_angle, transform
+from thermal_fiducial.core.geometry.se3 import apply, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
@@ -203,38 +203,15 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[M
     return transformed(marker_map, T), dict(zip(common, distances.tolist(), strict=True))
 
 
-def problems(marker_map: MarkerMap) -> list[str]:
-    """What is doubtful about a map, a line each; empty for a sound one."""
-    markers = [marker_map.markers[key] for key in sorted(marker_map.markers)]
-    if not markers:
-        return ['the map has no marker']
-    found = [] if any(m.fixed for m in markers) else ['no marker is fixed: a refinement has nothing to hold on to']
-    for m in markers:
-        found += [f'marker {m.id}: {what}' for what in _marker_problems(m)]
-    centres = np.stack([m.T_map_marker[:3, 3] for m in markers])
-    for i, m in enumerate(markers):
-        near = np.linalg.norm(centres[i + 1 :] - centres[i], axis=-1)
-        for j in np.flatnonzero(near < 0.5 * m.size) + i + 1:
-            facing = rotation_angle(m.T_map_marker[:3, :3].T @ markers[j].T_map_marker[:3, :3])
-            found.append(
-                f'markers {m.id} and {markers[j].id} overlap: {near[j - i - 1]:.3f} m and '
-                f'{np.rad2deg(float(facing)):.0f} deg apart'
-            )
-    return found
+def with_covariances(marker_map: MarkerMap, position_std: float, rotation_std: float) -> MarkerMap:
+    """The map with standard deviations [m, rad] for the markers that are neither fixed nor have any.
 
-
-def _marker_problems(marker: MapMarker) -> list[str]:
-    found = []
-    sigma = float(np.sqrt(max(np.trace(marker.covariance[:3, :3]), 0.0)))
-    if not marker.trusted:
-        found.append('in quarantine, it disagrees with the others')
-    if sigma > 0.1:
-        found.append(f'known to {sigma:.2f} m only')
-    if marker.reprojection_error_px > 2.0:
-        found.append(f're-projection error {marker.reprojection_error_px:.1f} px')
-    if not marker.fixed and not np.any(marker.covariance):
-        found.append('neither fixed nor with a covariance: it is taken for exact')
-    return found
+    The mapper takes such a marker for exact and never moves it; whoever writes one by hand does not mean that.
+    """
+    covariance = np.diag([position_std**2] * 3 + [rotation_std**2] * 3)
+    exact = [key for key, m in marker_map.markers.items() if not m.fixed and not np.any(m.covariance)]
+    changed = {key: replace(marker_map.markers[key], covariance=covariance) for key in exact}
+    return replace(marker_map, markers={**marker_map.markers, **changed})
 
 
 def _corners(markers: list[MapMarker]) -> FloatArray:

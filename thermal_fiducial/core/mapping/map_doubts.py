@@ -1,0 +1,73 @@
+"""What is doubtful about a map, and whether one can fly with it all the same."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from thermal_fiducial.core.geometry.se3 import rotation_angle
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+
+#: Re-projection error of a marker beyond which some of its views are wrong [px]. They have little weight in its pose.
+LARGE_PX = 2.0
+#: Re-projection error that nearly all markers exceed only where something that they share is wrong, the calibration.
+#: Corners of OpenCV are good to 0.2 px in photos, ours to 0.03 in counts; photos taken for free of distortion left 0.4.
+ALL_LARGE_PX = 0.3
+# Nearly all, and so many make a rule.
+_NEARLY_ALL, _FEW = 0.9, 3
+_WIDE_M = 0.1
+
+
+class Doubt(NamedTuple):
+    """A line of text, and whether poses from the map are further off than they claim."""
+
+    text: str
+    spoils: bool
+
+
+def doubts(marker_map: MarkerMap) -> list[Doubt]:
+    """What is doubtful about a map; empty for a sound one."""
+    markers = [marker_map.markers[key] for key in sorted(marker_map.markers)]
+    if not markers:
+        return [Doubt('the map has no marker', True)]
+    found = []
+    if not any(m.fixed for m in markers):
+        found.append(Doubt('no marker is fixed: a refinement has nothing to hold on to', False))
+    for m in markers:
+        found += _doubts_of(m)
+    return [*found, *_overlaps(markers), *_calibration(markers)]
+
+
+def _doubts_of(marker: MapMarker) -> list[Doubt]:
+    found = []
+    sigma = float(np.sqrt(max(np.trace(marker.covariance[:3, :3]), 0.0)))
+    if not marker.trusted:
+        found.append(('in quarantine, it disagrees with the others', False))
+    if sigma > _WIDE_M:
+        found.append((f'known to {sigma:.2f} m only', False))
+    if marker.reprojection_error_px > LARGE_PX:
+        found.append((f're-projection error {marker.reprojection_error_px:.1f} px', False))
+    if not marker.fixed and not np.any(marker.covariance):
+        found.append(('neither fixed nor with a covariance: it is taken for exact', True))
+    return [Doubt(f'marker {marker.id}: {text}', spoils) for text, spoils in found]
+
+
+def _overlaps(markers: Sequence[MapMarker]) -> list[Doubt]:
+    found = []
+    centres = np.stack([m.T_map_marker[:3, 3] for m in markers])
+    for i, m in enumerate(markers):
+        near = np.linalg.norm(centres[i + 1 :] - centres[i], axis=-1)
+        for j in np.flatnonzero(near < 0.5 * m.size).tolist():
+            other = markers[i + 1 + j]
+            facing = rotation_angle(m.T_map_marker[:3, :3].T @ other.T_map_marker[:3, :3])
+            apart = f'{near[j]:.3f} m and {np.rad2deg(float(facing)):.0f} deg apart'
+            found.append(Doubt(f'markers {m.id} and {other.id} overlap: {apart}', m.trusted and other.trusted))
+    return found
+
+
+def _calibration(markers: Sequence[MapMarker]) -> list[Doubt]:
+    errors = [m.reprojection_error_px for m in markers if m.trusted and m.reprojection_error_px > 0.0]
+    if len(errors) < _FEW or (least := float(np.quantile(errors, 1.0 - _NEARLY_ALL))) < ALL_LARGE_PX:
+        return []
+    text = f'nearly all markers have re-projection errors of {least:.1f} px or more: the likely cause is a calibration'
+    return [Doubt(f'{text} that is wrong or belongs to another camera, lens or image size', False)]
