@@ -443,6 +443,13 @@ class MarkerMapperConfig(SelfChecked):
     map_file: str = _map_file()
     mode: str = _mode()
     map_frame: str = param('map', 'Frame of the map.')
+    second_camera: str = param(
+        '',
+        'Name of a second camera, which makes poses better and stands in: NAME/markers and NAME/thermal/camera_info '
+        'are read. Empty: none.',
+    )
+    second_camera_position: tuple[float, ...] = _camera_position()
+    second_camera_orientation: tuple[float, ...] = _camera_orientation()
     cloud_file: str = param('', 'Point cloud of the place (.ply or .pcd) to show beside the markers. Empty: none.')
     cloud_alignment_file: str = param(
         '', 'Where the map lies in cloud_file, as map align writes it. Empty: both are in the same frame.'

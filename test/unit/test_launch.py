@@ -26,7 +26,7 @@ PARAMETER_FILE = '/share/thermal_fiducial/config/thermal_fiducial.yaml'
 ARGUMENTS = {
     'params_file': '', 'map_file': '', 'camera': '', 'landing_pad': '', 'image_topic': 'thermal/image_raw',
     'camera_info_topic': 'thermal/camera_info', 'imu_topic': 'imu/data', 'namespace': '', 'use_sim_time': 'false',
-    'log_level': 'info', 'rviz': 'false', 'prefix_frames': 'false',
+    'second_camera': '', 'second_camera_device': '', 'log_level': 'info', 'rviz': 'false', 'prefix_frames': 'false',
 }  # fmt: skip
 
 
@@ -151,6 +151,21 @@ def test_a_camera_is_started_with_the_nodes(launched):
     _, nodes = launched('mapping.launch.py', camera='/dev/video0')
     assert [node.executable for node in nodes] == ['thermal_source', *NODES]
     assert nodes[0].parameters[1]['camera'] == '/dev/video0'
+
+
+def test_a_second_camera_has_its_own_front_end_and_the_others_map_and_odometry(launched):
+    _, nodes = launched('localization.launch.py', namespace='drone', second_camera='down', second_camera_device='teax')
+    assert [node.executable for node in nodes] == [*NODES, 'thermal_source', 'tau2_camera', 'aruco_detector']
+    assert nodes[2].parameters[1]['second_camera'] == 'down'
+    assert {node.namespace for node in nodes[4:]} == {'drone/down'}
+    assert nodes[4].parameters[-1] == {'camera': 'teax'}
+    assert ('odometry', '/drone/odometry') in nodes[6].remappings
+    _, nodes = launched('localization.launch.py', second_camera='down')
+    assert [(node.executable, node.namespace) for node in nodes[4:]] == [
+        ('tau2_camera', 'down'),
+        ('aruco_detector', 'down'),
+    ]
+    assert ('marker_map', '/marker_map') in nodes[5].remappings
 
 
 def test_a_landing_pad_is_reported_where_one_is_named(launched):

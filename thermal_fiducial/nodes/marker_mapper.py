@@ -3,14 +3,13 @@
 import sys
 from typing import Any
 
-from geometry_msgs.msg import PoseWithCovarianceStamped
 from sensor_msgs.msg import PointCloud2
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.mapping.late_poses import LatePoses
 from thermal_fiducial.core.mapping.map_data import MapJump, MapperResult
 from thermal_fiducial.ros import clouds, convert, map_status, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
+from thermal_fiducial.ros.camera_poses import CameraPoses
 from thermal_fiducial.ros.map_services import MapServices
 from thermal_fiducial.ros.map_topics import MapTopics
 from thermal_fiducial.ros.run import run
@@ -24,29 +23,23 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._map = MapServices(self, self._publish_jump)
         self.mapper = self._map.mapper
         self._result = MapperResult(0, None, 'no markers yet')
-        self._late = LatePoses()
-        self._camera_pose = self.advertise(PoseWithCovarianceStamped, 'camera_pose')
-        self._topics = MapTopics(self, self.config.map_frame)
+        self._topics = MapTopics(self)
         self._frames = self.subscribe_newest(PointCloud2, 'markers', self._on_markers, qos.RESULT)
+        self._poses = CameraPoses(self, self.mapper)
         self.follow_hints()
         self._publish_map()
         self._topics.draw(self.mapper.map, self._result.in_view, 0)
-        cloud, alignment = self.config.cloud_file, self.config.cloud_alignment_file
-        if cloud:
-            self.attempt(lambda: self._topics.publish_cloud(cloud, alignment), None)
 
     def configure(self, config: MarkerMapperConfig) -> None:
         """Take over live parameters."""
         super().configure(config)
         self.mapper.configure(config)
+        self._poses.configure()
 
     def _on_markers(self, message: PointCloud2) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
         frame = self.mapper.locate(stamp, clouds.markers(message), self.camera(), self.odometry)
-        self._late.add(stamp)
-        if frame.pose is not None:
-            head, pose = convert.header(stamp, self.config.map_frame), self._late.as_of_its_stamp(frame.pose)
-            self._camera_pose.send(convert.pose_with_covariance(pose.T_map_camera, pose.covariance, head))
+        self._poses.send(stamp, frame.pose)
         # The pose is on its way by now.
         before, self._result = self._result, self.mapper.learn(frame)
         for marker_id, line in map_status.news(before, self._result).items():
@@ -62,8 +55,8 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     def _publish_jump(self, jump: MapJump | None) -> None:
         """Publish a map that has moved, and how where poses move with it, with the stamp of the newest frame before."""
         if jump is not None and jump.moves_poses:
-            self._late.moved(jump.T_new_old)
-            self._topics.publish_correction(jump.T_new_old, self._late.newest_ns)
+            self._poses.late.moved(jump.T_new_old)
+            self._topics.publish_correction(jump.T_new_old, self._poses.late.newest_ns)
         self._publish_map()
 
     def _publish_map(self) -> None:
@@ -85,7 +78,8 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
 
     def figures(self) -> dict[str, object]:
         """The map in numbers, and what waits to enter it."""
-        return super().figures() | map_status.figures(self.mapper.map, self.mapper.resets, self._result)
+        own = map_status.figures(self.mapper.map, self.mapper.resets, self._result)
+        return super().figures() | own | self._poses.figures()
 
 
 def main() -> int:

@@ -124,7 +124,11 @@ def _flat(section: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
 
 def _values_for(node: str, document: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     values: dict[str, Any] = {}
+    second = {str(section['second_camera']) for section in document.values() if section.get('second_camera')}
     for pattern, section in document.items():
+        # What is in the namespace of the second camera is not for the nodes of the first.
+        if second & set(pattern.split('/')[:-1]):
+            continue
         if pattern.rsplit('/', 1)[-1] in ('**', '*', node):
             values |= section
     return values

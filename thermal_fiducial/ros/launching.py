@@ -26,6 +26,11 @@ _ARGUMENTS = {
     'params_file': ('', 'parameter file of the rig; default: the one of the package'),
     'map_file': ('', 'marker map; default: what the parameter file says'),
     'camera': ('', 'start thermal_source with this camera: /dev/video0, teax, a folder; default: another driver runs'),
+    'second_camera': (
+        '',
+        'name of a second camera, the namespace of its images and detector; default: none',
+    ),
+    'second_camera_device': ('', 'start thermal_source for it too, as camera does; default: another driver runs'),
     'landing_pad': ('', 'start landing_target with these markers as the pad: 7, or 7,8,9; default: none'),
     'image_topic': ('thermal/image_raw', 'raw images of the camera'),
     'camera_info_topic': ('thermal/camera_info', 'calibration of the camera'),
@@ -73,7 +78,7 @@ def _actions(
     share = Path(get_package_share_directory(PACKAGE))
     overrides = {'mode': mode, 'use_sim_time': _is_true('use_sim_time', given), **parameters}
     overrides |= {'prefix_frames': True} if _is_true('prefix_frames', given) else {}
-    overrides |= {name: given[name] for name in ('map_file', 'camera') if given[name]}
+    overrides |= {name: given[name] for name in ('map_file', 'camera', 'second_camera') if given[name]}
     settings = {
         'package': PACKAGE,
         'namespace': given['namespace'],
@@ -87,6 +92,7 @@ def _actions(
     names = ['thermal_source', *NODES] if given['camera'] else list(NODES)
     names += ['landing_target'] if given['landing_pad'] else []
     actions += [_node(name, settings) for name in names]
+    actions += _second_camera(given, settings)
     if _is_true('rviz', given):
         actions.append(_rviz(given['namespace'], share))
     return actions
@@ -103,6 +109,19 @@ def _node(name: str, settings: dict[str, Any]) -> Node:
         return [told, TimerAction(period=_RESPAWN_DELAY, actions=[_node(name, settings)])]
 
     return Node(executable=name, name=name, on_exit=after, **settings)
+
+
+def _second_camera(given: dict[str, str], settings: dict[str, Any]) -> list[Node]:
+    """Front end and detector of a second camera, which look for the same markers as those of the first."""
+    name, device = given['second_camera'], given['second_camera_device']
+    if not name:
+        return []
+    own = given['namespace'].strip('/')
+    shared = [(topic, f'/{own}/{topic}'.replace('//', '/')) for topic in ('marker_map', 'odometry', 'camera_clock')]
+    parameters = [*settings['parameters'], *([{'camera': device}] if device else [])]
+    changes = {'namespace': f'{own}/{name}'.strip('/'), 'remappings': shared, 'parameters': parameters}
+    nodes = ['tau2_camera', 'aruco_detector']
+    return [_node(node, settings | changes) for node in (['thermal_source', *nodes] if device else nodes)]
 
 
 def _unknown_arguments(context: LaunchContext) -> list[Any]:

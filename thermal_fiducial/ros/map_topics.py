@@ -8,12 +8,13 @@ import numpy as np
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
+from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.se3 import apply, inverse
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.point_cloud import load_alignment, load_cloud, thinned
 from thermal_fiducial.ros import clouds, convert, display, qos
-from thermal_fiducial.ros.counting import CountingNode
+from thermal_fiducial.ros.node import StageNode
 
 # Points of the cloud that is shown: 0.7 MB, which goes through shared memory in one piece.
 _CLOUD_POINTS = 60_000
@@ -29,15 +30,18 @@ class _Drawing:
 
 
 class MapTopics:
-    """The topics of ``node`` that show the map, in ``frame_id``."""
+    """The topics of ``node`` that show the map, and the point cloud of the place where it names one."""
 
-    def __init__(self, node: CountingNode, frame_id: str) -> None:
-        self._frame_id = frame_id
+    def __init__(self, node: StageNode[MarkerMapperConfig]) -> None:
+        config = node.config
+        self._frame_id = config.map_frame
         self._drawn: _Drawing | None = None
         self._rows = node.advertise(PointCloud2, 'marker_map', qos.LATCHED)
         self._drawing = node.advertise(MarkerArray, 'marker_map/markers', qos.LATCHED)
         self._correction = node.advertise(TransformStamped, 'map_correction')
         self._cloud = node.advertise(PointCloud2, 'marker_map/cloud', qos.LATCHED)
+        if config.cloud_file:
+            node.attempt(lambda: self._publish_cloud(config.cloud_file, config.cloud_alignment_file), None)
 
     def publish(self, marker_map: MarkerMap, in_view: Collection[int], stamp_ns: int) -> None:
         """The map as it is after the frame of ``stamp_ns``, which shows the markers ``in_view``."""
@@ -68,7 +72,7 @@ class MapTopics:
         else:
             self._drawn = None
 
-    def publish_cloud(self, cloud_file: str, alignment_file: str) -> None:
+    def _publish_cloud(self, cloud_file: str, alignment_file: str) -> None:
         """The point cloud of the place, in the frame of the map, once: for RViz beside the markers.
 
         Raises

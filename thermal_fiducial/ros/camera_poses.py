@@ -1,0 +1,90 @@
+"""The output of a mapper: the pose of the camera at each frame, made better by a second camera where there is one."""
+
+from dataclasses import replace
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from sensor_msgs.msg import CameraInfo, PointCloud2
+
+from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.mapping.late_poses import LatePoses
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.mapping.second_camera import SecondCamera
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros import clouds, convert, qos
+from thermal_fiducial.ros.camera_node import CameraStageNode
+
+
+class CameraPoses:
+    """Publishes ``camera_pose`` for ``node``, with the camera that its parameter ``second_camera`` names.
+
+    The second camera is located in the map of ``mapper`` and never changes it: what both cameras see enters the map
+    through the first.
+    """
+
+    def __init__(self, node: CameraStageNode[MarkerMapperConfig], mapper: MarkerMapper) -> None:
+        self._node, self._mapper = node, mapper
+        #: which map the poses are of
+        self.late = LatePoses()
+        self._output = node.advertise(PoseWithCovarianceStamped, 'camera_pose')
+        self._camera: Camera | None = None
+        self._second: SecondCamera | None = None
+        name = node.config.second_camera
+        self._locator = MarkerMapper(_of_second(node.config), mapper.map)
+        if name:
+            self.configure()
+            node.subscribe_newest(PointCloud2, f'{name}/markers', self._on_second, qos.RESULT)
+            node.subscribe(CameraInfo, f'{name}/thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
+
+    def configure(self) -> None:
+        """Take over where the cameras are on the robot."""
+        config = self._node.config
+        self._locator.configure(_of_second(config))
+        if config.second_camera:
+            first = transform_from_quaternion(config.camera_position, config.camera_orientation)
+            second = transform_from_quaternion(config.second_camera_position, config.second_camera_orientation)
+            self._second = SecondCamera(first, second)
+
+    def send(self, stamp_ns: int, pose: CameraPose | None) -> None:
+        """Publish the pose of a frame of the first camera, where there is one, in the map of its stamp."""
+        self.late.add(stamp_ns)
+        if pose is not None:
+            self._publish(pose if self._second is None else self._second.with_second(pose, self._node.odometry))
+
+    def _publish(self, pose: CameraPose) -> None:
+        head, pose = convert.header(pose.stamp_ns, self._node.config.map_frame), self.late.as_of_its_stamp(pose)
+        self._output.send(convert.pose_with_covariance(pose.T_map_camera, pose.covariance, head))
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        self._camera = convert.camera(message)
+
+    def _on_second(self, message: PointCloud2) -> None:
+        if self._camera is None:
+            raise InputError(f'no camera_info of {self._node.config.second_camera}')
+        self._locator.map = self._mapper.map
+        stamp = convert.stamp_ns(message.header.stamp)
+        result = self._locator.process(stamp, clouds.markers(message), self._camera, self._node.odometry)
+        if result.pose is not None and self._second is not None:
+            alone = self._second.add_second(result.pose)
+            if alone is not None:
+                self._publish(alone)
+
+    def figures(self) -> dict[str, object]:
+        """What became of the second camera's poses."""
+        second = self._second
+        if second is None:
+            return {}
+        words = {'joined': second.joined, 'alone': second.alone, 'contradicted': second.contradicted}
+        return {f'second camera: {word}': count for word, count in words.items()}
+
+
+def _of_second(config: MarkerMapperConfig) -> MarkerMapperConfig:
+    """Parameters of a mapper that locates the second camera, on a map that it leaves alone."""
+    return replace(
+        config,
+        mode='localization',
+        camera_position=config.second_camera_position,
+        camera_orientation=config.second_camera_orientation,
+    )
