@@ -5,6 +5,7 @@
 # make bench     accuracy and speed against OpenCV and a batch smoother, in the same run
 # make faults    faults of IMU, camera, markers and nodes in flights of eight seeds, as a table for the documents
 # make fuzz      10,000 mutated messages, files and bags for the nodes and commands; anything found is an error
+# make latency   latency, losses and CPU of the nodes in real time, on the machine as it is and beside two busy loops
 # make tables    put measured tables and parameters into the documents
 # make structure print how large and how deep the package is, beside what it aims at
 # make docs      build the documentation as a web site in build/site; a link that leads nowhere fails it
@@ -21,7 +22,7 @@ export OMP_NUM_THREADS := 1
 # A notice of the theme about its successor.
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help demo test lint nightly coverage bench faults fuzz tables structure docs format clean
+.PHONY: help demo test lint nightly coverage bench faults fuzz latency tables structure docs format clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -70,6 +71,10 @@ faults: $(READY)
 fuzz: $(READY)
 	@echo '== Mutated messages, files and bags'
 	PYTHONPATH=test $(BIN)/python -m fuzz $(FUZZ_ARGS)
+
+latency: $(READY)
+	@echo '== Latency: one process a node, in real time; the idle row needs an idle machine'
+	$(BIN)/python test/latency.py
 
 tables: $(READY)
 	THERMAL_FIDUCIAL_TABLES=1 $(BIN)/python -m pytest --quiet -m '' test/real

@@ -240,6 +240,14 @@ def _image_rate() -> Any:
     return param(0.0, text, unit='Hz', minimum=0.0, maximum=1000.0)
 
 
+def _realtime_priority() -> Any:
+    text = (
+        'Priority of the nodes under SCHED_FIFO, where the user may (rtprio in limits.conf), that of the filter one '
+        'more; 0: ordinary processes.'
+    )
+    return param(1, text, minimum=0, maximum=98)
+
+
 def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
     """Marker ID to side [m] from strings "ID:SIZE".
 
@@ -313,6 +321,7 @@ class Tau2CameraConfig(SelfChecked):
     frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
     prefix_frames: bool = _prefix_frames()
     image_rate: float = _image_rate()
+    realtime_priority: int = _realtime_priority()
 
 
 @dataclass(frozen=True)
@@ -431,6 +440,7 @@ class ArucoDetectorConfig(SelfChecked):
         live=True,
     )
     image_rate: float = _image_rate()
+    realtime_priority: int = _realtime_priority()
 
 
 @dataclass(frozen=True)
@@ -489,6 +499,7 @@ class MarkerMapperConfig(SelfChecked):
         2.0, 'Shortest time between two joint refinements; 0: never.', unit='s', minimum=0.0, maximum=3600.0, live=True
     )
     image_rate: float = _image_rate()
+    realtime_priority: int = _realtime_priority()
 
 
 @dataclass(frozen=True)
@@ -652,12 +663,7 @@ class PoseEkfConfig(SelfChecked):
         maximum=1000.0,
     )
     px4: bool = param(False, 'Publish fmu/in/vehicle_visual_odometry at bridge_rate too (needs px4_msgs).')
-    realtime_priority: int = param(
-        1,
-        'Priority of the node under SCHED_FIFO, where the user may (rtprio in limits.conf); 0: an ordinary process.',
-        minimum=0,
-        maximum=99,
-    )
+    realtime_priority: int = _realtime_priority()
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('pose_ekf', PoseEkfConfig, **kwargs)
-        self.realtime_priority = self.config.realtime_priority
+        self.realtime_priority += self.realtime_priority > 0  # a pose takes a millisecond, a frame tens of them
         self._memory = FilterMemory(self)
         self.filter = PoseEkf(self.config)
         self._status = FilterStatus(self.filter, self.console)

@@ -52,8 +52,6 @@ class StageNode(CountingNode, Generic[Config]):
     def __init__(self, name: str, kind: type[Config], *, live: bool = True, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         self.live = live
-        #: of its process under SCHED_FIFO; 0: ordinary
-        self.realtime_priority = 0
         try:
             self.config = params.declare(self, kind)
         except InputError:
@@ -69,6 +67,8 @@ class StageNode(CountingNode, Generic[Config]):
             self.frame_prefix = f'{self.get_namespace()}/'.lstrip('/')
             frames = {name: getattr(self.config, name, '') for name in _ROBOT_FRAMES}
             self.derive(**{name: self.frame_prefix + frame for name, frame in frames.items() if frame})
+        #: of its process under SCHED_FIFO; 0: ordinary
+        self.realtime_priority = int(getattr(self.config, 'realtime_priority', 0))
         #: what was configured and cannot be used, in words; the node does without it
         self.faults: list[str] = []
         self._refused = 0
