@@ -55,6 +55,8 @@ def test_the_page_needs_nothing_from_elsewhere(page):
     assert not re.search(r'(src|href)="(?!#|data:)', rest)
     assert 'http' not in rest
     assert '@import' not in rest
+    # The library would offer a button that uploads a plot.
+    assert re.search(r"modeBarButtonsToRemove: \[[^\]]*'sendChartToCloud'", rest)
     # The library is in it once.
     assert len(page) - len(rest) > 1_000_000
     assert len(rest) < 1_500_000
@@ -176,6 +178,7 @@ def test_a_browser_draws_every_chart(run_folder, tmp_path):
     drawn = re.search(r'<body[^>]*data-drawn="(\d+)"', dom)
     assert drawn, dom[-2000:]
     assert int(drawn[1]) == len(CHARTS)
+    assert 'Share chart' not in dom[dom.index('<body') : dom.index('<script>')]
     for name in set(CHARTS) - {'scene'}:
         place = dom.index(f'id="chart-{name}"')
         assert '<svg class="main-svg"' in dom[place : place + 3000], name

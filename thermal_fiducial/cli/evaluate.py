@@ -4,6 +4,7 @@ import argparse
 from collections.abc import Iterable
 import json
 from pathlib import Path
+from typing import Literal
 
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.errors import InputError
@@ -12,6 +13,10 @@ from thermal_fiducial.report.run_folder import Run
 from thermal_fiducial.report.tables import Table, tables
 
 COMPARISON = Path('comparison.html')
+#: First columns up to this width do not wrap.
+_WHOLE = 44
+#: Tables of eight columns need as much.
+_NARROWEST = 110
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -96,13 +101,16 @@ def print_tables(shown: Iterable[Table]) -> None:
     except ImportError as error:
         raise InputError(f'the tables need {error.name}: install the extra "tools", or use --json') from None
     console = Console()
+    # In a narrower window lines wrap, but no number is cut.
+    console.width = max(console.width, _NARROWEST)
     for entry in shown:
         table = rich.table.Table(title=entry.title, title_justify='left', box=box.SIMPLE_HEAD, title_style='bold')
         for index, head in enumerate(entry.heads):
+            # What a row is about stays whole; heads of numbers wrap.
+            whole = index == 0 and max((len(row[0]) for row in entry.rows), default=0) <= _WHOLE
             style = 'blue' if head.startswith('fused') else 'red' if head.startswith('markers alone') else ''
-            table.add_column(
-                Text(head), justify='left' if entry.is_text(index) else 'right', header_style=style, overflow='fold'
-            )
+            justify: Literal['left', 'right'] = 'left' if entry.is_text(index) else 'right'
+            table.add_column(Text(head), justify=justify, header_style=style, overflow='fold', no_wrap=whole)
         for row in entry.rows:
             table.add_row(*map(Text, row))
         console.print(table)

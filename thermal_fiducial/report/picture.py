@@ -112,7 +112,7 @@ def _draw_error(axis: Axes, evaluation: Evaluation) -> None:
     if axis.get_legend_handles_labels()[0]:
         axis.set_yscale('log')
         axis.set_ylim(bottom=0.1)
-        axis.legend(loc='lower right', markerscale=5)
+        axis.legend(loc='lower right', markerscale=5, frameon=True, framealpha=0.9, edgecolor='none')
 
 
 def _errors(evaluation: Evaluation) -> list[tuple[str, str, FloatArray, FloatArray]]:

@@ -58,10 +58,16 @@
     if (touch.matches && !layout.scene) layout.dragmode = false;
     if (narrow.matches) {
       layout.margin = { ...layout.margin, l: Math.min(layout.margin.l, 52), r: 6 };
+      // Above a plot are its buttons; what the lines mean stands below it.
       if (layout.scene) layout.height = 420;
+      else {
+        layout.legend = { ...layout.legend, yref: 'container', y: 0, yanchor: 'bottom' };
+        layout.margin.b = 134;
+        layout.height += 90;
+      }
     }
     const config = { responsive: true, displaylogo: false, displayModeBar: touch.matches ? true : 'hover',
-      modeBarButtonsToRemove: ['select2d', 'lasso2d', 'autoScale2d'], scrollZoom: Boolean(layout.scene) };
+      modeBarButtonsToRemove: ['select2d', 'lasso2d', 'autoScale2d', 'sendChartToCloud', 'sendDataToCloud'], scrollZoom: Boolean(layout.scene) };
     await Plotly.newPlot(plot, figure.data, layout, config);
     await Plotly.relayout(plot, scheme(plot.layout));
     drawn.push(plot);
