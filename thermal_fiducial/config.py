@@ -408,7 +408,7 @@ class ArucoDetectorConfig(SelfChecked):
     blind_interval: int = param(
         10,
         'A blind search follows every so many frames, and sooner without a map or where expected markers are not seen. '
-        'Where all are clear, small markers (at full resolution) and faint ones (at half) are sought in turn.',
+        'Where all are clear, small markers (at full resolution) and faint ones (at half) are looked for in turn.',
         minimum=1,
         maximum=1000,
         live=True,
@@ -613,14 +613,14 @@ class PoseEkfConfig(SelfChecked):
     )
     reset_after: float = param(
         1.0,
-        'Start afresh when refused poses have agreed with each other for so long; a metre off all of a sudden, only '
+        'Reset when refused poses have agreed with each other for so long; a metre off all of a sudden, only '
         'when they are as many as had borne out the estimate (at most 300), or that is lost.',
         unit='s',
         minimum=0.0,
         live=True,
     )
     max_delay: float = param(1.0, 'Poses that arrive later than this are refused.', unit='s', minimum=0.0, maximum=10.0)
-    max_imu_gap: float = param(1.0, 'Start afresh after an IMU gap or clock jump beyond this.', unit='s', minimum=0.01)
+    max_imu_gap: float = param(1.0, 'Reset after an IMU gap or clock jump beyond this.', unit='s', minimum=0.01)
     lost_position_std: float = param(
         0.3,
         'The pose counts as lost when its position is known no better than this.',
@@ -629,7 +629,7 @@ class PoseEkfConfig(SelfChecked):
         live=True,
     )
     reinitialise_after: float = param(
-        60.0, 'Start afresh after so long without an accepted pose.', unit='s', minimum=1.0, live=True
+        60.0, 'Reset after so long without an accepted pose.', unit='s', minimum=1.0, live=True
     )
     smoothing_time: float = param(
         0.0, 'Spread corrections of the smooth output over this time; 0: no smooth output.', unit='s', minimum=0.0

@@ -82,10 +82,10 @@ def twin(now: World, _: float) -> World:
 
 def foreign(now: World, _: float) -> World:
     """Two markers that the map does not know."""
-    strangers = [
+    unmapped = [
         replace(m, id=m.id + 30, position=(m.position[0], m.position[1], m.position[2] - 0.4)) for m in now.markers[:2]
     ]
-    return replace(now, markers=[*now.markers, *strangers])
+    return replace(now, markers=[*now.markers, *unmapped])
 
 
 def replaced(now: World, _: float) -> World:

@@ -356,7 +356,7 @@ def test_a_map_out_of_plumb_costs_nothing():
     states, _ = run(ekf, timeline(data.samples(), poses, 0.03))
     upright = [replace(state, T_map_body=np.linalg.inv(tilt) @ state.T_map_body) for state in states]
     assert rms(errors(data, upright, SETTLED)[0]) < 1.2 * position_rms(config())
-    # one degree, known to the prior's size times what yaw tells apart from the bias
+    # one degree, known to the prior's size times what yaw distinguishes from the bias
     assert np.degrees(ekf.diagnostics()['map tilt']) == pytest.approx(1.0, abs=0.3)
 
 
@@ -423,7 +423,7 @@ def test_extrinsics_are_refined_on_request():
     # Twenty seconds: part of what a wrong lever arm does may be systematic errors of the poses, too.
     data = flight(SEEDS[1], seconds=20.0)
     wrong = np.add(config().camera_position, (0.01, -0.01, 0.01))
-    # What turns tell of the lever arm they tell of an unknown scale of the gyroscope too: this one is calibrated.
+    # What turns show of the lever arm they show of an unknown scale of the gyroscope too: this one is calibrated.
     imu = ImuNoise(gyroscope_scale_std=0.0)
     _, _, ekf, _ = flown(data, config(camera_position=tuple(wrong), estimate_extrinsics=True, imu=imu))
     before = np.linalg.norm(wrong - config().camera_position)

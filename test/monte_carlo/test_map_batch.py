@@ -47,7 +47,7 @@ def test_the_refined_map_is_as_good_as_a_batch_adjustment(seeds):
     flights = zip(*(one_flight(seed) for seed in seeds), strict=True)
     online, refined, batch = (np.sqrt(np.mean(np.square(e), axis=(0, 1))) for e in flights)
     # The numbers to reach: 1 mm and 0.05 deg online, 1.2 of the batch adjustment after refinement. Least squares of the
-    # same corners must agree closer: only corners beyond the robust bound, one in a thousand, tell them apart.
+    # same corners must agree closer: only corners beyond the robust bound, one in a thousand, separate them.
     assert online[0] < 1e-3
     assert online[1] < np.deg2rad(0.05)
     assert np.all(refined <= 1.05 * batch)

@@ -120,7 +120,7 @@ def test_the_filter_as_a_flight_controller_sees_it(flying, capfd):
     assert 'Listening to /mavros/odometry/out and /mavros/imu/data' in said
     findings = {finding['check']: finding for finding in json.loads(printed[printed.index('[') :])}
     levels = {name: finding['level'] for name, finding in findings.items()}
-    # a machine that tests keep busy may deliver late, and is told so; all else is the same on any
+    # a machine that tests keep busy may deliver late, which the report says; all else is the same on any
     assert 'not tested' not in {levels.pop(name) for name in ('rate', 'age', 'jumps')}
     assert levels == dict.fromkeys(
         ('values', 'stamps', 'frame names', 'gravity', 'yaw', 'velocity', 'covariance'), 'ok'

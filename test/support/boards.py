@@ -17,14 +17,14 @@ STILL = SplineTrajectory(np.arange(20.0), np.zeros((20, 3)), Rotation.from_quat(
 
 
 def chessboard_levels(columns, rows):
-    """Squares of a board with ``columns`` x ``rows`` inner corners and a rim of a square."""
+    """Squares of a board with ``columns`` x ``rows`` inner corners and a border of a square."""
     row, column = np.mgrid[0 : rows + 3, 0 : columns + 3]
     inside = (row > 0) & (row < rows + 2) & (column > 0) & (column < columns + 2)
     return ((row + column) % 2 == 0) & inside
 
 
 def circle_levels(columns, rows, spacing, diameter, cell):
-    """Round holes on a grid of cells of side ``cell`` [m], rim one spacing; and width and height."""
+    """Round holes on a grid of cells of side ``cell`` [m], border one spacing; and width and height."""
     height, width = (rows + 1) * spacing, (2 * columns + 1) * spacing
     v, u = (np.mgrid[0 : round(height / cell), 0 : round(width / cell)] + 0.5) * cell - spacing
     row = np.clip(np.rint(v / spacing), 0, rows - 1)

@@ -25,7 +25,7 @@ class Heat:
     reversed_to : contrast falls to minus this share of itself: a reflection
     lamp : a spot of heat on the board
     hot : something hot beside the board
-    hand : whether a finger covers a corner of the rim
+    hand : whether a finger covers a corner of the border
     diffusion : blur in the board by conduction [steps]
     gap : how far the warm squares draw back [steps]
     defocus : [px]

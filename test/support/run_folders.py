@@ -148,7 +148,7 @@ def write_frames(bag, types, looked_at, frames, pose):
 
 
 def made_up_innovations():
-    """What the filter tells each second."""
+    """What the filter publishes each second."""
     rng = np.random.default_rng(1)
     for second in range(1_000_000):
         stamps = (START_NS + second * 1_000_000_000 + np.arange(30) * 33_333_333).tolist()

@@ -183,7 +183,7 @@ def test_the_command_wants_something_to_check(tmp_path, capsys):
 
 
 def test_a_recorded_run_is_checked(tmp_path, flying, capsys):
-    """Written as messages of a bag, read back by the command; exit status 1 tells of a fault."""
+    """Written as messages of a bag, read back by the command; exit status 1 means a fault."""
     types = get_typestore(Stores.ROS2_JAZZY).types
     stamp_type, header_type = types['builtin_interfaces/msg/Time'], types['std_msgs/msg/Header']
     vector, point, quaternion = (types[f'geometry_msgs/msg/{name}'] for name in ('Vector3', 'Point', 'Quaternion'))

@@ -198,6 +198,6 @@ def test_place_needs_the_rows_at_the_rim():
     assert np.array_equal(placed, was) or np.array_equal(placed, (7, 5) - was)
     # Without a column it could as well lie a column further.
     assert isinstance(board.place(nodes[column > 0]), GridRefusal)
-    # A half-hidden column tells.
+    # A half-hidden column is enough.
     assert not isinstance(board.place(nodes[(column > 0) | (row < 4)]), GridRefusal)
     assert isinstance(board.place(nodes[:20]), GridRefusal)

@@ -78,11 +78,11 @@ def test_centroids_of_circles_are_not_their_centres():
     lens = LENSES['13mm']
     rng = np.random.default_rng(2)
     angle = np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
-    rim = 0.012 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    border = 0.012 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
     views = []
     for _ in range(14):
         T = random_view(lens, POINTS, rng)
-        outlines = lens.project(se3.apply(T, (POINTS[:, None] + rim).reshape(-1, 3))).reshape(48, 400, 2)
+        outlines = lens.project(se3.apply(T, (POINTS[:, None] + border).reshape(-1, 3))).reshape(48, 400, 2)
         a, b = outlines - outlines.mean(1, keepdims=True), np.roll(outlines, -1, 1) - outlines.mean(1, keepdims=True)
         cross = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
         middle = np.sum((a + b) * cross[..., None], axis=1) / (3.0 * cross.sum(1)[:, None])

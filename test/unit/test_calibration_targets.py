@@ -65,7 +65,7 @@ def test_circles(name):
         T = random_view(lens, CIRCLES.points, rng)
         plate = plate_pose(T, np.array([0.5 * width - 0.03, 0.5 * height - 0.03]))
         sighting = CIRCLES.find(render(lens, plate, levels, width, height, 8.0, seed), GUESS)
-        # Without those that the rim of the image cuts.
+        # Without those that the border of the image cuts.
         assert len(sighting.points) >= 38
         # Centroids differ from projected centres by perspective, at these sizes by less than half a pixel.
         truth = lens.project(se3.apply(T, sighting.points))

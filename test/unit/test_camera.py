@@ -40,7 +40,7 @@ def test_projection_is_opencv_s(name):
 @every_model
 def test_a_ray_projects_onto_its_pixel(name):
     points, uv = view_points(CAMERAS[name])
-    # Newton's iteration stops at rounding: 1e-14 of a focal length, a little more at the rim.
+    # Newton's iteration stops at rounding: 1e-14 of a focal length, a little more at the border.
     assert np.allclose(CAMERAS[name].project(points), uv, atol=1e-9)
     assert np.allclose(np.linalg.norm(CAMERAS[name].rays(uv), axis=1), 1.0)
 
@@ -104,7 +104,7 @@ def test_points_move_in_both_coordinates(name):
     px = np.array([[100.0, 80.0], [180.0, 90.0], [170.0, 160.0], [95.0, 150.0]])
     there = ImagePoints.at(px, camera).moved(np.full((4, 2), 2.0), camera)
     np.testing.assert_allclose(camera.distort(there.x), there.px, atol=1e-9)
-    # Over three pixels a lens bends by a hundredth; twice that allows for its rim.
+    # Over three pixels a lens bends by a hundredth; twice that allows for its border.
     np.testing.assert_allclose(there.px, px + 2.0, atol=0.02)
 
 

@@ -104,7 +104,7 @@ def test_bad_pixels_are_read_back(tmp_path):
 
 def test_comments_commas_and_empty_lists(tmp_path):
     path = tmp_path / 'bad.txt'
-    path.write_text('# dead\n\n 12, 7  # near the rim\n')
+    path.write_text('# dead\n\n 12, 7  # near the border\n')
     assert load_bad_pixels(path).tolist() == [[12, 7]]
     path.write_text('')
     assert load_bad_pixels(path).shape == (0, 2)

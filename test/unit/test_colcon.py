@@ -80,7 +80,7 @@ def test_what_is_installed(workspace):
 
 
 @pytest.mark.parametrize('node', NODES)
-def test_an_executable_runs_until_it_is_told_to_stop(workspace, node):
+def test_an_executable_runs_until_it_is_asked_to_stop(workspace, node):
     process = subprocess.Popen(
         executable(workspace, node),
         env={**os.environ, 'ROS_LOG_DIR': str(workspace / 'log')},

@@ -12,7 +12,7 @@ from thermal_fiducial.cli.progress import LINE_EVERY_S, progress_bar
 
 
 class Clock:
-    """A time that passes when it is told to."""
+    """A time that passes when it is asked to."""
 
     def __init__(self):
         self.now = 100.0

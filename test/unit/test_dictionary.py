@@ -88,8 +88,8 @@ def test_unknown_name(name):
     ],
 )
 def test_a_map_of_another_dictionary_is_told(of, read_as, words):
-    told = other_patterns([60, 3] if '250' in of else [3], of, read_as)
-    assert words in told if words else told == ''
+    reported = other_patterns([60, 3] if '250' in of else [3], of, read_as)
+    assert words in reported if words else reported == ''
 
 
 def test_a_map_names_a_dictionary_or_a_file_beside_it_and_opens_no_other(tmp_path):

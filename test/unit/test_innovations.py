@@ -16,14 +16,14 @@ def test_what_is_written_is_read():
         PoseUpdate(STAMP + 2, False, 'refused: 1000.0 sigma', 1e6),
         PoseUpdate(STAMP + 3, True, 'reset', 3e-7),
     ]
-    told = innovations_of(innovations_text(updates))
-    np.testing.assert_array_equal(told.stamps_ns, [STAMP, STAMP + 2, STAMP + 3])
+    innovations = innovations_of(innovations_text(updates))
+    np.testing.assert_array_equal(innovations.stamps_ns, [STAMP, STAMP + 2, STAMP + 3])
     # four digits
-    np.testing.assert_allclose(told.nis, [5.4321, 1e6, 3e-7], rtol=1e-3)
-    np.testing.assert_array_equal(told.accepted, [True, False, True])
+    np.testing.assert_allclose(innovations.nis, [5.4321, 1e6, 3e-7], rtol=1e-3)
+    np.testing.assert_array_equal(innovations.accepted, [True, False, True])
 
 
 def test_without_poses_there_are_none():
     assert innovations_text([]) == ''
-    told = innovations_of('')
-    assert (len(told.stamps_ns), len(told.nis), len(told.accepted)) == (0, 0, 0)
+    innovations = innovations_of('')
+    assert (len(innovations.stamps_ns), len(innovations.nis), len(innovations.accepted)) == (0, 0, 0)

@@ -68,8 +68,8 @@ def test_edits_make_versions_that_can_be_undone(path, poses, capsys):
     np.testing.assert_allclose(edited.markers[3].T_map_marker[:3, :3], poses[3][:3, :3], atol=1e-8)
     assert edited.markers[40].id == 40
     assert run('history', path) == 0
-    told = capsys.readouterr().out
-    assert [line.split('before: ')[1] for line in told.splitlines() if 'before' in line] == [
+    printed = capsys.readouterr().out
+    assert [line.split('before: ')[1] for line in printed.splitlines() if 'before' in line] == [
         'fix 1 2', 'move 3', 'rename 4 to 40', 'delete 5 6',
     ]  # fmt: skip
     for _ in range(4):
@@ -250,9 +250,9 @@ def test_align_finds_the_map_in_a_cloud(tmp_path, capsys):
     write_ply(tmp_path / 'room.ply', room_cloud(rng))
     arguments = ('--cloud', tmp_path / 'room.ply', '--out', tmp_path / 'T.yaml', '--plot', tmp_path / 'both.png')
     assert run('align', tmp_path / 'map.yaml', *arguments) == 0
-    told = capsys.readouterr().out
-    assert 'open' not in told.replace(str(tmp_path), '')  # parallel tests have it in their folder's name
-    position = np.array([float(v) for v in told.split('position ')[1].split(' orientation')[0].split()])
+    printed = capsys.readouterr().out
+    assert 'open' not in printed.replace(str(tmp_path), '')  # parallel tests have it in their folder's name
+    position = np.array([float(v) for v in printed.split('position ')[1].split(' orientation')[0].split()])
     # A plane of 70 points of 5 mm noise is known to 0.6 mm; over the 0.7 m between the two markers of the first wall
     # that is 1 mrad, or 4 mm at the origin 4 m away.
     np.testing.assert_allclose(position, T_cloud_map[:3, 3], atol=1.2e-2)
@@ -271,9 +271,9 @@ def test_align_along_a_lone_wall_says_what_stays_open(tmp_path, poses, capsys):
     save_map(tmp_path / 'map.yaml', MarkerMap({i: MapMarker(i, 0.3, True, T) for i, T in flat.items()}))
     write_ply(tmp_path / 'wall.ply', points)
     assert run('align', tmp_path / 'map.yaml', '--cloud', tmp_path / 'wall.ply') == 0
-    told = capsys.readouterr().out
-    assert '3 of 6 directions open' in told
-    position = np.array([float(v) for v in told.split('position ')[1].split(' orientation')[0].split()])
+    printed = capsys.readouterr().out
+    assert '3 of 6 directions open' in printed
+    position = np.array([float(v) for v in printed.split('position ')[1].split(' orientation')[0].split()])
     # It moved by the 5 cm towards the wall and not along it.
     np.testing.assert_allclose(position, [-0.05, 0.0, 0.0], atol=5e-3)
 

@@ -22,7 +22,7 @@ MOVE = np.array([0.08, -0.05, 0.03, 0.01, 0.02, -0.015])
 
 
 def odometry(k, ahead=0.0, sigma=(5e-3, 2e-3)):
-    """The truth at frame ``k`` as the filter would tell it, of a clock that is ``ahead`` seconds ahead."""
+    """The truth at frame ``k`` as the filter would publish it, of a clock that is ``ahead`` seconds ahead."""
     at, dt = k / 30, 1e-3
     T = flight(at)
     step = difference(flight(at + dt), flight(at - dt)) / (2 * dt)
@@ -74,9 +74,9 @@ def moved_wall():
 def test_who_stood_on_the_old_map_goes_with_it(moved_wall):
     frames, old, new, T = moved_wall
     for belief in (KNOWN, None):
-        told = correction(frames, [CAMERA], old, new, belief) @ frames[-1].T_map_rig
+        corrected = correction(frames, [CAMERA], old, new, belief) @ frames[-1].T_map_rig
         # The corners' noise, which the two maps share but for second order, and a second of motion.
-        np.testing.assert_allclose(told, T @ frames[-1].T_map_rig, atol=0.02)
+        np.testing.assert_allclose(corrected, T @ frames[-1].T_map_rig, atol=0.02)
 
 
 def test_who_never_stood_on_the_old_map_stays(moved_wall):

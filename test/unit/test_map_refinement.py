@@ -301,8 +301,8 @@ def test_odometry_holds_keyframes_that_a_marker_leaves_loose():
     assert np.sqrt(np.mean(off['held'] ** 2)) < 0.5 * np.sqrt(np.mean(off['loose'] ** 2))
     # What is far off counts less: of a filter that is lost by half a metre less than a tenth gets into the map.
     lost = [replace(frame, T_odometry=retract(frame.T_odometry, np.full(6, 0.5))) for frame in known]
-    astray = errors(refine(replace(loose, keyframes=tuple(lost))), poses)[:, :3]
-    assert np.sqrt(np.mean(astray**2)) < 0.1 * 0.5
+    off = errors(refine(replace(loose, keyframes=tuple(lost))), poses)[:, :3]
+    assert np.sqrt(np.mean(off**2)) < 0.1 * 0.5
 
 
 def test_errors_that_last_are_in_the_covariances():

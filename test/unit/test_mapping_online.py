@@ -76,7 +76,7 @@ def test_pose_and_map_jump_together():
         [difference(y.pose.T_map_camera, jump.T_new_old @ x.pose.T_map_camera)[:3] for x, y in pairs], axis=0
     )
     assert np.linalg.norm(moved) > 1e-3
-    # What is told weighs the frames and their markers by what they are known to, without the mapper's running errors.
+    # What is published weighs frames and markers by what they are known to, without the mapper's running errors.
     assert np.linalg.norm(left) < 0.5 * np.linalg.norm(moved)
     assert after[0].map_resets == before[-1].map_resets + 1
 
@@ -136,9 +136,9 @@ def test_another_map_is_taken_over_and_the_jump_told():
     # A refinement that was under way knows nothing of the new map.
     assert m.apply(late) is None
     after = m.process(stamp(k) + 2, rows, CAMERA)
-    told = T_new_old @ before.pose.T_map_camera
+    published = T_new_old @ before.pose.T_map_camera
     # The same corners; the weights have forgotten the running errors.
-    assert np.linalg.norm(difference(after.pose.T_map_camera, told)[:3]) < 1e-4
+    assert np.linalg.norm(difference(after.pose.T_map_camera, published)[:3]) < 1e-4
     elsewhere = MarkerMap({90: MapMarker(90, SIZE, True, np.eye(4))})
     assert m.load(elsewhere) is None
     assert sorted(m.map.markers) == [90]

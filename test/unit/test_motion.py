@@ -124,13 +124,13 @@ def test_twist_is_that_of_the_time_that_smears():
 def test_states_of_the_filter_tell_the_twist_whatever_the_stamps_of_frames_do():
     """Jitter of 2 ms is a twentieth of a frame's period: differences alone would be wrong by as much of the turn."""
     stamps = [round(k * 1e9 / 30) for k in range(12)]
-    told, alone = (
+    with_prior, alone = (
         np.array([twist.ago(LAG)[3:] - truth for twist, truth in list(turning(stamps, states, 2_000_000))[3:]])
         for states in (True, False)
     )
     # The mean of nine samples of a gyroscope with 0.01 rad/s of noise, and as much again for what the corners add.
-    assert np.sqrt(np.mean(told**2)) < 0.007
-    assert np.sqrt(np.mean(told**2)) < 0.2 * np.sqrt(np.mean(alone**2))
+    assert np.sqrt(np.mean(with_prior**2)) < 0.007
+    assert np.sqrt(np.mean(with_prior**2)) < 0.2 * np.sqrt(np.mean(alone**2))
 
 
 def test_states_without_any_error_are_no_division_by_zero():

@@ -22,7 +22,7 @@ def events(flight, delay_ns=40_000_000):
 
 
 def run(flight, T_new_old, jump_ns):
-    """Outputs of a filter that is told of the jump, with poses in the new map from then on."""
+    """Outputs of a filter that receives the jump, with poses in the new map from then on."""
     ekf, outputs, jumped = PoseEkf(config()), [], False
     for kind, item in events(flight):
         if not jumped and kind == 0 and item.stamp_ns >= jump_ns:

@@ -391,10 +391,10 @@ def test_one_pose_and_one_odometry_for_each_imu_message(graph):
     np.testing.assert_allclose(convert.transform_of(message.pose.pose), np.eye(4), atol=0.01)
     level, reason, figures = graph.diagnose(node)
     assert (level, reason, figures['lost']) == (OK, 'tracking', 'False')
-    # Of ten poses three start the filter; each is told once.
-    told = innovations_of(figures['innovations'])
-    assert list(told.stamps_ns) == [START + k * 5_000_000 for k in range(19, 60, 6)]
-    assert told.accepted.all()
+    # Of ten poses three start the filter; each is published once.
+    innovations = innovations_of(figures['innovations'])
+    assert list(innovations.stamps_ns) == [START + k * 5_000_000 for k in range(19, 60, 6)]
+    assert innovations.accepted.all()
     assert graph.diagnose(node)[2]['innovations'] == ''
 
 

@@ -11,7 +11,7 @@ from thermal_fiducial.ros import promptness
 
 @pytest.fixture
 def scheduler(monkeypatch):
-    """Policies of the threads as the kernel was told, instead of the kernel."""
+    """Policies of the threads as the kernel received them, instead of the kernel."""
     policies = {}
     monkeypatch.setattr(os, 'sched_getscheduler', lambda pid: policies.get(threading.get_native_id(), os.SCHED_OTHER))
     monkeypatch.setattr(os, 'sched_setscheduler', lambda thread, policy, _: policies.__setitem__(thread, policy))

@@ -51,7 +51,7 @@ def test_one_version():
     package = ElementTree.parse(ROOT / 'package.xml').getroot()
     assert package.findtext('version') == thermal_fiducial.__version__
     assert f'## {thermal_fiducial.__version__}' in (ROOT / 'doc' / 'CHANGELOG.md').read_text()
-    told = subprocess.run(
+    printed = subprocess.run(
         [sys.executable, 'setup.py', '--version'], cwd=ROOT, capture_output=True, text=True, check=True
     )
-    assert told.stdout.split()[-1] == thermal_fiducial.__version__
+    assert printed.stdout.split()[-1] == thermal_fiducial.__version__

@@ -69,7 +69,7 @@ def test_the_summary_keeps_what_it_had_and_gains_the_measures(run_folder):
 
 
 def test_the_camera_s_clock_is_no_error_of_the_fiducial_poses(small_run):
-    """Stamps 25 ms early, and the filter was told so: the same errors as with right stamps."""
+    """Stamps 25 ms early, and the filter was given that: the same errors as with right stamps."""
     right = evaluate_run(small_run)[1]['fiducial']['error']['position_rms_mm']
     lines = [line.split(' ', 1) for line in (small_run / 'fiducial.tum').read_text().splitlines()]
     early = [f'{Decimal(stamp) - Decimal("0.025")} {rest}\n' for stamp, rest in lines]

@@ -146,8 +146,8 @@ def test_arguments_that_ros_cannot_read_are_an_input_error(arguments):
     assert arguments[1] in str(caught.value)
 
 
-@pytest.mark.parametrize('told', ['os.kill(os.getpid(), signal.SIGINT)', 'rclpy.shutdown()'])
-def test_a_node_told_to_stop_while_it_is_made_stops_without_a_word(told):
+@pytest.mark.parametrize('ending', ['os.kill(os.getpid(), signal.SIGINT)', 'rclpy.shutdown()'])
+def test_a_node_told_to_stop_while_it_is_made_stops_without_a_word(ending):
     program = f"""
 import os, signal, sys
 import rclpy
@@ -156,7 +156,7 @@ from thermal_fiducial.ros.run import run
 
 class Stopped(MarkerMapperNode):
     def declare_parameter(self, *args, **kwargs):
-        {told}
+        {ending}
         return super().declare_parameter(*args, **kwargs)
 
 sys.exit(run(Stopped))

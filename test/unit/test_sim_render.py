@@ -146,7 +146,7 @@ def test_corners_are_clockwise_from_the_top_left_and_the_code_reads():
     corners, ids, _ = cv2.aruco.ArucoDetector(TINY.aruco_dictionary).detectMarkers(gray)
     assert sorted(ids.ravel().tolist()) == [5, 7]
     for found, marker_id in zip(corners, ids.ravel().tolist(), strict=True):
-        # Unrefined corners in an enlarged picture: a pixel is enough to tell the order.
+        # Unrefined corners in an enlarged picture: a pixel is enough to show the order.
         np.testing.assert_allclose((found[0] - 1.5) / 4, frame.corners_px[marker_id], atol=1.0)
 
 

@@ -80,9 +80,9 @@ def test_what_speaks_against_a_plate(options, said, tmp_path, capsys):
     assert f'marker 5: {said}' in output.err
     assert 'narrowest web' in output.out
     assert main(['markers', 'check', '--ids', '5', *arguments]) == 0
-    told = capsys.readouterr().out
-    assert f'1 of 1 markers: {said}' in told
-    assert '0 of 1 markers can be cut' in told
+    printed = capsys.readouterr().out
+    assert f'1 of 1 markers: {said}' in printed
+    assert '0 of 1 markers can be cut' in printed
 
 
 def test_the_plate_of_the_defaults_is_fine(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""Long work beside the callbacks: done elsewhere, told once, survived when it fails."""
+"""Long work beside the callbacks: done elsewhere, reported once, survived when it fails."""
 
 import os
 import time

@@ -97,7 +97,7 @@ class Disc:
     others: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     bent = False
     width_free = False
-    #: the whole disc: a part of it does not tell its middle
+    #: the whole disc: a part of it does not show its middle
     least_seen = 0.9
 
     def at(self, node: FloatArray, board: FloatArray) -> 'Disc':

@@ -36,7 +36,7 @@ _INLIER = 4.1
 _BIAS_PRIOR = np.array([0.1] * 3 + [1.0] * 3)
 # Scale errors (places of the diagonals) and misalignments [rad], by the data sheets of small IMUs.
 _AXES_PRIOR = np.where(np.isin(np.arange(AXES), (0, 4, 8, 9, 11, 14)), 0.01, 0.005)
-# Standard deviation of the read-out time about zero: while it is sought, and while it is held there [s].
+# Standard deviation of the read-out time about zero: while it is estimated, and while it is held there [s].
 _READOUT_PRIOR, _READOUT_HELD = 0.05, 1e-12
 
 

@@ -83,7 +83,7 @@ def calibrate_camera_imu(
     ----------
     poses : of the camera in the map, stamped by the camera's clock, in order
     imu : samples; times are seconds of the IMU's clock since ``start_ns``
-    noise : of the IMU at rest; where it shakes, the samples tell how much more there is
+    noise : of the IMU at rest; where it shakes, the samples show how much more there is
     gravity : its magnitude [m/s^2]
 
     Raises
@@ -222,7 +222,7 @@ class _Recording:
         rows: Sequence[RowMoments] | None = None,
         readout: float = 0.0,
     ) -> tuple[Problem, Solution]:
-        """The adjustment of all poses, ``rows`` about ``readout``, and its solution, sought from ``state`` on.
+        """The adjustment of all poses, ``rows`` about ``readout``, and its solution, iterated from ``state`` on.
 
         Raises
         ------

@@ -1,7 +1,7 @@
 """Points of a board to a few hundredths of a pixel, on raw counts.
 
 What the board looks like around a point (:mod:`appearance`) is fitted to the counts in a window, on ground that may
-slope. The grid tells how the board is seen there, so perspective and lens bend the pattern as they bend the image.
+slope. The grid shows how the board is seen there, so perspective and lens bend the pattern as they bend the image.
 Three rounds: each point alone; with the blur and the width that the board has in common; and with the contrast that the
 neighbours lead one to expect. So neither a lamp's spot of heat nor contrast that fades over the board, or reverses in
 a reflection, moves a point, and what covers a point is noticed.
@@ -24,9 +24,9 @@ _MOST_STEPS, _CONVERGED_PX, _DIFFERENCE, _HOPELESS = 20, 1e-3, 1e-4, 1e3
 # A point is lost when its standard deviation is larger than this [px], when the fit goes further from the start, in
 # steps of the grid, or when its contrast is not, within these shares, what the neighbours promise.
 _MOST_SIGMA_PX, _MOST_MOVE, _CONTRAST = 0.5, 0.25, (0.6, 1.6)
-# Where contrast reverses, at this share of the neighbours' or less, nothing tells where the point is.
+# Where contrast reverses, at this share of the neighbours' or less, nothing shows where the point is.
 _LEAST_CONTRAST = 0.25
-# Nodes whose contrast tells of that of another, in steps, how many of them, and how firmly the slope is held down.
+# Nodes whose contrast shows that of another, in steps, how many of them, and how firmly the slope is held down.
 _NEAR, _LEAST_NEIGHBOURS, _SLOPE_RIDGE = 2, 4, 0.1
 _LEAST_POINTS, _LEAST_PIXELS = 6, 12
 # What the linear part of a fit determines: ground (level and slope) and contrast.
@@ -90,7 +90,7 @@ def _round(
     shared: list[_Shared | None],
     contrast: FloatArray | None,
 ) -> list[_Fitted | None]:
-    """Fit all points once; with ``contrast``, points without one are lost ones and tell nothing of the grid."""
+    """Fit all points once; with ``contrast``, points without one are lost ones and say nothing of the grid."""
     known = np.ones(len(nodes), dtype=np.bool_) if contrast is None else np.isfinite(contrast)
     ridge = ROUGHLY if shared[0] is None else CLOSELY
     fits = []
@@ -151,7 +151,7 @@ class _Window:
 def _window(
     image: Float32Array, start: FloatArray, surface: Surface, appearance: Appearance, shared: _Shared | None
 ) -> _Window | None:
-    """Pixels within the reach of a pattern, with weights that fall towards the rim."""
+    """Pixels within the reach of a pattern, with weights that fall towards the border."""
     spacing = float(np.linalg.norm(surface.steps, axis=0).min())
     if spacing < _LEAST_SPACING:
         return None

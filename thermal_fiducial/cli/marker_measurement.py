@@ -82,7 +82,7 @@ def render_view(side_px: float, contrast: float, tilt_deg: float, rng: np.random
 
 
 def _places(lens: Lens, side_px: float, rng: np.random.Generator) -> Iterator[FloatArray]:
-    """Pixels (2,) far enough apart for markers with their warm rim in any direction."""
+    """Pixels (2,) far enough apart for markers with their warm border in any direction."""
     pitch = 1.95 * side_px + 6.0
     columns_, rows = max(1, int(lens.width / pitch)), max(1, int(lens.height / pitch))
     cells = rng.permutation(columns_ * rows)[:_MOST_MARKERS]
@@ -105,7 +105,7 @@ def _place(lens: Lens, pixel: FloatArray, side_px: float, tilt: float, rng: np.r
 
 
 def _plate(T: FloatArray, bits: np.ndarray, contrast: float) -> Plate:
-    """A stencil with a warm rim of one cell."""
+    """A stencil with a warm border of one cell."""
     levels = np.pad(np.pad(bits > 0, 1), 1, constant_values=True)
     side = _SIZE * len(levels) / (len(levels) - 2)
     return Plate(T, side, side, levels, np.ones_like(levels), contrast, 0.0)

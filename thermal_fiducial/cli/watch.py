@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Listen and show until told to stop."""
+    """Listen and show until asked to stop."""
     if not 0.0 < args.wait < 3600.0:
         raise InputError(f'--wait {args.wait:g}: between 0 and 3600')
     try:

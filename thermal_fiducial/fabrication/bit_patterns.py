@@ -73,11 +73,11 @@ def _has_point_contact(words: Words, n: int) -> BoolArray:
 def _in_one_piece(words: Words, n: int) -> BoolArray:
     full = (1 << n * n) - 1
     left, right = _columns(n, range(1)), _columns(n, range(n - 1, n))
-    rim = np.uint64(left | right | (full >> n * (n - 1)) | (full & ~(full >> n)))
+    border = np.uint64(left | right | (full >> n * (n - 1)) | (full & ~(full >> n)))
     not_left, not_right = np.uint64(full & ~left), np.uint64(full & ~right)
     row = np.uint64(n)
     acrylic = ~words & np.uint64(full)
-    reached = acrylic & rim
+    reached = acrylic & border
     while True:
         sideways = ((reached & not_right) << _ONE) | ((reached & not_left) >> _ONE)
         grown = (reached | sideways | (reached << row) | (reached >> row)) & acrylic

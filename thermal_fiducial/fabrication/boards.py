@@ -33,10 +33,10 @@ def circle_board(columns: int, rows: int, spacing: float, diameter: float, optio
     """
     if columns < 2 or rows < 2 or not 0.0 < diameter < spacing * np.sqrt(2.0) - 1.0:
         raise InputError('a circle grid needs 2 x 2 circles or more, and a millimetre of acrylic between them')
-    rim = 2.0 * spacing
+    margin = 2.0 * spacing
     centres = asymmetric_circles(columns, rows, spacing)
-    width, height = centres.max(axis=0) + 2.0 * rim
-    circles = [Circle(rim + x, height - rim - y, 0.5 * (diameter - options.kerf)) for x, y in centres.tolist()]
+    width, height = centres.max(axis=0) + 2.0 * margin
+    circles = [Circle(margin + x, height - margin - y, 0.5 * (diameter - options.kerf)) for x, y in centres.tolist()]
     label = f'circles {columns}x{rows} {spacing:g} mm'
     return Drawing(
         name=label.replace(' ', '-'),
@@ -68,9 +68,9 @@ def base_plate(centres: FloatArray, labels: Sequence[str], cells: int, options: 
     cells : of a marker along a side, its border included
     """
     points, size = mounting_points(options, cells)
-    rim = 0.5 * size + options.quiet_cells * options.size / cells
-    low = centres.min(axis=0) - rim
-    width, height = (centres.max(axis=0) + rim - low).tolist()
+    margin = 0.5 * size + options.quiet_cells * options.size / cells
+    low = centres.min(axis=0) - margin
+    width, height = (centres.max(axis=0) + margin - low).tolist()
     holes, engraving = [], []
     for (x, y), label in zip(centres - low, labels, strict=True):
         holes += [Circle(x + dx, y + dy, 0.5 * (options.hole_diameter - options.kerf)) for dx, dy in points.tolist()]

@@ -137,7 +137,7 @@ def search(
     n : bits along a side, 3 to 8
     distance : least Hamming distance
     seed, restarts : the same numbers give the same markers
-    signed : any marker is as far from the negatives of all, so that the bits tell warm from cold
+    signed : any marker is as far from the negatives of all, so that the bits distinguish warm from cold
     progress : called with the number of restarts done and the most markers found so far
 
     Returns

@@ -69,7 +69,7 @@ def trace(rectangles: Sequence[Rectangle]) -> list[FloatArray]:
 
 
 def _boundary_edges(acrylic: BoolArray) -> dict[tuple[int, int], tuple[int, int]]:
-    """Successor of each vertex (column, row of grid lines) along the boundary; ``acrylic`` has an empty rim."""
+    """Successor of each vertex (column, row of grid lines) along the boundary; ``acrylic`` has an empty border."""
     inside = acrylic[1:-1, 1:-1]
     edges = []
     for neighbour, start, end in (

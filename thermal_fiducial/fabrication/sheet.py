@@ -54,7 +54,7 @@ def nest(drawings: Sequence[Drawing], width: float, height: float, *, spacing: f
     Parameters
     ----------
     spacing : between drawings [mm]
-    margin : along the rim of the sheet [mm]
+    margin : along the border of the sheet [mm]
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """The text of a marker map: one schema, one reader, one writer, without geometry.
 
 ``version`` is the schema: files of another one are refused. ``revision`` counts the changes of a map. Until 0.2 there
-was no ``revision`` and ``version`` counted: such a file is refused too, as it can't be told from one of a schema to
-come, and ``map upgrade`` rewrites it.
+was no ``revision`` and ``version`` counted: such a file is refused too, as it may be one of a schema to come, and
+``map upgrade`` rewrites it.
 """
 
 from collections.abc import Callable, Iterable

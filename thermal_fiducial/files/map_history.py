@@ -55,7 +55,7 @@ def autosave_file(path: Path) -> Path:
 
 
 def digest(path: Path) -> str:
-    """What tells the present content of ``path`` from any other; empty when there is none."""
+    """What distinguishes the present content of ``path`` from any other; empty when there is none."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ''
     except OSError:

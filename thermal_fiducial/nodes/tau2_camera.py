@@ -73,7 +73,7 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
         """Why the last frame was withheld, and what is wrong with those that are not."""
         if self._reason:
             return WARN, self._reason
-        return OK, 'ok, but of 8 bits: raw counts tell corners ten times as well' if self._displayed else 'ok'
+        return OK, 'ok, but of 8 bits: raw counts show corners ten times as well' if self._displayed else 'ok'
 
     def headline(self) -> str:
         """That the camera gives nothing new, though frames come: one shutter event is over within a second."""

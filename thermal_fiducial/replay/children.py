@@ -12,7 +12,7 @@ from typing import Self
 
 from thermal_fiducial.errors import InputError, RunError
 
-#: A node that has been told to end, and has not worked for so long since, hangs [s].
+#: A node that has been asked to end, and has not worked for so long since, hangs [s].
 _IDLE_S = 15.0
 _GLANCE_S = 0.05
 _TICK = os.sysconf('SC_CLK_TCK')

@@ -217,12 +217,12 @@ def _velocity(record: BridgeRecord) -> list[Finding]:
     usable = (dt > 1e-4) & (dt < PX4_START)
     moved = np.diff(record.positions, axis=0) / np.where(usable, dt, 1.0)[:, None]
     in_body = (moved[:, None, :] @ record.rotations[:-1])[:, 0]
-    told = 0.5 * (record.velocities[:-1] + record.velocities[1:])
+    claimed = 0.5 * (record.velocities[:-1] + record.velocities[1:])
     usable &= np.linalg.norm(moved, axis=1) > MOVE
     if usable.sum() < 10:
         return [Finding('velocity', Level.UNTESTED, 'no motion', 'Carry the drone about while it listens.')]
     speed = float(np.median(np.linalg.norm(moved[usable], axis=1)))
-    wrong, swapped = (float(np.median(np.linalg.norm(told - v, axis=1)[usable])) for v in (in_body, moved))
+    wrong, swapped = (float(np.median(np.linalg.norm(claimed - v, axis=1)[usable])) for v in (in_body, moved))
     seen = f'differs from the moving position by {wrong:.2f} m/s at {speed:.2f} m/s'
     if wrong < max(0.25 * speed, 0.1):
         return [Finding('velocity', Level.OK, seen, 'In the robot frame, as mavros and PX4 want it.')]
@@ -255,8 +255,8 @@ def _covariance(record: BridgeRecord) -> list[Finding]:
 def _jumps(record: BridgeRecord) -> list[Finding]:
     """Steps of the position that the speed doesn't explain."""
     dt = np.diff(record.stamps_ns) * 1e-9
-    told = 0.5 * (record.velocities[:-1] + record.velocities[1:])
-    expected = (record.rotations[:-1] @ told[..., None])[..., 0] * dt[:, None]
+    claimed = 0.5 * (record.velocities[:-1] + record.velocities[1:])
+    expected = (record.rotations[:-1] @ claimed[..., None])[..., 0] * dt[:, None]
     jumps = np.linalg.norm(np.diff(record.positions, axis=0) - expected, axis=1)
     worst = float(jumps.max())
     seen = f'largest {worst * 1e3:.0f} mm'

@@ -101,7 +101,7 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
 
 
 def _camera_time_offset_ns(path: Path) -> int:
-    """t_imu - t_camera that the filter was told."""
+    """t_imu - t_camera that the filter was given."""
     if not path.is_file():
         return 0
     nodes = load_plain(path)

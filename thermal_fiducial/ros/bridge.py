@@ -30,7 +30,7 @@ class FlightControllerBridge:
     ----------
     node : whose outputs they are
     config : frames, rate
-    fault : told in words what was asked for and cannot be had
+    fault : says in words what was asked for and cannot be had
     """
 
     def __init__(self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None]) -> None:
@@ -60,7 +60,7 @@ class FlightControllerBridge:
         stamp = odometry.stamp_ns
         if not self._period_ns or self._due_ns - self._period_ns < stamp < self._due_ns:
             return
-        # In step with the IMU, however its period divides ours; afresh after a gap or a clock that was set back.
+        # In step with the IMU, however its period divides ours; reset after a gap or a clock that was set back.
         on_time = abs(stamp - self._due_ns) < self._period_ns
         self._due_ns = (self._due_ns if on_time else stamp) + self._period_ns
         message = convert.odometry_frames(self._config.map_frame, self._config.base_frame)

@@ -19,7 +19,7 @@ PACKAGE = 'thermal_fiducial'
 #: A node that crashed is started again after this [s].
 _RESPAWN_DELAY = 1.0
 _LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
-#: Exit status of a node that was told to stop, or that refuses its parameters: neither is tried again.
+#: Exit status of a node that was asked to stop, or that refuses its parameters: neither is tried again.
 _STOPPED, _REFUSED = 0, 2
 
 _ARGUMENTS = {
@@ -105,8 +105,8 @@ def _node(name: str, settings: dict[str, Any]) -> Node:
             return []
         if event.returncode == _REFUSED:
             return [LogInfo(msg=f'{name}: unusable parameters or arguments (see above); it is not started again')]
-        told = LogInfo(msg=f'{name}: ended with status {event.returncode}; it is started again')
-        return [told, TimerAction(period=_RESPAWN_DELAY, actions=[_node(name, settings)])]
+        message = LogInfo(msg=f'{name}: ended with status {event.returncode}; it is started again')
+        return [message, TimerAction(period=_RESPAWN_DELAY, actions=[_node(name, settings)])]
 
     return Node(executable=name, name=name, on_exit=after, **settings)
 

@@ -74,7 +74,7 @@ def _declare(node: Node, name: str, item: 'Field[Any]', default: Any) -> None:
     if default != ():
         node.declare_parameter(name, list(default) if isinstance(default, tuple) else default, _descriptor(item))
         return
-    # ROS cannot tell the type of an empty list, and leaves a parameter unset that is declared by its type alone;
+    # ROS cannot infer the type of an empty list, and leaves a parameter unset that is declared by its type alone;
     # asked for all parameters, it then gives none. It can be set only until it is read-only.
     kind = _ARRAYS[get_args(item.type)[0]]
     writable, final = _descriptor(item), _descriptor(item)

@@ -68,7 +68,7 @@ def initialise(
 
 
 def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = None) -> int:
-    """Run a node until it is told to stop.
+    """Run a node until it is asked to stop.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
         except ExternalShutdownException:
             pass
         except Exception:
-            # Told to stop while the node is being made, rcl refuses the rest of it: not an error of the node.
+            # Asked to stop while the node is being made, rcl refuses the rest of it: not an error of the node.
             if ok() and not stop.asked:
                 raise
     return 0

@@ -15,7 +15,7 @@ from thermal_fiducial.errors import InputError
 
 COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 
-# Newton with a numerical Jacobian: four steps leave 1e-11 px at the rim of the worst lens, two more are spare.
+# Newton with a numerical Jacobian: four steps leave 1e-11 px at the border of the worst lens, two more are spare.
 _STEPS = 6
 _DIFFERENCE = 1e-6
 

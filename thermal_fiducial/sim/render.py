@@ -4,7 +4,7 @@ A pixel wholly inside one cell of a plate at all times of a sub-frame needs one 
 points of a rank-1 lattice over its area and the sub-frame: each point is back-projected through the lens with the
 camera pose of its own time and looked up in the plate. Its time is drawn from the exponential by which the bolometer
 forgets within the sub-frame, so that the sum over sub-frames y <- e y + (1 - e) x is the lag's true response,
-y(t) = integral of x(t - a) exp(-a / tau) / tau da, and a moving edge is smeared without steps.
+y(t) = integral of x(t - a) exp(-a / tau) / tau da, and a moving edge is blurred without steps.
 
 In a rolling read-out t is another one for each row, and so are the times of its points: a plate's homographies, exact
 at the borders of strips of rows that take a millisecond, are linear in the row between them.

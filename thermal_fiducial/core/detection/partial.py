@@ -353,6 +353,6 @@ def _independent(J: FloatArray, information: FloatArray) -> FloatArray:
     """
     covariance = np.linalg.inv(information)
     blocks = J @ covariance @ np.swapaxes(J, 1, 2)
-    told = np.sum(np.swapaxes(J, 1, 2) @ np.linalg.inv(blocks) @ J, axis=0)
+    information = np.sum(np.swapaxes(J, 1, 2) @ np.linalg.inv(blocks) @ J, axis=0)
     L = np.linalg.cholesky(covariance)
-    return np.asarray(np.linalg.eigvalsh(L.T @ told @ L)[-1] * blocks)
+    return np.asarray(np.linalg.eigvalsh(L.T @ information @ L)[-1] * blocks)

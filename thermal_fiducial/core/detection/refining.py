@@ -29,7 +29,7 @@ from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, unknown_twist
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-#: Smear by lag below which the shape of an edge doesn't change [px].
+#: Blur by lag below which the shape of an edge doesn't change [px].
 BLUR_THAT_MATTERS_PX = 0.4
 #: Pixels round a marker that the refinement may look at.
 WINDOW_MARGIN_PX = 14

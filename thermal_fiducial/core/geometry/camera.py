@@ -19,11 +19,11 @@ from thermal_fiducial.errors import InputError
 #: Number of coefficients that each model takes (shorter lists are filled up with zeros).
 MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 
-# Newton's iteration doubles the digits: after a step this small nothing is left, and ten are enough at any lens's rim.
+# Newton's iteration doubles the digits: after a step this small nothing is left; ten do at any lens's border.
 _NEWTON_STEPS = 10
 _NEWTON_STEP = 1e-6
 _EYE = np.eye(2)
-# Widest angle from the axis that x/z can tell [rad].
+# Widest angle from the axis that x/z can express [rad].
 _WIDEST = 1.5
 
 
@@ -114,7 +114,7 @@ class Camera:
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
         """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`.
 
-        Newton's method on the distortion, which at the rim of a fisheye converges where OpenCV's fixed-point
+        Newton's method on the distortion, which at the border of a fisheye converges where OpenCV's fixed-point
         iteration does not; in the angle alone where the model is purely radial.
         """
         uv = np.asarray(uv, dtype=np.float64)
@@ -130,7 +130,7 @@ class Camera:
         return np.asarray(ray / np.linalg.norm(ray, axis=-1, keepdims=True))
 
     def contains(self, uv: npt.ArrayLike, margin_px: float = 0.0) -> BoolArray:
-        """Whether pixels (..., 2) lie in the image, ``margin_px`` away from its rim; False for NaN."""
+        """Whether pixels (..., 2) lie in the image, ``margin_px`` away from its border; False for NaN."""
         uv = np.asarray(uv, dtype=np.float64)
         last = self._last_pixel - margin_px
         return np.asarray(((uv >= margin_px) & (uv <= last)).all(axis=-1))
@@ -233,7 +233,7 @@ class ImagePoints:
         return ImagePoints(px, x, J, inverse_2x2(J))
 
     def moved(self, shift_px: FloatArray, camera: Camera) -> 'ImagePoints':
-        """Those some pixels (..., 2) away: undistorting them anew would cost more than it tells."""
+        """Those some pixels (..., 2) away: undistorting them anew would cost more than it is worth."""
         x = self.x + (self.inverse @ shift_px[..., None])[..., 0]
         return ImagePoints(camera.distort(x), x, self.J, self.inverse)
 

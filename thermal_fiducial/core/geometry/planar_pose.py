@@ -108,7 +108,7 @@ def planar_poses(corners: ImagePoints, corner_covs: FloatArray, sizes: FloatArra
     images = Images.of(corners, whitening(corner_covs)).repeated(2)
     points = np.repeat(sizes[:, None, None] * marker_corners(1.0), 2, axis=0)
     starts = ippe_square(corners.x, sizes).reshape(-1, 4, 4)
-    T, cost, information = fit(starts, points, images, rivals=2)
+    T, cost, information = fit(starts, points, images, alternatives=2)
     residuals = images.residuals(T, points)[..., None]
     facing = np.sum(T[:, :3, 2] * T[:, :3, 3], axis=-1) < 0.0
     chi2 = np.sum((images.whitening @ residuals) ** 2, axis=(-3, -2, -1))
@@ -204,7 +204,7 @@ def solve_camera_pose(
     middle = se3.transform(np.eye(3), squares.mean(axis=(0, 1)))
     points = (squares - middle[:3, 3]).reshape(1, -1, 3)
     starts = _starts(images, squares, points, middle, initial, compete)
-    T_camera_middle, chi2, information = fit(starts, points, images, _INLIER, rivals=len(starts))
+    T_camera_middle, chi2, information = fit(starts, points, images, _INLIER, alternatives=len(starts))
     best = int(np.argmin(chi2))
     if initial is not None and chi2[0] <= _AMBIGUOUS_RATIO * max(chi2[best], 8.0 * len(corners) - 6.0):
         best = 0

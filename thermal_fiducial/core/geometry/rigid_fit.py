@@ -16,7 +16,7 @@ from thermal_fiducial.core.types import BoolArray, FloatArray
 _MAX_STEPS = 20
 # Costs are chi-squares: a step that lowers one by less is a hundredth of a standard deviation, and the last. Of a pose
 # that the image refutes anyway a share of the cost is enough, lest it creep along its valley; of one that is worse than
-# a rival, a share of what it is worse by. One that costs so many times more even after a step is given up.
+# an alternative, a share of what it is worse by. One that costs so many times more even after a step is given up.
 _LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-4, 50.0, 1e-2, 10.0
 # Damping at which Levenberg-Marquardt finds no better pose at all.
 _HOPELESS = 1e6
@@ -69,14 +69,16 @@ class Images:
         return np.asarray(self.normalised - p[..., :2] / np.where(p[..., 2:] > _NEAR, p[..., 2:], np.nan))
 
 
-def fit(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf, rivals: int = 1) -> _Evaluation:
+def fit(
+    T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf, alternatives: int = 1
+) -> _Evaluation:
     """Poses of bodies in the camera with the least squared errors, from starts ``T`` (B, 4, 4).
 
     Parameters
     ----------
     points : (B or 1, K, 3) [m] in their bodies
     inlier : Mahalanobis distance up to which errors are squared; beyond, their influence falls to nothing
-    rivals : so many starts in a row are of the same body, and matter only where they may be the best
+    alternatives : so many starts in a row are of the same body, and matter only where they may be the best
 
     Returns
     -------
@@ -96,7 +98,7 @@ def fit(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.in
     for steps in range(_MAX_STEPS):
         step = _solve(information, damping, gradient)
         gain = np.sum(step * gradient, axis=-1)
-        best = np.repeat(cost.reshape(-1, rivals).min(axis=1), rivals)
+        best = np.repeat(cost.reshape(-1, alternatives).min(axis=1), alternatives)
         last = gain < np.maximum(_LAST_GAIN, _LAST_SHARE * (cost - np.minimum(best, _REFUTED)))
         given_up = (damping > _HOPELESS) | ((cost > _REFUTED + _TIMES_THE_BEST * best) & (steps > 0))
         trial = _moved(T, -step)

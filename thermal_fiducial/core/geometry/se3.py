@@ -239,7 +239,7 @@ def seen_between(c: FloatArray, weights: Real) -> Real:
 def perspective(c: FloatArray) -> FloatArray:
     """Third homogeneous coordinates (Q, 4) that make views (Q, 4, 2) of the corners of squares: alike from in front.
 
-    The diagonals of a square halve each other. What they do in its view, the triangles of all corners but one tell.
+    The diagonals of a square halve each other. What they do in its view, the triangles of all corners but one show.
     """
     to_next = c.take(_NEXT, axis=1) - c
     a, b = to_next.take(_NEXT, axis=1), to_next.take(_OPPOSITE, axis=1)

@@ -96,7 +96,7 @@ def _stands_out(counts: Counts, surroundings: Counts, margin_counts: float) -> I
     width = counts.shape[1]
     candidates = np.flatnonzero(cv2.absdiff(counts, surroundings) > margin_counts)
     rows, columns = np.divmod(candidates, width)
-    # Mirrored at the rim, so that no pixel is its own neighbour.
+    # Mirrored at the border, so that no pixel is its own neighbour.
     padded = cv2.copyMakeBorder(counts, 1, 1, 1, 1, cv2.BORDER_REFLECT_101)
     beside = padded.reshape(-1)[((rows + 1) * (width + 2) + columns + 1)[:, None] + _ring(width + 2)]
     beside = np.sort(beside.astype(np.int64), axis=1)
@@ -171,7 +171,7 @@ def _sound_pairs(rows: IntArray, columns: IntArray, bad: BoolArray) -> tuple[Int
         ends.append(r * width + c)
     penalty = np.where(usable, 0, unsound)
     penalty[:, _NEAR_PAIRS:] += _FAR_PENALTY_COUNTS
-    # At the rim and inside clusters no pair may be whole: the nearest sound pixel stands in for both ends.
+    # At the border and inside clusters no pair may be whole: the nearest sound pixel stands in for both ends.
     lone = ~usable.any(axis=1)
     if lone.any():
         ends[0][lone, 0] = ends[1][lone, 0] = _nearest_sound(bad, rows[lone], columns[lone])

@@ -109,7 +109,7 @@ class ShutterDetector:
     # The longest that a shutter stays closed; after it a flat picture is taken for a flat scene.
     LONGEST_NS = 1_500_000_000
     SMOOTHING = 0.2
-    # Fewer pixels have too few patches (8x8 px) to tell structure from noise.
+    # Fewer pixels have too few patches (8x8 px) to distinguish structure from noise.
     LEAST_PIXELS = 50 * 64
 
     def __init__(self) -> None:

@@ -19,7 +19,7 @@ from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.keyframes import Displacement
 from thermal_fiducial.core.types import FloatArray, IntArray
 
-#: Views closer in direction than this tell nothing new of the ambiguity [rad].
+#: Views closer in direction than this say nothing new of the ambiguity [rad].
 MIN_SEPARATION = np.deg2rad(1.0)
 MIN_VIEWS = 3
 #: Views kept of a candidate: the fit's cost stays bounded, however long the trial lasts.

@@ -54,7 +54,7 @@ FROM_FILE = 'in quarantine since before the map was loaded'
 CONTRADICTED = 'the known markers in view contradict the odometry'
 #: Candidates that are judged in one frame: bounds its time when many are new.
 TRIALS = 3
-# Last frames that tell how the map has moved where the robot is, each so many-th of them: neighbours tell the same.
+# Last frames that show how the map has moved where the robot is, each so many-th of them: neighbours show the same.
 _RECENT, _EVERY = 10, 3
 # A candidate is judged again when its views have grown by one in so many.
 _PATIENCE = 6

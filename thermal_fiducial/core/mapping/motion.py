@@ -11,7 +11,7 @@ from thermal_fiducial.core.error_model import delay_of_pose, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.types import FloatArray
 
-# Poses farther apart than this tell nothing of the velocity [s].
+# Poses farther apart than this say nothing of the velocity [s].
 _STALE_S = 0.15
 
 

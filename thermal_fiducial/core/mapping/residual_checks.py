@@ -1,4 +1,4 @@
-"""What the residuals of a joint adjustment tell beyond their size: errors that last, and markers that hang twice.
+"""What the residuals of a joint adjustment show beyond their size: errors that last, and duplicated markers.
 
 Both work on whitened residuals (n, 8) of n views, ordered by time.
 """
@@ -10,13 +10,13 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 #: Longest correlation that is looked for [views of one marker].
 _LONGEST = 100
 # Outlying views of a marker, in number and as a share, of which something can be said; and the share of their squared
-# error that one other pose must explain. Of ten views of noise six parameters explain 0.08; a smear that lasts for some
-# frames, 0.5.
+# error that one other pose must explain. Of ten views of noise six parameters explain 0.08; motion blur that lasts for
+# some frames, 0.5.
 _FEWEST, _LEAST, _EXPLAINED = 10, 0.1, 0.8
 
 
 def correlation_time(residuals: FloatArray, marker: IntArray) -> float:
-    """Views that tell as much as one, 1 for white noise.
+    """Views that say as much as one, 1 for white noise.
 
     Corner errors of a slow flight repeat themselves from frame to frame (of lag, optics, fixed pattern): N such views
     average as N / (1 + 2 sum rho_k) independent ones do, with rho_k the correlation at lag k (C. Geyer, "Practical
@@ -56,7 +56,7 @@ def two_places(residuals: FloatArray, J: FloatArray, outlying: BoolArray) -> boo
     count = np.count_nonzero(outlying)
     if count < _FEWEST or count < _LEAST * len(residuals):
         return False
-    # Each view counts alike, however far off it is: the linear step is then good enough to tell.
+    # Each view counts alike, however far off it is: the linear step is then good enough to decide.
     norms = np.linalg.norm(residuals[outlying], axis=-1)
     r = (residuals[outlying] / norms[:, None]).ravel()
     A = (J[outlying] / norms[:, None, None]).reshape(-1, 6)

@@ -87,7 +87,7 @@ def inconsistent(disagrees: np.ndarray, trusted: np.ndarray, markers: list[MapMa
     """Which of the disagreeing markers are to blame, (N,) bool.
 
     Among three or more the majority decides, which a robust pose already follows. Of two that disagree a fixed one
-    is believed, then the one seen more often by far; else nobody can tell and neither is blamed.
+    is believed, then the one seen more often by far; else it is open and neither is blamed.
     """
     if np.count_nonzero(trusted) != 2 or not np.any(disagrees & trusted):
         return disagrees
