@@ -1,6 +1,6 @@
 """Mutated files for everything that reads one, and for commands."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import redirect_stderr, redirect_stdout
 import io
 from pathlib import Path
@@ -143,7 +143,7 @@ def command(words: list[str]) -> None:
         raise RuntimeError(f'exit status {status}, {lines[-3:]}')
 
 
-def run(numbers: range, begin: Callable[[str, int], None]) -> list[Finding]:
+def run(numbers: Iterable[int], begin: Callable[[str, int], None]) -> list[Finding]:
     """Findings of inputs ``numbers``; ``begin`` is called before each."""
     findings: list[Finding] = []
     with tempfile.TemporaryDirectory() as name:

@@ -24,6 +24,7 @@ from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_mar
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.files.reading import one_line
 
 FORMAT = 'thermal_fiducial/marker_measurements'
 #: What the package ships.
@@ -136,7 +137,7 @@ def load_measurements(path: str | os.PathLike[str] = PACKAGED) -> Measurements:
     try:
         tables = [np.array(document[name], dtype=np.float64) for name in _TABLES]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f'{path}: {error} is missing or no table') from None
+        raise InputError(f'{path}: {one_line(error)} is missing or no table') from None
     measurements = Measurements(*tables)
     shape = len(measurements.side_px), len(measurements.contrast), len(measurements.tilt_deg)
     sized = (measurements.found, measurements.sigma_px, measurements.distance_error)

@@ -20,6 +20,7 @@ from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestor
 from rosbags.typesys.store import Typestore
 
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.schema import load_yaml
 
 IMAGE_TOPIC = 'thermal/image_raw'
 COMPRESSED_TOPIC = 'thermal/image_raw/compressed'
@@ -151,6 +152,9 @@ class BagReader:
             raise InputError(f'{self.path}: no such bag')
         if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
             raise InputError(f'{self.path}: no bag, the folder has no metadata.yaml')
+        if self.path.is_dir():
+            # What hurts a parser is refused before the library reads it.
+            load_yaml(self.path / 'metadata.yaml')
         with self._readable():
             reader = Rosbag1Reader(self.path) if self.path.suffix == '.bag' else Rosbag2Reader(self.path)
             reader.open()

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.reading import read_text
+from thermal_fiducial.files.reading import one_line, read_text
 from thermal_fiducial.files.schema import parse_yaml
 
 
@@ -25,6 +25,19 @@ def load_plain(path: str | Path, head: str = '') -> Any:
     text = read_text(path).removeprefix(head)
     parse_yaml(str(path), text)
     try:
-        return yaml.load(text, Loader=getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
-    except (yaml.YAMLError, ValueError, OverflowError) as error:
-        raise InputError(f'{path}: not valid YAML: {" ".join(str(error).split())[:200]}') from None
+        document = yaml.load(text, Loader=getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
+    except (yaml.YAMLError, ValueError, OverflowError, TypeError) as error:
+        raise InputError(f'{path}: not valid YAML: {one_line(error)}') from None
+    _check_integers(str(path), document)
+    return document
+
+
+def _check_integers(path: str, value: Any) -> None:
+    """Raise for a whole number that no field can hold: none of the libraries behind says so in a line."""
+    if isinstance(value, dict):
+        value = [*value.keys(), *value.values()]
+    if isinstance(value, list):
+        for item in value:
+            _check_integers(path, item)
+    elif isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise InputError(f'{path}: a whole number of {value.bit_length()} bits')

@@ -55,3 +55,9 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT_BYTES) -> str:
 def cannot_write(path: str | Path, what: str, error: OSError) -> InputError:
     """The one line for a file that cannot be written."""
     return InputError(f'{path}: cannot write {what}: {error.strerror or error}')
+
+
+def one_line(error: Exception, longest: int = 200) -> str:
+    """What an error of a library says, printable and short enough for one line."""
+    text = ' '.join(str(error).split())
+    return ''.join(letter if letter.isprintable() else '?' for letter in text)[:longest]

@@ -191,10 +191,10 @@ def _table(path: Path, columns: int) -> tuple[IntArray, FloatArray]:
 
 
 def _stamp(where: str, word: str) -> int:
-    try:
-        return int(word)
-    except ValueError:
-        raise InputError(f'{where}: {word!r} is no stamp in nanoseconds') from None
+    # As many digits as 64 bits have.
+    if not (word.isascii() and word.isdigit() and len(word) <= 18):
+        raise InputError(f'{where}: {word[:40]!r} is no stamp in nanoseconds')
+    return int(word)
 
 
 def _numbers(where: str, words: list[str]) -> list[float]:

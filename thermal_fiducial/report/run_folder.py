@@ -24,6 +24,8 @@ DETECTIONS, LATENCY, PARAMETERS = 'detections.csv', 'latency.csv', 'parameters.y
 MARKER_MAP, TRUE_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'map_true.yaml', 'summary.json', 'output'
 #: Bytes of a table: half a day of frames with eight markers each.
 LARGEST_TABLE = 1 << 30
+# As many digits of a whole number as 64 bits have; what is longer is one no more.
+_LONGEST_CELL = 18
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ def _rows(path: Path, kinds: dict[str, type]) -> list[list[Any]]:
     lines = csv.DictReader(io.StringIO(read_text(path, limit=LARGEST_TABLE)))
     try:
         for row in lines:
-            rows.append([kind(row[name]) for name, kind in kinds.items()])
+            rows.append([kind(row[name][:_LONGEST_CELL]) for name, kind in kinds.items()])
     except (KeyError, TypeError, ValueError, csv.Error):
         raise InputError(f'{path}, line {lines.line_num}: no {", ".join(kinds)}') from None
     return [list(column) for column in zip(*rows, strict=True)] or [[] for _ in kinds]
