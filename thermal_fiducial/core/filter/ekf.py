@@ -8,6 +8,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.camera_clock import CameraClock
 from thermal_fiducial.core.filter.coasting import usable_seconds
 from thermal_fiducial.core.filter.history import History, Instant, Node
 from thermal_fiducial.core.filter.hypotheses import Hypotheses, NO_GRAVITY
@@ -63,6 +64,7 @@ class PoseEkf:
         self._noise = ImuNoiseMonitor(config.imu)
         offset_ns = round(config.camera_time_offset * _SECOND_NS)
         self._history = History(config.max_delay + WINDOW_SECONDS, offset_ns)
+        self._camera_clock = CameraClock()
         self._verdicts: dict[int, PoseUpdate] = {}
         self._accepted = self._refused = 0
         self._imu_fault = ''
@@ -106,13 +108,47 @@ class PoseEkf:
 
         ``pose.stamp_ns`` is the camera's stamp; ``camera_time_offset`` and the estimated rest are applied here.
         """
+        pose = self._in_present_clock(pose)
         reason = self._unusable(pose)
         if reason:
             return PoseUpdate(pose.stamp_ns, False, reason, np.nan)
-        for index in range(self._history.insert(pose), len(self._history.nodes)):
-            self._advance(index)
+        self._advance_from(self._history.insert(pose))
         waiting = PoseUpdate(pose.stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
         return self._verdicts.get(pose.stamp_ns, waiting)
+
+    def _advance_from(self, first: int) -> None:
+        for index in range(first, len(self._history.nodes)):
+            self._advance(index)
+
+    def _in_present_clock(self, pose: CameraPose) -> CameraPose:
+        """``pose`` without the steps of the camera's clock, of which it may show another one."""
+        history, pose = self._history, self._camera_clock.stamped(pose)
+        if not history.nodes:
+            return pose
+        step_ns = self._camera_clock.proposed(pose, history.nodes[-1].stamp_ns)
+        restamped = replace(pose, stamp_ns=pose.stamp_ns - step_ns)
+        if not step_ns or not self._contradicts(pose) or not self._fits(restamped):
+            return pose
+        self._advance_from(history.discard(self._camera_clock.follow(step_ns)))
+        return restamped
+
+    def _contradicts(self, pose: CameraPose) -> bool:
+        """Whether poses like the one that comes are of no use by their stamps: refused, or out of time."""
+        main = self._belief.main
+        ahead = self._history.due_ns(pose, main) > self._history.nodes[-1].stamp_ns
+        return main is not None and (main.accepted_in_row == 0 or ahead or bool(self._unusable(pose)))
+
+    def _fits(self, pose: CameraPose) -> bool:
+        """Whether a pose is right up to an unknown clock."""
+        nodes, main = self._history.nodes, self._belief.main
+        index = min(max(self._history.index_at(self._history.due_ns(pose, main)), 1), len(nodes) - 1)
+        instant = self._history.instant(index, min(self._history.due_ns(pose, main), nodes[-1].stamp_ns))
+        before = nodes[index - 1].belief.main
+        if before is None:
+            return False
+        begin = self._history.instant(index, nodes[index - 1].stamp_ns)
+        there = self._moved(before, begin, instant, nodes[index])
+        return self._hypotheses.explains(there, pose, self._motion(instant, there))
 
     def move_map(self, T_new_old: FloatArray) -> None:
         """Follow a correction of the map: estimates and buffered poses move with it, T_new = T_new_old @ T_old."""
@@ -282,7 +318,11 @@ class PoseEkf:
         main = self._belief.main
         if main is None or self._time_offset_std(main) > _KNOWN_OFFSET_STD:
             return None
-        return self._config.camera_time_offset + main.prediction.state.time_offset
+        return self._clock_offset(main)
+
+    def _clock_offset(self, main: Hypothesis) -> float:
+        steps = self._camera_clock.ahead_ns / _SECOND_NS
+        return self._config.camera_time_offset + main.prediction.state.time_offset - steps
 
     def _time_offset_std(self, main: Hypothesis) -> float:
         """Of the estimate; before it is begun, and where there is none, what the parameter says [s]."""
@@ -371,7 +411,7 @@ class PoseEkf:
             'resets': float(self.resets),
             'position std': main.position_std,
             'usable for': self.usable_for,
-            'time offset': self._config.camera_time_offset + state.time_offset,
+            'time offset': self._clock_offset(main),
             'time offset std': self._time_offset_std(main),
             'white pose error': math.sqrt(noise.white),
             'systematic pose error': math.sqrt(noise.systematic),

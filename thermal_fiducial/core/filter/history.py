@@ -6,7 +6,7 @@ inertial step a sample.
 """
 
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,10 +61,20 @@ class History:
     def insert(self, pose: CameraPose) -> int:
         """Add a pose; the first node whose belief it may change."""
         insort(self.poses, pose, key=_stamp)
+        return self._first_reached(pose)
+
+    def _first_reached(self, pose: CameraPose) -> int:
         index = len(self.nodes)
         while index > 1 and self._reaches(pose, index - 1):
             index -= 1
         return index
+
+    def discard(self, stamps_ns: Iterable[int]) -> int:
+        """Forget poses by their stamps; the first node whose belief that may change."""
+        stamps = set(stamps_ns)
+        wrong = [pose for pose in self.poses if pose.stamp_ns in stamps]
+        self.poses = [pose for pose in self.poses if pose.stamp_ns not in stamps]
+        return min((self._first_reached(pose) for pose in wrong), default=len(self.nodes))
 
     def _reaches(self, pose: CameraPose, index: int) -> bool:
         belief = self.nodes[index - 1].belief

@@ -91,6 +91,14 @@ class Hypotheses:
             pose.stamp_ns, False, f'refused: {math.sqrt(innovation.nis):.1f} sigma', innovation.nis
         )
 
+    def explains(self, hypothesis: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> bool:
+        """Whether a pose at a hypothesis's instant is right by it, but for a clock offset that is not known."""
+        estimate = self.estimate(hypothesis)
+        if estimate.clock_open:
+            estimate = self._updater.with_unknown_clock(estimate)
+        measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
+        return self._updater.innovation(estimate, measured, motion).nis <= self._config.gate
+
     def _is_stale(self, hypothesis: Hypothesis) -> bool:
         """Whether it has gone without poses for too long to be corrected."""
         coasted_ns = hypothesis.prediction.stamp_ns - hypothesis.accepted_ns

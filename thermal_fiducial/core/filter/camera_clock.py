@@ -1,0 +1,54 @@
+"""Steps of the camera's clock that are too large for the estimated offset: all at once poses arrive later or earlier.
+
+How late a pose arrives by its stamp says nothing about a clock by itself, as a pipeline may stall. So a step is only
+proposed here, when several poses agree on it; it is one if poses that contradict the estimate fit it then.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import replace
+from statistics import median
+
+from thermal_fiducial.core.measurements import CameraPose
+
+#: Smaller steps are found by the clock offset that is estimated [ns].
+_SMALLEST_NS = 100_000_000
+#: Poses in a row that must agree on a step, to this [ns], and those that say what was usual before.
+_POSES, _AGREEMENT_NS, _USUAL = 5, 50_000_000, 30
+
+
+class CameraClock:
+    """Follows how late poses arrive in the clock of the IMU, and takes steps out of their stamps."""
+
+    def __init__(self) -> None:
+        #: by how much the stamps are ahead of what they were when the filter began [ns]
+        self.ahead_ns = 0
+        self._usual: deque[int] = deque(maxlen=_USUAL)
+        self._latest: deque[tuple[int, int]] = deque(maxlen=_POSES)
+
+    def stamped(self, pose: CameraPose) -> CameraPose:
+        """``pose`` with the stamp that it had without the steps."""
+        return replace(pose, stamp_ns=pose.stamp_ns - self.ahead_ns) if self.ahead_ns else pose
+
+    def proposed(self, pose: CameraPose, newest_ns: int) -> int:
+        """By how much stamps have jumped ahead [ns] for all that arrival tells, 0: not at all.
+
+        ``newest_ns``: stamp of the newest IMU sample when ``pose`` arrives.
+        """
+        late_ns = newest_ns - pose.stamp_ns
+        if len(self._usual) < _USUAL or abs(late_ns - median(self._usual)) < _SMALLEST_NS:
+            self._usual.append(late_ns)
+            self._latest.clear()
+            return 0
+        self._latest.append((pose.stamp_ns, late_ns))
+        delays = [delay for _, delay in self._latest]
+        if len(delays) < _POSES or max(delays) - min(delays) > _AGREEMENT_NS:
+            return 0
+        return round(median(self._usual) - median(delays))
+
+    def follow(self, step_ns: int) -> Iterable[int]:
+        """Take a step of the stamps for true; the stamps of the poses that came with it and were believed."""
+        self.ahead_ns += step_ns
+        wrong = [stamp for stamp, _ in self._latest]
+        self._latest.clear()
+        return wrong
