@@ -6,7 +6,7 @@ import pytest
 from support import real_flights
 from support.corner_runs import fly
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('real_data')]
+pytestmark = [pytest.mark.nightly, pytest.mark.usefixtures('real_data')]
 
 
 def test_two_cameras_are_at_least_as_good_as_the_first():
