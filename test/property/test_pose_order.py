@@ -25,7 +25,7 @@ def in_order(offset):
     return ekf.estimate
 
 
-@settings(max_examples=16)
+@settings(max_examples=8)
 @given(st.lists(st.floats(0.0, 0.5), min_size=POSES, max_size=POSES), st.sampled_from((-0.03, 0.0, 0.03)))
 def test_any_delays_give_the_same_state(delays, offset):
     """So it is, too, while a time offset is being learned."""

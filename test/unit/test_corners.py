@@ -72,7 +72,14 @@ def refine(image, corners, camera, marker_id, **options):
     ('distance', 'limit'),
     # Sides of 250, 100, 57, 30, 21 and 15 px. Without noise what is left is the last step (a settled corner has moved
     # less than 0.3 px, a twentieth of which remains) and what the model simplifies, most where cells have 2.5 px.
-    [(0.6, 0.025), (1.5, 0.02), (2.6, 0.02), (5.0, 0.02), (7.0, 0.03), (10.0, 0.1)],
+    [
+        pytest.param(0.6, 0.025, marks=pytest.mark.nightly),
+        (1.5, 0.02),
+        (2.6, 0.02),
+        (5.0, 0.02),
+        (7.0, 0.03),
+        (10.0, 0.1),
+    ],
 )
 def test_without_noise(model, distance, limit):
     camera, T = CAMERAS[model], marker_pose(distance, (0.3, -0.25, 0.4))
@@ -169,7 +176,7 @@ def test_a_side_that_something_covers_is_no_side_of_a_square(covered_px):
     assert squared.max() < 9.0
 
 
-@pytest.mark.parametrize('contrast', [12.0, 50.0])
+@pytest.mark.parametrize('contrast', [12.0, pytest.param(50.0, marks=pytest.mark.nightly)])
 def test_covariance_is_honest(contrast):
     rng = np.random.default_rng(3)
     squared, count = [], 0

@@ -45,7 +45,8 @@ def autosaved(keeper, marker_map):
 
 @pytest.mark.ros
 @pytest.mark.slow
-@pytest.mark.parametrize(('way', 'count'), [('signals', 20), ('kill', 20)])
+@pytest.mark.parametrize('way', ['signals', 'kill'])
+@pytest.mark.parametrize('count', [6, pytest.param(40, marks=pytest.mark.nightly)])
 def test_no_way_to_end_a_mapper_loses_its_map(tmp_path, way, count):
     """Two or three of SIGINT, SIGTERM and SIGHUP 1 to 400 ms apart; SIGKILL at any instant."""
     command = [sys.executable, '-m', 'support.shutdowns', str(tmp_path), str(count), '7', way]
