@@ -14,10 +14,11 @@ import cv2
 from matplotlib.figure import Figure
 import numpy as np
 import pytest
-from support.scenes import camera_of, detector_of, motion_prior
+from support.detector_scores import due, is_the_marker, odometry_before
+from support.scenes import camera_of, detector_of
 
 from thermal_fiducial.core.detection import detector as detection
-from thermal_fiducial.core.measurements import corners_px, Odometry
+from thermal_fiducial.core.measurements import corners_px
 from thermal_fiducial.sim.render import Quality
 from thermal_fiducial.sim.scenario import named
 from thermal_fiducial.sim.thermal_camera import render_frames
@@ -27,13 +28,6 @@ SECONDS, SEED = 20.0, 21
 #: Two stretches of flight, clear of the shutter; the first frames of each are for the motion estimate to settle.
 STRETCHES = ((120, 138), (300, 318))
 SETTLING = 3
-#: Markers that are wholly in the image and whose shortest side is at least so long should be found [px].
-SMALLEST_SIDE = 14.0
-#: A detection is a false one if its shape is farther off than this, or its place (the lag moves markers) [px].
-FALSE_SHAPE, FALSE_PLACE = 6.0, 15.0
-#: The odometry that guides: the truth at the last IMU samples with such errors [m], [rad], [m/s], [rad/s].
-ODOMETRY_ERRORS = (0.005, 0.002, 0.02, 0.005)
-ODOMETRY_AGES = 0.005 * np.arange(8)[::-1] + 0.004
 
 
 @dataclass(frozen=True)
@@ -93,32 +87,14 @@ def stretches(case):
     return [list(render_frames(case.scene, SECONDS, SEED, quality=quality, start=a, stop=b)) for a, b in STRETCHES]
 
 
-def odometry(case, frame, rng):
-    """What a filter would have said just before the frame: states of 200 Hz, all with the error of the last."""
-    position, attitude, speed = (sigma * rng.standard_normal(3) for sigma in ODOMETRY_ERRORS[:3])
-    pose_covariance, twist_covariance = (
-        np.diag([a**2] * 3 + [b**2] * 3) for a, b in (ODOMETRY_ERRORS[:2], ODOMETRY_ERRORS[2:])
-    )
-    states = []
-    for age in ODOMETRY_AGES:
-        motion = case.scene.trajectory(SECONDS, SEED)([frame.seconds - age])
-        T = motion.T_map_body[0].copy()
-        T[:3, 3] += position
-        T[:3, :3] = T[:3, :3] @ cv2.Rodrigues(attitude)[0]
-        velocity = motion.rotation.inv().apply(motion.velocity)[0] + speed
-        rate = motion.angular_velocity_body[0] + ODOMETRY_ERRORS[3] * rng.standard_normal(3)
-        stamp_ns = frame.stamp_ns - round(age * 1e9)
-        states.append(Odometry(stamp_ns, T, velocity, rate, pose_covariance, twist_covariance))
-    return states
-
-
 def our_detector(case, guided):
     """A function of a frame: ID to corners."""
     rng = np.random.default_rng(1)
     camera, detector = camera_of(case.scene), detector_of(case.scene, with_map=guided)
+    motion_at = case.scene.trajectory(SECONDS, SEED)
 
     def prepared(frame):
-        return frame, motion_prior(*odometry(case, frame, rng)) if guided else None
+        return frame, odometry_before(frame, motion_at, rng) if guided else None
 
     def detect(frame, state):
         rows = detector.detect(frame.stamp_ns, frame.counts, camera, state)
@@ -167,20 +143,6 @@ class Score:
     false: int
 
 
-def expected(frame):
-    sides = {
-        marker_id: np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min()
-        for marker_id, corners in frame.corners_px.items()
-    }
-    return [marker_id for marker_id, side in sides.items() if side >= SMALLEST_SIDE]
-
-
-def is_the_marker(error):
-    place = error.mean(axis=0)
-    shape = np.linalg.norm(error - place, axis=1)
-    return bool(np.linalg.norm(place) < FALSE_PLACE and shape.mean() < FALSE_SHAPE)
-
-
 @cache
 def score(case, method):
     """Run over the frames of a case."""
@@ -192,8 +154,8 @@ def score(case, method):
         for frame, found in list(zip(frames, answers, strict=True))[SETTLING:]:
             off = {i: corners - frame.corners_px[i] for i, corners in found if i in frame.corners_px}
             good = {i: error for i, error in off.items() if is_the_marker(error)}
-            due = expected(frame)
-            wanted, seen = wanted + len(due), seen + sum(i in good for i in due)
+            wanted_now = due(frame)
+            wanted, seen = wanted + len(wanted_now), seen + sum(i in good for i in wanted_now)
             false += len(off) - len(good) + sum(i not in present for i, _ in found)
             errors += [error - error.mean(axis=0) for error in good.values()]
     return Score(float(np.sqrt(np.mean(np.square(errors)))) if errors else np.nan, seen / wanted, false)

@@ -1,0 +1,299 @@
+"""Prints what each mechanism of the detector buys: ``make ablation``.
+
+For each mechanism one row: the lines that exist for it alone; on the scene that it is for, with and without it, the
+corners' error, the share of the markers that should be found, NEES, how many are false and how many turned to the wrong
+branch, and time; and the same over the acceptance scenes: geometric means of error and time without it over those with
+it, and the change of the mean share. A mechanism is switched off by putting what does nothing in its place. Names of
+mechanisms as arguments: only these.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, ExitStack
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib import import_module
+import inspect
+import sys
+import time
+from typing import Any
+from unittest import mock
+
+import cv2
+import numpy as np
+from support import approach
+from support.detector_scores import DetectorScore, odometry_before
+from support.scenes import camera_of
+
+from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
+from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
+from thermal_fiducial.sim.scenario import named, Scenario, with_contrast
+from thermal_fiducial.sim.thermal_camera import render_frames
+
+DETECTION = 'thermal_fiducial.core.detection.'
+SEED = 21
+#: Frames of a stretch that only settle the detector.
+SETTLING = 3
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Stretches of a flight, and how they are looked at.
+
+    Parameters
+    ----------
+    stretches : first and last frame of each
+    guided : whether map and odometry are known
+    eight_bits : whether the frames are pictures for a display
+    """
+
+    scenario: Scenario
+    guided: bool = False
+    eight_bits: bool = False
+    stretches: tuple[tuple[int, int], ...] = ((120, 138), (300, 318))
+    seconds: float = 20.0
+
+
+def _clear(name: str, contrast: float) -> Scenario:
+    """A scenario of constant contrast, without dead pixels."""
+    scenario = named(name)
+    acrylic = replace(scenario.acrylic, contrast=contrast, steady=0.0)
+    return replace(scenario, acrylic=acrylic, sensor=replace(scenario.sensor, bad_pixel_share=0.0))
+
+
+#: The scenes on which the detector is accepted.
+ACCEPTANCE = {
+    f'{flight}, {contrast:g} K, {"guided" if guided else "blind"}': Scene(_clear(scenario, contrast), guided)
+    for flight, scenario, contrasts in (('slow', 'wall', (8.0, 0.5, 0.1)), ('fast', 'fast', (8.0, 0.5)))
+    for contrast in contrasts
+    for guided in (False, True)
+}
+SCENES = ACCEPTANCE | {
+    'rolling shutter': Scene(_clear('rough', 8.0), guided=True),
+    '8 bits, slow': Scene(_clear('wall', 8.0), eight_bits=True),
+    '8 bits, fast': Scene(_clear('fast', 8.0), eight_bits=True),
+    'carpet': Scene(named('carpet'), stretches=((60, 72), (200, 212))),
+    'landing': Scene(with_contrast(approach.scenario(), 8.0), guided=True, stretches=((90, 150),), seconds=8.0),
+}
+
+
+@cache
+def rendered(scenario: Scenario, stretches: tuple[tuple[int, int], ...], seconds: float) -> list[list[Any]]:
+    """The frames of each stretch."""
+    return [list(render_frames(scenario, seconds, SEED, start=first, stop=last)) for first, last in stretches]
+
+
+@cache
+def inputs(name: str) -> list[list[tuple[Any, Any, Any]]]:
+    """Frames of each stretch with their counts as they are seen, and odometry."""
+    scene, rng = SCENES[name], np.random.default_rng(1)
+    motion_at = scene.scenario.trajectory(scene.seconds, SEED)
+    stretches = []
+    for frames in rendered(scene.scenario, scene.stretches, scene.seconds):
+        view = EightBitView(Tau2CameraConfig())
+        stretches.append(
+            [
+                (
+                    frame,
+                    view(frame.counts) if scene.eight_bits else frame.counts,
+                    odometry_before(frame, motion_at, rng) if scene.guided else None,
+                )
+                for frame in frames
+            ]
+        )
+    return stretches
+
+
+def detector_for(scene: Scene, changes: dict[str, Any]) -> MarkerDetector:
+    """A detector with the scene's rig, sensor and, where it is guided, map."""
+    scenario = scene.scenario
+    parameters = {
+        'marker_size': scenario.markers[0].size,
+        'camera_position': scenario.camera_position,
+        'camera_orientation': scenario.camera_orientation,
+        'bolometer_lag': scenario.sensor.lag,
+        'readout_time': scenario.sensor.readout,
+    }
+    detector = MarkerDetector(ArucoDetectorConfig(**(parameters | changes)), scenario.aruco_dictionary)
+    if scene.guided:
+        detector.set_map({marker.id: (marker.T_map_marker, marker.size) for marker in scenario.markers})
+    return detector
+
+
+def run(name: str, changes: dict[str, Any]) -> tuple[DetectorScore, float]:
+    """Score of a scene, and mean time of a frame [s]."""
+    scene, score, seconds, frames = SCENES[name], DetectorScore(), 0.0, 0
+    camera = camera_of(scene.scenario)
+    for stretch in inputs(name):
+        detector = detector_for(scene, changes)
+        for index, (frame, counts, prior) in enumerate(stretch):
+            begin = time.thread_time()
+            rows = detector.detect(frame.stamp_ns, counts, camera, prior)
+            if index < SETTLING:
+                continue
+            seconds, frames = seconds + time.thread_time() - begin, frames + 1
+            T_camera_map = se3.inverse(frame.T_map_camera)
+            score.add(frame, rows, {m.id: T_camera_map @ m.T_map_marker for m in scene.scenario.markers})
+    return score, seconds / frames
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """A part of the detector that can be taken out.
+
+    Parameters
+    ----------
+    scene : that it is for
+    parts : modules, or functions and classes of modules as ``module:name``, that exist for it alone
+    off : places (``module:name``, ``module:class.name``), and what is put there
+    changes : parameters that switch it off, where there are any
+    """
+
+    scene: str
+    parts: tuple[str, ...]
+    off: dict[str, Any]
+    changes: dict[str, Any] | None = None
+
+    @property
+    def lines(self) -> int:
+        """Of its parts."""
+        return sum(len(inspect.getsource(_place(part)).splitlines()) for part in self.parts)
+
+
+def _place(path: str) -> Any:
+    module, _, names = path.partition(':')
+    thing: Any = import_module(DETECTION + module)
+    for name in names.split('.') if names else ():
+        thing = getattr(thing, name)
+    return thing
+
+
+@contextmanager
+def without(mechanism: Mechanism) -> Iterator[None]:
+    """The detector without a mechanism."""
+    with ExitStack() as stack:
+        for path, stand_in in mechanism.off.items():
+            module, _, names = path.partition(':')
+            *owners, name = names.split('.')
+            owner = _place(':'.join([module, '.'.join(owners)]) if owners else module)
+            stack.enter_context(mock.patch.object(owner, name, stand_in))
+        yield
+
+
+def _nothing_found(*_: Any) -> Any:
+    return _place('found:Found').none()
+
+
+def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
+    none = np.zeros(len(seen))
+    return _place('corners.squares:Squared')(seen, covariance, none, none, none)
+
+
+def _near(corners: Any, *others: Any, **options: Any) -> Any:
+    refine_corners = _place('corners.refinement:refine_corners')
+    return refine_corners(corners, *others, **(options | {'near': np.ones(len(options['near']), dtype=bool)}))
+
+
+def _none_of(first: Any, *_: Any, **__: Any) -> Any:
+    return np.zeros(len(first), dtype=bool)
+
+
+def _no_covariance(_: Any, corners_px: Any, *__: Any) -> Any:
+    return np.zeros((len(corners_px), 4, 2, 2))
+
+
+_SCALES = _place('search:SearchScales')
+_ALL_IN_THE_SEARCH = {'finding:_next_scales': lambda *_, **__: _SCALES.ALL}
+_BORDER_WIDTH = {'displayed:DisplayedSides.corrected': lambda _, __, ___, refined, ____: refined.corners}
+
+MECHANISMS = {
+    'corners of squares': Mechanism(
+        'slow, 0.5 K, blind', ('corners.squares',), {'corners.segments:as_squares': _as_seen}
+    ),
+    'other tilt of a square': Mechanism('slow, 0.1 K, blind', (), {'corners.squares:_OTHER_TILT': np.inf}),
+    'wide first pass': Mechanism('slow, 0.5 K, blind', (), {'refining:refine_corners': _near}),
+    'passes until settled': Mechanism('fast, 8 K, blind', (), {'corners.refinement:_PASSES': 1}),
+    'second round': Mechanism('fast, 8 K, blind', (), {'refining:_ROUNDS': 1}),
+    'edges behind the sides': Mechanism(
+        'fast, 8 K, blind', ('corners.edges:_add_neighbours',), {'corners.edges:_NARROW': 0.0}
+    ),
+    'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
+    'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
+    'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'refining:worth_deblurring': _none_of}),
+    'search freed of lag': Mechanism(
+        'fast, 8 K, blind',
+        ('lag:LagField', 'lag:without_lag', 'finding:MarkerFinder._scene'),
+        {'finding:_BLUR_THAT_HIDES_PX': np.inf},
+    ),
+    'rolling shutter': Mechanism('rolling shutter', ('readout',), {}, {'readout_time': 0.0}),
+    'robust motion': Mechanism('fast, 8 K, blind', ('tracking:_trusted',), {'tracking:_OUTLIER': np.inf}),
+    'error of the lag model': Mechanism(
+        'fast, 8 K, blind', ('lag:model_error',), {'refining:model_error': _no_covariance}
+    ),
+    'partially visible markers': Mechanism(
+        'landing', ('partial', 'visible_cells', 'corners.grid'), {'detector:_ENOUGH_WHOLE': 0}
+    ),
+    'width of borders, slow': Mechanism('8 bits, slow', ('displayed',), _BORDER_WIDTH),
+    'width of borders, fast': Mechanism('8 bits, fast', ('displayed',), _BORDER_WIDTH),
+    'width of borders, carpet': Mechanism('carpet', ('displayed',), _BORDER_WIDTH),
+    'polarity': Mechanism('slow, 8 K, blind', ('polarity',), {}, {'polarity': 'any'}),
+    'half resolution': Mechanism('slow, 0.5 K, blind', (), {'finding:_next_scales': lambda *_, **__: _SCALES.FINE}),
+    'one resolution in turn': Mechanism('slow, 8 K, blind', (), _ALL_IN_THE_SEARCH),
+    'outlines pulled onto patterns': Mechanism(
+        'slow, 0.1 K, blind', ('alignment',), {'search:_rough': lambda *_: np.zeros(0, dtype=np.intp)}
+    ),
+    'markers in plates': Mechanism(
+        'fast, 0.5 K, blind', ('decoding:shrunk',), {'search:_with_shrunk': lambda quads, _: quads}
+    ),
+    'columns of the frame': Mechanism('slow, 0.1 K, guided', (), {'frame:without_columns': lambda counts, _: counts}),
+    'following': Mechanism(
+        'slow, 0.1 K, blind',
+        ('following',),
+        {'finding:Followed.of': lambda *_: _place('following:Followed').none()},
+    ),
+    'search near predictions': Mechanism(
+        'fast, 0.5 K, guided', ('guided',), {'finding:near_prediction': _nothing_found}
+    ),
+    'common shift': Mechanism('carpet', ('guided:common_shift',), {'finding:common_shift': lambda *_: np.zeros(2)}),
+    'branches by the map': Mechanism('slow, 0.1 K, guided', (), {'detector:choose_branches': lambda poses, *_: poses}),
+}
+
+
+def _figures(score: DetectorScore, seconds: float) -> str:
+    return (
+        f'{score.rms_px:.3f} px, {100 * score.rate:.1f} %, NEES {score.nees:.2f}, {score.false} false, '
+        f'{score.flipped} turned, {score.seen} seen, {1e3 * seconds:.1f} ms'
+    )
+
+
+def _row(key: str, mechanism: Mechanism, base: dict[str, tuple[DetectorScore, float]]) -> str:
+    with without(mechanism):
+        scenes = {name: run(name, mechanism.changes or {}) for name in {*ACCEPTANCE, mechanism.scene}}
+    both = [(base[name], scenes[name]) for name in ACCEPTANCE]
+    seen = [(old[0].rms_px, new[0].rms_px) for old, new in both if new[0].seen]
+    error = np.exp(np.mean([np.log(new / old) for old, new in seen]))
+    slower = np.exp(np.mean([np.log(new[1] / old[1]) for old, new in both]))
+    rate = 100 * np.mean([new[0].rate - old[0].rate for old, new in both])
+    false = sum(new[0].false - old[0].false for old, new in both)
+    cells = [key, str(mechanism.lines), mechanism.scene, _figures(*base[mechanism.scene])]
+    cells += [
+        _figures(*scenes[mechanism.scene]),
+        f'x {error:.2f}, {rate:+.1f} %, {false:+d} false, time x {slower:.2f}',
+    ]
+    return f'| {" | ".join(cells)} |'
+
+
+def main() -> None:
+    """Print the table."""
+    cv2.setNumThreads(1)
+    chosen = {key: MECHANISMS[key] for key in sys.argv[1:] or MECHANISMS}
+    base = {name: run(name, {}) for name in {*ACCEPTANCE, *(mechanism.scene for mechanism in chosen.values())}}
+    print('| mechanism | lines | its scene | with | without | acceptance scenes without |')
+    print('| --- | --- | --- | --- | --- | --- |')
+    for key, mechanism in chosen.items():
+        print(_row(key, mechanism, base), flush=True)
+
+
+if __name__ == '__main__':
+    main()
