@@ -7,9 +7,10 @@ import pytest
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.contrast import noise_of
 from thermal_fiducial.core.detection.decoding import Decoder, Reading, shrunk
+from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.patterns import marker_bits
-from thermal_fiducial.core.detection.search import _inside_out, BlindSearch, Found, SearchScales
+from thermal_fiducial.core.detection.search import _inside_out, BlindSearch, SearchScales
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.files.dictionary import load_dictionary
 

@@ -6,7 +6,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.contrast import halved
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.decoding import Decoder, Reading
-from thermal_fiducial.core.detection.search import Found
+from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
 # Cells at least this wide are read at half the resolution, where a pixel has half the noise.

@@ -12,13 +12,12 @@ from thermal_fiducial.core.detection.decoding import Decoder
 from thermal_fiducial.core.detection.displayed import DisplayedSides
 from thermal_fiducial.core.detection.finding import Findings
 from thermal_fiducial.core.detection.following import Followed
+from thermal_fiducial.core.detection.found import Found, places_of
 from thermal_fiducial.core.detection.frame import Frame, Places
 from thermal_fiducial.core.detection.ids import among
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.local_corners import local_corners
-from thermal_fiducial.core.detection.places import places_of
 from thermal_fiducial.core.detection.refining import RefinedMarkers, Refiner, sides_px
-from thermal_fiducial.core.detection.search import Found
 from thermal_fiducial.core.detection.small_markers import with_corners_by_pattern
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist

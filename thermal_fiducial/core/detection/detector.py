@@ -11,15 +11,15 @@ from thermal_fiducial.core.detection.corner_estimates import CornerEstimator, Ma
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.decoding import Decoder
 from thermal_fiducial.core.detection.finding import Findings, MarkerFinder
+from thermal_fiducial.core.detection.found import depths
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.frame_history import FrameHistory
 from thermal_fiducial.core.detection.frame_prediction import FramePrediction, Predictor
 from thermal_fiducial.core.detection.ids import among
-from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes
+from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes, MarkersOfMap
 from thermal_fiducial.core.detection.marker_rows import marker_rows
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import marker_bits
-from thermal_fiducial.core.detection.places import depths
 from thermal_fiducial.core.detection.tracking import MotionTrack, TrackedMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -101,7 +101,7 @@ class MarkerDetector:
             keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
             frame = Frame.of(stamp_ns, counts, camera, prediction.twist, config, keep_columns=keep_columns)
             expected = _expected(known, prediction, camera, config)
-            findings = self._finder.find(frame, history, expected, known, config)
+            findings = self._finder.find(frame, history, MarkersOfMap(known, expected), config)
             sizes = self._sizes.of(findings.found.ids, known)
             estimates = self._estimator.estimate(frame, findings, expected, sizes, history.track, config)
             poses = self._poses(estimates.ids, estimates.corners, estimates.at, prediction.T_camera_map)

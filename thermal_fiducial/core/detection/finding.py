@@ -8,15 +8,15 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.decoding import Decoder
 from thermal_fiducial.core.detection.following import Followed
+from thermal_fiducial.core.detection.found import Found, merged, places_of
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.frame_history import FrameHistory
 from thermal_fiducial.core.detection.guided import common_shift, near_prediction
 from thermal_fiducial.core.detection.ids import among
-from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes
+from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes, MarkersOfMap
 from thermal_fiducial.core.detection.lag import LagField, without_lag
-from thermal_fiducial.core.detection.places import places_of
 from thermal_fiducial.core.detection.readout import seen_displacement
-from thermal_fiducial.core.detection.search import BlindSearch, Found, merged, SearchScales
+from thermal_fiducial.core.detection.search import BlindSearch, SearchScales
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import BoolArray, Float32Array
 
@@ -70,44 +70,24 @@ class MarkerFinder:
         self._search = BlindSearch(decoder)
         self._lag_field: LagField | None = None
 
-    def find(
-        self,
-        frame: Frame,
-        history: FrameHistory,
-        in_map: ExpectedMarkers | None,
-        known: KnownMarkers,
-        config: ArucoDetectorConfig,
-    ) -> Findings:
-        """Markers to a pixel or two, at the frame's stamp.
-
-        Parameters
-        ----------
-        in_map : markers of the map where they should be; None: nothing says where
-        known : the markers of the map
-        """
-        near = self._near(frame, history, in_map, known, config)
+    def find(self, frame: Frame, history: FrameHistory, of_map: MarkersOfMap, config: ArucoDetectorConfig) -> Findings:
+        """Markers to a pixel or two, at the frame's stamp."""
+        near = self._near(frame, history, of_map, config)
         since_blind, interval = history.since_blind + 1, config.blind_interval
-        if in_map is None or not near.complete:
+        if of_map.expected is None or not near.complete:
             interval = min(interval, _INCOMPLETE)
-        if (near.complete or (near.holds and in_map is not None)) and since_blind < interval:
+        if (near.complete or (near.holds and of_map.expected is not None)) and since_blind < interval:
             return Findings(near.found, near.followed, since_blind, history.scales)
         scales = _next_scales(history, complete=near.complete)
-        blind = self._blind(frame, history, near.found, scales, known, config)
+        blind = self._blind(frame, history, near.found, scales, of_map.known, config)
         return Findings(merged(near.found, blind), near.followed, 0, scales)
 
-    def _near(
-        self,
-        frame: Frame,
-        history: FrameHistory,
-        in_map: ExpectedMarkers | None,
-        known: KnownMarkers,
-        config: ArucoDetectorConfig,
-    ) -> _Near:
+    def _near(self, frame: Frame, history: FrameHistory, of_map: MarkersOfMap, config: ArucoDetectorConfig) -> _Near:
         """Markers where they should be: followed from the last frame, and others of the map."""
         if frame.twist is None or not config.guided:
             return _Near(Found.none(), Followed.none(), complete=False, holds=False)
         last = Followed.of(history.track.expected(frame.stamp_ns, frame.twist), frame)
-        expected = _expected(frame.camera, last, in_map, known)
+        expected = _expected(frame.camera, last, of_map)
         followed = last.only(among(last.ids, expected.ids)).seen(frame, frame.twist, self._decoder, config)
         found = followed.found()
         new = np.flatnonzero(~among(expected.ids, followed.ids))
@@ -171,12 +151,12 @@ def _next_scales(history: FrameHistory, *, complete: bool) -> SearchScales:
     return SearchScales.FAINT if history.scales == SearchScales.FINE else SearchScales.FINE
 
 
-def _expected(camera: Camera, last: Followed, in_map: ExpectedMarkers | None, known: KnownMarkers) -> ExpectedMarkers:
+def _expected(camera: Camera, last: Followed, of_map: MarkersOfMap) -> ExpectedMarkers:
     """The map's markers and the last frame's others."""
     at = last.places.at
     others = ExpectedMarkers(last.ids, at.px, at.x, last.places.depth)
     new: BoolArray = np.asarray(camera.contains(at.px, _BORDER_PX).all(axis=1))
-    if in_map is None:
+    if of_map.expected is None:
         return others.only(new)
-    new &= ~among(last.ids, known.ids)
-    return in_map.joined(others.only(new)) if new.any() else in_map
+    new &= ~among(last.ids, of_map.known.ids)
+    return of_map.expected.joined(others.only(new)) if new.any() else of_map.expected

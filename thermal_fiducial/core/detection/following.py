@@ -6,9 +6,9 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.decoding import Decoder
+from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import Frame, Places
 from thermal_fiducial.core.detection.readout import expected_displacement
-from thermal_fiducial.core.detection.search import Found
 from thermal_fiducial.core.detection.tracking import TrackedMarkers
 from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints

@@ -11,13 +11,13 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.confirmation import read_quads
 from thermal_fiducial.core.detection.decoding import Decoder, Reading
+from thermal_fiducial.core.detection.found import Found, merged
 from thermal_fiducial.core.detection.frame import Frame, Places
 from thermal_fiducial.core.detection.ids import pairs
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.lag import markers_deblurred, REMAINING
 from thermal_fiducial.core.detection.readout import expected_displacement
 from thermal_fiducial.core.detection.refining import BLUR_THAT_MATTERS_PX, WINDOW_MARGIN_PX
-from thermal_fiducial.core.detection.search import Found, merged
 from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray

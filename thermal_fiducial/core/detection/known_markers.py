@@ -113,6 +113,14 @@ class KnownMarkers:
         return [self._entries.get(marker_id) for marker_id in ids.tolist()]
 
 
+class MarkersOfMap(NamedTuple):
+    """The markers of the map in a frame."""
+
+    known: KnownMarkers
+    #: where they should be; None: nothing says where
+    expected: ExpectedMarkers | None
+
+
 class MarkerSizes:
     """Sides of markers: of the map, or of the overrides, or the common one.
 

@@ -7,9 +7,7 @@ outside the image as well.
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-import math
 
-import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
@@ -23,18 +21,15 @@ from thermal_fiducial.core.detection.corners.grid import (
     PoseFit,
 )
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
-from thermal_fiducial.core.detection.corners.segments import LagTail
 from thermal_fiducial.core.detection.decoding import Decoder
 from thermal_fiducial.core.detection.displayed import DISPLACED
-from thermal_fiducial.core.detection.frame import Frame, Places
+from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import PartialMarkers
-from thermal_fiducial.core.detection.lag import GAIN, LAG_TAIL_AGE, lag_tail_maps, model_error, REMAINING, SPREAD
-from thermal_fiducial.core.detection.readout import expected_displacement, lag_tail
-from thermal_fiducial.core.detection.refining import sides_px, worth_deblurring
-from thermal_fiducial.core.detection.twist import interaction
+from thermal_fiducial.core.detection.lag import model_error
+from thermal_fiducial.core.detection.partial_layers import deblurred_layer, places_of_points, plain_layer
 from thermal_fiducial.core.detection.visible_cells import VisibleCells
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import marker_corners
 from thermal_fiducial.core.types import BoolArray, FloatArray, Gray, IntArray
 
@@ -60,8 +55,6 @@ _COARSE_STEPS, _NEAR_PX = 3, 0.3
 _STEPS, _WIDE, _SETTLED_PX = 8, 1.5, 0.1
 # A corner that is known no better shows nothing, nor one so far outside the image, in image widths [px].
 _KNOWN_PX, _OUTSIDE = 8.0, 1.0
-# Depth of points that are no longer in front of the camera [m].
-_LEAST_DEPTH = 1e-3
 # Standard deviation of what displaces a corner of a marker's window, whatever the edges say [px].
 _FLOOR_PX = 0.01
 
@@ -137,7 +130,7 @@ class PartialMarkerSearch:
     ) -> RefinedCorners | None:
         points = on_marker(self._visible.places, marker.size)
         factor = int(2 ** np.clip(np.floor(np.log2(marker.cell_px / _COARSE_PX)), 0, 3))
-        coarse = _plain(frame, marker.seen(), config.blur_px, factor)
+        coarse = plain_layer(frame, marker.seen(), config.blur_px, factor)
         T = self._moved(marker, points, coarse, marker.cell_px / factor)
         if T is None:
             return None
@@ -145,7 +138,7 @@ class PartialMarkerSearch:
         rough = _settled(T, marker.size, pattern, [coarse] * _COARSE_STEPS, _NEAR_PX)
         if rough is None or not self._recognised(rough, marker, coarse, allowed, frame.noise, config):
             return None
-        fine = _deblurred(frame, marker.seen(), rough.contrast, config.blur_px, self._cells)
+        fine = deblurred_layer(frame, marker.seen(), rough.contrast, config.blur_px, self._cells)
         layers = [replace(fine, blur=_WIDE * fine.blur), *[fine] * _STEPS]
         fit = _settled(rough.T_camera_marker, marker.size, pattern, layers, _SETTLED_PX)
         if fit is None or fit.moved_px > _SETTLED_PX or not _agrees(fit):
@@ -240,74 +233,6 @@ def _around(unsure_cells: float) -> FloatArray:
     return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
 
 
-def _plain(frame: Frame, window: FloatArray, blur_px: float, factor: int) -> Layer:
-    """The frame at one resolution in ``factor``, as blurred as it is round a ``window`` (4, 3) in the camera."""
-    camera = _coarser(frame.camera, factor)
-    image = frame.image
-    if factor > 1:
-        cropped = image[: camera.height * factor, : camera.width * factor]
-        image = np.asarray(cv2.resize(cropped, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
-    blur = math.hypot(blur_px / factor, math.sqrt((1.0 - 1.0 / factor**2) / 12.0))
-
-    def displacement(points: FloatArray) -> FloatArray:
-        return _displaced(frame, points, 0.0) / factor
-
-    return Layer(image, camera, displacement, blur, _lag_blur(frame, window) / factor)
-
-
-def _deblurred(frame: Frame, window: FloatArray, contrast: float, blur_px: float, cells: int) -> Layer:
-    """The frame as it is; without old lag tails round the window (4, 3), where that is worth its noise."""
-    places, twist = _places(window, frame.camera), frame.twist
-    mean = _lag_blur(frame, window)
-    cnr = np.array([contrast / frame.noise])
-    cell = sides_px(places.at.px) / cells
-    if twist is None or not worth_deblurring(np.array([mean @ mean]), cell, cells, cnr)[0]:
-        return _plain(frame, window, blur_px, 1)
-    maps = lag_tail_maps(places.at.px + _displaced(frame, window, 1.0 - REMAINING), lag_tail(places, twist, frame))
-
-    def displacement(points: FloatArray) -> FloatArray:
-        return _displaced(frame, points, 1.0 - REMAINING)
-
-    return Layer(frame.image, frame.camera, displacement, blur_px, SPREAD * mean, LagTail(maps, np.array([GAIN])))
-
-
-def _displaced(frame: Frame, points: FloatArray, removed: float) -> FloatArray:
-    """By how much points (P, 3) in the camera appear displaced (P, 2) [px], such a share of lag tails taken out."""
-    twist, lag = frame.twist, frame.lag
-    if twist is None:
-        return np.zeros((len(points), 2))
-    depth = np.maximum(points[:, 2], _LEAST_DEPTH)
-    x = points[:, :2] / depth[:, None]
-    back = -lag * (twist.ago(lag) - removed * twist.ago(LAG_TAIL_AGE * lag))
-    shift = (frame.camera.distort_linearised(x)[1] @ (interaction(x, depth) @ back)[..., None])[..., 0]
-    if frame.readout == 0.0:
-        return np.asarray(shift)
-    return np.asarray(shift + expected_displacement(_places(points, frame.camera), twist, frame)[0])
-
-
-def _lag_blur(frame: Frame, window: FloatArray) -> FloatArray:
-    """Mean motion blur (2,) [px] of what is seen of a marker, whose window is (4, 3) in the camera."""
-    if frame.twist is None:
-        return np.zeros(2)
-    return np.asarray(_places(window, frame.camera).lag_blur(frame.twist, frame.lag)[0].mean(axis=0))
-
-
-def _coarser(camera: Camera, factor: int) -> Camera:
-    """The camera of an image of which each pixel is the mean of so many squared."""
-    if factor == 1:
-        return camera
-    K = camera.K.copy()
-    K[:2, 2] += 0.5 - 0.5 * factor
-    K[:2] /= factor
-    return Camera(camera.width // factor, camera.height // factor, K, camera.model, camera.D)
-
-
-def _places(points: FloatArray, camera: Camera) -> Places:
-    """Places (1, P) of points (P, 3) in the camera."""
-    depth = np.maximum(points[None, :, 2], _LEAST_DEPTH)
-    return Places.of(ImagePoints.seen_at(points[None, :, :2] / depth[..., None], camera), depth)
-
-
 def _corners(frame: Frame, marker: _Marker, fit: PoseFit, cells: int) -> RefinedCorners | None:
     """The corners that follow from a marker's pose, with covariances (2, 2) that claim no more than is known of it.
 
@@ -335,7 +260,7 @@ def _pose_covariance(frame: Frame, marker: _Marker, fit: PoseFit, cells: int) ->
     J = pose_jacobian(T, window, frame.camera).reshape(8, 6)
     blocks = np.broadcast_to((DISPLACED if frame.displayed else _FLOOR_PX) ** 2 * np.eye(2), (4, 2, 2))
     if frame.twist is not None:
-        places = _places(se3.apply(T, window), frame.camera)
+        places = places_of_points(se3.apply(T, window), frame.camera)
         unknown = places.unknown(frame.twist, frame.lag)
         blocks = blocks + unknown[0] + model_error(places.lag_blur(frame.twist, frame.lag), places.at.px, cells)[0]
     gain = np.linalg.pinv(J).reshape(6, 4, 2)

@@ -13,6 +13,7 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.refinement import refine_corners, RefinedCorners
 from thermal_fiducial.core.detection.corners.segments import LagTail
+from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import Frame, Places
 from thermal_fiducial.core.detection.lag import (
     common_error,
@@ -24,7 +25,6 @@ from thermal_fiducial.core.detection.lag import (
     SPREAD,
 )
 from thermal_fiducial.core.detection.readout import delays, expected_displacement, lag_tail, seen_displacement
-from thermal_fiducial.core.detection.search import Found
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, unknown_twist
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray

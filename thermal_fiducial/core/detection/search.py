@@ -1,6 +1,6 @@
 """Blind search for markers in a frame."""
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from enum import auto, Flag
 
 import numpy as np
@@ -9,6 +9,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.alignment import aligned
 from thermal_fiducial.core.detection.contrast import dark, dark_in_picture, halved, Scale, without_columns
 from thermal_fiducial.core.detection.decoding import Decoder, Reading, shrunk
+from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.ids import among
 from thermal_fiducial.core.detection.quads import find_quads
@@ -43,33 +44,6 @@ class SearchScales(Flag):
     FINE = auto()
     FAINT = auto()
     ALL = FINE | FAINT
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """Markers that a search found.
-
-    Parameters
-    ----------
-    ids : (N,)
-    corners_px : (N, 4, 2) clockwise from the marker's top-left, to a pixel or two
-    cnr : (N,) contrast-to-noise ratio of a pixel; negative where black is warmer than white
-    expected : (N,) whether it was looked for where it was found
-    """
-
-    ids: IntArray
-    corners_px: FloatArray
-    cnr: FloatArray
-    expected: BoolArray
-
-    def only(self, keep: BoolArray | IntArray) -> 'Found':
-        """Those of the markers ``keep``."""
-        return Found(self.ids[keep], self.corners_px[keep], self.cnr[keep], self.expected[keep])
-
-    @staticmethod
-    def none() -> 'Found':
-        """No markers."""
-        return Found(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros(0), np.zeros(0, dtype=bool))
 
 
 class BlindSearch:
@@ -225,21 +199,6 @@ def _rough(reading: Reading, quads: FloatArray, seen: IntArray) -> IntArray:
 def _joined(first: Reading, second: Reading) -> Reading:
     names = [item.name for item in fields(Reading)]
     return Reading(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))
-
-
-def merged(first: Found, second: Found) -> Found:
-    """All markers of ``first``, and those of ``second`` that it does not have and that lie elsewhere."""
-    if len(second.ids) == 0:
-        return first
-    apart = np.linalg.norm(second.corners_px.mean(axis=1)[:, None] - first.corners_px.mean(axis=1), axis=-1)
-    extent = np.linalg.norm(first.corners_px[:, 2] - first.corners_px[:, 0], axis=-1)
-    new = ~among(second.ids, first.ids) & (apart > 0.35 * extent).all(axis=1)
-    return Found(
-        np.concatenate([first.ids, second.ids[new]]),
-        np.concatenate([first.corners_px, second.corners_px[new]]),
-        np.concatenate([first.cnr, second.cnr[new]]),
-        np.concatenate([first.expected | among(first.ids, second.ids[second.expected]), second.expected[new]]),
-    )
 
 
 def distinct(reading: Reading, noise: float, config: ArucoDetectorConfig) -> BoolArray:

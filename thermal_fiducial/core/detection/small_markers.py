@@ -14,9 +14,10 @@ from thermal_fiducial.core.detection.alignment import aligned
 from thermal_fiducial.core.detection.confirmation import speaks_for_itself
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.decoding import Decoder
+from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.refining import RefinedMarkers, sides_px
-from thermal_fiducial.core.detection.search import accepted, Found
+from thermal_fiducial.core.detection.search import accepted
 from thermal_fiducial.core.types import BoolArray
 
 # Widest cells of such markers [px].

@@ -8,23 +8,27 @@ fish-eye lenses", 2006, as ``cv2.fisheye`` has it (equidistant).
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from thermal_fiducial.core.geometry.distortion import (
+    distort_equidistant,
+    distort_polynomial,
+    equidistant_radius,
+    NEWTON_STEP,
+    NEWTON_STEPS,
+    Polynomial,
+    polynomial_derivative,
+    radial_factor,
+    radial_terms,
+    undistort_equidistant,
+)
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 
 #: Number of coefficients that each model takes (shorter lists are filled up with zeros).
 MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
-
-# Newton's iteration doubles the digits: after a step this small nothing is left; ten do at any lens's border.
-_NEWTON_STEPS = 10
-_NEWTON_STEP = 1e-6
-_EYE = np.eye(2)
-# Widest angle from the axis that x/z can express [rad].
-_WIDEST = 1.5
 
 
 @dataclass(frozen=True)
@@ -120,7 +124,7 @@ class Camera:
         uv = np.asarray(uv, dtype=np.float64)
         target = (uv - self.K[:2, 2]) @ self._inverse_focal.T
         if self.model == 'equidistant':
-            return _undistort_equidistant(target, self.D)
+            return undistort_equidistant(target, self.D)
         return self._undistort_polynomial(target)
 
     def rays(self, uv: npt.ArrayLike) -> FloatArray:
@@ -151,14 +155,14 @@ class Camera:
         r = np.linspace(0.0, 12.0, 4801)
         radial = self._distort(np.stack([r, np.zeros_like(r)], axis=-1))[0][:, 0]
         if self.model != 'equidistant':
-            radial = r * _radial_factor(r * r, self._polynomial)
+            radial = r * radial_factor(r * r, self._polynomial)
         falling = np.flatnonzero(np.diff(radial) <= 0.0)
         return float(r[falling[0]]) if len(falling) else np.inf
 
     @cached_property
-    def _polynomial(self) -> '_Polynomial':
+    def _polynomial(self) -> 'Polynomial':
         k1, k2, p1, p2, k3, *rational = self.D.tolist()
-        return _Polynomial((k1, k2, k3), tuple(rational) if any(rational) else (), p1, p2)
+        return Polynomial((k1, k2, k3), tuple(rational) if any(rational) else (), p1, p2)
 
     @cached_property
     def _last_pixel(self) -> FloatArray:
@@ -171,7 +175,7 @@ class Camera:
 
     def _undistort_polynomial(self, target: FloatArray) -> FloatArray:
         x = target.copy()
-        for _ in range(_NEWTON_STEPS):
+        for _ in range(NEWTON_STEPS):
             distorted, J = self._distort(x)
             a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
             determinant = a * d - b * c
@@ -182,7 +186,7 @@ class Camera:
             step[..., 1] = a * error[..., 1] - c * error[..., 0]
             step /= determinant[..., None]
             x = x + step
-            if np.abs(step).max(initial=0.0) < _NEWTON_STEP:
+            if np.abs(step).max(initial=0.0) < NEWTON_STEP:
                 break
         return x
 
@@ -191,17 +195,17 @@ class Camera:
         if self.model == 'equidistant':
             # Radius and angle are the same to the last digit where they are as small.
             r = np.maximum(np.sqrt(np.einsum('...k,...k->...', x, x)), 1e-12)
-            return np.asarray(x * (_equidistant_radius(np.arctan(r), self.D) / r)[..., None])
-        r2, factor = _radial(x, self._polynomial)
-        return _distort_polynomial(x, r2, factor, self._polynomial)
+            return np.asarray(x * (equidistant_radius(np.arctan(r), self.D) / r)[..., None])
+        r2, factor = radial_terms(x, self._polynomial)
+        return distort_polynomial(x, r2, factor, self._polynomial)
 
     def _distort(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Distorted normalised coordinates (..., 2) and their derivative (..., 2, 2)."""
         if self.model == 'equidistant':
-            return _distort_equidistant(x, self.D)
-        r2, factor = _radial(x, self._polynomial)
-        derivative = _polynomial_derivative(x, r2, factor, self._polynomial)
-        return _distort_polynomial(x, r2, factor, self._polynomial), derivative
+            return distort_equidistant(x, self.D)
+        r2, factor = radial_terms(x, self._polynomial)
+        derivative = polynomial_derivative(x, r2, factor, self._polynomial)
+        return distort_polynomial(x, r2, factor, self._polynomial), derivative
 
 
 @dataclass(frozen=True, slots=True)
@@ -253,104 +257,3 @@ def inverse_2x2(J: FloatArray) -> FloatArray:
     inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 1, 0], inverse[..., 1, 1] = d, -b, -c, a
     inverse /= (a * d - b * c)[..., None, None]
     return inverse
-
-
-class _Polynomial(NamedTuple):
-    """Distortion of plumb_bob, and of rational_polynomial where there is a denominator."""
-
-    #: k1 k2 k3
-    k: tuple[float, ...]
-    #: k4 k5 k6, or nothing
-    denominator: tuple[float, ...]
-    p1: float
-    p2: float
-
-
-def _radial_factor(r2: FloatArray, model: _Polynomial) -> FloatArray:
-    """Factor by which points at a squared distance from the axis are moved outwards."""
-    k1, k2, k3 = model.k
-    top = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    if not model.denominator:
-        return top
-    k4, k5, k6 = model.denominator
-    return np.asarray(top / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))))
-
-
-def _radial_slope(r2: FloatArray, factor: FloatArray, model: _Polynomial) -> FloatArray:
-    """Derivative of the ``factor`` with respect to the squared distance."""
-    k1, k2, k3 = model.k
-    d_top = k1 + r2 * (2.0 * k2 + 3.0 * k3 * r2)
-    if not model.denominator:
-        return d_top
-    k4, k5, k6 = model.denominator
-    d_bottom = k4 + r2 * (2.0 * k5 + 3.0 * k6 * r2)
-    return np.asarray((d_top - factor * d_bottom) / (1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))))
-
-
-def _radial(x: FloatArray, model: _Polynomial) -> tuple[FloatArray, FloatArray]:
-    """Squared distances (...) from the axis, and their :func:`_radial_factor`."""
-    r2 = np.einsum('...k,...k->...', x, x)
-    return r2, _radial_factor(r2, model)
-
-
-def _distort_polynomial(x: FloatArray, r2: FloatArray, factor: FloatArray, model: _Polynomial) -> FloatArray:
-    if not (model.p1 or model.p2):
-        return np.asarray(x * factor[..., None])
-    # The tangential part is p r^2 + 2 (p . x) x with p = (p2, p1).
-    p1, p2 = model.p1, model.p2
-    distorted = np.empty_like(x)
-    a, b = x[..., 0], x[..., 1]
-    factor = factor + (2.0 * p2) * a + (2.0 * p1) * b
-    distorted[..., 0], distorted[..., 1] = a * factor + p2 * r2, b * factor + p1 * r2
-    return distorted
-
-
-def _polynomial_derivative(x: FloatArray, r2: FloatArray, factor: FloatArray, model: _Polynomial) -> FloatArray:
-    """Derivative (..., 2, 2) of :func:`_distort_polynomial`."""
-    p1, p2 = model.p1, model.p2
-    a, b = x[..., 0], x[..., 1]
-    slope = 2.0 * _radial_slope(r2, factor, model)
-    J = np.empty((*x.shape[:-1], 2, 2))
-    J[..., 0, 0] = factor + a * (a * slope + 6.0 * p2) + 2.0 * p1 * b
-    J[..., 0, 1] = J[..., 1, 0] = a * (b * slope + 2.0 * p1) + 2.0 * p2 * b
-    J[..., 1, 1] = factor + b * (b * slope + 6.0 * p1) + 2.0 * p2 * a
-    return J
-
-
-def _equidistant_radius(theta: FloatArray, k: FloatArray) -> FloatArray:
-    """Distorted radius at angles ``theta`` from the axis."""
-    t2 = theta * theta
-    return np.asarray(theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3])))))
-
-
-def _equidistant_slope(theta: FloatArray, k: FloatArray) -> FloatArray:
-    """Its derivative."""
-    t2 = theta * theta
-    return np.asarray(1.0 + t2 * (3 * k[0] + t2 * (5 * k[1] + t2 * (7 * k[2] + t2 * 9 * k[3]))))
-
-
-def _undistort_equidistant(target: FloatArray, k: FloatArray) -> FloatArray:
-    radius = np.linalg.norm(target, axis=-1)
-    theta = np.minimum(radius, _WIDEST)
-    for _ in range(_NEWTON_STEPS):
-        slope = _equidistant_slope(theta, k)
-        step = (radius - _equidistant_radius(theta, k)) / np.where(np.abs(slope) < 1e-9, 1e-9, slope)
-        theta = np.clip(theta + step, 0.0, _WIDEST)
-        if np.all(np.abs(step) < _NEWTON_STEP):
-            break
-    near = radius < 1e-9
-    return np.asarray(target * np.where(near, 1.0, np.tan(theta) / np.where(near, 1.0, radius))[..., None])
-
-
-def _distort_equidistant(x: FloatArray, k: FloatArray) -> tuple[FloatArray, FloatArray]:
-    r2 = (x * x).sum(axis=-1)
-    r = np.sqrt(r2)
-    theta = np.arctan(r)
-    theta_d, d_theta_d = _equidistant_radius(theta, k), _equidistant_slope(theta, k)
-    near = r < 1e-6
-    safe = np.where(near, 1.0, r)
-    scale = np.where(near, 1.0, theta_d / safe)
-    # d(scale)/d(r^2): theta_d / r to second order at the axis is 1 + (k1 - 1/3) r^2.
-    d_scale = np.where(near, k[0] - 1 / 3, (d_theta_d / (1.0 + r2) - scale) / (2.0 * safe * safe))
-    J = scale[..., None, None] * _EYE + 2.0 * d_scale[..., None, None] * x[..., :, None] * x[..., None, :]
-    return x * scale[..., None], J

@@ -205,9 +205,7 @@ def solve_camera_pose(
     points = (squares - middle[:3, 3]).reshape(1, -1, 3)
     starts = _starts(images, squares, points, middle, initial, compete)
     T_camera_middle, chi2, information = fit(starts, points, images, _INLIER, alternatives=len(starts))
-    best = int(np.argmin(chi2))
-    if initial is not None and chi2[0] <= _AMBIGUOUS_RATIO * max(chi2[best], 8.0 * len(corners) - 6.0):
-        best = 0
+    best = _likeliest(chi2, 8 * len(corners) - 6, initial is not None)
     residuals = corners - camera.project(se3.apply(T_camera_middle[best], points).reshape(squares.shape))
     squared = np.sum(residuals**2, axis=-1)
     if not (np.isfinite(chi2[best]) and np.isfinite(squared).all()):
@@ -215,6 +213,12 @@ def solve_camera_pose(
     covariance = _of_camera(covariances(information[best]), T_camera_middle[best])
     T_map_camera = middle @ se3.inverse(T_camera_middle[best])
     return JointPose(T_map_camera, covariance, residuals, float(np.sqrt(squared.mean())), float(chi2[best]))
+
+
+def _likeliest(chi2: FloatArray, freedom: int, predicted: bool) -> int:
+    """Of poses of chi-squares (B,): the best, but the first, if that is ``predicted`` and not clearly worse."""
+    best = int(np.argmin(chi2))
+    return 0 if predicted and chi2[0] <= _AMBIGUOUS_RATIO * max(chi2[best], freedom) else best
 
 
 def _starts(
