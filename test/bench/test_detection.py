@@ -6,6 +6,7 @@ OpenCV doesn't know of the bolometers' lag, which shifts them all. Rms per axis 
 
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib.util import find_spec
 import itertools
 from pathlib import Path
 import time
@@ -40,6 +41,7 @@ class Case:
     stepwise: bool = False
     #: right after the shutter's correction, so that noise is all that is left
     corrected: bool = False
+    dictionary: str = 'DICT_4X4_50'
 
     @property
     def scene(self):
@@ -49,7 +51,7 @@ class Case:
         sensor = replace(scenario.sensor, lag=self.lag, bad_pixel_share=0.0)
         if self.corrected:
             sensor = replace(sensor, pixel_growth=0.0, column_growth=0.0, column_pattern=0.01)
-        return replace(scenario, acrylic=acrylic, sensor=sensor)
+        return replace(scenario, acrylic=acrylic, sensor=sensor, dictionary=self.dictionary)
 
 
 CONTRASTS = (8.0, 2.0, 0.5, 0.3, 0.1)
@@ -63,13 +65,19 @@ CASES = {
     'fast, 8 K, lag in steps': Case('fast', 8.0, stepwise=True),
     'fast, 8 K, lag of 14 ms': Case('fast', 8.0, lag=0.014),
     'fast, 0.5 K': Case('fast', 0.5),
+    'slow, 8 K, 36h11': Case('wall', 8.0, dictionary='DICT_APRILTAG_36h11'),
+    'slow, 0.5 K, 36h11': Case('wall', 0.5, dictionary='DICT_APRILTAG_36h11'),
 }
 OPENCV = {
     'OpenCV, no refinement': cv2.aruco.CORNER_REFINE_NONE,
     'SUBPIX': cv2.aruco.CORNER_REFINE_SUBPIX,
     'APRILTAG': cv2.aruco.CORNER_REFINE_APRILTAG,
 }
-METHODS = ['blind', 'guided', *OPENCV]
+#: Other detectors, where they are installed by hand (the one's licence allows no commercial use: never a dependency).
+OTHERS = [name for name, module in (('locus-tag', 'locus'), ('napa-vision', 'napa_vision')) if find_spec(module)]
+METHODS = ['blind', 'guided', *OPENCV, *OTHERS]
+#: Of napa-vision's arrays.
+pytestmark = pytest.mark.filterwarnings('ignore:A builtin ctypes object gave:RuntimeWarning')
 
 
 @pytest.fixture(autouse=True)
@@ -128,7 +136,40 @@ def opencv_detector(case, refinement):
     return prepared, detect
 
 
+def locus_detector(case):
+    """A function of a frame: ID to corners, on one thread."""
+    import locus
+
+    family = {
+        'DICT_4X4_50': locus.TagFamily.ArUco4x4_50,
+        'DICT_APRILTAG_36h11': locus.TagFamily.AprilTag36h11,
+    }[case.dictionary]
+    detector = locus.Detector(families=[family], threads=1)
+
+    def detect(image):
+        found = detector.detect(image)
+        # It counts from the corner of the first pixel.
+        return [(int(marker_id), corners - 0.5) for marker_id, corners in zip(found.ids, found.corners, strict=True)]
+
+    return lambda frame: (eight_bits(frame.counts),), detect
+
+
+def napa_detector(case):
+    """The same; it knows AprilTags alone, so that of others it finds none."""
+    import napa_vision
+
+    detector = napa_vision.NapaDetector()
+    knows = case.dictionary == 'DICT_APRILTAG_36h11'
+
+    def detect(image):
+        return [(tag.tag_id, tag.corners) for tag in detector.detect(image)] if knows else []
+
+    return lambda frame: (eight_bits(frame.counts),), detect
+
+
 def make(case, method):
+    if method in OTHERS:
+        return {'locus-tag': locus_detector, 'napa-vision': napa_detector}[method](case)
     if method in OPENCV:
         return opencv_detector(case, OPENCV[method])
     return our_detector(case, method == 'guided')
@@ -169,7 +210,10 @@ def cell(result):
 
 def time_cells(times):
     """In Markdown, of each method."""
-    return [f'{1e3 * times[method]:.1f} ms ({times[method] / times["SUBPIX"]:.2f})' for method in METHODS]
+    return [
+        f'{1e3 * times[method]:.1f} ms ({times[method] / times["SUBPIX"]:.2f})' if method in times else '-'
+        for method in METHODS
+    ]
 
 
 TIMES, POSE_TIMES = {}, {}
@@ -183,9 +227,9 @@ def pose_times(monkeypatch):
 
     def timed(function):
         def call(*arguments):
-            start = time.thread_time()
+            start = time.process_time()
             result = function(*arguments)
-            times.append(time.thread_time() - start)
+            times.append(time.process_time() - start)
             return result
 
         return call
@@ -195,14 +239,16 @@ def pose_times(monkeypatch):
     return times
 
 
-@pytest.mark.benchmark(timer=time.thread_time)
-@pytest.mark.parametrize('scene', ['slow, 8 K', 'slow, 0.5 K', 'fast, 8 K'])
+@pytest.mark.benchmark(timer=time.process_time)
+@pytest.mark.parametrize('scene', ['slow, 8 K', 'slow, 0.5 K', 'fast, 8 K', 'slow, 8 K, 36h11'])
 @pytest.mark.parametrize('method', METHODS)
 def test_time(benchmark, pose_times, scene, method):
     """Mean processor time of a frame of a settled detector: blind searches come every few frames only, and all count.
 
     Of several passes the fastest: the others waited for caches and neighbours.
     """
+    if method == 'napa-vision' and CASES[scene].dictionary != 'DICT_APRILTAG_36h11':
+        pytest.skip('it knows AprilTags alone')
     frames = stretches(CASES[scene])[0]
     poses = []
 
@@ -229,11 +275,11 @@ def test_table(benchmark, write_table):
     results = benchmark.pedantic(
         lambda: {(name, method): score(case, method) for name, case in CASES.items() for method in METHODS}, rounds=1
     )
-    rows = [['scene', 'ours, blind', 'ours, guided', *OPENCV]]
+    rows = [['scene', 'ours, blind', 'ours, guided', *OPENCV, *OTHERS]]
     rows += [[name, *(cell(results[name, method]) for method in METHODS)] for name in CASES]
     for scene in dict.fromkeys(scene for scene, _ in TIMES):
-        whole = {method: TIMES[scene, method] for method in METHODS}
-        without = {method: TIMES[scene, method] - POSE_TIMES[scene, method] for method in METHODS}
+        whole = {method: TIMES[scene, method] for method in METHODS if (scene, method) in TIMES}
+        without = {method: seconds - POSE_TIMES[scene, method] for method, seconds in whole.items()}
         rows.append([f'time of a frame, {scene} (ratio to SUBPIX)', *time_cells(whole)])
         rows.append(
             [f'of it detection and refinement, which is all that detectMarkers does, {scene}', *time_cells(without)]
@@ -250,10 +296,13 @@ def plot(results):
     """Corner error over contrast, slow, and for all scenes at 8 K."""
     figure = Figure(figsize=(10, 4), layout='constrained')
     left, right = figure.subplots(1, 2, sharey=True)
-    scenes = [name for name, case in CASES.items() if case.contrast == 8.0]
+    scenes = [name for name, case in CASES.items() if case.contrast == 8.0 and case.dictionary == 'DICT_4X4_50']
     shift = np.linspace(-0.32, 0.32, len(METHODS))
-    for method, marker, offset in zip(METHODS, itertools.cycle('os^vD'), shift, strict=False):
-        label = method if method in OPENCV else f'ours, {method}'
+    # The plot shows markers of 4 x 4 bits.
+    for method, marker, offset in zip(
+        [name for name in METHODS if name != 'napa-vision'], itertools.cycle('os^vDP*'), shift, strict=False
+    ):
+        label = f'ours, {method}' if method in ('blind', 'guided') else method
         errors = [results[f'slow, {contrast:g} K', method].rms_px for contrast in CONTRASTS]
         left.loglog(CONTRASTS, errors, marker=marker, label=label)
         right.bar(np.arange(len(scenes)) + offset, [results[name, method].rms_px for name in scenes], 0.15)
