@@ -166,7 +166,7 @@ def test_hostile_odometry_costs_no_pose_and_keeps_no_marker_out_of_the_map(graph
         graph.send('odometry', odometry(state(START + k * FRAME_NS, **values)))
         graph.send('markers', message)
     assert sorted(node.mapper.map.markers) == [0, 1, 2, 3]
-    assert node._camera_pose.count == len(detections)
+    assert graph.published(node, 'camera_pose') == len(detections)
     assert refusals(graph, node) > 0
     assert 'odometry' in graph.diagnose(node)[2]['last refusal']
 
