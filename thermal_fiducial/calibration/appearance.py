@@ -114,10 +114,12 @@ class Disc:
 
     def shape(self, place: FloatArray, blur: FloatArray, width: float) -> FloatArray:
         """See :class:`Appearance`."""
-        every = np.concatenate([np.zeros((1, 2)), self.others])
         # Farther than this, nothing of a neighbour is seen.
-        every = every[np.linalg.norm(every, axis=1) < np.abs(place).max() + width + _TAIL * float(blur.max())]
-        away = place[:, None] - every
-        radius = np.linalg.norm(away, axis=2) + 1e-9
-        across = radius / np.maximum(np.linalg.norm(away / blur, axis=2), 1e-9)
-        return np.asarray(np.sum(ndtr((width - radius) / across), axis=1))
+        seen = np.abs(place).max() + width + _TAIL * float(blur.max())
+        near = self.others[np.hypot(self.others[:, 0], self.others[:, 1]) < seen]
+        # A row a disc: sums run over long rows then, many times faster than over short ones.
+        x = np.concatenate([place[None, :, 0], place[:, 0] - near[:, :1]])
+        y = np.concatenate([place[None, :, 1], place[:, 1] - near[:, 1:]])
+        radius = np.sqrt(x * x + y * y) + 1e-9
+        across = radius / np.maximum(np.sqrt((x / blur[0]) ** 2 + (y / blur[1]) ** 2), 1e-9)
+        return np.asarray(ndtr((width - radius) / across).sum(axis=0))

@@ -7,7 +7,8 @@ neighbours lead one to expect. So neither a lamp's spot of heat nor contrast tha
 a reflection, moves a point, and what covers a point is noticed.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -124,6 +125,7 @@ class _Window:
     weight : (N,)
     ground : (N, 3) orthonormal: what level and slope explain
     inverse : (2, 2) steps of the grid by pixels
+    scale : (2,) steps along the axes in a pixel
     promise : (N,) contrast that the neighbours promise, or 1 everywhere
     promised : whether they do
     """
@@ -134,6 +136,7 @@ class _Window:
     weight: FloatArray
     ground: FloatArray
     inverse: FloatArray
+    scale: FloatArray
     promise: FloatArray
     promised: bool
 
@@ -144,7 +147,7 @@ class _Window:
     def shape(self, parameters: FloatArray, appearance: Appearance) -> FloatArray:
         """The pattern (N,) above ground, by the point's offset [px], the blur's logarithm and the width."""
         place = self.place - self.inverse @ parameters[:2]
-        blur = np.clip(np.exp(parameters[2]), *_BLUR_BOUNDS) * np.linalg.norm(self.inverse, axis=1)
+        blur = min(max(math.exp(parameters[2]), _BLUR_BOUNDS[0]), _BLUR_BOUNDS[1]) * self.scale
         return self.above_ground(self.weight * self.promise * appearance.shape(place, blur, float(parameters[3])))
 
 
@@ -172,7 +175,8 @@ def _window(
     ground, _ = np.linalg.qr(np.column_stack([np.ones(len(weight)), offset[inside]]) * weight[:, None])
     counts = image[low[1] : high[1] + 1, low[0] : high[0] + 1].reshape(-1)[inside].astype(np.float64) * weight
     counts -= ground @ (ground.T @ counts)
-    return _Window(start, place[inside], counts, weight, ground, inverse, np.ones(len(weight)), promised=False)
+    scale = np.asarray(np.linalg.norm(inverse, axis=1))
+    return _Window(start, place[inside], counts, weight, ground, inverse, scale, np.ones(len(weight)), promised=False)
 
 
 def _promised(window: _Window, away: FloatArray, contrast: FloatArray) -> _Window | None:
@@ -186,22 +190,13 @@ def _promised(window: _Window, away: FloatArray, contrast: FloatArray) -> _Windo
     if abs(level_and_slope[0]) < _LEAST_CONTRAST * np.abs(contrast[near]).max():
         return None
     promise = level_and_slope[0] + window.place @ level_and_slope[1:]
-    return _Window(
-        window.start,
-        window.place,
-        window.counts,
-        window.weight,
-        window.ground,
-        window.inverse,
-        promise,
-        promised=True,
-    )
+    return replace(window, promise=promise, promised=True)
 
 
 def _fit(window: _Window, appearance: Appearance, shared: _Shared | None) -> _Fitted | None:
     """Fit a point by Levenberg's and Marquardt's method: all of it, or the point alone with what is shared given."""
     if shared is None:
-        blur = max(_LEAST_BLUR, _BLUR / float(np.linalg.norm(window.inverse, axis=1).max()))
+        blur = max(_LEAST_BLUR, _BLUR / float(window.scale.max()))
         parameters = np.array([0.0, 0.0, np.log(blur), appearance.width])
         free = 4 if appearance.width_free else 3
     else:
