@@ -144,7 +144,6 @@ def test_time_offset_is_found_within_a_millisecond(offset):
     assert abs(ekf.diagnostics()['time offset'] - offset) < 4.0 * ekf.diagnostics()['time offset std']
 
 
-@pytest.mark.xfail(strict=True, reason='a noisy gyroscope makes the offset claim 0.5 ms where it is 4 to 19 ms off')
 @each_seed
 def test_shaking_does_not_bias_the_time_offset(seed):
     """A slow flight, its rates hidden below the noise of single samples."""
@@ -160,9 +159,10 @@ def test_shaking_does_not_bias_the_time_offset(seed):
 
 
 def first_seconds():
-    """Squared errors of the poses in sigma, per degree of freedom, and of the time offsets [s], in the first seconds.
+    """Squared errors of the poses in sigma, per degree of freedom, and the time offsets' (6, 2) errors and claims [s].
 
-    Flights that turn from the start, 60 deg/s rms about each axis, clocks apart by the default standard deviation.
+    Flights that turn from the start, 60 deg/s rms about each axis, three seconds long, clocks apart by the default
+    standard deviation.
     """
     squares, offsets = [], []
     for seed in range(6):
@@ -175,16 +175,19 @@ def first_seconds():
             turn = so3_log(T[:3, :3] @ state.T_map_body[:3, :3].T)
             error = np.concatenate((T[:3, 3] - state.T_map_body[:3, 3], turn))
             squares.append(error @ np.linalg.solve(state.pose_covariance, error) / 6.0)
-        offsets.append(ekf.diagnostics()['time offset'] - data.offset)
-    return np.mean(squares), rms(offsets)
+        offsets.append((ekf.diagnostics()['time offset'] - data.offset, ekf.diagnostics()['time offset std']))
+    return np.mean(squares), np.array(offsets)
 
 
 def test_first_seconds_are_consistent_and_show_the_time_offset():
-    square, offset = first_seconds()
+    square, offsets = first_seconds()
+    errors_ms, stds_ms = 1e3 * offsets.T
     # 1 is honest; the shipped noise is three times that of these poses, so it must be less
     assert square < 1.0
-    # over 3 s; twice what it is
-    assert offset < 0.0006
+    # the 99 % limit of the mean of six squares
+    assert rms(errors_ms / stds_ms) < 1.67
+    # of 30 ms, after 3 s
+    assert rms(stds_ms) < 2.0
 
 
 @pytest.mark.parametrize('offset', [pytest.param(0.01, marks=pytest.mark.nightly), 0.04])
@@ -214,7 +217,7 @@ def test_wild_poses_are_refused():
 
 def test_wild_poses_without_a_gate_are_noticed():
     """Negative control."""
-    assert position_rms(config(gate=1e12), wild) > 1.2 * position_rms(config())
+    assert position_rms(config(gate=1e6), wild) > 1.2 * position_rms(config())
 
 
 @each_seed

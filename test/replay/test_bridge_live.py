@@ -113,7 +113,6 @@ def flying(monkeypatch):
         node.wait(10.0)
 
 
-@pytest.mark.xfail(strict=False, reason='the velocity check of check-bridge reports a fault; cause not found yet')
 def test_the_filter_as_a_flight_controller_sees_it(flying, capfd):
     status = main(['check-bridge', '--seconds', str(SECONDS + 0.5), '--json'])
     printed, said = capfd.readouterr()

@@ -124,6 +124,12 @@ def test_each_fault_is_found(flying, check):
     assert level_of(FAULTS[check](flying), check) is Level.FAULT
 
 
+def test_corrections_by_markers_are_no_wrong_velocity(flying):
+    """Steps of 5 mm from message to message are 0.2 m/s at 40 Hz, and 10 mm/s over half a second."""
+    steps = np.random.default_rng(1).normal(scale=0.005, size=flying.positions.shape)
+    assert level_of(replace(flying, positions=flying.positions + steps), 'velocity') is Level.OK
+
+
 @pytest.mark.parametrize('fault', [upside_down, tilted])
 def test_a_wrong_vertical_is_found(resting, fault):
     assert level_of(fault(resting), 'gravity') is Level.FAULT

@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.estimates import difference
 from support.flights import config, errors, Flight, matched, Motion, rms, run, START_NS, timeline, white_poses
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.filter.state import TIME_OFFSET
 from thermal_fiducial.core.measurements import ImuSample
 
 
@@ -41,13 +43,28 @@ def test_every_sample_has_its_odometry_once_initialised(flight):
     assert not ekf.lost
 
 
+def in_order_and_late(flight, delay, **changes):
+    """Two filters at the end of a flight, one of which got its poses late."""
+    delays = np.random.default_rng(2).uniform(0.0, 0.2, len(flight.poses)) if delay == 'random' else delay
+    in_order, late = PoseEkf(config(**changes)), PoseEkf(config(**changes))
+    run(in_order, timeline(flight.samples(), flight.poses))
+    run(late, timeline(flight.samples(), flight.poses, delays))
+    return in_order, late
+
+
+def test_samples_after_a_late_pose_help_to_find_the_clock_offset(flight):
+    """They show the motion better; that is all that lateness changes."""
+    in_order, late = (ekf.estimate for ekf in in_order_and_late(flight, 0.05))
+    assert late.std(TIME_OFFSET) < in_order.std(TIME_OFFSET)
+    apart = difference(in_order.state, late.state)
+    # less than a standard deviation: they share nearly all that they know
+    assert (np.abs(apart[:15]) < np.sqrt(in_order.covariance.diagonal()[:15])).all()
+
+
 @pytest.mark.parametrize('delay', [0.05, 0.4, 'random'])
 def test_late_and_out_of_order_poses_equal_in_order_processing(short_flight, delay):
     flight = short_flight
-    delays = np.random.default_rng(2).uniform(0.0, 0.2, len(flight.poses)) if delay == 'random' else delay
-    in_order, late = PoseEkf(config()), PoseEkf(config())
-    run(in_order, timeline(flight.samples(), flight.poses))
-    run(late, timeline(flight.samples(), flight.poses, delays))
+    in_order, late = in_order_and_late(flight, delay, estimate_time_offset=False, time_offset_std=0.0, stamp_jitter=0.0)
     late_now, now = late.estimate, in_order.estimate
     # the last pose is 0.13 s old, so a delay of up to 0.4 s needs the poses that haven't arrived
     if delay == 0.4:

@@ -8,15 +8,41 @@ from support.estimates import any_estimate, difference
 from support.flights import CAMERA_POSITION, config
 
 from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise
-from thermal_fiducial.core.filter.state import EXTRINSICS, POSE, SIZE, SYSTEMATIC, TIME_OFFSET, VELOCITY
-from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_innovation, PoseUpdater
+from thermal_fiducial.core.filter.state import (
+    CORE,
+    EXTRINSICS,
+    POSE,
+    POSITION,
+    SIZE,
+    SYSTEMATIC,
+    TIME_OFFSET,
+    VELOCITY,
+)
+from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_innovation, PoseUpdater, slide
 from thermal_fiducial.core.geometry.se3 import so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose
 
 FULL = config(estimate_extrinsics=True, stamp_jitter=0.0)
 RATE = np.array([0.5, -1.0, 0.7])
-MOTION = MotionAtPose(rate=RATE, rate_variance=0.0, mean_rate=RATE, acceleration=np.zeros(3), turning=0.0)
-STILL = MotionAtPose(rate=np.zeros(3), rate_variance=0.0, mean_rate=np.zeros(3), acceleration=np.zeros(3), turning=0.0)
+
+
+def motion_of(state, rate=RATE, acceleration=(0.0, 0.0, 0.0), **others):
+    """A motion whose samples show this rate and this change of the velocity in the robot frame."""
+    gravity = state.gravity @ state.R_map_body
+    force = acceleration - gravity + np.cross(rate, state.velocity_body)
+    wanted = np.concatenate((rate, force)) + state.bias
+    imu = np.linalg.solve(np.eye(3) - state.scale, wanted.reshape(2, 3, 1)).reshape(6)
+    return MotionAtPose(**({'imu': imu, 'rate_variance': 0.0, 'velocity_variance': 0.0, 'turning': 0.0} | others))
+
+
+@pytest.fixture
+def motion(estimate):
+    return motion_of(estimate.state)
+
+
+@pytest.fixture
+def still(estimate):
+    return motion_of(estimate.state, np.zeros(3))
 
 
 @pytest.fixture
@@ -53,43 +79,75 @@ def test_covariance_of_the_body_pose_has_the_lever_arm(estimate):
     np.testing.assert_allclose(pose.covariance, J @ A @ A.T @ J.T, rtol=1e-4, atol=1e-5 * (A @ A.T).max())
 
 
-def test_time_offset_and_extrinsics_columns(estimate):
+def test_time_offset_and_extrinsics_columns(estimate, motion):
     """A pose taken later, and one through other extrinsics, differ as the columns of H say."""
     updater, state = PoseUpdater(FULL), estimate.state
     later = transform(state.R_map_body @ so3_exp(1e-6 * RATE), state.position + 1e-6 * state.velocity)
-    innovation = updater.innovation(known(estimate), BodyPose(0, later, np.eye(6)), MOTION)
+    innovation = updater.innovation(known(estimate), BodyPose(0, later, np.eye(6)), motion)
     np.testing.assert_allclose(innovation.value, 1e-6 * innovation.H[:, TIME_OFFSET], atol=1e-11)
     for axis, error in enumerate(1e-6 * np.eye(6)):
         T_true = transform(so3_exp(error[:3]), error[3:]) @ state.T_body_camera
         measured = body_pose(CameraPose(0, state.T_map_body @ T_true, np.eye(6)), state.T_body_camera, 1.0)
-        innovation = updater.innovation(known(estimate), measured, MOTION)
+        innovation = updater.innovation(known(estimate), measured, motion)
         np.testing.assert_allclose(innovation.value, 1e-6 * innovation.H[:, EXTRINSICS][:, axis], atol=1e-11)
 
 
-def test_the_systematic_error_is_part_of_the_measurement(estimate):
+def test_the_systematic_error_is_part_of_the_measurement(estimate, still):
     """In its own standard deviations, it moves a pose by the root of the pose's covariance."""
     updater = PoseUpdater(FULL)
     A = np.random.default_rng(3).normal(size=(6, 6)) * 1e-3
     pose = BodyPose(0, estimate.state.T_map_body, A @ A.T)
     same_view = replace(known(estimate), pose_noise=replace(PoseNoise.of(1.0, 2.0), last=pose))
     biased = replace(same_view, state=replace(estimate.state, systematic=np.arange(1.0, 7.0)))
-    innovation = updater.innovation(biased, pose, STILL)
+    innovation = updater.innovation(biased, pose, still)
     np.testing.assert_allclose(innovation.value, -innovation.H[:, SYSTEMATIC] @ np.arange(1.0, 7.0), atol=1e-12)
     root = innovation.H[:, SYSTEMATIC]
     # twice the standard deviation
     np.testing.assert_allclose(root @ root.T, 4.0 * pose.shape, rtol=1e-9, atol=1e-15)
 
 
-def test_a_motion_below_its_own_noise_says_nothing_of_the_clock(estimate):
-    updater = PoseUpdater(FULL)
-    pose = BodyPose(0, estimate.state.T_map_body, 1e-6 * np.eye(6))
-    unknown = known(estimate)
-    unknown.covariance[VELOCITY, VELOCITY] = np.eye(3)
-    noisy = replace(MOTION, rate_variance=1.0)
-    column = updater.innovation(unknown, pose, noisy).H[:, TIME_OFFSET]
-    assert not column.any()
-    sure = updater.innovation(known(estimate), pose, MOTION).H[:, TIME_OFFSET]
-    np.testing.assert_allclose(sure[:3], RATE, atol=1e-9)
+def at_camera_stamp(estimate, motion):
+    """Covariance of the core at the stamp of the camera, and with the clock offset: errors of X(t) Exp(slide s)."""
+    J = np.eye(SIZE)
+    J[CORE, TIME_OFFSET] = slide(estimate.state, motion.imu)
+    P = J @ estimate.covariance @ J.T
+    return P[CORE, CORE], P[CORE, TIME_OFFSET]
+
+
+def test_a_corrected_velocity_says_nothing_of_the_clock(estimate, motion):
+    """A pose is of the state at the camera's stamp: what is not correlated with the offset there, stays so."""
+    updater, std = PoseUpdater(FULL), 0.02
+    unknown = replace(estimate, covariance=np.zeros((SIZE, SIZE)), clock_open=True)
+    unknown.covariance[CORE, CORE] = np.diag(np.repeat((1e-2, 0.3, 1e-2), 3) ** 2)
+    unknown.covariance[VELOCITY, POSITION] = unknown.covariance[POSITION, VELOCITY] = 1.5e-3 * np.eye(3)
+    slid = np.zeros(SIZE)
+    slid[CORE], slid[TIME_OFFSET] = -slide(estimate.state, motion.imu), 1.0
+    unknown.covariance[...] += std**2 * np.outer(slid, slid)
+    np.testing.assert_allclose(at_camera_stamp(unknown, motion)[1], 0.0, atol=1e-12)
+    seen = transform(estimate.state.R_map_body, estimate.state.position + 0.02)
+    pose = BodyPose(0, seen, 1e-6 * np.eye(6))
+    after = updater.correct(pose, updater.innovation(unknown, pose, motion), motion)
+    assert np.linalg.norm(after.state.velocity - estimate.state.velocity) > 0.1
+    assert after.std(TIME_OFFSET) == pytest.approx(std)
+    # of 0.02 s times 1 m/s or 1 rad/s: rounding
+    np.testing.assert_allclose(at_camera_stamp(after, motion)[1], 0.0, atol=1e-9)
+
+
+def test_noise_of_the_motion_is_no_information(estimate, motion):
+    """A rate that is nothing but noise shows no clock offset; a true one does."""
+    updater, std = PoseUpdater(FULL), 0.02
+    P = 1e-12 * np.eye(SIZE)
+    P[TIME_OFFSET, TIME_OFFSET] = std**2
+    prior = replace(estimate, covariance=P, clock_open=True, state=replace(estimate.state, velocity=np.zeros(3)))
+    pose = BodyPose(0, prior.state.T_map_body, 1e-4 * np.eye(6))
+    noisy = motion_of(prior.state, 0.1 * RATE, rate_variance=0.01 * float(RATE @ RATE) / 3.0)
+    feigned = updater.correct(pose, updater.innovation(prior, pose, noisy), noisy)
+    # half as much again as this noise feigns is taken away, of which one pose shows a few per cent
+    assert std <= feigned.std(TIME_OFFSET) < 1.05 * std
+    true = replace(noisy, rate_variance=0.0)
+    learned = updater.correct(pose, updater.innovation(prior, pose, true), true)
+    # (1 / std^2 + |rate|^2 / R)^-1/2
+    assert learned.std(TIME_OFFSET) < 0.99 * std
 
 
 @pytest.mark.parametrize(('turning', 'push'), [(0.0, 0.0), (3.0, 0.0), (0.0, 2.0)])
@@ -99,7 +157,7 @@ def test_an_uncertain_time_offset_costs_what_the_acceleration_makes_of_it(estima
     P = np.zeros((SIZE, SIZE))
     P[TIME_OFFSET, TIME_OFFSET] = std**2
     resting = replace(estimate, state=replace(estimate.state, velocity=np.zeros(3)), covariance=P)
-    motion = MotionAtPose(np.zeros(3), 0.0, np.zeros(3), np.array([push, 0.0, 0.0]), turning)
+    motion = motion_of(resting.state, np.zeros(3), np.array([push, 0.0, 0.0]), turning=turning)
     pose = BodyPose(0, resting.state.T_map_body, np.zeros((6, 6)))
     innovation = updater.innovation(resting, pose, motion)
     expected = 0.75 * std**4 * np.repeat((turning**2, push**2), 3) + np.diag(pose.shape)
@@ -120,7 +178,7 @@ def test_at_rest_the_force_shows_tilt_bias_and_gravity(estimate, place):
     np.testing.assert_allclose(difference(estimate.state, found.state), error, atol=1e-5)
 
 
-def test_what_poses_are_worth_is_learned(estimate):
+def test_what_poses_are_worth_is_learned(estimate, still):
     """White errors of a third of what the covariance claims, about a state that is known."""
     rng, updater = np.random.default_rng(8), PoseUpdater(config(stamp_jitter=0.0, estimate_time_offset=False))
     R = np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)
@@ -129,8 +187,8 @@ def test_what_poses_are_worth_is_learned(estimate):
         noise = np.linalg.cholesky(R) @ rng.normal(size=6) / 3.0
         T = now.state.T_map_body @ transform(so3_exp(noise[:3]), noise[3:])
         pose = BodyPose(stamp, T, R)
-        innovation = updater.innovation(replace(now, covariance=1e-14 * np.eye(SIZE)), pose, STILL)
-        noise_then = updater.correct(pose, innovation, STILL).pose_noise
+        innovation = updater.innovation(replace(now, covariance=1e-14 * np.eye(SIZE)), pose, still)
+        noise_then = updater.correct(pose, innovation, still).pose_noise
         now = replace(now, pose_noise=noise_then)
     # the memory of 50 poses of 6 degrees of freedom: 12 % of the variance, 6 % of the deviation; three of that
     assert np.sqrt(now.pose_noise.white) == pytest.approx(1.0 / 3.0, rel=0.2)
@@ -153,7 +211,7 @@ def test_another_view_has_another_systematic_error():
     assert seen.alike(other_markers, 0.3) == pytest.approx((5.0 / 13.0) ** 3, rel=0.01)
 
 
-def test_the_jitter_of_the_stamps_is_learned(estimate):
+def test_the_jitter_of_the_stamps_is_learned(estimate, motion):
     """Stamps that scatter by 3 ms, about a state that is known and moves."""
     rng, updater = np.random.default_rng(9), PoseUpdater(config(estimate_time_offset=False, time_offset_std=0.0))
     R = np.diag(np.repeat((1e-5, 2e-5), 3) ** 2)
@@ -164,6 +222,6 @@ def test_the_jitter_of_the_stamps_is_learned(estimate):
         R_late = estimate.state.R_map_body @ so3_exp(late * RATE)
         pose = BodyPose(stamp, transform(R_late, estimate.state.position + late * velocity), R)
         now = replace(known(estimate, 1e-14), clock_open=False, pose_noise=noise)
-        noise = updater.correct(pose, updater.innovation(now, pose, MOTION), MOTION).pose_noise
+        noise = updater.correct(pose, updater.innovation(now, pose, motion), motion).pose_noise
     # the memory of 300 poses of one number: 6 % of the deviation; three of that
     assert np.sqrt(noise.jitter) == pytest.approx(3e-3, rel=0.18)

@@ -24,6 +24,8 @@ PX4_FLOOR, ARDUPILOT_FLOOR = 0.1, 0.2
 MADE_UP = 1e-5
 #: Turning about the vertical that a yaw check needs [rad/s], and moving that a velocity check needs [m/s].
 TURN, MOVE = 0.15, 0.2
+#: ... which is seen over so long [s].
+MOVE_SECONDS = 0.5
 #: At rest: rate [rad/s] and speed [m/s] below this, and specific force this near to gravity [m/s^2], for so long [ns]:
 #: where a flight turns back a drone is as slow for an instant, while it accelerates most.
 STILL_RATE, STILL_SPEED, STILL_FORCE, STILL_NS = 0.05, 0.05, 0.5, 500_000_000
@@ -212,22 +214,37 @@ def _yaw(record: BridgeRecord) -> list[Finding]:
 
 
 def _velocity(record: BridgeRecord) -> list[Finding]:
-    """The twist is the derivative of the position, in the robot's axes."""
-    dt = np.diff(record.stamps_ns) * 1e-9
-    usable = (dt > 1e-4) & (dt < PX4_START)
-    moved = np.diff(record.positions, axis=0) / np.where(usable, dt, 1.0)[:, None]
-    in_body = (moved[:, None, :] @ record.rotations[:-1])[:, 0]
-    claimed = 0.5 * (record.velocities[:-1] + record.velocities[1:])
-    usable &= np.linalg.norm(moved, axis=1) > MOVE
+    """The twist in the robot's axes, summed up over half a second, is how the position has changed.
+
+    Over one message it needn't be: corrections by markers, of millimetres, are as large as the motion.
+    """
+    t = (record.stamps_ns - record.stamps_ns[0]) * 1e-9
+    end = np.searchsorted(t, t + MOVE_SECONDS)
+    begin = np.flatnonzero(end < len(t))
+    end = end[begin]
+    # Stamps that go back have a finding of their own.
+    seconds = np.maximum(t[end] - t[begin], MOVE_SECONDS)[:, None]
+    velocity = (record.positions[end] - record.positions[begin]) / seconds
+    in_map = (record.rotations @ record.velocities[..., None])[..., 0]
+    as_robot, as_map = (
+        (path[end] - path[begin]) / seconds for path in (_summed(t, v) for v in (in_map, record.velocities))
+    )
+    usable = (np.linalg.norm(velocity, axis=1) > MOVE) & (seconds[:, 0] < MOVE_SECONDS + PX4_START)
     if usable.sum() < 10:
         return [Finding('velocity', Level.UNTESTED, 'no motion', 'Carry the drone about while it listens.')]
-    speed = float(np.median(np.linalg.norm(moved[usable], axis=1)))
-    wrong, swapped = (float(np.median(np.linalg.norm(claimed - v, axis=1)[usable])) for v in (in_body, moved))
+    speed = float(np.median(np.linalg.norm(velocity[usable], axis=1)))
+    wrong, swapped = (float(np.median(np.linalg.norm(velocity - v, axis=1)[usable])) for v in (as_robot, as_map))
     seen = f'differs from the moving position by {wrong:.2f} m/s at {speed:.2f} m/s'
     if wrong < max(0.25 * speed, 0.1):
         return [Finding('velocity', Level.OK, seen, 'In the robot frame, as mavros and PX4 want it.')]
     where = 'It is in the map frame instead.' if swapped < 0.5 * wrong else 'Its axes are wrong.'
     return [Finding('velocity', Level.FAULT, seen, f'{where} mavros and PX4 take it for the robot frame.')]
+
+
+def _summed(t: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Path (N, 3) of a velocity (N, 3) at times (N,), by the trapezoid rule."""
+    steps = 0.5 * (velocity[:-1] + velocity[1:]) * np.diff(t)[:, None]
+    return np.concatenate((np.zeros((1, 3)), np.cumsum(steps, axis=0)))
 
 
 def _covariance(record: BridgeRecord) -> list[Finding]:

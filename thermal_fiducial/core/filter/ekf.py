@@ -20,15 +20,12 @@ from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.filter.smoothing import SmoothOutput
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
 from thermal_fiducial.core.filter.state_output import odometry
-from thermal_fiducial.core.filter.update import MotionAtPose
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
 from thermal_fiducial.core.types import FloatArray
 
 _SECOND_NS = 1_000_000_000
 #: An offset known to this [s] moves a marker by a pixel or two in the fastest flights.
 _KNOWN_OFFSET_STD = 0.003
-#: Seconds of samples over which motion is averaged where noise matters.
-_GLANCE_SECONDS = 0.2
 #: Poses over which the normalised innovation squared is averaged for the diagnostics.
 _NIS_POSES = 30
 #: Verdicts on poses that are kept.
@@ -148,7 +145,7 @@ class PoseEkf:
             return False
         begin = self._history.instant(index, nodes[index - 1].stamp_ns)
         there = self._moved(before, begin, instant, nodes[index])
-        return self._hypotheses.explains(there, pose, self._motion(instant, there))
+        return self._hypotheses.explains(there, pose, self._history.motion(instant, there))
 
     def move_map(self, T_new_old: FloatArray) -> None:
         """Follow a correction of the map: estimates and buffered poses move with it, T_new = T_new_old @ T_old."""
@@ -205,7 +202,7 @@ class PoseEkf:
         self, belief: Belief, pose: CameraPose, instant: Instant, at_pose: Hypothesis, index: int
     ) -> Belief:
         window = self._history.window(instant, WINDOW_SECONDS)
-        motion = self._motion(instant, at_pose)
+        motion = self._history.motion(instant, at_pose)
         begun = self._hypotheses.alternative_to(at_pose, pose, instant.time_ns, motion, window)
         if begun is None:
             return belief
@@ -246,7 +243,7 @@ class PoseEkf:
         while (pose := history.next_pose(hypothesis.pose_stamp_ns, hypothesis, node.stamp_ns)) is not None:
             then = self._instant_of(pose, hypothesis, index)
             hypothesis, at = self._moved(hypothesis, at, then, node), then
-            motion = self._motion(then, hypothesis)
+            motion = self._history.motion(then, hypothesis)
             weighed, update = self._hypotheses.weigh(hypothesis, pose, motion)
             verdicts.append((pose, update, hypothesis))
             hypothesis = weighed
@@ -263,10 +260,6 @@ class PoseEkf:
         if end.time_ns <= begin.time_ns:
             return hypothesis
         return self._hypotheses.predicted(hypothesis, 0.5 * (begin.imu + end.imu), end.time_ns, node.densities)
-
-    def _motion(self, instant: Instant, hypothesis: Hypothesis) -> MotionAtPose:
-        before, after = self._history.nodes[instant.index - 1 : instant.index + 1]
-        return self._hypotheses.motion(hypothesis, self._history.window(instant, _GLANCE_SECONDS), before, after)
 
     def _decide(self, update: PoseUpdate) -> None:
         known = self._verdicts.pop(update.stamp_ns, None)

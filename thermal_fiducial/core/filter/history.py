@@ -1,8 +1,8 @@
 """The latest IMU samples and poses, and what is known at each: poses come late, and in any order.
 
 The belief at a sample is a function of the samples and poses up to it, ordered by time, never of the order in which
-they came: a pose that comes late goes where it belongs, and everything after it is computed again, at the cost of one
-inertial step a sample.
+they came, but for the few samples after a pose that show its motion: a pose that comes late goes where it belongs, and
+everything after it is computed again, at the cost of one inertial step a sample.
 """
 
 from bisect import bisect_left, bisect_right, insort
@@ -12,12 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
+from thermal_fiducial.core.filter.update import MotionAtPose
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.types import FloatArray
 
 _SECOND_NS = 1_000_000_000
 #: Farther than this [ns] an estimated clock offset never goes: the history is searched from there.
 _LARGEST_OFFSET_NS = 200_000_000
+#: Samples of so long [s] before and after a pose show its motion, if they have come: the noise of one would not.
+_MOTION_SECONDS = 0.05
 
 
 @dataclass(slots=True)
@@ -109,6 +112,21 @@ class History:
         """Samples (N, 6) of the last ``seconds`` up to an instant, the last one at it."""
         first = self.index_at(instant.time_ns - round(seconds * _SECOND_NS))
         return np.array([*(node.imu for node in self.nodes[first : instant.index]), instant.imu])
+
+    def motion(self, instant: Instant, hypothesis: Hypothesis) -> MotionAtPose:
+        """The motion at the instant of a pose, from the samples around it that have come."""
+        nodes, index = self.nodes, instant.index
+        before, after = nodes[index - 1 : index + 1]
+        seconds = (after.stamp_ns - before.stamp_ns) / _SECOND_NS
+        each_side = max(min(round(_MOTION_SECONDS / seconds), len(nodes) - index, index), 1)
+        samples = np.array([node.imu for node in nodes[index - each_side : index + each_side]])
+        since_pose = (instant.time_ns - hypothesis.accepted_ns) / _SECOND_NS
+        return MotionAtPose(
+            imu=samples.mean(axis=0),
+            rate_variance=float(after.densities[0]) ** 2 / (seconds * len(samples)),
+            velocity_variance=float(after.densities[3]) ** 2 * since_pose,
+            turning=float(np.linalg.norm(after.imu[:3] - before.imu[:3])) / seconds,
+        )
 
     def index_at(self, stamp_ns: int) -> int:
         """First node at ``stamp_ns`` or later."""

@@ -6,7 +6,6 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.history import Node
 from thermal_fiducial.core.filter.initialization import blank_state, start
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.prediction import Prediction
@@ -22,7 +21,7 @@ from thermal_fiducial.core.filter.state import (
     TIME_OFFSET,
     VELOCITY,
 )
-from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_innovation, PoseUpdater
+from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_innovation, PoseUpdater, slide
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
@@ -60,22 +59,6 @@ class Hypotheses:
     def estimate(self, hypothesis: Hypothesis) -> Estimate:
         """State and whole covariance at the hypothesis's instant."""
         return hypothesis.prediction.estimate(self._walks)
-
-    def motion(self, hypothesis: Hypothesis, samples: FloatArray, before: Node, after: Node) -> MotionAtPose:
-        """Motion at an instant between two nodes, ``samples`` (N, 6) up to it.
-
-        Their mean counts while the clock offset is unknown: noise of a single sample would correlate it with velocity.
-        """
-        state = hypothesis.prediction.state
-        imu = samples[-1] if hypothesis.prediction.origin.clock_open else samples.mean(axis=0)
-        seconds = (after.stamp_ns - before.stamp_ns) / _SECOND_NS
-        return MotionAtPose(
-            rate=state.corrected(after.imu)[:3],
-            rate_variance=float(after.densities[0]) ** 2 / seconds,
-            mean_rate=state.corrected(imu)[:3],
-            acceleration=_acceleration(state, imu),
-            turning=float(np.linalg.norm(after.imu[:3] - before.imu[:3])) / seconds,
-        )
 
     def weigh(self, hypothesis: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> tuple[Hypothesis, PoseUpdate]:
         """A hypothesis after a pose at its instant, and the verdict on the pose."""
@@ -158,16 +141,10 @@ class Hypotheses:
 
     def _clock_covariance(self, state: NavigationState, covariance: FloatArray, imu: FloatArray) -> FloatArray:
         """What an unknown offset (9, 9) is worth: the state has followed the clock of the camera."""
-        moved = np.concatenate((state.corrected(imu)[:3], _acceleration(state, imu), state.velocity_body))
+        moved = slide(state, imu)
         added = np.outer(moved, moved)
         added[POSITION, POSITION] += covariance[VELOCITY, VELOCITY]
         return np.asarray(self._config.time_offset_std**2 * added)
-
-
-def _acceleration(state: NavigationState, imu: FloatArray) -> FloatArray:
-    """Change (3,) of the velocity in the robot frame [m/s^2]."""
-    rate, force = np.split(state.corrected(imu), 2)
-    return np.asarray(force + state.gravity @ state.R_map_body - np.cross(rate, state.velocity_body))
 
 
 def _difference(state: NavigationState, other: NavigationState) -> FloatArray:

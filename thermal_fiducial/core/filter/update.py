@@ -11,13 +11,13 @@ from thermal_fiducial.core.filter.increments import rotation_integrals
 from thermal_fiducial.core.filter.pose_noise import BodyPose
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
+    CORE,
     Estimate,
     EXTRINSICS,
     GRAVITY,
     GYROSCOPE_BIAS,
     NavigationState,
     POSE,
-    POSITION,
     ROTATION,
     SIZE,
     SYSTEMATIC,
@@ -31,10 +31,10 @@ from thermal_fiducial.core.types import FloatArray
 #: Root of the sum of the velocity variances [m/s] from which the clock offset is estimated, and by how much the rate
 #: [rad/s] and the velocity [m/s] may have changed until then.
 _KNOWN_VELOCITY, _UNKNOWN_CHANGE = 0.2, 0.5
-#: Motion shows a clock offset as far as it exceeds its own noise: the variance of a regressor's noise is taken off its
-#: square so many times (W. James, C. Stein 1961; once for the mean, the rest since the noise is in the innovation too).
-_SHRINKAGE = 4.0
-_TINY = 1e-12
+#: Noise of the motion at a pose feigns information about the clock offset: once to twice what its square is worth, the
+#: more the larger the gain is, since differences of the motion from pose to pose count. One pose takes at most half of
+#: what is known.
+_FEIGNED, _LEAST_KEPT = 1.5, 0.5
 _SIX = np.arange(6)
 
 
@@ -43,6 +43,7 @@ class Innovation(NamedTuple):
 
     value: FloatArray
     S: FloatArray
+    S_inverse: FloatArray
     H: FloatArray
     R: FloatArray
     nis: float
@@ -56,17 +57,24 @@ class Innovation(NamedTuple):
 class MotionAtPose:
     """What the IMU shows of the motion at a pose's instant.
 
-    ``rate`` (3,) [rad/s], of a sample that the prediction hardly rests on: its noise would be in the innovation too;
-    ``rate_variance`` of one axis; ``mean_rate`` (3,) and ``acceleration`` (3,) of the velocity in the robot frame
-    [m/s^2], means over a while where one sample's noise would matter; ``turning`` [rad/s^2]: size of the angular
-    acceleration.
+    ``imu`` (6,): mean of as many samples before it as after it, so that its noise is as often in the innovations of
+    poses with one sign as with the other, and moves the clock offset to neither side; ``rate_variance`` [rad^2/s^2] of
+    one axis of it; ``velocity_variance`` [m^2/s^2]: what the noise of the accelerometer has added to the velocity since
+    the pose before; ``turning`` [rad/s^2]: size of the angular acceleration.
     """
 
-    rate: FloatArray
+    imu: FloatArray
     rate_variance: float
-    mean_rate: FloatArray
-    acceleration: FloatArray
+    velocity_variance: float
     turning: float
+
+
+def slide(state: NavigationState, imu: FloatArray) -> FloatArray:
+    """Change (9,) of the core with time: X(t + s) = X(t) Exp(slide s), as a sample ``imu`` (6,) shows it."""
+    rate, force = np.split(state.corrected(imu), 2)
+    velocity = state.velocity_body
+    acceleration = force + state.gravity @ state.R_map_body - skew(rate) @ velocity
+    return np.concatenate((rate, acceleration, velocity))
 
 
 def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> BodyPose:
@@ -107,17 +115,17 @@ class PoseUpdater:
         H[:, EXTRINSICS] = np.eye(6)
         H[:, SYSTEMATIC] = root
         R = prior.pose_noise.white * pose.shape
-        twist = np.concatenate((motion.rate, prior.state.velocity_body))
-        self._add_clock(prior, twist, motion, H, R)
+        self._add_clock(prior, motion, H, R)
         value = pose_innovation(prior.state, pose.T_map_body) - root @ prior.state.systematic
         S = H @ prior.covariance @ H.T + R
-        return Innovation(value, S, H, R, float(value @ np.linalg.solve(S, value)), alike, prior)
+        S_inverse = np.asarray(np.linalg.inv(S))
+        return Innovation(value, S, S_inverse, H, R, float(value @ S_inverse @ value), alike, prior)
 
-    def _add_clock(
-        self, prior: Estimate, twist: FloatArray, motion: MotionAtPose, H: FloatArray, R: FloatArray
-    ) -> None:
+    def _add_clock(self, prior: Estimate, motion: MotionAtPose, H: FloatArray, R: FloatArray) -> None:
         """What errors of the camera's clock do to a pose: jitter and, where it isn't estimated, the offset."""
         config = self.config
+        moved = slide(prior.state, motion.imu)
+        twist, acceleration = moved[POSE], moved[VELOCITY]
         unknown = prior.pose_noise.jitter + (0.0 if config.estimate_time_offset else config.time_offset_std**2)
         R += unknown * np.outer(twist, twist)
         if not config.estimate_time_offset:
@@ -127,12 +135,11 @@ class PoseUpdater:
             return
         P = prior.covariance
         velocity, variance = P[VELOCITY, VELOCITY], float(P[TIME_OFFSET, TIME_OFFSET])
-        H[:3, TIME_OFFSET] = _shrunk(twist[:3], 3.0 * motion.rate_variance)
-        H[3:, TIME_OFFSET] = _shrunk(twist[3:], float(np.trace(velocity)))
+        H[:, TIME_OFFSET] = twist
         # Second order: offset times what is uncertain of the motion, and half the acceleration times its square.
         square = 0.75 * variance**2
         R[_SIX[:3], _SIX[:3]] += variance * motion.rate_variance + square * motion.turning**2
-        R[_SIX[3:], _SIX[3:]] += square * float(motion.acceleration @ motion.acceleration)
+        R[_SIX[3:], _SIX[3:]] += square * float(acceleration @ acceleration)
         R[3:, 3:] += variance * velocity + np.outer(P[VELOCITY, TIME_OFFSET], P[VELOCITY, TIME_OFFSET])
 
     def correct(self, pose: BodyPose, innovation: Innovation, motion: MotionAtPose) -> Estimate:
@@ -140,10 +147,14 @@ class PoseUpdater:
         prior = innovation.prior
         error, covariance = self._gained(prior.covariance, innovation.value, innovation.H, innovation.R)
         state = prior.state.plus(error)
+        if prior.clock_open and self.config.estimate_time_offset:
+            change = slide(state, motion.imu) - slide(prior.state, motion.imu)
+            state = state.plus(_of_core(-change * error[TIME_OFFSET]))
+            covariance = self._in_clock_of_imu(covariance, change, slide(state, motion.imu), innovation, motion)
         variances = covariance.diagonal()[SYSTEMATIC]
         second_moment = float(state.systematic @ state.systematic + variances.sum()) / 6.0
         noise = prior.pose_noise.after(pose, innovation.value, innovation.S, second_moment, innovation.alike)
-        twist = np.concatenate((motion.rate, prior.state.velocity_body))
+        twist = slide(prior.state, motion.imu)[POSE]
         noise = noise.with_stamps(twist, innovation.value, innovation.S)
         # The same systematic error in units of its new standard deviation.
         unit = (prior.pose_noise.systematic / noise.systematic) ** 0.5
@@ -151,6 +162,30 @@ class PoseUpdater:
         covariance[:, SYSTEMATIC] *= unit
         state = replace(state, systematic=unit * state.systematic)
         return self._with_clock(replace(prior, state=state, covariance=covariance, pose_noise=noise), motion)
+
+    def _in_clock_of_imu(
+        self, P: FloatArray, change: FloatArray, moved: FloatArray, innovation: Innovation, motion: MotionAtPose
+    ) -> FloatArray:
+        """The covariance after a pose that has changed by ``change`` (9,) what is known of the motion, now ``moved``.
+
+        A pose is of the state at the stamp of the camera, X(t) Exp(slide s). That state's error has nothing to do with
+        how well the slide is known, so the error of X(t) follows the slide; else each correction of the velocity would
+        feign information about the offset s. (G. Huang, A. Mourikis, S. Roumeliotis, "Observability-based Rules for
+        Designing Consistent EKF SLAM Estimators", IJRR 2010, have the like of other unobservable directions.)
+
+        The square of the slide's noise feigns information too (errors in variables): what it is worth is taken away.
+        """
+        with_offset = P[TIME_OFFSET]
+        variance = float(with_offset[TIME_OFFSET])
+        followed = _of_core(-change)
+        half = np.outer(followed, with_offset + 0.5 * variance * followed)
+        noise = np.repeat((motion.rate_variance, motion.velocity_variance), 3)
+        feigned = _FEIGNED * float(innovation.S_inverse.diagonal() @ noise)
+        widest = max(variance, self.config.time_offset_std**2)
+        consistent = min(variance / max(1.0 - variance * feigned, _LEAST_KEPT), widest)
+        slid = _of_core(-moved)
+        slid[TIME_OFFSET] = 1.0
+        return P + half + half.T + (consistent - variance) * np.outer(slid, slid)
 
     def _gained(
         self, P: FloatArray, innovation: FloatArray, H: FloatArray, R: FloatArray
@@ -174,12 +209,9 @@ class PoseUpdater:
         return replace(estimate, covariance=self._slid(estimate, motion), clock_open=True)
 
     def _slid(self, estimate: Estimate, motion: MotionAtPose) -> FloatArray:
-        slide = np.zeros(SIZE)
-        slide[ROTATION] = -motion.mean_rate
-        slide[VELOCITY] = -motion.acceleration
-        slide[POSITION] = -estimate.state.velocity_body
-        slide[TIME_OFFSET] = 1.0
-        return np.asarray(estimate.covariance + self.config.time_offset_std**2 * np.outer(slide, slide))
+        slid = _of_core(-slide(estimate.state, motion.imu))
+        slid[TIME_OFFSET] = 1.0
+        return np.asarray(estimate.covariance + self.config.time_offset_std**2 * np.outer(slid, slid))
 
     def with_unknown_clock(self, estimate: Estimate) -> Estimate:
         """The estimate as good as it is, its clock offset as unknown as after a step of the camera's clock."""
@@ -221,6 +253,8 @@ def _with_new_view(estimate: Estimate, alike: float) -> Estimate:
     return replace(estimate, state=state, covariance=P)
 
 
-def _shrunk(regressor: FloatArray, variance: float) -> FloatArray:
-    """(3,) shrunk towards zero as far as noise of ``variance`` on all axes may have made it."""
-    return np.asarray(max(1.0 - _SHRINKAGE * variance / max(float(regressor @ regressor), _TINY), 0.0) * regressor)
+def _of_core(error: FloatArray) -> FloatArray:
+    """An error (48,) of the core (9,) alone."""
+    whole = np.zeros(SIZE)
+    whole[CORE] = error
+    return whole
