@@ -31,7 +31,7 @@ class CameraClock:
         return replace(pose, stamp_ns=pose.stamp_ns - self.ahead_ns) if self.ahead_ns else pose
 
     def proposed(self, pose: CameraPose, newest_ns: int) -> int:
-        """By how much stamps have jumped ahead [ns] for all that arrival tells, 0: not at all.
+        """By how much stamps have jumped ahead [ns] for all that arrival shows, 0: not at all.
 
         ``newest_ns``: stamp of the newest IMU sample when ``pose`` arrives.
         """
