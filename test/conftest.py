@@ -11,6 +11,7 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 import cv2
 import hypothesis
 import pytest
+from rclpy.logging import LoggingSeverity, set_logger_level
 
 from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.ros.run import use_transport_profile
@@ -42,3 +43,10 @@ def real_data():
     if not folder:
         pytest.skip('THERMAL_FIDUCIAL_DATA is not set: no real data')
     return Path(folder)
+
+
+@pytest.fixture
+def log_level_restored():
+    """For tests whose nodes are silent: the level is that of the process, and later tests read the console."""
+    yield
+    set_logger_level('', LoggingSeverity.INFO)

@@ -134,9 +134,14 @@ KEYS = {
     'tf2_ros': 'tf2_ros_py',
 }
 #: Not in Ubuntu: from pip, for those who replay bags, cut markers, align clouds or show trajectories.
-FROM_PIP = {'rosbags', 'ezdxf', 'small_gicp', 'plyfile', 'pypcd4', 'usb', 'allantools', 'dask', 'distributed'}
+FROM_PIP = {'rosbags', 'ezdxf', 'small_gicp', 'plyfile', 'pypcd4', 'usb', 'allantools', 'dask', 'distributed'} | {
+    'av',
+    'evo',
+    'plotly',
+    'svgwrite',
+}
 #: Of the user's workspace, where they are asked for.
-OPTIONAL = {'px4_msgs', 'aruco_opencv_msgs', 'apriltag_msgs', 'vision_msgs'}
+OPTIONAL = {'px4_msgs', 'aruco_opencv_msgs', 'apriltag_msgs', 'vision_msgs', 'foxglove_msgs'}
 
 
 def test_the_manifest_names_each_package_that_is_imported():

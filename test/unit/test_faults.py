@@ -18,6 +18,7 @@ STEP = 0.005
 
 
 @pytest.mark.ros
+@pytest.mark.usefixtures('log_level_restored')
 def test_a_frozen_imu_is_declared_and_no_wrong_pose_goes_out():
     flight = Recorded(0, last=LAST)
     last = next(item for item in reversed(flight.imu) if item.sampled < BEGIN)

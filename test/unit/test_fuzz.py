@@ -18,6 +18,7 @@ def nothing(target, number):
 
 
 @pytest.mark.ros
+@pytest.mark.usefixtures('log_level_restored')
 # Their own complaints are the libraries' matter: what counts is what comes of them.
 @pytest.mark.filterwarnings('ignore')
 def test_mutated_messages_harm_nothing():

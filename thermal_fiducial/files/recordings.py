@@ -191,8 +191,8 @@ def _table(path: Path, columns: int) -> tuple[IntArray, FloatArray]:
 
 
 def _stamp(where: str, word: str) -> int:
-    # As many digits as 64 bits have.
-    if not (word.isascii() and word.isdigit() and len(word) <= 18):
+    # As many digits as 64 bits have; the length first, since a word of thousands of them is no number.
+    if not (word.isascii() and word.isdigit() and len(word) <= 19 and int(word) < 2**63):
         raise InputError(f'{where}: {word[:40]!r} is no stamp in nanoseconds')
     return int(word)
 

@@ -24,8 +24,8 @@ DETECTIONS, LATENCY, PARAMETERS = 'detections.csv', 'latency.csv', 'parameters.y
 MARKER_MAP, TRUE_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'map_true.yaml', 'summary.json', 'output'
 #: Bytes of a table: half a day of frames with eight markers each.
 LARGEST_TABLE = 1 << 30
-# As many digits of a whole number as 64 bits have; what is longer is one no more.
-_LONGEST_CELL = 18
+#: Longer words are no numbers; whole ones fit into 64 bits.
+_LONGEST_CELL, _LARGEST_WHOLE = 40, 2**63
 
 
 @dataclass(frozen=True)
@@ -133,10 +133,19 @@ def _rows(path: Path, kinds: dict[str, type]) -> list[list[Any]]:
     lines = csv.DictReader(io.StringIO(read_text(path, limit=LARGEST_TABLE)))
     try:
         for row in lines:
-            rows.append([kind(row[name][:_LONGEST_CELL]) for name, kind in kinds.items()])
+            rows.append([_value(row[name], kind) for name, kind in kinds.items()])
     except (KeyError, TypeError, ValueError, csv.Error):
         raise InputError(f'{path}, line {lines.line_num}: no {", ".join(kinds)}') from None
     return [list(column) for column in zip(*rows, strict=True)] or [[] for _ in kinds]
+
+
+def _value(word: str, kind: type) -> float:
+    if len(word) > _LONGEST_CELL:
+        raise ValueError
+    value: float = kind(word)
+    if kind is int and abs(value) >= _LARGEST_WHOLE:
+        raise ValueError
+    return value
 
 
 def _detections(path: Path) -> Detections:
