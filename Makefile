@@ -65,7 +65,7 @@ bench: $(READY)
 	$(BIN)/python -m pytest test/bench --benchmark-only --benchmark-columns=median,min,max,rounds $(PYTEST_ARGS)
 
 faults: $(READY)
-	@echo '== Faults in flight: half an hour on two cores; fewer flights: make faults FAULTS_ARGS="--seeds 1"'
+	@echo '== Faults in flight: about an hour on two cores; fewer flights: make faults FAULTS_ARGS="--seeds 1"'
 	PYTHONPATH=test $(BIN)/python -m faults $(FAULTS_ARGS)
 	$(BIN)/python test/documents.py
 
