@@ -5,45 +5,33 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from rosbags.typesys import get_typestore, Stores
 
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Markers
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.files.rosbags_types import BODY_FRAME, CAMERA_FRAME, header, make, MAP_FRAME
 
-CAMERA_FRAME, BODY_FRAME, MAP_FRAME = 'thermal_camera_optical', 'base_link', 'map'
-
-_TYPES = get_typestore(Stores.ROS2_JAZZY).types
 #: sensor_msgs/msg/PointField's codes of the types that rows have.
 _POINT_CODES = {'<f4': 7, '<u4': 6, '|u1': 2}
 _NO_ORIENTATION = np.array([-1.0] + [0.0] * 8)
 
 
-def _make(kind: str, *args: Any, **fields: Any) -> Any:
-    return _TYPES[kind](*args, **fields)
-
-
-def _header(stamp_ns: int, frame_id: str) -> Any:
-    time = _make('builtin_interfaces/msg/Time', *divmod(int(stamp_ns), 1_000_000_000))
-    return _make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)
-
-
 def _vector(values: FloatArray, kind: str = 'Vector3') -> Any:
-    return _make(f'geometry_msgs/msg/{kind}', *(float(value) for value in values))
+    return make(f'geometry_msgs/msg/{kind}', *(float(value) for value in values))
 
 
 def _pose(T: FloatArray) -> Any:
     quaternion = _vector(quaternion_from_rotation(T[:3, :3]), 'Quaternion')
-    return _make('geometry_msgs/msg/Pose', _vector(T[:3, 3], 'Point'), quaternion)
+    return make('geometry_msgs/msg/Pose', _vector(T[:3, 3], 'Point'), quaternion)
 
 
 def imu(sample: ImuSample) -> Any:
     """sensor_msgs/msg/Imu without orientation; its covariances say nothing."""
-    return _make(
+    return make(
         'sensor_msgs/msg/Imu',
-        header=_header(sample.stamp_ns, BODY_FRAME),
-        orientation=_make('geometry_msgs/msg/Quaternion', 0.0, 0.0, 0.0, 1.0),
+        header=header(sample.stamp_ns, BODY_FRAME),
+        orientation=make('geometry_msgs/msg/Quaternion', 0.0, 0.0, 0.0, 1.0),
         orientation_covariance=_NO_ORIENTATION,
         angular_velocity=_vector(sample.angular_velocity),
         angular_velocity_covariance=np.zeros(9),
@@ -54,9 +42,9 @@ def imu(sample: ImuSample) -> Any:
 
 def camera_info(stamp_ns: int, camera: Camera) -> Any:
     """sensor_msgs/msg/CameraInfo."""
-    return _make(
+    return make(
         'sensor_msgs/msg/CameraInfo',
-        header=_header(stamp_ns, CAMERA_FRAME),
+        header=header(stamp_ns, CAMERA_FRAME),
         height=camera.height,
         width=camera.width,
         distortion_model=camera.model,
@@ -66,7 +54,7 @@ def camera_info(stamp_ns: int, camera: Camera) -> Any:
         p=np.hstack([camera.K, np.zeros((3, 1))]).ravel(),
         binning_x=0,
         binning_y=0,
-        roi=_make('sensor_msgs/msg/RegionOfInterest', 0, 0, 0, 0, do_rectify=False),
+        roi=make('sensor_msgs/msg/RegionOfInterest', 0, 0, 0, 0, do_rectify=False),
     )
 
 
@@ -74,9 +62,9 @@ def image(stamp_ns: int, pixels: npt.NDArray[Any]) -> Any:
     """sensor_msgs/msg/Image of (H, W) uint8 as mono8 or uint16 as mono16."""
     height, width = pixels.shape
     wide = pixels.dtype.itemsize == 2
-    return _make(
+    return make(
         'sensor_msgs/msg/Image',
-        header=_header(stamp_ns, CAMERA_FRAME),
+        header=header(stamp_ns, CAMERA_FRAME),
         height=height,
         width=width,
         encoding='mono16' if wide else 'mono8',
@@ -90,12 +78,12 @@ def markers(stamp_ns: int, rows: Markers) -> Any:
     """sensor_msgs/msg/PointCloud2 of rows of MARKER_DTYPE, as the detector publishes it."""
     layout: Mapping[str, Any] = rows.dtype.fields or {}
     fields = [
-        _make('sensor_msgs/msg/PointField', name, layout[name][1], _POINT_CODES[layout[name][0].str], 1)
+        make('sensor_msgs/msg/PointField', name, layout[name][1], _POINT_CODES[layout[name][0].str], 1)
         for name in rows.dtype.names or ()
     ]
-    return _make(
+    return make(
         'sensor_msgs/msg/PointCloud2',
-        header=_header(stamp_ns, CAMERA_FRAME),
+        header=header(stamp_ns, CAMERA_FRAME),
         height=1,
         width=len(rows),
         fields=fields,
@@ -109,17 +97,17 @@ def markers(stamp_ns: int, rows: Markers) -> Any:
 
 def camera_pose(pose: CameraPose) -> Any:
     """geometry_msgs/msg/PoseWithCovarianceStamped."""
-    place = _make('geometry_msgs/msg/PoseWithCovariance', _pose(pose.T_map_camera), pose.covariance.ravel())
-    return _make('geometry_msgs/msg/PoseWithCovarianceStamped', _header(pose.stamp_ns, MAP_FRAME), place)
+    place = make('geometry_msgs/msg/PoseWithCovariance', _pose(pose.T_map_camera), pose.covariance.ravel())
+    return make('geometry_msgs/msg/PoseWithCovarianceStamped', header(pose.stamp_ns, MAP_FRAME), place)
 
 
 def truth(stamp_ns: int, T_map_body: FloatArray) -> Any:
     """nav_msgs/msg/Odometry of a reference pose, without a twist."""
-    twist = _make('geometry_msgs/msg/Twist', _vector(np.zeros(3)), _vector(np.zeros(3)))
-    return _make(
+    twist = make('geometry_msgs/msg/Twist', _vector(np.zeros(3)), _vector(np.zeros(3)))
+    return make(
         'nav_msgs/msg/Odometry',
-        header=_header(stamp_ns, MAP_FRAME),
+        header=header(stamp_ns, MAP_FRAME),
         child_frame_id=BODY_FRAME,
-        pose=_make('geometry_msgs/msg/PoseWithCovariance', _pose(T_map_body), np.zeros(36)),
-        twist=_make('geometry_msgs/msg/TwistWithCovariance', twist, np.zeros(36)),
+        pose=make('geometry_msgs/msg/PoseWithCovariance', _pose(T_map_body), np.zeros(36)),
+        twist=make('geometry_msgs/msg/TwistWithCovariance', twist, np.zeros(36)),
     )

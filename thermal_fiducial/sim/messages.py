@@ -3,37 +3,24 @@
 from typing import Any
 
 import numpy as np
-from rosbags.typesys import get_typestore, Stores
 
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.files.rosbags_types import BODY_FRAME, CAMERA_FRAME, header, make, MAP_FRAME
 from thermal_fiducial.sim.imu import ImuModel
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.thermal_camera import SimFrame
 
-CAMERA_FRAME, BODY_FRAME, MAP_FRAME = 'thermal_camera_optical', 'base_link', 'map'
-
-_TYPES = get_typestore(Stores.ROS2_JAZZY).types
-
-
-def _make(kind: str, *args: Any, **fields: Any) -> Any:
-    return _TYPES[kind](*args, **fields)
-
-
-def _header(stamp_ns: int, frame_id: str) -> Any:
-    time = _make('builtin_interfaces/msg/Time', *divmod(int(stamp_ns), 1_000_000_000))
-    return _make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)
-
 
 def _vector(values: FloatArray, kind: str = 'Vector3') -> Any:
-    return _make(f'geometry_msgs/msg/{kind}', *values.tolist())
+    return make(f'geometry_msgs/msg/{kind}', *values.tolist())
 
 
 def image(frame: SimFrame, *, eight_bit: bool = False) -> Any:
     """A frame as little-endian mono16, or as mono8."""
     height, width = frame.counts.shape
-    return _make(
+    return make(
         'sensor_msgs/msg/Image',
-        header=_header(frame.stamp_ns, CAMERA_FRAME),
+        header=header(frame.stamp_ns, CAMERA_FRAME),
         height=height,
         width=width,
         encoding='mono8' if eight_bit else 'mono16',
@@ -45,9 +32,9 @@ def image(frame: SimFrame, *, eight_bit: bool = False) -> Any:
 
 def camera_info(lens: Lens, stamp_ns: int) -> Any:
     """Calibration of the lens."""
-    return _make(
+    return make(
         'sensor_msgs/msg/CameraInfo',
-        header=_header(stamp_ns, CAMERA_FRAME),
+        header=header(stamp_ns, CAMERA_FRAME),
         height=lens.height,
         width=lens.width,
         distortion_model=lens.model,
@@ -57,7 +44,7 @@ def camera_info(lens: Lens, stamp_ns: int) -> Any:
         p=np.hstack([lens.matrix, np.zeros((3, 1))]).ravel(),
         binning_x=0,
         binning_y=0,
-        roi=_make('sensor_msgs/msg/RegionOfInterest', 0, 0, 0, 0, do_rectify=False),
+        roi=make('sensor_msgs/msg/RegionOfInterest', 0, 0, 0, 0, do_rectify=False),
     )
 
 
@@ -65,10 +52,10 @@ def imu(stamp_ns: int, angular_velocity: FloatArray, linear_acceleration: FloatA
     """An IMU sample, without orientation, with the variances of its noise."""
     deviations = np.array([model.noise.gyroscope_noise_density, model.noise.accelerometer_noise_density])
     gyroscope, accelerometer = (np.eye(3).ravel() * variance for variance in deviations**2 * model.rate)
-    return _make(
+    return make(
         'sensor_msgs/msg/Imu',
-        header=_header(stamp_ns, BODY_FRAME),
-        orientation=_make('geometry_msgs/msg/Quaternion', 0.0, 0.0, 0.0, 1.0),
+        header=header(stamp_ns, BODY_FRAME),
+        orientation=make('geometry_msgs/msg/Quaternion', 0.0, 0.0, 0.0, 1.0),
         orientation_covariance=np.array([-1.0] + [0.0] * 8),
         angular_velocity=_vector(angular_velocity),
         angular_velocity_covariance=gyroscope,
@@ -85,12 +72,12 @@ def odometry(
     angular_velocity_body: FloatArray,
 ) -> Any:
     """The truth: pose of the body in ``map``, twist in the body's frame."""
-    pose = _make('geometry_msgs/msg/Pose', _vector(position, 'Point'), _vector(quaternion, 'Quaternion'))
-    twist = _make('geometry_msgs/msg/Twist', _vector(velocity_body), _vector(angular_velocity_body))
-    return _make(
+    pose = make('geometry_msgs/msg/Pose', _vector(position, 'Point'), _vector(quaternion, 'Quaternion'))
+    twist = make('geometry_msgs/msg/Twist', _vector(velocity_body), _vector(angular_velocity_body))
+    return make(
         'nav_msgs/msg/Odometry',
-        header=_header(stamp_ns, MAP_FRAME),
+        header=header(stamp_ns, MAP_FRAME),
         child_frame_id=BODY_FRAME,
-        pose=_make('geometry_msgs/msg/PoseWithCovariance', pose, np.zeros(36)),
-        twist=_make('geometry_msgs/msg/TwistWithCovariance', twist, np.zeros(36)),
+        pose=make('geometry_msgs/msg/PoseWithCovariance', pose, np.zeros(36)),
+        twist=make('geometry_msgs/msg/TwistWithCovariance', twist, np.zeros(36)),
     )

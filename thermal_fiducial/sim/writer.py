@@ -20,6 +20,7 @@ from thermal_fiducial.core.types import IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, TRUTH_TOPIC
 from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry
+from thermal_fiducial.files.rosbags_types import MAP_FRAME
 from thermal_fiducial.files.trajectory_file import save_tum
 from thermal_fiducial.sim import messages
 from thermal_fiducial.sim.imu import ImuRecord
@@ -216,7 +217,7 @@ def _marker_map(scenario: Scenario, markers: tuple[Marker, ...]) -> str:
         )
         for marker in markers
     ]
-    return dump_document(MapDocument(tuple(entries), messages.MAP_FRAME, scenario.dictionary))
+    return dump_document(MapDocument(tuple(entries), MAP_FRAME, scenario.dictionary))
 
 
 def _parameters(scenario: Scenario) -> dict[str, Any]:

@@ -1,0 +1,20 @@
+"""ROS messages as objects of rosbags: what all writers of bags share."""
+
+from typing import Any
+
+from rosbags.typesys import get_typestore, Stores
+
+CAMERA_FRAME, BODY_FRAME, MAP_FRAME = 'thermal_camera_optical', 'base_link', 'map'
+
+_TYPES = get_typestore(Stores.ROS2_JAZZY).types
+
+
+def make(kind: str, *args: Any, **fields: Any) -> Any:
+    """A message of ``kind``, e.g. 'std_msgs/msg/Header', of its fields in order or by name."""
+    return _TYPES[kind](*args, **fields)
+
+
+def header(stamp_ns: int, frame_id: str) -> Any:
+    """std_msgs/msg/Header."""
+    time = make('builtin_interfaces/msg/Time', *divmod(int(stamp_ns), 1_000_000_000))
+    return make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)
