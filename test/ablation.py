@@ -227,7 +227,6 @@ MECHANISMS = {
         {'finding:_BLUR_THAT_HIDES_PX': np.inf},
     ),
     'rolling shutter': Mechanism('rolling shutter', ('readout',), {}, {'readout_time': 0.0}),
-    'robust motion': Mechanism('fast, 8 K, blind', ('tracking:_trusted',), {'tracking:_OUTLIER': np.inf}),
     'error of the lag model': Mechanism(
         'fast, 8 K, blind', ('lag:model_error',), {'refining:model_error': _no_covariance}
     ),
@@ -255,7 +254,6 @@ MECHANISMS = {
     'search near predictions': Mechanism(
         'fast, 0.5 K, guided', ('guided',), {'finding:near_prediction': _nothing_found}
     ),
-    'common shift': Mechanism('carpet', ('guided:common_shift',), {'finding:common_shift': lambda *_: np.zeros(2)}),
     'branches by the map': Mechanism('slow, 0.1 K, guided', (), {'detector:choose_branches': lambda poses, *_: poses}),
 }
 

@@ -9,8 +9,6 @@ from support.scenes import motion_prior
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.found import Found
-from thermal_fiducial.core.detection.guided import common_shift
 from thermal_fiducial.core.detection.known_markers import KnownMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -92,13 +90,6 @@ def test_columns_of_fixed_pattern_hardly_pull_the_sides():
     clean = shape_error(detector(), shown, shown.counts)
     # Left in the image these columns make errors half to three quarters larger; taken out, by up to an eighth.
     assert shape_error(detector(), shown, pulled) < 1.25 * clean
-
-
-def test_new_markers_are_expected_off_their_places_like_those_followed():
-    ids, corners = np.array([3, 5, 8]), np.zeros((3, 4, 2))
-    seen = Found(np.array([8, 3, 9]), np.full((3, 4, 2), 4.0), np.ones(3), np.ones(3, dtype=bool))
-    np.testing.assert_allclose(common_shift(ids, corners, seen), [4.0, 4.0])
-    np.testing.assert_allclose(common_shift(ids, corners, Found.none()), 0.0)
 
 
 @pytest.mark.parametrize('noise', [1.5, 20.0])

@@ -3,14 +3,11 @@
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.contrast import halved
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.decoding import Decoder, Reading
 from thermal_fiducial.core.detection.found import Found
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
+from thermal_fiducial.core.types import BoolArray, Float32Array
 
-# Cells at least this wide are read at half the resolution, where a pixel has half the noise.
-_WIDE_CELL_PX = 8.0
 # Correlation at the refined corners: of a marker with sharp sides, and (less when faint) of one with softer sides.
 _SIMILAR = 0.82
 _CLEARLY_SIMILAR = 0.9
@@ -56,7 +53,7 @@ def confirmed(
     """
     if len(found.ids) == 0:
         return np.zeros(0, dtype=bool)
-    reading = read_quads(image, refined.corners_px, decoder)
+    reading = decoder.read(image, refined.corners_px)
     similarity = np.abs(reading.correlation)
     contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
     same = reading.ids == found.ids
@@ -83,12 +80,3 @@ def _stands_out(reading: Reading, decoder: Decoder) -> BoolArray:
     margin = (np.abs(reading.correlation) - reading.runner_up) / decoder.isolation[reading.ids]
     white = (reading.surround >= _WHITE[0]) & (reading.surround <= _WHITE[1])
     return np.asarray((margin >= _CLEAR_MARGIN) & white)
-
-
-def read_quads(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
-    """Readings of (Q, 4, 2) among all IDs, at half the resolution when all are large enough for it."""
-    everything = np.ones(decoder.count, dtype=bool)
-    sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
-    if sides.min(initial=np.inf) >= _WIDE_CELL_PX * decoder.cells:
-        return decoder.read(halved(image), 0.5 * (quads - 0.5), everything)
-    return decoder.read(image, quads, everything)

@@ -93,8 +93,8 @@ class Decoder:
         mean = np.kron(np.eye(self.cells), np.full((len(_SAMPLES), 1), 1.0 / len(_SAMPLES)))
         self._cells_of_samples = (np.kron(mean, mean) @ self._detrend).astype(np.float32)
 
-    def read(self, image: Float32Array, quads: FloatArray, allowed: BoolArray) -> Reading:
-        """Most similar pattern of each quadrilateral (Q, 4, 2) among those ``allowed`` (M,)."""
+    def read(self, image: Float32Array, quads: FloatArray, allowed: BoolArray | None = None) -> Reading:
+        """Most similar pattern of each quadrilateral (Q, 4, 2) among those ``allowed`` (M,), or all."""
         if len(quads) == 0:
             nothing = np.zeros(0)
             none = nothing.astype(np.int64)

@@ -11,7 +11,7 @@ from thermal_fiducial.core.detection.following import Followed
 from thermal_fiducial.core.detection.found import Found, merged, places_of
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.frame_history import FrameHistory
-from thermal_fiducial.core.detection.guided import common_shift, near_prediction
+from thermal_fiducial.core.detection.guided import near_prediction
 from thermal_fiducial.core.detection.ids import among
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes, MarkersOfMap
 from thermal_fiducial.core.detection.lag import LagField, without_lag
@@ -28,8 +28,6 @@ _ENOUGH = 0.5
 _CLEAR = 20.0
 # Nearer to the border of the image than this a marker is not expected to be observed [px].
 _BORDER_PX = 2.0
-# Of so many expected markers or more some are looked for before the others.
-_MANY, _SOME = 12, 6
 # Where not all markers are known, or not all observed that should be, a blind search follows at least every so many
 # frames.
 _INCOMPLETE = 2
@@ -90,12 +88,10 @@ class MarkerFinder:
         expected = _expected(frame.camera, last, of_map)
         followed = last.only(among(last.ids, expected.ids)).seen(frame, frame.twist, self._decoder, config)
         found = followed.found()
-        new = np.flatnonzero(~among(expected.ids, followed.ids))
-        # Where none is followed, some show by how much all the others are off.
-        for some in (new,) if len(found.ids) or len(new) < _MANY else (new[:_SOME], new[_SOME:]):
-            if len(some):
-                others = expected.only(some).shifted(common_shift(expected.ids, expected.corners_px, found))
-                found = merged(found, near_prediction(frame, frame.twist, others, self._decoder, config))
+        new = ~among(expected.ids, followed.ids)
+        if new.any():
+            near = near_prediction(frame, frame.twist, expected.only(new), self._decoder, config)
+            found = merged(found, near)
         number = len(expected.ids)
         complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
         return _Near(found, followed, complete, number > 0 and len(found.ids) >= _ENOUGH * number)

@@ -4,16 +4,12 @@ A marker is accepted by its own evidence alone: its pattern, in its expected pla
 the image clearly, and better than the pattern of any other marker or any other turn of its own.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.confirmation import read_quads
 from thermal_fiducial.core.detection.decoding import Decoder, Reading
-from thermal_fiducial.core.detection.found import Found, merged
+from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import Frame, Places
-from thermal_fiducial.core.detection.ids import pairs
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.lag import markers_deblurred, REMAINING
 from thermal_fiducial.core.detection.readout import expected_displacement
@@ -22,9 +18,8 @@ from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# Places round the prediction that are tried, in shares of a cell: near first, then far.
+# Places round the prediction that are tried, in shares of a cell.
 _NEAR = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]), axis=-1).reshape(-1, 2)
-_FAR = np.stack(np.meshgrid([-1.4, -0.7, 0.0, 0.7, 1.4], [-1.4, -0.7, 0.0, 0.7, 1.4]), axis=-1).reshape(-1, 2)
 
 
 def near_prediction(
@@ -43,53 +38,19 @@ def near_prediction(
     if blurred.any():
         scene = markers_deblurred(frame.image, corners[blurred], shift[blurred], WINDOW_MARGIN_PX)
     left = np.where(blurred[:, None, None], REMAINING * shift, shift)
-    found, there = _look(scene, ids, corners + left, decoder, frame.noise, config)
-    found = replace(found, corners_px=found.corners_px - (left + rolling)[there])
-    faint = np.flatnonzero(blurred & ~there)
-    if len(faint) == 0:
-        return found
-    # Freeing a faint marker of its lag may have drowned it in noise.
-    also, there = _look(frame.image, ids[faint], (corners + shift)[faint], decoder, frame.noise, config)
-    return merged(found, replace(also, corners_px=also.corners_px - (shift + rolling)[faint[there]]))
+    shown = _shifted(scene, ids, corners + left, decoder)
+    reading = decoder.read(scene, shown)
+    good = _confirmed(reading, ids, frame.noise, config)
+    corners = (shown - left - rolling)[good]
+    return Found(ids[good], corners, reading.contrast[good] / frame.noise, np.ones(len(corners), dtype=bool))
 
 
-def common_shift(ids: IntArray, corners: FloatArray, observed: Found) -> FloatArray:
-    """By how much (2,) markers are off their predicted corners (N, 4, 2): the median of those that are observed."""
-    predicted, found = pairs(ids, observed.ids)
-    if len(found) == 0:
-        return np.zeros(2)
-    return np.asarray(np.median((observed.corners_px[found] - corners[predicted]).mean(axis=1), axis=0))
-
-
-def _look(
-    image: Float32Array,
-    ids: IntArray,
-    corners: FloatArray,
-    decoder: Decoder,
-    noise: float,
-    config: ArucoDetectorConfig,
-) -> tuple[Found, BoolArray]:
-    """The expected markers (N,), (N, 4, 2) that the image shows, and which (N,) of them these are."""
-    corners = _shifted(image, ids, corners, decoder, _NEAR)
-    reading = read_quads(image, corners, decoder)
-    good, contrast = _confirmed(reading, ids, noise, config), reading.contrast.copy()
-    missing = np.flatnonzero(~good)
-    if len(missing):
-        far = _shifted(image, ids[missing], corners[missing], decoder, _FAR)
-        corners[missing] = _shifted(image, ids[missing], far, decoder, _NEAR)
-        reading = read_quads(image, corners[missing], decoder)
-        good[missing], contrast[missing] = _confirmed(reading, ids[missing], noise, config), reading.contrast
-    return Found(ids[good], corners[good], contrast[good] / noise, np.ones(int(good.sum()), dtype=bool)), good
-
-
-def _shifted(
-    image: Float32Array, ids: IntArray, corners: FloatArray, decoder: Decoder, offsets: FloatArray
-) -> FloatArray:
+def _shifted(image: Float32Array, ids: IntArray, corners: FloatArray, decoder: Decoder) -> FloatArray:
     """Corners (N, 4, 2) moved to where their patterns correlate best, between the places by the centre of gravity."""
     cell = np.linalg.norm(corners[:, 2] - corners[:, 0], axis=-1) / (np.sqrt(2.0) * decoder.cells)
-    step = cell[:, None, None] * offsets
+    step = cell[:, None, None] * _NEAR
     tried = (corners[:, None] + step[:, :, None]).reshape(-1, 4, 2)
-    similarity = np.abs(decoder.match(image, tried, np.repeat(ids, len(offsets)))).reshape(len(ids), -1)
+    similarity = np.abs(decoder.match(image, tried, np.repeat(ids, len(_NEAR)))).reshape(len(ids), -1)
     weight = np.maximum(similarity - 0.8 * similarity.max(axis=1, keepdims=True), 0.0)
     shift = np.einsum('np,npk->nk', weight, step) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
     return np.asarray(corners + shift[:, None])

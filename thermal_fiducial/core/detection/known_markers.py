@@ -33,10 +33,6 @@ class ExpectedMarkers(NamedTuple):
         """Those of the markers ``keep``."""
         return ExpectedMarkers(self.ids[keep], self.corners_px[keep], self.x[keep], self.depth[keep])
 
-    def shifted(self, shift_px: FloatArray) -> 'ExpectedMarkers':
-        """All a way (2,) further in the image."""
-        return ExpectedMarkers(self.ids, self.corners_px + shift_px, self.x, self.depth)
-
     def joined(self, others: 'ExpectedMarkers') -> 'ExpectedMarkers':
         """Those of ``others`` as well."""
         return ExpectedMarkers(

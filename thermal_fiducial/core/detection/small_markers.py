@@ -43,7 +43,7 @@ def with_corners_by_pattern(
         return refined, by_pattern
     shift, upright = refined.view.shift[small], np.zeros(len(small), dtype=np.int64)
     corners = aligned(frame.image, found.corners_px[small] + shift, found.ids[small], upright, decoder, noisy=False)
-    reading = decoder.read(frame.image, corners, np.ones(decoder.count, dtype=bool))
+    reading = decoder.read(frame.image, corners)
     good = (reading.ids == found.ids[small]) & (reading.turns == 0) & speaks_for_itself(reading, decoder)
     good &= accepted(reading, frame.noise, decoder.correctable, config)
     good &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)

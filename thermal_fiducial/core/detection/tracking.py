@@ -7,7 +7,6 @@ round the frame and by how the markers' corners moved since.
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -38,9 +37,6 @@ _ENOUGH_STATES = 4
 _JITTER_S = 0.001
 # How far corners that lag displaces may be off their mean delay, where the form of blurred edges is unknown [lag].
 _DELAY_UNSURE = 0.5
-# Mean square of a marker's residuals over what the noise of its corners makes of it, beyond which not all markers can
-# be of one scene (two in a hundred of brisk flights); how often weights are adapted, and when they have settled.
-_OUTLIER, _ROUNDS, _SETTLED = 12.0, 10, 0.02
 # Of the corners of a marker.
 _COORDINATES = 8
 
@@ -70,63 +66,6 @@ class TrackedMarkers:
     def none() -> 'TrackedMarkers':
         """No markers."""
         return TrackedMarkers(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4)), np.zeros(0))
-
-
-class _Flow(NamedTuple):
-    """Velocities of the M = 8 N coordinates of N markers' corners.
-
-    Parameters
-    ----------
-    A : (M, 6) derivative by the twist
-    velocity : (M,) normalised
-    stretch : (M,) by what all velocities may be off together, one standard deviation
-    weight : (M,) inverse variance of what each may be off by itself
-    """
-
-    A: FloatArray
-    velocity: FloatArray
-    stretch: FloatArray
-    weight: FloatArray
-
-    def robust(self, start: Twist, ago: float) -> Twist:
-        """The twist ``start`` corrected by the velocities so many seconds before.
-
-        A marker that moves by itself, or whose corners went wrong, shows by its residuals beside those of the others,
-        and loses weight accordingly.
-        """
-        twist = corrected(start, *self._information(self.weight), -ago)
-        if self._chi2(twist.ago(ago), self.weight).max() <= _OUTLIER:
-            return twist
-        # Together with the others, those that are wrong hide among them: what was expected sets them apart.
-        trust = _trusted(self._chi2(start.ago(ago), self.weight))
-        for _ in range(_ROUNDS):
-            weight = np.repeat(trust, _COORDINATES) * self.weight
-            twist = corrected(start, *self._information(weight), -ago)
-            former, trust = trust, _trusted(self._chi2(twist.ago(ago), weight))
-            if np.abs(trust - former).max() < _SETTLED:
-                break
-        return twist
-
-    def _information(self, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Information on the twist (6, 6), and times the twist (6,)."""
-        weighted, stretched = self.A.T * weight, weight * self.stretch
-        spread = weighted @ self.stretch
-        share = spread / (1.0 + stretched @ self.stretch)
-        information = weighted @ self.A - spread[:, None] * share
-        return information, weighted @ self.velocity - share * (stretched @ self.velocity)
-
-    def _chi2(self, twist: FloatArray, weight: FloatArray) -> FloatArray:
-        """Squared residuals (N,) of markers from a twist (6,), per degree of freedom."""
-        residual, stretched = self.velocity - self.A @ twist, weight * self.stretch
-        residual = residual - (stretched @ residual) / (1.0 + stretched @ self.stretch) * self.stretch
-        return np.asarray((self.weight * residual * residual).reshape(-1, _COORDINATES).sum(axis=1) / _COORDINATES)
-
-
-def _trusted(chi2: FloatArray) -> FloatArray:
-    """Factors (N,) on the weights of markers, 1 for residuals like those of most (S. Geman, D. McClure, 1987)."""
-    half = (len(chi2) - 1) // 2
-    typical = max(float(np.partition(chi2, half)[half]), 1.0)
-    return np.asarray(np.minimum(2.0 * typical / (typical + chi2), 1.0) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,8 +162,13 @@ class MotionTrack:
         A = interaction(0.5 * (x[now] + self.markers.x[before]), depth[now]).reshape(-1, 6)
         velocity = (x[now] - self.markers.x[before]).reshape(-1) / seconds
         stretch = A @ (np.zeros(6) if predicted is None else math.sqrt(unsure) / seconds * predicted.value)
-        flow = _Flow(A, velocity, stretch, np.repeat((seconds / (1.5 * noise[now])) ** 2, _COORDINATES))
-        return flow.robust(start, 0.5 * (begin + end))
+        weight = np.repeat((seconds / (1.5 * noise[now])) ** 2, _COORDINATES)
+        # Weighted least squares whose residuals share one more error: by the formula of Sherman and Morrison.
+        weighted, stretched = A.T * weight, weight * stretch
+        spread = weighted @ stretch
+        share = spread / (1.0 + stretched @ stretch)
+        information = weighted @ A - spread[:, None] * share
+        return corrected(start, information, weighted @ velocity - share * (stretched @ velocity), -0.5 * (begin + end))
 
     def all_clearer_than(self, cnr: float) -> bool:
         """Whether there were markers, all of more contrast over noise."""
