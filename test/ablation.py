@@ -203,9 +203,13 @@ def _no_covariance(_: Any, corners_px: Any, *__: Any) -> Any:
     return np.zeros((len(corners_px), 4, 2, 2))
 
 
+_READOUT = tuple(
+    f'frame:{name}' for name in ('delays', 'stretch', 'displacement', 'expected_displacement', 'seen_displacement')
+)
 _SCALES = _place('search:SearchScales')
 _ALL_IN_THE_SEARCH = {'finding:_next_scales': lambda *_, **__: _SCALES.ALL}
-_BORDER_WIDTH = {'displayed:DisplayedSides.corrected': lambda _, __, ___, refined, ____: refined.corners}
+_DISPLAYED = 'corner_estimates:DisplayedSides', 'corner_estimates:_outward'
+_BORDER_WIDTH = {'corner_estimates:DisplayedSides.corrected': lambda _, __, ___, refined, ____: refined.corners}
 
 MECHANISMS = {
     'corners of squares': Mechanism(
@@ -216,7 +220,7 @@ MECHANISMS = {
     'passes until settled': Mechanism('fast, 8 K, blind', (), {'corners.refinement:_PASSES': 1}),
     'second round': Mechanism('fast, 8 K, blind', (), {'refining:_ROUNDS': 1}),
     'edges behind the sides': Mechanism(
-        'fast, 8 K, blind', ('corners.edges:_add_neighbours',), {'corners.edges:_NARROW': 0.0}
+        'fast, 8 K, blind', ('corners.sides:_add_neighbours',), {'corners.sides:_NARROW': 0.0}
     ),
     'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
@@ -226,33 +230,35 @@ MECHANISMS = {
         ('lag:LagField', 'lag:without_lag', 'finding:MarkerFinder._scene'),
         {'finding:_BLUR_THAT_HIDES_PX': np.inf},
     ),
-    'rolling shutter': Mechanism('rolling shutter', ('readout',), {}, {'readout_time': 0.0}),
+    'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(
         'fast, 8 K, blind', ('lag:model_error',), {'refining:model_error': _no_covariance}
     ),
     'partially visible markers': Mechanism(
         'landing', ('partial', 'visible_cells', 'corners.grid'), {'detector:_ENOUGH_WHOLE': 0}
     ),
-    'width of borders, slow': Mechanism('8 bits, slow', ('displayed',), _BORDER_WIDTH),
-    'width of borders, fast': Mechanism('8 bits, fast', ('displayed',), _BORDER_WIDTH),
-    'width of borders, carpet': Mechanism('carpet', ('displayed',), _BORDER_WIDTH),
-    'polarity': Mechanism('slow, 8 K, blind', ('polarity',), {}, {'polarity': 'any'}),
+    'width of borders, slow': Mechanism('8 bits, slow', _DISPLAYED, _BORDER_WIDTH),
+    'width of borders, fast': Mechanism('8 bits, fast', _DISPLAYED, _BORDER_WIDTH),
+    'width of borders, carpet': Mechanism('carpet', _DISPLAYED, _BORDER_WIDTH),
+    'polarity': Mechanism('slow, 8 K, blind', ('finding:Polarity',), {}, {'polarity': 'any'}),
     'half resolution': Mechanism('slow, 0.5 K, blind', (), {'finding:_next_scales': lambda *_, **__: _SCALES.FINE}),
     'one resolution in turn': Mechanism('slow, 8 K, blind', (), _ALL_IN_THE_SEARCH),
     'outlines pulled onto patterns': Mechanism(
         'slow, 0.1 K, blind', ('alignment',), {'search:_rough': lambda *_: np.zeros(0, dtype=np.intp)}
     ),
     'markers in plates': Mechanism(
-        'fast, 0.5 K, blind', ('decoding:shrunk',), {'search:_with_shrunk': lambda quads, _: quads}
+        'fast, 0.5 K, blind', ('patterns:shrunk',), {'search:_with_shrunk': lambda quads, _: quads}
     ),
     'columns of the frame': Mechanism('slow, 0.1 K, guided', (), {'frame:without_columns': lambda counts, _: counts}),
     'following': Mechanism(
         'slow, 0.1 K, blind',
-        ('following',),
-        {'finding:Followed.of': lambda *_: _place('following:Followed').none()},
+        ('guided:Followed',),
+        {'finding:Followed.of': lambda *_: _place('guided:Followed').none()},
     ),
     'search near predictions': Mechanism(
-        'fast, 0.5 K, guided', ('guided',), {'finding:near_prediction': _nothing_found}
+        'fast, 0.5 K, guided',
+        ('guided:near_prediction', 'guided:_shifted', 'guided:_confirmed'),
+        {'finding:near_prediction': _nothing_found},
     ),
     'branches by the map': Mechanism('slow, 0.1 K, guided', (), {'detector:choose_branches': lambda poses, *_: poses}),
 }

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core.detection.alignment import aligned
-from thermal_fiducial.core.detection.decoding import Decoder
-from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))

@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.corners.edges import edges_behind
 from thermal_fiducial.core.detection.corners.refinement import refine_corners
+from thermal_fiducial.core.detection.corners.sides import edges_behind
 from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints

@@ -9,7 +9,7 @@ from thermal_fiducial.core.detection.lag import (
     LAG_TAIL_AGE,
 )
 from thermal_fiducial.core.detection.tracking import MotionTrack, TrackedMarkers
-from thermal_fiducial.core.detection.twist import camera_twist, interaction, plausible, Twist
+from thermal_fiducial.core.detection.twist import interaction, plausible, transfer_from_body, transferred, Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import Odometry
@@ -43,7 +43,7 @@ def test_twist_of_the_camera_from_that_of_the_body():
     T_camera = se3.inverse(T_body_camera) @ T_body @ T_body_camera
     numeric = np.concatenate([T_camera[:3, 3], se3.so3_log(T_camera[:3, :3])]) / dt
     odometry = Odometry(0, np.eye(4), body[:3], body[3:], np.eye(6), np.eye(6))
-    np.testing.assert_allclose(camera_twist(odometry, T_body_camera).value, numeric, atol=1e-5)
+    np.testing.assert_allclose(transferred(odometry, transfer_from_body(T_body_camera)).value, numeric, atol=1e-5)
 
 
 def test_tracker_finds_the_twist_from_two_frames():

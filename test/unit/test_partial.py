@@ -10,10 +10,10 @@ from support.scenes import motion_prior
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.grid import adjusted, grid_edges, Layer
-from thermal_fiducial.core.detection.decoding import Decoder
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import KnownMarkers
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
+from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_camera_pose

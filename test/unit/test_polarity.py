@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.polarity import Polarity
+from thermal_fiducial.core.detection.finding import Polarity
 
 BOTH = np.array([5.0, -5.0])
 

@@ -5,8 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.frame import Frame, Places
-from thermal_fiducial.core.detection.readout import delays, expected_displacement, seen_displacement, stretch
+from thermal_fiducial.core.detection.frame import (
+    delays,
+    expected_displacement,
+    Frame,
+    Places,
+    seen_displacement,
+    stretch,
+)
 from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints

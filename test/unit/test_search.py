@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.contrast import noise_of
-from thermal_fiducial.core.detection.decoding import Decoder, Reading, shrunk
 from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.detection.patterns import Decoder, marker_bits, Reading, shrunk
+from thermal_fiducial.core.detection.quads import noise_of
 from thermal_fiducial.core.detection.search import _inside_out, BlindSearch, SearchScales
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.files.dictionary import load_dictionary

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.decoding import Decoder, sampled
+from thermal_fiducial.core.detection.patterns import Decoder, sampled
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
 from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
 

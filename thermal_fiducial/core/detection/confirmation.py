@@ -1,11 +1,22 @@
-"""Whether markers still look like themselves at their refined corners."""
+"""Whether markers look like themselves where their corners were refined to.
+
+Markers that are too small for their sides to be measured one by one show by their whole pattern. Where a cell is hardly
+wider than the blur, the columns of pixels across a side show all of the marker's edges at once: its pattern is fitted
+to the picture then. That speaks for itself only where the markers of a dictionary differ in many bits.
+"""
+
+from dataclasses import replace
 
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.alignment import aligned
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
-from thermal_fiducial.core.detection.decoding import Decoder, Reading
 from thermal_fiducial.core.detection.found import Found
+from thermal_fiducial.core.detection.frame import Frame
+from thermal_fiducial.core.detection.patterns import Decoder, Reading
+from thermal_fiducial.core.detection.refining import RefinedMarkers, sides_px
+from thermal_fiducial.core.detection.search import accepted
 from thermal_fiducial.core.types import BoolArray, Float32Array
 
 # Correlation at the refined corners: of a marker with sharp sides, and (less when faint) of one with softer sides.
@@ -31,6 +42,10 @@ _SOFT = 12.0
 _NOISY = 8.0
 # Pixels along a side that the refinement uses of a long one.
 _SEEN_PX = 60.0
+# Widest cells of markers too small for their sides to be measured [px]; deviation of a corner by the pattern [cells].
+_WIDEST_CELL_PX, _DEVIATION_CELLS = 2.5, 0.2
+# Nearer to the border of the image than this a marker may be cut off [px].
+_BORDER_PX = 1.0
 
 
 def confirmed(
@@ -80,3 +95,43 @@ def _stands_out(reading: Reading, decoder: Decoder) -> BoolArray:
     margin = (np.abs(reading.correlation) - reading.runner_up) / decoder.isolation[reading.ids]
     white = (reading.surround >= _WHITE[0]) & (reading.surround <= _WHITE[1])
     return np.asarray((margin >= _CLEAR_MARGIN) & white)
+
+
+def with_corners_by_pattern(
+    frame: Frame,
+    found: Found,
+    refined: RefinedMarkers,
+    lost: BoolArray,
+    decoder: Decoder,
+    config: ArucoDetectorConfig,
+) -> tuple[RefinedMarkers, BoolArray]:
+    """Refined corners with those by the pattern of small ones among the ``lost`` (N,), and which (N,) these are."""
+    cell = sides_px(found.corners_px) / decoder.cells
+    small = np.flatnonzero(lost & (cell < _WIDEST_CELL_PX))
+    by_pattern = np.zeros(len(lost), dtype=bool)
+    if len(small) == 0:
+        return refined, by_pattern
+    shift, upright = refined.view.shift[small], np.zeros(len(small), dtype=np.int64)
+    corners = aligned(frame.image, found.corners_px[small] + shift, found.ids[small], upright, decoder, noisy=False)
+    reading = decoder.read(frame.image, corners)
+    good = (reading.ids == found.ids[small]) & (reading.turns == 0) & speaks_for_itself(reading, decoder)
+    good &= accepted(reading, frame.noise, decoder.correctable, config)
+    good &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)
+    which, corners, shift = small[good], corners[good], shift[good]
+    by_pattern[which] = True
+    covariances = (_DEVIATION_CELLS * cell[which, None, None, None]) ** 2 * np.broadcast_to(np.eye(2), (4, 2, 2))
+    contrast, doubt = reading.contrast[good], np.zeros(len(which))
+    noise = np.full(len(which), frame.noise)
+    observed = RefinedCorners(corners, covariances, contrast, noise, doubt)
+    at_stamp = replace(observed, corners_px=corners - shift)
+    px = refined.places.at.px.copy()
+    px[which] = at_stamp.corners_px
+    return (
+        replace(
+            refined,
+            observed=refined.observed.with_others(which, observed),
+            corners=refined.corners.with_others(which, at_stamp),
+            places=refined.places.moved(refined.places.at.at_pixels(px)),
+        ),
+        by_pattern,
+    )

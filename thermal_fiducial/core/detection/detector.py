@@ -9,25 +9,23 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.detection.corner_estimates import CornerEstimator, MarkerEstimates
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
-from thermal_fiducial.core.detection.decoding import Decoder
-from thermal_fiducial.core.detection.finding import Findings, MarkerFinder
-from thermal_fiducial.core.detection.found import depths
+from thermal_fiducial.core.detection.finding import Findings, FrameHistory, MarkerFinder
+from thermal_fiducial.core.detection.found import among, depths
 from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.frame_history import FrameHistory
-from thermal_fiducial.core.detection.frame_prediction import FramePrediction, Predictor
-from thermal_fiducial.core.detection.ids import among
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes, MarkersOfMap
-from thermal_fiducial.core.detection.marker_rows import marker_rows
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
-from thermal_fiducial.core.detection.patterns import marker_bits
-from thermal_fiducial.core.detection.tracking import MotionTrack, TrackedMarkers
+from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
+from thermal_fiducial.core.detection.tracking import FramePrediction, MotionTrack, Predictor, TrackedMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses
-from thermal_fiducial.core.measurements import Markers
+from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 
+# All fields have four bytes: a row is a row of a table of numbers as well.
+_COLUMN = {name: column for column, name in enumerate(MARKER_DTYPE.names or ())}
+_NUMBER = np.dtype('<f4')
 # Contrast over noise beyond which the column pattern of the array displaces no side.
 _CLEARER_THAN_COLUMNS = 100.0
 # So many known markers wholly in view give the pose so well that partially visible ones are not worth a look.
@@ -105,7 +103,8 @@ class MarkerDetector:
             sizes = self._sizes.of(findings.found.ids, known)
             estimates = self._estimator.estimate(frame, findings, expected, sizes, history.track, config)
             poses = self._poses(estimates.ids, estimates.corners, estimates.at, prediction.T_camera_map)
-            rows = _rows(estimates.ids, estimates.corners, poses)
+            corners = estimates.corners
+            rows = marker_rows(estimates.ids, corners.corners_px, corners.covariances, poses, corners.contrast)
             if expected is not None:
                 rows = self._with_partial(rows, frame, prediction)
         self._history = self._after(frame, findings, estimates, poses, saw_partial=len(rows) > len(estimates.ids))
@@ -130,7 +129,8 @@ class MarkerDetector:
         if len(ids) == 0:
             return rows
         poses = self._poses(ids, corners, ImagePoints.at(corners.corners_px, frame.camera), T_camera_map)
-        rows = np.concatenate([rows, _rows(ids, corners, poses)])
+        partial = marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)
+        rows = np.concatenate([rows, partial])
         return np.asarray(rows[np.argsort(rows['id'], kind='stable')])
 
     def _after(
@@ -161,5 +161,43 @@ def _expected(
     return known.expected(prediction.T_camera_map, camera, config.min_side_px)
 
 
-def _rows(ids: IntArray, corners: RefinedCorners, poses: PlanarPoses) -> Markers:
-    return marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)
+def marker_rows(
+    ids: IntArray,
+    corners_px: FloatArray,
+    covariances: FloatArray,
+    poses: PlanarPoses,
+    contrast: FloatArray | None = None,
+) -> Markers:
+    """Rows of N markers by rising ID, without those that have no pose.
+
+    Parameters
+    ----------
+    ids : (N,)
+    corners_px, covariances : (N, 4, 2) [px], (N, 4, 2, 2) [px^2]
+    contrast : (N,) [counts], where it is known
+    """
+    rows = np.zeros(len(ids), dtype=MARKER_DTYPE)
+    table = rows.view(_NUMBER).reshape(-1, len(_COLUMN))
+    table[:, _CORNERS] = corners_px.reshape(-1, 8)
+    terms = covariances.reshape(-1, 4, 4)[..., [0, 1, 3]]
+    table[:, _COVARIANCES] = terms.reshape(-1, 12)
+    rows['sigma_px'] = np.sqrt(0.125 * (terms[..., 0] + terms[..., 2]).sum(axis=1))
+    if contrast is not None:
+        rows['contrast_counts'] = contrast
+    positions = poses.T_camera_marker[..., :3, 3]
+    orientations = se3.quaternion_from_rotation(poses.T_camera_marker[..., :3, :3])
+    table[:, _POSITION], table[:, _OTHER_POSITION] = positions[:, 0], positions[:, 1]
+    table[:, _ORIENTATION], table[:, _OTHER_ORIENTATION] = orientations[:, 0], orientations[:, 1]
+    rows['rms_px'], rows['arms_px'] = poses.rms_px[:, 0], poses.rms_px[:, 1]
+    rows['id'] = ids
+    usable = np.flatnonzero(np.isfinite(poses.rms_px[:, 0]))
+    return np.asarray(rows[usable[np.argsort(ids[usable], kind='stable')]])
+
+
+def _between(first: str, last: str) -> slice:
+    return slice(_COLUMN[first], _COLUMN[last] + 1)
+
+
+_CORNERS, _COVARIANCES = _between('u0', 'v3'), _between('c0uu', 'c3vv')
+_POSITION, _ORIENTATION = _between('x', 'z'), _between('qx', 'qw')
+_OTHER_POSITION, _OTHER_ORIENTATION = _between('ax', 'az'), _between('aqx', 'aqw')

@@ -1,25 +1,26 @@
 """Markers of a frame: followed, known ones near their predicted places, and blindly when that is due."""
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.decoding import Decoder
-from thermal_fiducial.core.detection.following import Followed
-from thermal_fiducial.core.detection.found import Found, merged, places_of
-from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.frame_history import FrameHistory
-from thermal_fiducial.core.detection.guided import near_prediction
-from thermal_fiducial.core.detection.ids import among
+from thermal_fiducial.core.detection.found import among, Found, merged, places_of
+from thermal_fiducial.core.detection.frame import Frame, seen_displacement
+from thermal_fiducial.core.detection.guided import Followed, near_prediction
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes, MarkersOfMap
 from thermal_fiducial.core.detection.lag import LagField, without_lag
-from thermal_fiducial.core.detection.readout import seen_displacement
+from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.search import BlindSearch, SearchScales
+from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.types import BoolArray, Float32Array
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
+# A frame's markers are remembered for about so many frames, and make sure of the kind when so many more are of it.
+_FRAMES, _SURE = 30, 6.0
+# Depth of the scene while no marker has shown it [m].
+_TYPICAL_DEPTH_M = 3.0
 # Motion blur by lag below which the search misses nothing [px].
 _BLUR_THAT_HIDES_PX = 2.0
 # Share of the map's expected markers that, when observed, shows that the prediction holds.
@@ -31,6 +32,43 @@ _BORDER_PX = 2.0
 # Where not all markers are known, or not all observed that should be, a blind search follows at least every so many
 # frames.
 _INCOMPLETE = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Polarity:
+    """The kind of the markers that were seen last: how many more were dark than bright, the older the less."""
+
+    balance: float = 0.0
+
+    def after(self, contrast: FloatArray) -> 'Polarity':
+        """With the markers (N,) of one more frame, by white minus black."""
+        return Polarity(self.balance + float(np.sign(contrast).sum()) - self.balance / _FRAMES)
+
+    def kinds(self, rule: str) -> tuple[float, ...]:
+        """Which kinds there may be by the parameter ``polarity``: 1 for markers darker than what is behind, -1."""
+        return tuple(kind for kind in (1.0, -1.0) if self.possible(np.array([kind]), rule)[0])
+
+    def possible(self, contrast: FloatArray, rule: str) -> BoolArray:
+        """Which markers (N,) may be some, by the parameter ``polarity``."""
+        if rule == 'any' or (rule == 'alike' and abs(self.balance) < _SURE):
+            return np.ones(len(contrast), dtype=bool)
+        kind = self.balance if rule == 'alike' else 1.0 if rule == 'dark' else -1.0
+        return np.asarray(contrast * kind > 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameHistory:
+    """What the frames so far have shown."""
+
+    track: MotionTrack
+    polarity: Polarity = field(default_factory=Polarity)
+    #: mean depth of the last markers [m]
+    depth_m: float = _TYPICAL_DEPTH_M
+    #: whether the last frame showed markers that are partially visible
+    saw_partial: bool = False
+    #: frames since the last blind search, and at which resolutions that was
+    since_blind: int = 0
+    scales: SearchScales = SearchScales.ALL
 
 
 class Findings(NamedTuple):

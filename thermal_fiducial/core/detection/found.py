@@ -5,13 +5,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core.detection.frame import Frame, Places
-from thermal_fiducial.core.detection.ids import among, pairs
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square, marker_corners
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 # Corners of a marker of side 1 in its plane.
 _FACE = marker_corners(1.0)[:, :2]
+
+
+def among(ids: IntArray, others: IntArray) -> BoolArray:
+    """Which of ``ids`` (N,) are among ``others`` (M,)."""
+    return np.asarray((ids[:, None] == others).any(axis=1))
+
+
+def pairs(ids: IntArray, others: IntArray) -> tuple[IntArray, IntArray]:
+    """Places, in ``ids`` (N,) and in ``others`` (M,), of the IDs that both have."""
+    first, second = np.nonzero(ids[:, None] == others)
+    return first, second
 
 
 @dataclass(frozen=True, slots=True)

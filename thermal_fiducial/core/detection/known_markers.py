@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.ids import among
+from thermal_fiducial.core.detection.found import among
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import marker_corners

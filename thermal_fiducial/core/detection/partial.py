@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.corner_estimates import DISPLACED
 from thermal_fiducial.core.detection.corners.grid import (
     adjusted,
     grid_edges,
@@ -21,12 +22,11 @@ from thermal_fiducial.core.detection.corners.grid import (
     PoseFit,
 )
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
-from thermal_fiducial.core.detection.decoding import Decoder
-from thermal_fiducial.core.detection.displayed import DISPLACED
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import PartialMarkers
 from thermal_fiducial.core.detection.lag import model_error
 from thermal_fiducial.core.detection.partial_layers import deblurred_layer, places_of_points, plain_layer
+from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.visible_cells import VisibleCells
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera

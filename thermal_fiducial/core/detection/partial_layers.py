@@ -7,9 +7,8 @@ import numpy as np
 
 from thermal_fiducial.core.detection.corners.grid import Layer
 from thermal_fiducial.core.detection.corners.segments import LagTail
-from thermal_fiducial.core.detection.frame import Frame, Places
+from thermal_fiducial.core.detection.frame import expected_displacement, Frame, lag_tail, Places
 from thermal_fiducial.core.detection.lag import GAIN, LAG_TAIL_AGE, lag_tail_maps, REMAINING, SPREAD
-from thermal_fiducial.core.detection.readout import expected_displacement, lag_tail
 from thermal_fiducial.core.detection.refining import sides_px, worth_deblurring
 from thermal_fiducial.core.detection.twist import interaction
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints

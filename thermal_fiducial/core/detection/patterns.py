@@ -1,9 +1,26 @@
-"""Bit patterns of the markers of a dictionary."""
+"""Patterns of the markers of a dictionary: their bits, and what quadrilaterals of a frame look most like.
+
+All cells count, the black border as well as the bits, each the mean of several pixels, so that a pattern stands out
+from noise at contrasts where no single bit could be thresholded: what is compared are correlations.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.types import Gray
+from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
+
+# How far off a side black and white are compared: in cells, and at most in pixels.
+_OUTSIDE = 0.4
+_OUTSIDE_PX = 2.5
+# Correlation below which nothing is a marker whatever surrounds it.
+_SIMILAR = 0.5
+# Samples along a cell, in its middle, away from blurred edges.
+_SAMPLES = np.array([0.3, 0.5, 0.7])
 
 
 def marker_bits(dictionary: cv2.aruco.Dictionary) -> Gray:
@@ -31,3 +48,174 @@ def correctable_bits(bits: Gray) -> int:
     distance = flat.sum(axis=1)[:, None] + turned.sum(axis=1) - 2.0 * flat @ turned.T
     np.fill_diagonal(distance, np.inf)
     return max((int(distance.min()) - 1) // 2, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What Q quadrilaterals look most like."""
+
+    #: (Q,) most similar ID
+    ids: IntArray
+    #: (Q,) quarter turns that make the first corner the marker's top-left
+    turns: IntArray
+    #: (Q,) its correlation, negative where black and white are swapped
+    correlation: FloatArray
+    #: (Q,) correlation of the most similar other ID
+    runner_up: FloatArray
+    #: (Q,) white minus black [counts]
+    contrast: FloatArray
+    #: (Q,) bits on the wrong side of the middle between black and white
+    bit_errors: IntArray
+    #: (Q,) the same of border cells
+    border_errors: IntArray
+    #: (Q,) step from the black border to its white surroundings over the contrast, on the worst side but one; 0 of what
+    #: is unlike any marker
+    surround: FloatArray
+
+
+class PatternMatch(NamedTuple):
+    """Which patterns Q quadrilaterals look most like."""
+
+    #: (Q, m * m) contrast of the cells, without background
+    values: Float32Array
+    #: (Q,) four times the most similar ID, and the quarter turns
+    best: IntArray
+    #: (Q,) its correlation, and that of the most similar other ID
+    correlation: FloatArray
+    runner_up: FloatArray
+
+
+class Decoder:
+    """Patterns of a dictionary, ready for correlation.
+
+    Parameters
+    ----------
+    bits : (M, n, n)
+    correctable : number of wrong bits that still leave the nearest marker certain
+    """
+
+    def __init__(self, bits: Gray, correctable: int = 1) -> None:
+        self.correctable = correctable
+        grid = np.pad(bits.astype(np.float64), ((0, 0), (1, 1), (1, 1)))
+        self.count, self.cells = len(grid), grid.shape[-1]
+        self._border = np.pad(np.zeros(bits.shape[1:], dtype=bool), 1, constant_values=True).ravel()
+        # Pattern k after `turn` steps: as it looks in a quadrilateral whose first corner is the marker's corner `turn`.
+        self._grids = np.stack([np.rot90(grid, turn, axes=(1, 2)) for turn in range(4)], axis=1)
+        flat = self._grids.reshape(-1, self.cells**2)
+        across = np.linspace(-1.0, 1.0, self.cells)
+        x, y = np.tile(across, self.cells), np.repeat(across, self.cells)
+        smooth = np.linalg.qr(np.stack([np.ones(x.size), x, y, x * x, x * y, y * y], axis=1))[0]
+        # A background that rises or bends across the marker is no pattern: it is projected out of both.
+        self._detrend = np.eye(x.size) - smooth @ smooth.T
+        detrended = flat @ self._detrend
+        patterns = detrended / np.maximum(np.linalg.norm(detrended, axis=1, keepdims=True), 1e-9)
+        likeness = np.abs(patterns[::4] @ patterns.T).reshape(self.count, -1, 4).max(axis=-1)
+        np.fill_diagonal(likeness, 0.0)
+        #: (M,) by how much a perfect view of each marker correlates better with itself than with any other
+        self.isolation = 1.0 - likeness.max(axis=1)
+        self._patterns = patterns.astype(np.float32)
+        share = ((np.arange(self.cells)[:, None] + _SAMPLES) / self.cells).ravel()
+        self._samples = bilinear(*(axis.ravel() for axis in np.meshgrid(share, share))).astype(np.float32)
+        self._along_sides, self._away = _beside_sides(self.cells)
+        mean = np.kron(np.eye(self.cells), np.full((len(_SAMPLES), 1), 1.0 / len(_SAMPLES)))
+        self._cells_of_samples = (np.kron(mean, mean) @ self._detrend).astype(np.float32)
+
+    def read(self, image: Float32Array, quads: FloatArray, allowed: BoolArray | None = None) -> Reading:
+        """Most similar pattern of each quadrilateral (Q, 4, 2) among those ``allowed`` (M,), or all."""
+        if len(quads) == 0:
+            nothing = np.zeros(0)
+            none = nothing.astype(np.int64)
+            return Reading(none, none, nothing, nothing, nothing, none, none, nothing)
+        values, best, correlation, runner_up = self.likeness(image, quads, allowed)
+        steps = np.zeros((len(quads), 4))
+        alike = np.flatnonzero(np.abs(correlation) >= _SIMILAR)
+        if len(alike):
+            steps[alike] = self._steps(image, quads[alike])
+        return self._judged(values, best, correlation, runner_up, steps)
+
+    def likeness(
+        self, image: Counts | Float32Array, quads: FloatArray, allowed: BoolArray | None = None
+    ) -> PatternMatch:
+        """Most similar patterns of quadrilaterals (Q, 4, 2) among those ``allowed`` (M,), or all."""
+        values = self._contrasts(image, quads)
+        spread = np.sqrt((values * values).sum(axis=1, keepdims=True))
+        similar = (values / np.maximum(spread, np.float32(1e-9))) @ self._patterns.T
+        if allowed is not None and not allowed.all():
+            similar[:, np.repeat(~allowed, 4)] = 0.0
+        size = np.abs(similar)
+        best, rows = size.argmax(axis=1), np.arange(len(quads))
+        correlation = similar[rows, best].astype(np.float64)
+        size.reshape(len(quads), -1, 4)[rows, best // 4] = 0.0
+        return PatternMatch(values, best, correlation, size.max(axis=1).astype(np.float64))
+
+    def match(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
+        """Correlation (Q,) of quadrilaterals (Q, 4, 2) with the upright patterns of ``ids`` (Q,)."""
+        values = self._contrasts(image, quads)
+        spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), np.float32(1e-9))
+        return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread, dtype=np.float64)
+
+    def seen(self, ids: IntArray, turns: IntArray) -> FloatArray:
+        """Cells (Q, m, m), 1 for white, as quadrilaterals show markers whose corners they name ``turns`` late."""
+        return np.asarray(self._grids[ids, turns])
+
+    def _judged(
+        self, values: Float32Array, best: IntArray, correlation: FloatArray, runner_up: FloatArray, steps: FloatArray
+    ) -> Reading:
+        expected = self._grids.reshape(-1, self.cells**2)[best]
+        shape = expected @ self._detrend
+        contrast = np.sum(values * shape, axis=1) / np.maximum(np.sum(shape * shape, axis=1), 1e-9)
+        safe = np.where(np.abs(contrast) < 1e-6, 1e-6, contrast)[:, None]
+        # What is left of the pattern, back on the scale from 0 for black to 1 for white.
+        seen = expected + (values - contrast[:, None] * shape) / safe
+        wrong = (seen > 0.5) != (expected > 0.5)
+        return Reading(
+            best // 4,
+            best % 4,
+            correlation,
+            runner_up,
+            contrast,
+            np.sum(wrong & ~self._border, axis=1),
+            np.sum(wrong & self._border, axis=1),
+            np.sort(steps / safe, axis=1)[:, 1],
+        )
+
+    def _steps(self, image: Float32Array, quads: FloatArray) -> FloatArray:
+        """Mean counts just outside the sides (Q, 4) less those just inside."""
+        side = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1) / np.sqrt(2.0)
+        near = np.minimum(_OUTSIDE / self.cells, _OUTSIDE_PX / np.maximum(side, 1.0))[:, None, None]
+        weights = self._along_sides + near.astype(np.float32) * self._away
+        means = sampled(image, seen_between(quads, weights)).reshape(len(quads), 2, 4, -1).mean(axis=-1)
+        return np.asarray(means[:, 0] - means[:, 1], dtype=np.float64)
+
+    def _contrasts(self, image: Counts | Float32Array, quads: FloatArray) -> Float32Array:
+        """Mean counts (Q, m * m) of the cells without the background."""
+        values = sampled(image, seen_between(quads, self._samples))
+        values -= values[:, :1].copy()
+        return np.asarray(values @ self._cells_of_samples)
+
+
+def shrunk(quads: FloatArray, cells: int) -> FloatArray:
+    """The markers (Q, 4, 2) in plates (Q, 4, 2) that surround them with a white margin of one cell."""
+    return seen_between(quads, _in_plate(cells)).transpose(1, 2, 0)
+
+
+def _beside_sides(cells: int) -> tuple[Float32Array, Float32Array]:
+    """Of :func:`bilinear`, (4, 8 m): places along the sides, and how they move outward, then inward, with distance."""
+    t, low, high = (np.arange(cells) + 0.5) / cells, np.zeros(cells), np.ones(cells)
+    a, b = np.concatenate([t, t, low, high]), np.concatenate([low, high, t, t])
+    outward = bilinear(a + (a == 1.0) - (a == 0.0), b + (b == 1.0) - (b == 0.0)) - bilinear(a, b)
+    at, away = np.tile(bilinear(a, b), 2), np.concatenate([outward, -outward], axis=-1)
+    return at.astype(np.float32), away.astype(np.float32)
+
+
+@cache
+def _in_plate(cells: int) -> FloatArray:
+    """Of :func:`bilinear`, (4, 4), for the corners of such a marker."""
+    low, high = 1.0 / (cells + 2), (cells + 1.0) / (cells + 2)
+    return bilinear(np.array([low, high, high, low]), np.array([low, low, high, high]))
+
+
+def sampled(image: Counts | Float32Array, places: Float32Array) -> Float32Array:
+    """Values (Q, P) of the image at columns and rows (2, Q, P)."""
+    values = cv2.remap(image, places[0], places[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, dtype=np.float32)

@@ -1,13 +1,111 @@
-"""Quadrilaterals in the outlines of a mask: where markers may be."""
+"""Where markers may be: quadrilaterals in the outlines of what is darker than its surroundings.
+
+Darker by a share of the local contrast, the same of markers of any contrast. The local spread is the measure, down to a
+floor of the order of the noise, below which ever more is asked for: next to strong structures little shows, of a marker
+of twice the noise all, of a bare wall nearly nothing.
+"""
+
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.types import FloatArray, Gray
+from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray
 
+# The spread is taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
+_LOCAL = 17
+# Odd width of the median that takes out specks.
+_SPECKS = 3
+# Half-resolution pixels along a row over which columns are compared.
+_COLUMNS = 9
+# In a picture for a display: odd width of the surroundings, no wider than the white round the smallest markers; and by
+# how much darker a pixel must be [gray levels], and in standard deviations of the noise.
+_PICTURE_WINDOW_PX, _PICTURE_STEP, _PICTURE_NOISE = 5, 3.0, 2.0
+# Mean of Gaussian noise clipped at one standard deviation moves by 0.68 of a small offset.
+_CLIPPED = 1.0 / 0.68
+# 1 / (sqrt(2) * 0.6745): standard deviation from the median absolute difference of two pixels.
+_MAD_OF_DIFFERENCE = 1.0484
 # The hull of an outline is simplified to within this share of its length: more than noise bends it, less than a side.
 _STRAIGHT = 0.05
 _CORNERS, _NEXT = 4, np.array([1, 2, 3, 0])
+
+
+def noise_of(counts: Counts | Gray | Float32Array) -> float:
+    """Standard deviation of pixel noise [counts]: median absolute difference of vertical neighbours, sparsely.
+
+    Differences along a column leave the column pattern out.
+    """
+    rows = counts[4::16, ::3]
+    below = counts[5::16, ::3]
+    count = min(len(rows), len(below))
+    difference = cv2.absdiff(np.ascontiguousarray(rows[:count]), np.ascontiguousarray(below[:count])).ravel()
+    middle = difference.size // 2
+    # Whole counts: half a count of quantisation is what a median of 0 can mean.
+    return max(float(np.partition(difference, middle)[middle]) * _MAD_OF_DIFFERENCE, 0.3)
+
+
+def halved(counts: Float32Array) -> Float32Array:
+    """Half the resolution: means of 2 x 2 pixels, with half the noise."""
+    height, width = counts.shape[0] // 2, counts.shape[1] // 2
+    return np.asarray(cv2.resize(counts, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def without_columns(counts: Float32Array, noise: float) -> Float32Array:
+    """``counts`` without the offsets of its columns.
+
+    They show in the typical pixel of each column against its neighbours. What the scene does to a column is bounded by
+    the noise: no pixel counts for more than that.
+    """
+    deviation = counts - cv2.blur(counts, (_COLUMNS, 1))
+    np.clip(deviation, -noise, noise, out=deviation)
+    offsets = np.float32(_CLIPPED) * cv2.reduce(deviation, 0, cv2.REDUCE_AVG)
+    return np.asarray(np.subtract(counts, offsets, out=deviation))
+
+
+class Scale(NamedTuple):
+    """How dark places are looked for at one resolution."""
+
+    #: standard deviation of the Gaussian before the search [px]
+    smoothing_px: float
+    #: odd width of the surroundings, and by how much lower the resolution is at which their mean is taken
+    window_px: int
+    window_shrink: int
+    #: how much darker than the mean of the surroundings, in local standard deviations
+    depth: float
+    #: spread below which it shows less and less, in standard deviations of the noise of a pixel
+    floor: float
+
+
+def dark(counts: Float32Array, noise: float, scale: Scale) -> Gray:
+    """Mask (height, width) of what is darker than its surroundings, 255 where it is.
+
+    Parameters
+    ----------
+    counts : (height, width) counts or gray levels
+    noise : standard deviation of the noise of a pixel [counts]
+    """
+    shape = counts.shape
+    reach = 2 * round(2.5 * scale.smoothing_px) + 1
+    smooth = cv2.GaussianBlur(counts, (reach, reach), scale.smoothing_px)
+    coarse = counts if scale.window_shrink == 1 else halved(counts)
+    limit = cv2.blur(smooth if scale.window_shrink == 1 else coarse, (scale.window_px, scale.window_px))
+    small = halved(coarse)
+    deviation = small - cv2.blur(small, (_LOCAL, _LOCAL))
+    variance = np.maximum(cv2.blur(deviation * deviation, (_LOCAL, _LOCAL)), 1e-6)
+    asked = (scale.depth / np.sqrt(variance)) * (variance + (scale.floor * noise) ** 2)
+    cv2.subtract(limit, cv2.resize(asked, limit.shape[::-1], interpolation=cv2.INTER_LINEAR), dst=limit)
+    if limit.shape != shape:
+        limit = cv2.resize(limit, shape[::-1], interpolation=cv2.INTER_LINEAR)
+    mask = cv2.compare(smooth, limit, cv2.CMP_LT)
+    # Specks of noise are many, and each is an outline to follow.
+    return np.asarray(cv2.medianBlur(mask, _SPECKS))
+
+
+def dark_in_picture(picture: Float32Array, noise: float) -> Gray:
+    """The same of a picture for a display, whose pixels have little noise: markers of cells of a pixel show in it."""
+    mean = np.asarray(cv2.blur(picture, (_PICTURE_WINDOW_PX, _PICTURE_WINDOW_PX)), dtype=np.float32)
+    limit = mean - np.float32(max(_PICTURE_STEP, _PICTURE_NOISE * noise))
+    return np.asarray(cv2.compare(picture, limit, cv2.CMP_LT), dtype=np.uint8)
 
 
 def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray) -> FloatArray:

@@ -14,7 +14,14 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.refinement import refine_corners, RefinedCorners
 from thermal_fiducial.core.detection.corners.segments import LagTail
 from thermal_fiducial.core.detection.found import Found
-from thermal_fiducial.core.detection.frame import Frame, Places
+from thermal_fiducial.core.detection.frame import (
+    delays,
+    expected_displacement,
+    Frame,
+    lag_tail,
+    Places,
+    seen_displacement,
+)
 from thermal_fiducial.core.detection.lag import (
     common_error,
     GAIN,
@@ -24,7 +31,6 @@ from thermal_fiducial.core.detection.lag import (
     REMAINING,
     SPREAD,
 )
-from thermal_fiducial.core.detection.readout import delays, expected_displacement, lag_tail, seen_displacement
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, unknown_twist
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
@@ -109,7 +115,7 @@ class Refiner:
 
     Parameters
     ----------
-    behind : (M, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.edges.edges_behind`
+    behind : (M, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
     """
 
     def __init__(self, behind: Float32Array) -> None:
@@ -182,12 +188,14 @@ class Refiner:
         at = places.at.moved(seen.corners_px - view.shift - places.at.px, frame.camera)
         variance = seen.covariances[..., 0, 0] + seen.covariances[..., 1, 1]
         deviation = np.sqrt(0.125 * variance.sum(axis=1)) / frame.camera.focal_px
+        # Corners that make no square are those of something else.
+        doubted = seen.covariances + seen.doubt[:, None, None, None] * _EYE
         # The same displacement in two frames in a row hides from the first twist; once freed, they are not alike.
         twist = known
         if frame.twist is not None or known is None:
             twist = track.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
         if twist is None:
-            unsure = seen.covariances + _doubts(seen) + self._never_seen(frame, places, seen, unknown_twist())
+            unsure = doubted + self._never_seen(frame, places, seen, unknown_twist())
             return RefinedMarkers(view, seen, replace(seen, covariances=unsure), places.moved(at), None)
         lag_blur = places.lag_blur(twist, frame.lag)
         rolling = seen_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
@@ -195,7 +203,7 @@ class Refiner:
         unknown = places.unknown(twist, frame.lag) + model_error(lag_blur, places.at.px, self._behind.shape[2])
         if frame.twist is None:
             unknown = unknown + self._never_seen(frame, places, seen, twist)
-        refined = replace(seen, corners_px=corners, covariances=seen.covariances + _doubts(seen) + unknown)
+        refined = replace(seen, corners_px=corners, covariances=doubted + unknown)
         return RefinedMarkers(view, seen, refined, places.moved(at.at_pixels(corners)), twist)
 
     def _never_seen(self, frame: Frame, places: Places, seen: RefinedCorners, twist: Twist) -> FloatArray:
@@ -204,11 +212,6 @@ class Refiner:
         unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), 1e-6)
         cell = sides_px(seen.corners_px) / self._behind.shape[2]
         return common_error(since[..., None, None] * places.flow, twist.covariance_ago(frame.lag), unsharpness, cell)
-
-
-def _doubts(seen: RefinedCorners) -> FloatArray:
-    """Covariances (N, 1, 2, 2) [px^2] of corners that make no square."""
-    return seen.doubt[:, None, None, None] * _EYE
 
 
 def worth_deblurring(square: FloatArray, cell: FloatArray, cells: int, cnr: FloatArray) -> BoolArray:

@@ -7,12 +7,10 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.alignment import aligned
-from thermal_fiducial.core.detection.contrast import dark, dark_in_picture, halved, Scale, without_columns
-from thermal_fiducial.core.detection.decoding import Decoder, Reading, shrunk
-from thermal_fiducial.core.detection.found import Found
+from thermal_fiducial.core.detection.found import among, Found
 from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.ids import among
-from thermal_fiducial.core.detection.quads import find_quads
+from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
+from thermal_fiducial.core.detection.quads import dark, dark_in_picture, find_quads, halved, Scale, without_columns
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # Full resolution sees small and blurred markers; half resolution, without the pattern of columns, faint ones.

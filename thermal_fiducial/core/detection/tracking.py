@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.ids import pairs
+from thermal_fiducial.core.detection.found import pairs
 from thermal_fiducial.core.detection.twist import (
     carried,
     corrected,
@@ -18,7 +18,7 @@ from thermal_fiducial.core.detection.twist import (
     interaction,
     joined,
     line_through,
-    of_unsure_stamp,
+    plausible,
     RANDOM,
     transfer_from_body,
     transferred,
@@ -27,6 +27,7 @@ from thermal_fiducial.core.detection.twist import (
 )
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 # Frames farther apart show nothing of each other [s].
@@ -39,6 +40,12 @@ _JITTER_S = 0.001
 _DELAY_UNSURE = 0.5
 # Of the corners of a marker.
 _COORDINATES = 8
+# The filter's states from so many time constants before a frame to one after it, symmetric about the velocity that
+# blurs it, say how it moved; so many of them at most. Without lag, those of so long a time.
+_LAGS_BEFORE, _STATES, _SHORTEST_LAG_S = 3, 10, 0.005
+# Standard deviation of the offset between the clocks before the filter has estimated it: that of drivers' stamps, and
+# what the filter itself starts from (``time_offset_std``) [s].
+_UNKNOWN_CLOCK_S = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,12 +116,14 @@ class MotionTrack:
         """
         dt = self._since(stamp_ns)
         before = None
-        if self.twist is not None and dt is not None and self._saw_lately(stamp_ns):
+        # Markers show that the twist holds: one that went wrong would hide them from then on.
+        saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_S * 1e9
+        if self.twist is not None and dt is not None and saw_lately:
             before = carried(self.twist, dt)
         odometry_ns = stamp_ns if odometry_ns is None else odometry_ns
         if len(odometry) >= _ENOUGH_STATES:
-            observed = line_through(odometry_ns, odometry, self.from_body)
-            return joined(before or unknown_twist(), of_unsure_stamp(observed, clock_std_s))
+            observed = line_through(odometry_ns, odometry, self.from_body, clock_std_s)
+            return joined(before or unknown_twist(), observed)
         if len(odometry) == 0 or abs(odometry_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
             return before
         seen, later = transferred(odometry[-1], self.from_body), (odometry[-1].stamp_ns - odometry_ns) * 1e-9
@@ -181,12 +190,67 @@ class MotionTrack:
         last_seen_ns = stamp_ns if len(markers.ids) else self.last_seen_ns
         return MotionTrack(self.from_body, self.lag, stamp_ns, twist, markers, last_seen_ns)
 
-    def _saw_lately(self, stamp_ns: int) -> bool:
-        """Whether markers show that the twist holds: one that went wrong would hide them from then on."""
-        return self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_S * 1e9
-
     def _since(self, stamp_ns: int) -> float | None:
         """Time since the last frame [s], negative for one that comes late; None when that shows nothing of this one."""
         if self.stamp_ns is None or not 0 < abs(stamp_ns - self.stamp_ns) < _STALE_S * 1e9:
             return None
         return (stamp_ns - self.stamp_ns) * 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class FramePrediction:
+    """What is known of a frame before it is looked at."""
+
+    #: of the camera; None: nothing is known
+    twist: Twist | None
+    #: (4, 4); None: no odometry that is fresh enough
+    T_camera_map: FloatArray | None
+    #: standard deviation of the camera's position in it [m]
+    position_std_m: float
+
+
+class Predictor:
+    """Predicts a frame from the filter's states and from the last frames' markers.
+
+    Parameters
+    ----------
+    T_body_camera : (4, 4)
+    lag : time constant of the bolometers [s]
+    """
+
+    def __init__(self, T_body_camera: FloatArray, lag: float) -> None:
+        self._T_body_camera = T_body_camera
+        self._lag_ns = round(1e9 * max(lag, _SHORTEST_LAG_S))
+
+    def predict(
+        self, stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, max_age_s: float
+    ) -> FramePrediction:
+        """Of a frame at ``stamp_ns`` in the camera's clock; odometry older than ``max_age_s`` says no pose."""
+        if prior is None:
+            return FramePrediction(track.predict(stamp_ns, []), None, math.inf)
+        odometry_ns = prior.in_odometry_clock(stamp_ns)
+        clock_std_s = 0.0 if prior.clock_is_known else _UNKNOWN_CLOCK_S
+        states = self._states(odometry_ns, prior)
+        twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)
+        nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
+        if nearest is None or twist is None or abs(odometry_ns - nearest.stamp_ns) * 1e-9 > max_age_s:
+            return FramePrediction(twist, None, math.inf)
+        T_map_camera = _carried_on(odometry_ns, nearest, self._T_body_camera, twist)
+        moved = clock_std_s * float(np.linalg.norm(nearest.velocity_body))
+        position_std_m = math.sqrt(np.trace(nearest.pose_covariance[:3, :3]) + moved**2)
+        return FramePrediction(twist, se3.inverse(T_map_camera), position_std_m)
+
+    def _states(self, odometry_ns: int, prior: MotionPrior) -> list[Odometry]:
+        """The filter's states while a frame came about, or the nearest."""
+        states = prior.between(odometry_ns - _LAGS_BEFORE * self._lag_ns, odometry_ns + self._lag_ns, _STATES)
+        if not states and (nearest := prior.nearest(odometry_ns)) is not None:
+            states = [nearest]
+        return [state for state in states if plausible(state)]
+
+
+def _carried_on(odometry_ns: int, odometry: Odometry, T_body_camera: FloatArray, twist: Twist) -> FloatArray:
+    """T_map_camera (4, 4) at a frame, from the odometry near it carried on with the camera's twist."""
+    dt = (odometry_ns - odometry.stamp_ns) * 1e-9
+    mean = twist.ago(0.5 * dt)
+    moved = se3.transform(se3.so3_exp(mean[3:] * dt), mean[:3] * dt)
+    return np.asarray(odometry.T_map_body @ T_body_camera @ moved)

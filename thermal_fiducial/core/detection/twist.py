@@ -67,14 +67,10 @@ def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
     return J
 
 
-def camera_twist(odometry: Odometry, T_body_camera: FloatArray) -> Twist:
-    """Twist of the camera from that of the body."""
-    return transferred(odometry, transfer_from_body(T_body_camera))
-
-
 def transferred(odometry: Odometry, transfer: FloatArray) -> Twist:
     """Twist of the camera from that of the body, by :func:`transfer_from_body`."""
-    return Twist(transfer @ _body_twist(odometry), transfer @ odometry.twist_covariance @ transfer.T)
+    body = np.concatenate([odometry.velocity_body, odometry.angular_velocity_body])
+    return Twist(transfer @ body, transfer @ odometry.twist_covariance @ transfer.T)
 
 
 def transfer_from_body(T_body_camera: FloatArray) -> FloatArray:
@@ -86,10 +82,6 @@ def transfer_from_body(T_body_camera: FloatArray) -> FloatArray:
     return transfer
 
 
-def _body_twist(odometry: Odometry) -> FloatArray:
-    return np.concatenate([odometry.velocity_body, odometry.angular_velocity_body])
-
-
 def unknown_twist() -> Twist:
     """That of a camera of which nothing is known."""
     return Twist(np.zeros(6), np.diag(np.concatenate([_UNKNOWN, RANDOM.diagonal()])))
@@ -99,9 +91,14 @@ def carried(twist: Twist, seconds: float) -> Twist:
     """Twist so much later, its acceleration having died down a little and changed at random; or as much earlier."""
     left, sign = math.exp(-abs(seconds) / _CORRELATED_S), math.copysign(1.0, seconds)
     lasting = sign * _CORRELATED_S * (1.0 - left)
-    F = _of_blocks(1.0, lasting, 0.0, left, _IDENTITIES)
+    F = np.eye(12)
+    F[:6, 6:], F[6:, 6:] = lasting * _EYE, left * _EYE
     own, both, change = growth(abs(seconds))
-    covariance = F @ twist.covariance @ F.T + _of_blocks(own, sign * both, sign * both, change, _RANDOMS)
+    covariance = F @ twist.covariance @ F.T
+    covariance[:6, :6] += own * RANDOM
+    covariance[:6, 6:] += sign * both * RANDOM
+    covariance[6:, :6] += sign * both * RANDOM
+    covariance[6:, 6:] += change * RANDOM
     return Twist(twist.value + lasting * twist.acceleration, covariance, left * twist.acceleration)
 
 
@@ -115,21 +112,8 @@ def growth(seconds: float) -> tuple[float, float, float]:
     return own, both, 1.0 - left**2
 
 
-def _blocks(matrix: FloatArray) -> FloatArray:
-    """Flat matrices (4, 144) that have a ``matrix`` (6, 6) as one of their four blocks."""
-    return np.stack([np.kron(block.reshape(2, 2), matrix).ravel() for block in np.eye(4)])
-
-
-def _of_blocks(a: float, b: float, c: float, d: float, blocks: FloatArray) -> FloatArray:
-    """Matrix (12, 12) of such blocks times a, b; c, d."""
-    return np.asarray((np.array([a, b, c, d]) @ blocks).reshape(12, 12))
-
-
-_IDENTITIES, _RANDOMS = _blocks(np.eye(6)), _blocks(RANDOM)
-
-
-def line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatArray) -> Twist:
-    """Twist that changes evenly through those of K states.
+def line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatArray, clock_std_s: float) -> Twist:
+    """Twist that changes evenly through those of K states, at a stamp with a standard deviation ``clock_std_s``.
 
     The error of the velocity is the same in all, that of a turn rate, a gyroscope's noise, is new in each.
     """
@@ -145,27 +129,20 @@ def line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatArr
     noise[3:, 3:] = typical[3:, 3:]
     slope = noise / square + growth(float(t[-1] - t[0]))[2] * RANDOM + _UNSURE
     covariance = np.empty((12, 12))
-    covariance[:6, :6] = noise / len(t) + middle**2 * slope + _LEAST
+    unsure = clock_std_s**2 * (np.outer(acceleration, acceleration) + slope)
+    covariance[:6, :6] = noise / len(t) + middle**2 * slope + unsure + _LEAST
     covariance[:3, :3] += typical[:3, :3]
     covariance[:6, 6:] = covariance[6:, :6] = -middle * slope
     covariance[6:, 6:] = slope
     return Twist(values.sum(axis=0) / len(t) - middle * acceleration, covariance, acceleration)
 
 
-def of_unsure_stamp(twist: Twist, clock_std_s: float) -> Twist:
-    """``twist`` with what the uncertainty of its stamp [s] makes of it by its acceleration, and of what that is."""
-    covariance = twist.covariance.copy()
-    square = np.outer(twist.acceleration, twist.acceleration) + covariance[6:, 6:]
-    covariance[:6, :6] += clock_std_s**2 * square
-    return Twist(twist.value, covariance, twist.acceleration)
-
-
 def joined(first: Twist, second: Twist) -> Twist:
     """What two independent estimates show together: of covariances P and R the gain P inv(P + R)."""
     gain = np.linalg.solve(first.covariance + second.covariance, first.covariance).T
     change = gain @ np.concatenate([second.value - first.value, second.acceleration - first.acceleration])
-    covariance = _symmetric(gain @ second.covariance)
-    return Twist(first.value + change[:6], covariance, first.acceleration + change[6:])
+    P = gain @ second.covariance
+    return Twist(first.value + change[:6], 0.5 * (P + P.T), first.acceleration + change[6:])
 
 
 def corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later: float) -> Twist:
@@ -180,13 +157,9 @@ def corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later
     residual = weighted - information @ twist.ago(-later)
     solved = np.linalg.solve(S, np.concatenate([information @ HP, residual[:, None]], axis=1))
     change = HP.T @ solved
-    mean = change[:, 12]
-    return Twist(twist.value + mean[:6], _symmetric(P - change[:, :12]), twist.acceleration + mean[6:])
-
-
-def _symmetric(P: FloatArray) -> FloatArray:
-    """Without what rounding makes of a covariance."""
-    return 0.5 * (P + P.T)
+    mean, P = change[:, 12], P - change[:, :12]
+    # What rounding makes of a covariance would add up over the frames.
+    return Twist(twist.value + mean[:6], 0.5 * (P + P.T), twist.acceleration + mean[6:])
 
 
 def plausible(odometry: Odometry) -> bool:

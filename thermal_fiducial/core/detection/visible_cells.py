@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.decoding import Decoder, sampled
+from thermal_fiducial.core.detection.patterns import Decoder, sampled
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
 # Samples along a cell, in its middle, away from blurred edges.

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.detection.marker_rows import marker_rows
+from thermal_fiducial.core.detection.detector import marker_rows
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject

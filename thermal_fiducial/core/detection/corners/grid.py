@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corners import edges
 from thermal_fiducial.core.detection.corners.segments import (
     counts_across,
     HOPELESS,
@@ -20,7 +19,7 @@ from thermal_fiducial.core.detection.corners.segments import (
     measure,
     REACHED,
 )
-from thermal_fiducial.core.detection.corners.sides import columns_across, NODES, Sides
+from thermal_fiducial.core.detection.corners.sides import blurred_step, blurs, columns_across, half_width, NODES, Sides
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
@@ -129,9 +128,9 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     length = float(np.linalg.norm(nodes[:, 4] - nodes[:, 0], axis=1).max())
     columns = int(np.clip(length / _EVERY_PX, _FEWEST, _MOST))
     widest = math.hypot(layer.blur, float(np.linalg.norm(layer.lag_blur)))
-    half = edges.half_width(widest)
+    half = half_width(widest)
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, columns, half)
-    blur = edges.blurs(sides.normal[0], layer.blur, layer.lag_blur[None])
+    blur = blurs(sides.normal[0], layer.blur, layer.lag_blur[None])
     counts = counts_across(layer.image, sides, layer.lag_tail)
     modelled = _model(sides, pattern.step, blur)
     measured = measure(counts, modelled, REACHED * blur[0], len(nodes))
@@ -147,7 +146,7 @@ def _model(
     sides: Sides, step: FloatArray, blur: tuple[FloatArray, FloatArray]
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
     """White's share of every pixel but for a constant, its derivative by distance, and its weight, (M, C, 1, E)."""
-    value, slope = edges.blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32))
+    value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32))
     sign = step.astype(np.float32)
     value *= sign
     slope *= sign

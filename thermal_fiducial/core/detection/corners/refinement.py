@@ -9,9 +9,8 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corners import edges
 from thermal_fiducial.core.detection.corners.segments import adjust, counts_across, HOPELESS, LagTail, measure, REACHED
-from thermal_fiducial.core.detection.corners.sides import sides_of
+from thermal_fiducial.core.detection.corners.sides import blurs, half_width, model, sides_of
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
 
@@ -78,7 +77,7 @@ def refine_corners(
     ----------
     image : (height, width) counts
     corners : (N, 4) to within two pixels, or a third of a cell
-    behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.edges.edges_behind`
+    behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
     blur_px : standard deviation of optics and pixel
     lag_blur_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
     columns : of pixels, in a segment
@@ -136,11 +135,11 @@ def _pass(task: _Task, start: ImagePoints, optics: float, prior: FloatArray) -> 
     """Where one linearised adjustment moves the corners, and the longest step (N,) of each marker."""
     cells = task.behind.shape[2]
     widest = math.hypot(optics, math.sqrt(float((task.lag_blur * task.lag_blur).sum(axis=1).max())))
-    half = edges.half_width(widest)
+    half = half_width(widest)
     sides = sides_of(start.x, task.camera, task.image.shape, cells, task.columns, half)
-    blur = edges.blurs(sides.normal[cells // 2], optics, task.lag_blur)
+    blur = blurs(sides.normal[cells // 2], optics, task.lag_blur)
     counts = counts_across(task.image, sides, task.lag_tail)
-    segments = measure(counts, edges.model(sides, task.behind, blur), REACHED * blur[0])
+    segments = measure(counts, model(sides, task.behind, blur), REACHED * blur[0])
     shift, covariances, doubt = adjust(sides, segments, prior, start)
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]

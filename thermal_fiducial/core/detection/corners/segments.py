@@ -183,14 +183,14 @@ def _noise(fit: _SegmentFit) -> FloatArray:
     """Variances of pixels (N, S): of a marker's typical segment, or a segment's own where that is much larger."""
     free = fit.number - 3.0
     own = fit.square / np.maximum(free, 1.0)
-    typical = _Median(free > 1.5)(own)
+    typical = _median(own, free > 1.5)
     return np.where(own > 2.5 * typical, own, typical) + 1e-3
 
 
 def _judged(fit: _SegmentFit, noise: FloatArray, reach: FloatArray) -> Segments:
     """Which segments measure anything, within their reach (N, S)."""
     contrast, product, usable = fit.contrast, fit.product, fit.number > 4.5
-    typical = _Median(usable)(contrast)
+    typical = _median(contrast, usable)
     own = noise * fit.contrast_variance
     scale = np.sign(typical) / np.maximum(np.abs(typical), 1e-6)
     relative, unsure = contrast * scale, 2.0 * np.sqrt(own) * np.abs(scale)
@@ -202,20 +202,13 @@ def _judged(fit: _SegmentFit, noise: FloatArray, reach: FloatArray) -> Segments:
     return Segments(shift, np.where(usable, noise * fit.product_variance / (safe * safe), HOPELESS), contrast, noise)
 
 
-class _Median:
+def _median(values: FloatArray, good: BoolArray) -> FloatArray:
     """Medians (N, 1) of the good ones of values (N, S), 0 where there is none."""
-
-    def __init__(self, good: BoolArray) -> None:
-        number = good.sum(axis=1)
-        self._good, self._none = good, number == 0
-        self._place = np.arange(len(good)), np.maximum(number - 1, 0) // 2
-
-    def __call__(self, values: FloatArray) -> FloatArray:
-        order = np.where(self._good, values, np.inf)
-        order.sort(axis=1)
-        median = order[self._place]
-        median[self._none] = 0.0
-        return np.asarray(median[:, None])
+    number = good.sum(axis=1)
+    order = np.sort(np.where(good, values, np.inf), axis=1)
+    median = order[np.arange(len(good)), np.maximum(number - 1, 0) // 2]
+    median[number == 0] = 0.0
+    return np.asarray(median[:, None])
 
 
 def adjust(
@@ -231,7 +224,7 @@ def adjust(
     at : (N, 4) corners so far
     """
     used = segments.variance < HOPELESS
-    median, sharpness = _Median(used), 1.0 / np.sqrt(segments.variance)
+    sharpness = 1.0 / np.sqrt(segments.variance)
     A, shift = _design(sides) * sharpness[..., None], segments.shift * sharpness
     weighted = turned = A.swapaxes(1, 2)
     robust = np.ones_like(shift)
@@ -239,7 +232,7 @@ def adjust(
         covariance = np.linalg.inv(weighted @ A + prior)
         moved = covariance @ (weighted @ shift[..., None])
         left = np.abs(shift - (A @ moved)[..., 0])
-        scale = np.maximum(1.4826 * median(left), 1.0)
+        scale = np.maximum(1.4826 * _median(left, used), 1.0)
         former, robust = robust, 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
         if np.abs(robust - former).max() < _SETTLED:
             break

@@ -63,16 +63,12 @@ class Squared(NamedTuple):
     #: (N, 8, 1) how far they are off, and its covariance (N, 8, 8) [px]
     moved: FloatArray
     covariance: FloatArray
-    #: (N,) squared Mahalanobis distance from the nearest square, and square of what is left of it in the corners
+    #: (N,) squared Mahalanobis distance from the nearest square
     chi2: FloatArray
-    left: FloatArray
+    #: (N,) squares of the errors of shapes that are none of squares, zero of the others
+    doubt: FloatArray
     #: (N,) how many of the two conditions, rather than the image, constrain the corners
     constrained: FloatArray
-
-    @property
-    def doubt(self) -> FloatArray:
-        """Squares (N,) of the errors of shapes that are none of squares, zero of the others."""
-        return np.where(self.chi2 > _TOO_FAR, self.left, 0.0)
 
 
 def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squared:
@@ -112,7 +108,8 @@ def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance:
             break
     chi2, left = (error * weighted).sum(axis=(1, 2)), ((variance * weighted) ** 2).sum(axis=(1, 2))
     constrained = 2.0 - (variance * information * _EYE).sum(axis=(1, 2))
-    return Squared(moved, covariance - spread @ information @ spread.swapaxes(1, 2), chi2, left, constrained)
+    doubt = np.where(chi2 > _TOO_FAR, left, 0.0)
+    return Squared(moved, covariance - spread @ information @ spread.swapaxes(1, 2), chi2, doubt, constrained)
 
 
 def squareness(x: FloatArray, inverse: FloatArray) -> Squareness:
