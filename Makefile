@@ -4,6 +4,7 @@
 # make coverage  all tests, with the branch coverage of the core: less than 95 % fails
 # make bench     accuracy and speed against OpenCV and a batch smoother, in the same run
 # make faults    faults of IMU, camera, markers and nodes in flights of eight seeds, as a table for the documents
+# make soak      an hour of flight in real time: memory, CPU and error by the minute
 # make fuzz      10,000 mutated messages, files and bags for the nodes and commands; anything found is an error
 # make latency   latency, losses and CPU of the nodes in real time, on the machine as it is and beside two busy loops
 # make tables    put measured tables and parameters into the documents
@@ -23,7 +24,7 @@ export OMP_NUM_THREADS := 1
 # A notice of the theme about its successor.
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help demo test lint nightly coverage bench faults fuzz latency tables structure docs format clean
+.PHONY: help demo test lint nightly coverage bench faults soak fuzz latency tables structure docs format clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -68,6 +69,10 @@ faults: $(READY)
 	@echo '== Faults in flight: about an hour on two cores; fewer flights: make faults FAULTS_ARGS="--seeds 1"'
 	PYTHONPATH=test $(BIN)/python -m faults $(FAULTS_ARGS)
 	$(BIN)/python test/documents.py
+
+soak: $(READY)
+	@echo '== An hour of flight in real time; shorter: make soak SOAK_ARGS="--minutes 6"'
+	PYTHONPATH=test $(BIN)/python -m soak $(SOAK_ARGS)
 
 fuzz: $(READY)
 	@echo '== Mutated messages, files and bags'

@@ -60,6 +60,7 @@ setup(
             'pytest-xdist',
             'pytest-cov',
             'av',
+            'psutil',
         ],
         # Pinned: a new version of a linter must not turn an untouched commit red.
         'lint': ['ruff==0.17.6', 'mypy==2.4.1', 'import-linter==2.16', 'types-PyYAML==6.0.12.20261113'],

@@ -33,6 +33,8 @@ class NodeProcesses:
         self._environment = {**os.environ, 'ROS_DOMAIN_ID': str(domain_id)}
         self._arguments = ['--ros-args', *ros_arguments]
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        #: after the end, in words: nodes that did not end as they should
+        self.unclean: list[str] = []
 
     def __enter__(self) -> Self:
         self._folder = tempfile.TemporaryDirectory(prefix='thermal_fiducial_')
@@ -48,8 +50,9 @@ class NodeProcesses:
     def __exit__(self, *_: object) -> None:
         for process in self._processes.values():
             process.send_signal(signal.SIGINT)
-        for process in self._processes.values():
-            _await_end(process)
+        for node, process in self._processes.items():
+            if fault := _await_end(process):
+                self.unclean.append(f'{node}: {fault}')
         self._folder.cleanup()
 
     def check(self) -> None:
@@ -85,14 +88,22 @@ class NodeProcesses:
         return Path(self._folder.name) / f'{node}.txt'
 
 
-def _await_end(process: subprocess.Popen[bytes]) -> None:
-    """Let a process end its work, however slow the machine; end it when it has none and stays."""
+def _await_end(process: subprocess.Popen[bytes]) -> str:
+    """Let a process end its work, however slow the machine; end it when it has none and stays.
+
+    Returns
+    -------
+    What was wrong with its end, in words.
+    """
     idle = 0
     while process.poll() is None and idle * _GLANCE_S < _IDLE_S:
         time.sleep(_GLANCE_S)
         idle += not _works(process.pid)
+    if process.poll() is not None:
+        return f'ended with status {process.returncode}' if process.returncode else ''
     process.kill()
     process.wait()
+    return f'did not end within {_IDLE_S:g} idle seconds of SIGINT, killed'
 
 
 def _works(pid: int) -> bool:

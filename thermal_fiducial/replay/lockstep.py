@@ -13,14 +13,14 @@ from rclpy.context import Context
 from rclpy.serialization import deserialize_message
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagMessage, BagReader
+from thermal_fiducial.files.bags import BagMessage
 from thermal_fiducial.nodes.aruco_detector import ArucoDetector
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
 from thermal_fiducial.replay.domain import own_domain
-from thermal_fiducial.replay.recorder import Recorder, RunFiles
-from thermal_fiducial.replay.topics import PLAYED, Topics
+from thermal_fiducial.replay.recorder import Recorder, Sink
+from thermal_fiducial.replay.topics import Playable, PLAYED, Topics
 from thermal_fiducial.replay.waiting import Wait
 from thermal_fiducial.ros.counting import CountingNode
 from thermal_fiducial.ros.node import StageNode
@@ -36,10 +36,10 @@ _KINDS: dict[str, type[StageNode[Any]]] = {
 
 
 def replay_lockstep(
-    bag: BagReader,
+    bag: Playable,
     nodes: Sequence[str],
     played: Sequence[str],
-    files: RunFiles,
+    files: Sink,
     recorded: Topics,
     ros_arguments: Sequence[str],
     progress: Callable[[int], None],
@@ -100,7 +100,7 @@ class _Graph:
         for node in self._nodes:
             self._executor.add_node(node)
 
-    def play(self, bag: BagReader, played: Sequence[str], files: RunFiles, progress: Callable[[int], None]) -> None:
+    def play(self, bag: Playable, played: Sequence[str], files: Sink, progress: Callable[[int], None]) -> None:
         """Play it all, with diagnostics once a second of the bag's time."""
         faults = [fault for stage in self._stages for fault in stage.faults]
         if faults:
@@ -119,7 +119,7 @@ class _Graph:
             self._settle(message.stamp_ns, files)
         self._diagnose(next_diagnosis, files)
 
-    def _diagnose(self, time_ns: int, files: RunFiles) -> None:
+    def _diagnose(self, time_ns: int, files: Sink) -> None:
         for stage in self._stages:
             stage.diagnose(time_ns)
         self._settle(time_ns, files)
@@ -137,7 +137,7 @@ class _Graph:
         self._wait(lambda: [source.topic for source, count in writers if source.publishers != count])
         self._heard = [(output, count) for output, count in readers if count]
 
-    def _settle(self, time_ns: int, files: RunFiles) -> None:
+    def _settle(self, time_ns: int, files: Sink) -> None:
         """Run callbacks until nothing is under way; hand what was recorded on in a fixed order of topics."""
         self._wait(self._under_way)
         self._arrived.sort(key=lambda entry: self._order[entry[0]])

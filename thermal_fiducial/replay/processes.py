@@ -10,7 +10,6 @@ from rclpy.context import Context
 
 from thermal_fiducial.files.bags import (
     BagMessage,
-    BagReader,
     CAMERA_INFO_TOPIC,
     COMPRESSED_TOPIC,
     IMAGE_TOPIC,
@@ -20,8 +19,8 @@ from thermal_fiducial.files.images import header_stamp_ns
 from thermal_fiducial.replay.children import NodeProcesses
 from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.replay.latency import LatencyMeter
-from thermal_fiducial.replay.recorder import Recorder, RunFiles
-from thermal_fiducial.replay.topics import PLAYED, Topics
+from thermal_fiducial.replay.recorder import Recorder, Sink
+from thermal_fiducial.replay.topics import Playable, PLAYED, Topics
 from thermal_fiducial.replay.waiting import Wait
 from thermal_fiducial.ros.counting import CountingNode
 from thermal_fiducial.ros.promptness import prompt
@@ -41,10 +40,10 @@ _KINDS = {IMAGE_TOPIC: 'image', COMPRESSED_TOPIC: 'image', IMU_TOPIC: 'imu'}
 
 
 def replay_processes(
-    bag: BagReader,
+    bag: Playable,
     nodes: Sequence[str],
     played: Sequence[str],
-    files: RunFiles,
+    files: Sink,
     recorded: Topics,
     ros_arguments: Sequence[str],
     progress: Callable[[int], None],
@@ -73,9 +72,12 @@ def replay_processes(
                 try:
                     player.connect(processes, nodes, warn)
                     with prompt(_PRIORITY):
-                        return player.play(bag, processes, rate, progress)
+                        timing = player.play(bag, processes, rate, progress)
                 finally:
                     player.close()
+            for fault in processes.unclean:
+                warn(f'at the end, {fault}')
+            return timing
         finally:
             context.try_shutdown()
 
@@ -83,7 +85,7 @@ def replay_processes(
 class _Player:
     """Publishes the bag on time, and between its messages takes what the nodes publish."""
 
-    def __init__(self, context: Context, played: Sequence[str], files: RunFiles, recorded: Topics) -> None:
+    def __init__(self, context: Context, played: Sequence[str], files: Sink, recorded: Topics) -> None:
         quiet: dict[str, Any] = {
             'context': context,
             'use_global_arguments': False,
@@ -116,9 +118,7 @@ class _Player:
         while time.monotonic() < deadline:
             self._executor.spin_once(timeout_sec=0.05)
 
-    def play(
-        self, bag: BagReader, nodes: NodeProcesses, rate: float, progress: Callable[[int], None]
-    ) -> dict[str, Any]:
+    def play(self, bag: Playable, nodes: NodeProcesses, rate: float, progress: Callable[[int], None]) -> dict[str, Any]:
         """Publish the bag; then wait for the last results."""
         self._bag_start_ns, self._rate = bag.start_ns, rate
         cpu = nodes.cpu_seconds()

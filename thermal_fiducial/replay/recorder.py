@@ -6,7 +6,7 @@ from decimal import Decimal
 from functools import partial
 from pathlib import Path
 import shutil
-from typing import Any, Self, TextIO
+from typing import Any, Protocol, Self, TextIO
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
@@ -21,6 +21,15 @@ from thermal_fiducial.files.trajectory_file import tum_line
 from thermal_fiducial.replay.topics import Topics, type_name
 from thermal_fiducial.ros import clouds, convert
 from thermal_fiducial.ros.counting import CountingNode
+
+
+class Sink(Protocol):
+    """What takes the messages that nodes publish."""
+
+    folder: Path
+
+    def add(self, topic: str, time_ns: int, data: bytes) -> None:
+        """Take one message, as CDR bytes, that came at ``time_ns`` of the bag's clock."""
 
 
 class RunFiles:

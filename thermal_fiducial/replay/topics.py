@@ -1,8 +1,8 @@
 """What a replay plays and what it records: topic to message type and quality of service, by where the bag begins."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseArray, PoseWithCovarianceStamped, TransformStamped
@@ -12,6 +12,7 @@ from visualization_msgs.msg import MarkerArray
 
 from thermal_fiducial.config import NODES
 from thermal_fiducial.files.bags import (
+    BagMessage,
     CAMERA_INFO_TOPIC,
     CAMERA_POSE_TOPIC,
     COMPRESSED_TOPIC,
@@ -22,6 +23,18 @@ from thermal_fiducial.files.bags import (
 from thermal_fiducial.ros import qos
 
 Topics: TypeAlias = dict[str, tuple[type, Any]]
+
+
+class Playable(Protocol):
+    """What can be played: a bag, or what passes for one."""
+
+    @property
+    def start_ns(self) -> int:
+        """Stamp of the first message."""
+
+    def messages(self, topics: Iterable[str] | None = None) -> Iterator[BagMessage]:
+        """The messages on ``topics`` in their order."""
+
 
 PLAYED: Topics = {
     IMAGE_TOPIC: (Image, qos.IMAGE_OUTPUT),

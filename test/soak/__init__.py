@@ -1,0 +1,1 @@
+"""Hours of flight through the nodes: memory, processor time, error, shutdown."""

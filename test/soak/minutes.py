@@ -1,0 +1,143 @@
+"""What is measured in each minute of flight, and what is made of it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
+import psutil
+from rclpy.serialization import deserialize_message
+
+from soak.laps import Laps
+from thermal_fiducial.ros import convert
+
+MINUTE_NS = 60_000_000_000
+#: What a node may grow by after the second minute, when all that is made on first use is there [MB].
+GROWTH_MB = 5.0
+#: What the error may rise by from the second minute to the last [mm], beside three standard errors.
+TREND_MM = 1.0
+#: Of the IMU's messages, how many may have no pose: the filter's start, and single ones lost on a busy machine.
+LOST_SHARE = 0.02
+
+
+@dataclass(frozen=True)
+class Minute:
+    """One minute: MB and per cent of a core by node, poses, root mean square and worst error of their positions."""
+
+    memory_mb: dict[str, float]
+    cpu_percent: dict[str, float]
+    poses: int
+    rms_mm: float
+    worst_mm: float
+
+
+class Errors:
+    """Takes what the nodes publish, and keeps how far off the poses were."""
+
+    def __init__(self, laps: Laps, folder: Path) -> None:
+        self.folder, self._laps = folder, laps
+        self._errors_m: list[float] = []
+
+    def add(self, topic: str, time_ns: int, data: bytes) -> None:
+        """Take one message; ``time_ns`` does not matter."""
+        if topic == 'pose':
+            message = deserialize_message(data, PoseWithCovarianceStamped)
+            position = convert.transform_of(message.pose.pose)[:3, 3]
+            truth = self._laps.truth(convert.stamp_ns(message.header.stamp))
+            self._errors_m.append(float(np.linalg.norm(position - truth[:3, 3])))
+
+    def take(self) -> np.ndarray:
+        """Errors since the last call [m]."""
+        taken, self._errors_m = np.array(self._errors_m), []
+        return taken
+
+
+class Meter:
+    """A row a minute of flight.
+
+    Parameters
+    ----------
+    errors : of the poses
+    processes : by the name of the node; asked anew each minute
+    say : takes each row as it comes
+    """
+
+    def __init__(self, errors: Errors, processes, say) -> None:
+        self._errors, self._processes, self._say = errors, processes, say
+        self.minutes: list[Minute] = []
+        self._cpu: dict[str, float] = {}
+        self._at_ns = 0
+
+    def __call__(self, elapsed_ns: int) -> None:
+        """Note what is to be noted at this time of the flight."""
+        if elapsed_ns // MINUTE_NS <= self._at_ns // MINUTE_NS and self._cpu:
+            return
+        seconds, self._at_ns = (elapsed_ns - self._at_ns) * 1e-9, elapsed_ns
+        found = self._processes()
+        memory = {name: process.memory_info().rss / 2**20 for name, process in found.items()}
+        times = {name: sum(process.cpu_times()[:2]) for name, process in found.items()}
+        before, self._cpu = self._cpu, times
+        if before:
+            cpu = {name: 100.0 * (times[name] - before[name]) / seconds for name in times}
+            errors = 1e3 * self._errors.take()
+            rms, worst = (np.sqrt(np.mean(errors**2)), errors.max()) if len(errors) else (0.0, 0.0)
+            self.minutes.append(Minute(memory, cpu, len(errors), float(rms), float(worst)))
+            self._say(row(len(self.minutes), self.minutes[-1]))
+
+
+def node_processes(names: Iterable[str]) -> dict[str, psutil.Process]:
+    """The nodes among this process's children."""
+    found = {}
+    for child in psutil.Process().children():
+        words = child.cmdline()
+        found |= {name: child for name in names if f'thermal_fiducial.nodes.{name}' in words}
+    return found
+
+
+HEAD = '| minute | memory [MB] | CPU [% of a core] | poses | error rms / worst [mm] |\n|---|---|---|---|---|'
+
+
+def row(number: int, minute: Minute) -> str:
+    """One of the table."""
+    memory = ', '.join(f'{value:.1f}' for value in minute.memory_mb.values())
+    cpu = ', '.join(f'{value:.0f}' for value in minute.cpu_percent.values())
+    return (
+        f'| {number} | {memory} | {cpu}: {sum(minute.cpu_percent.values()):.0f} | {minute.poses} '
+        f'| {minute.rms_mm:.1f} / {minute.worst_mm:.1f} |'
+    )
+
+
+def growth_mb(minutes: list[Minute]) -> dict[str, float]:
+    """What each node has grown by since the second minute, or since the first of two."""
+    settled = minutes[min(1, len(minutes) - 2)]
+    return {name: minutes[-1].memory_mb[name] - value for name, value in settled.memory_mb.items()}
+
+
+def trend_mm(minutes: list[Minute]) -> tuple[float, float]:
+    """What a line through the errors of all minutes but the first, which maps, rises by; its standard error."""
+    errors = np.array([minute.rms_mm for minute in minutes[1:]])
+    if len(errors) < 3:
+        return (float(errors[-1] - errors[0]), 0.0) if len(errors) else (0.0, 0.0)
+    times = np.arange(len(errors)) - 0.5 * (len(errors) - 1)
+    slope = times @ errors / (times @ times)
+    residuals = errors - np.mean(errors) - slope * times
+    deviation = np.sqrt(residuals @ residuals / (len(errors) - 2) / (times @ times))
+    return float(slope * (len(errors) - 1)), float(deviation * (len(errors) - 1))
+
+
+def faults(minutes: list[Minute], imu_count: int, warnings: list[str]) -> list[str]:
+    """What is wrong with a soak, in words."""
+    found = [f'said: {line}' for line in warnings]
+    if len(minutes) < 2:
+        return [*found, 'not two minutes were flown']
+    for name, grown in growth_mb(minutes).items():
+        if grown > GROWTH_MB:
+            found.append(f'{name} grew by {grown:.1f} MB')
+    trend, deviation = trend_mm(minutes)
+    if trend > TREND_MM + 3.0 * deviation:
+        found.append(f'the error grew by {trend:.1f} mm')
+    poses = sum(minute.poses for minute in minutes)
+    if poses < (1.0 - LOST_SHARE) * imu_count:
+        found.append(f'{poses} poses of {imu_count} samples of the IMU')
+    return found
