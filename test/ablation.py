@@ -249,6 +249,7 @@ MECHANISMS = {
     'markers in plates': Mechanism(
         'fast, 0.5 K, blind', ('patterns:shrunk',), {'search:_with_shrunk': lambda quads, _: quads}
     ),
+    'large markers halved': Mechanism('landing', ('confirmation:_read',), {'confirmation:_WIDE_CELL_PX': np.inf}),
     'columns of the frame': Mechanism('slow, 0.1 K, guided', (), {'frame:without_columns': lambda counts, _: counts}),
     'following': Mechanism(
         'slow, 0.1 K, blind',

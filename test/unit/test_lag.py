@@ -72,7 +72,7 @@ def test_sharpened_corners_do_not_depend_on_the_form_of_the_lag(steps):
     image = cv2.GaussianBlur(seen.astype(np.float32), (0, 0), 0.6)
     corners = np.array([[low, low], [high, low], [high, high], [low, high]])
     blurred = np.broadcast_to(-tau * velocity, (1, 4, 2))
-    sharp = markers_deblurred(image, corners[None], blurred, 60)
+    sharp = markers_deblurred(image, corners[None], blurred)
     v, u = np.mgrid[:100, :100]
     centre = np.array([(sharp * u).sum(), (sharp * v).sum()]) / sharp.sum()
     mean_age = float(weights @ ages)
@@ -100,7 +100,7 @@ def test_sharpened_edges_are_those_of_a_response_that_forgets(lag_blur):
 
     corners = np.array([[[44.7, 20.0], [64.7, 20.0], [64.7, 40.0], [44.7, 40.0]]])
     blurred = np.broadcast_to([-lag_blur, 0.0], (1, 4, 2))
-    sharp, young = markers_deblurred(seen(ages < 10.0), corners, blurred, 12)[30], seen(ages < 0.75)[30]
+    sharp, young = markers_deblurred(seen(ages < 10.0), corners, blurred)[30], seen(ages < 0.75)[30]
     slope = np.gradient(young)
     side = slice(59, 70)
     displaced = slope[side] @ (sharp - young)[side] / (slope[side] @ slope[side])
@@ -147,4 +147,4 @@ def test_windows_outside_or_without_numbers_are_skipped():
     image = np.random.default_rng(2).normal(size=(60, 80)).astype(np.float32)
     square = np.array([[0.0, 0.0], [20.0, 0.0], [20.0, 20.0], [0.0, 20.0]])
     corners = np.stack([square + 500.0, square - 500.0, square + np.nan])
-    np.testing.assert_array_equal(markers_deblurred(image, corners, np.ones((3, 4, 2)), 16), image)
+    np.testing.assert_array_equal(markers_deblurred(image, corners, np.ones((3, 4, 2))), image)

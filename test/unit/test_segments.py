@@ -4,9 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.corners.segments import counts_across, LagTail
 from thermal_fiducial.core.detection.corners.sides import sides_of
-from thermal_fiducial.core.detection.lag import GAIN, lag_tail_maps, markers_deblurred
 from thermal_fiducial.core.geometry.camera import Camera
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 527.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 1e-4, -2e-4, 0.0])
@@ -45,16 +43,3 @@ def test_columns_beyond_the_image_do_not_count(image):
     assert sides.inside is not None
     assert sides.fresh[..., 0].any()
     assert not sides.fresh[..., 2].all()
-
-
-def test_memory_is_taken_out_as_in_a_whole_image(image):
-    displacement = np.array([[[3.0, 1.0]] * 4, [[0.0, 0.0]] * 4])
-    sides = sides_of(CAMERA.normalise(CORNERS), CAMERA, image.shape, cells=6, columns=6, half=5)
-    lag_tail = LagTail(lag_tail_maps(CORNERS, displacement), np.array([GAIN, 1.0]))
-    counts = counts_across(image, sides, lag_tail)
-    sharp = markers_deblurred(image, CORNERS[:1], displacement[:1], 14)
-    # OpenCV interpolates between thirty-seconds of a pixel, to which both ways may round differently.
-    np.testing.assert_allclose(counts, sharp.ravel()[sides.pixel], atol=2.0)
-    assert np.abs(counts - image.ravel()[sides.pixel])[..., :4].max() > 10.0
-    np.testing.assert_array_equal(counts[..., 4:], image.ravel()[sides.pixel[..., 4:]])
-    np.testing.assert_array_equal(counts_across(image, sides), image.ravel()[sides.pixel])

@@ -15,10 +15,13 @@ from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
+from thermal_fiducial.core.detection.quads import halved
 from thermal_fiducial.core.detection.refining import RefinedMarkers, sides_px
 from thermal_fiducial.core.detection.search import accepted
-from thermal_fiducial.core.types import BoolArray, Float32Array
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
+# Cells at least this wide are read at half the resolution, where a pixel has half the noise and less blur.
+_WIDE_CELL_PX = 8.0
 # Correlation at the refined corners: of a marker with sharp sides, and (less when faint) of one with softer sides.
 _SIMILAR = 0.82
 _CLEARLY_SIMILAR = 0.9
@@ -68,7 +71,7 @@ def confirmed(
     """
     if len(found.ids) == 0:
         return np.zeros(0, dtype=bool)
-    reading = decoder.read(image, refined.corners_px)
+    reading = _read(image, refined.corners_px, decoder)
     similarity = np.abs(reading.correlation)
     contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
     same = reading.ids == found.ids
@@ -83,6 +86,14 @@ def confirmed(
     known = (similarity >= config.guided_min_correlation) & (similarity - reading.runner_up >= config.guided_min_margin)
     there = np.abs(refined.corners_px - found.corners_px).max(axis=(1, 2)) < 0.7 * side / decoder.cells
     return np.asarray(same & ((found.expected & known & there) | (alike & (sharp | soft))))
+
+
+def _read(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
+    """Readings of (Q, 4, 2), at half the resolution when all are large enough for it."""
+    sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
+    if sides.min() < _WIDE_CELL_PX * decoder.cells:
+        return decoder.read(image, quads)
+    return decoder.read(halved(image), 0.5 * (quads - 0.5))
 
 
 def speaks_for_itself(reading: Reading, decoder: Decoder) -> BoolArray:

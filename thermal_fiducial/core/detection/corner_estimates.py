@@ -13,7 +13,7 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.confirmation import confirmed, with_corners_by_pattern
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
-from thermal_fiducial.core.detection.corners.segments import counts_across, HOPELESS, measure, REACHED, Segments
+from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind, edges_behind_border, model, sides_of
 from thermal_fiducial.core.detection.finding import Findings
 from thermal_fiducial.core.detection.found import among, Found, places_of
@@ -106,8 +106,7 @@ class DisplayedSides:
         blur = blurs(sides.normal[self._bits // 2], blur_px, refined.view.spread)
         value, slope, weight = model(sides, self._behind[ids], blur)
         weight *= self._white[ids].reshape(-1, self._bits).T
-        counts = counts_across(frame.image, sides, refined.view.lag_tail)
-        return measure(counts, (value, slope, weight), REACHED * blur[0])
+        return measure(refined.view.image, sides, (value, slope, weight), REACHED * blur[0])
 
 
 def _outward(corners: FloatArray) -> FloatArray:
@@ -187,11 +186,11 @@ class CornerEstimator:
         keep = read & among(found.ids, followed.ids[followed.certain])
         others = np.flatnonzero(~keep)
         if len(others):
-            image = view.image(observed.corners_px, others)
             expected = replace(found, corners_px=there).only(others)
             observed = observed.only(others)
             blur = np.sqrt(np.sum(view.spread[others] ** 2, axis=1))
             standing = frame.displayed & (blur < _STANDING * sides_px(expected.corners_px) / self._decoder.cells)
+            image = np.asarray(view.image, dtype=np.float32)
             keep[others] = confirmed(image, expected, observed, self._decoder, config, standing_picture=standing)
         return np.asarray(keep & frame.camera.contains(refined.observed.corners_px, _BORDER_PX).all(axis=1))
 

@@ -14,7 +14,7 @@ from thermal_fiducial.core.detection.frame import expected_displacement, Frame, 
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.lag import markers_deblurred, REMAINING
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
-from thermal_fiducial.core.detection.refining import BLUR_THAT_MATTERS_PX, WINDOW_MARGIN_PX
+from thermal_fiducial.core.detection.refining import BLUR_THAT_MATTERS_PX
 from thermal_fiducial.core.detection.tracking import TrackedMarkers
 from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
@@ -95,7 +95,7 @@ def near_prediction(
     blurred = np.abs(shift).max(axis=(1, 2)) > BLUR_THAT_MATTERS_PX
     scene = frame.image
     if blurred.any():
-        scene = markers_deblurred(frame.image, corners[blurred], shift[blurred], WINDOW_MARGIN_PX)
+        scene = markers_deblurred(frame.image, corners[blurred], shift[blurred])
     left = np.where(blurred[:, None, None], REMAINING * shift, shift)
     shown = _shifted(scene, ids, corners + left, decoder)
     reading = decoder.read(scene, shown)

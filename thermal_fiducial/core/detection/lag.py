@@ -25,14 +25,16 @@ from thermal_fiducial.core.types import Float32Array, FloatArray
 _DERIVATIVE = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0], dtype=np.float32) / 60.0
 # Linear interpolation blurs the lag tail more than the image that it is taken from, and would displace the difference.
 _WARP = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP
+# Pixels round a marker that its refinement may look at.
+_MARGIN_PX = 14
 # How much of the past is taken out of the image, in time constants, and its weight.
 _TAIL = 0.75
 _FORGOTTEN = math.exp(-_TAIL)
-#: The present's weight when the lag tail is taken out.
-GAIN = 1.0 / (1.0 - _FORGOTTEN)
+# The present's weight when the lag tail is taken out.
+_GAIN = 1.0 / (1.0 - _FORGOTTEN)
 #: What is left of the motion blur: its mean, and its standard deviation about that, as shares of the whole.
-REMAINING = 1.0 - _TAIL * _FORGOTTEN * GAIN
-SPREAD = math.sqrt(1.0 - _TAIL**2 * _FORGOTTEN * GAIN**2)
+REMAINING = 1.0 - _TAIL * _FORGOTTEN * _GAIN
+SPREAD = math.sqrt(1.0 - _TAIL**2 * _FORGOTTEN * _GAIN**2)
 _EYE = np.eye(2)
 #: Age, in time constants, of the velocity that has carried the lag tail as far as it is from the image.
 LAG_TAIL_AGE = 1.0 + 0.5 * _TAIL
@@ -106,31 +108,26 @@ def without_lag(image: Float32Array, blur_u: Float32Array, blur_v: Float32Array)
     return np.asarray(image + blur_u * du + blur_v * dv)
 
 
-def markers_deblurred(
-    image: Float32Array,
-    corners_px: FloatArray,
-    lag_blur_px: FloatArray,
-    margin_px: int,
-) -> Float32Array:
+def markers_deblurred(image: Float32Array, corners_px: FloatArray, lag_blur_px: FloatArray) -> Float32Array:
     """``image`` with the windows round N markers (corners, motion blur: (N, 4, 2) [px]) freed of their lag tails."""
     result = image.copy()
     height, width = image.shape
     finite = np.isfinite(corners_px).all(axis=(1, 2)) & np.isfinite(lag_blur_px).all(axis=(1, 2))
     corners_px, lag_blur_px = corners_px[finite], lag_blur_px[finite]
-    maps = lag_tail_maps(corners_px, lag_blur_px)
-    low = np.floor(corners_px.min(axis=1)).astype(int) - margin_px
-    high = np.ceil(corners_px.max(axis=1)).astype(int) + margin_px + 1
+    maps = _lag_tail_maps(corners_px, lag_blur_px)
+    low = np.floor(corners_px.min(axis=1)).astype(int) - _MARGIN_PX
+    high = np.ceil(corners_px.max(axis=1)).astype(int) + _MARGIN_PX + 1
     low, high = np.maximum(low, 0), np.minimum(high, (width, height))
     seen = (low < high).all(axis=1)
     low, high, to_tail = low[seen], high[seen], maps[seen].astype(np.float32)
     to_tail[:, :, 2:] += to_tail[:, :, :2] @ low[..., None].astype(np.float32)
     for (u0, v0), (u1, v1), inverse in zip(low.tolist(), high.tolist(), to_tail, strict=True):
         lag_tail = cv2.warpAffine(image, inverse, (u1 - u0, v1 - v0), flags=_WARP, borderMode=cv2.BORDER_REPLICATE)
-        cv2.addWeighted(image[v0:v1, u0:u1], GAIN, lag_tail, 1.0 - GAIN, 0.0, dst=result[v0:v1, u0:u1])
+        cv2.addWeighted(image[v0:v1, u0:u1], _GAIN, lag_tail, 1.0 - _GAIN, 0.0, dst=result[v0:v1, u0:u1])
     return result
 
 
-def lag_tail_maps(corners_px: FloatArray, lag_blur_px: FloatArray) -> FloatArray:
+def _lag_tail_maps(corners_px: FloatArray, lag_blur_px: FloatArray) -> FloatArray:
     """Affine maps (N, 2, 3) of the pixels round markers, (N, 4, 2) both, to where their lag tail lies.
 
     What a pixel saw earlier, the scene now has farther on.

@@ -6,9 +6,8 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.detection.corners.grid import Layer
-from thermal_fiducial.core.detection.corners.segments import LagTail
 from thermal_fiducial.core.detection.frame import expected_displacement, Frame, lag_tail, Places
-from thermal_fiducial.core.detection.lag import GAIN, LAG_TAIL_AGE, lag_tail_maps, REMAINING, SPREAD
+from thermal_fiducial.core.detection.lag import LAG_TAIL_AGE, markers_deblurred, REMAINING, SPREAD
 from thermal_fiducial.core.detection.refining import sides_px, worth_deblurring
 from thermal_fiducial.core.detection.twist import interaction
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -41,12 +40,13 @@ def deblurred_layer(frame: Frame, window: FloatArray, contrast: float, blur_px: 
     cell = sides_px(places.at.px) / cells
     if twist is None or not worth_deblurring(np.array([mean @ mean]), cell, cells, cnr)[0]:
         return plain_layer(frame, window, blur_px, 1)
-    maps = lag_tail_maps(places.at.px + _displaced(frame, window, 1.0 - REMAINING), lag_tail(places, twist, frame))
+    shown = places.at.px + _displaced(frame, window, 1.0 - REMAINING)
+    image = markers_deblurred(frame.image, shown, lag_tail(places, twist, frame))
 
     def displacement(points: FloatArray) -> FloatArray:
         return _displaced(frame, points, 1.0 - REMAINING)
 
-    return Layer(frame.image, frame.camera, displacement, blur_px, SPREAD * mean, LagTail(maps, np.array([GAIN])))
+    return Layer(image, frame.camera, displacement, blur_px, SPREAD * mean)
 
 
 def _displaced(frame: Frame, points: FloatArray, removed: float) -> FloatArray:

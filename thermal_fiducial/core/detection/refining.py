@@ -12,7 +12,6 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.refinement import refine_corners, RefinedCorners
-from thermal_fiducial.core.detection.corners.segments import LagTail
 from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import (
     delays,
@@ -24,8 +23,6 @@ from thermal_fiducial.core.detection.frame import (
 )
 from thermal_fiducial.core.detection.lag import (
     common_error,
-    GAIN,
-    lag_tail_maps,
     markers_deblurred,
     model_error,
     REMAINING,
@@ -33,12 +30,10 @@ from thermal_fiducial.core.detection.lag import (
 )
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, unknown_twist
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray
 
 #: Blur by lag below which the shape of an edge doesn't change [px].
 BLUR_THAT_MATTERS_PX = 0.4
-#: Pixels round a marker that the refinement may look at.
-WINDOW_MARGIN_PX = 14
 # What both ways to measure blurred corners cost: deblurring adds noise, in pixels times contrast over noise times root
 # of the side; without it the tail of the lag passes for a symmetric blur, which displaces corners by so much of the
 # square of the motion blur over a cell.
@@ -56,36 +51,17 @@ _NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
 class DeblurredView:
     """A frame in which the motion blur of N markers is short."""
 
-    frame: Frame
+    image: Counts | Float32Array
     #: (N, 4, 2) where the corners appear in the view, off their places at the stamp [px]
     shift: FloatArray
     #: (N, 4, 2) how much of the motion blur's shift is taken out
     removed: FloatArray
     #: (N, 2) standard deviation of what is left of the motion blur, along it
     spread: FloatArray
-    #: (N,) round which markers old lag tails are taken out, by what displacement (N, 4, 2) these are off, and how
-    deblurred: BoolArray
-    off: FloatArray
-    lag_tail: LagTail | None
 
     def only(self, keep: BoolArray) -> 'DeblurredView':
         """That of the markers ``keep`` (N,)."""
-        return DeblurredView(
-            self.frame,
-            self.shift[keep],
-            self.removed[keep],
-            self.spread[keep],
-            self.deblurred[keep],
-            self.off[keep],
-            None if self.lag_tail is None else self.lag_tail.only(np.flatnonzero(keep)),
-        )
-
-    def image(self, corners_px: FloatArray, which: IntArray) -> Float32Array:
-        """The view as an image, round the markers ``which`` with ``corners_px`` (N, 4, 2) in it."""
-        which = which[self.deblurred[which]]
-        if len(which) == 0:
-            return self.frame.image
-        return markers_deblurred(self.frame.image, corners_px[which], self.off[which], WINDOW_MARGIN_PX)
+        return replace(self, shift=self.shift[keep], removed=self.removed[keep], spread=self.spread[keep])
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,9 +123,7 @@ class Refiner:
             start = places.at.moved(view.shift, frame.camera)
             behind = self._behind[found.ids]
             blur = config.blur_px, view.spread
-            seen = refine_corners(
-                frame.samples, start, frame.camera, behind, *blur, columns, near=near, lag_tail=view.lag_tail
-            )
+            seen = refine_corners(view.image, start, frame.camera, behind, *blur, columns, near=near)
             refinement = self._at_stamp(frame, found, places, view, seen, twist, track)
             change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)
             if refinement.twist is None or change.max(initial=0.0) < BLUR_THAT_MATTERS_PX:
@@ -169,10 +143,10 @@ class Refiner:
         deblur = worth_deblurring((mean * mean).sum(axis=1), cell, self._behind.shape[2], cnr)
         removed = (1.0 - REMAINING) * old * deblur[:, None, None]
         shift = lag_blur - removed + expected_displacement(places, twist, frame)
-        spread, past = mean * np.where(deblur, SPREAD, 1.0)[:, None], None
+        spread, image = mean * np.where(deblur, SPREAD, 1.0)[:, None], frame.samples
         if deblur.any():
-            past = LagTail(lag_tail_maps(places.at.px + shift, old), np.where(deblur, GAIN, 1.0))
-        return DeblurredView(frame, shift, removed, spread, deblur, old, past)
+            image = markers_deblurred(frame.image, (places.at.px + shift)[deblur], old[deblur])
+        return DeblurredView(image, shift, removed, spread)
 
     def _at_stamp(
         self,

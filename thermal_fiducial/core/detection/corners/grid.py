@@ -12,10 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.core.detection.corners.segments import (
-    counts_across,
     HOPELESS,
     KEPT_VARIANCE,
-    LagTail,
     measure,
     REACHED,
 )
@@ -87,8 +85,6 @@ class Layer:
     #: standard deviation of optics and pixels [px], and what motion adds to it (2,), along itself
     blur: float
     lag_blur: FloatArray
-    #: what to take out of the image; None: nothing
-    lag_tail: LagTail | None = None
 
     def project(self, points: FloatArray) -> FloatArray:
         """Pixels (..., 2) in which points (..., 3) in the camera appear, NaN where the lens shows none."""
@@ -131,9 +127,8 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     half = half_width(widest)
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, columns, half)
     blur = blurs(sides.normal[0], layer.blur, layer.lag_blur[None])
-    counts = counts_across(layer.image, sides, layer.lag_tail)
     modelled = _model(sides, pattern.step, blur)
-    measured = measure(counts, modelled, REACHED * blur[0], len(nodes))
+    measured = measure(layer.image, sides, modelled, REACHED * blur[0], len(nodes))
     used = measured.variance[0] < HOPELESS
     if used.sum() < 6:
         return None

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corners.segments import adjust, counts_across, HOPELESS, LagTail, measure, REACHED
+from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED
 from thermal_fiducial.core.detection.corners.sides import blurs, half_width, model, sides_of
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
@@ -69,7 +69,6 @@ def refine_corners(
     columns: int = 6,
     *,
     near: BoolArray | None = None,
-    lag_tail: LagTail | None = None,
 ) -> RefinedCorners:
     """Corners of N markers, refined.
 
@@ -82,10 +81,9 @@ def refine_corners(
     lag_blur_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
     columns : of pixels, in a segment
     near : (N,) which corners are good to a pixel already, so that nothing wide need catch them
-    lag_tail : what to take out of the image; nothing when left out
     """
     lag_blur = np.zeros((len(corners.px), 2)) if lag_blur_px is None else lag_blur_px
-    task = _Task(image, camera, corners, behind, lag_blur, columns, lag_tail)
+    task = _Task(image, camera, corners, behind, lag_blur, columns)
     start = corners
     far = np.arange(len(corners.px)) if near is None else np.flatnonzero(~near)
     if len(far):
@@ -115,15 +113,13 @@ class _Task:
     behind: Float32Array
     lag_blur: FloatArray
     columns: int
-    lag_tail: LagTail | None
 
     def only(self, which: IntArray) -> '_Task':
         """For the markers ``which``."""
         if len(which) == len(self.behind):
             return self
-        lag_tail = None if self.lag_tail is None else self.lag_tail.only(which)
         corners, behind, lag_blur = self.corners.only(which), self.behind[which], self.lag_blur[which]
-        return _Task(self.image, self.camera, corners, behind, lag_blur, self.columns, lag_tail)
+        return _Task(self.image, self.camera, corners, behind, lag_blur, self.columns)
 
     def seen_from(self, corners_px: FloatArray) -> ImagePoints:
         """The corners where they are by now (N, 4, 2)."""
@@ -138,8 +134,7 @@ def _pass(task: _Task, start: ImagePoints, optics: float, prior: FloatArray) -> 
     half = half_width(widest)
     sides = sides_of(start.x, task.camera, task.image.shape, cells, task.columns, half)
     blur = blurs(sides.normal[cells // 2], optics, task.lag_blur)
-    counts = counts_across(task.image, sides, task.lag_tail)
-    segments = measure(counts, model(sides, task.behind, blur), REACHED * blur[0])
+    segments = measure(task.image, sides, model(sides, task.behind, blur), REACHED * blur[0])
     shift, covariances, doubt = adjust(sides, segments, prior, start)
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]

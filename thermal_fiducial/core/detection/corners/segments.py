@@ -7,13 +7,12 @@ hidden stretches cost the segments that they touch.
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from thermal_fiducial.core.detection.corners.sides import ENDS, Sides, STARTS
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.geometry.camera import ImagePoints
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray
 
 #: A linearised displacement is good for this many blurs.
 REACHED = 2.0
@@ -36,23 +35,6 @@ _SIDES = np.arange(4)
 # Products of the columns of a segment's least squares, and of columns and products together.
 _PRODUCTS = (1, 1), (1, 2), (2, 2), (1, 3), (2, 3), (3, 3)
 _PLANES = 4 + len(_PRODUCTS)
-
-
-class LagTail(NamedTuple):
-    """What the image still shows of the past, to be taken out round N markers.
-
-    Parameters
-    ----------
-    maps : (N, 2, 3) of the pixels (u, v, 1) to those that show what they remember
-    gain : (N,) weight of the present, so that 1 takes nothing out
-    """
-
-    maps: FloatArray
-    gain: FloatArray
-
-    def only(self, keep: IntArray) -> 'LagTail':
-        """That round the markers ``keep``."""
-        return LagTail(self.maps[keep], self.gain[keep])
 
 
 class Segments(NamedTuple):
@@ -82,35 +64,23 @@ class _SegmentFit(NamedTuple):
     number: FloatArray
 
 
-def counts_across(image: Counts | Float32Array, sides: Sides, lag_tail: LagTail | None = None) -> Float32Array:
-    """Counts (M, C, m, E) of the pixels across sides, without their lag tails."""
-    counts = image.ravel().take(sides.pixel, mode='clip').astype(np.float32, copy=False)
-    if lag_tail is None or not (lag_tail.gain > 1.0).any():
-        return counts
-    of_each = sides.pixel.shape[-1] // len(lag_tail.gain)
-    pixel, which = sides.pixel.reshape(-1, len(lag_tail.gain), of_each), np.flatnonzero(lag_tail.gain > 1.0)
-    v, u = (a.astype(np.float32) for a in np.divmod(pixel[:, which].astype(np.int32), np.int32(image.shape[1])))
-    maps = lag_tail.maps[which].astype(np.float32)[..., None]
-    to_u, to_v = (maps[:, row, 0] * u + maps[:, row, 1] * v + maps[:, row, 2] for row in (0, 1))
-    flat = (len(pixel), -1)
-    past = cv2.remap(image, to_u.reshape(flat), to_v.reshape(flat), cv2.INTER_LANCZOS4, borderMode=cv2.BORDER_REPLICATE)
-    gain, of_marker = lag_tail.gain[which, None].astype(np.float32), counts.reshape(pixel.shape)
-    of_marker[:, which] = gain * of_marker[:, which] + (np.float32(1.0) - gain) * past.reshape(u.shape)
-    return counts
-
-
 def measure(
-    counts: Float32Array, modelled: tuple[Float32Array, Float32Array, Float32Array], reach: FloatArray, sides: int = 4
+    image: Counts | Float32Array,
+    sides: Sides,
+    modelled: tuple[Float32Array, Float32Array, Float32Array],
+    reach: FloatArray,
+    of_each: int = 4,
 ) -> Segments:
     """Displacement of each segment, S = 4 m to a marker: one of m on each side, the sides of the first parts first.
 
     Parameters
     ----------
-    counts : (M, C, m, E) of :func:`counts_across`
-    modelled : value, derivative and weight of each pixel, of ``edges.model``
+    image : (height, width) counts
+    modelled : value, derivative and weight of each pixel (M, C, m, E), of ``sides.model``
     reach : (E,) longest displacement for which the model can be linearised [px]
-    sides : of a marker, if it has not 4
+    of_each : number of sides of a marker
     """
+    counts = image.ravel().take(sides.pixel, mode='clip').astype(np.float32, copy=False)
     cells = counts.shape[2]
     value, slope, weight = modelled
     X = np.empty((_PLANES, *counts.shape), dtype=np.float32)
@@ -121,18 +91,18 @@ def measure(
     X[3] *= weight
     X = X.reshape(_PLANES, -1, cells * len(reach))
     moments = _moments(X)
-    fit = _fit(_by_marker(moments, cells, sides))
+    fit = _fit(_by_marker(moments, cells, of_each))
     noise = _noise(fit)
-    inliers = np.abs(_residuals(fit, X, cells, sides)) <= _by_segment(_PIXEL_OUTLIER * np.sqrt(noise), cells, sides)
+    inliers = np.abs(_residuals(fit, X, cells, of_each)) <= _by_segment(_PIXEL_OUTLIER * np.sqrt(noise), cells, of_each)
     touched = np.flatnonzero(~inliers.all(axis=0))
     if len(touched):
         part = X[..., touched]
         part[:4] *= inliers[:, touched]
         moments[:, touched] = _moments(part)
-        fit = _fit(_by_marker(moments, cells, sides))
+        fit = _fit(_by_marker(moments, cells, of_each))
         noise = _noise(fit)
-    farthest = np.empty((len(reach) // sides, cells, sides))
-    farthest[:] = reach.reshape(-1, 1, sides)
+    farthest = np.empty((len(reach) // of_each, cells, of_each))
+    farthest[:] = reach.reshape(-1, 1, of_each)
     return _judged(fit, noise, farthest.reshape(noise.shape))
 
 
