@@ -11,12 +11,13 @@ from support.scenes import motion_prior
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
-from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform, transform_from_quaternion
-from thermal_fiducial.core.mapping.bundle_adjustment import refine, Snapshot
+from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, transform, transform_from_quaternion
+from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe
 from thermal_fiducial.core.mapping.map_building import decide, rows_from_corners
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.core.measurements import Odometry
 
 #: Noise of the recorded corners [px]: the re-projection errors of the reference are about that.
@@ -156,7 +157,7 @@ def solve(recording, passes=1):
         refinement_period=1.0,
     )
     mapper = MarkerMapper(config, MarkerMap(start))
-    camera, poses = recording.rig.cameras[0], {}
+    camera = recording.rig.cameras[0]
     T_camera_rig = inverse(recording.rig.T_rig_camera[0])
     for _ in range(passes):
         stand_in = _Filter(recording)
@@ -169,9 +170,8 @@ def solve(recording, passes=1):
                 mapper.refine()
         mapper.refine()
     snapshot = mapper.snapshot()
-    poses = {frame.stamp_ns: frame.T_map_rig @ T_camera_rig for frame in snapshot.keyframes}
-    frames = [_keyframe(stamp, poses[stamp], recording.views[stamp]) for stamp in poses]
-    whole = Snapshot(snapshot.markers, tuple(frames), recording.rig, snapshot.links)
+    frames = [_keyframe(frame, T_camera_rig, recording.views[frame.stamp_ns]) for frame in snapshot.keyframes]
+    whole = Snapshot(snapshot.markers, tuple(frames), recording.rig)
     # Markers seen too briefly by one camera alone: all frames of all cameras decide between their two poses.
     for candidate in mapper.candidates.values():
         settled = decide(whole, candidate.id, candidate.size, candidate.solutions(camera)[:2])
@@ -189,14 +189,20 @@ def _frame(recording, seen):
     return rows_from_corners(ids, corners, covariances, sizes, recording.rig.cameras[0])
 
 
-def _keyframe(stamp, T_map_rig, seen):
+def _keyframe(frame, T_camera_rig, seen):
+    """A keyframe of the first camera as one of the whole rig."""
+    T_odometry = frame.T_odometry @ T_camera_rig
+    of_camera = np.eye(6)
+    of_camera[:3, 3:] = -skew(frame.T_odometry[:3, 3] - T_odometry[:3, 3])
     return Keyframe(
-        stamp,
-        T_map_rig,
+        frame.stamp_ns,
+        frame.T_map_rig @ T_camera_rig,
         np.array([key for key, _, _ in seen]),
         np.array([corners for _, _, corners in seen]),
         np.broadcast_to(SIGMA_PX**2 * np.eye(2), (len(seen), 4, 2, 2)),
         np.array([camera for _, camera, _ in seen]),
+        T_odometry,
+        of_camera.T @ frame.information @ of_camera,
     )
 
 

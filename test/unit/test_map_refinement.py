@@ -1,4 +1,4 @@
-"""Joint adjustment: exactness, the Schur complement, robustness, gauge, links, priors."""
+"""Joint adjustment: exactness, the Schur complement, robustness, gauge, odometry, priors."""
 
 from dataclasses import replace
 import pickle
@@ -9,11 +9,12 @@ import pytest
 from test.support.walls import CAMERA, flight, see, SIZE, wall
 from thermal_fiducial.core.error_model import NO_SYSTEMATIC_ERRORS
 from thermal_fiducial.core.geometry.reprojection import difference, retract
-from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping import bundle_adjustment
-from thermal_fiducial.core.mapping.bundle_adjustment import prior_poses, refine, Snapshot
-from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe, Link
+from thermal_fiducial.core.mapping.bundle_adjustment import refine
+from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe
 from thermal_fiducial.core.mapping.map_data import MapMarker
+from thermal_fiducial.core.mapping.snapshot import prior_poses, Snapshot
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
 
 
@@ -59,11 +60,13 @@ def test_the_schur_complement_answers_like_the_whole_system():
     rng = np.random.default_rng(2)
     poses = wall(rng, 4)
     s = snapshot(rng, poses, count=6, disturbance=1e-3)
-    s = replace(s, links=(Link(2, 5, inverse(flight(20 / 6)) @ flight(80 / 6), np.diag([1e-4] * 3 + [1e-5] * 3)),))
+    information = np.diag([1e4] * 3 + [1e5] * 3)
+    bridge = replace(s.keyframes[2], T_odometry=flight(40 / 6), information=information)
+    s = replace(s, keyframes=(*s.keyframes[:2], bridge, *s.keyframes[3:]))
     s = replace(s, priors=prior_poses({1: s.markers[1]}))
     problem = bundle_adjustment._Problem.build(s)
     assert problem is not None
-    e = problem.evaluate(problem.start, 1.0)
+    e = problem.evaluate(problem.start)
     F, M = len(problem.stamps), len(problem.ids)
     H, g = np.zeros((6 * (F + M),) * 2), np.zeros(6 * (F + M))
 
@@ -74,47 +77,28 @@ def test_the_schur_complement_answers_like_the_whole_system():
                 H[6 * i : 6 * i + 6, 6 * j : 6 * j + 6] += J_i.T @ J_j
 
     for v in range(len(problem.frame)):
-        w = np.sqrt(e.weights[v])
+        w = np.sqrt(e.weights(1.0)[v])
         terms = [(problem.frame[v], w * e.J_rig[v]), (F + problem.marker[v], w * e.J_marker[v])]
         add(terms, w * e.r[v])
-    for a, b, r, J_a, J_b in problem._linked(problem.start):
-        add([(a, J_a), (b, J_b)], r)
-    for m, r, J in problem._prior_terms(problem.start):
-        add([(F + m, J)], r)
+    for T, known, node in (
+        (bridge.T_map_rig, (bridge.T_odometry, information), 2),
+        (s.markers[1].T_map_marker, (s.priors[1][0], np.linalg.inv(s.priors[1][1])), F + 1),
+    ):
+        root = np.linalg.cholesky(known[1]).T
+        add([(node, root)], root @ difference(known[0], T))
     free = np.repeat(np.concatenate([np.ones(F, dtype=bool), ~problem.held]), 6)
     expected = np.zeros(6 * (F + M))
     expected[free] = np.linalg.solve(H[np.ix_(free, free)], g[free])
-    blocks = problem._blocks(problem.start, e)
-    frames, markers = problem.equations.solve(blocks, 0.0)
+    blocks, *sides = problem._normal(e, 1.0)
+    system = problem.equations.reduced(blocks)
+    frames, markers = system.solve(*sides)
     # Two ways of solving one system of condition 1e8.
     np.testing.assert_allclose(np.concatenate([frames.ravel(), markers.ravel()]), expected, rtol=1e-5, atol=1e-9)
     inverse_H = np.linalg.inv(H[np.ix_(free, free)])
-    covariances = problem.equations.covariances(problem.equations.reduced(blocks), 1.0, np.zeros((M, 6, 6)))
+    covariances = system.covariances(1.0, np.zeros((M, 6, 6)))
     for k, m in enumerate(np.flatnonzero(~problem.held)):
         own = slice(6 * (F + k), 6 * (F + k) + 6)
         np.testing.assert_allclose(covariances[m], inverse_H[own, own], rtol=1e-4, atol=1e-15)
-
-
-def test_derivatives_of_a_link_are_those_of_its_residual():
-    rng = np.random.default_rng(3)
-    poses = wall(rng, 3)
-    s = snapshot(rng, poses, count=4, disturbance=0.0)
-    T = [frame.T_map_rig for frame in s.keyframes]
-    s = replace(s, links=(Link(1, 3, inverse(T[0]) @ T[2], np.eye(6)),))
-    problem = bundle_adjustment._Problem.build(s)
-    assert problem is not None
-    h = 1e-6
-    ((a, b, _, J_a, J_b),) = problem._linked(problem.start)
-    for index, J in ((a, J_a), (b, J_b)):
-        for axis in range(6):
-            d = np.zeros((len(T), 6))
-            d[index, axis] = h
-            e = [
-                problem._linked(replace(problem.start, T_map_rig=retract(problem.start.T_map_rig, sign * d)))[0][2]
-                for sign in (1.0, -1.0)
-            ]
-            # The residual is measured minus predicted; central differences of step 1e-6.
-            np.testing.assert_allclose(-(e[0] - e[1]) / (2 * h), J[:, axis], atol=1e-8)
 
 
 def test_outliers_do_not_move_the_map_and_are_told():
@@ -167,7 +151,7 @@ def test_the_covariance_of_a_fixed_marker_enters_that_of_the_others():
         np.testing.assert_allclose(marker.T_map_marker, sharp.markers[key].T_map_marker, atol=1e-9)
 
 
-def test_a_link_carries_the_map_over_a_gap():
+def test_odometry_carries_the_map_over_a_gap():
     """Two groups of markers that no frame shows together: only odometry joins them."""
     rng = np.random.default_rng(7)
     poses = wall(rng)
@@ -178,10 +162,10 @@ def test_a_link_carries_the_map_over_a_gap():
         frames.append(replace(frame, ids=frame.ids[group], corners=frame.corners[group],
                               covariances=frame.covariances[group], cameras=frame.cameras[group]))  # fmt: skip
     drift = np.array([0.01, -0.02, 0.005, 0.002, -0.001, 0.003])
-    T_a, T_b = (flight(20.0 * (k - 1) / 20) for k in (10, 11))
     covariance = np.diag([4e-4] * 3 + [1e-5] * 3)
-    link = Link(10, 11, retract(inverse(T_a) @ T_b, drift), covariance)
-    refinement = refine(replace(s, keyframes=tuple(frames), links=(link,)))
+    T = retract(flight(20.0 * (11 - 1) / 20), drift)
+    frames[10] = replace(frames[10], T_odometry=T, information=np.linalg.inv(covariance))
+    refinement = refine(replace(s, keyframes=tuple(frames)))
     assert refinement is not None
     near = [difference(refinement.markers[i].T_map_marker, poses[i]) for i in (1, 2, 3)]
     # Ten frames of 0.02 px; the gap is no concern of theirs.
@@ -194,7 +178,7 @@ def test_a_link_carries_the_map_over_a_gap():
         assert np.trace(refinement.markers[i].covariance[:3, :3]) > np.trace(covariance[:3, :3])
 
 
-def test_without_a_link_the_other_side_of_a_gap_is_left_alone():
+def test_without_odometry_the_other_side_of_a_gap_is_left_alone():
     rng = np.random.default_rng(8)
     poses = wall(rng, 2)
     s = snapshot(rng, poses, count=5)
@@ -321,18 +305,6 @@ def test_errors_that_last_are_in_the_covariances():
     # Six, or 32 / 25 times that (the mean of an inverted Wishart matrix of 32 samples). A map's markers share most
     # of their error: the mean of twenty has a standard deviation of 0.9.
     assert 6.0 - 2.7 < np.mean(nees) < 6.0 * 32 / 25 + 2.7
-
-
-def test_responses_are_what_the_steps_are():
-    rng = np.random.default_rng(13)
-    start = snapshot(rng, wall(rng), count=8)
-    problem = bundle_adjustment._Problem.build(start)
-    blocks = problem._blocks(problem.start, problem.evaluate(problem.start, 1.0))
-    _, markers = problem.equations.solve(blocks, 0.0)
-    once = blocks.rig_gradient[..., None], blocks.marker_gradient[..., None]
-    sides = (np.concatenate([side, 2.0 * side], axis=-1) for side in once)
-    responses = problem.equations.responses(problem.equations.reduced(blocks), *sides)
-    np.testing.assert_allclose(responses, np.stack([markers, 2.0 * markers], axis=-1), atol=1e-10)
 
 
 def test_a_marker_that_starts_behind_the_camera_spoils_nothing():

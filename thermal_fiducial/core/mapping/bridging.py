@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, transform
-from thermal_fiducial.core.mapping.keyframes import Keyframe, Link
+from thermal_fiducial.core.geometry.se3 import skew, so3_exp, transform
 from thermal_fiducial.core.measurements import CameraPose, Odometry
 from thermal_fiducial.core.types import FloatArray
 
@@ -21,9 +20,3 @@ def camera_pose(odometry: Odometry, stamp_ns: int, T_body_camera: FloatArray) ->
     A = np.eye(6)
     A[:3, 3:] = -skew(T_map_body[:3, :3] @ T_body_camera[:3, 3])
     return CameraPose(stamp_ns, T_map_body @ T_body_camera, A @ odometry.pose_covariance @ A.T)
-
-
-def link(a: Keyframe, b: Keyframe, covariance: FloatArray) -> Link:
-    """Odometry from ``a``, whose pose is known, to ``b``, whose pose in the map has ``covariance``."""
-    rotation = np.kron(np.eye(2), a.T_map_rig[:3, :3].T)
-    return Link(a.stamp_ns, b.stamp_ns, inverse(a.T_map_rig) @ b.T_map_rig, rotation @ covariance @ rotation.T)

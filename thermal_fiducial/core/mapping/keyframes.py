@@ -49,21 +49,14 @@ class Keyframe:
     T_odometry: FloatArray = field(default_factory=lambda: np.eye(4))
     information: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
+    @property
+    def has_odometry(self) -> bool:
+        """Whether odometry knows anything of it."""
+        return bool(np.any(self.information))
+
     def moved(self, T_new_old: FloatArray) -> 'Keyframe':
         """The keyframe in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
         return replace(self, T_map_rig=T_new_old @ self.T_map_rig, T_odometry=T_new_old @ self.T_odometry)
-
-
-@dataclass(frozen=True)
-class Link:
-    """Odometry between two keyframes that no marker connects."""
-
-    stamp_a_ns: int
-    stamp_b_ns: int
-    #: (4, 4)
-    T_a_b: FloatArray
-    #: (6, 6) of T_a_b, ROS convention, in frame a
-    covariance: FloatArray
 
 
 def packed(frames: Sequence[Keyframe]) -> tuple[FloatArray | IntArray, ...]:
@@ -124,7 +117,8 @@ class KeyframeStore:
 
     budget: int
     frames: dict[int, Keyframe] = field(default_factory=dict)
-    links: list[Link] = field(default_factory=list)
+    #: stamps of those that odometry alone joins to the rest: they are never dropped
+    bridges: set[int] = field(default_factory=set)
     #: frames that were ever added
     added: int = 0
 
@@ -166,13 +160,12 @@ class KeyframeStore:
         self.frames = {stamp: frame for stamp, frame in self.frames.items() if stamp in kept}
 
     def _spread(self, room: int) -> set[int]:
-        """Stamps of about ``room`` keyframes from all places and directions, and of all that odometry links."""
-        linked = {stamp for link in self.links for stamp in (link.stamp_a_ns, link.stamp_b_ns)}
+        """Stamps of about ``room`` keyframes from all places and directions, and of all bridges."""
         coarseness = 1.0
         while len(cells := self._cells(coarseness)) > room:
             coarseness *= 2.0
         share = _fair_share([len(stamps) for stamps in cells.values()], room)
-        kept = linked & self.frames.keys()
+        kept = self.bridges & self.frames.keys()
         for stamps in cells.values():
             chosen = np.linspace(0, len(stamps) - 1, min(share, len(stamps))).round().astype(int)
             kept.update(stamps[i] for i in chosen)

@@ -18,8 +18,7 @@ from thermal_fiducial.core.error_model import alike_odometry, INCONSISTENT_PX, p
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise, reproject
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
-from thermal_fiducial.core.mapping.bridging import link
-from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, prior_poses, refine, Snapshot
+from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, MarkerView, Viewpoint
 from thermal_fiducial.core.mapping.correction import correction
 from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe, KeyframeStore
@@ -38,6 +37,7 @@ from thermal_fiducial.core.mapping.odometry_prior import (
     PredictedCamera,
     together,
 )
+from thermal_fiducial.core.mapping.snapshot import prior_poses, Snapshot
 from thermal_fiducial.core.mapping.trust import DISAGREEMENT, inconsistent, MEMORY, Trust
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers
 from thermal_fiducial.core.motion_prior import MotionPrior
@@ -62,7 +62,7 @@ _PATIENCE = 6
 _GROWTH, _FEW = 0.2, 15
 #: Views of markers that a refinement in flight takes: a second or two of a slow core.
 VIEWS = 10_000
-# Time between two refinements for each view of the last [s]: a view takes half of it on a slow core. With three
+# Time between two refinements for each view of the last [s]: a view takes a third of it on a slow core. With three
 # times as much, poses from markers just placed along a chain were too vague to publish: 19 of 633 over a carpet.
 _PERIOD_A_VIEW = 3e-4
 
@@ -314,18 +314,18 @@ class MarkerMapper:
             return False, {}
         if not 0 <= frame.stamp_ns - last.stamp_ns <= self.config.bridge_duration * 1e9:
             return False, {}
-        return self._bridge(frame, last, predicted)
+        return self._bridge(frame, predicted)
 
-    def _bridge(self, frame: LocatedFrame, last: Keyframe, predicted: PredictedCamera) -> tuple[bool, dict[int, str]]:
-        """Place new markers from the odometry since ``last`` while no known one is in view."""
+    def _bridge(self, frame: LocatedFrame, predicted: PredictedCamera) -> tuple[bool, dict[int, str]]:
+        """Place new markers from the odometry while no known one is in view."""
         pose, rows = predicted.pose, frame.new
         keyframe = _keyframe(rows, pose, self._camera_index(frame.camera), predicted)
         if not any(int(key) in self._candidates for key in rows['id']):
-            # Nothing but the odometry joins these markers to the map. Once is enough: its error is the same for all
-            # that follow, which hang together through the markers themselves.
-            self._keyframes.add(last)
-            self._keyframes.links.append(link(last, keyframe, pose.covariance))
-            self._keyframes.add(keyframe)
+            # Nothing but the odometry joins these markers to the map. Once in full is enough: its error is the same
+            # for all that follow, which hang together through the markers themselves.
+            information = np.asarray(np.linalg.inv(pose.covariance), dtype=np.float64)
+            self._keyframes.bridges.add(frame.stamp_ns)
+            self._keyframes.add(replace(keyframe, information=information))
         elif len(rows) >= 2:
             self._keyframes.add(keyframe)
         if self._gap is None:
@@ -364,7 +364,6 @@ class MarkerMapper:
             {key: marker for key, marker in self.map.markers.items() if marker.trusted},
             frames,
             CameraRig(tuple(self._cameras), np.broadcast_to(np.eye(4), (len(self._cameras), 4, 4))),
-            tuple(self._keyframes.links),
             prior_poses(self._initial.markers),
             self.map.revision,
             self._errors,
