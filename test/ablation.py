@@ -190,11 +190,6 @@ def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
     return _place('corners.squares:Squared')(seen, covariance, none, none, none)
 
 
-def _near(corners: Any, *others: Any, **options: Any) -> Any:
-    refine_corners = _place('corners.refinement:refine_corners')
-    return refine_corners(corners, *others, **(options | {'near': np.ones(len(options['near']), dtype=bool)}))
-
-
 def _none_of(first: Any, *_: Any, **__: Any) -> Any:
     return np.zeros(len(first), dtype=bool)
 
@@ -216,7 +211,6 @@ MECHANISMS = {
         'slow, 0.5 K, blind', ('corners.squares',), {'corners.segments:as_squares': _as_seen}
     ),
     'other tilt of a square': Mechanism('slow, 0.1 K, blind', (), {'corners.squares:_OTHER_TILT': np.inf}),
-    'wide first pass': Mechanism('slow, 0.5 K, blind', (), {'refining:refine_corners': _near}),
     'passes until settled': Mechanism('fast, 8 K, blind', (), {'corners.refinement:_PASSES': 1}),
     'second round': Mechanism('fast, 8 K, blind', (), {'refining:_ROUNDS': 1}),
     'edges behind the sides': Mechanism(

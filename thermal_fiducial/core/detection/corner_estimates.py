@@ -159,8 +159,8 @@ class CornerEstimator:
         found, followed = findings.found, findings.followed
         if len(found.ids) == 0:
             return _none(frame.twist)
-        near, places = _places(frame, found, followed, in_map, sizes)
-        refined = self._refiner.refine(frame, found, places, near | frame.displayed, track, config)
+        places = _places(frame, found, followed, in_map, sizes)
+        refined = self._refiner.refine(frame, found, places, track, config)
         keep = self._confirmed(frame, found, refined, followed, config)
         if frame.displayed and not keep.all():
             refined, small = with_corners_by_pattern(frame, found, refined, ~keep, self._decoder, config)
@@ -197,13 +197,12 @@ class CornerEstimator:
 
 def _places(
     frame: Frame, found: Found, followed: Followed, in_map: ExpectedMarkers | None, sizes: FloatArray
-) -> tuple[BoolArray, Places]:
-    """Which markers (N,) are where they were followed to, and where all are."""
-    near = among(found.ids, followed.ids)
-    if len(followed.ids) == len(found.ids) and near.all():
-        return near, followed.places
+) -> Places:
+    """Where the markers are: those that were followed, where they were followed to."""
+    if np.array_equal(found.ids, followed.ids):
+        return followed.places
     known = [] if in_map is None else [(in_map.ids, in_map.depth)]
-    return near, places_of(frame, found, sizes, *known, (followed.ids, followed.places.depth))
+    return places_of(frame, found, sizes, *known, (followed.ids, followed.places.depth))
 
 
 def _none(twist: Twist | None) -> MarkerEstimates:

@@ -102,7 +102,6 @@ class Refiner:
         frame: Frame,
         found: Found,
         places: Places,
-        near: BoolArray,
         track: MotionTrack,
         config: ArucoDetectorConfig,
     ) -> RefinedMarkers:
@@ -112,7 +111,6 @@ class Refiner:
         ----------
         found : the markers
         places : where they roughly are at the stamp
-        near : (N,) which of them to a pixel
         track : the frames before, which with the corners give the twist
         """
         cell = sides_px(found.corners_px) / self._behind.shape[2]
@@ -123,12 +121,12 @@ class Refiner:
             start = places.at.moved(view.shift, frame.camera)
             behind = self._behind[found.ids]
             blur = config.blur_px, view.spread
-            seen = refine_corners(view.image, start, frame.camera, behind, *blur, columns, near=near)
+            seen = refine_corners(view.image, start, frame.camera, behind, *blur, columns)
             refinement = self._at_stamp(frame, found, places, view, seen, twist, track)
             change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)
             if refinement.twist is None or change.max(initial=0.0) < BLUR_THAT_MATTERS_PX:
                 break
-            twist, places, near = refinement.twist, refinement.places, np.ones(len(near), dtype=bool)
+            twist, places = refinement.twist, refinement.places
         return refinement
 
     def _view(

@@ -19,8 +19,6 @@ _FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor
 # Among markers that are seen clearly noise is left alone, and with it what it would show of the faintest.
 _FINE_OF_CLEAR = _FINE._replace(floor=4.0)
 _FAINT_OF_CLEAR = _FAINT._replace(floor=4.0)
-# Weight of white surroundings against correlation in choosing among the outlines of a marker.
-_SURROUNDED = 0.2
 # Correlation beyond which an outline needs no alignment, and from which, by such a margin, it is worth one.
 _CLEAR = 0.95
 _HINT, _HINT_MARGIN = 0.5, 0.06
@@ -241,7 +239,7 @@ def _whole(quads: FloatArray, image: Float32Array, border: float) -> BoolArray:
 
 def _once(reading: Reading, quads: FloatArray, good: BoolArray, drop_duplicates: bool) -> IntArray:
     """Place of the best reading of every ID; of an ID at two places neither, when such are to be dropped."""
-    similarity = np.where(good, np.abs(reading.correlation) + _SURROUNDED * np.clip(reading.surround, 0.0, 1.0), 0.0)
+    similarity = np.abs(reading.correlation)
     across = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)
     centre = quads.mean(axis=1)
     best = []
@@ -251,15 +249,4 @@ def _once(reading: Reading, quads: FloatArray, good: BoolArray, drop_duplicates:
         apart = np.linalg.norm(centre[same] - centre[clearest], axis=-1) > 0.5 * across[clearest]
         if not (drop_duplicates and apart.any()):
             best.append(clearest)
-    return _alone(np.array(best, dtype=np.int64), similarity, centre, across)
-
-
-def _alone(places: IntArray, similarity: FloatArray, centre: FloatArray, across: FloatArray) -> IntArray:
-    """Of markers that lie in one another the clearest: a plate round a marker may look like another, inside out."""
-    order = places[np.argsort(-similarity[places], kind='stable')]
-    kept: list[int] = []
-    for place in order.tolist():
-        distance = np.linalg.norm(centre[kept] - centre[place], axis=-1)
-        if np.all(distance > _TOGETHER * np.maximum(across[kept], across[place])):
-            kept.append(place)
-    return np.array(kept, dtype=np.int64)
+    return np.array(best, dtype=np.int64)

@@ -14,14 +14,12 @@ from thermal_fiducial.core.detection.corners.sides import blurs, half_width, mod
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
 
-# A first pass with so much more blur catches corners from farther away. Those that follow measure, until the last step
-# was short enough; for outlines that are no squares a shorter one, as these may become ones.
-_WIDE, _PASSES = 1.4, 4
+# Passes follow one another until the last step was short enough; for outlines that are no squares a shorter one, as
+# these may become ones.
+_PASSES = 4
 _SETTLED_PX, _STILL_PX = 0.3, 0.1
-# Standard deviation of what is known of the corners beforehand, and of their places among themselves [px].
-_PRIOR_PX, _PRIOR_SHAPE_PX = 3.0, 0.7
-_PRIOR = np.eye(8) / _PRIOR_PX**2
-_PRIOR_OF_SHAPE = np.linalg.inv(_PRIOR_SHAPE_PX**2 * np.eye(8) + _PRIOR_PX**2 * np.kron(np.ones((4, 4)), np.eye(2)))
+# Standard deviation of what is known of the corners beforehand [px].
+_PRIOR_PX = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +65,6 @@ def refine_corners(
     blur_px: float,
     lag_blur_px: FloatArray | None = None,
     columns: int = 6,
-    *,
-    near: BoolArray | None = None,
 ) -> RefinedCorners:
     """Corners of N markers, refined.
 
@@ -80,23 +76,16 @@ def refine_corners(
     blur_px : standard deviation of optics and pixel
     lag_blur_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
     columns : of pixels, in a segment
-    near : (N,) which corners are good to a pixel already, so that nothing wide need catch them
     """
     lag_blur = np.zeros((len(corners.px), 2)) if lag_blur_px is None else lag_blur_px
     task = _Task(image, camera, corners, behind, lag_blur, columns)
-    start = corners
-    far = np.arange(len(corners.px)) if near is None else np.flatnonzero(~near)
-    if len(far):
-        caught = corners.px.copy()
-        caught[far] = _pass(task.only(far), corners.only(far), _WIDE * blur_px, _PRIOR_OF_SHAPE)[0].corners_px
-        start = task.seen_from(caught)
-    found, step = _pass(task, start, blur_px, _PRIOR)
+    found, step = _pass(task, corners, blur_px)
     for _ in range(_PASSES - 1):
         away = np.flatnonzero(step > np.where(found.doubt > 0.0, _STILL_PX, _SETTLED_PX))
         if len(away) == 0:
             break
         part = task.only(away)
-        again, further = _pass(part, part.seen_from(found.corners_px[away]), blur_px, _PRIOR)
+        again, further = _pass(part, part.seen_from(found.corners_px[away]), blur_px)
         found = found.with_others(away, again)
         step = np.zeros(len(step))
         step[away] = further
@@ -127,7 +116,7 @@ class _Task:
         return self.corners.moved(moved, self.camera) if moved.any() else self.corners
 
 
-def _pass(task: _Task, start: ImagePoints, optics: float, prior: FloatArray) -> tuple[RefinedCorners, FloatArray]:
+def _pass(task: _Task, start: ImagePoints, optics: float) -> tuple[RefinedCorners, FloatArray]:
     """Where one linearised adjustment moves the corners, and the longest step (N,) of each marker."""
     cells = task.behind.shape[2]
     widest = math.hypot(optics, math.sqrt(float((task.lag_blur * task.lag_blur).sum(axis=1).max())))
@@ -135,7 +124,7 @@ def _pass(task: _Task, start: ImagePoints, optics: float, prior: FloatArray) -> 
     sides = sides_of(start.x, task.camera, task.image.shape, cells, task.columns, half)
     blur = blurs(sides.normal[cells // 2], optics, task.lag_blur)
     segments = measure(task.image, sides, model(sides, task.behind, blur), REACHED * blur[0])
-    shift, covariances, doubt = adjust(sides, segments, prior, start)
+    shift, covariances, doubt = adjust(sides, segments, _PRIOR_PX, start)
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]
     contrast, noise = (segments.contrast * share).sum(axis=1), np.sqrt((segments.noise * share).sum(axis=1))

@@ -182,7 +182,7 @@ def _median(values: FloatArray, good: BoolArray) -> FloatArray:
 
 
 def adjust(
-    sides: Sides, segments: Segments, prior: FloatArray, at: ImagePoints
+    sides: Sides, segments: Segments, prior_px: float, at: ImagePoints
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """How corners move (N, 4, 2) to explain the shifts of all segments, and their covariances (N, 4, 2, 2).
 
@@ -190,14 +190,14 @@ def adjust(
 
     Parameters
     ----------
-    prior : (8, 8) information on the eight numbers beforehand
+    prior_px : standard deviation of what is known of the corners beforehand [px]
     at : (N, 4) corners so far
     """
     used = segments.variance < HOPELESS
     sharpness = 1.0 / np.sqrt(segments.variance)
     A, shift = _design(sides) * sharpness[..., None], segments.shift * sharpness
     weighted = turned = A.swapaxes(1, 2)
-    robust = np.ones_like(shift)
+    robust, prior = np.ones_like(shift), np.eye(8) / prior_px**2
     for _ in range(_ROUNDS):
         covariance = np.linalg.inv(weighted @ A + prior)
         moved = covariance @ (weighted @ shift[..., None])
