@@ -1,5 +1,6 @@
 """How noisy the IMU is now: by its data sheet, under vibration, in motion, over gaps and at the end of its range."""
 
+from collections import deque
 import math
 
 import numpy as np
@@ -7,15 +8,19 @@ import numpy as np
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.types import FloatArray
 
-#: Motion is what differs from the mean over so long; how violent it is, the mean of its square over so long [s].
-_SLOW, _VIOLENCE_TIME = 0.2, 2.0
-#: An IMU at rest may begin to move in a gap: least standard deviations of that [rad/s, m/s^2].
-_LEAST_MOTION = np.array((0.03, 0.15))
+#: Motion of the force is what differs from the mean over so long [s].
+_SLOW = 0.2
+#: Lags [s] at which differences are averaged, over so long [s].
+_SHORTEST_LAG, _MEMORY = 0.02, 2.0
+_OCTAVES = np.arange(6)
+_LAGS = _SHORTEST_LAG * 2.0**_OCTAVES
+#: An IMU at rest may begin to move in a gap: mean squares of the differences that are possible at any time.
+_LEAST_MOTION = (2.0 * (_LAGS / 0.2) ** 3 / (1.0 + (_LAGS / 0.2) ** 2))[:, None] * np.array((0.03, 0.15)) ** 2
 #: Errors of nonlinearity, bandwidth and internal lever arms last as long as the motion does that makes them [s].
 _MOTION_TIME = 1.0
 #: A saturated sample may hide a hit [m/s^2], or a spin as fast again as the range [rad/s].
 _SATURATED = np.array((5.0, 150.0))
-#: Longer steps than this [s] interrupt the spectrum.
+#: Longer steps than this [s] interrupt the spectrum; what they hide is more than the spectrum shows.
 _INTERRUPTED = 0.03
 #: The floor of the spectrum is that of the quietest of so many bands between these frequencies [Hz]: above the motion,
 #: below what an IMU's own low-pass filter takes away. The tones of rotors leave at least one of them nearly alone.
@@ -34,8 +39,8 @@ class ImuNoiseMonitor:
     def __init__(self, noise: ImuNoise) -> None:
         self._noise = noise
         self._floor = NoiseFloor()
+        self._motion = StructureFunction()
         self._mean: FloatArray | None = None
-        self._variance = _LEAST_MOTION**2
         self._recent: list[FloatArray] = []
         self._sheet = np.array((noise.gyroscope_noise_density, noise.accelerometer_noise_density))
         self._nonlinearity = np.array((noise.gyroscope_nonlinearity, noise.accelerometer_nonlinearity))
@@ -50,34 +55,27 @@ class ImuNoiseMonitor:
     def densities(self, imu: FloatArray, seconds: float) -> FloatArray:
         """(6,) densities for the step of ``seconds`` that ends with sample ``imu`` (6,)."""
         self._follow_spectrum(imu, seconds)
-        motion = self._follow_motion(imu, seconds)
+        self._motion.add(imu, seconds)
+        motion = self._size_of_motion(imu, seconds)
         white = np.maximum(self._sheet, self._noise.vibration * np.asarray(self._floor.densities)) ** 2
         moving = (self._nonlinearity * motion) ** 2 * _MOTION_TIME
-        between = self._hidden_change(seconds) * seconds / 12.0
+        between = self._motion.hidden(seconds) if self._interrupted(seconds) else 0.0
         beyond = (np.abs(imu).reshape(2, 3).max(axis=1) >= self._ranges) * _SATURATED**2 * seconds
         lost = np.maximum(beyond, self._saturated)
         self._saturated = beyond
         return np.repeat(np.sqrt(white + moving + between + lost), 3)
 
-    def _follow_motion(self, imu: FloatArray, seconds: float) -> FloatArray:
+    def _interrupted(self, seconds: float) -> bool:
+        """Whether a step is of those of which the spectrum says nothing."""
+        return seconds > _INTERRUPTED or not any(self._floor.densities)
+
+    def _size_of_motion(self, imu: FloatArray, seconds: float) -> FloatArray:
         """Size (2,) of the rate, and of the force beside its slow mean, which is gravity."""
         if self._mean is None:
             self._mean = imu
         self._mean = self._mean + min(seconds / _SLOW, 1.0) * (imu - self._mean)
-        moved = ((imu - self._mean) ** 2).reshape(2, 3).sum(axis=1)
-        self._variance = self._variance + min(seconds / _VIOLENCE_TIME, 1.0) * (moved / 3.0 - self._variance)
-        self._variance = np.maximum(self._variance, _LEAST_MOTION**2)
-        return np.array((math.sqrt(float(imu[:3] @ imu[:3])), math.sqrt(float(moved[1]))))
-
-    def _hidden_change(self, seconds: float) -> FloatArray:
-        """Variance (2,) by which rate and force may differ between two samples so many ``seconds`` apart.
-
-        Over times as long as that of the running mean it is what the motion has shown, over longer ones it grows as of
-        a random walk, over shorter ones with the third power, as of a smooth motion. Of a Brownian bridge a twelfth
-        of it, times the length of the step, is the variance of the integral.
-        """
-        ratio = seconds / _SLOW
-        return np.asarray(2.0 * self._variance * ratio**3 / (1.0 + ratio**2))
+        moved = imu[3:] - self._mean[3:]
+        return np.array((math.sqrt(float(imu[:3] @ imu[:3])), math.sqrt(float(moved @ moved))))
 
     def _follow_spectrum(self, imu: FloatArray, seconds: float) -> None:
         if seconds > _INTERRUPTED:
@@ -88,6 +86,57 @@ class ImuNoiseMonitor:
             first, second, third = self._recent
             self._floor.add(first - 2.0 * second + third, seconds)
             del self._recent[0]
+
+
+class StructureFunction:
+    """By how much rate and force differ after so long, and what is hidden between two samples so far apart.
+
+    D(tau) is the mean square of the difference of samples tau apart (A. Kolmogorov's structure function; S. Panchev,
+    "Random Functions and Turbulence", 1971). Where it grows as tau^a, the mean over a step of T seconds differs from
+    that of the samples at its ends by a variance of D(T) (1 / (a + 2) - 1 / 4): a quarter of D(T) for vibration, a
+    twelfth for Brownian motion, nothing for motion that is linear in time. Motion is the smoother the shorter one
+    looks: with the exponent at T itself it is an upper bound.
+    """
+
+    def __init__(self) -> None:
+        self._time = 0.0
+        self._kept: deque[tuple[float, FloatArray]] = deque()
+        self._weights = np.zeros(len(_LAGS))
+        self._measured = np.zeros((len(_LAGS), 2))
+
+    def add(self, imu: FloatArray, seconds: float) -> None:
+        """Take a sample (6,) that comes ``seconds`` after the one before."""
+        self._time += seconds
+        if self._kept and self._time - self._kept[-1][0] < _SHORTEST_LAG:
+            return
+        while self._kept and self._time - self._kept[0][0] > _LAGS[-1]:
+            self._kept.popleft()
+        if self._kept:
+            self._compare(imu)
+        self._kept.append((self._time, imu))
+
+    def _compare(self, imu: FloatArray) -> None:
+        times, samples = (np.array(part) for part in zip(*self._kept, strict=True))
+        squares = ((samples - imu) ** 2).reshape(-1, 2, 3).mean(axis=2)
+        of_lag = np.rint(np.log2((self._time - times) / _SHORTEST_LAG)) == _OCTAVES[:, None]
+        counts = of_lag.sum(axis=1)
+        # The mean of all that came at first, later of the latest.
+        new = np.minimum(counts, 1) * min(self._time - times[-1], _MEMORY)
+        self._weights = np.minimum(self._weights + new, _MEMORY)
+        gain = new / np.maximum(self._weights, _SHORTEST_LAG)
+        mean = (of_lag @ squares) / np.maximum(counts, 1)[:, None]
+        self._measured = self._measured + gain[:, None] * (mean - self._measured)
+
+    def hidden(self, seconds: float) -> FloatArray:
+        """Squared densities (2,) of the noise that a step of ``seconds`` between two samples makes."""
+        place = math.log2(seconds / _SHORTEST_LAG)
+        lower = min(max(int(place), 0), len(_LAGS) - 2)
+        D = np.maximum(self._measured[lower : lower + 2], _LEAST_MOTION[lower : lower + 2])
+        exponent = np.clip(np.log2(D[1] / D[0]), 0.0, 2.0)
+        at_step = D[0] * 2.0 ** (exponent * (place - lower))
+        # The errors of steps in a row share a sample: they add up twice as fast if all is vibration.
+        shared = 1.0 + np.maximum(1.0 - exponent, 0.0)
+        return np.asarray(at_step * (1.0 / (exponent + 2.0) - 0.25) * shared * seconds)
 
 
 class NoiseFloor:
