@@ -5,6 +5,7 @@
 # make bench     accuracy and speed against OpenCV and a batch smoother, in the same run
 # make faults    faults of IMU, camera, markers and nodes in flights of eight seeds, as a table for the documents
 # make soak      an hour of flight in real time: memory, CPU and error by the minute
+# make restart   how long a node that is killed in flight takes to be back
 # make fuzz      10,000 mutated messages, files and bags for the nodes and commands; anything found is an error
 # make latency   latency, losses and CPU of the nodes in real time, on the machine as it is and beside two busy loops
 # make tables    put measured tables and parameters into the documents
@@ -24,7 +25,7 @@ export OMP_NUM_THREADS := 1
 # A notice of the theme about its successor.
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: help demo test lint nightly coverage bench faults soak fuzz latency tables structure docs format clean
+.PHONY: help demo test lint nightly coverage bench faults soak restart fuzz latency tables structure docs format clean
 
 help:
 	@sed -n 's/^# \(make .*\)/\1/p' Makefile
@@ -73,6 +74,10 @@ faults: $(READY)
 soak: $(READY)
 	@echo '== An hour of flight in real time; shorter: make soak SOAK_ARGS="--minutes 6"'
 	PYTHONPATH=test $(BIN)/python -m soak $(SOAK_ARGS)
+
+restart: $(READY)
+	@echo '== Nodes killed in flight, one after another'
+	PYTHONPATH=test $(BIN)/python test/restart.py
 
 fuzz: $(READY)
 	@echo '== Mutated messages, files and bags'

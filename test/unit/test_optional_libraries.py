@@ -82,3 +82,48 @@ def test_the_demo_without_ros_says_what_is_missing(tmp_path):
     code = 'from pathlib import Path\nfrom thermal_fiducial.cli.demo import _replay\n_replay(Path(), Path())'
     result = python(code, ('rclpy', 'sensor_msgs', 'diagnostic_msgs', 'geometry_msgs'))
     assert 'install the extra "ros"' in result.stderr
+
+
+SLOW = ('scipy.stats', 'scipy.ndimage', 'matplotlib', 'rosbags', 'plotly', 'jinja2', 'rich')
+#: What a node that has no pictures does not need either.
+OF_SOME = {'pose_ekf': ('cv2', 'scipy', 'xml')}
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('node', ['tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf'])
+def test_a_node_that_is_back_in_flight_does_not_wait_for_what_it_does_not_use(node):
+    code = f'import sys, thermal_fiducial.nodes.{node}\nprint(*[name for name in sys.argv[1:] if name in sys.modules])'
+    result = python(code, (), *SLOW, *OF_SOME.get(node, ()))
+    assert (result.stdout, result.stderr) == ('\n', '')
+
+
+def test_of_filterpy_its_filter_alone_is_loaded_and_the_rest_stays_to_be_had():
+    code = """
+from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
+import numpy as np
+assert not any(name.startswith(('filterpy', 'scipy')) for name in sys.modules)
+ours = ExtendedKalmanFilter(dim_x=2, dim_z=1)
+import filterpy.kalman
+whole = filterpy.kalman.ExtendedKalmanFilter(dim_x=2, dim_z=1)
+for each in (ours, whole):
+    each.P = np.array([[2.0, 0.5], [0.5, 1.0]])
+    each.update(np.array([0.3]), lambda x: np.array([[1.0, 0.2]]), lambda x: np.array([0.1]), R=np.eye(1))
+# Another library's inverse: the last bits.
+assert np.allclose(ours.x, whole.x, rtol=1e-12) and np.allclose(ours.P, whole.P, rtol=1e-12)
+assert abs(ours.log_likelihood - whole.log_likelihood) < 1e-9
+"""
+    result = python(code, ())
+    assert result.returncode == 0, result.stderr
+
+
+def test_a_filterpy_that_is_laid_out_otherwise_is_loaded_whole(tmp_path):
+    (tmp_path / 'filterpy').mkdir()
+    (tmp_path / 'filterpy' / '__init__.py').write_text('')
+    (tmp_path / 'filterpy' / 'kalman.py').write_text('class ExtendedKalmanFilter: whole = True')
+    code = """
+sys.path.insert(0, sys.argv[1])
+from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
+assert ExtendedKalmanFilter.whole and 'filterpy' in sys.modules
+"""
+    result = python(code, (), str(tmp_path))
+    assert result.returncode == 0, result.stderr

@@ -40,12 +40,15 @@ class NodeProcesses:
         self._folder = tempfile.TemporaryDirectory(prefix='thermal_fiducial_')
         self._environment.setdefault('ROS_LOG_DIR', self._folder.name)
         for node in self._nodes:
-            command = [sys.executable, '-m', f'thermal_fiducial.nodes.{node}', *self._arguments]
-            with self._log(node).open('wb') as log:
-                self._processes[node] = subprocess.Popen(
-                    command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
-                )
+            self._start(node)
         return self
+
+    def _start(self, node: str) -> None:
+        command = [sys.executable, '-m', f'thermal_fiducial.nodes.{node}', *self._arguments]
+        with self._log(node).open('ab') as log:
+            self._processes[node] = subprocess.Popen(
+                command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
+            )
 
     def __exit__(self, *_: object) -> None:
         for process in self._processes.values():
@@ -74,6 +77,12 @@ class NodeProcesses:
             if status == 2:
                 raise InputError(reason)
             raise RunError(f'node {node} ended: {reason}')
+
+    def crash(self, node: str) -> None:
+        """Kill a node, and start it again as a launch file that respawns does."""
+        self._processes[node].kill()
+        self._processes[node].wait()
+        self._start(node)
 
     @property
     def working(self) -> bool:

@@ -2,13 +2,16 @@
 
 from collections.abc import Iterator
 import math
-from xml.etree import ElementTree
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import inverse, transform
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
+
+if TYPE_CHECKING:
+    from xml.etree.ElementTree import Element
 
 #: No robot has more links one behind the other: a longer chain goes round in a circle.
 _LONGEST = 100
@@ -47,6 +50,9 @@ def fixed_joints(urdf: str) -> Iterator[tuple[str, str, FloatArray]]:
     InputError
         What is no URDF, or a joint that says nothing usable.
     """
+    # Few robots have one, and it costs a node a tenth of the time that it takes to be back in flight.
+    from xml.etree import ElementTree
+
     try:
         robot = ElementTree.fromstring(urdf)
     except ElementTree.ParseError as error:
@@ -57,7 +63,7 @@ def fixed_joints(urdf: str) -> Iterator[tuple[str, str, FloatArray]]:
             yield parent.get('link', ''), child.get('link', ''), _origin(joint)
 
 
-def _origin(joint: ElementTree.Element) -> FloatArray:
+def _origin(joint: 'Element') -> FloatArray:
     origin = joint.find('origin')
     name = joint.get('name', '')
     xyz, rpy = (_three(name, '' if origin is None else origin.get(key, '')) for key in ('xyz', 'rpy'))

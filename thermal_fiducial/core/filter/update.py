@@ -3,11 +3,11 @@
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from filterpy.kalman import ExtendedKalmanFilter
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.increments import rotation_integrals
+from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
 from thermal_fiducial.core.filter.pose_noise import BodyPose
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,

@@ -1,0 +1,58 @@
+"""filterpy's extended Kalman filter without the rest of filterpy, which is two thirds of a node's start.
+
+Importing anything of filterpy imports all of it, and scipy's statistics with it. The one module that is used here needs
+three functions of the others, one of them only for a likelihood that nobody asks for, and the inverse of scipy's linear
+algebra, of which numpy has one too.
+"""
+
+from importlib import import_module
+from importlib.util import find_spec
+import sys
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+_NAME = 'filterpy'
+
+
+def _logpdf(*args: Any, **kwargs: Any) -> Any:
+    """The one of filterpy, for the likelihood."""
+    return import_module(f'{_NAME}.stats').logpdf(*args, **kwargs)
+
+
+def _load() -> Any:
+    """The class; from the whole of filterpy where it is loaded already, or is not laid out as it was."""
+    spec = find_spec(_NAME)
+    if _NAME not in sys.modules and spec is not None and spec.submodule_search_locations:
+        try:
+            return _load_alone(list(spec.submodule_search_locations))
+        except (ImportError, AttributeError):
+            pass
+    return import_module(f'{_NAME}.kalman').ExtendedKalmanFilter
+
+
+def _load_alone(places: list[str]) -> Any:
+    shells = {
+        name: ModuleType(name) for name in (_NAME, *(f'{_NAME}.{part}' for part in ('kalman', 'common', 'stats')))
+    }
+    for name, shell in shells.items():
+        shell.__path__ = [place + name.removeprefix(_NAME).replace('.', '/') for place in places]
+    shells[f'{_NAME}.stats'].logpdf = _logpdf  # type: ignore[attr-defined]
+    scipy = ModuleType('scipy')
+    scipy.linalg = np.linalg  # type: ignore[attr-defined]
+    shells |= {'scipy': scipy, 'scipy.linalg': np.linalg}
+    before = {name: sys.modules[name] for name in shells if name in sys.modules}
+    sys.modules.update(shells)
+    try:
+        helpers = import_module(f'{_NAME}.common.helpers')
+        vars(shells[f'{_NAME}.common']).update(pretty_str=helpers.pretty_str, reshape_z=helpers.reshape_z)
+        return import_module(f'{_NAME}.kalman.EKF').ExtendedKalmanFilter
+    finally:
+        # Whoever imports filterpy or scipy gets all of it.
+        for name in [name for name in sys.modules if name in shells or name.startswith(f'{_NAME}.')]:
+            del sys.modules[name]
+        sys.modules.update(before)
+
+
+ExtendedKalmanFilter = _load()
