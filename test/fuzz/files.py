@@ -43,6 +43,8 @@ PLY = 'ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float
 PCD = 'VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 3\nHEIGHT 1\nPOINTS 3\nDATA ascii\n'
 POINTS = '0 0 1\n1 0 2\n0 1 3\n'
 _START = small_bag.START_NS
+#: Commands that write a map, and the markers that they are asked to take out.
+_LEFT: dict[str, set[int]] = {'map delete': {2}, 'map move': set(), 'map show': set()}
 
 
 class Targets:
@@ -161,13 +163,33 @@ def run(numbers: Iterable[int], begin: Callable[[str, int], None]) -> list[Findi
             path = rng.choice(sorted(paths))
             good = path.read_bytes()
             path.write_bytes(mutated_bytes(good, rng))
-            findings += _judged(target, number, path, read)
+            markers = _markers(path) if target in _LEFT else None
+            found = _judged(target, number, path, read)
+            if not found and markers is not None and (loss := _loss(target, path, markers)):
+                found = [Finding(f'files {target}', number, 'lost', loss)]
+            findings += found
             path.write_bytes(good)
             if target.startswith('map '):
                 # Commands leave their traces.
                 shutil.rmtree(pristine)
                 shutil.copytree(backup, pristine)
     return findings
+
+
+def _markers(path: Path) -> set[int] | None:
+    try:
+        return set(load_map(path).markers)
+    except InputError:
+        return None
+
+
+def _loss(target: str, path: Path, markers: set[int]) -> str:
+    """What a map command has lost of a map that could be read, whether it did its work or refused to."""
+    left = _markers(path)
+    if left is None:
+        return 'the map can no longer be read'
+    missing = markers - left - _LEFT[target]
+    return f'markers {sorted(missing)} are no longer in the map' if missing else ''
 
 
 def _judged(target: str, number: int, path: Path, read: Callable[[], Any]) -> list[Finding]:

@@ -1,5 +1,6 @@
 """Mutated messages for the four nodes, and a good flight after every few of them."""
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from pathlib import Path
@@ -20,6 +21,7 @@ from fuzz.findings import Finding, timed
 from fuzz.mutations import mutate_message
 from thermal_fiducial.core.measurements import Odometry as State
 from thermal_fiducial.errors import INTERNAL_ERROR
+from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.nodes.aruco_detector import ArucoDetector
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
@@ -32,6 +34,10 @@ AT_ONCE = 50
 PATIENCE = 15.0
 #: The robot at rest is known to the floor of made-up poses [m].
 GOOD = 0.05
+#: Markers in the map.
+MAPPED = (0, 1, 2, 3)
+#: What the filter publishes for every sample of the IMU, and in thirty milliseconds of them.
+_OUTPUTS, _SAMPLES = ('/pose', '/odometry'), 6
 #: Topic to how often it is mutated: images take long.
 _TOPICS = {
     '/imu/data': 10,
@@ -54,13 +60,13 @@ class Nodes:
         self._graph = DirectGraph(context)
         self._samples = 0
         self._latest: np.ndarray | None = None
-        self._poses = 0
+        self._published: Counter[str] = Counter()
         self.not_finite: list[str] = []
-        map_file = small_bag.side_files(folder, ids=(0, 1, 2, 3))[0]
+        self._map_file = small_bag.side_files(folder, ids=MAPPED)[0]
         camera = {name: small_bag.PARAMETERS[name] for name in ('camera_position', 'camera_orientation')}
         self._graph.start(Tau2Camera)
         self._graph.start(ArucoDetector, **small_bag.PARAMETERS)
-        self._graph.start(MarkerMapperNode, **small_bag.PARAMETERS, map_file=str(map_file), mode='mapping')
+        self._graph.start(MarkerMapperNode, **small_bag.PARAMETERS, map_file=str(self._map_file), mode='mapping')
         self._graph.start(PoseEkfNode, **camera, bridge_rate=50.0)
         self._graph.listen('/pose', self._on_pose)
         for topic in ('/pose', '/odometry', '/bridge/odometry', '/camera_pose', '/camera_clock'):
@@ -68,11 +74,11 @@ class Nodes:
         self._good = _good_messages(self._graph)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        self._poses += 1
         self._latest = np.array([message.pose.pose.position.x, message.pose.pose.position.y])
 
     def _check(self, topic: str, message: Any) -> None:
         """Whatever the nodes publish themselves is finite."""
+        self._published[topic] += 1
         if not all(np.isfinite(value).all() for value in _numbers(message)):
             self.not_finite.append(topic)
 
@@ -92,25 +98,35 @@ class Nodes:
         return found
 
     def good_flight(self) -> str:
-        """Fly until the pose is good; why it is not, in the end."""
+        """Fly until the pose is good; why it is not, in the end, or what does not come with it."""
         good = 0
         for _ in range(round(PATIENCE / 0.03)):
+            self._latest = None
+            self._published.clear()
             self._thirty_milliseconds()
             good = good + 1 if self._latest is not None and np.abs(self._latest).max() < GOOD else 0
             if good == 10:
-                return '' if self._poses >= 6 else 'samples of the IMU without a pose'
-            self._poses, self._latest = 0, None
+                missing = [topic for topic in _OUTPUTS if self._published[topic] != _SAMPLES]
+                return f'{_SAMPLES} samples of the IMU, but {dict(self._published)}' if missing else ''
         return self._graph.nodes['pose_ekf'].headline()
 
+    def losses(self) -> list[str]:
+        """Markers that are missing from the map."""
+        left = set(MAPPED) - set(self._graph.nodes['marker_mapper'].mapper.map.markers)
+        return [f'markers {sorted(left)} are no longer in the map'] if left else []
+
     def _thirty_milliseconds(self) -> None:
-        for _ in range(6):
+        for _ in range(_SAMPLES):
             self._graph.send('/imu/data', imu(self._samples))
             self._samples += 1
         self._graph.send('/camera_pose', pose(self._samples - 4))
 
-    def close(self) -> None:
-        """End the nodes."""
+    def close(self) -> list[str]:
+        """End the nodes; what is missing from the map that they leave."""
+        self._graph.nodes['marker_mapper'].close()
         self._graph.close()
+        left = set(MAPPED) - set(load_map(self._map_file, small_bag.SIZE).markers)
+        return [f'markers {sorted(left)} are not in the map that was saved'] if left else []
 
 
 def _numbers(message: Any) -> Iterator[Any]:
@@ -164,8 +180,9 @@ def run(numbers: range, begin: Callable[[str, int], None]) -> list[Finding]:
             findings += [Finding('messages', number, 'internal error', line) for line in nodes.internal_errors()]
             findings += [Finding('messages', number, 'not finite', f'{bad} after {topic}') for bad in nodes.not_finite]
             nodes.not_finite.clear()
+            findings += [Finding('messages', number, 'lost', f'{loss} after {topic}') for loss in nodes.losses()]
             if (number + 1) % AT_ONCE == 0 and (reason := nodes.good_flight()):
                 findings.append(Finding('messages', number, 'poisoned', reason))
-        nodes.close()
+        findings += [Finding('messages', numbers[-1], 'lost', loss) for loss in nodes.close()]
     context.try_shutdown()
     return findings
