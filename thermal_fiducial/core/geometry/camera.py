@@ -12,18 +12,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.geometry.distortion import (
-    distort_equidistant,
-    distort_polynomial,
-    equidistant_radius,
-    NEWTON_STEP,
-    NEWTON_STEPS,
-    Polynomial,
-    polynomial_derivative,
-    radial_factor,
-    radial_terms,
-    undistort_equidistant,
-)
+from thermal_fiducial.core.geometry.distortion import EquidistantLens, LensModel, PolynomialLens
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 
@@ -91,14 +80,14 @@ class Camera:
         """
         points = np.asarray(points, dtype=np.float64)
         x, visible = self._normalised(points)
-        uv = self._to_pixels(self._distorted(x))
+        uv = self._to_pixels(self._lens.distort(x))
         return np.where(visible[..., None], uv, np.nan)
 
     def project_jacobian(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Pixels (..., 2) of points (..., 3), and their derivative (..., 2, 3) [px/m]."""
         points = np.asarray(points, dtype=np.float64)
         x, visible = self._normalised(points)
-        distorted, dd_dx = self._distort(x)
+        distorted, dd_dx = self._lens.linearise(x)
         uv = np.where(visible[..., None], self._to_pixels(distorted), np.nan)
         inverse_z = 1.0 / points[..., 2]
         dx_dp = np.zeros((*points.shape[:-1], 2, 3))
@@ -108,11 +97,11 @@ class Camera:
 
     def distort(self, normalised: npt.ArrayLike) -> FloatArray:
         """Pixels (..., 2) of normalised image coordinates x/z, y/z (..., 2)."""
-        return self._to_pixels(self._distorted(np.asarray(normalised, dtype=np.float64)))
+        return self._to_pixels(self._lens.distort(np.asarray(normalised, dtype=np.float64)))
 
     def distort_linearised(self, normalised: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """:meth:`distort`, and its derivative (..., 2, 2) [px]."""
-        x, J = self._distort(np.asarray(normalised, dtype=np.float64))
+        x, J = self._lens.linearise(np.asarray(normalised, dtype=np.float64))
         return self._to_pixels(x), self.K[:2, :2] @ J
 
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
@@ -122,10 +111,7 @@ class Camera:
         iteration does not; in the angle alone where the model is purely radial.
         """
         uv = np.asarray(uv, dtype=np.float64)
-        target = (uv - self.K[:2, 2]) @ self._inverse_focal.T
-        if self.model == 'equidistant':
-            return undistort_equidistant(target, self.D)
-        return self._undistort_polynomial(target)
+        return self._lens.undistort((uv - self.K[:2, 2]) @ self._inverse_focal.T)
 
     def rays(self, uv: npt.ArrayLike) -> FloatArray:
         """Unit viewing directions (..., 3) of pixels (..., 2)."""
@@ -153,16 +139,12 @@ class Camera:
     def _fold_radius(self) -> float:
         """Normalised radius up to which the distorted radius grows: beyond it two points share a pixel."""
         r = np.linspace(0.0, 12.0, 4801)
-        radial = self._distort(np.stack([r, np.zeros_like(r)], axis=-1))[0][:, 0]
-        if self.model != 'equidistant':
-            radial = r * radial_factor(r * r, self._polynomial)
-        falling = np.flatnonzero(np.diff(radial) <= 0.0)
+        falling = np.flatnonzero(np.diff(self._lens.radius(r)) <= 0.0)
         return float(r[falling[0]]) if len(falling) else np.inf
 
     @cached_property
-    def _polynomial(self) -> 'Polynomial':
-        k1, k2, p1, p2, k3, *rational = self.D.tolist()
-        return Polynomial((k1, k2, k3), tuple(rational) if any(rational) else (), p1, p2)
+    def _lens(self) -> LensModel:
+        return EquidistantLens(self.D) if self.model == 'equidistant' else PolynomialLens(self.D)
 
     @cached_property
     def _last_pixel(self) -> FloatArray:
@@ -172,40 +154,6 @@ class Camera:
     def _inverse_focal(self) -> FloatArray:
         """(2, 2) [1/px]."""
         return np.asarray(np.linalg.inv(self.K[:2, :2]))
-
-    def _undistort_polynomial(self, target: FloatArray) -> FloatArray:
-        x = target.copy()
-        for _ in range(NEWTON_STEPS):
-            distorted, J = self._distort(x)
-            a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
-            determinant = a * d - b * c
-            determinant = np.where(np.abs(determinant) < 1e-9, 1e-9, determinant)
-            error = target - distorted
-            step = np.empty_like(x)
-            step[..., 0] = d * error[..., 0] - b * error[..., 1]
-            step[..., 1] = a * error[..., 1] - c * error[..., 0]
-            step /= determinant[..., None]
-            x = x + step
-            if np.abs(step).max(initial=0.0) < NEWTON_STEP:
-                break
-        return x
-
-    def _distorted(self, x: FloatArray) -> FloatArray:
-        """Distorted normalised coordinates (..., 2)."""
-        if self.model == 'equidistant':
-            # Radius and angle are the same to the last digit where they are as small.
-            r = np.maximum(np.sqrt(np.einsum('...k,...k->...', x, x)), 1e-12)
-            return np.asarray(x * (equidistant_radius(np.arctan(r), self.D) / r)[..., None])
-        r2, factor = radial_terms(x, self._polynomial)
-        return distort_polynomial(x, r2, factor, self._polynomial)
-
-    def _distort(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Distorted normalised coordinates (..., 2) and their derivative (..., 2, 2)."""
-        if self.model == 'equidistant':
-            return distort_equidistant(x, self.D)
-        r2, factor = radial_terms(x, self._polynomial)
-        derivative = polynomial_derivative(x, r2, factor, self._polynomial)
-        return distort_polynomial(x, r2, factor, self._polynomial), derivative
 
 
 @dataclass(frozen=True, slots=True)

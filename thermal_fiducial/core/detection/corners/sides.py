@@ -68,7 +68,12 @@ def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, 
     columns : C in each of them
     half : number of pixels of a column on either side; M = 2 half + 1
     """
-    nodes = _nodes(x, camera)
+    weight = se3.perspective(x)
+    start, end = x.take(STARTS, axis=1), x.take(ENDS, axis=1)
+    ratio = (weight.take(ENDS, axis=1) / weight.take(STARTS, axis=1))[..., None]
+    share = NODES * ratio / (1.0 + NODES * (ratio - 1.0))
+    points = start[:, :, None] + share[..., None] * (end - start)[:, :, None]
+    nodes = camera.distort(points).reshape(-1, len(NODES), 2)
     middle = nodes[:, 2]
     opposite = middle.reshape(-1, 4, 2).take(_OPPOSITE, axis=1).reshape(-1, 2) - middle
     return columns_across(nodes, opposite, shape, cells, columns, half)
@@ -117,16 +122,6 @@ def columns_across(
         np.abs((opposite * normal[cells // 2]).sum(axis=-1)),
         np.sqrt((span * span).sum(axis=-1)),
     )
-
-
-def _nodes(x: FloatArray, camera: Camera) -> FloatArray:
-    """Pixels (4 N, 5, 2) of five points on every side of quadrilaterals (N, 4, 2), normalised."""
-    weight = se3.perspective(x)
-    start, end = x.take(STARTS, axis=1), x.take(ENDS, axis=1)
-    ratio = (weight.take(ENDS, axis=1) / weight.take(STARTS, axis=1))[..., None]
-    share = NODES * ratio / (1.0 + NODES * (ratio - 1.0))
-    points = start[:, :, None] + share[..., None] * (end - start)[:, :, None]
-    return camera.distort(points).reshape(-1, len(NODES), 2)
 
 
 @cache
