@@ -64,7 +64,7 @@ coverage: $(READY)
 
 bench: $(READY)
 	@echo '== Benchmarks, one thread'
-	$(BIN)/python -m pytest test/bench --benchmark-only --benchmark-columns=median,min,max,rounds $(PYTEST_ARGS)
+	$(BIN)/python -m pytest test/bench -m '' --benchmark-only --benchmark-columns=median,min,max,rounds $(PYTEST_ARGS)
 
 faults: $(READY)
 	@echo '== Faults in flight: about an hour on two cores; fewer flights: make faults FAULTS_ARGS="--seeds 1"'

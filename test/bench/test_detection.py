@@ -240,7 +240,13 @@ def pose_times(monkeypatch):
 
 
 @pytest.mark.benchmark(timer=time.process_time)
-@pytest.mark.parametrize('scene', ['slow, 8 K', 'slow, 0.5 K', 'fast, 8 K', 'slow, 8 K, 36h11'])
+@pytest.mark.parametrize(
+    'scene',
+    [
+        'slow, 8 K',
+        *(pytest.param(s, marks=pytest.mark.nightly) for s in ('slow, 0.5 K', 'fast, 8 K', 'slow, 8 K, 36h11')),
+    ],
+)
 @pytest.mark.parametrize('method', METHODS)
 def test_time(benchmark, pose_times, scene, method):
     """Mean processor time of a frame of a settled detector: blind searches come every few frames only, and all count.

@@ -11,7 +11,7 @@ from thermal_fiducial.core.mapping.mapper import MarkerMapper
 
 FLIGHTS = (*range(12, 18), 24, 25)
 #: Flights on which markers do enter by the wrong branch when no ambiguity is waited for.
-FEW = (13, 24)
+FEW = (24,)
 #: A wrong branch is tens of degrees off.
 WRONG = np.deg2rad(8.0)
 

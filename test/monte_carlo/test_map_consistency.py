@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from support.walls import CAMERA, flight, see, SIZE, wall
 
-from test.support.walls import CAMERA, flight, see, SIZE, wall
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe

@@ -10,41 +10,45 @@ from support.corner_runs import fly
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('real_data')]
 
 
-#: The other camera of the rig sees the same flight.
-each_camera = pytest.mark.parametrize('camera', ['cam0', pytest.param('cam1', marks=pytest.mark.nightly)])
+#: The first seconds show what breaks; all of both cameras, which see the same flight, are flown at night.
+WHOLE = 40.0
+whole = [pytest.param(camera, WHOLE, marks=pytest.mark.nightly) for camera in ('cam0', 'cam1')]
+each_flight = pytest.mark.parametrize(('camera', 'seconds'), [('cam0', 6.0), *whole])
 
 
 @cache
-def board_run(camera):
+def board_run(camera, seconds):
     """The board with published densities and default parameters, poses 30 ms late."""
-    return fly(real_flights.april_board(camera))
+    return fly(real_flights.april_board(camera, seconds=seconds))
 
 
-@each_camera
-def test_markers_alone_are_as_good_as_the_reference(camera):
-    run = board_run(camera)
+@each_flight
+def test_markers_alone_are_as_good_as_the_reference(camera, seconds):
+    run = board_run(camera, seconds)
     score = run.markers.score(run.flight)
-    assert len(run.markers) > 790  # of 801 frames
+    assert len(run.markers) > 0.986 * len(run.flight.frames)
     # The reference is good to 3 mm and 0.2 deg, and rests on the same corners.
     assert score.rms_mm < 5.0
     assert score.rms_deg < 0.25
     # The reference shares lens and board with the markers. With both estimated from the recording the markers are 8.7
-    # and 7.0 mm off (rms), and that is what they have to claim: at least as much, and at most twice.
-    assert 7.0 < score.claimed_mm < 17.5
+    # and 7.0 mm off (rms), and that is what they have to claim: at least as much, and at most twice. At first the board
+    # is nearer: no less than from the reference.
+    assert (7.0 if seconds == WHOLE else score.rms_mm) < score.claimed_mm < 17.5
 
 
-@each_camera
-def test_the_filter_goes_through_without_a_reset(camera):
-    run = board_run(camera)
+@each_flight
+def test_the_filter_goes_through_without_a_reset(camera, seconds):
+    run = board_run(camera, seconds)
     assert run.resets == 0
-    assert run.refused < 0.01
+    # One in a hundred of all 801 poses.
+    assert run.refused * len(run.poses) < 8.0
     # Every IMU sample after the start has a pose.
     assert len(run.published) > 0.97 * len(run.flight.samples)
 
 
-@each_camera
-def test_the_fused_pose_stays_with_the_markers_by_their_systematic_error(camera):
-    score = board_run(camera).published.score(board_run(camera).flight)
+@each_flight
+def test_the_fused_pose_stays_with_the_markers_by_their_systematic_error(camera, seconds):
+    score = board_run(camera, seconds).published.score(board_run(camera, seconds).flight)
     # What the lens makes of the reference: 8.7 mm and 0.39 deg (rms), 29 mm at the most, as of the markers alone
     # against poses with lens and board estimated; a third more for what the fused pose adds.
     assert score.rms_mm < 1.33 * 8.7

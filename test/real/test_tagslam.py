@@ -1,11 +1,12 @@
 """Recorded tag corners: our map explains them as well as an offline solver's."""
 
 import pytest
+from support import tagslam
 
-from test.support import tagslam
 
-
-@pytest.mark.parametrize('name', ['test_1', 'test_16', 'test_22', pytest.param('test_12', marks=pytest.mark.nightly)])
+@pytest.mark.parametrize(
+    'name', ['test_22', *(pytest.param(name, marks=pytest.mark.nightly) for name in ('test_1', 'test_12', 'test_16'))]
+)
 def test_reprojection_error_against_the_reference(real_data, name, measured):
     recording = tagslam.load(real_data / 'tagslam' / name)
     markers, refinement = tagslam.solve(recording, 1)

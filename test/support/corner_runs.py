@@ -4,13 +4,13 @@ The runs need a ``CornerFlight``, whoever made it: a recording or a simulation.
 """
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.stats import chi2
 
 from thermal_fiducial.config import ImuNoise, MarkerMapperConfig, PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import (
     inverse,
@@ -129,21 +129,30 @@ class Run:
     flight: CornerFlight
     #: at every IMU sample as published, poses ``late`` seconds late
     published: Poses
-    #: at the instants of the frames, after their update
-    updated: Poses
     #: from the markers of each frame alone
     markers: Poses
-    #: the last word on each pose
-    updates: list[PoseUpdate]
+    #: the poses that the filter received
+    poses: list[CameraPose]
     #: how often the filter began anew
     resets: int
     marker_map: MarkerMap
     late: float
+    #: parameters of the filter
+    config: PoseEkfConfig
+
+    @cached_property
+    def _prompt(self):
+        return _updated(self.flight, PoseEkf(self.config), self.poses)
+
+    @property
+    def updated(self) -> Poses:
+        """At the instants of the frames, after their update, of a filter that has each pose at its own instant."""
+        return _compared(self.flight, self._prompt[1])
 
     @property
     def refused(self) -> float:
-        """Share of the poses that were refused."""
-        return float(np.mean([not update.accepted for update in self.updates]))
+        """Share of the poses that were refused, by the last word on each."""
+        return float(np.mean([not update.accepted for update in self._prompt[0]]))
 
     def latest_marker_errors(self, stamps_ns):
         """(K,) [m] distance of the latest marker pose at hand, late as it is, at these instants."""
@@ -159,21 +168,20 @@ class _Chain:
         orientation = tuple(quaternion_from_rotation(flight.T_body_camera[:3, :3]))
         camera = {'camera_position': tuple(flight.T_body_camera[:3, 3]), 'camera_orientation': orientation}
         camera['camera_time_offset'] = flight.time_offset
-        self._flight = flight
+        self.flight = flight
         self.mapper = MarkerMapper(MarkerMapperConfig(mode=mode, marker_size=flight.marker_size, **camera), marker_map)
-        config = PoseEkfConfig(**({'imu': flight.imu_noise} | camera | config))
-        #: the filter, and one that has each pose at its own instant: its states are those after the update
-        self.filter, self.prompt = PoseEkf(config), PoseEkf(config)
+        self.config = PoseEkfConfig(**({'imu': flight.imu_noise} | camera | config))
+        self.filter = PoseEkf(self.config)
         self._prior = MotionPrior(flight.time_offset)
         self._pair: SecondCamera | None = None
 
     def add_camera(self, flight):
         """The same flight through a second camera, in the same map."""
         self._second = _Chain(flight, self.mapper.map, 'localization', {})
-        self._pair = SecondCamera(self._flight.T_body_camera, flight.T_body_camera)
+        self._pair = SecondCamera(self.flight.T_body_camera, flight.T_body_camera)
 
     def add_second_frame(self, stamp_ns) -> None:
-        flight, mapper = self._second._flight, self._second.mapper
+        flight, mapper = self._second.flight, self._second.mapper
         pose = mapper.process(stamp_ns, flight.frames[stamp_ns], flight.camera, self._prior).pose
         alone = None if pose is None else self._pair.add_second(pose)
         if alone is not None:
@@ -186,8 +194,8 @@ class _Chain:
         return odometry
 
     def add_frame(self, stamp_ns) -> CameraPose | None:
-        rows = self._flight.frames[stamp_ns]
-        pose = self.mapper.process(stamp_ns, rows, self._flight.camera, self._prior).pose
+        rows = self.flight.frames[stamp_ns]
+        pose = self.mapper.process(stamp_ns, rows, self.flight.camera, self._prior).pose
         if pose is not None:
             pose = self._pair.with_second(pose, self._prior) if self._pair else pose
             self.filter.add_pose(pose)
@@ -234,16 +242,15 @@ def fly(flight, marker_map=None, *, mode='localization', late=0.03, left_out=(),
         else:
             poses.append(chain.add_frame(item))
     poses = [pose for pose in poses if pose is not None]
-    updates, updated = _updated(flight, chain.prompt, poses)
     return Run(
         flight,
         _compared(flight, [_pose(o.stamp_ns, o.T_map_body, o.pose_covariance) for o in published if o]),
-        _compared(flight, updated),
         _compared(flight, [_of_body(pose, flight) for pose in poses]),
-        updates,
+        poses,
         chain.filter.resets,
         chain.mapper.map,
         late,
+        chain.config,
     )
 
 
@@ -260,7 +267,7 @@ def _updated(flight, ekf, poses):
             waiting.append(time_ns)
             continue
         odometry = ekf.add_imu(item)
-        decided |= {stamp: ekf.decided[stamp] for stamp in decided if stamp in ekf.decided}
+        decided |= ekf.decided
         if odometry is not None:
             result += [_carried(odometry, at) for at in waiting if time_ns - at <= _NEAR_NS]
         waiting.clear()

@@ -47,8 +47,8 @@ def folder(name) -> Path:
 
 
 @cache
-def april_board(camera='cam0', sigma_px=BOARD_SIGMA_PX) -> CornerFlight:
-    """Forty seconds before the board through ``cam0`` or ``cam1``, with the published densities."""
+def april_board(camera='cam0', sigma_px=BOARD_SIGMA_PX, seconds=40.0, every=1) -> CornerFlight:
+    """Forty seconds before the board, or the first of them, through ``cam0`` or ``cam1``: ``every`` so many frames."""
     place = folder('april_board')
     rig = yaml.safe_load((place / 'rig.yaml').read_text())
     entry = rig['cameras'][camera]
@@ -59,8 +59,8 @@ def april_board(camera='cam0', sigma_px=BOARD_SIGMA_PX) -> CornerFlight:
     lens = _lens(entry)
     return CornerFlight(
         f'april board {camera}',
-        _samples(place / 'imu.csv'),
-        _frames(place / f'{camera}.csv', size, lens, sigma_px),
+        _samples(place / 'imu.csv', seconds),
+        _frames(place / f'{camera}.csv', size, lens, sigma_px, seconds, every),
         lens,
         np.array(entry['T_body_camera']).reshape(4, 4),
         marker_map,
@@ -174,21 +174,23 @@ def _lens(entry) -> Camera:
     return Camera(entry['width'], entry['height'], K, entry['model'], np.array(entry['D']))
 
 
-def _table(path):
+def _table(path, seconds):
     with path.open(newline='') as file:
         rows = list(csv.reader(file))[1:]
-    return np.array([int(row[0]) for row in rows]), np.array([[float(word) for word in row[1:]] for row in rows])
+    stamps, values = np.array([int(row[0]) for row in rows]), np.array([[float(v) for v in row[1:]] for row in rows])
+    first = stamps - stamps.min() < seconds * 1e9
+    return stamps[first], values[first]
 
 
-def _samples(path):
-    stamps, values = _table(path)
+def _samples(path, seconds=np.inf):
+    stamps, values = _table(path, seconds)
     return [ImuSample(int(stamp), row[:3], row[3:]) for stamp, row in zip(stamps, values, strict=True)]
 
 
-def _frames(path, size, lens, sigma_px):
-    stamps, values = _table(path)
+def _frames(path, size, lens, sigma_px, seconds=np.inf, every=1):
+    stamps, values = _table(path, seconds)
     frames = {}
-    for stamp in np.unique(stamps):
+    for stamp in np.unique(stamps)[::every]:
         rows = values[stamps == stamp]
         covariances = np.broadcast_to(sigma_px**2 * np.eye(2), (len(rows), 4, 2, 2))
         corners = rows[:, 1:9].reshape(-1, 4, 2)

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.walls import CAMERA, flight, see, SIZE, stamp, wall
 
-from test.support.walls import CAMERA, flight, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import (
     corner_field,

@@ -1,8 +1,8 @@
 """The store of keyframes: bounded, spread out, moved as one."""
 
 import numpy as np
+from support.walls import flight
 
-from test.support.walls import flight
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from support.walls import CAMERA, flight, see, SIZE, stamp, wall
 
-from test.support.walls import CAMERA, flight, see, SIZE, stamp, wall
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.cli.map_plot import draw_map
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference

@@ -5,8 +5,8 @@ import pickle
 
 import numpy as np
 import pytest
+from support.walls import CAMERA, flight, see, SIZE, wall
 
-from test.support.walls import CAMERA, flight, see, SIZE, wall
 from thermal_fiducial.core.error_model import NO_SYSTEMATIC_ERRORS
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform

@@ -3,9 +3,9 @@
 import time
 
 import numpy as np
+from support.scenes import motion_prior
+from support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 
-from test.support.scenes import motion_prior
-from test.support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform

@@ -4,8 +4,8 @@ import re
 
 import numpy as np
 import pytest
+from support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 
-from test.support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.mapping.mapper import MapMarker, MarkerMap, MarkerMapper

@@ -71,8 +71,8 @@ class StageNode(CountingNode, Generic[Config]):
         self.realtime_priority = int(getattr(self.config, 'realtime_priority', 0))
         #: what was configured and cannot be used, in words; the node does without it
         self.faults: list[str] = []
-        self._refused = 0
-        self._refusal = ''
+        self.refused = 0
+        self.last_refusal = ''
         self._diagnosed_refused = 0
         self._rates = InputRates(self.inputs, _expected_rate(self.config))
         #: lines for a pilot
@@ -141,10 +141,10 @@ class StageNode(CountingNode, Generic[Config]):
 
     def refuse(self, reason: str) -> None:
         """Count a message that could not be used; the first and then one a second is logged."""
-        if self._refused == self._diagnosed_refused:
+        if self.refused == self._diagnosed_refused:
             self.get_logger().warning(reason)
-        self._refused += 1
-        self._refusal = reason
+        self.refused += 1
+        self.last_refusal = reason
 
     def state(self) -> tuple[bytes, str]:
         """Level and reason in words of a stage that gets usable input."""
@@ -173,18 +173,18 @@ class StageNode(CountingNode, Generic[Config]):
         counts |= {
             f'published {output.topic}': output.count for output in self.outputs if output.topic != '/diagnostics'
         }
-        refusals = {'refused messages': self._refused, 'last refusal': self._refusal}
+        refusals = {'refused messages': self.refused, 'last refusal': self.last_refusal}
         values = {**self.figures(), **refusals, **self._rates.figures(), **counts}
         name = self.get_fully_qualified_name().lstrip('/')
         self._diagnostics.send(convert.diagnostics(name, level, reason, values, stamp_ns))
-        self._diagnosed_refused = self._refused
+        self._diagnosed_refused = self.refused
 
     def _level(self) -> tuple[bytes, str]:
         """What is worst: something configured, unusable input, none, what the stage says, its rate."""
         if self.faults:
             return ERROR, '; '.join(self.faults)
-        if self._refused > self._diagnosed_refused:
-            return WARN, self._refusal
+        if self.refused > self._diagnosed_refused:
+            return WARN, self.last_refusal
         if self._rates.silent:
             return ERROR if self._rates.stopped else WARN, f'no {self._rates.main}'
         level, reason = self.state()
