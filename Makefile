@@ -51,7 +51,7 @@ lint: $(READY)
 
 test: lint
 	@echo '== Tests (real data are used where THERMAL_FIDUCIAL_DATA names their folder)'
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --durations 15 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal --durations 15 $(PYTEST_ARGS)
 
 nightly: $(READY)
 	@echo '== Studies of many flights, views and recordings, beside what make test runs'
@@ -59,7 +59,7 @@ nightly: $(READY)
 
 coverage: $(READY)
 	@echo '== Tests with the branch coverage of the core'
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --cov thermal_fiducial.core --cov-branch \
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal --cov thermal_fiducial.core --cov-branch \
 		--cov-report term-missing:skip-covered --cov-fail-under 95 $(PYTEST_ARGS)
 
 bench: $(READY)

@@ -117,7 +117,7 @@ class Simulation:
         else:
             self._graph.send('/thermal/image_raw', convert.image(item.value, convert.header(item.stamp_ns, 'camera')))
         for node in self._graph.nodes.values():
-            self.flown.last_refusals.add(node._refusal)
+            self.flown.last_refusals.add(node.last_refusal)
 
     def _note_status(self) -> None:
         node = self._graph.nodes.get('pose_ekf')

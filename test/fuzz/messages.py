@@ -92,7 +92,7 @@ class Nodes:
 
     def internal_errors(self) -> list[str]:
         """Refusals for reasons that nobody foresaw since the last call."""
-        found = [node._refusal for node in self._graph.nodes.values() if INTERNAL_ERROR in node._refusal]
+        found = [node.last_refusal for node in self._graph.nodes.values() if INTERNAL_ERROR in node.last_refusal]
         for node in self._graph.nodes.values():
             node.refuse('')
         return found

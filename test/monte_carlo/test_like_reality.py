@@ -5,8 +5,9 @@ import pytest
 from support.corner_runs import fly
 from support.sim_flights import simulated
 
-from thermal_fiducial.core.measurements import corners_px
-from thermal_fiducial.sim.thermal_camera import render_frames, simulate_imu
+from thermal_fiducial.sim.corner_flight import corner_frames
+from thermal_fiducial.sim.scenario import named
+from thermal_fiducial.sim.thermal_camera import plan, render_frames, simulate_imu
 
 pytestmark = pytest.mark.slow
 
@@ -60,6 +61,7 @@ def test_samples_over_the_carpet_come_as_recorded():
 
 
 def test_corners_repeat_with_the_seed():
-    first, second = (simulated.__wrapped__('cheap_imu', seconds=12.0) for _ in range(2))
-    for a, b in zip(first.frames.values(), second.frames.values(), strict=True):
-        np.testing.assert_array_equal(corners_px(a), corners_px(b))
+    flight, noise = plan('cheap_imu', 12.0, 0), named('cheap_imu').corner_noise
+    first, second = (corner_frames(flight, noise) for _ in range(2))
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a.corners_px, b.corners_px)

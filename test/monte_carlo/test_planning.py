@@ -32,7 +32,7 @@ def ratios_of_errors(views, seeds):
 
 
 def test_planned_pose_errors_are_the_measured_ones():
-    ratios = ratios_of_errors([(34.0, 20.0, 1.0), (50.0, 40.0, 6.0), (50.0, 58.0, 1.0)], SEEDS[:1])
+    ratios = ratios_of_errors([(34.0, 20.0, 1.0), (50.0, 58.0, 6.0)], SEEDS[:1])
     # As below: of one median each, an eighth, beside the tables' tenth.
     assert np.all(np.abs(np.log(ratios)) < np.log(1.5))
 

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.ros
 def folder(tmp_path_factory):
     """A bag of images, its run, and bags of what its nodes published beside the IMU and the calibration."""
     folder = tmp_path_factory.mktemp('entries')
-    small_bag.recording(seconds=2.0).write(folder / 'images')
+    small_bag.recording(seconds=1.2).write(folder / 'images')
     small_bag.side_files(folder, ids=(0, 1, 2, 3))
     assert replay(folder, 'images') == 0
     for topic in ('markers', 'camera_pose'):
@@ -34,8 +34,15 @@ def replay(folder, bag, *extra):
     return main([str(word) for word in ('replay', folder / bag, *run, '--mode', 'localization', '--no-report', *extra)])
 
 
-@pytest.mark.parametrize('entry', ['markers', 'camera_pose'])
-@pytest.mark.parametrize('transport', ['lockstep', 'processes'])
+@pytest.mark.parametrize(
+    ('entry', 'transport'),
+    [
+        ('markers', 'lockstep'),
+        ('camera_pose', 'lockstep'),
+        ('markers', 'processes'),
+        pytest.param('camera_pose', 'processes', marks=pytest.mark.nightly),
+    ],
+)
 def test_the_same_poses_as_from_images(folder, entry, transport):
     assert replay(folder, entry, '--transport', transport, '--rate', '0.5') == 0
     run, images = folder / f'{entry}_run', folder / 'images_run'

@@ -129,9 +129,9 @@ def test_frames_that_swap_places_on_the_way_lose_nothing(folder, short, tmp_path
     assert np.sqrt(np.mean(np.sum((fused[0][1] - fused[1][1]) ** 2, axis=1))) < 0.001
 
 
-def test_two_replays_give_the_same_bytes(run, folder):
-    assert replay(folder / 'bag', folder / 'again', folder) == 0
-    assert_same_files(run, folder / 'again')
+def test_two_replays_give_the_same_bytes(short, folder):
+    assert replay(folder / 'short', folder / 'again', folder) == 0
+    assert_same_files(short[1], folder / 'again')
 
 
 def test_the_executor_does_not_matter(short, folder, monkeypatch):

@@ -54,7 +54,8 @@ class Graph:
         """The node's next diagnostic status: (level, message, figures)."""
         heard = self.heard['/diagnostics']
         count = len(heard)
-        self.spin_until(lambda: node._diagnostics.listeners == 1 and self.tester.inputs[0].publishers)
+        output = self.output(node, 'diagnostics')
+        self.spin_until(lambda: output.listeners == 1 and self.tester.inputs[0].publishers)
         node.diagnose(0)
         self.spin_until(lambda: len(heard) > count)
         (status,) = heard[-1].status
@@ -62,8 +63,19 @@ class Graph:
 
     def published(self, node, topic):
         """How many messages a node has published on a topic."""
+        return self.output(node, topic).count
+
+    @staticmethod
+    def output(node, topic):
+        """What a node publishes on a topic."""
         (output,) = [output for output in node.outputs if output.topic == f'/{topic}']
-        return output.count
+        return output
+
+    @staticmethod
+    def input(node, topic):
+        """What a node receives on a topic."""
+        (source,) = [source for source in node.inputs if source.topic == f'/{topic}']
+        return source
 
     def spin_until(self, condition, seconds=10.0):
         deadline = time.monotonic() + seconds

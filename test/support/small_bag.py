@@ -115,17 +115,33 @@ def map_of(ids):
 
 def recording(seconds=3.0, seed=0):
     """Frames at 30 Hz, camera_info with each, IMU at 200 Hz."""
-    rng = np.random.default_rng(seed)
+    pictures = _pictures(seed)
     result = Recording()
     for k in range(round(200 * seconds)):
         stamp = START_NS + k * 5_000_000
         result.events.append((stamp + 1_000_000, IMU_TOPIC, imu(stamp, _motion().imu(k * 0.005))))
     for k in range(round(30 * seconds)):
         stamp = START_NS + 2_000_000 + k * 33_333_333
-        counts = frame(_motion().pose((stamp - START_NS) * 1e-9), rng)
         result.events.append((stamp + 20_000_000, CAMERA_INFO_TOPIC, camera_info(stamp)))
-        result.events.append((stamp + 20_000_001, IMAGE_TOPIC, image(stamp, counts)))
+        result.events.append((stamp + 20_000_001, IMAGE_TOPIC, image(stamp, pictures[k])))
     return result
+
+
+class _Pictures:
+    """The frames of a recording, each made when it is first asked for and kept for the next recording."""
+
+    def __init__(self, seed):
+        self._rng, self._made = np.random.default_rng(seed), []
+
+    def __getitem__(self, k):
+        while len(self._made) <= k:
+            seconds = (2_000_000 + len(self._made) * 33_333_333) * 1e-9
+            self._made.append(frame(true_pose(seconds), self._rng))
+            self._made[-1].flags.writeable = False
+        return self._made[k]
+
+
+_pictures = cache(_Pictures)
 
 
 def side_files(folder, ids=(0,)):

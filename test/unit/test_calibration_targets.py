@@ -35,11 +35,12 @@ def smallest_error(pixels, truth):
     return min((pixels - order for order in (truth, truth[::-1])), key=lambda error: np.abs(error).max())
 
 
+@pytest.mark.parametrize('views', [1, pytest.param(4, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize('contrast', [8.0, -8.0, 2.0])
-def test_chessboard_of_either_polarity(contrast):
+def test_chessboard_of_either_polarity(contrast, views):
     rng = np.random.default_rng(7)
     errors = []
-    for seed in range(4):
+    for seed in range(views):
         counts, truth = chessboard_view(rng, contrast, seed)
         sighting = CHESSBOARD.find(counts, GUESS)
         errors.append(smallest_error(sighting.pixels, truth))
@@ -56,12 +57,13 @@ def test_chessboard_beside_something_hot():
     assert np.abs(smallest_error(sighting.pixels, truth)).max() < 0.3
 
 
+@pytest.mark.parametrize('views', [1, pytest.param(3, marks=pytest.mark.nightly)])
 @pytest.mark.parametrize('name', ['13mm', '7.5mm'])
-def test_circles(name):
+def test_circles(name, views):
     lens = LENSES[name]
     levels, width, height = circle_levels(4, 11, 0.03, 0.024, 0.0005)
     rng = np.random.default_rng(2)
-    for seed in range(3):
+    for seed in range(views):
         T = random_view(lens, CIRCLES.points, rng)
         plate = plate_pose(T, np.array([0.5 * width - 0.03, 0.5 * height - 0.03]))
         sighting = CIRCLES.find(render(lens, plate, levels, width, height, 8.0, seed), GUESS)

@@ -79,7 +79,13 @@ def test_what_is_installed(workspace):
         assert (code / data).is_file()
 
 
-@pytest.mark.parametrize('node', NODES)
+#: All are made in the same way: two show whether it works, the others at night.
+AT_ONCE = ('pose_ekf', 'thermal_source')
+
+
+@pytest.mark.parametrize(
+    'node', [*AT_ONCE, *(pytest.param(node, marks=pytest.mark.nightly) for node in NODES if node not in AT_ONCE)]
+)
 def test_an_executable_runs_until_it_is_asked_to_stop(workspace, node):
     process = subprocess.Popen(
         executable(workspace, node),

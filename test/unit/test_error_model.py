@@ -118,7 +118,7 @@ def test_the_bias_of_the_corners_is_learned_from_residuals_that_last(true_px):
     m = MarkerMapper(
         MarkerMapperConfig(mode='localization'), MarkerMap({i: MapMarker(i, SIZE, True, T) for i, T in poses.items()})
     )
-    for k in range(900):
+    for k in range(600):
         rows = see(flight(k / 30), poses, 0.1, rng)
         corners = corners_px(rows).reshape(-1, 2)
         nearest = np.argmin(np.sum((corners[:, None] - grid) ** 2, axis=-1), axis=1)

@@ -25,9 +25,9 @@ def run(script, *arguments):
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """A bag of three seconds with its parameters, a map of all markers and one of the first alone."""
+    """A bag of two seconds with its parameters, a map of all markers and one of the first alone."""
     folder = tmp_path_factory.mktemp('examples')
-    small_bag.recording(3.0).write(folder / 'bag')
+    small_bag.recording(2.0).write(folder / 'bag')
     small_bag.side_files(folder, ids=(0,))
     (folder / 'map.yaml').rename(folder / 'start.yaml')
     small_bag.side_files(folder, ids=small_bag.CENTRES)
@@ -36,7 +36,7 @@ def folder(tmp_path_factory):
 
 def assert_near_the_truth(path):
     stamps, positions, _ = load_tum(path)
-    assert len(stamps) > 300  # of 600 IMU samples, the first of which come before the filter has started
+    assert len(stamps) > 300  # of 400 IMU samples, the first of which come before the filter has started
     truth = [small_bag.true_pose((stamp - small_bag.START_NS) * 1e-9)[:3, 3] for stamp in stamps]
     assert np.max(np.linalg.norm(positions - truth, axis=1)) < TOLERANCE_M
 

@@ -262,7 +262,7 @@ def test_images_of_odd_sizes_go_through(graph, size, dtype):
     for k in range(3):
         picture = (100 * (columns > width // 2) + 50 * (rows > height // 2) + 10 * k + rows % 5).astype(dtype)
         graph.send('thermal/image_raw', convert.image(picture, at(START + k * FRAME_NS, 'camera')))
-    graph.spin_until(lambda: detector._markers.count == 3)
+    graph.spin_until(lambda: graph.published(detector, 'markers') == 3)
     assert (refusals(graph, camera), refusals(graph, detector)) == (0, 0)
 
 
@@ -366,7 +366,7 @@ def test_everything_hostile_and_then_a_good_flight(graph, tmp_path):
 
 def fly(graph, detector, seconds):
     """The sway of the small bag: IMU and frames in the order of their stamps."""
-    samples = small_bag._motion().imu(np.arange(round(200 * seconds)) * 0.005)
+    samples = small_bag.true_imu(np.arange(round(200 * seconds)) * 0.005)
     pictures = frames(round(30 * seconds))
     events = [(START + k * IMU_NS, 'imu/data', imu(k, row[:3], row[3:])) for k, row in enumerate(samples)]
     events += [(convert.stamp_ns(image.header.stamp) + 1, 'thermal/image', image) for image in pictures]
@@ -388,7 +388,7 @@ def test_services_timers_and_parameters_that_fail_end_nothing(graph, monkeypatch
         response = graph.call(Trigger, 'pose_ekf/reset', Trigger.Request())
         assert (response.success, 'ZeroDivisionError' in response.message) == (False, True)
         fault.setattr(node, 'figures', fail)
-        graph.spin_until(lambda: node._refused > 0, seconds=20.0)
+        graph.spin_until(lambda: node.refused > 0, seconds=20.0)
     assert graph.call(Trigger, 'pose_ekf/reset', Trigger.Request()).success
 
 

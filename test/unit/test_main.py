@@ -56,23 +56,29 @@ def parsers_of(command, monkeypatch):
     while waiting:
         parser = waiting.pop()
         found.append(parser)
-        for action in parser._actions:
-            if isinstance(action, argparse._SubParsersAction):
+        for action in actions(parser):
+            if isinstance(action.choices, dict):
                 waiting += [
                     choice for name, choice in action.choices.items() if parser is not found[0] or name == command
                 ]
     return found
 
 
+def actions(parser):
+    """Options, arguments and sub-commands: argparse has no public list of them."""
+    return parser._actions  # noqa: SLF001
+
+
 @pytest.mark.parametrize('command', COMMANDS)
 def test_help_says_what_every_option_does_and_is_when_left_out(command, monkeypatch):
     for parser in parsers_of(command, monkeypatch):
         text = ' '.join(parser.format_help().split())
-        for action in parser._actions:
+        for action in actions(parser):
             if not action.option_strings or action.default is argparse.SUPPRESS:
                 continue
             assert action.help, f'{parser.prog} {action.option_strings}'
-            said = ' '.join(parser._get_formatter()._expand_help(action).split())
+            # As argparse itself expands it; it offers no other way.
+            said = ' '.join(parser._get_formatter()._expand_help(action).split())  # noqa: SLF001
             assert said in text
             if action.default not in (None, False, '', []) or (action.default == 0 and action.nargs != 0):
                 assert 'default' in said, f'{parser.prog} {action.option_strings}'

@@ -7,12 +7,14 @@ from scipy.spatial import cKDTree
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from support import small_bag
+from support.messages import info
 from support.ros_graph import ros_graph
 from visualization_msgs.msg import Marker, MarkerArray
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.se3 import apply, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MapperResult, MarkerMap
+from thermal_fiducial.core.measurements import MARKER_DTYPE
 from thermal_fiducial.files.map_history import entries
 from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.files.point_cloud import save_alignment
@@ -111,7 +113,7 @@ def test_a_cloud_that_cannot_be_read_is_a_fault(graph, tmp_path, map_file):
     assert 'none.ply' in reason
 
 
-def test_all_markers_are_drawn_once_and_then_those_that_change_colour(graph, tmp_path):
+def test_all_markers_are_drawn_once_and_then_those_that_change_colour(graph, tmp_path, monkeypatch):
     path = tmp_path / 'map.yaml'
     save_map(path, MarkerMap({i: MapMarker(i, 0.3, True, transform(np.eye(3), [i, 0.0, 0.0])) for i in range(3)}))
     node = graph.add(MarkerMapperNode, map_file=str(path))
@@ -124,7 +126,9 @@ def test_all_markers_are_drawn_once_and_then_those_that_change_colour(graph, tmp
     plates = [[m.id for m in message.markers if m.ns == 'plates'] for message in heard]
     assert plates[-1] == [0, 1, 2]
     assert heard[-1].markers[0].action == Marker.DELETEALL
-    node._result = MapperResult(1, None, '', residuals_px={1: 0.1})
+    monkeypatch.setattr(node.mapper, 'learn', lambda _: MapperResult(1, None, '', residuals_px={1: 0.1}))
+    graph.send('thermal/camera_info', info())
+    graph.send('markers', clouds.cloud(np.zeros(0, MARKER_DTYPE), convert.header(1, 'camera')))
     graph.diagnose(node)
     graph.spin_until(lambda: len(heard) == 3)
     assert [(m.ns, m.id, m.action, m.color.r > 0.5) for m in heard[2].markers if m.ns == 'plates'] == [

@@ -110,7 +110,7 @@ def test_the_8_bit_view_is_made_only_for_somebody(graph):
     graph.send('thermal/image_raw', first)
     assert graph.diagnose(node)[2]['published /thermal/image_mono8'] == '0'
     graph.listen(Image, 'thermal/image_mono8')
-    graph.spin_until(lambda: node._image_mono8.listeners == 1)
+    graph.spin_until(lambda: graph.output(node, 'thermal/image_mono8').listeners == 1)
     graph.send('thermal/image_raw', second)
     graph.spin_until(lambda: graph.heard['thermal/image_mono8'])
     assert graph.heard['thermal/image_mono8'][0].encoding == 'mono8'
@@ -214,12 +214,12 @@ def test_a_detector_that_cannot_keep_up_takes_the_newest_image_and_counts_the_ot
     graph.listen(PointCloud2, 'markers')
     graph.send('thermal/camera_info', info())
     output = graph.tester.advertise(Image, 'thermal/image')
-    graph.spin_until(lambda: output.listeners == 1 and node._images.publishers == 1)
+    graph.spin_until(lambda: output.listeners == 1 and graph.input(node, 'thermal/image').publishers == 1)
     images = frames(6)
     for image in images:
         output.send(image)
     time.sleep(0.3)  # all have arrived, none has been looked at
-    graph.spin_until(lambda: node._images.count == 6)
+    graph.spin_until(lambda: graph.input(node, 'thermal/image').count == 6)
     graph.spin_until(lambda: graph.heard['markers'])
     stamps = [convert.stamp_ns(message.header.stamp) for message in graph.heard['markers']]
     assert stamps == [convert.stamp_ns(images[-1].header.stamp)]
@@ -247,7 +247,7 @@ def test_an_unknown_dictionary_is_a_fault_and_the_node_lives(graph):
 def test_the_annotated_image_is_made_for_a_listener(graph):
     node = graph.add(ArucoDetector, marker_size=small_bag.SIZE)
     graph.listen(Image, 'thermal/image_markers')
-    graph.spin_until(lambda: node._annotated.listeners == 1)
+    graph.spin_until(lambda: graph.output(node, 'thermal/image_markers').listeners == 1)
     graph.send('thermal/camera_info', info())
     graph.send('thermal/image', *frames(1))
     graph.spin_until(lambda: graph.heard['thermal/image_markers'])

@@ -9,7 +9,7 @@ from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.patterns import Decoder, marker_bits, Reading, shrunk
 from thermal_fiducial.core.detection.quads import noise_of
-from thermal_fiducial.core.detection.search import _inside_out, BlindSearch, SearchScales
+from thermal_fiducial.core.detection.search import BlindSearch, inside_out, SearchScales
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.files.dictionary import load_dictionary
 
@@ -99,7 +99,7 @@ def test_bright_markers_far_away_are_found(contrast):
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
-def test_edge_of_a_plate_is_no_marker_inside_out(sign):
+def test_edge_of_a_plate_is_no_markerinside_out(sign):
     """Readings at one place: a marker without much of a surround, the edge of its plate, bits in it, another."""
     correlation = sign * np.array([0.96, -0.89, -0.88, -0.9])
     reading = Reading(
@@ -116,9 +116,9 @@ def test_edge_of_a_plate_is_no_marker_inside_out(sign):
     quads = CORNERS.mean(axis=0) + factor * (CORNERS - CORNERS.mean(axis=0))
     quads[3] += 200.0
     everything = np.ones(4, dtype=bool)
-    assert _inside_out(reading, quads, everything, everything).tolist() == [False, True, True, False]
+    assert inside_out(reading, quads, everything, everything).tolist() == [False, True, True, False]
     # What cannot be read is no evidence against another.
-    assert not _inside_out(reading, quads, everything, ~everything).any()
+    assert not inside_out(reading, quads, everything, ~everything).any()
 
 
 def test_what_is_seen_already_is_not_sought():

@@ -141,7 +141,7 @@ def test_true_corners_beside_it(bag):
     np.testing.assert_allclose(corners, frame.corners_px[int(rows[0, 1])], atol=1e-4)
 
 
-@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize('storage', ['mcap', pytest.param('sqlite3', marks=pytest.mark.nightly)])
 def test_same_seed_same_bytes_with_any_number_of_workers(tmp_path, storage):
     for name, workers in (('one', 1), ('two', 2)):
         (tmp_path / name).mkdir()

@@ -1,6 +1,7 @@
 """What ``make soak`` measures and how it judges."""
 
 from dataclasses import replace
+import time
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from soak.laps import lap, Laps, Repeated
 from soak.minutes import faults, Minute
 from support.tiny import TINY
 
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.replay.children import NodeProcesses
 from thermal_fiducial.ros import convert
@@ -64,8 +66,11 @@ def test_growth_a_trend_and_what_is_missing_are_named(flown, expected):
 
 @pytest.mark.ros
 def test_a_node_that_does_not_end_well_is_named():
-    with NodeProcesses(77, ['tau2_camera'], ['-p', 'image_rate:=-1.0']) as nodes:
-        nodes._processes['tau2_camera'].wait()
+    refused = pytest.raises(InputError, match='image_rate')
+    with NodeProcesses(77, ['tau2_camera'], ['-p', 'image_rate:=-1.0']) as nodes, refused:
+        while True:
+            nodes.check()
+            time.sleep(0.02)
     assert nodes.unclean == ['tau2_camera: ended with status 2']
 
 

@@ -20,7 +20,7 @@ def soft_step(x):
 
 def scene(shift=0.0, contrast=150.0, shape=(512, 640)):
     """Warm squares on a colder wall, edges as soft as a lens makes them, moved to the right by ``shift`` px."""
-    rows, columns = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
+    rows, columns = np.arange(shape[0], dtype=float)[:, None], np.arange(shape[1], dtype=float)
 
     def box(u0, v0, side):
         across = soft_step(columns - shift - u0) - soft_step(columns - shift - u0 - side)

@@ -78,7 +78,8 @@ def test_a_camera_that_is_none_is_a_fault(graph, camera, words):
 def test_a_frame_that_nobody_foresaw_does_not_end_it(graph, folder):
     node = graph.add(ThermalSource, camera=folder, frame_rate=100.0)
     graph.spin_until(lambda: node.state()[0] == OK)
-    node.guard(node._publish, None)
+    # What the camera's thread calls with a frame, called with none.
+    node.on_frame(None)
     graph.listen(Image, 'thermal/image_raw')
     graph.spin_until(lambda: graph.heard['thermal/image_raw'])
     assert 'internal error' in graph.diagnose(node)[2]['last refusal']

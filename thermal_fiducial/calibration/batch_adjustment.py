@@ -155,7 +155,7 @@ class Problem:
             state, change, covariance = self.improved(state)
             if change < _CONVERGED:
                 break
-        error, _, shared = self._pose_errors(state)
+        error, _, shared = self.pose_errors(state)
         whitened = (self._whitening(shared[:, :, 6]) @ error[:, :, None])[:, :, 0]
         scale = max(1.0, 1.4826 * float(np.median(np.abs(whitened))))
         jitter = self._scatter(error, shared[:, :, 6])
@@ -225,9 +225,9 @@ class Problem:
         covariance = np.linalg.inv(reduced)
         shared = -covariance @ (c - flat.T @ solved[:, 0])
         own = (-solved[:, 0] - by_shared @ shared).reshape(count, _STATE)
-        return self._moved(state, own, shared), float(np.abs(shared).max()), covariance
+        return self.moved(state, own, shared), float(np.abs(shared).max()), covariance
 
-    def _pose_errors(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def pose_errors(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Predicted minus measured (N, 6), and its derivatives by state (N, 6, 15) and shared unknowns (N, 6, 25)."""
         count = len(state.p)
         rate, _ = self._steady.corrected(state.axes).at(self._stamps + state.offset)
@@ -273,7 +273,7 @@ class Problem:
     def _add_poses(
         self, state: State, H: FloatArray, B: FloatArray, C: FloatArray, g: FloatArray, c: FloatArray
     ) -> None:
-        error, own, shared = self._pose_errors(state)
+        error, own, shared = self.pose_errors(state)
         root = self._whitening(shared[:, :, 6])
         e = (root @ error[:, :, None])[:, :, 0]
         distance = np.linalg.norm(e, axis=1)
@@ -303,7 +303,8 @@ class Problem:
         C += np.einsum('nij,nik->jk', shared, shared)
         c += np.einsum('nij,ni->j', shared, e)
 
-    def _moved(self, state: State, own: FloatArray, shared: FloatArray) -> State:
+    def moved(self, state: State, own: FloatArray, shared: FloatArray) -> State:
+        """``state`` after a step of each frame's own unknowns (N, 15) and of the shared ones (25,)."""
         moved = replace(
             state,
             R=state.R @ se3.so3_exp(own[:, 3:6]),

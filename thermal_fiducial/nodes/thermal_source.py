@@ -30,9 +30,10 @@ class ThermalSource(StageNode[ThermalSourceConfig]):
         self._source = self.attempt(lambda: make_source(config), None)
         self._capture: Capture | None = None
         if self._source is not None:
-            self._capture = Capture(self._source, self._on_frame, self._on_change)
+            self._capture = Capture(self._source, self.on_frame, self._on_change)
 
-    def _on_frame(self, frame: CapturedFrame) -> None:
+    def on_frame(self, frame: CapturedFrame) -> None:
+        """Publish a frame; the camera's thread calls it."""
         self.guard(self._publish, frame)
 
     def _publish(self, frame: CapturedFrame) -> None:

@@ -90,7 +90,7 @@ class BlindSearch:
         good &= _whole(quads, frame.image, _BORDER)
         if not good.any():
             return Found.none()
-        good &= ~_inside_out(reading, quads, good, distinct(reading, frame.noise, config))
+        good &= ~inside_out(reading, quads, good, distinct(reading, frame.noise, config))
         return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), frame.noise)
 
     def _read(
@@ -218,7 +218,7 @@ def accepted(reading: Reading, noise: float, correctable: int, config: ArucoDete
     )
 
 
-def _inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: BoolArray) -> BoolArray:
+def inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: BoolArray) -> BoolArray:
     """Which good readings (Q,) are of a plate's border or of bits: at a more similar readable one of other polarity."""
     mine, others = np.flatnonzero(good), np.flatnonzero(readable)
     similarity, centre = np.abs(reading.correlation), quads.mean(axis=1)
