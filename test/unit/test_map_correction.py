@@ -13,8 +13,8 @@ from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.correction import correction
 from thermal_fiducial.core.mapping.keyframes import Keyframe
 from thermal_fiducial.core.mapping.mapper import MapMarker, MarkerMap, MarkerMapper
-from thermal_fiducial.core.mapping.odometry_prior import predicted_camera, together
-from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Odometry
+from thermal_fiducial.core.mapping.odometry_prior import predicted_camera
+from thermal_fiducial.core.measurements import corner_covariances, corners_px, Odometry
 
 AS_BODY = {'camera_orientation': (0.0, 0.0, 0.0, 1.0)}
 KNOWN = np.diag([5e-3] * 3 + [2e-3] * 3) ** 2
@@ -106,21 +106,3 @@ def test_the_offset_of_the_clocks_is_the_filters_to_say():
         # Velocities by differences over 2 ms.
         np.testing.assert_allclose(after.T_map_camera, flight(k / 30), atol=1e-9)
         np.testing.assert_allclose(after.covariance, known)
-
-
-@pytest.mark.parametrize(('place', 'own', 'sigma'), [(0, 1.0, 1e-6), (1, 1e-6, 1.0)])
-def test_the_better_of_two_poses_prevails(place, own, sigma):
-    markers, other = flight(0.0), retract(flight(0.0), 0.01 * np.ones(6))
-    fused = together(markers, own**2 * np.eye(6), np.zeros((6, 6)), CameraPose(0, other, sigma**2 * np.eye(6)))
-    np.testing.assert_allclose(fused.T_map_camera, (other, markers)[place], atol=1e-6)
-    # Neither is counted for more than it is worth.
-    assert np.all(np.diagonal(fused.white + fused.systematic) <= 1.01 * min(own, sigma) ** 2)
-    assert np.all(np.diagonal(fused.white + fused.systematic) >= 0.99 * min(own, sigma) ** 2)
-
-
-def test_odometry_that_contradicts_the_markers_is_left_out():
-    markers, other = flight(0.0), retract(flight(0.0), np.full(6, 0.3))
-    own = 1e-4 * np.eye(6)
-    fused = together(markers, own, np.zeros((6, 6)), CameraPose(0, other, 1e-6 * np.eye(6)))
-    np.testing.assert_array_equal(fused.T_map_camera, markers)
-    np.testing.assert_array_equal(fused.white, own)

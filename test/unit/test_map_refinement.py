@@ -10,7 +10,7 @@ from support.walls import CAMERA, flight, see, SIZE, wall
 from thermal_fiducial.core.error_model import NO_SYSTEMATIC_ERRORS
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
-from thermal_fiducial.core.mapping import bundle_adjustment
+from thermal_fiducial.core.mapping.adjustment_problem import MapProblem
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe
 from thermal_fiducial.core.mapping.map_data import MapMarker
@@ -64,7 +64,7 @@ def test_the_schur_complement_answers_like_the_whole_system():
     bridge = replace(s.keyframes[2], T_odometry=flight(40 / 6), information=information)
     s = replace(s, keyframes=(*s.keyframes[:2], bridge, *s.keyframes[3:]))
     s = replace(s, priors=prior_poses({1: s.markers[1]}))
-    problem = bundle_adjustment._Problem.build(s)
+    problem = MapProblem.build(s)
     assert problem is not None
     e = problem.evaluate(problem.start)
     F, M = len(problem.stamps), len(problem.ids)
@@ -89,7 +89,7 @@ def test_the_schur_complement_answers_like_the_whole_system():
     free = np.repeat(np.concatenate([np.ones(F, dtype=bool), ~problem.held]), 6)
     expected = np.zeros(6 * (F + M))
     expected[free] = np.linalg.solve(H[np.ix_(free, free)], g[free])
-    blocks, *sides = problem._normal(e, 1.0)
+    blocks, *sides = problem.normal(e, 1.0)
     system = problem.equations.reduced(blocks)
     frames, markers = system.solve(*sides)
     # Two ways of solving one system of condition 1e8.

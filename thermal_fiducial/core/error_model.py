@@ -52,8 +52,6 @@ NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0)
 MAP_COMMON = 0.75
 #: Poses of the odometry in succession are wrong alike: so many are worth one, as its errors last for seconds.
 CORRELATED_ODOMETRY = 30.0
-#: Share of the variance of the odometry's error that is new in each view of a marker: the rest is common to all views.
-ODOMETRY_SHARE_NEW = 0.25
 #: However uncertain odometry says it is, it is no worse than this while it agrees with the markers [m, rad].
 ODOMETRY_AT_WORST = np.repeat([0.3, 0.2], 3)
 #: Re-projection error to allow for before a marker counts as inconsistent [px]: bent plates, and the corners' bias.
@@ -195,11 +193,6 @@ def map_weights(pixels: FloatArray, noise: FloatArray, errors: SystematicErrors)
 def alike_odometry(covariance: FloatArray) -> FloatArray:
     """Covariance (6, 6) of one of many poses by the odometry whose errors are the same for seconds."""
     return CORRELATED_ODOMETRY * covariance
-
-
-def split_odometry(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The part of odometry's covariance (6, 6) that is new in each view of a marker, and that common to all."""
-    return ODOMETRY_SHARE_NEW * covariance, (1.0 - ODOMETRY_SHARE_NEW) * covariance
 
 
 def bounded_odometry(covariance: FloatArray) -> FloatArray:

@@ -4,7 +4,8 @@ Poses near the robot move like the localization of its last frames: the same cor
 new one. Where fixed markers alone carry it nothing moves, however much the adjustment has changed its mind about where
 the frames were taken. A filter that the new map does not contradict is left alone: it never stood on what was poorly
 known, and weighs what it knows from gravity and inertia against the poses that follow. Else it gets the share of the
-movement that brings it nearest to where the new map has those frames.
+movement that brings it nearest to where the new map has those frames. Poses of older frames that are still to come
+belong to the old map.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,6 +25,7 @@ from thermal_fiducial.core.geometry.reprojection import (
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.keyframes import Keyframe
 from thermal_fiducial.core.mapping.map_data import MapMarker
+from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
 #: Squared distance (6 degrees of freedom) beyond which the filter would not follow the new map by itself.
@@ -112,3 +114,27 @@ def _located(
     T, _ = fit_pose(frame.T_map_rig, evaluate)
     J = evaluate(T)[1]
     return T, np.asarray(J.T @ J, dtype=np.float64)
+
+
+class LatePoses:
+    """Poses of frames that arrive after the map has moved: in the map that their stamp stands for."""
+
+    def __init__(self) -> None:
+        #: stamp of the newest frame so far
+        self.newest_ns = 0
+        self._moved_ns = 0
+        self._T_new_old: FloatArray = np.eye(4)
+
+    def add(self, stamp_ns: int) -> None:
+        """Take in the stamp of a frame; one of long before is that of a clock that was set back."""
+        self.newest_ns = max(stamp_ns, self.newest_ns) if stamp_ns >= self.newest_ns - LATEST_NS else stamp_ns
+
+    def moved(self, T_new_old: FloatArray) -> None:
+        """The map has moved by (4, 4), after the newest frame."""
+        self._moved_ns, self._T_new_old = self.newest_ns, T_new_old
+
+    def as_of_its_stamp(self, pose: CameraPose) -> CameraPose:
+        """``pose``, found in the map of now, in the map of its stamp."""
+        if 0 <= self._moved_ns - pose.stamp_ns <= LATEST_NS:
+            return in_moved_map(pose, inverse(self._T_new_old))
+        return pose

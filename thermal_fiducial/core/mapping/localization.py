@@ -4,17 +4,16 @@ S. Khattak, C. Papachristos, K. Alexis, "Marker based thermal-inertial localizat
 filled environments", ISVC 2018.
 """
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 
 from thermal_fiducial.core.error_model import (
     corners_of_pose,
     correlated_sum,
+    INCONSISTENT_PX,
     map_of_pose,
     map_weights,
-    positive,
     scale_of_pose,
     SystematicErrors,
     visible_share,
@@ -24,7 +23,6 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.fitting import fit_pose
 from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
 from thermal_fiducial.core.geometry.reprojection import (
-    corners_in_map,
     corners_of,
     difference,
     linearise,
@@ -32,8 +30,8 @@ from thermal_fiducial.core.geometry.reprojection import (
     whitening,
 )
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
-from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.mapping.located import Location, PoseErrors, Refusal, Sight
+from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
 #: Difference of chi square that refutes the worse of two poses: odds of e^-10.
@@ -46,97 +44,6 @@ WIDE = np.deg2rad(25.0)
 _HYPOTHESIS_PX = 3.0
 # Markers that propose hypotheses: with many in view the largest are precise enough, and the rest only votes.
 _PROPOSERS = 6
-
-
-@dataclass(frozen=True)
-class Sight:
-    """The known markers of one frame, N of them."""
-
-    markers: list[MapMarker]
-    #: (N, 4, 2) [px]
-    corners: FloatArray
-    #: (N, 4, 2, 2) [px^2]
-    covariances: FloatArray
-    #: (N, 2, 4, 4) both branches of T_camera_marker, NaN where there is none
-    branches: FloatArray
-
-    def select(self, chosen: BoolArray) -> 'Sight':
-        """The chosen (N,) markers alone."""
-        markers = [marker for marker, keep in zip(self.markers, chosen, strict=True) if keep]
-        return Sight(markers, self.corners[chosen], self.covariances[chosen], self.branches[chosen])
-
-    @cached_property
-    def T_map_marker(self) -> FloatArray:
-        """(N, 4, 4)."""
-        return np.stack([marker.T_map_marker for marker in self.markers])
-
-    @cached_property
-    def sizes(self) -> FloatArray:
-        """(N,) [m]."""
-        return np.array([marker.size for marker in self.markers])
-
-    @cached_property
-    def points(self) -> FloatArray:
-        """(N, 4, 3) corners in the map [m]."""
-        return corners_in_map(self.T_map_marker, self.sizes)
-
-    @cached_property
-    def map_covariances(self) -> FloatArray:
-        """(N, 6, 6) of the markers' poses in the map."""
-        return np.stack([marker.covariance for marker in self.markers])
-
-    @cached_property
-    def relative_covariances(self) -> FloatArray:
-        """(N, 6, 6) the same without what the best-known one is uncertain by: the error that all of them share."""
-        covariances = self.map_covariances
-        best = covariances[np.argmin(np.trace(covariances, axis1=1, axis2=2))]
-        return positive(covariances - best)
-
-
-@dataclass(frozen=True)
-class PoseErrors:
-    """Covariances (6, 6) of a camera pose, ROS convention, by where its errors come from."""
-
-    #: noise of the corners, new in each frame
-    white: FloatArray
-    #: the map, the scale, the lens and the bias of the corners: as good as the same in the frames that follow
-    systematic: FloatArray
-    #: noise, and the map without the error that all markers in view share: how well it is placed among them
-    relative: FloatArray
-    #: share of the variance of the corners' systematic errors that the residuals show: the pose takes up the rest
-    visible: float = 0.0
-
-
-@dataclass(frozen=True)
-class Location:
-    """Where the camera is."""
-
-    T_map_camera: FloatArray
-    errors: PoseErrors
-    #: (N,) weights of the markers, 1 for one as good as the rest
-    weights: FloatArray
-    #: (N, 4, 2) measured minus predicted [px]
-    residuals: FloatArray
-
-    @property
-    def rms_px(self) -> float:
-        """Re-projection error, rms over the corners [px]."""
-        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=-1))))
-
-    @property
-    def covariance(self) -> FloatArray:
-        """(6, 6), ROS convention, of all errors together."""
-        return self.errors.white + self.errors.systematic
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """Why nobody knows where the camera is, in words."""
-
-    reason: str
-    #: (2, 4, 4) the two poses of an unsettled ambiguity, where it is that, and (2, 6, 6) their covariances
-    alternatives: FloatArray | None = None
-    covariances: FloatArray | None = None
 
 
 def locate(
@@ -308,3 +215,22 @@ def _distance(T: FloatArray, prior: FloatArray) -> float:
 def _names(sight: Sight) -> str:
     ids = [marker.id for marker in sight.markers]
     return f'marker {ids[0]}' if len(ids) == 1 else 'markers ' + ', '.join(str(i) for i in ids)
+
+
+def reprojection_errors(sight: Sight, camera: Camera, T_map_camera: FloatArray) -> FloatArray:
+    """Rms error (N,) [px] of each marker; that of one behind the camera is the image's width."""
+    residuals = sight.corners - reproject(camera, T_map_camera, sight.points)
+    squared = np.mean(np.sum(residuals**2, axis=-1), axis=-1)
+    return np.sqrt(np.where(np.isfinite(squared), squared, float(camera.width) ** 2))
+
+
+def expected_errors(sight: Sight, location: Location, camera: Camera) -> FloatArray:
+    """Rms error (N,) [px] that the noise, the pose and the map's own uncertainty explain."""
+    n = len(sight.markers)
+    T = np.broadcast_to(location.T_map_camera, (n, 4, 4))
+    _, J_camera, J_marker = linearise(camera, T, sight.T_map_marker, sight.sizes)
+    noise = np.trace(sight.covariances, axis1=-2, axis2=-1).sum(axis=-1)
+    pose = np.sum(J_camera @ location.covariance * J_camera, axis=(1, 2))
+    marker = np.sum(J_marker @ sight.map_covariances * J_marker, axis=(1, 2))
+    variance = 0.25 * (noise + pose + marker)
+    return np.asarray(np.sqrt(np.nan_to_num(variance) + INCONSISTENT_PX**2))

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import bounded_odometry, positive, split_odometry
-from thermal_fiducial.core.geometry.reprojection import difference, retract
-from thermal_fiducial.core.mapping.bridging import camera_pose
-from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.error_model import bounded_odometry, positive
+from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.geometry.se3 import skew, so3_exp, transform
+from thermal_fiducial.core.measurements import CameraPose, Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray
 
@@ -57,39 +57,20 @@ def predicted_camera(
     return PredictedCamera(pose, turn @ odometry.twist_covariance @ turn.T)
 
 
-@dataclass(frozen=True)
-class Fused:
-    """A camera pose from markers and odometry together."""
-
-    T_map_camera: FloatArray
-    #: (6, 6) ROS convention, of white errors, new in each frame, and of systematic ones
-    white: FloatArray
-    systematic: FloatArray
+def camera_pose(odometry: Odometry, stamp_ns: int, T_body_camera: FloatArray) -> CameraPose:
+    """The camera where the odometry, its velocities constant, has it at ``stamp_ns``, with its covariance."""
+    dt = (stamp_ns - odometry.stamp_ns) * 1e-9
+    step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
+    T_map_body = odometry.T_map_body @ step
+    A = np.eye(6)
+    A[:3, 3:] = -skew(T_map_body[:3, :3] @ T_body_camera[:3, 3])
+    return CameraPose(stamp_ns, T_map_body @ T_body_camera, A @ odometry.pose_covariance @ A.T)
 
 
 def contradicts(T_map_camera: FloatArray, covariance: FloatArray, odometry: CameraPose) -> bool:
     """Whether a camera pose (4, 4) from markers is where odometry cannot be, even odometry that is in doubt itself."""
     apart = difference(odometry.T_map_camera, T_map_camera)
     return bool(apart @ np.linalg.solve(covariance + bounded_odometry(odometry.covariance), apart) > CONTRADICTION)
-
-
-def together(T_map_camera: FloatArray, white: FloatArray, systematic: FloatArray, odometry: CameraPose) -> Fused:
-    """The pose (4, 4) from the markers of a frame and that from the odometry, each by what it is worth.
-
-    Markers alone count where the odometry contradicts them: it is lost, or in another map.
-    """
-    P = odometry.covariance
-    apart = difference(odometry.T_map_camera, T_map_camera)
-    if apart @ np.linalg.solve(white + systematic + P, apart) > CONTRADICTION:
-        return Fused(T_map_camera, white, systematic)
-    gain = np.linalg.solve(white + systematic + P, white + systematic).T
-    rest = np.eye(6) - gain
-    new, common = split_odometry(gain @ P @ gain.T)
-    return Fused(
-        np.asarray(retract(T_map_camera, gain @ apart)),
-        rest @ white @ rest.T + new,
-        rest @ systematic @ rest.T + common,
-    )
 
 
 def growth(first: CameraPose, predicted: PredictedCamera) -> FloatArray:

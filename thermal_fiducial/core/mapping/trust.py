@@ -4,13 +4,15 @@ A marker that was moved, hangs twice, or was put in the map wrongly re-projects 
 others. One bad frame is an outlier; most of a second of them is a fact about the marker.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from thermal_fiducial.core.mapping.map_data import MapMarker
 
+#: Why a marker is in quarantine that came so with the map.
+FROM_FILE = 'in quarantine since before the map was loaded'
 #: Weight of a new frame in the running error and in the share of disagreeing frames: a memory of 20 frames.
 MEMORY = 0.05
 #: Share of disagreeing frames that puts a marker in quarantine, and the share below which it comes out again.
@@ -31,6 +33,19 @@ class Trust:
 
     def __init__(self) -> None:
         self._records: dict[int, _Record] = {}
+        #: markers in quarantine, each with the reason in words
+        self.quarantined: dict[int, str] = {}
+
+    def start(self, markers: Mapping[int, MapMarker]) -> None:
+        """Take over the standings of a map."""
+        self.quarantined = {key: FROM_FILE for key, marker in markers.items() if not marker.trusted}
+
+    def set_standing(self, markers: dict[int, MapMarker], marker_id: int, reason: str) -> None:
+        """Trust one of ``markers`` again, or put it in quarantine for a reason."""
+        markers[marker_id] = replace(markers[marker_id], trusted=not reason)
+        self.quarantined.pop(marker_id, None)
+        if reason:
+            self.quarantined[marker_id] = reason
 
     def running_errors(self, markers: Iterable[MapMarker]) -> np.ndarray:
         """Running rms re-projection error of each of ``markers`` [px]."""

@@ -1,0 +1,132 @@
+"""Frames that the mapper remembers: keyframes for the refinement, and the last ones, which show where it is now."""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from thermal_fiducial.core.error_model import alike_odometry, SystematicErrors
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap
+from thermal_fiducial.core.mapping.correction import correction
+from thermal_fiducial.core.mapping.keyframes import CameraRig, Displacement, Keyframe, KeyframeStore
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.odometry_prior import PredictedCamera
+from thermal_fiducial.core.mapping.snapshot import prior_poses, Snapshot
+from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers
+from thermal_fiducial.core.types import FloatArray
+
+# Last frames that show how the map has moved where the robot is, each so many-th of them: neighbours show the same.
+_RECENT, _EVERY = 10, 3
+# A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
+_GROWTH, _FEW = 0.2, 15
+#: Views of markers that a refinement in flight takes: a second or two of a slow core.
+VIEWS = 10_000
+# Time between two refinements for each view of the last [s]: a view takes a third of it on a slow core. With three
+# times as much, poses from markers just placed along a chain were too vague to publish: 19 of 633 over a carpet.
+_PERIOD_A_VIEW = 3e-4
+
+
+class FrameMemory:
+    """What was seen where.
+
+    Parameters
+    ----------
+    budget : keyframes at most
+    marker_map : the map to begin with
+    """
+
+    def __init__(self, budget: int, marker_map: MarkerMap) -> None:
+        self._keyframes = KeyframeStore(budget)
+        self._cameras: list[Camera] = []
+        #: what the map learned from last; None: nothing yet
+        self.last: Keyframe | None = None
+        self._recent: deque[Keyframe] = deque(maxlen=_RECENT)
+        self._belief: FloatArray | None = None
+        self._priors = prior_poses(marker_map.markers)
+        self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(marker_map.markers)
+        self._added_then, self._refined_views = 0, 0
+
+    def keep(self, rows: Markers, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> None:
+        """Keep a frame whose camera is known; of one marker alone a refinement can learn nothing."""
+        self.last = keyframe = self._keyframe(rows, pose, camera, predicted)
+        self._belief = None if predicted is None else predicted.pose.covariance
+        self._recent.append(keyframe)
+        if len(rows) >= 2:
+            self._keyframes.add(keyframe)
+
+    def bridge(self, rows: Markers, camera: Camera, predicted: PredictedCamera, *, first: bool) -> None:
+        """Keep a frame without a known marker.
+
+        Nothing but the odometry joins its markers to the map. Once, for the ``first`` of them, that counts in full: its
+        error is the same for all that follow, which hang together through the markers themselves.
+        """
+        keyframe = self._keyframe(rows, predicted.pose, camera, predicted)
+        if first:
+            information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)
+            self._keyframes.bridges.add(keyframe.stamp_ns)
+            self._keyframes.add(replace(keyframe, information=information))
+        elif len(rows) >= 2:
+            self._keyframes.add(keyframe)
+
+    def refinement_due(self, stamp_ns: int, period: float, markers: int) -> bool:
+        """Whether a refinement is worth its time, ``period`` [s] after the last or more, for so many markers."""
+        if not self._keyframes.frames or period == 0.0:
+            return False
+        if stamp_ns - self._refined_ns < max(period, _PERIOD_A_VIEW * self._refined_views) * 1e9:
+            return False
+        enough = self._keyframes.added - self._added_then >= _GROWTH * self._refined_frames + _FEW
+        return enough or markers > self._refined_markers
+
+    def snapshot(self, marker_map: MarkerMap, errors: SystematicErrors, views: int) -> Snapshot | None:
+        """What a refinement works on, with about so many views of markers at most; None: nothing yet."""
+        if not self._keyframes.frames:
+            return None
+        frames = self._keyframes.selected(views)
+        self._refined_ns = next(reversed(self._keyframes.frames))
+        self._refined_frames, self._refined_markers = len(self._keyframes.frames), len(marker_map.markers)
+        self._refined_views = sum(len(frame.ids) for frame in frames)
+        self._added_then = self._keyframes.added
+        return Snapshot(
+            {key: marker for key, marker in marker_map.markers.items() if marker.trusted},
+            frames,
+            CameraRig(tuple(self._cameras), np.broadcast_to(np.eye(4), (len(self._cameras), 4, 4))),
+            self._priors,
+            marker_map.revision,
+            errors,
+        )
+
+    def move(
+        self, refinement: AdjustedMap, before: Mapping[int, MapMarker], now: Mapping[int, MapMarker]
+    ) -> tuple[Displacement, FloatArray]:
+        """Go along with a refinement: how the map has moved at each time, and T_new_old (4, 4) where the robot is."""
+        displacement = self._keyframes.move(refinement.keyframes)
+        if self.last is None:
+            return displacement, np.eye(4)
+        T_new_old = correction(tuple(self._recent)[::_EVERY], self._cameras, before, now, self._belief)
+        self._recent = deque((frame.moved(T_new_old) for frame in self._recent), maxlen=_RECENT)
+        self.last = self.last.moved(T_new_old)
+        return displacement, T_new_old
+
+    def _keyframe(self, rows: Markers, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> Keyframe:
+        frame = Keyframe(
+            pose.stamp_ns,
+            pose.T_map_camera,
+            rows['id'].astype(np.int64),
+            corners_px(rows),
+            corner_covariances(rows),
+            np.full(len(rows), self._index(camera)),
+        )
+        if predicted is None:
+            return frame
+        information = np.asarray(np.linalg.inv(alike_odometry(predicted.pose.covariance)), dtype=np.float64)
+        return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)
+
+    def _index(self, camera: Camera) -> int:
+        """Index of ``camera`` among those seen so far: a calibration may change, or frames of several cameras come."""
+        for index, known in enumerate(self._cameras):
+            if camera is known or camera.matches(known):
+                return index
+        self._cameras.append(camera)
+        return len(self._cameras) - 1
