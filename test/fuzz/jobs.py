@@ -23,7 +23,9 @@ def batch(target: str, numbers: range, note: str) -> list[Finding]:
 
 
 def _noted(note: str, text: str) -> None:
-    Path(note).write_text(text)
+    # Whole at any instant: a process ends when another beside it has died.
+    Path(f'{note}.new').write_text(text)
+    Path(f'{note}.new').replace(note)
 
 
 def batches(target: str, first: int, count: int) -> list[tuple[str, range]]:

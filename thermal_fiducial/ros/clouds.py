@@ -94,16 +94,15 @@ def cloud_rows(message: PointCloud2, dtype: 'np.dtype[Any]', optional: Iterable[
 
 
 def _source_dtype(message: PointCloud2, fields: list[PointField]) -> 'np.dtype[Any]':
-    order = '>' if message.is_bigendian else '<'
+    order, step = '>' if message.is_bigendian else '<', int(message.point_step)
     try:
-        return np.dtype(
-            {
-                'names': [field.name for field in fields],
-                'formats': [order + _POINT_TYPES[field.datatype] for field in fields],
-                'offsets': [field.offset for field in fields],
-                'itemsize': message.point_step,
-            }
-        )
+        formats = [np.dtype(order + _POINT_TYPES[field.datatype]) for field in fields]
+        # numpy adds them as numbers of 32 bits, and reads outside the points where the sum passes those.
+        if any(field.offset + kind.itemsize > step for field, kind in zip(fields, formats, strict=True)):
+            raise ValueError
+        offsets = [field.offset for field in fields]
+        names = [field.name for field in fields]
+        return np.dtype({'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': step})
     except (KeyError, ValueError, OverflowError):
         raise InputError(f'cloud with fields outside its points of {message.point_step} bytes') from None
 
