@@ -8,7 +8,7 @@ from rich.console import Console
 from thermal_fiducial.cli import progress
 from thermal_fiducial.cli import terminal_tables as tables
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.cli.progress import LINE_EVERY_S, progress_bar
+from thermal_fiducial.cli.progress import counted, LINE_EVERY_S, progress_bar
 
 
 class Clock:
@@ -32,6 +32,17 @@ def test_progress_is_a_line_every_few_seconds_without_a_terminal(capsys, monkeyp
     # Eleven seconds.
     assert len(lines) == int(11.0 / LINE_EVERY_S)
     assert lines[0] == 'replay hall: markers, 45 %'
+
+
+def test_pieces_are_counted(capsys, monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(progress, 'time', clock)
+    with progress_bar('wall, 20 s') as show:
+        advance = counted(show, 600)
+        advance(100)
+        clock.now += LINE_EVERY_S
+        advance(200)
+    assert capsys.readouterr().err == 'wall, 20 s: 50 %\n'
 
 
 def test_short_work_says_nothing_without_a_terminal(capsys):

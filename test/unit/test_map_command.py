@@ -1,5 +1,8 @@
 """The map command: every action on small files."""
 
+from itertools import pairwise
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 import numpy as np
 import pytest
 from support.walls import CAMERA, flight, see, SIZE, stamp, wall
@@ -291,3 +294,17 @@ def test_the_drawing_shows_the_faces_as_the_camera_sees_them(poses, turn, invert
     front = draw_map(MarkerMap(markers)).axes[2]
     assert front.xaxis_inverted() == inverted
     assert ('along x' in front.get_title()) == inverted
+
+
+def test_labels_of_a_drawing_of_one_wall_stand_apart(poses):
+    # Eight markers over 6 m, 12 cm out of their plane: seen from the side they are a line.
+    places = [[4.0 + 0.017 * k, 0.9 * k - 3.0, 0.2 * k] for k in range(8)]
+    markers = {k: MapMarker(k, 0.3, True, transform(poses[2][:3, :3], place)) for k, place in enumerate(places)}
+    figure = draw_map(MarkerMap(markers))
+    FigureCanvasAgg(figure).draw()
+    for axis in figure.axes:
+        boxes = [label.get_window_extent() for label in axis.get_xticklabels() if label.get_text()]
+        low, high = axis.get_window_extent().intervalx
+        shown = sorted((box for box in boxes if low <= box.x0 + box.width / 2 <= high), key=lambda box: box.x0)
+        assert shown
+        assert all(left.x1 < right.x0 for left, right in pairwise(shown))

@@ -9,7 +9,7 @@ import time
 from typing import Any
 
 from thermal_fiducial.cli.evaluate import make_video, print_tables
-from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.page import evaluate_run, Evaluation, require_packages, write_page
 from thermal_fiducial.report.tables import tables
@@ -76,14 +76,7 @@ def _simulate(bag: Path, seconds: float, seed: int) -> None:
 
     flight = plan(SCENARIO, seconds, seed)
     with _step(f'1/3 simulating {flight.seconds:g} s of flight') as share:
-        done = 0
-
-        def advance(frames: int) -> None:
-            nonlocal done
-            done += frames
-            share(min(1.0, done / flight.frame_count))
-
-        write_flight(bag, flight, workers=len(os.sched_getaffinity(0)), progress=advance)
+        write_flight(bag, flight, workers=len(os.sched_getaffinity(0)), progress=counted(share, flight.frame_count))
 
 
 def _replay(bag: Path, out: Path) -> None:

@@ -6,6 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
+from matplotlib.ticker import MaxNLocator
 import numpy as np
 
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
@@ -18,6 +19,8 @@ _VIEWS = (('from above', 0, 1), ('from the side, along y', 0, 2))
 _STANDINGS = {'fixed': 'black', 'free': 'tab:blue', 'in quarantine': 'tab:red'}
 #: Millimetres would not be seen in a drawing of metres.
 _ENLARGED = 20.0
+#: Along the whole width of a view, of labels of four digits.
+_MOST_TICKS = 7
 
 
 def plot_map(marker_map: MarkerMap, path: Path, cloud: FloatArray | None = None) -> None:
@@ -46,12 +49,20 @@ def draw_map(marker_map: MarkerMap, cloud: FloatArray | None = None) -> Figure:
             _draw(axis, marker, i, j)
         axis.set(title=title, xlabel=f'{"xyz"[i]} [m]', ylabel=f'{"xyz"[j]} [m]', aspect='equal')
         axis.grid(alpha=0.3)
+        _space_ticks(axis)
         if title.endswith('along x'):
             axis.invert_xaxis()  # y points to the left of whoever looks along x
     handles = [Line2D([], [], color=colour, label=standing) for standing, colour in _STANDINGS.items()]
     title = f'{len(marker_map.markers)} markers, normals, ellipses of three sigma enlarged {_ENLARGED:g} times'
     figure.legend(handles=handles, title=title, loc='outside lower center', ncols=len(handles))
     return figure
+
+
+def _space_ticks(axis: Axes) -> None:
+    """Have labels stand apart along an axis that is short, as the one across a wall is."""
+    low, high = axis.get_xlim()
+    share = (high - low) / max(np.ptp(axis.get_ylim()), high - low)
+    axis.xaxis.set_major_locator(MaxNLocator(nbins=max(1, int(_MOST_TICKS * share)), min_n_ticks=1))
 
 
 def _front(marker_map: MarkerMap) -> str:

@@ -1,6 +1,6 @@
 """How far long work has come: a bar on a terminal, a line every few seconds anywhere else."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 import sys
 import time
@@ -37,6 +37,18 @@ def progress_bar(title: str) -> Iterator[ShowProgress]:
             bar.update(task, completed=share, total=total, description=f'{title}: {note}' if note else title)
 
         yield update
+
+
+def counted(show: ShowProgress, total: int) -> Callable[[int], None]:
+    """What takes how many of ``total`` pieces are done since it was called last."""
+    done = 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        show(min(1.0, done / total))
+
+    return advance
 
 
 def _lines(title: str) -> ShowProgress:

@@ -2,13 +2,10 @@
 
 import argparse
 from dataclasses import replace
-from functools import partial
 import os
 from pathlib import Path
 
-from rich.console import Console
-from rich.progress import Progress, TimeElapsedColumn
-
+from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.cli.simulate_corners import write_corner_flight
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import STORAGES
@@ -64,15 +61,12 @@ def run(args: argparse.Namespace) -> int:
             raise InputError(f'--{name.replace("_", "-")} {value} is outside {low} .. {high}')
     scenario = _scenario(args)
     flight = plan(scenario, args.seconds, args.seed)
-    console = Console(stderr=True)
-    with Progress(*Progress.get_default_columns(), TimeElapsedColumn(), console=console) as progress:
-        task = progress.add_task(f'{scenario.name}, {flight.seconds:g} s', total=flight.frame_count)
-        advance = partial(progress.advance, task)
+    with progress_bar(f'{scenario.name}, {flight.seconds:g} s') as show:
+        advance = counted(show, flight.frame_count)
         if scenario.corner_noise is None:
             write_flight(args.out, flight, args.storage, args.workers, advance)
         else:
             write_corner_flight(args.out, flight, scenario.corner_noise, args.storage, advance)
-        progress.update(task, completed=flight.frame_count)
     print(_summary(args.out, flight))
     return 0
 
