@@ -52,3 +52,70 @@ def test_late_poses_are_no_step(late):
     # Beyond ``max_delay`` they are refused, and the filter coasts for two and a half seconds.
     assert off.max() < (0.05 if late < 1.0 else 0.5)
     assert abs(ekf.camera_time_offset or 0.0) < 0.02
+
+
+def flown_by_a_stepping_imu(step):
+    """Filter, output with the time at which each sample was taken, and flight: the IMU's clock steps at ``AT``."""
+    flight = Flight(seed=3, seconds=5.0)
+    arrivals = [(pose.stamp_ns + round(1e9 * LATE), 1, pose) for pose in flight.poses]
+    for sample in flight.samples():
+        later = sample.stamp_ns - START_NS >= AT * 1e9
+        arrivals.append((sample.stamp_ns, 0, replace(sample, stamp_ns=sample.stamp_ns + round(1e9 * step * later))))
+    ekf, output = PoseEkf(config()), []
+    for taken_ns, _, item in sorted(arrivals, key=lambda entry: entry[:2]):
+        if isinstance(item, ImuSample):
+            state = ekf.add_imu(item)
+            output += [replace(state, stamp_ns=taken_ns)] if state and not ekf.lost else []
+        else:
+            ekf.add_pose(item)
+    return ekf, output, flight
+
+
+@pytest.mark.parametrize('step', [-0.2, 0.2, 0.5, 3600.0, -3600.0])
+def test_a_step_of_the_clock_of_the_imu_is_followed(step):
+    ekf, output, flight = flown_by_a_stepping_imu(step)
+    # Half a second for ten samples, five poses, and as many to begin with as a start needs.
+    off, _ = errors(flight, output, AT + 0.5)
+    assert len(off) > 0.95 * 2.0 * 200.0
+    # One marker at 2 m, a filter of half a second: 2 cm rms.
+    assert off.max() < 0.1
+    assert ekf.camera_time_offset is None or ekf.camera_time_offset == pytest.approx(step, abs=0.01)
+    assert ekf.reset_reason == "the IMU's clock has jumped"
+
+
+def test_all_clocks_may_step():
+    flight = Flight(seed=3, seconds=5.0)
+    hour_ns = 3_600_000_000_000
+    arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
+    arrivals += [(pose.stamp_ns + round(1e9 * LATE), 1, pose) for pose in flight.poses]
+    ekf, output = PoseEkf(config()), []
+    for time_ns, kind, item in sorted(arrivals, key=lambda entry: entry[:2]):
+        later = time_ns - START_NS >= AT * 1e9
+        stepped = replace(item, stamp_ns=item.stamp_ns + hour_ns * later)
+        if kind:
+            ekf.add_pose(stepped)
+        elif (state := ekf.add_imu(stepped)) is not None:
+            output.append(replace(state, stamp_ns=time_ns))
+    off, _ = errors(flight, output, AT + 0.5)
+    assert off.max() < 0.1
+    assert abs(ekf.camera_time_offset or 0.0) < 0.01
+
+
+def test_one_stamp_of_the_imu_half_a_second_ahead_costs_one_sample():
+    flight = Flight(seed=3, seconds=3.0)
+    arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
+    arrivals += [(pose.stamp_ns + round(1e9 * LATE), 1, pose) for pose in flight.poses]
+    bad = flight.samples()[500]
+    ekf, output = PoseEkf(config()), []
+    for _, kind, item in sorted(arrivals, key=lambda entry: entry[:2]):
+        if kind:
+            ekf.add_pose(item)
+            continue
+        ahead = replace(item, stamp_ns=item.stamp_ns + 500_000_000) if item.stamp_ns == bad.stamp_ns else item
+        state = ekf.add_imu(ahead)
+        assert state is not None or item.stamp_ns == bad.stamp_ns or not output
+        output += [state] if state else []
+    off, _ = errors(flight, output, 2.0)
+    # as good as without it: one marker at 2 m
+    assert off.max() < 0.05
+    assert ekf.resets == 0

@@ -2,6 +2,8 @@
 
 How late a pose arrives by its stamp says nothing about a clock by itself, as a pipeline may stall. So a step is only
 proposed here, when several poses agree on it; it is one if poses that contradict the estimate fit it then.
+
+A step of the IMU's clock shows as one of the camera's: it is known by the IMU's own stamps, which jumped by as much.
 """
 
 from collections import deque
@@ -15,6 +17,8 @@ from thermal_fiducial.core.measurements import CameraPose
 _SMALLEST_NS = 100_000_000
 #: Poses in a row that must agree on a step, to this [ns], and those that say what was usual before.
 _POSES, _AGREEMENT_NS, _USUAL = 5, 50_000_000, 30
+#: So many poses that arrive unlike those before a jump of the IMU's stamps wait for an explanation.
+_PATIENCE = 15
 
 
 class CameraClock:
@@ -25,6 +29,21 @@ class CameraClock:
         self.ahead_ns = 0
         self._usual: deque[int] = deque(maxlen=_USUAL)
         self._latest: deque[tuple[int, int]] = deque(maxlen=_POSES)
+        self._imu_jump_ns = 0
+        self._waited = 0
+
+    def imu_jumped(self, jump_ns: int) -> None:
+        """Take note that the stamps of the IMU jumped [ns]: they missed samples, or their clock stepped."""
+        self._imu_jump_ns, self._waited = jump_ns, 0
+
+    @property
+    def in_question(self) -> bool:
+        """Whether poses since a jump of the IMU's stamps came unlike those before, and nothing says why."""
+        return self._imu_jump_ns != 0 and 0 < self._waited < _PATIENCE
+
+    def is_of_imu(self, step_ns: int) -> bool:
+        """Whether what looks like a step of the camera's clock is one of the IMU's."""
+        return self._imu_jump_ns != 0 and abs(step_ns + self._imu_jump_ns) < _AGREEMENT_NS
 
     def stamped(self, pose: CameraPose) -> CameraPose:
         """``pose`` with the stamp that it had without the steps."""
@@ -39,7 +58,9 @@ class CameraClock:
         if len(self._usual) < _USUAL or abs(late_ns - median(self._usual)) < _SMALLEST_NS:
             self._usual.append(late_ns)
             self._latest.clear()
+            self._imu_jump_ns = 0
             return 0
+        self._waited += 1
         self._latest.append((pose.stamp_ns, late_ns))
         delays = [delay for _, delay in self._latest]
         if len(delays) < _POSES or max(delays) - min(delays) > _AGREEMENT_NS:
@@ -51,4 +72,5 @@ class CameraClock:
         self.ahead_ns += step_ns
         wrong = [stamp for stamp, _ in self._latest]
         self._latest.clear()
+        self._imu_jump_ns = 0
         return wrong

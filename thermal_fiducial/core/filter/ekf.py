@@ -24,6 +24,8 @@ from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
 from thermal_fiducial.core.types import FloatArray
 
 _SECOND_NS = 1_000_000_000
+#: Why the filter begins anew, or a pose has to wait.
+CLOCK_JUMPED = "the IMU's clock has jumped"
 #: An offset known to this [s] moves a marker by a pixel or two in the fastest flights.
 _KNOWN_OFFSET_STD = 0.003
 #: Poses over which the normalised innovation squared is averaged for the diagnostics.
@@ -54,6 +56,7 @@ class PoseEkf:
         self._hypotheses = Hypotheses(config)
         self._imu_refused = 0
         self._input = ImuInput(config.max_imu_gap, config.imu.gyroscope_range, config.imu.accelerometer_range)
+        self._camera_clock = CameraClock()
         self._begin()
 
     def _begin(self) -> None:
@@ -61,7 +64,6 @@ class PoseEkf:
         self._noise = ImuNoiseMonitor(config.imu)
         offset_ns = round(config.camera_time_offset * _SECOND_NS)
         self._history = History(config.max_delay + WINDOW_SECONDS, offset_ns)
-        self._camera_clock = CameraClock()
         self._verdicts: dict[int, PoseUpdate] = {}
         self._accepted = self._refused = 0
         self._imu_fault = ''
@@ -81,12 +83,14 @@ class PoseEkf:
         """
         verdict = self._input.judge(sample)
         if verdict is Verdict.RESTART:
-            self._restart_reason = "the IMU's clock has jumped"
+            self._restart_reason = CLOCK_JUMPED
             self._begin()
         self._imu_fault = verdict.value
         if verdict not in (Verdict.USE, Verdict.RESTART):
             self._imu_refused += 1
             return None
+        if self._input.jump_ns:
+            self._camera_clock.imu_jumped(self._input.jump_ns)
         imu = np.concatenate((sample.angular_velocity, sample.linear_acceleration))
         nodes = self._history.nodes
         if not nodes:
@@ -106,6 +110,8 @@ class PoseEkf:
         ``pose.stamp_ns`` is the camera's stamp; ``camera_time_offset`` and the estimated rest are applied here.
         """
         pose = self._in_present_clock(pose)
+        if self._belief.main is None and self._camera_clock.in_question:
+            return PoseUpdate(pose.stamp_ns, False, CLOCK_JUMPED, np.nan)
         reason = self._unusable(pose)
         if reason:
             return PoseUpdate(pose.stamp_ns, False, reason, np.nan)
@@ -124,6 +130,12 @@ class PoseEkf:
             return pose
         step_ns = self._camera_clock.proposed(pose, history.nodes[-1].stamp_ns)
         restamped = replace(pose, stamp_ns=pose.stamp_ns - step_ns)
+        if step_ns and self._camera_clock.is_of_imu(step_ns):
+            # All since then was propagated over time that never was.
+            self._camera_clock.follow(step_ns)
+            self._restart_reason = CLOCK_JUMPED
+            self._begin()
+            return restamped
         if not step_ns or not self._contradicts(pose) or not self._fits(restamped):
             return pose
         self._advance_from(history.discard(self._camera_clock.follow(step_ns)))

@@ -6,8 +6,11 @@ import numpy as np
 
 from thermal_fiducial.core.measurements import ImuSample
 
-#: So many samples in a row must agree with each other on a new clock before it is believed [samples].
-CLOCK_EVIDENCE = 10
+#: So many samples in a row must agree on a new clock before it is believed; on the end of a gap.
+CLOCK_EVIDENCE, GAP_EVIDENCE = 10, 2
+#: A step is unusual if it is so many times longer than the longest of late, and than this [ns]; how much of the longest
+#: is kept from sample to sample: half of it for 140 samples.
+UNUSUAL_FACTOR, UNUSUAL_NS, KEPT = 3.0, 30_000_000, 0.995
 #: A sensor saturates at its full scale; a reading so many times as large is a broken message.
 IMPOSSIBLE_RANGES = 2.0
 #: Noise makes no two samples equal, coarse quantisation of a still sensor a few: equal ones for so long [s], and
@@ -31,8 +34,9 @@ class Verdict(Enum):
 class ImuInput:
     """Judges samples one by one.
 
-    A stamp out of line is refused, as it may be a single bad one. When the stamps go on from there, the clock was
-    set, the bag restarted, or the IMU was away: then everything begins anew.
+    A stamp out of line is refused, as it may be a single bad one. When the stamps go on from there, it was the end of a
+    gap, or, where it goes back or lasts too long, the clock was set, the bag restarted, or the IMU was away: then
+    everything begins anew.
     """
 
     def __init__(self, max_gap: float, gyroscope_range: float, accelerometer_range: float) -> None:
@@ -40,8 +44,11 @@ class ImuInput:
         self._max_gap_ns = round(max_gap * 1e9)
         self._limits = IMPOSSIBLE_RANGES * gyroscope_range, IMPOSSIBLE_RANGES * accelerometer_range
         self._last_ns: int | None = None
-        self._stray_ns = 0
+        self._stray_ns = self._first_stray_ns = 0
         self._strays = 0
+        self._longest_ns = 0.0
+        #: by how much the stamps jumped at the sample that was used last [ns]; 0: they went on as usual
+        self.jump_ns = 0
         self._reading: bytes = b''
         self._first_equal_ns = 0
         self._equal = 0
@@ -56,12 +63,26 @@ class ImuInput:
             return Verdict.IMPOSSIBLE
         if self._is_frozen(sample):
             return Verdict.FROZEN
-        if self._last_ns is None or 0 < sample.stamp_ns - self._last_ns <= self._max_gap_ns:
-            self._last_ns, self._strays = sample.stamp_ns, 0
-            return Verdict.USE
-        if sample.stamp_ns == self._last_ns:
+        if self._last_ns is None:
+            self._last_ns = sample.stamp_ns
+        elif sample.stamp_ns == self._last_ns:
             return Verdict.REPEATED
-        return self._stray(sample.stamp_ns)
+        elif not 0 < sample.stamp_ns - self._last_ns <= self._usual_ns:
+            return self._stray(sample.stamp_ns)
+        self._follow(sample.stamp_ns)
+        return Verdict.USE
+
+    @property
+    def _usual_ns(self) -> float:
+        """Longest step [ns] that is taken without another sample that follows it."""
+        return min(max(UNUSUAL_FACTOR * self._longest_ns, UNUSUAL_NS), self._max_gap_ns)
+
+    def _follow(self, stamp_ns: int, jump_ns: int = 0) -> None:
+        assert self._last_ns is not None
+        step_ns = stamp_ns - self._last_ns
+        if 0 < step_ns <= self._max_gap_ns:
+            self._longest_ns = max(KEPT * self._longest_ns, step_ns)
+        self._last_ns, self._strays, self.jump_ns = stamp_ns, 0, jump_ns
 
     def _is_frozen(self, sample: ImuSample) -> bool:
         reading = sample.angular_velocity.tobytes() + sample.linear_acceleration.tobytes()
@@ -73,10 +94,17 @@ class ImuInput:
 
     def _stray(self, stamp_ns: int) -> Verdict:
         assert self._last_ns is not None
-        follows = 0 < stamp_ns - self._stray_ns <= self._max_gap_ns
-        self._strays = self._strays + 1 if follows else 1
+        if not 0 < stamp_ns - self._stray_ns <= self._max_gap_ns:
+            self._strays, self._first_stray_ns = 0, stamp_ns
+        self._strays += 1
         self._stray_ns = stamp_ns
-        if self._strays >= CLOCK_EVIDENCE:
-            self._last_ns, self._strays = stamp_ns, 0
-            return Verdict.RESTART
-        return Verdict.BACKWARD if stamp_ns < self._last_ns else Verdict.AHEAD
+        jump_ns = self._first_stray_ns - self._last_ns
+        if 0 < jump_ns <= self._max_gap_ns:
+            if self._strays < GAP_EVIDENCE:
+                return Verdict.AHEAD
+            self._follow(stamp_ns, jump_ns)
+            return Verdict.USE
+        if self._strays < CLOCK_EVIDENCE:
+            return Verdict.BACKWARD if jump_ns < 0 else Verdict.AHEAD
+        self._follow(stamp_ns, jump_ns)
+        return Verdict.RESTART
