@@ -14,10 +14,13 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corner_estimates import DISPLACED
 from thermal_fiducial.core.detection.corners.grid import (
     adjusted,
+    deblurred_layer,
     grid_edges,
     GridEdges,
     Layer,
     on_marker,
+    places_of_points,
+    plain_layer,
     pose_jacobian,
     PoseFit,
 )
@@ -25,7 +28,6 @@ from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import PartialMarkers
 from thermal_fiducial.core.detection.lag import model_error
-from thermal_fiducial.core.detection.partial_layers import deblurred_layer, places_of_points, plain_layer
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.visible_cells import VisibleCells
 from thermal_fiducial.core.geometry import se3

@@ -13,8 +13,7 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import correlated_sum, SystematicErrors, with_corner_errors
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.fitting import fit_pose
-from thermal_fiducial.core.geometry.reprojection import linearise
+from thermal_fiducial.core.geometry.reprojection import fit_pose, linearise
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.keyframes import Displacement
 from thermal_fiducial.core.types import FloatArray, IntArray

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.fitting import fit_pose
 from thermal_fiducial.core.geometry.reprojection import (
     difference,
+    fit_pose,
     linearise,
     retract,
     shared_covariances,

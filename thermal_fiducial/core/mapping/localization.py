@@ -20,11 +20,11 @@ from thermal_fiducial.core.error_model import (
     with_corner_errors,
 )
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.fitting import fit_pose
 from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
 from thermal_fiducial.core.geometry.reprojection import (
     corners_of,
     difference,
+    fit_pose,
     linearise,
     reproject,
     whitening,
