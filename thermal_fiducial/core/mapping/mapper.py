@@ -18,6 +18,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, Viewpoint
+from thermal_fiducial.core.mapping.corner_bias import CornerBias
 from thermal_fiducial.core.mapping.frame_memory import FrameMemory, VIEWS
 from thermal_fiducial.core.mapping.localization import expected_errors, locate, reprojection_errors
 from thermal_fiducial.core.mapping.located import Located, LocatedFrame, Location, Refusal, Sight
@@ -25,7 +26,6 @@ from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperRes
 from thermal_fiducial.core.mapping.map_editing import align
 from thermal_fiducial.core.mapping.motion import CameraMotion
 from thermal_fiducial.core.mapping.new_markers import entry, NewMarkers
-from thermal_fiducial.core.mapping.noise_level import CornerBias, NoiseLevel
 from thermal_fiducial.core.mapping.odometry_prior import (
     contradicts,
     growth,
@@ -105,7 +105,6 @@ class MarkerMapper:
         #: whether odometry has been in this map
         self._odometry_agreed = False
         self._motion = CameraMotion()
-        self._noise = NoiseLevel()
         self._bias = CornerBias(SystematicErrors())
         self._gap: CameraPose | None = None
         self._memory = FrameMemory(self.config.keyframe_budget, self._initial)
@@ -126,7 +125,6 @@ class MarkerMapper:
     def locate(self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None) -> LocatedFrame:
         """The first half of :meth:`process`, which ends with the pose: whoever waits for that need wait no longer."""
         markers = usable(markers)
-        self._noise.add(markers)
         # Step 2: known and new markers.
         is_known = np.array([int(key) in self.map.markers for key in markers['id']], dtype=bool)
         known = self._sight(markers[is_known])
@@ -205,7 +203,7 @@ class MarkerMapper:
     def _sight(self, rows: Markers) -> Sight:
         branches = np.stack([marker_poses(rows, ''), marker_poses(rows, 'a')], axis=1)
         known = [self.map.markers[int(key)] for key in rows['id'] if int(key) in self.map.markers]
-        return Sight(known, corners_px(rows), self._noise.factor * corner_covariances(rows), branches)
+        return Sight(known, corners_px(rows), corner_covariances(rows), branches)
 
     def _update_errors(self, frame: LocatedFrame, location: Location) -> FloatArray:
         """Re-projection error (N,) [px] of each known marker, taken into its statistics."""
@@ -234,7 +232,7 @@ class MarkerMapper:
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, dict[int, str]]:
         """Show new markers to their candidates; whether any entered the map, and what the others wait for."""
         sizes = {key: self._sizes.get(key, self.config.marker_size) for key in frame.new['id'].tolist()}
-        shown = self._new.add(frame.stamp_ns, frame.new, sizes, viewpoint, self._noise.factor)
+        shown = self._new.add(frame.stamp_ns, frame.new, sizes, viewpoint)
         placed = self._new.judge(frame.stamp_ns, shown, frame.camera)
         for marker in placed:
             self._take_in(marker)

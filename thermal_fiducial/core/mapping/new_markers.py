@@ -13,8 +13,6 @@ from thermal_fiducial.core.types import FloatArray
 
 #: Candidates that are judged in one frame: bounds its time when many are new.
 TRIALS = 3
-# A candidate is judged again when its views have grown by one in so many.
-_PATIENCE = 6
 
 
 class NewMarkers:
@@ -23,12 +21,10 @@ class NewMarkers:
     def __init__(self) -> None:
         self.candidates: dict[int, Candidate] = {}
 
-    def add(
-        self, stamp_ns: int, rows: Markers, sizes: Mapping[int, float], viewpoint: Viewpoint, noise_factor: float
-    ) -> list[Candidate]:
+    def add(self, stamp_ns: int, rows: Markers, sizes: Mapping[int, float], viewpoint: Viewpoint) -> list[Candidate]:
         """Show a frame's rows to their candidates, markers of ``sizes`` [m]; those candidates."""
         branches = np.stack([marker_poses(rows, ''), marker_poses(rows, 'a')], axis=1)
-        corners, covariances = corners_px(rows), noise_factor * corner_covariances(rows)
+        corners, covariances = corners_px(rows), corner_covariances(rows)
         shown = []
         for i, marker_id in enumerate(rows['id'].tolist()):
             candidate = self.candidates.setdefault(marker_id, Candidate(marker_id, sizes[marker_id]))
@@ -40,7 +36,7 @@ class NewMarkers:
         """Those of the candidates whose views have settled their poses by now."""
         placed = []
         for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:
-            if candidate.untried <= len(candidate.views) // _PATIENCE:
+            if not candidate.untried:
                 continue
             placement = candidate.place(camera)
             candidate.reason = placement.reason
