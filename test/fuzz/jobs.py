@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from concurrent.futures import as_completed, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from itertools import islice
 import multiprocessing
 from pathlib import Path
 
@@ -15,6 +16,8 @@ TARGETS: dict[str, Callable[[range, Callable[[str, int], None]], list[Finding]]]
 }
 #: Inputs that a process takes in one go.
 BATCH = {'messages': 200, 'files': 200}
+#: Batches that a process works on.
+BATCHES = 5
 
 
 def batch(target: str, numbers: range, note: str) -> list[Finding]:
@@ -39,11 +42,12 @@ def findings(jobs: list[tuple[str, range]], workers: int, folder: Path) -> Itera
     context = multiprocessing.get_context('spawn')
     waiting = dict(enumerate(jobs))
     while waiting:
-        # A process that dies takes its pool along: what was not done is done in a new one.
-        with ProcessPoolExecutor(workers, mp_context=context, max_tasks_per_child=5) as pool:
+        # A process that dies takes its pool along: what was not done is done in a new one. None works for long, as what
+        # one batch leaves behind must not become the next one's; max_tasks_per_child of Python 3.11 hangs for that.
+        with ProcessPoolExecutor(workers, mp_context=context) as pool:
             running = {
                 pool.submit(batch, target, numbers, str(folder / f'{key}.txt')): key
-                for key, (target, numbers) in waiting.items()
+                for key, (target, numbers) in islice(waiting.items(), workers * BATCHES)
             }
             try:
                 for future in as_completed(running):
