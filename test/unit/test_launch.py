@@ -27,6 +27,7 @@ ARGUMENTS = {
     'params_file': '', 'map_file': '', 'camera': '', 'landing_pad': '', 'image_topic': 'thermal/image_raw',
     'camera_info_topic': 'thermal/camera_info', 'imu_topic': 'imu/data', 'namespace': '', 'use_sim_time': 'false',
     'second_camera': '', 'second_camera_device': '', 'log_level': 'info', 'rviz': 'false', 'prefix_frames': 'false',
+    'discovery_range': '', 'enclave': '',
 }  # fmt: skip
 
 
@@ -145,6 +146,24 @@ def test_arguments_reach_the_nodes(launched, tmp_path):
         assert node.ros_arguments == ['--log-level', 'warn']
     view = Path(nodes[4].arguments[1])
     assert (ROOT / view.relative_to('/share/thermal_fiducial')).is_file()
+
+
+@pytest.mark.parametrize(
+    ('asked', 'environment', 'expected'),
+    [('', '', 'LOCALHOST'), ('', 'SUBNET', 'SUBNET'), ('subnet', 'LOCALHOST', 'SUBNET'), ('OFF', '', 'OFF')],
+)
+def test_only_this_computer_finds_the_nodes_unless_somebody_says_so(
+    launched, monkeypatch, asked, environment, expected
+):
+    monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', environment)
+    _, nodes = launched('mapping.launch.py', discovery_range=asked, enclave='/drone')
+    assert [node.additional_env for node in nodes] == [{'ROS_AUTOMATIC_DISCOVERY_RANGE': expected}] * 4
+    assert all(node.ros_arguments[2:] == ['--enclave', '/drone'] for node in nodes)
+
+
+def test_a_discovery_range_that_does_not_exist_is_refused(launched):
+    with pytest.raises(InputError, match='discovery_range LAN: not one of LOCALHOST'):
+        launched('mapping.launch.py', discovery_range='LAN')
 
 
 def test_a_camera_is_started_with_the_nodes(launched):

@@ -1,6 +1,9 @@
 """Every service of the mapper, frozen and free, started in either mode; what of it reaches the file and the console."""
 
+from dataclasses import replace
+import errno
 import multiprocessing
+import os
 
 import pytest
 from sensor_msgs.msg import PointCloud2
@@ -77,6 +80,29 @@ def test_load_undo_and_save_of_a_free_map(graph, map_file, mode):
     assert ask(graph, 'undo')[0]
     assert ask(graph, 'undo') == (False, f'{map_file}: no earlier version is kept')
     assert ask(graph, 'reset') == (True, '2 markers left')
+
+
+def test_a_full_disk_at_undo_costs_neither_the_map_nor_its_history_nor_the_node(graph, map_file, monkeypatch):
+    node = graph.add(MarkerMapperNode, map_file=str(map_file), mode='mapping')
+    node.mapper.map.markers[9] = replace(node.mapper.map.markers[0], id=9)
+    assert ask(graph, 'save')[0]
+    saved, files = map_file.read_bytes(), sorted(map_file.parent.rglob('*'))
+
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, 'fsync', full)
+        success, message = ask(graph, 'undo')
+        assert not success
+        assert message.count('\n') == 0
+        assert str(map_file) in message
+        assert 'No space left on device' in message
+        assert map_file.read_bytes() == saved
+        assert sorted(map_file.parent.rglob('*')) == files
+        assert node.mapper.map.markers.keys() == {0, 9}
+    assert ask(graph, 'undo')[0]
+    assert load_map(map_file).markers.keys() == node.mapper.map.markers.keys() == {0}
 
 
 @pytest.mark.parametrize('mode', MODES)

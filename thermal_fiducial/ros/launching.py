@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 import difflib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,16 @@ _ARGUMENTS = {
     'prefix_frames': ('false', 'put the namespace before the frames of the robot'),
     'use_sim_time': ('false', 'time from /clock; only diagnostics use it'),
     'log_level': ('info', f'one of {", ".join(_LEVELS)}'),
+    'discovery_range': (
+        '',
+        'LOCALHOST or SUBNET: who finds the nodes; default: as the environment says, or LOCALHOST',
+    ),
+    'enclave': ('', 'SROS2 enclave of all nodes, as /thermal_fiducial; default: none'),
     'rviz': ('false', 'start RViz with the view of the package'),
 }
+_DISCOVERY = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
+#: What it may be; OFF and SYSTEM_DEFAULT are for whoever lists peers, or has a middleware of his own settings.
+_RANGES = ('LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT')
 _TOPICS = ('image_topic', 'camera_info_topic', 'imu_topic')
 
 
@@ -84,7 +93,8 @@ def _actions(
         'namespace': given['namespace'],
         'parameters': [_params_file(given['params_file'], share), overrides],
         'remappings': [*remappings, *_topics(given)],
-        'ros_arguments': ['--log-level', _log_level(given['log_level'])],
+        'ros_arguments': ['--log-level', _log_level(given['log_level']), *_enclave(given['enclave'])],
+        'additional_env': {_DISCOVERY: _discovery_range(given['discovery_range'])},
         'output': 'screen',
     }
     if given['landing_pad']:
@@ -163,6 +173,18 @@ def _log_level(level: str) -> str:
     if level.lower() not in _LEVELS:
         raise InputError(f'log_level {level}: not one of {", ".join(_LEVELS)}')
     return level.lower()
+
+
+def _discovery_range(given: str) -> str:
+    """Whoever finds the nodes may reset the filter and send poses: nobody but this computer, unasked."""
+    asked = given or os.environ.get(_DISCOVERY, '') or _RANGES[0]
+    if asked.upper() not in _RANGES:
+        raise InputError(f'discovery_range {asked}: not one of {", ".join(_RANGES)}')
+    return asked.upper()
+
+
+def _enclave(name: str) -> list[str]:
+    return ['--enclave', name] if name else []
 
 
 def _rviz(namespace: str, share: Path) -> Any:
