@@ -34,7 +34,9 @@ def flown(step=0.0, late=LATE):
     return ekf, states, np.array(lost), flight
 
 
-@pytest.mark.parametrize('step', [-0.5, 1.0, *(pytest.param(step, marks=pytest.mark.nightly) for step in (0.2, -1.0))])
+@pytest.mark.parametrize(
+    'step', [0.05, -0.05, -0.5, 1.0, *(pytest.param(step, marks=pytest.mark.nightly) for step in (0.2, -1.0))]
+)
 def test_a_step_is_followed(step):
     ekf, states, lost, flight = flown(step)
     off, _ = errors(flight, states, FOLLOWED)

@@ -13,10 +13,12 @@ from statistics import median
 
 from thermal_fiducial.core.measurements import CameraPose
 
-#: Smaller steps are found by the clock offset that is estimated [ns].
-_SMALLEST_NS = 100_000_000
-#: Poses in a row that must agree on a step, to this [ns], and those that say what was usual before.
-_POSES, _AGREEMENT_NS, _USUAL = 5, 50_000_000, 30
+#: Smaller steps [ns] are found by the clock offset that is estimated: a frame's time, in which motion is hardly curved.
+_SMALLEST_NS = 35_000_000
+#: Poses in a row that must agree on a step, and those that say what was usual before.
+_POSES, _USUAL = 5, 30
+#: They agree to half of the step, and to this [ns].
+_AGREEMENT_NS = 50_000_000
 #: So many poses that arrive unlike those before a jump of the IMU's stamps wait for an explanation.
 _PATIENCE = 15
 
@@ -63,9 +65,10 @@ class CameraClock:
         self._waited += 1
         self._latest.append((pose.stamp_ns, late_ns))
         delays = [delay for _, delay in self._latest]
-        if len(delays) < _POSES or max(delays) - min(delays) > _AGREEMENT_NS:
+        step_ns = round(median(self._usual) - median(delays))
+        if len(delays) < _POSES or max(delays) - min(delays) > min(abs(step_ns) // 2, _AGREEMENT_NS):
             return 0
-        return round(median(self._usual) - median(delays))
+        return step_ns
 
     def follow(self, step_ns: int) -> Iterable[int]:
         """Take a step of the stamps for true; the stamps of the poses that came with it and were believed."""

@@ -218,8 +218,10 @@ class PoseEkf:
         begun = self._hypotheses.alternative_to(at_pose, pose, instant.time_ns, motion, window)
         if begun is None:
             return belief
+        drifted = begun.needed == 0 or (belief.drifted and at_pose.refused_in_row > 0)
+        begun = replace(begun, needed=0) if drifted else begun
         alternative, _ = self._hypothesis_through(begun, index, instant)
-        return replace(belief, alternative=alternative, hits_before=at_pose.hits)
+        return replace(belief, alternative=alternative, hits_before=at_pose.hits, drifted=drifted)
 
     def _settled(self, belief: Belief) -> Belief:
         settled = belief.settled(self._config)

@@ -108,6 +108,9 @@ class Belief:
     resets: int = 0
     #: hits of the estimate when the alternative began
     hits_before: int = 0
+    #: whether the first of the poses that the estimate has refused in a row was near it: it has drifted, as by a fault
+    #: of the IMU; a marker that moved, or has a twin, is far off at once
+    drifted: bool = False
     #: why that happened the last time
     reset_reason: str = ''
 
