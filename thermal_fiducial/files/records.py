@@ -1,5 +1,6 @@
 """Records out of messages, from rclpy or from a bag, checked at the door."""
 
+import math
 from typing import Any
 
 import numpy as np
@@ -67,11 +68,11 @@ def imu_sample(message: Any) -> ImuSample:
         (REP-145).
     """
     w, a = message.angular_velocity, message.linear_acceleration
-    angular_velocity, linear_acceleration = np.array([w.x, w.y, w.z]), np.array([a.x, a.y, a.z])
-    if not (np.isfinite(angular_velocity.sum()) and np.isfinite(linear_acceleration.sum())):
-        raise InputError('IMU message that is not finite')
-    if max(np.abs(angular_velocity).max() / _FASTEST_TURN, np.abs(linear_acceleration).max() / _LARGEST_FORCE) > 1.0:
-        raise InputError('IMU message beyond what any IMU measures')
+    turn, force = (w.x, w.y, w.z), (a.x, a.y, a.z)
+    # Plain numbers: of six of them, 200 times a second, numpy takes three times as long. NaN is below no bound.
+    if not (all(abs(x) <= _FASTEST_TURN for x in turn) and all(abs(x) <= _LARGEST_FORCE for x in force)):
+        finite = all(math.isfinite(x) for x in turn + force)
+        raise InputError('IMU message beyond what any IMU measures' if finite else 'IMU message that is not finite')
     if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
         raise InputError('IMU message without angular velocity or without acceleration')
-    return ImuSample(stamp_ns(message.header.stamp), angular_velocity, linear_acceleration)
+    return ImuSample(stamp_ns(message.header.stamp), np.array(turn), np.array(force))
