@@ -1,5 +1,6 @@
 """What a flight controller may count on, in numbers; and that each number notices the fault that it is there for.
 
+Negative controls and second seeds fly at night.
 One 0.2 m marker at 2 m with 0.3 px corners, about 1 m/s: a single frame places the robot to 5 cm and 1.5 degrees.
 """
 
@@ -95,6 +96,7 @@ def test_one_marker_gives_millimetres(configuration, metres, degrees, seed):
     assert np.degrees(rms(attitude)) < degrees
 
 
+@pytest.mark.nightly
 def test_cross_terms_are_worth_half_of_the_error():
     """Negative control: without them the bound of the test above breaks."""
     assert position_rms(matched(), without_cross_terms) > 0.006
@@ -129,6 +131,7 @@ def test_late_frames_cost_nothing(seed):
     assert rms(flown(data, config(), delay=late(data))[0]) <= 1.1 * undelayed
 
 
+@pytest.mark.nightly
 def test_frames_stamped_at_arrival_are_noticed():
     """Negative control: no delay compensation. At 1 m/s, 50 ms are 5 cm."""
     data = flight(SEEDS[0])
@@ -200,6 +203,7 @@ def test_an_offset_that_is_not_estimated_stays_bounded(offset):
     assert ekf.diagnostics()['poses refused'] < 0.1 * len(data.poses)
 
 
+@pytest.mark.nightly
 def test_lock_out_without_floor_and_reset():
     """Negative control of the test above."""
     data = flight(22, offset=0.04)
@@ -215,6 +219,7 @@ def test_wild_poses_are_refused():
     assert position_rms(config(), wild) <= 1.2 * position_rms(config())
 
 
+@pytest.mark.nightly
 def test_wild_poses_without_a_gate_are_noticed():
     """Negative control."""
     assert position_rms(config(gate=1e6), wild) > 1.2 * position_rms(config())
@@ -227,6 +232,7 @@ def test_a_frozen_camera_does_not_hold_the_estimate(seed):
     assert ekf.diagnostics()['resets'] == 0.0
 
 
+@pytest.mark.nightly
 def test_a_frozen_camera_without_a_gate_is_noticed():
     """Negative control."""
     assert standard(config(gate=1e12), frozen)[0].max() > 0.05

@@ -33,7 +33,7 @@ def in_order(offset):
     return ekf.estimate
 
 
-@settings(max_examples=8)
+@settings(max_examples=5)
 @given(st.lists(st.floats(0.0, 0.5), min_size=POSES, max_size=POSES), st.sampled_from((-0.03, 0.0, 0.03)))
 def test_any_delays_give_the_same_state(delays, offset):
     ekf, expected = PoseEkf(known_clock(offset)), in_order(offset)

@@ -77,7 +77,9 @@ def test_chessboard(heat, share, rms, views):
     assert np.sqrt(np.mean(error**2)) < rms
 
 
-@pytest.mark.parametrize(('target', 'radius'), [(ASYMMETRIC, 0.4), (SYMMETRIC, 0.27)])
+@pytest.mark.parametrize(
+    ('target', 'radius'), [(ASYMMETRIC, 0.4), pytest.param(SYMMETRIC, 0.27, marks=pytest.mark.nightly)]
+)
 @pytest.mark.parametrize(
     ('heat', 'rms'),
     [

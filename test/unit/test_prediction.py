@@ -53,7 +53,7 @@ def test_impossible_odometry_is_left_alone():
     assert found.T_camera_map is None
 
 
-@pytest.mark.parametrize('offset_s', [0.0, 0.035])
+@pytest.mark.parametrize('offset_s', [pytest.param(0.0, marks=pytest.mark.nightly), 0.035])
 def test_markers_are_found_whatever_the_offset_of_a_clock_that_is_not_known_yet(offset_s):
     scenario = named('fast')
     scenario = replace(scenario, sensor=replace(scenario.sensor, bad_pixel_share=0.0))
