@@ -25,8 +25,8 @@ from thermal_fiducial.core.types import Float32Array, FloatArray
 _DERIVATIVE = np.array([-1.0, 9.0, -45.0, 0.0, 45.0, -9.0, 1.0], dtype=np.float32) / 60.0
 # Linear interpolation blurs the lag tail more than the image that it is taken from, and would displace the difference.
 _WARP = cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP
-# Pixels round a marker that its refinement may look at.
-_MARGIN_PX = 14
+# Pixels round a marker that its refinement may look at: 10 across its sides at most, and two that they may be off.
+_MARGIN_PX = 12
 # How much of the past is taken out of the image, in time constants, and its weight.
 _TAIL = 0.75
 _FORGOTTEN = math.exp(-_TAIL)
