@@ -136,10 +136,10 @@ class Belief:
         main, other = self.main, self.alternative
         if other is None:
             return self
+        if other.failed or (main and main.accepted_in_row >= _REFUTED):
+            return replace(self, alternative=None)
         if main is None:
             return self._promoted('') if other.hits >= config.initial_poses else self
-        if main.accepted_in_row >= _REFUTED or other.failed:
-            return replace(self, alternative=None)
         if other.hits < config.initial_poses:
             return self
         reason = self._why_reset(main, other, config)
