@@ -6,6 +6,7 @@ the image clearly, and better than the pattern of any other marker or any other 
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
@@ -95,7 +96,7 @@ def near_prediction(
     blurred = np.abs(shift).max(axis=(1, 2)) > BLUR_THAT_MATTERS_PX
     scene = frame.image
     if blurred.any():
-        scene = markers_deblurred(frame.image, corners[blurred], shift[blurred])
+        scene = markers_deblurred(frame.image, corners[blurred], shift[blurred], cv2.INTER_CUBIC)
     left = np.where(blurred[:, None, None], REMAINING * shift, shift)
     shown = _shifted(scene, ids, corners + left, decoder)
     reading = decoder.read(scene, shown)
