@@ -8,9 +8,9 @@ from thermal_fiducial.core.measurements import ImuSample
 
 #: So many samples in a row must agree on a new clock before it is believed; on the end of a gap.
 CLOCK_EVIDENCE, GAP_EVIDENCE = 10, 2
-#: A step is unusual if it is so many times longer than the longest of late, and than this [ns]; how much of the longest
-#: is kept from sample to sample: half of it for 140 samples.
-UNUSUAL_FACTOR, UNUSUAL_NS, KEPT = 3.0, 30_000_000, 0.995
+#: A step is unusual if it is so many times longer than the longest of late, and than this [ns]; that one is forgotten
+#: within so long [ns].
+UNUSUAL_FACTOR, UNUSUAL_NS, MEMORY_NS = 3.0, 30_000_000, 2_000_000_000
 #: A sensor saturates at its full scale; a reading so many times as large is a broken message.
 IMPOSSIBLE_RANGES = 2.0
 #: Noise makes no two samples equal, coarse quantisation of a still sensor a few: equal ones for so long [s], and
@@ -81,7 +81,7 @@ class ImuInput:
         assert self._last_ns is not None
         step_ns = stamp_ns - self._last_ns
         if 0 < step_ns <= self._max_gap_ns:
-            self._longest_ns = max(KEPT * self._longest_ns, step_ns)
+            self._longest_ns = max(self._longest_ns * (1.0 - step_ns / MEMORY_NS), step_ns)
         self._last_ns, self._strays, self.jump_ns = stamp_ns, 0, jump_ns
 
     def _is_frozen(self, sample: ImuSample) -> bool:
