@@ -124,7 +124,7 @@ def test_model_error_leaves_the_common_shift_out():
 
 
 @pytest.mark.parametrize('turn', [0.0, 0.7])
-def test_model_error_counts_the_cells_that_the_smear_passes(turn):
+def test_model_error_counts_the_cells_that_the_motion_blur_passes(turn):
     """Seen from the side, a marker's cells are narrower one way; how it is turned in the image does not matter."""
     R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     across, along = (np.broadcast_to(R @ shift, (1, 4, 2)) for shift in ([6.0, 0.0], [0.0, 6.0]))

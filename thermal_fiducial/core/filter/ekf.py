@@ -129,14 +129,16 @@ class PoseEkf:
         if not history.nodes:
             return pose
         step_ns = self._camera_clock.proposed(pose, history.nodes[-1].stamp_ns)
+        if not step_ns:
+            return pose
         restamped = replace(pose, stamp_ns=pose.stamp_ns - step_ns)
-        if step_ns and self._camera_clock.is_of_imu(step_ns):
+        if self._camera_clock.is_of_imu(step_ns):
             # All since then was propagated over time that never was.
             self._camera_clock.follow(step_ns)
             self._restart_reason = CLOCK_JUMPED
             self._begin()
             return restamped
-        if not step_ns or not self._contradicts(pose) or not self._fits(restamped):
+        if not self._contradicts(pose) or not self._fits(restamped):
             return pose
         self._advance_from(history.discard(self._camera_clock.follow(step_ns)))
         return restamped

@@ -146,16 +146,15 @@ class PoseUpdater:
         """The estimate after an accepted pose."""
         prior = innovation.prior
         error, covariance = self._gained(prior.covariance, innovation.value, innovation.H, innovation.R)
-        state = prior.state.plus(error)
+        state, before = prior.state.plus(error), slide(prior.state, motion.imu)
         if prior.clock_open and self.config.estimate_time_offset:
-            change = slide(state, motion.imu) - slide(prior.state, motion.imu)
+            change = slide(state, motion.imu) - before
             state = state.plus(_of_core(-change * error[TIME_OFFSET]))
             covariance = self._in_clock_of_imu(covariance, change, slide(state, motion.imu), innovation, motion)
         variances = covariance.diagonal()[SYSTEMATIC]
         second_moment = float(state.systematic @ state.systematic + variances.sum()) / 6.0
         noise = prior.pose_noise.after(pose, innovation.value, innovation.S, second_moment, innovation.alike)
-        twist = slide(prior.state, motion.imu)[POSE]
-        noise = noise.with_stamps(twist, innovation.value, innovation.S)
+        noise = noise.with_stamps(before[POSE], innovation.value, innovation.S)
         # The same systematic error in units of its new standard deviation.
         unit = (prior.pose_noise.systematic / noise.systematic) ** 0.5
         covariance[SYSTEMATIC] *= unit
