@@ -7,22 +7,18 @@ it, and the change of the mean share. A mechanism is switched off by putting wha
 mechanisms as arguments: only these.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib import import_module
-import inspect
 import sys
 import time
 from typing import Any
-from unittest import mock
 
 import cv2
 import numpy as np
 from support import approach
 from support.detector_scores import DetectorScore, odometry_before
 from support.scenes import camera_of
+from support.taken_out import lines_of, place, replaced
 
 from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
@@ -31,7 +27,7 @@ from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.sim.scenario import named, Scenario, with_contrast
 from thermal_fiducial.sim.thermal_camera import render_frames
 
-DETECTION = 'thermal_fiducial.core.detection.'
+DETECTION = 'thermal_fiducial.core.detection'
 SEED = 21
 #: Frames of a stretch that only settle the detector.
 SETTLING = 3
@@ -158,27 +154,11 @@ class Mechanism:
     @property
     def lines(self) -> int:
         """Of its parts."""
-        return sum(len(inspect.getsource(_place(part)).splitlines()) for part in self.parts)
+        return lines_of(DETECTION, self.parts)
 
 
 def _place(path: str) -> Any:
-    module, _, names = path.partition(':')
-    thing: Any = import_module(DETECTION + module)
-    for name in names.split('.') if names else ():
-        thing = getattr(thing, name)
-    return thing
-
-
-@contextmanager
-def without(mechanism: Mechanism) -> Iterator[None]:
-    """The detector without a mechanism."""
-    with ExitStack() as stack:
-        for path, stand_in in mechanism.off.items():
-            module, _, names = path.partition(':')
-            *owners, name = names.split('.')
-            owner = _place(':'.join([module, '.'.join(owners)]) if owners else module)
-            stack.enter_context(mock.patch.object(owner, name, stand_in))
-        yield
+    return place(DETECTION, path)
 
 
 def _nothing_found(*_: Any) -> Any:
@@ -267,7 +247,7 @@ def _figures(score: DetectorScore, seconds: float) -> str:
 
 
 def _row(key: str, mechanism: Mechanism, base: dict[str, tuple[DetectorScore, float]]) -> str:
-    with without(mechanism):
+    with replaced(DETECTION, mechanism.off):
         scenes = {name: run(name, mechanism.changes or {}) for name in {*ACCEPTANCE, mechanism.scene}}
     both = [(base[name], scenes[name]) for name in ACCEPTANCE]
     seen = [(old[0].rms_px, new[0].rms_px) for old, new in both if new[0].seen]

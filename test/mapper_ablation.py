@@ -6,22 +6,19 @@ arguments: only these. Recordings are taken where ``THERMAL_FIDUCIAL_DATA`` name
 """
 
 from collections.abc import Callable
-from contextlib import contextmanager, ExitStack
 from dataclasses import dataclass
 from functools import cache
-from importlib import import_module
-import inspect
 import os
 from pathlib import Path
 import sys
 import time
 from typing import Any
-from unittest import mock
 
 import numpy as np
 from support import real_flights, tagslam, walls
 from support.corner_runs import rms
 from support.scenes import motion_prior
+from support.taken_out import lines_of, replaced
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
@@ -32,7 +29,7 @@ from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, Odometry
 
-MAPPING = 'thermal_fiducial.core.mapping.'
+MAPPING = 'thermal_fiducial.core.mapping'
 AS_BODY = {'camera_orientation': (0.0, 0.0, 0.0, 1.0)}
 SECOND_NS = 1_000_000_000
 #: Change of a figure that is worth printing.
@@ -126,9 +123,21 @@ def board() -> Figures:
     return {'located': len(stamps), 'mm': 1e3 * rms(ours), 'NEES': float(np.mean(squares))}
 
 
+def _figures_of_maps(maps: list[tuple[MarkerMap, dict[int, np.ndarray]]]) -> Figures:
+    """Of maps and the true poses of their markers, all but the first: how many are placed, and how well."""
+    errors, squares = [], []
+    for marker_map, truth in maps:
+        for key, marker in marker_map.markers.items():
+            if key:
+                d = difference(truth[key], marker.T_map_marker)
+                errors.append(np.linalg.norm(d[:3]))
+                squares.append(d @ np.linalg.solve(marker.covariance, d) / 6.0)
+    return {'placed': len(errors), 'map mm': 1e3 * rms(errors), 'map NEES': float(np.mean(squares))}
+
+
 def wall() -> Figures:
     """A slow simulated flight past eight markers of which one is known, corners of 0.1 px, without odometry."""
-    errors, squares, frames_located = [], [], []
+    maps, frames_located = [], []
     for seed in range(2):
         rng = np.random.default_rng(seed)
         poses = walls.wall(rng)
@@ -137,17 +146,8 @@ def wall() -> Figures:
             walls.stamp(k): walls.see(walls.flight(k / 30 + 5.0 * seed), poses, 0.1, rng) for k in range(0, 600, 5)
         }
         frames_located.append(_mapped(mapper, frames, walls.CAMERA)['located %'])
-        for key, marker in mapper.map.markers.items():
-            if key:
-                d = difference(poses[key], marker.T_map_marker)
-                errors.append(np.linalg.norm(d[:3]))
-                squares.append(d @ np.linalg.solve(marker.covariance, d) / 6.0)
-    return {
-        'located %': float(np.mean(frames_located)),
-        'placed': len(errors),
-        'map mm': 1e3 * rms(errors),
-        'map NEES': float(np.mean(squares)),
-    }
+        maps.append((mapper.map, poses))
+    return {'located %': float(np.mean(frames_located)), **_figures_of_maps(maps)}
 
 
 def small_markers() -> Figures:
@@ -175,7 +175,7 @@ def small_markers() -> Figures:
 
 def chain() -> Figures:
     """A corridor of markers of which at most two are in view, some spans with none known: odometry that drifts."""
-    errors, squares, located = [], [], []
+    maps, located = [], []
     for seed in range(2):
         rng = np.random.default_rng(seed)
         row = walls.wall(rng, 4)
@@ -193,17 +193,8 @@ def chain() -> Figures:
             frames[stamp] = walls.see(T, poses, 0.1, rng)
             states[stamp] = motion_prior(Odometry(stamp, retract(T, drift), np.zeros(3), np.zeros(3), P, twist))
         located.append(_mapped(mapper, frames, walls.CAMERA, states.get)['located %'])
-        for key, marker in mapper.map.markers.items():
-            if key:
-                d = difference(poses[key], marker.T_map_marker)
-                errors.append(np.linalg.norm(d[:3]))
-                squares.append(d @ np.linalg.solve(marker.covariance, d) / 6.0)
-    return {
-        'located %': float(np.mean(located)),
-        'placed': len(errors),
-        'map mm': 1e3 * rms(errors),
-        'map NEES': float(np.mean(squares)),
-    }
+        maps.append((mapper.map, poses))
+    return {'located %': float(np.mean(located)), **_figures_of_maps(maps)}
 
 
 def moved_marker() -> Figures:
@@ -280,25 +271,7 @@ class Mechanism:
     @property
     def lines(self) -> int:
         """Of its parts."""
-        return sum(len(inspect.getsource(_place(part)).splitlines()) for part in self.parts)
-
-
-def _place(path: str) -> Any:
-    module, _, names = path.partition(':')
-    thing: Any = import_module(MAPPING + module)
-    for name in names.split('.') if names else ():
-        thing = getattr(thing, name)
-    return thing
-
-
-@contextmanager
-def without(mechanism: Mechanism) -> Any:
-    """The mapper without a mechanism."""
-    with ExitStack() as stack:
-        for path, stand_in in mechanism.off.items():
-            owner, _, name = path.rpartition('.') if '.' in path.partition(':')[2] else path.rpartition(':')
-            stack.enter_context(mock.patch.object(_place(owner), name, stand_in))
-        yield
+        return lines_of(MAPPING, self.parts)
 
 
 def _ignored(*_: Any, **__: Any) -> None:
@@ -381,7 +354,7 @@ def row(name: str, mechanism: Mechanism) -> str:
     """A line of the table."""
     cells = []
     for scene in (name for name in mechanism.scenes if name in SCENES):
-        with without(mechanism):
+        with replaced(MAPPING, mechanism.off):
             figures = SCENES[scene]()
         changes = [
             f'{what} {base(scene)[what]:.3g} -> {value:.3g}'
