@@ -9,7 +9,7 @@ The layers, each importing only from those below it (checked by import-linter)::
     replay                            recorded bags through the real nodes
     nodes     report                  thin ROS 2 nodes; plots and HTML
     ros                               messages to records, parameters, QoS, run loop
-    sim  files  fabrication  calibration
+    sim  files  fabrication  calibration  map_tools
     core                              the algorithms: no ROS, no files, no clock, no printing
     config  errors
 """

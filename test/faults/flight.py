@@ -6,8 +6,8 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
+from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.mapping.map_building import rows_from_corners
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.scenario import named

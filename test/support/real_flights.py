@@ -17,15 +17,16 @@ import yaml
 from support.batch_map import adjust
 from support.corner_runs import CornerFlight
 from thermal_fiducial.config import ImuNoise, MarkerMapperConfig
+from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform, transform_from_quaternion
-from thermal_fiducial.core.mapping.map_building import build_map, rows_from_corners
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, ImuSample
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.trajectory_file import load_tum
+from thermal_fiducial.map_tools.map_building import build_map
 
 CARPETS = ('carpet_mountain', 'carpet_slow_circle')
 #: Corner noise [px]: what re-projection leaves of the board's corners, and the median that it leaves of the carpet's

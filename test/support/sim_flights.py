@@ -7,7 +7,7 @@ import numpy as np
 from support.corner_runs import CornerFlight
 from thermal_fiducial.cli.simulate_corners import simulated_recording
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.mapping.map_building import rows_from_corners
+from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.sim.scenario import named
 from thermal_fiducial.sim.thermal_camera import plan

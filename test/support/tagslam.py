@@ -9,16 +9,17 @@ import yaml
 
 from support.scenes import motion_prior
 from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, transform, transform_from_quaternion
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe
-from thermal_fiducial.core.mapping.map_building import decide, rows_from_corners
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.map_tools.map_building import decide
 
 #: Noise of the recorded corners [px]: the re-projection errors of the reference are about that.
 SIGMA_PX = 0.3

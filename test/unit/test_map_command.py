@@ -12,11 +12,11 @@ from thermal_fiducial.cli.map_plot import draw_map
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference
 from thermal_fiducial.core.geometry.se3 import apply, inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.mapping.map_doubts import doubts
-from thermal_fiducial.core.mapping.map_editing import transformed
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.map_tools.map_doubts import doubts
+from thermal_fiducial.map_tools.map_editing import transformed
 
 
 @pytest.fixture

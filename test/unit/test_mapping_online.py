@@ -10,9 +10,9 @@ from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
-from thermal_fiducial.core.mapping.map_editing import transformed
 from thermal_fiducial.core.mapping.mapper import CONTRADICTED, MapMarker, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.map_tools.map_editing import transformed
 
 # The body is the camera: odometry and camera pose are one.
 UNIT = np.eye(6)

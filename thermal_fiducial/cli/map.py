@@ -14,7 +14,6 @@ from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
-from thermal_fiducial.core.mapping import map_editing
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
@@ -24,6 +23,7 @@ from thermal_fiducial.files.dictionary import not_in_dictionary
 from thermal_fiducial.files.map_format import upgraded
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.reading import read_text
+from thermal_fiducial.map_tools import map_editing
 
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 

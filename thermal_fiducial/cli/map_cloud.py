@@ -9,10 +9,10 @@ from rich.table import Table
 
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.se3 import apply, inverse, quaternion_from_rotation, transform_from_quaternion
-from thermal_fiducial.core.mapping.cloud_alignment import align_to_cloud, CloudAlignment
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.point_cloud import load_cloud, save_alignment, thinned
+from thermal_fiducial.map_tools.cloud_alignment import align_to_cloud, CloudAlignment
 
 # Points of the cloud in the picture: more make it no clearer.
 _DRAWN = 200_000

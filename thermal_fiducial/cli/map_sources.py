@@ -9,12 +9,9 @@ import numpy as np
 
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, size_overrides
-from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.detection.detector import MarkerDetector, rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.mapping import map_editing
-from thermal_fiducial.core.mapping.map_building import build_map, Built, rows_from_corners
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.mapping.map_doubts import Doubt, doubts
 from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE, Markers
 from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
@@ -24,6 +21,9 @@ from thermal_fiducial.files.images import read_picture
 from thermal_fiducial.files.map_history import save_with_history
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.reading import read_text
+from thermal_fiducial.map_tools import map_editing
+from thermal_fiducial.map_tools.map_building import build_map, Built
+from thermal_fiducial.map_tools.map_doubts import Doubt, doubts
 
 _IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
 #: Noise of OpenCV's sub-pixel corners in photos [px]; the mapper takes the actual noise from the pictures.

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
-from thermal_fiducial.core.mapping.map_building import rows_from_corners
 from thermal_fiducial.core.measurements import Markers
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import bag_messages

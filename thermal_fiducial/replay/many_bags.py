@@ -19,12 +19,12 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.mapping.map_building import build_map, Built
 from thermal_fiducial.core.measurements import Markers
 from thermal_fiducial.errors import InputError, RunError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.replay.session import MAP_FILE, Options, replay
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.ros import clouds, convert

@@ -18,7 +18,7 @@ from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
 from thermal_fiducial.core.detection.tracking import FramePrediction, MotionTrack, Predictor, TrackedMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses
+from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses, solve_marker_poses
 from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
@@ -192,6 +192,19 @@ def marker_rows(
     rows['id'] = ids
     usable = np.flatnonzero(np.isfinite(poses.rms_px[:, 0]))
     return np.asarray(rows[usable[np.argsort(ids[usable], kind='stable')]])
+
+
+def rows_from_corners(
+    ids: IntArray, corners: FloatArray, covariances: FloatArray, sizes: FloatArray, camera: Camera
+) -> Markers:
+    """Rows (N,) of MARKER_DTYPE by rising ID of markers known by their corners alone, as in a file of detections.
+
+    Parameters
+    ----------
+    ids, sizes : (N,), (N,) [m]
+    corners, covariances : (N, 4, 2) [px], (N, 4, 2, 2) [px^2]
+    """
+    return marker_rows(ids, corners, covariances, solve_marker_poses(corners, covariances, sizes, camera))
 
 
 def _between(first: str, last: str) -> slice:

@@ -22,8 +22,8 @@ from thermal_fiducial.core.mapping.corner_bias import CornerBias
 from thermal_fiducial.core.mapping.frame_memory import FrameMemory, VIEWS
 from thermal_fiducial.core.mapping.localization import expected_errors, locate, reprojection_errors
 from thermal_fiducial.core.mapping.located import Located, LocatedFrame, Location, Refusal, Sight
+from thermal_fiducial.core.mapping.map_alignment import align
 from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
-from thermal_fiducial.core.mapping.map_editing import align
 from thermal_fiducial.core.mapping.motion import CameraMotion
 from thermal_fiducial.core.mapping.new_markers import entry, NewMarkers
 from thermal_fiducial.core.mapping.odometry_prior import (

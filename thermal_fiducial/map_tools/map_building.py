@@ -7,9 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.detection.detector import marker_rows
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
@@ -18,7 +16,7 @@ from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.core.measurements import corners_px, Markers
-from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.types import FloatArray
 
 # Passes over all frames: more than any chain of markers needs of which each is seen with the last alone.
 _MAX_PASSES = 50
@@ -73,19 +71,6 @@ def build_map(
     unplaced = {key: why for key, why in waiting.items() if key not in mapper.map.markers}
     used, errors = _residuals(mapper.map, frames, camera, config)
     return Built(_with_statistics(mapper.map, frames, marker_map, errors), refinement, unplaced, used)
-
-
-def rows_from_corners(
-    ids: IntArray, corners: FloatArray, covariances: FloatArray, sizes: FloatArray, camera: Camera
-) -> Markers:
-    """Rows (N,) of MARKER_DTYPE by rising ID of markers known by their corners alone, as in a file of detections.
-
-    Parameters
-    ----------
-    ids, sizes : (N,), (N,) [m]
-    corners, covariances : (N, 4, 2) [px], (N, 4, 2, 2) [px^2]
-    """
-    return marker_rows(ids, corners, covariances, solve_marker_poses(corners, covariances, sizes, camera))
 
 
 def _stamp(k: int) -> int:
