@@ -80,6 +80,14 @@ def test_help_says_what_every_option_does_and_is_when_left_out(command, monkeypa
             # As argparse itself expands it; it offers no other way.
             said = ' '.join(parser._get_formatter()._expand_help(action).split())  # noqa: SLF001
             assert said in text
-            if action.default not in (None, False, '', []) or (action.default == 0 and action.nargs != 0):
+            if action.nargs != 0 and not action.required:
                 assert 'default' in said, f'{parser.prog} {action.option_strings}'
                 assert said.count('default') == 1, f'{parser.prog} {action.option_strings}'
+
+
+@pytest.mark.parametrize('command', COMMANDS)
+def test_help_fits_a_terminal_of_80_columns(command, monkeypatch):
+    monkeypatch.setenv('COLUMNS', '80')
+    for parser in parsers_of(command, monkeypatch):
+        wide = [line for line in parser.format_help().splitlines() if len(line) > 80]
+        assert not wide, f'{parser.prog}: {wide}'

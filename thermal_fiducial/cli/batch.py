@@ -14,16 +14,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='as for replay')
     parser.add_argument('--out', type=Path, required=True, metavar='FOLDER', help='for a run folder a bag and the map')
     parser.add_argument('--map', type=Path, required=True, metavar='FILE', help='marker map to start from')
-    parser.add_argument('--params', type=Path, metavar='FILE', help='ROS parameter file for the nodes')
-    parser.add_argument('--mode', choices=('mapping', 'localization'), help='of each replay')
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument('--workers', type=int, default=1, metavar='N', help='processes of this machine (default 1)')
-    where.add_argument(
-        '--scheduler', default='', metavar='ADDRESS', help='of a Dask cluster that sees the same files, tcp://HOST:8786'
+    parser.add_argument(
+        '--params', type=Path, metavar='FILE', help="ROS parameter file (default: the nodes' own values)"
     )
     parser.add_argument(
-        '--max-frames', type=int, default=1000, metavar='N', help='frames of all bags in the joint map (default 1000)'
+        '--mode', choices=('mapping', 'localization'), help='of each replay (default: mode of --params)'
     )
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument('--workers', type=int, default=1, metavar='N', help='processes of this machine')
+    where.add_argument(
+        '--scheduler',
+        default='',
+        metavar='ADDRESS',
+        help='of a Dask cluster that sees the same files, tcp://HOST:8786 (default: this machine)',
+    )
+    parser.add_argument('--max-frames', type=int, default=1000, metavar='N', help='frames of all bags in the joint map')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bags')
 
 

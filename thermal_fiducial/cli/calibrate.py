@@ -44,18 +44,18 @@ def run(args: argparse.Namespace) -> int:
 def _add_camera_imu(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(do=_camera_imu)
     parser.add_argument('bag', type=Path, help='bag with thermal/image_raw and imu/data, moving before mapped markers')
-    parser.add_argument('--map', type=Path, required=True, help='marker map')
+    parser.add_argument('--map', type=Path, required=True, help='marker map (YAML)')
     parser.add_argument('--calibration', type=Path, help='camera_info YAML (default: the camera_info of the bag)')
     parser.add_argument('--out', type=Path, default=Path('extrinsics.yaml'), help='parameters to write')
     noise = ImuNoise()
-    for name in (
-        'gyroscope_noise_density',
-        'accelerometer_noise_density',
-        'gyroscope_random_walk',
-        'accelerometer_random_walk',
+    for name, unit in (
+        ('gyroscope_noise_density', 'rad/s/sqrt(Hz)'),
+        ('accelerometer_noise_density', 'm/s^2/sqrt(Hz)'),
+        ('gyroscope_random_walk', 'rad/s^2/sqrt(Hz)'),
+        ('accelerometer_random_walk', 'm/s^3/sqrt(Hz)'),
     ):
         default = getattr(noise, name)
-        parser.add_argument('--' + name.replace('_', '-'), type=float, default=default, help=f'(default: {default:g})')
+        parser.add_argument('--' + name.replace('_', '-'), type=float, default=default, metavar='X', help=f'[{unit}]')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bag')
 
 

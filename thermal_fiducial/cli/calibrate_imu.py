@@ -21,7 +21,7 @@ def add_imu(parser: argparse.ArgumentParser) -> None:
     """Options of the action."""
     parser.set_defaults(do=calibrate_imu)
     parser.add_argument('bag', type=Path, help='bag with imu/data, the robot at rest (minutes, better hours)')
-    parser.add_argument('--out', type=Path, default=Path('imu.yaml'), help='parameters to write (default: imu.yaml)')
+    parser.add_argument('--out', type=Path, default=Path('imu.yaml'), help='parameters to write')
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bag')
 
 

@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--out', type=Path, default=Path('camera_info.yaml'), help='calibration to write')
     parser.add_argument('--report', type=Path, help='report to write (default: next to the calibration, .html)')
     parser.add_argument('--models', default=','.join(CANDIDATES), help='to choose among, by held-out error')
-    parser.add_argument('--focal-px', type=float, default=600.0, help='rough focal length to start from')
+    parser.add_argument('--focal-px', type=float, default=600.0, help='rough focal length to start from [px]')
     parser.add_argument('--most-views', type=int, default=80, help='stop looking for views after this many')
     parser.add_argument('--every', type=int, default=5, help='look at every n-th frame of a bag')
     parser.add_argument('--size', type=int, nargs=2, metavar=('WIDTH', 'HEIGHT'), help='of the image, with a CSV file')
@@ -60,13 +60,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_board(group: argparse._ArgumentGroup) -> None:
-    group.add_argument('--target', choices=TARGETS, default='chessboard', help='(default: %(default)s)')
+    group.add_argument(
+        '--target', choices=TARGETS, default='chessboard', metavar='KIND', help=f'one of {", ".join(TARGETS)}'
+    )
     group.add_argument(
         '--grid',
         type=int,
         nargs=2,
         metavar=('COLUMNS', 'ROWS'),
-        help='inner corners (8 6), or circles as OpenCV counts them (circles: 4 11; symmetric-circles: 7 5)',
+        help='inner corners, or circles as OpenCV counts them (default: 8 6; circles 4 11; symmetric-circles 7 5)',
     )
     group.add_argument(
         '--longer-rows', type=int, default=0, metavar='N', help='circles that every other row has more than COLUMNS'

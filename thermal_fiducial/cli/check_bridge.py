@@ -24,8 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('recording', nargs='?', type=Path, metavar='RECORDING', help='bag or run folder; none: listen')
     parser.add_argument('--topic', default='', help='odometry to check (default: what pose_ekf sends, as remapped)')
-    parser.add_argument('--imu', type=Path, metavar='BAG', help='bag with imu/data, where RECORDING has none')
-    parser.add_argument('--seconds', type=float, default=15.0, help='how long to listen (default: 15)')
+    parser.add_argument('--imu', type=Path, metavar='BAG', help='bag with imu/data (default: RECORDING itself)')
+    parser.add_argument('--seconds', type=float, default=15.0, help='how long to listen [s]')
     parser.add_argument(
         '--ros-args', nargs=argparse.REMAINDER, default=[], help='remaps and the like, as for any node; last'
     )

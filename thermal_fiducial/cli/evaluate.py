@@ -23,10 +23,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument('folders', type=Path, nargs='+', metavar='RUN', help='run folder, as replay leaves it')
     parser.add_argument(
-        '--truth', type=Path, metavar='BAG-or-TUM', help='ground truth: a TUM file, or a bag with ground_truth/odometry'
+        '--truth',
+        type=Path,
+        metavar='BAG-or-TUM',
+        help='ground truth: a TUM file, or a bag with ground_truth/odometry (default: truth.tum in RUN, if any)',
     )
     parser.add_argument(
-        '--truth-map', type=Path, metavar='FILE', help='the map as it really is (default: map_true.yaml at the truth)'
+        '--truth-map', type=Path, metavar='FILE', help='the map as it really is (default: map_true.yaml beside it)'
     )
     parser.add_argument('--bag', type=Path, help='the bag with the frames (default: where it was when it was replayed)')
     parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
@@ -35,9 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--compare', action='store_true', help="several runs side by side, with evo's conventions and numbers"
     )
-    parser.add_argument(
-        '--out', type=Path, default=COMPARISON, metavar='HTML', help=f'page of --compare (default: {COMPARISON})'
-    )
+    parser.add_argument('--out', type=Path, default=COMPARISON, metavar='HTML', help='page of --compare')
 
 
 def run(args: argparse.Namespace) -> int:

@@ -14,11 +14,12 @@ from thermal_fiducial.files.recordings import read_recording
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = (
         'layouts:\n'
-        '  ours    imu.csv, rig.yaml, and detections.csv or CAMERA.csv (corners) or camera_pose.csv\n'
-        '  EuRoC   [mav0/]imu0/data.csv, CAMERA/data.csv and pictures, a sensor.yaml in each\n'
+        '  ours    imu.csv, rig.yaml, and detections.csv or CAMERA.csv (corners) or\n'
+        '          camera_pose.csv\n'
+        '  EuRoC   [mav0/]imu0/data.csv, CAMERA/data.csv and pictures, a sensor.yaml in\n'
+        '          each\n'
         '  Kalibr  imu0.csv, CAMERA/STAMP.png, a camchain and an IMU file\n\n'
         'The bag has params.yaml (the rig) in its folder, for replay --params.'
     )
@@ -27,8 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--camera', default='cam0', help='which of the cameras (default: cam0)')
     parser.add_argument('--camchain', type=Path, metavar='YAML', help="Kalibr's camchain (default: in the folder)")
     parser.add_argument('--imu', type=Path, metavar='YAML', help="Kalibr's IMU file (default: in the folder)")
-    parser.add_argument('--marker-size', type=float, metavar='M', help='side of the markers, for corners')
-    parser.add_argument('--dictionary', metavar='NAME', help='of the markers')
+    parser.add_argument(
+        '--marker-size', type=float, metavar='M', help='side of the markers, for corners [m] (default: of rig.yaml)'
+    )
+    parser.add_argument('--dictionary', metavar='NAME', help='of the markers (default: of rig.yaml)')
     parser.add_argument(
         '--sigma-px', type=float, default=0.3, help='standard deviation of corners that come without (default: 0.3)'
     )

@@ -34,16 +34,22 @@ MODULES = {'import': 'import_recording'}
 
 
 class _Help(argparse.HelpFormatter):
-    """Says what every option is when it is left out, unless its text does."""
+    """Says what every option is when it is left out, unless its text does; a text of several lines keeps them."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         default = action.default
-        nothing = default is None or default is False or default in ('', [], argparse.SUPPRESS)
-        if nothing or not action.option_strings or 'default' in (action.help or ''):
+        needs_none = action.nargs == 0 or action.required or default is argparse.SUPPRESS
+        if needs_none or not action.option_strings or 'default' in (action.help or ''):
             return action.help
-        values = default if isinstance(default, (list, tuple)) else [default]
+        values = list(default) if isinstance(default, (list, tuple)) else [default]
+        if not values or values[0] in (None, ''):
+            values = ['none']
         text = ' '.join(f'{value:g}' if isinstance(value, float) else str(value) for value in values)
         return f'{action.help or ""} (default: {text.replace("%", "%%")})'.lstrip()
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        lines = text.splitlines()
+        return text if len(lines) > 1 else super()._fill_text(text, width, indent)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -30,7 +30,7 @@ def add_align(parser: argparse.ArgumentParser) -> None:
         metavar=('X', 'Y', 'Z', 'QX', 'QY', 'QZ', 'QW'),
         help='rough pose of the map in the cloud (default: the same frame)',
     )
-    parser.add_argument('--reach', type=float, default=0.5, metavar='M', help='how rough that may be (0.5 m)')
+    parser.add_argument('--reach', type=float, default=0.5, metavar='M', help='how rough that may be')
     parser.add_argument('--out', type=Path, metavar='YAML', help='write the transform here')
     parser.add_argument('--plot', type=Path, metavar='PNG', help='draw map and cloud together')
     parser.set_defaults(do=_align)

@@ -38,7 +38,7 @@ def add_plan(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``markers plan``."""
     parser.set_defaults(do=_plan)
     camera = parser.add_argument_group('camera')
-    camera.add_argument('--calibration', type=Path, help='camera_info YAML')
+    camera.add_argument('--calibration', type=Path, help='camera_info YAML (default: the --lens of a Tau 2)')
     camera.add_argument('--lens', type=float, default=13.0, metavar='MM', help='focal length, without a calibration')
     camera.add_argument('--netd', type=float, default=0.05, metavar='K', help='temporal noise of the camera')
     marker = parser.add_argument_group('marker')
@@ -56,7 +56,9 @@ def add_plan(parser: argparse.ArgumentParser) -> None:
     scene.add_argument('--tilt', type=float, default=30.0, metavar='DEG', help='between normal and line of sight')
     scene.add_argument('--distances', default='1,1.5,2,3,4,6,8,12', metavar='LIST', help='metres')
     parser.add_argument('--plot', type=Path, metavar='FILE', help='picture of both tables (PNG, PDF, SVG)')
-    parser.add_argument('--tables', type=Path, default=PACKAGED, help='measurements (default: those of the package)')
+    parser.add_argument(
+        '--tables', type=Path, default=PACKAGED, help='of measured views (default: those of the package)'
+    )
 
 
 def _plan(args: argparse.Namespace) -> int:

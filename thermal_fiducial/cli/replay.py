@@ -16,9 +16,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of the command."""
     parser.add_argument('bag', type=Path, metavar='BAG', help='rosbag2 folder, .mcap or .db3 file, or ROS 1 .bag')
     parser.add_argument('--out', type=Path, required=True, metavar='RUN', help='folder for the results')
-    parser.add_argument('--params', type=Path, metavar='FILE', help='ROS parameter file for the nodes')
-    parser.add_argument('--map', type=Path, metavar='FILE', help='marker map to start from')
-    parser.add_argument('--mode', choices=('mapping', 'localization'), help='whether new markers enter the map')
+    parser.add_argument(
+        '--params', type=Path, metavar='FILE', help="ROS parameter file (default: the nodes' own values)"
+    )
+    parser.add_argument(
+        '--map', type=Path, metavar='FILE', help='marker map to start from (default: map_file of --params)'
+    )
+    parser.add_argument(
+        '--mode',
+        choices=('mapping', 'localization'),
+        help='whether new markers enter the map (default: mode of --params)',
+    )
     parser.add_argument(
         '--transport',
         choices=('lockstep', 'processes'),

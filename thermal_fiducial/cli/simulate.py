@@ -4,6 +4,7 @@ import argparse
 from dataclasses import replace
 import os
 from pathlib import Path
+import textwrap
 
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.cli.simulate_corners import write_corner_flight
@@ -15,6 +16,7 @@ from thermal_fiducial.sim.sensor import FFC_BEHAVIOURS, Sensor
 from thermal_fiducial.sim.thermal_camera import FlightPlan, plan
 from thermal_fiducial.sim.writer import write_flight
 
+_OWN = "the scenario's"
 #: Inclusive ranges of the numbers.
 _RANGES = {
     'seconds': (1.0, 3600.0),
@@ -30,27 +32,49 @@ _RANGES = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    scenarios = '\n'.join(f'  {name:14}{item.description} ({item.seconds:g} s)' for name, item in SCENARIOS.items())
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = (
-        f'scenarios:\n{scenarios}\n\nOUT becomes a rosbag2 with ground_truth.tum, map_true.yaml, map_one.yaml (one '
-        'fixed marker)\nand params.yaml (the rig) in it. The same options and seed give the same bytes.'
+        f'scenarios:\n{_scenarios()}\n\nOUT becomes a rosbag2 with ground_truth.tum, map_true.yaml, map_one.yaml (one\n'
+        'fixed marker) and params.yaml (the rig) in it. The same options and seed give\nthe same bytes.'
     )
     parser.add_argument('out', type=Path, metavar='OUT', help='folder to create')
-    parser.add_argument('--scenario', default='fog', metavar='NAME', help='see below (default: fog)')
-    parser.add_argument('--seconds', type=float, help="length of the flight [s] (default: the scenario's)")
-    parser.add_argument('--seed', type=int, default=0, help='of path and noise (default: 0)')
-    parser.add_argument('--storage', choices=sorted(STORAGES), default='mcap', help='of the bag (default: mcap)')
-    parser.add_argument('--lens', help=f'another lens: {", ".join(LENSES)}')
-    parser.add_argument('--contrast', type=float, metavar='K', help='warm plates over cold acrylic [K]')
+    parser.add_argument('--scenario', default='fog', metavar='NAME', help='see below')
+    parser.add_argument('--seconds', type=float, help=f'length of the flight [s] (default: {_OWN})')
+    parser.add_argument('--seed', type=int, default=0, help='of path and noise')
+    parser.add_argument('--storage', choices=sorted(STORAGES), default='mcap', help='of the bag')
+    parser.add_argument('--lens', help=f'one of {", ".join(LENSES)} (default: {_OWN})')
+    parser.add_argument(
+        '--contrast', type=float, metavar='K', help=f'warm plates over cold acrylic [K] (default: {_OWN})'
+    )
     parser.add_argument('--inverted', action='store_true', help='warm code on a cold ground')
-    parser.add_argument('--fog', type=float, metavar='E', help='extinction in the long-wave infrared [1/m]')
-    parser.add_argument('--lag', type=float, metavar='S', help='thermal time constant of the bolometers [s]')
-    parser.add_argument('--readout', type=float, metavar='S', help="from the first row's sampling to the last's [s]")
-    parser.add_argument('--ffc', choices=(*FFC_BEHAVIOURS, 'never'), help='what a shutter event sends')
-    parser.add_argument('--time-offset', type=float, metavar='S', help="camera's clock: t_imu = t_camera + S [s]")
-    parser.add_argument('--trajectory', type=Path, metavar='TUM', help='fly these poses of base_link in map instead')
+    parser.add_argument(
+        '--fog', type=float, metavar='E', help=f'extinction in the long-wave infrared [1/m] (default: {_OWN})'
+    )
+    parser.add_argument(
+        '--lag', type=float, metavar='S', help=f'thermal time constant of the bolometers [s] (default: {_OWN})'
+    )
+    parser.add_argument(
+        '--readout', type=float, metavar='S', help=f"from the first row's sampling to the last's [s] (default: {_OWN})"
+    )
+    parser.add_argument(
+        '--ffc', choices=(*FFC_BEHAVIOURS, 'never'), help=f'what a shutter event sends (default: {_OWN})'
+    )
+    parser.add_argument(
+        '--time-offset', type=float, metavar='S', help=f"camera's clock: t_imu = t_camera + S [s] (default: {_OWN})"
+    )
+    parser.add_argument(
+        '--trajectory', type=Path, metavar='TUM', help=f'fly these poses of base_link in map (default: {_OWN})'
+    )
     parser.add_argument('--workers', type=int, default=_cores(), help='processes (default: one a core)')
+
+
+def _scenarios() -> str:
+    """Name and description of each, on lines of at most 80 characters."""
+    return '\n'.join(
+        textwrap.fill(
+            f'{item.description} ({item.seconds:g} s)', 80, initial_indent=f'  {name:14}', subsequent_indent=16 * ' '
+        )
+        for name, item in SCENARIOS.items()
+    )
 
 
 def run(args: argparse.Namespace) -> int:

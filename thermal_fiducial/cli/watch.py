@@ -28,9 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--once', action='store_true', help='show the state once and end; exit status 1 unless the pose may be flown on'
     )
-    parser.add_argument(
-        '--wait', type=float, default=3.0, help='with --once: listen for so long first [s] (default: 3)'
-    )
+    parser.add_argument('--wait', type=float, default=3.0, help='with --once: listen for so long first [s]')
     parser.add_argument('--plain', action='store_true', help='lines of plain text, no screen')
     parser.add_argument(
         '--ros-args', nargs=argparse.REMAINDER, default=[], help='remaps and the like, as for any node; last'
