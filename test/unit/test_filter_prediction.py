@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.estimates import any_estimate, difference
 
+from thermal_fiducial.core.filter.imu_buffer import Steps
 from thermal_fiducial.core.filter.prediction import Prediction
 from thermal_fiducial.core.filter.state import SIZE
 
@@ -21,8 +22,9 @@ def estimate():
 
 def after(estimate, steps=1, imu=IMU):
     prediction = Prediction.begin(estimate)
+    one = Steps(imu[None], np.array([1e-9 * STEP_NS]), DENSITIES[None])
     for step in range(1, steps + 1):
-        prediction = prediction.after(imu, estimate.stamp_ns + step * STEP_NS, DENSITIES)
+        prediction = prediction.after(one, estimate.stamp_ns + step * STEP_NS)
     return prediction
 
 

@@ -1,143 +1,211 @@
-"""The latest IMU samples and poses, and what is known at each: poses come late, and in any order.
+"""What is believed after each pose. Poses come late, and in any order.
 
-The belief at a sample is a function of the samples and poses up to it, ordered by time, never of the order in which
+The belief after a pose is a function of the samples and poses up to it, ordered by time, never of the order in which
 they came, but for the few samples after a pose that show its motion: a pose that comes late goes where it belongs, and
-everything after it is computed again, at the cost of one inertial step a sample.
+those after it are taken in again.
 """
 
 from bisect import bisect_left, bisect_right, insort
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+import math
 
-import numpy as np
-
+from thermal_fiducial.core.filter.hypotheses import Hypotheses, NO_GRAVITY
+from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
+from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
+from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.filter.update import MotionAtPose
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.types import FloatArray
 
 _SECOND_NS = 1_000_000_000
-#: Farther than this [ns] an estimated clock offset never goes: the history is searched from there.
-_LARGEST_OFFSET_NS = 200_000_000
-#: Samples of so long [s] before and after a pose show its motion, if they have come: the noise of one would not.
-_MOTION_SECONDS = 0.05
-
-
-@dataclass(slots=True)
-class Node:
-    """An IMU sample (6,), the densities (6,) of the noise of the step that ends with it, and the belief there."""
-
-    stamp_ns: int
-    imu: FloatArray
-    densities: FloatArray
-    belief: Belief
-
-
-@dataclass(frozen=True, slots=True)
-class Instant:
-    """Where a pose lies between two samples: ``time_ns`` in the clock of the IMU, and the sample (6,) there."""
-
-    time_ns: int
-    imu: FloatArray
-    index: int
 
 
 class History:
-    """Samples, poses, and beliefs, kept for so many ``seconds``."""
+    """Samples, poses, and beliefs, kept for so many ``seconds``.
 
-    def __init__(self, seconds: float, offset_ns: int) -> None:
-        self._kept_ns = round(seconds * _SECOND_NS)
-        self._offset_ns = offset_ns
-        self.nodes: list[Node] = []
-        self.poses: list[CameraPose] = []
+    ``camera_time_offset`` [s]: what is added to the camera's stamps before an offset is estimated.
+    """
 
-    def append(self, node: Node) -> None:
-        """Add the newest sample; forget what no pose may reach any more."""
-        self.nodes.append(node)
-        horizon = node.stamp_ns - self._kept_ns
-        # In blocks, as deleting from a list's head moves the rest.
-        if self.nodes[len(self.nodes) // 2].stamp_ns < horizon:
-            del self.nodes[: self.index_at(horizon)]
-            oldest = self.nodes[0].stamp_ns - self._offset_ns - _LARGEST_OFFSET_NS
-            del self.poses[: bisect_left(self.poses, oldest, key=_stamp)]
+    def __init__(self, hypotheses: Hypotheses, seconds: float, camera_time_offset: float) -> None:
+        self._hypotheses = hypotheses
+        self._kept_ns, self._offset_ns = round(seconds * _SECOND_NS), round(camera_time_offset * _SECOND_NS)
+        self.imu = ImuBuffer()
+        self._poses: list[CameraPose] = []
+        self._beliefs = [Belief()]
+        self._main: Hypothesis | None = None
 
-    def insert(self, pose: CameraPose) -> int:
-        """Add a pose; the first node whose belief it may change."""
-        insort(self.poses, pose, key=_stamp)
-        return self._first_reached(pose)
+    @property
+    def belief(self) -> Belief:
+        """The latest."""
+        return self._beliefs[-1]
 
-    def _first_reached(self, pose: CameraPose) -> int:
-        index = len(self.nodes)
-        while index > 1 and self._reaches(pose, index - 1):
-            index -= 1
-        return index
+    @property
+    def main(self) -> Hypothesis | None:
+        """The estimate at the newest sample."""
+        return self._main
 
-    def discard(self, stamps_ns: Iterable[int]) -> int:
-        """Forget poses by their stamps; the first node whose belief that may change."""
-        stamps = set(stamps_ns)
-        wrong = [pose for pose in self.poses if pose.stamp_ns in stamps]
-        self.poses = [pose for pose in self.poses if pose.stamp_ns not in stamps]
-        return min((self._first_reached(pose) for pose in wrong), default=len(self.nodes))
+    @property
+    def alternative(self) -> Hypothesis | None:
+        """The alternative to it at the newest sample."""
+        other = self.belief.alternative
+        return other and self._hypotheses.carried(other, self.imu, self.imu.newest_ns)
 
-    def _reaches(self, pose: CameraPose, index: int) -> bool:
-        belief = self.nodes[index - 1].belief
-        hypotheses: list[Hypothesis | None] = [h for h in (belief.main, belief.alternative) if h]
-        return any(self.due_ns(pose, h) <= self.nodes[index].stamp_ns for h in hypotheses or [None])
+    def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
+        """Add the newest sample (6,), and the densities (6,) of its step."""
+        self.imu.append(stamp_ns, imu, densities)
+        # In blocks, as the rest moves.
+        if stamp_ns - self.imu.oldest_ns > 2 * self._kept_ns:
+            self._forget_old()
+
+    def _forget_old(self) -> None:
+        """Forget what no pose may reach any more."""
+        horizon_ns = self.imu.newest_ns - self._kept_ns
+        while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
+            del self._beliefs[0]
+        oldest = self._beliefs[0]
+        del self._poses[: bisect_right(self._poses, oldest.pose_stamp_ns, key=_stamp)]
+        self.imu.forget_before(min(horizon_ns, oldest.stamp_ns) if oldest.hypotheses else horizon_ns)
+
+    def insert(self, pose: CameraPose) -> None:
+        """Add a pose; it is taken in when its time has come."""
+        insort(self._poses, pose, key=_stamp)
+        self._go_back_before(pose.stamp_ns)
+
+    def discard(self, stamps_ns: Iterable[int]) -> None:
+        """Forget poses by their stamps."""
+        stamps = {pose.stamp_ns for pose in self._poses} & set(stamps_ns)
+        self._poses = [pose for pose in self._poses if pose.stamp_ns not in stamps]
+        if stamps:
+            self._go_back_before(min(stamps))
+
+    def _go_back_before(self, stamp_ns: int) -> None:
+        """Forget what was believed after the pose of ``stamp_ns``."""
+        while len(self._beliefs) > 1 and self.belief.pose_stamp_ns >= stamp_ns:
+            self._forget_belief()
+
+    def _forget_belief(self) -> None:
+        del self._beliefs[-1]
+        self._main = None
+
+    def is_forgotten(self, pose: CameraPose) -> bool:
+        """Whether a pose is older than all beliefs."""
+        return pose.stamp_ns <= self._beliefs[0].pose_stamp_ns
 
     def holds(self, stamp_ns: int) -> bool:
         """Whether there is a pose of this stamp."""
-        place = bisect_left(self.poses, stamp_ns, key=_stamp)
-        return place < len(self.poses) and self.poses[place].stamp_ns == stamp_ns
+        place = bisect_left(self._poses, stamp_ns, key=_stamp)
+        return place < len(self._poses) and self._poses[place].stamp_ns == stamp_ns
 
     def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None) -> int:
         """Instant of a pose in the clock of the IMU by a hypothesis's estimate of the offset."""
-        offset = hypothesis.prediction.state.time_offset if hypothesis else 0.0
+        offset = hypothesis.prediction.origin.state.time_offset if hypothesis else 0.0
         return pose.stamp_ns + self._offset_ns + round(offset * _SECOND_NS)
 
-    def next_pose(self, seen_ns: int, hypothesis: Hypothesis | None, until_ns: int) -> CameraPose | None:
-        """The first pose after the stamp ``seen_ns`` that is due until an instant."""
-        place = bisect_right(self.poses, seen_ns, key=_stamp)
-        if place == len(self.poses) or self.due_ns(self.poses[place], hypothesis) > until_ns:
-            return None
-        return self.poses[place]
-
-    def instant(self, index: int, time_ns: int) -> Instant:
-        """An instant in the step that ends with node ``index``; before it, its beginning."""
-        before, after = self.nodes[index - 1], self.nodes[index]
-        time_ns = max(time_ns, before.stamp_ns)
-        share = (time_ns - before.stamp_ns) / (after.stamp_ns - before.stamp_ns)
-        return Instant(time_ns, before.imu + share * (after.imu - before.imu), index)
-
-    def window(self, instant: Instant, seconds: float) -> FloatArray:
-        """Samples (N, 6) of the last ``seconds`` up to an instant, the last one at it."""
-        first = self.index_at(instant.time_ns - round(seconds * _SECOND_NS))
-        return np.array([*(node.imu for node in self.nodes[first : instant.index]), instant.imu])
-
-    def motion(self, instant: Instant, hypothesis: Hypothesis) -> MotionAtPose:
-        """The motion at the instant of a pose, from the samples around it that have come."""
-        nodes, index = self.nodes, instant.index
-        before, after = nodes[index - 1 : index + 1]
-        seconds = (after.stamp_ns - before.stamp_ns) / _SECOND_NS
-        each_side = max(min(round(_MOTION_SECONDS / seconds), len(nodes) - index, index), 1)
-        samples = np.array([node.imu for node in nodes[index - each_side : index + each_side]])
-        since_pose = (instant.time_ns - hypothesis.accepted_ns) / _SECOND_NS
-        return MotionAtPose(
-            imu=samples.mean(axis=0),
-            rate_variance=float(after.densities[0]) ** 2 / (seconds * len(samples)),
-            velocity_variance=float(after.densities[3]) ** 2 * since_pose,
-            turning=float(np.linalg.norm(after.imu[:3] - before.imu[:3])) / seconds,
-        )
-
-    def index_at(self, stamp_ns: int) -> int:
-        """First node at ``stamp_ns`` or later."""
-        return bisect_left(self.nodes, stamp_ns, key=_node_stamp)
+    def main_at(self, pose: CameraPose) -> tuple[Hypothesis, MotionAtPose] | None:
+        """The estimate and the motion at the instant of a pose that is not to be taken in."""
+        for belief in reversed(self._beliefs):
+            time_ns = min(self.due_ns(pose, belief.main), self.imu.newest_ns)
+            if belief.main and belief.main.prediction.stamp_ns <= time_ns:
+                there = self._hypotheses.carried(belief.main, self.imu, time_ns)
+                return there, self.imu.motion(time_ns, there.accepted_ns)
+        return None
 
     def move_map(self, T_new_old: FloatArray) -> None:
         """Move beliefs and poses with the map, T_new = T_new_old @ T_old."""
-        for node in self.nodes:
-            node.belief = node.belief.in_moved_map(T_new_old)
-        self.poses = [in_moved_map(pose, T_new_old) for pose in self.poses]
+        self._beliefs = [belief.in_moved_map(T_new_old) for belief in self._beliefs]
+        self._poses = [in_moved_map(pose, T_new_old) for pose in self._poses]
+        self._main = self._main and self._main.in_moved_map(T_new_old)
+
+    # --- taking in poses ------------------------------------------------------------------------------
+
+    def take_in(self) -> list[PoseUpdate]:
+        """Take in all poses that are due by the newest sample, and go on to it; the verdicts on them."""
+        updates: list[PoseUpdate] = []
+        while (pose := self._next_due()) is not None:
+            belief, decided = self._after(pose)
+            self._beliefs.append(belief)
+            self._main = None
+            updates += decided
+        self._go_on()
+        return updates
+
+    def _next_due(self) -> CameraPose | None:
+        belief = self.belief
+        place = bisect_right(self._poses, belief.pose_stamp_ns, key=_stamp)
+        if place == len(self._poses):
+            return None
+        pose = self._poses[place]
+        due_ns = max((self.due_ns(pose, h) for h in belief.hypotheses), default=self.due_ns(pose, None))
+        return pose if due_ns <= self.imu.newest_ns else None
+
+    def _go_on(self) -> None:
+        """Carry the estimate to the newest sample; what is folded on the way is kept."""
+        belief = self.belief
+        if belief.main is None:
+            return
+        self._main = self._hypotheses.carried(self._main or belief.main, self.imu, self.imu.newest_ns)
+        if self._main.prediction.origin is not belief.main.prediction.origin:
+            self._beliefs.append(belief._replace(main=self._main, alternative=self.alternative))
+
+    def _after(self, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
+        """The belief after the next pose, and verdicts on that."""
+        self._unfold(pose)
+        belief = self.belief._replace(pose_stamp_ns=pose.stamp_ns)
+        if not belief.hypotheses:
+            return self._begun(belief, pose)
+        main, decided = belief.main, [PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)]
+        at_pose = main and self._at(main, pose)
+        motion = at_pose and self.imu.motion(at_pose.prediction.stamp_ns, at_pose.accepted_ns)
+        if at_pose and motion:
+            main, update = self._hypotheses.weigh(at_pose, pose, motion)
+            decided = [update]
+        alternative = belief.alternative
+        if alternative:
+            alternative = self._at(alternative, pose)
+            its_motion = self.imu.motion(alternative.prediction.stamp_ns, alternative.accepted_ns)
+            alternative, _ = self._hypotheses.weigh(alternative, pose, its_motion)
+        belief = belief._replace(main=main, alternative=alternative)
+        if at_pose and motion and alternative is None and not decided[0].accepted:
+            belief = self._with_alternative(belief, at_pose, pose, motion)
+        return self._settled(belief, decided)
+
+    def _unfold(self, pose: CameraPose) -> None:
+        """Go back before what was folded later than a pose's instant."""
+        while len(self._beliefs) > 1 and self._beliefs[-2].pose_stamp_ns == self.belief.pose_stamp_ns:
+            if all(h.prediction.stamp_ns <= self.due_ns(pose, h) for h in self.belief.hypotheses):
+                return
+            self._forget_belief()
+
+    def _at(self, hypothesis: Hypothesis, pose: CameraPose) -> Hypothesis:
+        """A hypothesis at the instant of a pose; where it is now, if it is beyond that by what it learned since."""
+        time_ns = max(self.due_ns(pose, hypothesis), hypothesis.prediction.stamp_ns)
+        return self._hypotheses.carried(hypothesis, self.imu, min(time_ns, self.imu.newest_ns))
+
+    def _begun(self, belief: Belief, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
+        time_ns = max(self.due_ns(pose, None), self.imu.oldest_ns)
+        window = self.imu.window(time_ns, WINDOW_SECONDS)
+        begun = self._hypotheses.from_nothing(pose, time_ns, window)
+        decided = [PoseUpdate(pose.stamp_ns, False, 'initialising' if begun else NO_GRAVITY, math.nan)]
+        return self._settled(belief._replace(alternative=begun), decided) if begun else (belief, decided)
+
+    def _with_alternative(self, belief: Belief, at_pose: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> Belief:
+        """With an alternative that begins with a pose that the estimate refuses, if one can."""
+        time_ns = at_pose.prediction.stamp_ns
+        window = self.imu.window(time_ns, WINDOW_SECONDS)
+        begun = self._hypotheses.alternative_to(at_pose, pose, time_ns, motion, window)
+        if begun is None:
+            return belief
+        drifted = begun.needed == 0 or (belief.drifted and at_pose.refused_in_row > 0)
+        begun = begun._replace(needed=0) if drifted else begun
+        return belief._replace(alternative=begun, hits_before=at_pose.hits, drifted=drifted)
+
+    def _settled(self, belief: Belief, decided: list[PoseUpdate]) -> tuple[Belief, list[PoseUpdate]]:
+        settled = self._hypotheses.settled(belief)
+        if settled.main is None or settled.main is belief.main:
+            return settled, decided
+        reason = 'reset' if belief.main else 'initialised'
+        return settled, [*decided, PoseUpdate(settled.pose_stamp_ns, True, reason, math.nan)]
 
 
 _stamp: Callable[[CameraPose], int] = lambda pose: pose.stamp_ns  # noqa: E731
-_node_stamp: Callable[[Node], int] = lambda node: node.stamp_ns  # noqa: E731

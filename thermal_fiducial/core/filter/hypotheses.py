@@ -6,10 +6,11 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import blank_state, start
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.prediction import Prediction
-from thermal_fiducial.core.filter.recovery import Belief, far_covariance, Hypothesis
+from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
     Estimate,
@@ -28,8 +29,8 @@ from thermal_fiducial.core.types import FloatArray
 _SECOND_NS = 1_000_000_000
 #: why a pose was refused that no attitude of a robot under gravity explains
 NO_GRAVITY = 'refused: contradicts gravity'
-#: The accumulated transition is folded into the covariance after so long [s].
-_FOLDED = 0.1
+#: The motion since the origin is folded into the covariance after so long [ns], as the biases walk meanwhile.
+_FOLDED_NS = 100_000_000
 #: A pose that is off even for an estimate that claims so many times too little, and by more than a few of these
 #: [rad, m], is a marker's fault, unless as many poses bear it out as have borne out the estimate, or so many. Nearer
 #: ones are believed earlier: coasting on for long would do more harm.
@@ -49,12 +50,16 @@ class Hypotheses:
         self._config = config
         self._updater.config = config
 
-    def predicted(self, hypothesis: Hypothesis, imu: FloatArray, stamp_ns: int, densities: FloatArray) -> Hypothesis:
-        """A hypothesis after a step to ``stamp_ns`` with mean sample ``imu`` (6,) and noise ``densities`` (6,)."""
-        prediction = hypothesis.prediction.after(imu, stamp_ns, densities)
-        if prediction.seconds > _FOLDED:
-            prediction = Prediction.begin(prediction.estimate(self._walks))
-        return hypothesis.moved(prediction)
+    def carried(self, hypothesis: Hypothesis, imu: ImuBuffer, until_ns: int) -> Hypothesis:
+        """A hypothesis as the samples carry it on to an instant that is not later than the newest of them."""
+        prediction = hypothesis.prediction
+        while prediction.stamp_ns < until_ns:
+            folded_ns = imu.first_after(prediction.origin.stamp_ns + _FOLDED_NS)
+            end_ns = min(until_ns, max(folded_ns, imu.first_after(prediction.stamp_ns)))
+            prediction = prediction.after(imu.steps(prediction.stamp_ns, end_ns), end_ns)
+            if end_ns - prediction.origin.stamp_ns > _FOLDED_NS:
+                prediction = Prediction.begin(prediction.estimate(self._walks))
+        return hypothesis._replace(prediction=prediction)
 
     def estimate(self, hypothesis: Hypothesis) -> Estimate:
         """State and whole covariance at the hypothesis's instant."""
@@ -67,9 +72,9 @@ class Hypotheses:
         innovation = self._updater.innovation(estimate, measured, motion)
         if innovation.nis <= self._config.gate and not self._is_stale(hypothesis):
             corrected = self._updater.correct(measured, innovation, motion)
-            accepted = hypothesis.accepting(Prediction.begin(corrected), pose.stamp_ns)
+            accepted = hypothesis.accepting(Prediction.begin(corrected))
             return accepted, PoseUpdate(pose.stamp_ns, True, '', innovation.nis)
-        refusing = hypothesis.refusing(Prediction.begin(estimate), pose.stamp_ns)
+        refusing = hypothesis.refusing(Prediction.begin(estimate))
         return refusing, PoseUpdate(
             pose.stamp_ns, False, f'refused: {math.sqrt(innovation.nis):.1f} sigma', innovation.nis
         )
@@ -81,6 +86,10 @@ class Hypotheses:
             estimate = self._updater.with_unknown_clock(estimate)
         measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
         return self._updater.innovation(estimate, measured, motion).nis <= self._config.gate
+
+    def settled(self, belief: Belief) -> Belief:
+        """The belief after its hypotheses were weighed against each other."""
+        return belief.settled(self._config)
 
     def _is_stale(self, hypothesis: Hypothesis) -> bool:
         """Whether it has gone without poses for too long to be corrected."""
@@ -107,14 +116,14 @@ class Hypotheses:
             innovation = self._updater.innovation(self._updater.with_unknown_clock(estimate), measured, motion)
             if innovation.nis <= self._config.gate:
                 corrected = self._updater.correct(measured, innovation, motion)
-                return Hypothesis(Prediction.begin(corrected), time_ns, time_ns, pose.stamp_ns)
+                return Hypothesis(Prediction.begin(corrected), time_ns, time_ns)
         begun = self._begun(pose, time_ns, window, estimate.state)
         if begun is None:
             return None
-        widened = far_covariance(estimate.covariance, _FAR_TOO_SURE, _FAR, POSE)
+        widened = _far_covariance(estimate.covariance)
         far = self._updater.innovation(replace(estimate, covariance=widened), measured, motion)
         needed = 0 if far.nis <= self._config.gate else min(main.hits, _ENOUGH_POSES)
-        return replace(begun, needed=needed)
+        return begun._replace(needed=needed)
 
     def _begun(self, pose: CameraPose, time_ns: int, window: FloatArray, prior: NavigationState) -> Hypothesis | None:
         config = self._config
@@ -122,21 +131,22 @@ class Hypotheses:
         estimate = start(config, self._updater, measured, time_ns, prior, window)
         if estimate is None:
             return None
-        return Hypothesis(Prediction.begin(estimate), time_ns, time_ns, pose.stamp_ns)
+        return Hypothesis(Prediction.begin(estimate), time_ns, time_ns)
 
-    def core_covariance(self, belief: Belief, imu: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Covariance (9, 9) of the main estimate's core, and (9, 3) of it with the gyroscope's bias, to be published.
+    def core_covariance(
+        self, main: Hypothesis, other: Hypothesis | None, imu: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Covariance (9, 9) of an estimate's core, and (9, 3) of it with the gyroscope's bias, to be published.
 
-        They count what the clock offset may be even before that is estimated, and an alternative that contradicts.
+        They count what the clock offset may be even before that is estimated, and an ``other`` one at the same instant
+        that contradicts it. ``imu`` (6,): sample there.
         """
-        main, other = belief.main, belief.alternative
-        assert main
-        covariance, with_bias = main.prediction.core_covariance()
+        covariance, with_bias = main.prediction.core_covariance
         if self._config.estimate_time_offset and not main.prediction.origin.clock_open:
             covariance = covariance + self._clock_covariance(main.prediction.state, covariance, imu)
-        if other and main.in_doubt and other.hits >= self._config.initial_poses:
+        if other:
             apart = _difference(main.prediction.state, other.prediction.state)
-            covariance = covariance + other.prediction.core_covariance()[0] + np.outer(apart, apart)
+            covariance = covariance + other.prediction.core_covariance[0] + np.outer(apart, apart)
         return covariance, with_bias
 
     def _clock_covariance(self, state: NavigationState, covariance: FloatArray, imu: FloatArray) -> FloatArray:
@@ -145,6 +155,13 @@ class Hypotheses:
         added = np.outer(moved, moved)
         added[POSITION, POSITION] += covariance[VELOCITY, VELOCITY]
         return np.asarray(self._config.time_offset_std**2 * added)
+
+
+def _far_covariance(covariance: FloatArray) -> FloatArray:
+    """The covariance (48, 48) of an estimate that claims too little, and may besides be off by some distance."""
+    widened = _FAR_TOO_SURE**2 * covariance
+    widened[POSE, POSE] += np.square(_FAR)
+    return widened
 
 
 def _difference(state: NavigationState, other: NavigationState) -> FloatArray:

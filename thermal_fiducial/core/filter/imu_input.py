@@ -1,8 +1,7 @@
 """What may enter the filter from the IMU: finite samples in the order of their stamps, on one clock."""
 
 from enum import Enum
-
-import numpy as np
+import math
 
 from thermal_fiducial.core.measurements import ImuSample
 
@@ -55,11 +54,10 @@ class ImuInput:
 
     def judge(self, sample: ImuSample) -> Verdict:
         """Verdict on ``sample``; it is remembered."""
-        if not (np.isfinite(sample.angular_velocity).all() and np.isfinite(sample.linear_acceleration).all()):
+        rates, forces = sample.angular_velocity.tolist(), sample.linear_acceleration.tolist()
+        if not all(map(math.isfinite, (*rates, *forces))):
             return Verdict.NOT_FINITE
-        if np.abs(sample.angular_velocity).max() > self._limits[0]:
-            return Verdict.IMPOSSIBLE
-        if np.abs(sample.linear_acceleration).max() > self._limits[1]:
+        if max(map(abs, rates)) > self._limits[0] or max(map(abs, forces)) > self._limits[1]:
             return Verdict.IMPOSSIBLE
         if self._is_frozen(sample):
             return Verdict.FROZEN

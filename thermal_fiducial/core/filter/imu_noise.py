@@ -19,7 +19,7 @@ _LEAST_MOTION = (2.0 * (_LAGS / 0.2) ** 3 / (1.0 + (_LAGS / 0.2) ** 2))[:, None]
 #: Errors of nonlinearity, bandwidth and internal lever arms last as long as the motion does that makes them [s].
 _MOTION_TIME = 1.0
 #: A saturated sample may hide a hit [m/s^2], or a spin as fast again as the range [rad/s].
-_SATURATED = np.array((5.0, 150.0))
+_SATURATED = 5.0, 150.0
 #: Longer steps than this [s] interrupt the spectrum; what they hide is more than the spectrum shows.
 _INTERRUPTED = 0.03
 #: The floor of the spectrum is that of the quietest of so many bands between these frequencies [Hz]: above the motion,
@@ -40,12 +40,13 @@ class ImuNoiseMonitor:
         self._noise = noise
         self._floor = NoiseFloor()
         self._motion = StructureFunction()
-        self._mean: FloatArray | None = None
+        self._mean_force: FloatArray | None = None
         self._recent: list[FloatArray] = []
-        self._sheet = np.array((noise.gyroscope_noise_density, noise.accelerometer_noise_density))
-        self._nonlinearity = np.array((noise.gyroscope_nonlinearity, noise.accelerometer_nonlinearity))
-        self._ranges = np.array((noise.gyroscope_range, noise.accelerometer_range))
-        self._saturated = np.zeros(2)
+        # Of gyroscope and accelerometer, as single numbers: arrays of two take ten times as long.
+        self._sheet = noise.gyroscope_noise_density, noise.accelerometer_noise_density
+        self._nonlinearity = noise.gyroscope_nonlinearity, noise.accelerometer_nonlinearity
+        self._ranges = noise.gyroscope_range, noise.accelerometer_range
+        self._saturated = [0.0, 0.0]
 
     @property
     def vibration(self) -> tuple[float, float]:
@@ -56,26 +57,31 @@ class ImuNoiseMonitor:
         """(6,) densities for the step of ``seconds`` that ends with sample ``imu`` (6,)."""
         self._follow_spectrum(imu, seconds)
         self._motion.add(imu, seconds)
-        motion = self._size_of_motion(imu, seconds)
-        white = np.maximum(self._sheet, self._noise.vibration * np.asarray(self._floor.densities)) ** 2
-        moving = (self._nonlinearity * motion) ** 2 * _MOTION_TIME
-        between = self._motion.hidden(seconds) if self._interrupted(seconds) else 0.0
-        beyond = (np.abs(imu).reshape(2, 3).max(axis=1) >= self._ranges) * _SATURATED**2 * seconds
-        lost = np.maximum(beyond, self._saturated)
-        self._saturated = beyond
-        return np.repeat(np.sqrt(white + moving + between + lost), 3)
+        between = self._motion.hidden(seconds) if self._interrupted(seconds) else (0.0, 0.0)
+        largest = np.abs(imu)
+        squares = []
+        for triad, motion in enumerate(self._size_of_motion(imu, seconds)):
+            white = max(self._sheet[triad], self._noise.vibration * self._floor.densities[triad]) ** 2
+            moving = (self._nonlinearity[triad] * motion) ** 2 * _MOTION_TIME
+            beyond = largest[3 * triad : 3 * triad + 3].max() >= self._ranges[triad]
+            lost = _SATURATED[triad] ** 2 * seconds if beyond else 0.0
+            squares.append(white + moving + between[triad] + max(lost, self._saturated[triad]))
+            self._saturated[triad] = lost
+        rate, force = map(math.sqrt, squares)
+        return np.array((rate, rate, rate, force, force, force))
 
     def _interrupted(self, seconds: float) -> bool:
         """Whether a step is of those of which the spectrum says nothing."""
         return seconds > _INTERRUPTED or not any(self._floor.densities)
 
-    def _size_of_motion(self, imu: FloatArray, seconds: float) -> FloatArray:
-        """Size (2,) of the rate, and of the force beside its slow mean, which is gravity."""
-        if self._mean is None:
-            self._mean = imu
-        self._mean = self._mean + min(seconds / _SLOW, 1.0) * (imu - self._mean)
-        moved = imu[3:] - self._mean[3:]
-        return np.array((math.sqrt(float(imu[:3] @ imu[:3])), math.sqrt(float(moved @ moved))))
+    def _size_of_motion(self, imu: FloatArray, seconds: float) -> tuple[float, float]:
+        """Size of the rate, and of the force beside its slow mean, which is gravity."""
+        rate, force = imu[:3], imu[3:]
+        if self._mean_force is None:
+            self._mean_force = force
+        self._mean_force = self._mean_force + min(seconds / _SLOW, 1.0) * (force - self._mean_force)
+        moved = force - self._mean_force
+        return math.sqrt(float(rate @ rate)), math.sqrt(float(moved @ moved))
 
     def _follow_spectrum(self, imu: FloatArray, seconds: float) -> None:
         if seconds > _INTERRUPTED:
@@ -127,8 +133,8 @@ class StructureFunction:
         mean = (of_lag @ squares) / np.maximum(counts, 1)[:, None]
         self._measured = self._measured + gain[:, None] * (mean - self._measured)
 
-    def hidden(self, seconds: float) -> FloatArray:
-        """Squared densities (2,) of the noise that a step of ``seconds`` between two samples makes."""
+    def hidden(self, seconds: float) -> tuple[float, float]:
+        """Squared densities of the noise that a step of ``seconds`` between two samples makes."""
         place = math.log2(seconds / _SHORTEST_LAG)
         lower = min(max(int(place), 0), len(_LAGS) - 2)
         D = np.maximum(self._measured[lower : lower + 2], _LEAST_MOTION[lower : lower + 2])
@@ -136,7 +142,8 @@ class StructureFunction:
         at_step = D[0] * 2.0 ** (exponent * (place - lower))
         # The errors of steps in a row share a sample: they add up twice as fast if all is vibration.
         shared = 1.0 + np.maximum(1.0 - exponent, 0.0)
-        return np.asarray(at_step * (1.0 / (exponent + 2.0) - 0.25) * shared * seconds)
+        rate, force = (at_step * (1.0 / (exponent + 2.0) - 0.25) * shared * seconds).tolist()
+        return rate, force
 
 
 class NoiseFloor:

@@ -10,6 +10,7 @@ Series Smoothing and Forecasting Using the EM Algorithm", 1982.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 import math
 
 import numpy as np
@@ -27,10 +28,10 @@ _LARGEST_NIS = 12.6
 #: largest square of an innovation along the motion, normalised.
 _PRIOR_STAMPS, _MEMORY, _STAMP_RANGE, _LARGEST_SQUARE = 10.0, 300.0, (1e-4, 5e-3), 9.0
 #: What the covariance of a pose never is below: rounding of float32 corners [rad, m].
-_ROUNDING = np.repeat([1e-5, 3e-5], 3) ** 2
+_ROUNDING = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class BodyPose:
     """A measured pose of the robot; ``covariance`` (6, 6): rotation, then position, in the robot frame [rad, m]."""
 
@@ -38,10 +39,10 @@ class BodyPose:
     T_map_body: FloatArray
     covariance: FloatArray
 
-    @property
+    @cached_property
     def shape(self) -> FloatArray:
         """(6, 6) the covariance, never singular."""
-        return self.covariance + np.diag(_ROUNDING)
+        return self.covariance + _ROUNDING
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,8 @@ class PoseNoise:
             return 0.0
         A, B = self.last.shape, pose.shape
         # What is uncertain of position for what is uncertain of rotation: the distance to the markers.
-        distance = math.sqrt(float(np.trace(B[3:, 3:]) / np.trace(B[:3, :3])))
+        variances = B.diagonal()
+        distance = math.sqrt(float(variances[3:].sum() / variances[:3].sum()))
         T_last, T = self.last.T_map_body, pose.T_map_body
         turned = float(rotation_angle(T_last[:3, :3].T @ T[:3, :3]))
         moved = float(np.linalg.norm(T[:3, 3] - T_last[:3, 3])) / distance
@@ -88,17 +90,17 @@ class PoseNoise:
         return math.exp(-(turned + moved) / angle + min(float(overlap), 0.0))
 
     def after(
-        self, pose: BodyPose, innovation: FloatArray, S: FloatArray, second_moment: float, alike: float
+        self, pose: BodyPose, innovation: FloatArray, S_inverse: FloatArray, second_moment: float, alike: float
     ) -> 'PoseNoise':
         """What is known after an accepted pose.
 
         Parameters
         ----------
-        innovation, S : (6,) and its covariance (6, 6)
+        innovation, S_inverse : (6,) and the inverse (6, 6) of its covariance
         second_moment : expected square of the systematic error, per coordinate, in its own standard deviations
         alike : correlation of the systematic error with that of the pose before
         """
-        white = self.white * self._white_step(pose, innovation, S)
+        white = self.white * self._white_step(pose, innovation, S_inverse)
         # As much is new about the systematic error as has changed of it.
         news = (1.0 - alike * alike) / _PRIOR_VIEWS * (second_moment - 1.0)
         systematic = self.systematic * math.exp(min(news, _LARGEST_STEP))
@@ -109,14 +111,14 @@ class PoseNoise:
             last=pose,
         )
 
-    def with_stamps(self, twist: FloatArray, innovation: FloatArray, S: FloatArray) -> 'PoseNoise':
+    def with_stamps(self, twist: FloatArray, innovation: FloatArray, S_inverse: FloatArray) -> 'PoseNoise':
         """What is known of the stamps' jitter after an innovation: a step of Fisher scoring on its likelihood.
 
         ``twist`` (6,): by which a late stamp moves the pose [1/s].
         """
         if not self.jitter:
             return self
-        weighted = np.linalg.solve(S, twist)
+        weighted = S_inverse @ twist
         precision = float(twist @ weighted)
         square = min(float(innovation @ weighted) ** 2, _LARGEST_SQUARE * precision)
         share = self.jitter * precision
@@ -126,10 +128,10 @@ class PoseNoise:
         jitter = min(max(self.jitter * math.exp(step), low**2), high**2)
         return replace(self, jitter=jitter, jitter_information=information)
 
-    def _white_step(self, pose: BodyPose, innovation: FloatArray, S: FloatArray) -> float:
+    def _white_step(self, pose: BodyPose, innovation: FloatArray, S_inverse: FloatArray) -> float:
         """Factor on the white variance: a step of Fisher scoring on the likelihood of an innovation."""
-        weighted = np.linalg.solve(S, innovation)
-        share = np.linalg.solve(S, self.white * pose.shape)
+        weighted = S_inverse @ innovation
+        share = S_inverse @ (self.white * pose.shape)
         nis = float(innovation @ weighted)
         bounded = min(_LARGEST_NIS / max(nis, _LARGEST_NIS), 1.0)
         score = 0.5 * (bounded * self.white * float(weighted @ pose.shape @ weighted) - float(np.trace(share)))

@@ -5,10 +5,8 @@ not. One that many poses agree with, while the estimate accepts few, replaces it
 thing without an estimate to replace.
 """
 
-from dataclasses import dataclass, replace
 import math
-
-import numpy as np
+from typing import NamedTuple
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.prediction import Prediction
@@ -23,19 +21,16 @@ _PREFERRED = 4
 REFUSALS_OF_DOUBT = 3
 #: So many accepted ones in a row, and the alternative is forgotten.
 _REFUTED = 3
-_NEVER = -(1 << 62)
+NEVER = -(1 << 62)
 
 
-@dataclass(frozen=True, slots=True)
-class Hypothesis:
+class Hypothesis(NamedTuple):
     """A prediction and the poses that speak for it, and against it."""
 
     prediction: Prediction
     #: instants of its first and of its last accepted pose, clock of the IMU
     started_ns: int
     accepted_ns: int
-    #: stamp of the last pose that it was compared with
-    pose_stamp_ns: int
     hits: int = 1
     misses: int = 0
     #: latest poses that it accepted, refused, in a row
@@ -44,45 +39,34 @@ class Hypothesis:
     #: of an alternative: poses that must agree on it
     needed: int = 0
 
-    def moved(self, prediction: Prediction) -> 'Hypothesis':
-        """After an inertial step."""
-        return Hypothesis(
-            prediction,
-            self.started_ns,
-            self.accepted_ns,
-            self.pose_stamp_ns,
-            self.hits,
-            self.misses,
-            self.accepted_in_row,
-            self.refused_in_row,
-            self.needed,
-        )
-
-    def accepting(self, prediction: Prediction, pose_stamp_ns: int) -> 'Hypothesis':
+    def accepting(self, prediction: Prediction) -> 'Hypothesis':
         """After a pose that it accepts."""
-        return replace(
-            self.moved(prediction),
+        return self._replace(
+            prediction=prediction,
             accepted_ns=prediction.stamp_ns,
-            pose_stamp_ns=pose_stamp_ns,
             hits=self.hits + 1,
             accepted_in_row=self.accepted_in_row + 1,
             refused_in_row=0,
         )
 
-    def refusing(self, prediction: Prediction, pose_stamp_ns: int) -> 'Hypothesis':
+    def refusing(self, prediction: Prediction) -> 'Hypothesis':
         """After a pose that it refuses."""
-        return replace(
-            self.moved(prediction),
-            pose_stamp_ns=pose_stamp_ns,
+        return self._replace(
+            prediction=prediction,
             misses=self.misses + 1,
             accepted_in_row=0,
             refused_in_row=self.refused_in_row + 1,
         )
 
+    def in_moved_map(self, T_new_old: FloatArray) -> 'Hypothesis':
+        """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
+        origin = self.prediction.origin.in_moved_map(T_new_old)
+        return self._replace(prediction=self.prediction.with_origin(origin))
+
     @property
     def position_std(self) -> float:
         """Root of the sum of the position variances [m]."""
-        core, _ = self.prediction.core_covariance()
+        core, _ = self.prediction.core_covariance
         return math.sqrt(float(core[POSITION, POSITION].trace()))
 
     @property
@@ -96,14 +80,13 @@ class Hypothesis:
         return self.misses >= self.hits
 
 
-@dataclass(frozen=True, slots=True)
-class Belief:
-    """Everything that the filter knows at one instant."""
+class Belief(NamedTuple):
+    """Everything that the filter knows after a pose."""
 
     main: Hypothesis | None = None
     alternative: Hypothesis | None = None
-    #: stamp of the last camera pose that was looked at while there was no hypothesis
-    pose_stamp_ns: int = _NEVER
+    #: stamp of the last camera pose that was taken in
+    pose_stamp_ns: int = NEVER
     #: times that an alternative has replaced an estimate
     resets: int = 0
     #: hits of the estimate when the alternative began
@@ -115,21 +98,20 @@ class Belief:
     reset_reason: str = ''
 
     @property
-    def time_offset(self) -> float | None:
-        """Clock offset that holds [s]; None where there is no estimate of it."""
-        hypothesis = self.main or self.alternative
-        return hypothesis.prediction.state.time_offset if hypothesis else None
+    def hypotheses(self) -> list[Hypothesis]:
+        """Those that there are."""
+        return [hypothesis for hypothesis in (self.main, self.alternative) if hypothesis]
+
+    @property
+    def stamp_ns(self) -> int:
+        """Instant up to which nothing before it matters any more; that of the pose's stamp without any hypothesis."""
+        return min((h.prediction.stamp_ns for h in self.hypotheses), default=self.pose_stamp_ns)
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'Belief':
         """The belief in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-
-        def move(hypothesis: Hypothesis | None) -> Hypothesis | None:
-            if hypothesis is None:
-                return None
-            prediction = hypothesis.prediction
-            return hypothesis.moved(prediction.in_moved_map(prediction.origin.in_moved_map(T_new_old), T_new_old))
-
-        return replace(self, main=move(self.main), alternative=move(self.alternative))
+        main = self.main and self.main.in_moved_map(T_new_old)
+        alternative = self.alternative and self.alternative.in_moved_map(T_new_old)
+        return self._replace(main=main, alternative=alternative)
 
     def settled(self, config: PoseEkfConfig) -> 'Belief':
         """The belief after the alternative was weighed against the estimate: it is forgotten, replaces it, or waits."""
@@ -137,7 +119,7 @@ class Belief:
         if other is None:
             return self
         if other.failed or (main and main.accepted_in_row >= _REFUTED):
-            return replace(self, alternative=None)
+            return self._replace(alternative=None)
         if main is None:
             return self._promoted('') if other.hits >= config.initial_poses else self
         if other.hits < config.initial_poses:
@@ -160,21 +142,10 @@ class Belief:
         """With the alternative as the estimate, for a ``reason`` in words where there was one."""
         assert self.alternative
         resets = self.resets + (self.main is not None)
-        fresh = replace(self.alternative, accepted_in_row=1, refused_in_row=0, needed=0)
-        return replace(
-            self,
+        fresh = self.alternative._replace(accepted_in_row=1, refused_in_row=0, needed=0)
+        return self._replace(
             main=fresh,
             alternative=None,
-            pose_stamp_ns=self.alternative.pose_stamp_ns,
             resets=resets,
             reset_reason=reason,
         )
-
-
-def far_covariance(
-    covariance: FloatArray, claimed_too_little: float, distance: FloatArray, place: FloatArray
-) -> FloatArray:
-    """``covariance`` of an estimate that claims too little, and may besides be off by ``distance`` at ``place``."""
-    widened = claimed_too_little**2 * covariance
-    widened[place, place] += np.square(distance)
-    return widened

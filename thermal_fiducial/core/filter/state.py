@@ -14,8 +14,8 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.filter.increments import rotation_integrals
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
+from thermal_fiducial.core.filter.rotation_integrals import rotation_integrals
 from thermal_fiducial.core.geometry.se3 import transform
 from thermal_fiducial.core.types import FloatArray
 

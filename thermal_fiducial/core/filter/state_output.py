@@ -3,13 +3,16 @@
 import numpy as np
 
 from thermal_fiducial.core.filter.prediction import Prediction
+from thermal_fiducial.core.filter.rotation_integrals import SKEW
 from thermal_fiducial.core.filter.state import GYROSCOPE_BIAS, POSITION, ROTATION, VELOCITY
-from thermal_fiducial.core.geometry.se3 import skew
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray
 
-_ORDER = np.r_[POSITION, ROTATION, VELOCITY]
-_ALL = np.ix_(_ORDER, _ORDER)
+#: (12, 12) position, rotation, velocity and rate of the robot by the core's errors and the gyroscope's bias, for a
+#: robot at rest whose axes are those of the map.
+_AT_REST = np.zeros((12, 12))
+_AT_REST[6:9, VELOCITY] = np.eye(3)
+_AT_REST[9:, 9:] = -np.eye(3)
 
 
 def odometry(
@@ -27,16 +30,12 @@ def odometry(
     state = prediction.state
     R, velocity_body = state.R_map_body, state.velocity_body
     joint = np.empty((12, 12))
-    joint[:9, :9] = core[_ALL]
-    joint[:9, 9:] = with_bias[_ORDER]
-    joint[9:, :9] = joint[:9, 9:].T
+    joint[:9, :9], joint[:9, 9:], joint[9:, :9] = core, with_bias, with_bias.T
     joint[9:, 9:] = prediction.origin.covariance[GYROSCOPE_BIAS, GYROSCOPE_BIAS]
     # (p, theta) of the map are R times the error of the robot frame; v_body moves with both nu and phi.
-    J = np.zeros((12, 12))
-    J[0:3, 0:3] = J[3:6, 3:6] = R
-    J[6:9, 3:6] = skew(velocity_body)
-    J[6, 6] = J[7, 7] = J[8, 8] = 1.0
-    J[9, 9] = J[10, 10] = J[11, 11] = -1.0
+    J = _AT_REST.copy()
+    J[0:3, POSITION] = J[3:6, ROTATION] = R
+    J[6:9, ROTATION] = (velocity_body @ SKEW).reshape(3, 3)
     covariance = J @ joint @ J.T
     twist_covariance = covariance[6:, 6:]
     twist_covariance[(3, 4, 5), (3, 4, 5)] += rate_variance

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.increments import rotation_integrals
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
 from thermal_fiducial.core.filter.pose_noise import BodyPose
+from thermal_fiducial.core.filter.rotation_integrals import rotation_integrals, SKEW
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
     CORE,
@@ -18,6 +18,7 @@ from thermal_fiducial.core.filter.state import (
     GYROSCOPE_BIAS,
     NavigationState,
     POSE,
+    POSITION,
     ROTATION,
     SIZE,
     SYSTEMATIC,
@@ -39,10 +40,9 @@ _SIX = np.arange(6)
 
 
 class Innovation(NamedTuple):
-    """Difference (6,) of a pose and the prediction, its covariance S (6, 6), Jacobian H (6, 48), noise R (6, 6)."""
+    """Difference (6,) of a pose and the prediction, inverse of its covariance S, Jacobian H (6, 48), noise R (6, 6)."""
 
     value: FloatArray
-    S: FloatArray
     S_inverse: FloatArray
     H: FloatArray
     R: FloatArray
@@ -51,6 +51,8 @@ class Innovation(NamedTuple):
     alike: float
     #: the estimate that it was compared with, its systematic error as old as the pose's
     prior: Estimate
+    #: change (9,) of that estimate's core with time
+    slide: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,10 +73,11 @@ class MotionAtPose:
 
 def slide(state: NavigationState, imu: FloatArray) -> FloatArray:
     """Change (9,) of the core with time: X(t + s) = X(t) Exp(slide s), as a sample ``imu`` (6,) shows it."""
-    rate, force = np.split(state.corrected(imu), 2)
-    velocity = state.velocity_body
-    acceleration = force + state.gravity @ state.R_map_body - skew(rate) @ velocity
-    return np.concatenate((rate, acceleration, velocity))
+    moved, velocity = np.empty(9), state.velocity_body
+    moved[:6] = state.corrected(imu)
+    moved[VELOCITY] += state.gravity @ state.R_map_body - (moved[ROTATION] @ SKEW).reshape(3, 3) @ velocity
+    moved[POSITION] = velocity
+    return moved
 
 
 def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> BodyPose:
@@ -84,9 +87,8 @@ def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> Body
     lever = T_map_body[:3, 3] - pose.T_map_camera[:3, 3]
     # d p_body = d p_camera + d theta x lever, both in the map; then into the robot frame, rotation first.
     J = np.zeros((6, 6))
-    J[:3, 3:] = R.T
-    J[3:, :3] = R.T
-    J[3:, 3:] = -R.T @ skew(lever)
+    J[:3, 3:] = J[3:, :3] = R.T
+    J[3:, 3:] = R.T @ (lever @ -SKEW).reshape(3, 3)
     return BodyPose(pose.stamp_ns, T_map_body, scale**2 * (J @ pose.covariance @ J.T))
 
 
@@ -115,16 +117,17 @@ class PoseUpdater:
         H[:, EXTRINSICS] = np.eye(6)
         H[:, SYSTEMATIC] = root
         R = prior.pose_noise.white * pose.shape
-        self._add_clock(prior, motion, H, R)
+        moved = slide(prior.state, motion.imu)
+        self._add_clock(prior, motion, moved, H, R)
         value = pose_innovation(prior.state, pose.T_map_body) - root @ prior.state.systematic
-        S = H @ prior.covariance @ H.T + R
-        S_inverse = np.asarray(np.linalg.inv(S))
-        return Innovation(value, S, S_inverse, H, R, float(value @ S_inverse @ value), alike, prior)
+        S_inverse = np.asarray(np.linalg.inv(H @ prior.covariance @ H.T + R))
+        return Innovation(value, S_inverse, H, R, float(value @ S_inverse @ value), alike, prior, moved)
 
-    def _add_clock(self, prior: Estimate, motion: MotionAtPose, H: FloatArray, R: FloatArray) -> None:
+    def _add_clock(
+        self, prior: Estimate, motion: MotionAtPose, moved: FloatArray, H: FloatArray, R: FloatArray
+    ) -> None:
         """What errors of the camera's clock do to a pose: jitter and, where it isn't estimated, the offset."""
         config = self.config
-        moved = slide(prior.state, motion.imu)
         twist, acceleration = moved[POSE], moved[VELOCITY]
         unknown = prior.pose_noise.jitter + (0.0 if config.estimate_time_offset else config.time_offset_std**2)
         R += unknown * np.outer(twist, twist)
@@ -146,15 +149,15 @@ class PoseUpdater:
         """The estimate after an accepted pose."""
         prior = innovation.prior
         error, covariance = self._gained(prior.covariance, innovation.value, innovation.H, innovation.R)
-        state, before = prior.state.plus(error), slide(prior.state, motion.imu)
+        state, before = prior.state.plus(error), innovation.slide
         if prior.clock_open and self.config.estimate_time_offset:
-            change = slide(state, motion.imu) - before
-            state = state.plus(_of_core(-change * error[TIME_OFFSET]))
-            covariance = self._in_clock_of_imu(covariance, change, slide(state, motion.imu), innovation, motion)
+            now = slide(state, motion.imu)
+            state = state.plus(_of_core((before - now) * error[TIME_OFFSET]))
+            covariance = self._in_clock_of_imu(covariance, now - before, now, innovation, motion)
         variances = covariance.diagonal()[SYSTEMATIC]
         second_moment = float(state.systematic @ state.systematic + variances.sum()) / 6.0
-        noise = prior.pose_noise.after(pose, innovation.value, innovation.S, second_moment, innovation.alike)
-        noise = noise.with_stamps(before[POSE], innovation.value, innovation.S)
+        noise = prior.pose_noise.after(pose, innovation.value, innovation.S_inverse, second_moment, innovation.alike)
+        noise = noise.with_stamps(before[POSE], innovation.value, innovation.S_inverse)
         # The same systematic error in units of its new standard deviation.
         unit = (prior.pose_noise.systematic / noise.systematic) ** 0.5
         covariance[SYSTEMATIC] *= unit

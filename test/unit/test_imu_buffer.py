@@ -1,0 +1,70 @@
+"""What the buffer of IMU samples shows of the time between them."""
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
+
+#: Uneven, as real drivers are.
+STAMPS_NS = [0, 5_000_000, 9_000_000, 15_000_000, 20_000_000]
+DENSITIES = np.arange(5.0)[:, None] * np.ones(6)
+
+
+def line(time_ns):
+    """Sample of a motion that is linear in time."""
+    return np.arange(6.0) + time_ns * 1e-7 * np.array([1.0, -2.0, 3.0, -1.0, 0.5, 2.0])
+
+
+@pytest.fixture
+def buffer():
+    buffer = ImuBuffer()
+    for stamp_ns, densities in zip(STAMPS_NS, DENSITIES, strict=True):
+        buffer.append(stamp_ns, line(stamp_ns), densities)
+    return buffer
+
+
+@pytest.mark.parametrize('time_ns', [0, 2_000_000, 9_000_000, 19_999_999])
+def test_between_samples_the_motion_is_linear(buffer, time_ns):
+    np.testing.assert_allclose(buffer.at(time_ns), line(time_ns), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('begin_ns', 'end_ns', 'lengths_ms', 'last_densities'),
+    [
+        (0, 20_000_000, [5, 4, 6, 5], 4.0),
+        (5_000_000, 9_000_000, [4], 2.0),
+        (6_000_000, 8_000_000, [2], 2.0),
+        (3_000_000, 12_000_000, [2, 4, 3], 3.0),
+    ],
+)
+def test_steps_begin_and_end_where_they_are_asked_to(buffer, begin_ns, end_ns, lengths_ms, last_densities):
+    steps = buffer.steps(begin_ns, end_ns)
+    np.testing.assert_allclose(1e3 * steps.seconds, lengths_ms, rtol=1e-12)
+    middles_ns = begin_ns + 1e9 * (np.cumsum(steps.seconds) - 0.5 * steps.seconds)
+    np.testing.assert_allclose(steps.imu, [line(middle) for middle in middles_ns], rtol=1e-9)
+    assert steps.densities[-1, 0] == last_densities
+
+
+def test_a_stretch_does_not_change_the_samples(buffer):
+    before = buffer.imu.copy()
+    buffer.steps(3_000_000, 12_000_000)
+    np.testing.assert_array_equal(buffer.imu, before)
+
+
+def test_a_window_ends_at_its_instant(buffer):
+    window = buffer.window(12_000_000, 0.008)
+    np.testing.assert_allclose(window, [line(5_000_000), line(9_000_000), line(12_000_000)], rtol=1e-12)
+
+
+def test_it_grows_and_forgets():
+    buffer = ImuBuffer()
+    for index in range(5000):
+        buffer.append(index, line(index), np.ones(6))
+        if index % 100 == 0:
+            buffer.forget_before(index - 1500)
+    # the one before 3400, as an instant between the two may be asked for
+    assert buffer.oldest_ns == 3399
+    assert len(buffer) == 5000 - 3399
+    np.testing.assert_allclose(buffer.imu[[0, -1]], [line(3399), line(4999)], rtol=1e-12)
+    assert buffer.first_after(4000) == 4001
+    assert buffer.first_after(9000) == 4999

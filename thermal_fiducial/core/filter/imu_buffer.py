@@ -1,0 +1,126 @@
+"""The latest IMU samples, and what they show of any stretch of time between them."""
+
+from bisect import bisect_left, bisect_right
+from typing import NamedTuple
+
+import numpy as np
+
+from thermal_fiducial.core.filter.update import MotionAtPose
+from thermal_fiducial.core.types import FloatArray
+
+_SECOND_NS = 1_000_000_000
+#: Samples of so long [s] before and after a pose show its motion, if they have come: the noise of one would not.
+_MOTION_SECONDS = 0.05
+#: Room for so many samples to begin with: five seconds at 200 Hz.
+_CAPACITY = 1000
+
+
+class Steps(NamedTuple):
+    """N steps in a row: mean samples (N, 6), lengths (N,) [s], densities (N, 6) of the samples' noise over them."""
+
+    imu: FloatArray
+    seconds: FloatArray
+    densities: FloatArray
+
+
+class ImuBuffer:
+    """Samples in the order of their stamps; between two of them rate and force are linear in time."""
+
+    def __init__(self) -> None:
+        self._stamps_ns: list[int] = []
+        #: (capacity, 2, 6) the samples, and the densities of the noise of the steps that end with them
+        self._rows = np.zeros((_CAPACITY, 2, 6))
+
+    def __len__(self) -> int:
+        """Samples that are kept."""
+        return len(self._stamps_ns)
+
+    @property
+    def imu(self) -> FloatArray:
+        """(N, 6) all samples."""
+        return self._rows[: len(self._stamps_ns), 0]
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the last sample."""
+        return self._stamps_ns[-1]
+
+    @property
+    def oldest_ns(self) -> int:
+        """Stamp of the first sample that is kept."""
+        return self._stamps_ns[0]
+
+    @property
+    def last_densities(self) -> FloatArray:
+        """(6,) of the step that ends with the last sample."""
+        return np.asarray(self._rows[len(self._stamps_ns) - 1, 1])
+
+    @property
+    def last_step_seconds(self) -> float:
+        """Length of the step that ends with the last sample [s]."""
+        return (self._stamps_ns[-1] - self._stamps_ns[-2]) / _SECOND_NS
+
+    def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
+        """Add a sample (6,) and the densities (6,) of the step that ends with it."""
+        place = len(self._stamps_ns)
+        if place == len(self._rows):
+            self._rows = np.concatenate((self._rows, np.zeros_like(self._rows)))
+        self._stamps_ns.append(stamp_ns)
+        self._rows[place, 0], self._rows[place, 1] = imu, densities
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Forget samples that lie so far back that none of those from ``stamp_ns`` on needs them."""
+        first = max(bisect_left(self._stamps_ns, stamp_ns) - 1, 0)
+        kept = self._rows[first : len(self._stamps_ns)].copy()
+        self._rows[: len(kept)] = kept
+        del self._stamps_ns[:first]
+
+    def first_after(self, stamp_ns: int) -> int:
+        """Stamp [ns] of the first sample later than ``stamp_ns``; of the newest one where there is none."""
+        return self._stamps_ns[min(bisect_right(self._stamps_ns, stamp_ns), len(self._stamps_ns) - 1)]
+
+    def steps(self, begin_ns: int, end_ns: int) -> Steps:
+        """The steps between two instants that needn't be those of samples (trapezoid rule)."""
+        first = bisect_right(self._stamps_ns, begin_ns) - 1
+        last = bisect_left(self._stamps_ns, end_ns)
+        stamps_ns, imu = self._stamps_ns[first : last + 1], self._rows[first : last + 1, 0]
+        if stamps_ns[0] != begin_ns or stamps_ns[-1] != end_ns:
+            imu = imu.copy()
+            imu[0], imu[-1] = self.at(begin_ns), self.at(end_ns)
+            stamps_ns[0], stamps_ns[-1] = begin_ns, end_ns
+        times_ns = np.array(stamps_ns)
+        seconds = (times_ns[1:] - times_ns[:-1]) / _SECOND_NS
+        return Steps(0.5 * (imu[:-1] + imu[1:]), seconds, self._rows[first + 1 : last + 1, 1])
+
+    def at(self, time_ns: int) -> FloatArray:
+        """(6,) the sample at an instant."""
+        index = bisect_left(self._stamps_ns, time_ns)
+        after = self._rows[index, 0]
+        after_ns = self._stamps_ns[index]
+        if after_ns == time_ns:
+            return np.asarray(after)
+        before, before_ns = self._rows[index - 1, 0], self._stamps_ns[index - 1]
+        return np.asarray(before + (time_ns - before_ns) / (after_ns - before_ns) * (after - before))
+
+    def window(self, until_ns: int, seconds: float) -> FloatArray:
+        """Samples (N, 6) of the last ``seconds`` up to an instant, the last one at it."""
+        first = bisect_left(self._stamps_ns, until_ns - round(seconds * _SECOND_NS))
+        return np.vstack((self._rows[first : bisect_left(self._stamps_ns, until_ns), 0], self.at(until_ns)))
+
+    def motion(self, time_ns: int, accepted_ns: int) -> MotionAtPose:
+        """The motion at the instant of a pose, from the samples around it that have come.
+
+        ``accepted_ns``: instant of the last pose before it that was believed.
+        """
+        stamps_ns, imu = self._stamps_ns, self._rows[:, 0]
+        index = max(bisect_left(stamps_ns, time_ns), 1)
+        seconds = (stamps_ns[index] - stamps_ns[index - 1]) / _SECOND_NS
+        each_side = max(min(round(_MOTION_SECONDS / seconds), len(stamps_ns) - index, index), 1)
+        samples = imu[index - each_side : index + each_side]
+        density = self._rows[index, 1]
+        return MotionAtPose(
+            imu=samples.mean(axis=0),
+            rate_variance=float(density[0]) ** 2 / (seconds * len(samples)),
+            velocity_variance=float(density[3]) ** 2 * (time_ns - accepted_ns) / _SECOND_NS,
+            turning=float(np.linalg.norm(imu[index, :3] - imu[index - 1, :3])) / seconds,
+        )
