@@ -248,17 +248,23 @@ def test_tables_leave_out_what_is_not_known(small_run):
 def test_what_the_nodes_said_is_counted_whatever_its_numbers(run_folder):
     said = {(entry.node, entry.level, entry.message): entry.count for entry in read_run(run_folder).output.diagnostics}
     assert said == {
-        ('pose_ekf', 'ok', 'running for … s'): 20,
+        ('pose_ekf', 'ok', 'running for N s'): 20,
         ('tau2_camera', 'warning', 'FFC'): 20,
     }
 
 
 def test_figures_and_load_of_the_nodes(small_run):
-    diagnostics = {'tau2_camera': {'withheld: FFC': '12', 'refused messages': '0', 'received /thermal/image_raw': '9'}}
+    counted = {'withheld: FFC': '12', 'refused messages': '0', 'received /thermal/image_raw': '9'}
+    rates = {'rate /thermal/image_raw [Hz]': '29.9', 'vibration m/s^2/sqrt(Hz)': '0.0018'}
+    diagnostics = {'tau2_camera': counted | rates}
     (small_run / 'summary.json').write_text(
         json.dumps({'diagnostics': diagnostics, 'cpu_percent': {'pose_ekf': 24.04}})
     )
     evaluation = evaluate(read_run(small_run))
     made = tables(evaluation, evaluation.numbers())
-    assert made['figures'].rows == [('tau2_camera', 'withheld: FFC', '12', 'count')]
+    assert made['figures'].rows == [
+        ('tau2_camera', 'withheld: FFC', '12', 'count'),
+        ('tau2_camera', 'rate /thermal/image_raw', '29.9', 'Hz'),
+        ('tau2_camera', 'vibration', '0.0018', 'm/s^2/sqrt(Hz)'),
+    ]
     assert made['load'].rows == [('pose_ekf', '24')]

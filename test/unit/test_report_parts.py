@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.run_folders import CAMERA_DELAY_NS, FUSED_DELAY_NS, make_run, START_NS, true_pose, wall
 
+from thermal_fiducial.cli.evaluate import print_tables
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MarkerMap
@@ -19,6 +20,7 @@ from thermal_fiducial.report.map_error import map_accuracy, marker_errors
 from thermal_fiducial.report.metrics import errors
 from thermal_fiducial.report.output_bag import Arrivals, RecordedOutput
 from thermal_fiducial.report.run_folder import Detections, read_run, Run
+from thermal_fiducial.report.tables import Table
 from thermal_fiducial.report.tags import tags
 from thermal_fiducial.report.trajectory import Trajectory
 from thermal_fiducial.report.verdict import HEADLINES, judge, Weight
@@ -242,3 +244,17 @@ def test_what_speaks_against_a_run(tmp_path, path, value, weight, words):
     verdict = judge(evaluation, with_value(GOOD, path, value))
     assert (verdict.weight, verdict.headline) == (weight, HEADLINES[weight])
     assert words in verdict.remarks[0].text
+
+
+@pytest.mark.parametrize('columns', [60, 80, 200])
+def test_tables_in_a_terminal_are_parted_and_lose_nothing(columns, capsys, monkeypatch):
+    monkeypatch.setenv('COLUMNS', str(columns))
+    heads = ('marker', *(f'sigma of axis {axis} [mm]' for axis in range(12)), 'status', 'why')
+    rows = [(str(marker), *(f'{marker}.{axis:03}' for axis in range(12)), 'used', 'it fits') for marker in (17, 18)]
+    print_tables([Table('Markers, one by one', heads, rows)])
+    shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= columns
+    assert (shown.count('Markers, one by one') == 1) == (columns == 200)
+    assert shown.count('[mm]') == 12
+    for cell in rows[0][1:-1] + rows[1][1:-1]:
+        assert cell in shown.split()

@@ -1,10 +1,10 @@
 """``evaluate RUN``: errors, jitter, consistency and latency of a run, as tables and as a page; or several compared."""
 
 import argparse
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 import json
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.errors import InputError
@@ -15,8 +15,6 @@ from thermal_fiducial.report.tables import Table, tables
 COMPARISON = Path('comparison.html')
 #: First columns up to this width do not wrap.
 _WHOLE = 44
-#: Tables of eight columns need as much.
-_NARROWEST = 110
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -87,7 +85,7 @@ def _compare(args: argparse.Namespace) -> int:
 
 
 def print_tables(shown: Iterable[Table]) -> None:
-    """Print tables to the terminal.
+    """Print tables to the terminal, one that is wider below one another in parts.
 
     Raises
     ------
@@ -95,23 +93,40 @@ def print_tables(shown: Iterable[Table]) -> None:
         Without rich (extra ``tools``).
     """
     try:
-        from rich import box
-        from rich.console import Console
-        import rich.table
-        from rich.text import Text
+        from thermal_fiducial.cli.terminal_tables import show
     except ImportError as error:
         raise InputError(f'the tables need {error.name}: install the extra "tools", or use --json') from None
-    console = Console()
-    # In a narrower window lines wrap, but no number is cut.
-    console.width = max(console.width, _NARROWEST)
     for entry in shown:
-        table = rich.table.Table(title=entry.title, title_justify='left', box=box.SIMPLE_HEAD, title_style='bold')
-        for index, head in enumerate(entry.heads):
-            # What a row is about stays whole; heads of numbers wrap.
-            whole = index == 0 and max((len(row[0]) for row in entry.rows), default=0) <= _WHOLE
-            style = 'blue' if head.startswith('fused') else 'red' if head.startswith('markers alone') else ''
-            justify: Literal['left', 'right'] = 'left' if entry.is_text(index) else 'right'
-            table.add_column(Text(head), justify=justify, header_style=style, overflow='fold', no_wrap=whole)
-        for row in entry.rows:
-            table.add_row(*map(Text, row))
-        console.print(table)
+        for part in _parts(entry):
+            show(_for_terminal(part))
+
+
+def _parts(entry: Table) -> Iterator[Table]:
+    """Tables of as many columns as fit, each with what its rows are about."""
+    from thermal_fiducial.cli.terminal_tables import fits
+
+    about = [column for column, head in enumerate(entry.heads[:2]) if column == 0 or head == 'unit']
+    left = list(range(len(about), len(entry.heads)))
+    while left:
+        count = len(left)
+        while count > 1 and not fits(_for_terminal(entry.of([*about, *left[:count]]))):
+            count -= 1
+        yield entry.of([*about, *left[:count]])
+        left = left[count:]
+
+
+def _for_terminal(entry: Table) -> Any:
+    from rich.text import Text
+
+    from thermal_fiducial.cli.terminal_tables import table_of
+
+    table = table_of(entry.title, ())
+    for index, head in enumerate(entry.heads):
+        # What a row is about stays whole; heads of numbers wrap.
+        whole = index == 0 and max((len(row[0]) for row in entry.rows), default=0) <= _WHOLE
+        style = 'blue' if head.startswith('fused') else 'red' if head.startswith('markers alone') else ''
+        justify: Literal['left', 'right'] = 'left' if entry.is_text(index) else 'right'
+        table.add_column(Text(head), justify=justify, header_style=style, overflow='fold', no_wrap=whole)
+    for row in entry.rows:
+        table.add_row(*map(Text, row))
+    return table

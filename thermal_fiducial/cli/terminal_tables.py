@@ -19,11 +19,21 @@ def table_of(title: str, headers: Sequence[str], left: Sequence[str] = ()) -> Ta
 
 def show(table: Table) -> None:
     """Print a table; where the window is narrower than its words, lines run over instead of losing some."""
-    for column in table.columns:
-        words = ' '.join([str(column.header), *map(str, column.cells)]).split()
-        column.min_width = max(map(len, words), default=0)
     console = Console()
-    # Measured as if there was room for all.
-    options = console.options.update(width=_WIDEST)
-    console.width = max(console.width, console.measure(table, options=options).minimum)
+    console.width = max(console.width, _least_width(console, table))
     console.print(table)
+
+
+def fits(table: Table) -> bool:
+    """Whether the window is wide enough for all its words."""
+    console = Console()
+    return _least_width(console, table) <= console.width
+
+
+def _least_width(console: Console, table: Table) -> int:
+    for column in table.columns:
+        texts = [str(text) for text in (column.header, *column.cells)]
+        words = texts[1:] + texts[0].split() if column.no_wrap else ' '.join(texts).split()
+        column.min_width = max(map(len, words), default=0)
+    # Measured as if there was room for all.
+    return console.measure(table, options=console.options.update(width=_WIDEST)).minimum

@@ -109,6 +109,7 @@ class _Graph:
         self._connect()
         self._settle(bag.start_ns, files)
         next_diagnosis = bag.start_ns + _SECOND_NS
+        last_ns = bag.start_ns
         for message in bag.messages(played):
             while message.stamp_ns >= next_diagnosis:
                 self._diagnose(next_diagnosis, files)
@@ -117,7 +118,9 @@ class _Graph:
             _check(message)
             outputs[message.topic].send(message.cdr)
             self._settle(message.stamp_ns, files)
-        self._diagnose(next_diagnosis, files)
+            last_ns = message.stamp_ns
+        # Not a second later: rates would count the time after the end.
+        self._diagnose(max(last_ns, next_diagnosis - _SECOND_NS + 1), files)
 
     def _diagnose(self, time_ns: int, files: Sink) -> None:
         for stage in self._stages:

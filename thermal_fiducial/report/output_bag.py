@@ -127,7 +127,7 @@ def _diagnostics(statuses: Iterable[Any]) -> tuple[Diagnostic, ...]:
     said: Counter[tuple[str, str, str]] = Counter()
     for status in statuses:
         level = status.level[0] if isinstance(status.level, (bytes, np.ndarray)) else status.level
-        said[status.name, _LEVELS[min(int(level), 3)], _NUMBER.sub('…', status.message)] += 1
+        said[status.name, _LEVELS[min(int(level), 3)], _NUMBER.sub('N', status.message)] += 1
     return tuple(Diagnostic(*key, count) for key, count in said.most_common())
 
 

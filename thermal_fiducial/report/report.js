@@ -56,15 +56,19 @@
     layout.font = { family: 'system-ui, sans-serif', size: 12 };
     // A finger scrolls the page; the buttons above a plot zoom it.
     if (touch.matches && !layout.scene) layout.dragmode = false;
-    if (narrow.matches) {
-      layout.margin = { ...layout.margin, l: Math.min(layout.margin.l, 52), r: 6 };
-      // Above a plot are its buttons; what the lines mean stands below it.
-      if (layout.scene) layout.height = 420;
-      else {
-        layout.legend = { ...layout.legend, yref: 'container', y: 0, yanchor: 'bottom' };
-        layout.margin.b = 134;
-        layout.height += 90;
-      }
+    if (narrow.matches) layout.margin = { ...layout.margin, l: Math.min(layout.margin.l, 52), r: 6 };
+    if (narrow.matches && layout.scene) {
+      // From farther away the whole path fits into an upright picture.
+      const { eye } = layout.scene.camera;
+      layout.scene.camera = { eye: { x: 1.5 * eye.x, y: 1.5 * eye.y, z: 1.5 * eye.z } };
+      layout.legend = { orientation: 'h', x: 0, y: 0, yanchor: 'top' };
+      layout.margin.b = 110;
+      layout.height = 540;
+    } else if (!layout.scene && (narrow.matches || touch.matches)) {
+      // The buttons are always there, above the plot; what the lines mean stands below it.
+      layout.legend = { ...layout.legend, yref: 'container', y: 0, yanchor: 'bottom' };
+      layout.margin.b = narrow.matches ? 134 : 90;
+      layout.height += layout.margin.b - 44;
     }
     const config = { responsive: true, displaylogo: false, displayModeBar: touch.matches ? true : 'hover',
       modeBarButtonsToRemove: ['select2d', 'lasso2d', 'autoScale2d', 'sendChartToCloud', 'sendDataToCloud'], scrollZoom: Boolean(layout.scene) };

@@ -29,6 +29,11 @@ class Table:
         """Whether it takes the width of a page."""
         return len(self.heads) > _NARROW
 
+    def of(self, columns: Sequence[int]) -> 'Table':
+        """The same of some columns."""
+        rows = [tuple(row[column] for column in columns) for row in self.rows]
+        return Table(self.title, tuple(self.heads[column] for column in columns), rows, self.words)
+
 
 def number(value: float | None, digits: int = 3) -> str:
     """``value`` to ``digits`` significant digits, never in powers of ten."""
@@ -272,7 +277,7 @@ def _figures(evaluation: Evaluation) -> Table:
     """What the nodes counted, but for the traffic on their topics and what stands in other tables."""
     said = evaluation.run.summary.get('diagnostics', {})
     rows = [
-        (node, name, str(value), _unit(name, str(value)))
+        (node, *_split(name, str(value)))
         for node, figures in said.items()
         for name, value in figures.items()
         if value not in ('', '0') and not name.startswith(_ELSEWHERE)
@@ -281,9 +286,11 @@ def _figures(evaluation: Evaluation) -> Table:
     return Table('What the nodes counted, at the end', heads, rows, heads)
 
 
-def _unit(name: str, value: str) -> str:
+def _split(name: str, value: str) -> tuple[str, str, str]:
+    """Name without unit, value, unit of what a node counted."""
     if name.startswith('vibration '):
-        return name.removeprefix('vibration ')
+        return 'vibration', value, name.removeprefix('vibration ')
     if name.endswith(']'):
-        return name[name.rindex('[') + 1 : -1]
-    return _UNITS.get(name, 'count' if value.isdigit() else '')
+        name, _, unit = name[:-1].rpartition(' [')
+        return name, value, unit
+    return name, value, _UNITS.get(name, 'count' if value.isdigit() else '')

@@ -100,7 +100,7 @@ def _error(numbers: dict[str, Any]) -> Remark | None:
     return Remark(
         Weight.GOOD,
         f'Errors against ground truth: {error["position_rms_mm"]:.1f} mm and {error["attitude_rms_deg"]:.2f} deg rms, '
-        f'{error["position_max_mm"]:.0f} mm at the worst.',
+        f'{error["position_max_mm"]:.0f} mm at the worst, each pose at its own stamp.',
     )
 
 
