@@ -199,11 +199,6 @@ MECHANISMS = {
     'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
     'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'refining:worth_deblurring': _none_of}),
-    'search freed of lag': Mechanism(
-        'fast, 8 K, blind',
-        ('lag:LagField', 'lag:without_lag', 'finding:MarkerFinder._scene'),
-        {'finding:_BLUR_THAT_HIDES_PX': np.inf},
-    ),
     'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(
         'fast, 8 K, blind', ('lag:model_error',), {'refining:model_error': _no_covariance}

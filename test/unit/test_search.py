@@ -39,7 +39,7 @@ def frame_of(image):
 
 
 def search(image, config=None, allowed=EVERY):
-    return SEARCH.search(frame_of(image), image, allowed, config or ArucoDetectorConfig(), Found.none())
+    return SEARCH.search(frame_of(image), allowed, config or ArucoDetectorConfig(), Found.none())
 
 
 @pytest.mark.parametrize('turn', range(4))
@@ -125,7 +125,7 @@ def test_what_is_seen_already_is_not_sought():
     image = scene(21, 100.0, 2.0)
     image[300:396, 400:496] = scene(8, 100.0, 2.0)[138:234, 188:284]
     seen = Found(np.array([21]), CORNERS[None], np.ones(1), np.ones(1, dtype=bool))
-    found = SEARCH.search(frame_of(image), image, EVERY, ArucoDetectorConfig(), seen)
+    found = SEARCH.search(frame_of(image), EVERY, ArucoDetectorConfig(), seen)
     assert found.ids.tolist() == [8]
 
 
@@ -133,7 +133,7 @@ def test_what_is_seen_already_is_not_sought():
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 def test_either_resolution_shows_a_clear_marker(scales, sign):
     image = scene(21, 50.0 * sign, 2.0)
-    found = SEARCH.search(frame_of(image), image, EVERY, ArucoDetectorConfig(), Found.none(), scales)
+    found = SEARCH.search(frame_of(image), EVERY, ArucoDetectorConfig(), Found.none(), scales)
     assert found.ids.tolist() == [21]
 
 

@@ -106,7 +106,8 @@ class DisplayedSides:
         blur = blurs(sides.normal[self._bits // 2], blur_px, refined.view.spread)
         value, slope, weight = model(sides, self._behind[ids], blur)
         weight *= self._white[ids].reshape(-1, self._bits).T
-        return measure(refined.view.image, sides, (value, slope, weight), REACHED * blur[0])
+        counts = sides.counts(refined.view.image, refined.view.lag_tails)
+        return measure(counts, (value, slope, weight), REACHED * blur[0])
 
 
 def _outward(corners: FloatArray) -> FloatArray:
@@ -190,7 +191,7 @@ class CornerEstimator:
             observed = observed.only(others)
             blur = np.sqrt(np.sum(view.spread[others] ** 2, axis=1))
             standing = frame.displayed & (blur < _STANDING * sides_px(expected.corners_px) / self._decoder.cells)
-            image = np.asarray(view.image, dtype=np.float32)
+            image = view.round_markers(there, others)
             keep[others] = confirmed(image, expected, observed, self._decoder, config, standing_picture=standing)
         return np.asarray(keep & frame.camera.contains(refined.observed.corners_px, _BORDER_PX).all(axis=1))
 

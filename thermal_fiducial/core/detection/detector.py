@@ -145,7 +145,6 @@ class MarkerDetector:
         return FrameHistory(
             history.track.after(frame.stamp_ns, twist, markers),
             history.polarity.after(estimates.corners.contrast),
-            float(depth.mean()) if len(ids) else history.depth_m,
             saw_partial,
             findings.since_blind,
             findings.scales,

@@ -10,19 +10,14 @@ from thermal_fiducial.core.detection.found import among, Found, merged, places_o
 from thermal_fiducial.core.detection.frame import Frame, seen_displacement
 from thermal_fiducial.core.detection.guided import Followed, near_prediction
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes, MarkersOfMap
-from thermal_fiducial.core.detection.lag import LagField, without_lag
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.search import BlindSearch, SearchScales
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray
 
 # A frame's markers are remembered for about so many frames, and make sure of the kind when so many more are of it.
 _FRAMES, _SURE = 30, 6.0
-# Depth of the scene while no marker has shown it [m].
-_TYPICAL_DEPTH_M = 3.0
-# Motion blur by lag below which the search misses nothing [px].
-_BLUR_THAT_HIDES_PX = 2.0
 # Share of the map's expected markers that, when observed, shows that the prediction holds.
 _ENOUGH = 0.5
 # Contrast over noise beyond which a marker shows at full and at half the resolution.
@@ -62,8 +57,6 @@ class FrameHistory:
 
     track: MotionTrack
     polarity: Polarity = field(default_factory=Polarity)
-    #: mean depth of the last markers [m]
-    depth_m: float = _TYPICAL_DEPTH_M
     #: whether the last frame showed markers that are partially visible
     saw_partial: bool = False
     #: frames since the last blind search, and at which resolutions that was
@@ -104,7 +97,6 @@ class MarkerFinder:
     def __init__(self, decoder: Decoder, sizes: MarkerSizes) -> None:
         self._decoder, self._sizes = decoder, sizes
         self._search = BlindSearch(decoder)
-        self._lag_field: LagField | None = None
 
     def find(self, frame: Frame, history: FrameHistory, of_map: MarkersOfMap, config: ArucoDetectorConfig) -> Findings:
         """Markers to a pixel or two, at the frame's stamp."""
@@ -144,23 +136,10 @@ class MarkerFinder:
         config: ArucoDetectorConfig,
     ) -> Found:
         """Markers wherever they are, but for those that are ``found`` already."""
-        scene, allowed = self._scene(frame, history.depth_m), self.allowed(known, config)
-        kinds = history.polarity.kinds(config.polarity)
-        blind = self._search.search(frame, scene, allowed, config, found, scales, kinds)
+        kinds, allowed = history.polarity.kinds(config.polarity), self.allowed(known, config)
+        blind = self._search.search(frame, allowed, config, found, scales, kinds)
         blind = blind.only(history.polarity.possible(blind.cnr, config.polarity))
         return self._without_rolling_shutter(frame, blind, known)
-
-    def _scene(self, frame: Frame, depth_m: float) -> Float32Array:
-        """The frame as the search sees it, freed of lag where motion is fast enough to matter there."""
-        if frame.twist is None or frame.lag <= 0.0:
-            return frame.image
-        if self._lag_field is None or self._lag_field.camera is not frame.camera:
-            self._lag_field = LagField(frame.camera)
-        motion = frame.twist, depth_m, frame.lag
-        if self._lag_field.longest(*motion) < _BLUR_THAT_HIDES_PX:
-            return frame.image
-        field = self._lag_field.full(self._lag_field.at(*motion))
-        return without_lag(frame.image, field[..., 0], field[..., 1])
 
     def allowed(self, known: KnownMarkers, config: ArucoDetectorConfig) -> BoolArray:
         """Which IDs of the dictionary may be found."""

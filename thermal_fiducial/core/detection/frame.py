@@ -6,7 +6,6 @@ sides stay straight, and shifts of the corners say it all.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
@@ -26,7 +25,8 @@ class Frame:
     """An image, and what is known of the camera's motion at its stamp."""
 
     stamp_ns: int
-    counts: Counts | Gray | Float32Array
+    #: (height, width) counts as floating-point numbers
+    image: Float32Array
     #: standard deviation of a pixel [counts]
     noise: float
     camera: Camera
@@ -50,20 +50,10 @@ class Frame:
         """A frame without its columns' fixed pattern, unless that is kept or the frame has eight bits."""
         noise, displayed = noise_of(counts), bool(counts[::64].max() < _LEVELS)
         lag, readout = config.bolometer_lag, config.readout_time
-        if counts.dtype == np.uint8 or keep_columns:
-            return Frame(stamp_ns, counts, noise, camera, twist, lag, readout, displayed)
-        plain = without_columns(counts.astype(np.float32), noise)
-        return Frame(stamp_ns, plain, noise, camera, twist, lag, readout, displayed)
-
-    @cached_property
-    def image(self) -> Float32Array:
-        """As floating-point numbers: a copy that few places of it are not worth."""
-        return np.asarray(self.counts, dtype=np.float32)
-
-    @property
-    def samples(self) -> Counts | Float32Array:
-        """To be looked up in few places, interpolated to whole counts at worst."""
-        return np.asarray(self.counts, dtype=np.uint16) if self.counts.dtype == np.uint16 else self.image
+        image = counts.astype(np.float32)
+        if counts.dtype != np.uint8 and not keep_columns:
+            image = without_columns(image, noise)
+        return Frame(stamp_ns, image, noise, camera, twist, lag, readout, displayed)
 
 
 @dataclass(frozen=True, slots=True)

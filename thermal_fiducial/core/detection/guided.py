@@ -6,14 +6,13 @@ the image clearly, and better than the pattern of any other marker or any other 
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import expected_displacement, Frame, Places
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
-from thermal_fiducial.core.detection.lag import markers_deblurred, REMAINING
+from thermal_fiducial.core.detection.lag import lag_tail_maps, markers_deblurred, REMAINING
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
 from thermal_fiducial.core.detection.refining import BLUR_THAT_MATTERS_PX
 from thermal_fiducial.core.detection.tracking import TrackedMarkers
@@ -73,7 +72,7 @@ class Followed:
             return self
         shown = self.places.at.px + self.places.lag_blur(twist, frame.lag)
         shown += expected_displacement(self.places, twist, frame)
-        likeness = decoder.likeness(frame.samples, shown)
+        likeness = decoder.likeness(frame.image, shown)
         similarity = likeness.correlation * np.sign(self.cnr)
         alike = (likeness.best == 4 * self.ids) & (similarity > _STILL_SIMILAR)
         alike &= frame.camera.contains(shown).all(axis=1)
@@ -96,7 +95,7 @@ def near_prediction(
     blurred = np.abs(shift).max(axis=(1, 2)) > BLUR_THAT_MATTERS_PX
     scene = frame.image
     if blurred.any():
-        scene = markers_deblurred(frame.image, corners[blurred], shift[blurred], cv2.INTER_CUBIC)
+        scene = markers_deblurred(frame.image, corners[blurred], lag_tail_maps(corners[blurred], shift[blurred]))
     left = np.where(blurred[:, None, None], REMAINING * shift, shift)
     shown = _shifted(scene, ids, corners + left, decoder)
     reading = decoder.read(scene, shown)

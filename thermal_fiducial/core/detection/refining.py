@@ -23,6 +23,8 @@ from thermal_fiducial.core.detection.frame import (
 )
 from thermal_fiducial.core.detection.lag import (
     common_error,
+    lag_tail_maps,
+    LagTails,
     markers_deblurred,
     model_error,
     REMAINING,
@@ -30,7 +32,7 @@ from thermal_fiducial.core.detection.lag import (
 )
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, unknown_twist
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Blur by lag below which the shape of an edge doesn't change [px].
 BLUR_THAT_MATTERS_PX = 0.4
@@ -51,7 +53,9 @@ _NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
 class DeblurredView:
     """A frame in which the motion blur of N markers is short."""
 
-    image: Counts | Float32Array
+    #: as it is, and what is to be taken out of it
+    image: Float32Array
+    lag_tails: LagTails | None
     #: (N, 4, 2) where the corners appear in the view, off their places at the stamp [px]
     shift: FloatArray
     #: (N, 4, 2) how much of the motion blur's shift is taken out
@@ -61,7 +65,15 @@ class DeblurredView:
 
     def only(self, keep: BoolArray) -> 'DeblurredView':
         """That of the markers ``keep`` (N,)."""
-        return replace(self, shift=self.shift[keep], removed=self.removed[keep], spread=self.spread[keep])
+        tails = None if self.lag_tails is None else self.lag_tails.only(keep)
+        return DeblurredView(self.image, tails, self.shift[keep], self.removed[keep], self.spread[keep])
+
+    def round_markers(self, corners_px: FloatArray, which: IntArray) -> Float32Array:
+        """The image freed of lag tails round those of the markers ``which``, with corners (N, 4, 2)."""
+        if self.lag_tails is None or not self.lag_tails.unwanted[which].any():
+            return self.image
+        which = which[self.lag_tails.unwanted[which]]
+        return markers_deblurred(self.image, corners_px[which], self.lag_tails.maps[which])
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +133,7 @@ class Refiner:
             start = places.at.moved(view.shift, frame.camera)
             behind = self._behind[found.ids]
             blur = config.blur_px, view.spread
-            seen = refine_corners(view.image, start, frame.camera, behind, *blur, columns)
+            seen = refine_corners(view.image, start, frame.camera, behind, *blur, columns, view.lag_tails)
             refinement = self._at_stamp(frame, found, places, view, seen, twist, track)
             change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)
             if refinement.twist is None or change.max(initial=0.0) < BLUR_THAT_MATTERS_PX:
@@ -141,10 +153,8 @@ class Refiner:
         deblur = worth_deblurring((mean * mean).sum(axis=1), cell, self._behind.shape[2], cnr)
         removed = (1.0 - REMAINING) * old * deblur[:, None, None]
         shift = lag_blur - removed + expected_displacement(places, twist, frame)
-        spread, image = mean * np.where(deblur, SPREAD, 1.0)[:, None], frame.samples
-        if deblur.any():
-            image = markers_deblurred(frame.image, (places.at.px + shift)[deblur], old[deblur])
-        return DeblurredView(image, shift, removed, spread)
+        tails = LagTails(lag_tail_maps(places.at.px + shift, old), deblur) if deblur.any() else None
+        return DeblurredView(frame.image, tails, shift, removed, mean * np.where(deblur, SPREAD, 1.0)[:, None])
 
     def _at_stamp(
         self,

@@ -56,7 +56,6 @@ class BlindSearch:
     def search(
         self,
         frame: Frame,
-        scene: Float32Array,
         allowed: BoolArray,
         config: ArucoDetectorConfig,
         seen: Found,
@@ -67,7 +66,6 @@ class BlindSearch:
 
         Parameters
         ----------
-        scene : the frame freed of lag, which costs noise: the finest markers show there, the faintest in the frame
         seen : markers that are there: nothing is looked for in them and their plates
         scales : at which resolutions
         kinds : of markers looked for among the faintest, 1 for darker than their surroundings, -1 for brighter
@@ -75,9 +73,9 @@ class BlindSearch:
         hidden = _grown(seen.corners_px, 1.0 + 2.0 * _PLATE_CELLS / self._decoder.cells)
         min_side_px = _PICTURE_SIDE * config.min_side_px if frame.displayed else config.min_side_px
         fine = faint = np.zeros((0, 4, 2))
-        half = scene
+        half = frame.image
         if SearchScales.FINE in scales:
-            fine = find_quads(_fine_mask(frame, scene, scales), min_side_px, hidden)
+            fine = find_quads(_fine_mask(frame, scales), min_side_px, hidden)
         if SearchScales.FAINT in scales:
             half = without_columns(halved(frame.image), 0.5 * frame.noise)
             faint = _faint_quads(half, frame.noise, scales, kinds, config.min_side_px, hidden)
@@ -85,7 +83,7 @@ class BlindSearch:
             return Found.none()
         # At full resolution alone those are looked for that show clearly, if not now then in a frame to come.
         pull = SearchScales.FAINT in scales
-        reading, quads = self._read(frame, scene, half, (fine, faint), allowed, seen.ids if pull else None)
+        reading, quads = self._read(frame, half, (fine, faint), allowed, seen.ids if pull else None)
         good = accepted(reading, frame.noise, self._decoder.correctable, config) & _large(quads, min_side_px)
         good &= _whole(quads, frame.image, _BORDER)
         if not good.any():
@@ -96,7 +94,6 @@ class BlindSearch:
     def _read(
         self,
         frame: Frame,
-        scene: Float32Array,
         half: Float32Array,
         outlines: tuple[FloatArray, FloatArray],
         allowed: BoolArray,
@@ -111,25 +108,25 @@ class BlindSearch:
         # Blur may leave nothing to be seen of a border between two white ones but the outline of the whole plate.
         fine, faint = (_with_shrunk(quads, decoder.cells) for quads in outlines)
         quads = np.concatenate([fine, faint])
-        reading = _joined(decoder.read(scene, fine, allowed), decoder.read(half, _halfway(faint), allowed))
+        reading = _joined(decoder.read(frame.image, fine, allowed), decoder.read(half, _halfway(faint), allowed))
         rough = _NONE if seen is None else _rough(reading, quads, seen)
         if len(rough) == 0:
             return reading, quads
         ids, turns = reading.ids[rough], reading.turns[rough]
         if frame.displayed:
-            pulled = aligned(scene, quads[rough], ids, turns, decoder, noisy=False)
-            again = decoder.read(scene, pulled, allowed)
+            pulled = aligned(frame.image, quads[rough], ids, turns, decoder, noisy=False)
+            again = decoder.read(frame.image, pulled, allowed)
         else:
             halfway = aligned(half, _halfway(quads[rough]), ids, turns, decoder)
             pulled, again = 2.0 * halfway + 0.5, decoder.read(half, halfway, allowed)
         return _joined(reading, again), np.concatenate([quads, pulled])
 
 
-def _fine_mask(frame: Frame, scene: Float32Array, scales: SearchScales) -> Gray:
+def _fine_mask(frame: Frame, scales: SearchScales) -> Gray:
     """What is dark at full resolution."""
-    if frame.displayed and scene is frame.image:
-        return dark_in_picture(scene, frame.noise)
-    return dark(scene, frame.noise, _FINE if scales == SearchScales.ALL else _FINE_OF_CLEAR)
+    if frame.displayed:
+        return dark_in_picture(frame.image, frame.noise)
+    return dark(frame.image, frame.noise, _FINE if scales == SearchScales.ALL else _FINE_OF_CLEAR)
 
 
 def _faint_quads(

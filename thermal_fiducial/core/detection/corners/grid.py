@@ -21,7 +21,7 @@ from thermal_fiducial.core.detection.corners.segments import (
 )
 from thermal_fiducial.core.detection.corners.sides import blurred_step, blurs, columns_across, half_width, NODES, Sides
 from thermal_fiducial.core.detection.frame import expected_displacement, Frame, lag_tail, Places
-from thermal_fiducial.core.detection.lag import LAG_TAIL_AGE, markers_deblurred, REMAINING, SPREAD
+from thermal_fiducial.core.detection.lag import EXACT, LAG_TAIL_AGE, lag_tail_maps, markers_deblurred, REMAINING, SPREAD
 from thermal_fiducial.core.detection.refining import sides_px, worth_deblurring
 from thermal_fiducial.core.detection.twist import interaction
 from thermal_fiducial.core.geometry import se3
@@ -136,7 +136,7 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, columns, half)
     blur = blurs(sides.normal[0], layer.blur, layer.lag_blur[None])
     modelled = _model(sides, pattern.step, blur)
-    measured = measure(layer.image, sides, modelled, REACHED * blur[0], len(nodes))
+    measured = measure(sides.counts(layer.image), modelled, REACHED * blur[0], len(nodes))
     used = measured.variance[0] < HOPELESS
     if used.sum() < 6:
         return None
@@ -248,7 +248,7 @@ def deblurred_layer(frame: Frame, window: FloatArray, contrast: float, blur_px: 
     if twist is None or not worth_deblurring(np.array([mean @ mean]), cell, cells, cnr)[0]:
         return plain_layer(frame, window, blur_px, 1)
     shown = places.at.px + _displaced(frame, window, 1.0 - REMAINING)
-    image = markers_deblurred(frame.image, shown, lag_tail(places, twist, frame))
+    image = markers_deblurred(frame.image, shown, lag_tail_maps(shown, lag_tail(places, twist, frame)), EXACT)
 
     def displacement(points: FloatArray) -> FloatArray:
         return _displaced(frame, points, 1.0 - REMAINING)

@@ -11,8 +11,9 @@ import numpy as np
 
 from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED
 from thermal_fiducial.core.detection.corners.sides import blurs, half_width, model, sides_of
+from thermal_fiducial.core.detection.lag import LagTails
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 # Passes follow one another until the last step was short enough; for outlines that are no squares a shorter one, as
 # these may become ones.
@@ -58,13 +59,14 @@ class RefinedCorners:
 
 
 def refine_corners(
-    image: Counts | Float32Array,
+    image: Float32Array,
     corners: ImagePoints,
     camera: Camera,
     behind: Float32Array,
     blur_px: float,
     lag_blur_px: FloatArray | None = None,
     columns: int = 6,
+    lag_tails: LagTails | None = None,
 ) -> RefinedCorners:
     """Corners of N markers, refined.
 
@@ -76,54 +78,38 @@ def refine_corners(
     blur_px : standard deviation of optics and pixel
     lag_blur_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
     columns : of pixels, in a segment
+    lag_tails : to be taken out of the image; none when left out
     """
     lag_blur = np.zeros((len(corners.px), 2)) if lag_blur_px is None else lag_blur_px
-    task = _Task(image, camera, corners, behind, lag_blur, columns)
-    found, step = _pass(task, corners, blur_px)
+    found, step = _pass(image, corners, camera, behind, blur_px, lag_blur, columns, lag_tails)
+    which = np.arange(len(step))
     for _ in range(_PASSES - 1):
-        away = np.flatnonzero(step > np.where(found.doubt > 0.0, _STILL_PX, _SETTLED_PX))
-        if len(away) == 0:
+        which = which[step > np.where(found.doubt[which] > 0.0, _STILL_PX, _SETTLED_PX)]
+        if len(which) == 0:
             break
-        part = task.only(away)
-        again, further = _pass(part, part.seen_from(found.corners_px[away]), blur_px)
-        found = found.with_others(away, again)
-        step = np.zeros(len(step))
-        step[away] = further
+        tails = None if lag_tails is None else lag_tails.only(which)
+        start = corners.only(which).moved(found.corners_px[which] - corners.px[which], camera)
+        again, step = _pass(image, start, camera, behind[which], blur_px, lag_blur[which], columns, tails)
+        found = found.with_others(which, again)
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """What to refine, as :func:`refine_corners` is given it."""
-
-    image: Counts | Float32Array
-    camera: Camera
-    corners: ImagePoints
-    behind: Float32Array
-    lag_blur: FloatArray
-    columns: int
-
-    def only(self, which: IntArray) -> '_Task':
-        """For the markers ``which``."""
-        if len(which) == len(self.behind):
-            return self
-        corners, behind, lag_blur = self.corners.only(which), self.behind[which], self.lag_blur[which]
-        return _Task(self.image, self.camera, corners, behind, lag_blur, self.columns)
-
-    def seen_from(self, corners_px: FloatArray) -> ImagePoints:
-        """The corners where they are by now (N, 4, 2)."""
-        moved = corners_px - self.corners.px
-        return self.corners.moved(moved, self.camera) if moved.any() else self.corners
-
-
-def _pass(task: _Task, start: ImagePoints, optics: float) -> tuple[RefinedCorners, FloatArray]:
+def _pass(
+    image: Float32Array,
+    start: ImagePoints,
+    camera: Camera,
+    behind: Float32Array,
+    blur_px: float,
+    lag_blur: FloatArray,
+    columns: int,
+    lag_tails: LagTails | None,
+) -> tuple[RefinedCorners, FloatArray]:
     """Where one linearised adjustment moves the corners, and the longest step (N,) of each marker."""
-    cells = task.behind.shape[2]
-    widest = math.hypot(optics, math.sqrt(float((task.lag_blur * task.lag_blur).sum(axis=1).max())))
-    half = half_width(widest)
-    sides = sides_of(start.x, task.camera, task.image.shape, cells, task.columns, half)
-    blur = blurs(sides.normal[cells // 2], optics, task.lag_blur)
-    segments = measure(task.image, sides, model(sides, task.behind, blur), REACHED * blur[0])
+    cells = behind.shape[2]
+    half = half_width(math.hypot(blur_px, math.sqrt(float((lag_blur * lag_blur).sum(axis=1).max()))))
+    sides = sides_of(start.x, camera, image.shape, cells, columns, half)
+    blur = blurs(sides.normal[cells // 2], blur_px, lag_blur)
+    segments = measure(sides.counts(image, lag_tails), model(sides, behind, blur), REACHED * blur[0])
     shift, covariances, doubt = adjust(sides, segments, _PRIOR_PX, start)
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]

@@ -12,7 +12,7 @@ import numpy as np
 from thermal_fiducial.core.detection.corners.sides import ENDS, Sides, STARTS
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.geometry.camera import ImagePoints
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
 #: A linearised displacement is good for this many blurs.
 REACHED = 2.0
@@ -65,8 +65,7 @@ class _SegmentFit(NamedTuple):
 
 
 def measure(
-    image: Counts | Float32Array,
-    sides: Sides,
+    counts: Float32Array,
     modelled: tuple[Float32Array, Float32Array, Float32Array],
     reach: FloatArray,
     of_each: int = 4,
@@ -75,12 +74,11 @@ def measure(
 
     Parameters
     ----------
-    image : (height, width) counts
+    counts : (M, C, m, E) of the pixels across the sides
     modelled : value, derivative and weight of each pixel (M, C, m, E), of ``sides.model``
     reach : (E,) longest displacement for which the model can be linearised [px]
     of_each : number of sides of a marker
     """
-    counts = image.ravel().take(sides.pixel, mode='clip').astype(np.float32, copy=False)
     cells = counts.shape[2]
     value, slope, weight = modelled
     X = np.empty((_PLANES, *counts.shape), dtype=np.float32)

@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from thermal_fiducial.core.detection.lag import LagTails
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
@@ -56,6 +57,11 @@ class Sides:
     across: FloatArray
     #: (E,) length [px]
     along: FloatArray
+
+    def counts(self, image: Float32Array, lag_tails: LagTails | None = None) -> Float32Array:
+        """Of the pixels (M, C, m, E), without the ``lag_tails`` of N markers, if there are any."""
+        counts = image.ravel().take(self.pixel, mode='clip')
+        return counts if lag_tails is None else lag_tails.taken_out(counts, self.pixel, image)
 
 
 def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, columns: int, half: int) -> Sides:
