@@ -17,10 +17,14 @@ import pytest
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
+from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.csv_rows import csv_rows, named_rows
 from thermal_fiducial.files.dictionary import load_dictionary
+from thermal_fiducial.files.map_history import save_with_history
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.point_cloud import load_alignment, load_cloud
+from thermal_fiducial.files.rig_files import densities, of_camchain, of_rig
 from thermal_fiducial.files.trajectory_file import load_tum
 from thermal_fiducial.replay.domain import own_domain
 
@@ -229,3 +233,117 @@ def test_a_lock_file_that_is_a_link_is_neither_followed_nor_cut(tmp_path, monkey
     with own_domain() as domain:
         assert domain == 89
     assert victim.read_text() == 'precious'
+
+
+def _sparse(path):
+    with path.open('wb') as file:
+        file.truncate(400 << 20)
+
+
+#: What may stand where a table or a bag is looked for; all of it is refused without being read to its end.
+NO_TABLES = {
+    'a pipe': os.mkfifo,
+    'a device': lambda path: path.symlink_to('/dev/zero'),
+    'a link to itself': lambda path: path.symlink_to(path),
+    'nothing but holes': _sparse,
+    'blank lines': lambda path: path.write_bytes(b'\n' * 1_000_000),
+    'one long line': lambda path: path.write_bytes(b'1' * 1_000_000),
+    'a quotation mark that is never closed': lambda path: path.write_text('"' + '1\n' * 200_000),
+    'no text': lambda path: path.write_bytes(b'\xff\xfe1,2\n'),
+}
+TABLES = {
+    'trajectory': load_tum,
+    'table': lambda path: list(csv_rows(path)),
+    'named columns': lambda path: list(named_rows(path, ('stamp_ns', 'id'))),
+}
+
+
+@pytest.mark.parametrize('kind', NO_TABLES)
+@pytest.mark.parametrize('table', TABLES)
+def test_tables_that_are_none(tmp_path, table, kind):
+    path = tmp_path / 'table.csv'
+    NO_TABLES[kind](path)
+    if (table, kind) == ('table', 'a quotation mark that is never closed'):
+        # It ends with its line.
+        assert [cells for _, cells in csv_rows(path)][:2] == [['1'], ['1']]
+        return
+    assert str(path) in refused(TABLES[table], path)
+
+
+@pytest.mark.parametrize('kind', ['a pipe', 'a device', 'nothing but holes'])
+@pytest.mark.parametrize('suffix', ['.mcap', '.db3', '.bag'])
+@pytest.mark.parametrize('in_folder', [False, True])
+def test_files_that_are_no_bags(tmp_path, suffix, kind, in_folder):
+    path = tmp_path / f'file{suffix}'
+    NO_TABLES[kind](path)
+    if in_folder:
+        (tmp_path / 'metadata.yaml').write_text('rosbag2_bagfile_information: {version: 9}\n')
+
+    def opened(bag):
+        with BagReader(bag):
+            pass
+
+    refused(opened, tmp_path if in_folder else path)
+
+
+@pytest.mark.parametrize('kind', ['a pipe', 'a device', 'a link to itself', 'nothing but holes'])
+def test_a_map_is_not_written_over_what_no_map_is(tmp_path, kind):
+    good, out = tmp_path / 'map.yaml', tmp_path / 'out.yaml'
+    good.write_text(MAP)
+    NO_TABLES[kind](out)
+    before = out.lstat()
+    refused(lambda path: save_with_history(path, load_map(good), 'test'), out)
+    assert out.lstat() == before
+    assert Path('/dev/zero').is_char_device()
+
+
+RIG = {
+    'width': '640', 'height': '512', 'model': 'plumb_bob', 'K': '[500, 0, 320, 0, 500, 256, 0, 0, 1]',
+    'D': '[0, 0, 0, 0]', 'camera_position': '[0.1, 0, 0]', 'time_offset': '0.01',
+    'camera_orientation': '[-0.5, 0.5, -0.5, 0.5]',
+}  # fmt: skip
+CHAIN = {
+    'camera_model': 'pinhole', 'intrinsics': '[500, 500, 320, 256]', 'distortion_model': 'radtan',
+    'distortion_coeffs': '[0, 0, 0, 0]', 'resolution': '[640, 512]', 'timeshift_cam_imu': '0.01',
+    'T_cam_imu': '[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]',
+}  # fmt: skip
+IMU = {'gyroscope_noise_density': '1.0e-3', 'accelerometer_random_walk': '1.0e-3'}
+RIG_FILES = {
+    'rig': ('cameras: {cam0: {%s}}\n', RIG, lambda path: of_rig(path, 'cam0')),
+    'camchain': ('cam0: {%s}\n', CHAIN, lambda path: of_camchain(path, 'cam0', {})),
+    'noise': ('imu0: {%s}\n', IMU, densities),
+}
+
+
+@pytest.mark.parametrize('name', RIG_FILES)
+@pytest.mark.parametrize('value', [*VALUES, '1e300', '[.nan]', '[[1]]', '{a: 1}', 'true', '1' * 400])
+def test_values_of_a_rig(tmp_path, name, value):
+    """Each in the place of each field, and of the camera or IMU as a whole."""
+    form, fields, read = RIG_FILES[name]
+    path = tmp_path / f'{name}.yaml'
+    path.write_text(form % ', '.join(f'{field}: {text}' for field, text in fields.items()))
+    read(path)
+    optional = {
+        'model',
+        'D',
+        'time_offset',
+        'camera_model',
+        'distortion_model',
+        'distortion_coeffs',
+        'timeshift_cam_imu',
+    }
+    possible = {
+        'null': optional | set(IMU),
+        '-1': {'time_offset', 'timeshift_cam_imu'},
+        '[]': {'D', 'distortion_coeffs'},
+    }
+    for changed in fields:
+        if changed in possible.get(value, ()):
+            continue
+        path.write_text(
+            form % ', '.join(f'{field}: {value if field == changed else text}' for field, text in fields.items())
+        )
+        assert f'{path}: line 1' in refused(read, path)
+    path.write_text(form.replace('{%s}', value))
+    if value not in ('null', '{}', '{a: 1}', '!!float {}') or name != 'noise':
+        refused(read, path)

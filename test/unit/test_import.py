@@ -179,7 +179,7 @@ def corrupt(path, change):
         ('cam1.csv', lambda text: text.replace('1700000000000000000', '17e3', 1), ('cam1.csv line 2', 'stamp')),
         ('rig.yaml', lambda text: '- 1', ('rig.yaml',)),
         ('rig.yaml', lambda text: text.replace('cam1', 'cam0'), ('rig.yaml', 'cam1', 'cam0')),
-        ('rig.yaml', lambda text: text.replace('width: 640', 'width: wide'), ('rig.yaml', 'resolution')),
+        ('rig.yaml', lambda text: text.replace('width: 640', 'width: wide'), ('rig.yaml: line', 'cam1: width', 'wide')),
         ('rig.yaml', lambda text: text.replace('radtan', 'cubic'), ('rig.yaml', 'cubic')),
         ('rig.yaml', lambda text: text.replace('marker_size: 0.3', ''), ('--marker-size',)),
     ],

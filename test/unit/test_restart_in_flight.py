@@ -1,5 +1,6 @@
 """A filter that crashed in flight goes on with what it knew last."""
 
+import json
 import os
 import time
 
@@ -50,11 +51,47 @@ def test_the_file_holds_it_for_ten_seconds(tmp_path):
 
 
 @pytest.mark.parametrize(
-    'text', ['', '{', '[]', '{"stamp_ns": 1}', '{"stamp_ns": 1, "T_map_body": [[1.0]], "camera_time_offset": null}']
-)
+    'text',
+    [
+        '', '{', '[]', '1', '{"stamp_ns": 1}', '[' * 9000, '{"a": ' * 1500, '\xff', ' ' * 1_000_000,
+        '{"stamp_ns": 1, "T_map_body": [[1.0]], "camera_time_offset": null}',
+    ],
+)  # fmt: skip
 def test_a_file_that_is_none_is_no_hint(tmp_path, text):
-    (tmp_path / 'pose.json').write_text(text)
+    (tmp_path / 'pose.json').write_text(text, encoding='latin-1')
     assert recent_pose(tmp_path / 'pose.json') is None
+
+
+@pytest.mark.parametrize(
+    ('field', 'value'),
+    [
+        ('stamp_ns', '1e999'), ('stamp_ns', '1' + '0' * 30), ('stamp_ns', '-1'), ('stamp_ns', '"x"'), ('format', '"x"'),
+        ('T_map_body', 'NaN'), ('T_map_body', '[1e200]'), ('camera_time_offset', 'NaN'), ('camera_time_offset', '7'),
+        ('version', '[]'),
+    ],
+)  # fmt: skip
+def test_values_that_no_filter_leaves_are_no_hint(tmp_path, field, value):
+    path = tmp_path / 'pose.json'
+    save_last_pose(path, LAST)
+    document = json.loads(path.read_text())
+    text = json.dumps({**document, field: 'HERE'}).replace('"HERE"', value)
+    path.write_text(text.replace('1e200', json.dumps([[1e200] * 4] * 4)[1:-1]))
+    assert recent_pose(path) is None
+
+
+def test_what_stands_where_the_file_is_made_is_neither_followed_nor_waited_for(tmp_path):
+    path, victim = tmp_path / 'pose.json', tmp_path / 'victim'
+    victim.write_text('precious')
+    (tmp_path / 'pose.json.new').symlink_to(victim)
+    with pytest.raises(InputError, match='pose'):
+        save_last_pose(path, LAST)
+    assert victim.read_text() == 'precious'
+    (tmp_path / 'pose.json.new').unlink()
+    os.mkfifo(tmp_path / 'pose.json.new')
+    with pytest.raises(InputError, match='pose'):
+        save_last_pose(path, LAST)
+    os.mkfifo(path)
+    assert recent_pose(path) is None
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path):

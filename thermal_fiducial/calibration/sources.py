@@ -1,7 +1,6 @@
 """Raw frames, IMU samples and intrinsics from a folder of pictures or a bag."""
 
 from collections.abc import Iterator
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.types import Counts, FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 from thermal_fiducial.files.images import read_picture as load_picture
 
@@ -86,26 +86,19 @@ def measured_points(path: Path, width: int, height: int) -> list[tuple[str, Sigh
         No such file or columns, numbers that are none, points outside the image or twice in a view.
     """
     views: dict[str, dict[str, list[float]]] = {}
-    try:
-        with path.open(newline='', encoding='utf-8') as file:
-            table = csv.DictReader(file, skipinitialspace=True)
-            if not set(POINT_COLUMNS) <= set(table.fieldnames or ()):
-                raise InputError(f'{path}: the first line must name the columns {", ".join(POINT_COLUMNS)}')
-            for row in table:
-                where = f'{path}, line {table.line_num}'
-                points = views.setdefault(row['view'], {})
-                if row['point'] in points:
-                    raise InputError(f'{where}: point {row["point"]} of view {row["view"]} for the second time')
-                points[row['point']] = _measured(row, where, width, height)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f'{path}: {error}') from None
+    for number, (view, point, *cells) in named_rows(path, POINT_COLUMNS):
+        where = f'{path}, line {number}'
+        points = views.setdefault(view, {})
+        if point in points:
+            raise InputError(f'{where}: point {point} of view {view} for the second time')
+        points[point] = _measured(cells, where, width, height)
     return [(name, _flat_sighting(np.array(list(points.values())))) for name, points in views.items()]
 
 
-def _measured(row: dict[str, str], where: str, width: int, height: int) -> list[float]:
+def _measured(cells: list[str], where: str, width: int, height: int) -> list[float]:
     try:
-        u, v, x, y = (float(row[name]) for name in POINT_COLUMNS[2:])
-    except (TypeError, ValueError):
+        u, v, x, y = map(float, cells)
+    except ValueError:
         raise InputError(f'{where}: u, v, x and y must be numbers') from None
     if not (-0.5 <= u <= width - 0.5 and -0.5 <= v <= height - 0.5 and np.isfinite(x) and np.isfinite(y)):
         raise InputError(f'{where}: a point that lies outside {width} x {height} pixels, or on no board')

@@ -2,7 +2,6 @@
 
 import argparse
 from collections.abc import Callable
-import csv
 from pathlib import Path
 import re
 from typing import TypeAlias
@@ -19,10 +18,10 @@ from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import map_history
 from thermal_fiducial.files.atomic import locked
+from thermal_fiducial.files.csv_rows import csv_rows
 from thermal_fiducial.files.dictionary import not_in_dictionary
 from thermal_fiducial.files.map_format import upgraded
 from thermal_fiducial.files.marker_map import load_map
-from thermal_fiducial.files.reading import read_text
 from thermal_fiducial.map_tools import map_editing
 
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
@@ -217,11 +216,11 @@ def _anchor(args: argparse.Namespace) -> int:
 
 def _survey(path: Path) -> dict[int, FloatArray]:
     surveyed: dict[int, FloatArray] = {}
-    for number, row in enumerate(csv.reader(read_text(path).splitlines()), start=1):
-        if not row or row[0].strip().lower() in ('id', '') or row[0].startswith('#'):
+    for number, row in csv_rows(path):
+        if row[0].lower() in ('id', '') or row[0].startswith('#'):
             continue
         try:
-            if not re.fullmatch(r'\s*\d{1,9}\s*', row[0]):
+            if not re.fullmatch(r'[0-9]{1,9}', row[0]):
                 raise ValueError
             centre = np.array([float(value) for value in row[1:4]]).reshape(3)
         except ValueError:

@@ -1,7 +1,6 @@
 """``map build`` and ``map refine``: maps from photos and from the detections of a run."""
 
 import argparse
-import csv
 from pathlib import Path
 
 import cv2
@@ -16,11 +15,11 @@ from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE, Mark
 from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.dictionary import load_dictionary, not_in_dictionary
 from thermal_fiducial.files.images import read_picture
 from thermal_fiducial.files.map_history import save_with_history
 from thermal_fiducial.files.marker_map import load_map
-from thermal_fiducial.files.reading import read_text
 from thermal_fiducial.map_tools import map_editing
 from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.map_tools.map_doubts import Doubt, doubts
@@ -28,8 +27,6 @@ from thermal_fiducial.map_tools.map_doubts import Doubt, doubts
 _IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
 #: Noise of OpenCV's sub-pixel corners in photos [px]; the mapper takes the actual noise from the pictures.
 PHOTO_SIGMA_PX = 0.2
-# Of a table of detections: an hour of flight with ten markers in view has 150 MB.
-_DETECTIONS_BYTES = 400_000_000
 # Beyond any stamp [ns] and any corner [px]; and any ID of a dictionary.
 _LARGEST_VALUE, _LARGEST_ID = 9.2e18, 100_000
 # How far entries may be off that somebody has written by hand, without a covariance.
@@ -222,13 +219,11 @@ def _detection_table(path: Path) -> FloatArray:
     """Stamp [ns], ID, sigma and corners [px] of each row of a ``detections.csv``, (N, 11)."""
     names = ('stamp_ns', 'id', 'sigma_px', *CORNER_FIELDS)
     rows = []
-    for number, row in enumerate(csv.DictReader(read_text(path, _DETECTIONS_BYTES).splitlines()), start=2):
+    for number, cells in named_rows(path, names):
         try:
-            values = [float(row[name]) for name in names]
-        except (KeyError, TypeError, ValueError):
-            raise InputError(
-                f'{path}: line {number}: not a table of detections, which has {", ".join(names)}'
-            ) from None
+            values = [float(cell) for cell in cells]
+        except ValueError:
+            raise InputError(f'{path}: line {number}: not a detection') from None
         if not all(abs(value) < _LARGEST_VALUE for value in values) or not 0 <= values[1] < _LARGEST_ID:
             raise InputError(f'{path}: line {number}: not a detection')
         rows.append(values)

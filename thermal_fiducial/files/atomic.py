@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+import errno
 import fcntl
 import os
 from pathlib import Path
@@ -26,7 +27,9 @@ def write_atomically(path: Path, text: str) -> None:
     OSError
         As the file system says; the old file is then untouched.
     """
-    path = path.resolve()
+    path = _target(path)
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, 'not a regular file')
     descriptor, name = tempfile.mkstemp(prefix=f'.{path.name}.', suffix='.tmp', dir=path.parent)
     temporary = Path(name)
     try:
@@ -53,7 +56,7 @@ def sync_folder(folder: Path) -> None:
 
 def clean_up(path: Path) -> None:
     """Remove what killed writers of ``path`` have left; only under :func:`locked`."""
-    path = path.resolve()
+    path = _target(path)
     for litter in path.parent.glob(f'.{_literal(path.name)}.*.tmp'):
         litter.unlink(missing_ok=True)
 
@@ -69,8 +72,9 @@ def locked(path: Path) -> Iterator[None]:
     InputError
         No such folder, or another program does not give it free.
     """
-    folder = path.resolve().parent
+    folder = path.parent
     try:
+        folder = _target(path).parent
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
         raise InputError(f'{folder}: {error.strerror}') from None
@@ -94,6 +98,14 @@ def _wait_for(descriptor: int, folder: Path) -> None:
         except OSError:
             # A file system without locks: as good as one writer.
             return
+
+
+def _target(path: Path) -> Path:
+    """Where ``path`` is behind its symbolic links. Raises OSError where they go round in a circle."""
+    try:
+        return path.resolve()
+    except RuntimeError:
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP)) from None
 
 
 def _literal(name: str) -> str:

@@ -1,5 +1,8 @@
 """Pixels of ``sensor_msgs/msg/Image`` and ``CompressedImage``, from rclpy or from a bag."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+import os
 from pathlib import Path
 import struct
 from typing import Any
@@ -79,13 +82,27 @@ def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
     """
     data = np.frombuffer(read_bytes(path, _LARGEST_FILE_BYTES), np.uint8)
     try:
-        pixels = cv2.imdecode(data, flags) if data.size else None
+        with _without_libraries_lines():
+            pixels = cv2.imdecode(data, flags) if data.size else None
     except cv2.error as error:
         reason = 'it is too large' if 'PIXELS' in str(error) or 'WIDTH' in str(error) else 'it is broken'
         raise InputError(f'{path}: not a readable picture: {reason}') from None
     if pixels is None:
         raise InputError(f'{path}: not a readable picture')
     return pixels
+
+
+@contextmanager
+def _without_libraries_lines() -> Iterator[None]:
+    """Keep what libpng and others write about a broken picture, past OpenCV, off the console of a command."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def stamp_to_ns(stamp: Any) -> int:

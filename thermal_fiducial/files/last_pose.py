@@ -1,17 +1,21 @@
 """The file with the last pose of a running filter, for the one that is started after it crashed."""
 
 import json
+import os
 from pathlib import Path
 import time
 
 import numpy as np
 
 from thermal_fiducial.core.filter.restart import HINT_SECONDS, LastPose
+from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.reading import read_text
 
 _FORMAT = {'format': 'thermal_fiducial/last_pose', 'version': 1}
 #: Of the parameter camera_time_offset [s].
 _LARGEST_OFFSET = 1.0
+_LIMIT_BYTES = 10_000
 
 
 def save_last_pose(path: Path, last: LastPose) -> None:
@@ -30,7 +34,10 @@ def save_last_pose(path: Path, last: LastPose) -> None:
     new = path.with_name(path.name + '.new')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        new.write_text(json.dumps(document), encoding='utf-8')
+        # What somebody else has put there, a link or a pipe, is neither followed nor waited for.
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        with os.fdopen(os.open(new, flags, 0o600), 'w', encoding='utf-8') as file:
+            json.dump(document, file)
         new.replace(path)
     except OSError as error:
         raise InputError(f'{path}: {error.strerror}') from None
@@ -44,10 +51,12 @@ def recent_pose(path: Path) -> LastPose | None:
     try:
         if not 0.0 <= time.time() - path.stat().st_mtime <= HINT_SECONDS:
             return None
-        document = json.loads(path.read_text(encoding='utf-8'))
+        document = json.loads(read_text(path, _LIMIT_BYTES))
         T_map_body, offset = np.array(document['T_map_body'], dtype=np.float64), document['camera_time_offset']
         last = LastPose(int(document['stamp_ns']), T_map_body, None if offset is None else float(offset))
-    except (OSError, ValueError, TypeError, KeyError):
+        of_this_form = document.items() >= _FORMAT.items()
+    except (OSError, InputError, ValueError, TypeError, KeyError, OverflowError, RecursionError):
         return None
-    usable = T_map_body.shape == (4, 4) and np.isfinite(T_map_body).all() and abs(offset or 0.0) <= _LARGEST_OFFSET
-    return last if usable and document.items() >= _FORMAT.items() else None
+    is_pose = T_map_body.shape == (4, 4) and bool((np.abs(T_map_body) <= LARGEST_COORDINATE).all())
+    in_time = 0 <= last.stamp_ns < 2**63 and abs(last.camera_time_offset or 0.0) <= _LARGEST_OFFSET
+    return last if of_this_form and is_pose and in_time else None

@@ -14,7 +14,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.atomic import clean_up, locked, sync_folder, write_atomically
 from thermal_fiducial.files.map_format import parse_document
 from thermal_fiducial.files.marker_map import dump_map
-from thermal_fiducial.files.reading import cannot_write, read_text
+from thermal_fiducial.files.reading import cannot_write, read_bytes, read_text, TEXT_LIMIT_BYTES
 
 #: Earlier versions kept.
 KEPT = 50
@@ -55,10 +55,10 @@ def autosave_file(path: Path) -> Path:
 
 
 def digest(path: Path) -> str:
-    """What distinguishes the present content of ``path`` from any other; empty when there is none."""
+    """What distinguishes the present content of ``path`` from any other; empty when there is none that can be read."""
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ''
-    except OSError:
+        return hashlib.sha256(read_bytes(path, TEXT_LIMIT_BYTES)).hexdigest()
+    except InputError:
         return ''
 
 
@@ -90,18 +90,23 @@ def replace(path: Path, text: str, action: str) -> None:
     Raises
     ------
     InputError
-        The folder can't be written to.
+        The folder can't be written to, or what is there is larger than any map, or no file.
     """
     try:
         clean_up(path)
         if path.exists():
-            earlier = path.read_text(encoding='utf-8', errors='replace')
+            earlier = _whatever(path)
             if earlier == text:
                 return
             keep(path, earlier, action)
         write_atomically(path, text)
     except OSError as error:
         raise cannot_write(path, 'the map', error) from None
+
+
+def _whatever(path: Path) -> str:
+    """The text in a file, whatever it is; raises InputError for what no map can be."""
+    return read_bytes(path, TEXT_LIMIT_BYTES).decode('utf-8', errors='replace')
 
 
 def keep(path: Path, text: str, action: str) -> None:
@@ -196,9 +201,17 @@ def take_up_autosave(path: Path) -> None:
 
 
 def put_autosave_aside(path: Path) -> None:
-    """Move an autosaved map that nobody has taken up into the history; only under :func:`locked`. Raises OSError."""
+    """Move an autosaved map that nobody has taken up into the history; only under :func:`locked`.
+
+    Raises
+    ------
+    OSError
+        The history cannot be written.
+    InputError
+        What is there is larger than any map.
+    """
     file = autosave_file(path)
     if file.is_file():
-        keep(path, file.read_text(encoding='utf-8', errors='replace'), PUT_ASIDE)
+        keep(path, _whatever(file), PUT_ASIDE)
         file.unlink(missing_ok=True)
         sync_folder(path.resolve().parent)

@@ -1,4 +1,4 @@
-"""YAML files whose fields are not of ours alone, as plain objects: parameters of ROS, rigs of others.
+"""YAML files whose fields are not of ours alone, as plain objects: parameters of ROS, for one.
 
 The text passes the checks of :mod:`thermal_fiducial.files.schema` first: neither aliases nor tags, nor a depth or
 length that no such file has.
@@ -14,15 +14,15 @@ from thermal_fiducial.files.reading import one_line, read_text
 from thermal_fiducial.files.schema import parse_yaml
 
 
-def load_plain(path: str | Path, head: str = '') -> Any:
-    """The one document of a YAML file, None of an empty one; ``head`` is left out at its beginning.
+def load_plain(path: str | Path) -> Any:
+    """The one document of a YAML file, None of an empty one.
 
     Raises
     ------
     InputError
         As :func:`thermal_fiducial.files.schema.load_yaml`, or a value that is spelt like a date or number and is none.
     """
-    text = read_text(path).removeprefix(head)
+    text = read_text(path)
     parse_yaml(str(path), text)
     try:
         document = yaml.load(text, Loader=getattr(yaml, 'CSafeLoader', yaml.SafeLoader))

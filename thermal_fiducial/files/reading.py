@@ -1,13 +1,20 @@
 """Reading of files that anybody may have written: regular ones only, and no more of them than they may hold."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import stat
+from typing import BinaryIO
 
 from thermal_fiducial.errors import InputError
 
 #: Of a text that is taken into memory at once: a map of 1,700 markers has 2 MB.
 TEXT_LIMIT_BYTES = 6_000_000
+#: Of a line of a table: a camera pose with its covariance has 1,200 bytes.
+LINE_LIMIT_BYTES = 10_000
+#: Blank lines in a row: where there are more, nobody meant to write a table.
+_BLANK_LINES = 100_000
 
 
 def read_bytes(path: str | Path, limit: int) -> bytes:
@@ -18,6 +25,18 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
     InputError
         No such file, not a regular one (a device, a pipe, a folder), too large, or unreadable.
     """
+    with _opened(path, limit) as file:
+        return file.read(os.fstat(file.fileno()).st_size)
+
+
+def require_regular(path: str | Path) -> None:
+    """Raise InputError for what is no regular file that can be opened: whoever read from it might wait for ever."""
+    with _opened(path, 1 << 63):
+        pass
+
+
+@contextmanager
+def _opened(path: str | Path, limit: int) -> Iterator[BinaryIO]:
     try:
         # A pipe without a writer would be waited for.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -31,7 +50,7 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
         if found.st_size > limit:
             raise InputError(f'{path}: {found.st_size} bytes, more than such a file may have ({limit})')
         with os.fdopen(descriptor, 'rb', closefd=False) as file:
-            return file.read(found.st_size)
+            yield file
     except OSError as error:
         raise InputError(f'{path}: cannot read it: {error.strerror}') from None
     finally:
@@ -50,6 +69,33 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT_BYTES) -> str:
         return read_bytes(path, limit).decode('utf-8')
     except UnicodeDecodeError:
         raise InputError(f'{path}: not a text file') from None
+
+
+def text_lines(path: str | Path, limit: int) -> Iterator[tuple[int, str]]:
+    """Number, from 1, and text of each line that is not blank, of a file of at most ``limit`` bytes.
+
+    One line is held at a time, so that the first that cannot be used is all that a broken file of any size costs.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_bytes`, not a text, or lines that nobody writes.
+    """
+    number = last = 0
+    with _opened(path, limit) as file:
+        while data := file.readline(LINE_LIMIT_BYTES + 1):
+            number += 1
+            if len(data) > LINE_LIMIT_BYTES:
+                raise InputError(f'{path}: line {number} is longer than {LINE_LIMIT_BYTES} bytes')
+            try:
+                line = data.decode('utf-8').strip()
+            except UnicodeDecodeError:
+                raise InputError(f'{path}: line {number} is not text') from None
+            if line:
+                last = number
+                yield number, line
+            elif number - last > _BLANK_LINES:
+                raise InputError(f'{path}: more than {_BLANK_LINES} blank lines from line {last + 1} on')
 
 
 def cannot_write(path: str | Path, what: str, error: OSError) -> InputError:

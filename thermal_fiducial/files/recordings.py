@@ -7,8 +7,9 @@ EuRoC (ASL): ``[mav0/]imu0/data.csv``, ``CAMERA/data.csv`` with pictures, a ``se
 Kalibr: ``imu0.csv`` and pictures ``CAMERA/STAMP.png``, with a camchain and an IMU file.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+import math
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,14 @@ from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.rig_files import NOISE_NAMES, of_camchain, of_rig, of_sensor, read_yaml, Rig
+from thermal_fiducial.files.csv_rows import csv_rows
+from thermal_fiducial.files.images import read_picture
+from thermal_fiducial.files.records import is_imu_reading
+from thermal_fiducial.files.rig_files import densities, of_camchain, of_rig, of_sensor, Rig
 from thermal_fiducial.files.trajectory_file import load_tum
+
+#: Of markers, more than any dictionary has; of a quaternion, as in maps.
+_IDS, _NORM_TOLERANCE = 100_000, 0.01
 
 
 @dataclass(frozen=True)
@@ -49,8 +56,8 @@ class Picture:
         InputError
             No picture.
         """
-        pixels = cv2.imread(str(self.path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-        if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
+        pixels = read_picture(self.path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+        if pixels.dtype not in (np.uint8, np.uint16):
             raise InputError(f'{self.path}: not a picture of 8 or 16 bit')
         return pixels
 
@@ -133,7 +140,7 @@ def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) 
     if chain is None:
         raise InputError(f'{folder}: no camchain file beside the pictures: name it with --camchain')
     noise = imu or next((path for path in sorted(folder.glob('*imu*.yaml')) if path != chain), None)
-    densities = {} if noise is None else _densities(read_yaml(noise))
+    known = {} if noise is None else densities(noise)
     place = folder / camera
     pictures = [
         Picture(_stamp(str(path), path.stem), path)
@@ -143,12 +150,7 @@ def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) 
     if not pictures:
         raise InputError(f'{place}: no pictures')
     pictures.sort(key=lambda picture: picture.stamp_ns)
-    return Recording(of_camchain(chain, camera, densities), _samples(folder / 'imu0.csv'), pictures=pictures)
-
-
-def _densities(document: Mapping[str, Any]) -> dict[str, float]:
-    section = document.get('imu0', document)
-    return {name: float(section[name]) for name in NOISE_NAMES if name in section}
+    return Recording(of_camchain(chain, camera, known), _samples(folder / 'imu0.csv'), pictures=pictures)
 
 
 # --- tables -------------------------------------------------------------------------------------------
@@ -162,29 +164,32 @@ def _lines(path: Path, least: int) -> Iterator[tuple[int, list[str]]]:
     InputError
         Unreadable, no line, or one of fewer cells than ``least``.
     """
-    try:
-        lines = path.read_text(encoding='utf-8').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'{path}: {getattr(error, "strerror", None) or "no text"}') from None
-    numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line[0] != '#']
-    if numbered and not numbered[0][1][0].isdigit():
-        del numbered[0]
-    if not numbered:
-        raise InputError(f'{path}: no lines of numbers')
-    for number, line in numbered:
-        words = [word.strip() for word in line.split(',')]
+    head, empty = True, True
+    for number, words in csv_rows(path):
+        if words[0].startswith('#'):
+            continue
+        names_columns, head = head and not words[0][:1].isdigit(), False
+        if names_columns:
+            continue
         if len(words) < least:
             raise InputError(f'{path} line {number}: {len(words)} values, at least {least} are needed')
+        empty = False
         yield number, words
+    if empty:
+        raise InputError(f'{path}: no lines of numbers')
 
 
-def _table(path: Path, columns: int) -> tuple[IntArray, FloatArray]:
-    """Stamps (N,) [ns] and the values (N, M) after them, at least ``columns`` with the stamp."""
+def _table(
+    path: Path, columns: int, possible: Callable[[list[float]], bool] = lambda _: True
+) -> tuple[IntArray, FloatArray]:
+    """Stamps (N,) [ns] and the values (N, M) after them, at least ``columns`` with the stamp; all ``possible``."""
     stamps, rows = [], []
     for number, words in _lines(path, columns):
         where = f'{path} line {number}'
         stamps.append(_stamp(where, words[0]))
         rows.append(_numbers(where, words[1:]))
+        if not possible(rows[-1]):
+            raise InputError(f'{where}: numbers, but none that were measured')
     if len({len(row) for row in rows}) > 1:
         raise InputError(f'{path}: lines of different lengths')
     return np.array(stamps, dtype=np.int64), np.array(rows)
@@ -208,12 +213,12 @@ def _numbers(where: str, words: list[str]) -> list[float]:
 
 
 def _samples(path: Path) -> list[ImuSample]:
-    stamps, values = _table(path, 7)
+    stamps, values = _table(path, 7, lambda row: is_imu_reading(row[:3], row[3:6]))
     return [ImuSample(int(stamp), row[:3], row[3:6]) for stamp, row in zip(stamps, values, strict=True)]
 
 
 def _corners(path: Path) -> Iterator[Corners]:
-    stamps, values = _table(path, 10)
+    stamps, values = _table(path, 10, lambda row: row[0] in range(_IDS))
     order = np.argsort(stamps, kind='stable')
     stamps, values = stamps[order], values[order]
     for rows in np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(stamps)) + 1):
@@ -223,7 +228,7 @@ def _corners(path: Path) -> Iterator[Corners]:
 
 
 def _poses(path: Path) -> list[CameraPose]:
-    stamps, values = _table(path, 44)
+    stamps, values = _table(path, 44, lambda row: abs(math.hypot(*row[3:7]) - 1.0) < _NORM_TOLERANCE)
     T_map_camera = transform_from_quaternion(values[:, :3], values[:, 3:7])
     rows = zip(stamps, T_map_camera, values[:, 7:43].reshape(-1, 6, 6), strict=True)
     return [CameraPose(int(stamp), T, covariance) for stamp, T, covariance in rows]

@@ -1,5 +1,6 @@
 """Records out of messages, from rclpy or from a bag, checked at the door."""
 
+from collections.abc import Iterable
 import math
 from typing import Any
 
@@ -54,6 +55,12 @@ def camera(message: Any) -> Camera:
         raise InputError(f'camera_info: {error}') from None
 
 
+def is_imu_reading(turn: Iterable[float], force: Iterable[float]) -> bool:
+    """Whether an IMU can have measured it [rad/s, m/s^2]."""
+    # Plain numbers: of six of them, 200 times a second, numpy takes three times as long. NaN is below no bound.
+    return all(abs(x) <= _FASTEST_TURN for x in turn) and all(abs(x) <= _LARGEST_FORCE for x in force)
+
+
 def imu_sample(message: Any) -> ImuSample:
     """One IMU measurement.
 
@@ -69,8 +76,7 @@ def imu_sample(message: Any) -> ImuSample:
     """
     w, a = message.angular_velocity, message.linear_acceleration
     turn, force = (w.x, w.y, w.z), (a.x, a.y, a.z)
-    # Plain numbers: of six of them, 200 times a second, numpy takes three times as long. NaN is below no bound.
-    if not (all(abs(x) <= _FASTEST_TURN for x in turn) and all(abs(x) <= _LARGEST_FORCE for x in force)):
+    if not is_imu_reading(turn, force):
         finite = all(math.isfinite(x) for x in turn + force)
         raise InputError('IMU message beyond what any IMU measures' if finite else 'IMU message that is not finite')
     if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:

@@ -3,16 +3,17 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE, require_usable
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import MODEL_SYNONYMS
-from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.files.reading import read_text
+from thermal_fiducial.files.schema import parse_yaml, Value
 
 #: Kalibr's names of the densities, which are ours.
 NOISE_NAMES = (
@@ -21,6 +22,11 @@ NOISE_NAMES = (
     'gyroscope_random_walk',
     'accelerometer_random_walk',
 )
+# Of these, in any of their units: no sensor that anybody flies comes near.
+_LARGEST_NOISE = 100.0
+_LONGEST_SIDE, _LARGEST_MARKER_M, _LARGEST_OFFSET_S = 65_535, 100.0, 1.0
+#: OpenCV's head, as some of EuRoC's files have it, is no YAML of version 1.1.
+_OPENCV_HEAD = '%YAML:1.0'
 
 
 @dataclass(frozen=True)
@@ -39,21 +45,6 @@ class Rig:
     dictionary: str = ''
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The document of a YAML file.
-
-    Raises
-    ------
-    InputError
-        Unreadable, or not a mapping.
-    """
-    # OpenCV's head, as some of EuRoC's files have it, is no YAML of version 1.1.
-    document = load_plain(path, head='%YAML:1.0')
-    if not isinstance(document, dict):
-        raise InputError(f'{path}: no names with values')
-    return document
-
-
 def of_rig(path: Path, camera: str) -> Rig:
     """Of our ``rig.yaml``: ``cameras: {cam0: {width, height, model, K, D, T_body_camera}}``, ``imu``, ``marker_size``.
 
@@ -64,20 +55,21 @@ def of_rig(path: Path, camera: str) -> Rig:
     InputError
         A missing or unusable entry.
     """
-    document = read_yaml(path)
-    entry = _section(path, _section(path, document, 'cameras'), camera)
-    where = f'{path}: {camera}'
-    lens = _camera(where, entry.get('model'), (entry.get('width'), entry.get('height')), entry.get('K'), entry.get('D'))
-    if 'T_body_camera' in entry:
-        T_body_camera = matrix(f'{where} T_body_camera', entry['T_body_camera'])
+    root = _document(path)
+    entry = _needed(_needed(root, 'cameras'), camera)
+    fields, top = entry.mapping(), root.mapping()
+    lens = _lens(
+        entry, _size(_needed(entry, 'width')), _size(_needed(entry, 'height')), _needed(entry, 'K'), 'model', 'D'
+    )
+    if 'T_body_camera' in fields:
+        T_body_camera = _rigid(fields['T_body_camera'])
     else:
-        position = _vector(f'{where} camera_position', entry.get('camera_position'), 3)
-        orientation = _vector(f'{where} camera_orientation', entry.get('camera_orientation'), 4)
-        T_body_camera = transform_from_quaternion(position, orientation)
-    size = float(_vector(f'{path} marker_size', [document.get('marker_size', 0.0)], 1)[0])
-    offset = float(_vector(f'{where} time_offset', [entry.get('time_offset', 0.0)], 1)[0])
-    noise = _noise(path, document.get('imu') or {})
-    return Rig(lens, T_body_camera, noise, offset, size, str(document.get('dictionary', '')))
+        orientation = _needed(entry, 'camera_orientation')
+        position = _numbers(_needed(entry, 'camera_position'), 3, LARGEST_COORDINATE)
+        T_body_camera = transform_from_quaternion(position, _unit(orientation))
+    size = top['marker_size'].number(0.0, _LARGEST_MARKER_M) if 'marker_size' in top else 0.0
+    dictionary = top['dictionary'].text() if 'dictionary' in top else ''
+    return Rig(lens, T_body_camera, _noise(top.get('imu')), _offset(fields, 'time_offset'), size, dictionary)
 
 
 def of_sensor(camera: Path, imu: Path) -> Rig:
@@ -88,15 +80,11 @@ def of_sensor(camera: Path, imu: Path) -> Rig:
     InputError
         A missing or unusable entry.
     """
-    entry, other = read_yaml(camera), read_yaml(imu)
-    D = entry.get('distortion_coefficients')
-    lens = _camera(str(camera), entry.get('distortion_model'), entry.get('resolution'), _pinhole(camera, entry), D)
-    places = [
-        matrix(f'{path} T_BS', _section(path, content, 'T_BS').get('data'))
-        for path, content in ((imu, other), (camera, entry))
-    ]
+    entry, other = _document(camera), _document(imu)
+    lens = _lens(entry, *_resolution(entry), _pinhole(entry), 'distortion_model', 'distortion_coefficients')
+    T_body_camera, T_body_imu = (_rigid(_needed(_needed(sensor, 'T_BS'), 'data')) for sensor in (entry, other))
     # ASL's gyroscope_random_walk and so on are Kalibr's.
-    return Rig(lens, inverse(places[0]) @ places[1], _noise(imu, other))
+    return Rig(lens, inverse(T_body_imu) @ T_body_camera, _noise(other))
 
 
 def of_camchain(path: Path, camera: str, noise: Mapping[str, float]) -> Rig:
@@ -107,68 +95,101 @@ def of_camchain(path: Path, camera: str, noise: Mapping[str, float]) -> Rig:
     InputError
         A missing or unusable entry, or a camera model that is no pinhole.
     """
-    entry = _section(path, read_yaml(path), camera)
-    if entry.get('camera_model', 'pinhole') != 'pinhole':
-        raise InputError(f'{path}: {camera} has camera_model {entry["camera_model"]}, not pinhole')
-    D = entry.get('distortion_coeffs')
-    K = _pinhole(path, entry)
-    lens = _camera(f'{path}: {camera}', entry.get('distortion_model'), entry.get('resolution'), K, D)
-    T_camera_body = matrix(f'{path} T_cam_imu', entry.get('T_cam_imu'))
-    offset = float(_vector(f'{path} timeshift_cam_imu', [entry.get('timeshift_cam_imu', 0.0)], 1)[0])
-    return Rig(lens, inverse(T_camera_body), dict(noise), offset)
+    entry = _needed(_document(path), camera)
+    fields = entry.mapping()
+    if 'camera_model' in fields and fields['camera_model'].content != 'pinhole':
+        raise fields['camera_model'].error(f'{fields["camera_model"].quoted()} is not pinhole')
+    lens = _lens(entry, *_resolution(entry), _pinhole(entry), 'distortion_model', 'distortion_coeffs')
+    T_camera_body = _rigid(_needed(entry, 'T_cam_imu'))
+    return Rig(lens, inverse(T_camera_body), dict(noise), _offset(fields, 'timeshift_cam_imu'))
 
 
-def matrix(where: str, values: Any) -> FloatArray:
-    """A rigid transform (4, 4) from 16 numbers, nested or not.
+def densities(path: Path) -> dict[str, float]:
+    """Of Kalibr's IMU file, by :data:`NOISE_NAMES`; what it does not have is not there.
 
     Raises
     ------
     InputError
-        Other than that.
+        Unreadable, or values that are none.
     """
-    T = _vector(where, values, 16).reshape(4, 4)
-    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(T[:3, :3]) < 0.0:
-        raise InputError(f'{where} is no rigid transform')
+    root = _document(path)
+    return _noise(root.mapping().get('imu0', root))
+
+
+def _document(path: Path) -> Value:
+    root = parse_yaml(str(path), read_text(path).removeprefix(_OPENCV_HEAD))
+    root.mapping()
+    return root
+
+
+def _needed(value: Value, name: str) -> Value:
+    fields = value.mapping()
+    if name not in fields:
+        raise value.error(f'no {name}; it has {", ".join(list(fields)[:20]) or "nothing"}')
+    return fields[name]
+
+
+def _numbers(value: Value, size: int, limit: float = np.inf) -> FloatArray:
+    """As many finite numbers, in a list or in rows of one."""
+    rows = [entry.items() if isinstance(entry.content, list) else [entry] for entry in value.items()]
+    numbers = [entry.number(-limit, limit) for row in rows for entry in row]
+    if len(numbers) != size:
+        raise value.error(f'{len(numbers)} numbers, not {size}')
+    return np.array(numbers)
+
+
+def _rigid(value: Value) -> FloatArray:
+    """A rigid transform (4, 4) from 16 numbers, nested or not."""
+    T = _numbers(value, 16, LARGEST_COORDINATE).reshape(4, 4)
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0.0 or not np.allclose(T[3], (0, 0, 0, 1)):
+        raise value.error('no rigid transform')
     return T
 
 
-def _section(path: Path, document: Mapping[str, Any], name: str) -> dict[str, Any]:
-    entry = document.get(name)
-    if not isinstance(entry, dict):
-        raise InputError(f'{path}: no {name}; it has {", ".join(map(str, document)) or "nothing"}')
-    return entry
+def _unit(value: Value) -> FloatArray:
+    quaternion = _numbers(value, 4, 2.0)
+    if abs(float(np.linalg.norm(quaternion)) - 1.0) > 0.01:
+        raise value.error('no unit quaternion x y z w')
+    return quaternion
 
 
-def _vector(where: str, values: Any, size: int) -> FloatArray:
-    try:
-        result = np.array(values, dtype=np.float64).reshape(-1)
-    except (TypeError, ValueError):
-        raise InputError(f'{where} does not hold numbers') from None
-    if result.size != size or not np.isfinite(result).all():
-        raise InputError(f'{where} is not {size} finite numbers')
-    return result
+def _size(value: Value) -> int:
+    return value.integer(1, _LONGEST_SIDE)
 
 
-def _pinhole(path: Path, entry: Mapping[str, Any]) -> FloatArray:
-    fx, fy, cx, cy = _vector(f'{path} intrinsics', entry.get('intrinsics'), 4)
+def _resolution(entry: Value) -> tuple[int, int]:
+    value = _needed(entry, 'resolution')
+    sides = value.items()
+    if len(sides) != 2:
+        raise value.error('not width and height')
+    return _size(sides[0]), _size(sides[1])
+
+
+def _pinhole(entry: Value) -> FloatArray:
+    fx, fy, cx, cy = _numbers(_needed(entry, 'intrinsics'), 4)
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def _camera(where: str, model: Any, resolution: Any, K: Any, D: Any) -> Camera:
-    name = MODEL_SYNONYMS.get(str(model or 'plumb_bob'), str(model or 'plumb_bob'))
-    width, height = _vector(f'{where} resolution', resolution, 2)
-    coefficients = [] if D is None else D
+def _lens(entry: Value, width: int, height: int, K: 'FloatArray | Value', model: str, coefficients: str) -> Camera:
+    """The camera of ``entry``, whose fields ``model`` and ``coefficients`` say how it distorts."""
+    fields = entry.mapping()
+    matrix = _numbers(K, 9).reshape(3, 3) if isinstance(K, Value) else K
+    name = fields[model].text() if model in fields else 'plumb_bob'
+    D = fields[coefficients].items() if coefficients in fields else []
+    distortion = np.array([value.number() for value in D])
     try:
-        return Camera(
-            int(width),
-            int(height),
-            _vector(f'{where} K', K, 9).reshape(3, 3),
-            name,
-            _vector(f'{where} D', coefficients, len(coefficients)),
-        )
+        return require_usable(Camera(width, height, matrix, MODEL_SYNONYMS.get(name, name), distortion))
     except InputError as error:
-        raise InputError(str(error) if str(error).startswith(where) else f'{where}: {error}') from None
+        raise entry.error(str(error)) from None
 
 
-def _noise(path: Path, section: Mapping[str, Any]) -> dict[str, float]:
-    return {name: float(_vector(f'{path} {name}', [section[name]], 1)[0]) for name in NOISE_NAMES if name in section}
+def _offset(fields: Mapping[str, Value], name: str) -> float:
+    return fields[name].number(-_LARGEST_OFFSET_S, _LARGEST_OFFSET_S) if name in fields else 0.0
+
+
+def _noise(section: Value | None) -> dict[str, float]:
+    if section is None:
+        return {}
+    fields = section.mapping()
+    return {name: fields[name].number(0.0, _LARGEST_NOISE) for name in NOISE_NAMES if name in fields}

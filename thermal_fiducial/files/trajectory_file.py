@@ -9,7 +9,7 @@ import numpy as np
 
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.reading import read_text
+from thermal_fiducial.files.reading import text_lines
 
 _NS = 1_000_000_000
 # What an integer of 64 bits holds in nanoseconds: the year 2262.
@@ -52,15 +52,18 @@ def load_tum(path: str | Path) -> tuple[IntArray, FloatArray, FloatArray]:
     InputError
         Unreadable, empty, a line that isn't eight finite numbers, a quaternion of no length, stamps that go back.
     """
-    text = read_text(path, _LIMIT_BYTES)
-    lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != '#']
-    if not lines:
+    numbers: list[int] = []
+    rows: list[tuple[int, list[float]]] = []
+    for number, line in text_lines(path, _LIMIT_BYTES):
+        if line[0] != '#':
+            numbers.append(number)
+            rows.append(_row(path, number, line))
+    if not rows:
         raise InputError(f'{path}: no poses')
-    rows = [_row(path, number, line) for number, line in lines]
     stamps = np.array([stamp for stamp, _ in rows], dtype=np.int64)
     back = np.flatnonzero(np.diff(stamps) < 0)
     if len(back):
-        raise InputError(f'{path} line {lines[back[0] + 1][0]}: the stamp goes back')
+        raise InputError(f'{path} line {numbers[back[0] + 1]}: the stamp goes back')
     values = np.array([row for _, row in rows])
     quaternions = values[:, 3:]
     return stamps, values[:, :3], quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)

@@ -1,8 +1,6 @@
 """What a run folder holds, read into arrays."""
 
-import csv
 from dataclasses import dataclass
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.plain_yaml import load_plain
 from thermal_fiducial.files.reading import read_text
@@ -22,8 +21,6 @@ from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
 FUSED, FIDUCIAL, TRUTH = 'fused.tum', 'fiducial.tum', 'truth.tum'
 DETECTIONS, LATENCY, PARAMETERS = 'detections.csv', 'latency.csv', 'parameters.yaml'
 MARKER_MAP, TRUE_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'map_true.yaml', 'summary.json', 'output'
-#: Bytes of a table: half a day of frames with eight markers each.
-LARGEST_TABLE = 1 << 30
 #: Longer words are no numbers; whole ones fit into 64 bits.
 _LONGEST_CELL, _LARGEST_WHOLE = 40, 2**63
 
@@ -130,12 +127,11 @@ def _rows(path: Path, kinds: dict[str, type]) -> list[list[Any]]:
     if not path.is_file():
         return [[] for _ in kinds]
     rows: list[list[Any]] = []
-    lines = csv.DictReader(io.StringIO(read_text(path, limit=LARGEST_TABLE)))
-    try:
-        for row in lines:
-            rows.append([_value(row[name], kind) for name, kind in kinds.items()])
-    except (KeyError, TypeError, ValueError, csv.Error):
-        raise InputError(f'{path}, line {lines.line_num}: no {", ".join(kinds)}') from None
+    for number, cells in named_rows(path, tuple(kinds)):
+        try:
+            rows.append([_value(cell, kind) for cell, kind in zip(cells, kinds.values(), strict=True)])
+        except ValueError:
+            raise InputError(f'{path}, line {number}: no {", ".join(kinds)}') from None
     return [list(column) for column in zip(*rows, strict=True)] or [[] for _ in kinds]
 
 
