@@ -57,3 +57,15 @@ def test_old_states_are_forgotten_and_a_clock_set_back_begins_anew():
     assert 100 <= len(kept) <= 201
     log.add(0, lambda: STATE)
     assert stamps(log.between(-1, 10**12, 10**6)) == [0]
+
+
+def test_stamps_that_do_not_go_on_fill_no_memory():
+    log = MotionPrior()
+    for k in range(10_000):
+        log.add(0, lambda k=k: replace(STATE, stamp_ns=k))
+    # Of one stamp the latest.
+    assert stamps(log.between(-1, 1, 10**6)) == [9_999]
+    for k in range(10_000):
+        log.add(k, lambda k=k: replace(STATE, stamp_ns=k))
+    assert 1000 <= len(log.between(-1, 10**12, 10**6)) <= 2000
+    assert log.latest().stamp_ns == 9_999

@@ -74,3 +74,8 @@ def test_names_of_impossible_length_are_refused():
     message[12:16] = (2**32 - 1).to_bytes(4, 'little')
     with pytest.raises(InputError, match='cut short'):
         odometry_bytes.odometry(bytes(message))
+
+
+def test_names_of_kilobytes_are_not_kept():
+    with pytest.raises(InputError, match='bytes'):
+        odometry_bytes.stamp_ns(serialize_message(sent(state(), 'x' * 10_000)))

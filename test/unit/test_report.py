@@ -132,7 +132,7 @@ BROKEN = [
     ('fiducial.tum', 'a b c d e f g h\n', 'fiducial.tum'),
     ('fused.tum', '2.0 0 0 0 0 0 0 1\n1.0 0 0 0 0 0 0 1\n', 'goes back'),
     ('fused.tum', '2.0 0 0 0 0 0 0 nan\n', 'fused.tum'),
-    ('detections.csv', 'stamp_ns,id\n1,2\n', 'detections.csv, line 2'),
+    ('detections.csv', 'stamp_ns,id\n1,2\n', 'detections.csv: line 1'),
     ('latency.csv', 'kind,stamp_ns,latency_ms\nimu_to_pose,1,slow\n', 'latency.csv, line 2'),
     ('summary.json', '{"bag": ', 'summary.json'),
     ('summary.json', '[1]', 'not a JSON object'),

@@ -11,6 +11,8 @@ from thermal_fiducial.core.measurements import Odometry
 
 # Frames come no later than this; nothing older is kept [ns].
 _KEPT_NS = 500_000_000
+# No more, though; of an odometry of 1 kHz these are two seconds.
+_MOST = 2000
 # Stamps that go back farther are those of another clock, or of a bag that starts anew.
 _RESTART_NS = 1_000_000_000
 
@@ -43,9 +45,15 @@ class MotionPrior:
         """Keep the state of a stamp, which ``read`` gives; None if that proves to be unusable."""
         if self._stamps_ns and stamp_ns < self._stamps_ns[-1] - _RESTART_NS:
             self._stamps_ns, self._readers = [], []
-        place = bisect_right(self._stamps_ns, stamp_ns)
+        place = bisect_left(self._stamps_ns, stamp_ns)
+        if place < len(self._stamps_ns) and self._stamps_ns[place] == stamp_ns:
+            self._readers[place] = read
+            return
         self._stamps_ns.insert(place, stamp_ns)
         self._readers.insert(place, read)
+        # The states of an odometry whose stamps hardly go on would be kept for ever.
+        if len(self._stamps_ns) > _MOST:
+            del self._stamps_ns[: _MOST // 2], self._readers[: _MOST // 2]
         if self._stamps_ns[-1] - self._stamps_ns[0] > 2 * _KEPT_NS:
             old = bisect_left(self._stamps_ns, self._stamps_ns[-1] - _KEPT_NS)
             del self._stamps_ns[:old], self._readers[:old]

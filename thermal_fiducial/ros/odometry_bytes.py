@@ -17,6 +17,8 @@ from thermal_fiducial.ros import convert
 _HEADER, _LITTLE_ENDIAN = 4, b'\x00\x01'
 _STAMP, _LENGTH, _NUMBERS = struct.Struct('<iI'), struct.Struct('<I'), np.dtype('<f8')
 _COUNT = 7 + 36 + 6 + 36
+# Hundreds of messages are kept: numbers have 712 bytes, and nobody's frames have names of kilobytes.
+_LONGEST = 8192
 # Nothing that sees markers is faster [m/s, rad/s].
 _FASTEST = 1000.0
 
@@ -27,8 +29,10 @@ def stamp_ns(message: bytes) -> int:
     Raises
     ------
     InputError
-        Of another encoding, too short, or with a stamp that is none.
+        Of another encoding, too short or too long, or with a stamp that is none.
     """
+    if len(message) > _LONGEST:
+        raise InputError(f'odometry of {len(message)} bytes')
     if len(message) < _HEADER + _STAMP.size or message[:2] != _LITTLE_ENDIAN:
         raise InputError('odometry of an encoding that is not known')
     return convert.checked_stamp(*_STAMP.unpack_from(message, _HEADER))
