@@ -5,252 +5,18 @@ twentieth without it. A mechanism is switched off by putting what does nothing i
 arguments: only these. Recordings are taken where ``THERMAL_FIDUCIAL_DATA`` names their folder, else left out.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-import os
-from pathlib import Path
 import sys
-import time
 from typing import Any
 
 import numpy as np
-from support import real_flights, tagslam, walls
-from support.corner_runs import rms
-from support.scenes import motion_prior
+from support.mapper_scenes import Figures, SCENES
 from support.taken_out import lines_of, replaced
 
-from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, retract
-from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, transform
-from thermal_fiducial.core.mapping import bundle_adjustment
-from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.mapping.mapper import MarkerMapper
-from thermal_fiducial.core.measurements import corner_covariances, corners_px, Odometry
-
 MAPPING = 'thermal_fiducial.core.mapping'
-AS_BODY = {'camera_orientation': (0.0, 0.0, 0.0, 1.0)}
-SECOND_NS = 1_000_000_000
 #: Change of a figure that is worth printing.
 NOTABLE = 0.05
-
-Figures = dict[str, float]
-
-
-def _mapped(mapper: MarkerMapper, frames: dict[int, Any], camera: Any, prior: Any = lambda stamp: None) -> Figures:
-    """Frames through the mapper with its refinements: located, and what a frame and the refinements cost."""
-    located, adjusting, begin = 0, 0.0, time.process_time()
-    for stamp, rows in frames.items():
-        located += mapper.process(stamp, rows, camera, prior(stamp)).pose is not None
-        if mapper.refinement_due(stamp):
-            since = time.process_time()
-            snapshot = mapper.snapshot()
-            refinement = None if snapshot is None else bundle_adjustment.refine(snapshot)
-            if refinement is not None:
-                mapper.apply(refinement)
-            adjusting += time.process_time() - since
-    total = time.process_time() - begin
-    stamps = list(frames)
-    return {
-        'located %': 100 * located / len(frames),
-        'ms a frame': 1e3 * (total - adjusting) / len(frames),
-        'refinement, % of a core': 100 * adjusting / ((stamps[-1] - stamps[0]) / SECOND_NS),
-    }
-
-
-def _scale_free(stamps: np.ndarray, positions: np.ndarray) -> float:
-    """Rms second difference of positions (N, 3) between frames in steady succession [mm]."""
-    steps = np.diff(stamps)
-    even = (np.abs(steps[1:] - steps[:-1]) < 0.1 * steps[1:]) & (steps[1:] < 2 * np.median(steps))
-    second = positions[2:] - 2.0 * positions[1:-1] + positions[:-2]
-    return 1e3 * rms(np.linalg.norm(second, axis=1)[even]) / np.sqrt(6.0)
-
-
-def _jitter(marker_map: MarkerMap, frames: dict[int, Any], flight: Any) -> float:
-    """Jitter of the mapper's poses on its own map, over that of plain least squares of the same corners on it."""
-    mapper = MarkerMapper(MarkerMapperConfig(mode='localization', marker_size=flight.marker_size), marker_map)
-    stamps, ours, plain = [], [], []
-    for stamp, rows in frames.items():
-        pose = mapper.process(stamp, rows, flight.camera).pose
-        rows = rows[np.isin(rows['id'], list(marker_map.markers))]
-        if pose is None or len(rows) < 2:
-            continue
-        known = [marker_map.markers[int(key)] for key in rows['id']]
-        squares = corners_in_map(np.stack([m.T_map_marker for m in known]), np.array([m.size for m in known]))
-        solution = solve_camera_pose(
-            corners_px(rows), corner_covariances(rows), squares, flight.camera, pose.T_map_camera, compete=False
-        )
-        stamps.append(stamp)
-        ours.append(pose.T_map_camera[:3, 3])
-        plain.append(solution.T_map_camera[:3, 3])
-    return _scale_free(np.array(stamps), np.array(ours)) / _scale_free(np.array(stamps), np.array(plain))
-
-
-def carpet() -> Figures:
-    """Every third frame of a flight over a carpet of 81 tags: the map from one of them."""
-    flight = real_flights.carpet('carpet_mountain')
-    frames = dict(list(flight.frames.items())[::3])
-    config = MarkerMapperConfig(marker_size=flight.marker_size)
-    mapper = MarkerMapper(config, real_flights.origin_alone())
-    figures = _mapped(mapper, frames, flight.camera)
-    figures['placed'] = len(mapper.map.markers)
-    figures['map mm'] = real_flights.map_error_mm(mapper.map, flight.marker_map)
-    figures['jitter over plain'] = _jitter(mapper.map, frames, flight)
-    return figures
-
-
-def board() -> Figures:
-    """Every other frame of a real calibration flight before 36 tags, on the map of the board."""
-    flight = real_flights.april_board('cam0')
-    config = MarkerMapperConfig(
-        mode='localization',
-        marker_size=flight.marker_size,
-        camera_position=tuple(flight.T_body_camera[:3, 3]),
-        camera_orientation=tuple(quaternion_from_rotation(flight.T_body_camera[:3, :3])),
-    )
-    mapper = MarkerMapper(config, flight.marker_map)
-    stamps, ours, squares = [], [], []
-    for stamp, rows in list(flight.frames.items())[::2]:
-        pose = mapper.process(stamp, rows, flight.camera).pose
-        if pose is None or not flight.reference_ns[0] <= stamp <= flight.reference_ns[-1]:
-            continue
-        truth = flight.truth([stamp])[0] @ flight.T_body_camera
-        d = difference(truth, pose.T_map_camera)
-        ours.append(np.linalg.norm(d[:3]))
-        squares.append(d @ np.linalg.solve(pose.covariance, d) / 6.0)
-        stamps.append(stamp)
-    return {'located': len(stamps), 'mm': 1e3 * rms(ours), 'NEES': float(np.mean(squares))}
-
-
-def _figures_of_maps(maps: list[tuple[MarkerMap, dict[int, np.ndarray]]]) -> Figures:
-    """Of maps and the true poses of their markers, all but the first: how many are placed, and how well."""
-    errors, squares = [], []
-    for marker_map, truth in maps:
-        for key, marker in marker_map.markers.items():
-            if key:
-                d = difference(truth[key], marker.T_map_marker)
-                errors.append(np.linalg.norm(d[:3]))
-                squares.append(d @ np.linalg.solve(marker.covariance, d) / 6.0)
-    return {'placed': len(errors), 'map mm': 1e3 * rms(errors), 'map NEES': float(np.mean(squares))}
-
-
-def wall() -> Figures:
-    """A slow simulated flight past eight markers of which one is known, corners of 0.1 px, without odometry."""
-    maps, frames_located = [], []
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        poses = walls.wall(rng)
-        mapper = MarkerMapper(MarkerMapperConfig(), MarkerMap({0: MapMarker(0, walls.SIZE, True, poses[0])}))
-        frames = {
-            walls.stamp(k): walls.see(walls.flight(k / 30 + 5.0 * seed), poses, 0.1, rng) for k in range(0, 600, 5)
-        }
-        frames_located.append(_mapped(mapper, frames, walls.CAMERA)['located %'])
-        maps.append((mapper.map, poses))
-    return {'located %': float(np.mean(frames_located)), **_figures_of_maps(maps)}
-
-
-def small_markers() -> Figures:
-    """Small and noisy markers far away: how many enter the map, and how many of them by the wrong planar branch."""
-    entered = wrong = 0
-    located = []
-    for seed in (13, 24):
-        rng = np.random.default_rng(seed)
-        size, sigma, distance = rng.uniform(0.1, 0.3), rng.choice([0.05, 0.15, 0.3]), rng.uniform(2.0, 5.0)
-        poses = walls.wall(rng, 8, tilt=rng.choice([0.0, 0.1, 0.3]))
-        centre = np.mean([T[:3, 3] for T in poses.values()], axis=0)
-        config = MarkerMapperConfig(marker_size=size, refinement_period=1.0)
-        mapper = MarkerMapper(config, MarkerMap({0: MapMarker(0, size, True, poses[0])}))
-        frames = {}
-        for k in range(0, 300, 4):
-            offset = [-distance, 0.4 * distance * np.sin(k / 50), 0.3 * distance * np.sin(k / 30)]
-            T = walls.look(centre + offset, centre, 0.1 * np.sin(k / 30))
-            frames[walls.stamp(k)] = walls.see(T, poses, sigma, rng, size=size)
-        located.append(_mapped(mapper, frames, walls.CAMERA)['located %'])
-        for key, marker in mapper.map.markers.items():
-            entered += key != 0
-            wrong += bool(np.linalg.norm(difference(marker.T_map_marker, poses[key])[3:]) > np.deg2rad(8.0))
-    return {'located %': float(np.mean(located)), 'placed': entered, 'wrong': wrong}
-
-
-def chain() -> Figures:
-    """A corridor of markers of which at most two are in view, some spans with none known: odometry that drifts."""
-    maps, located = [], []
-    for seed in range(2):
-        rng = np.random.default_rng(seed)
-        row = walls.wall(rng, 4)
-        poses = {i: retract(row[0], [0.0, 1.1 * i + (0.9 * (i > 4)), 0.0, 0.0, 0.0, 0.0]) for i in range(9)}
-        mapper = MarkerMapper(MarkerMapperConfig(**AS_BODY), MarkerMap({0: MapMarker(0, walls.SIZE, True, poses[0])}))
-        frames, states, drift = {}, {}, np.zeros(6)
-        for k in range(0, 600, 4):
-            y = poses[0][1, 3] + 0.5 + 9.5 * k / 600
-            eye = np.array([-1.6, y + 0.3 * np.sin(k / 9), 1.0 + 0.3 * np.sin(k / 14)])
-            T = walls.look(eye, [0.0, y, 1.0 + 0.1 * np.sin(k / 20)])
-            drift = 0.98 * drift + rng.normal(size=6) * ([0.002] * 3 + [0.0005] * 3)
-            P = np.diag([0.01**2] * 3 + [0.0025**2] * 3)
-            twist = np.diag([0.03**2] * 3 + [0.01**2] * 3)
-            stamp = walls.stamp(k)
-            frames[stamp] = walls.see(T, poses, 0.1, rng)
-            states[stamp] = motion_prior(Odometry(stamp, retract(T, drift), np.zeros(3), np.zeros(3), P, twist))
-        located.append(_mapped(mapper, frames, walls.CAMERA, states.get)['located %'])
-        maps.append((mapper.map, poses))
-    return {'located %': float(np.mean(located)), **_figures_of_maps(maps)}
-
-
-def moved_marker() -> Figures:
-    """Two of eight known markers hang elsewhere than the map has them, one by 5 cm and one by half a metre."""
-    rng = np.random.default_rng(5)
-    truth = walls.wall(rng)
-    in_map = truth | {
-        3: transform(np.eye(3), [0.0, 0.05, 0.0]) @ truth[3],
-        6: transform(np.eye(3), [0.0, 0.0, 0.5]) @ truth[6],
-    }
-    covariance = np.diag([0.002**2] * 3 + [0.002**2] * 3)
-    marker_map = MarkerMap({i: MapMarker(i, walls.SIZE, i == 0, T, covariance * (i > 0)) for i, T in in_map.items()})
-    mapper = MarkerMapper(MarkerMapperConfig(mode='localization'), marker_map)
-    errors, squares, result = [], [], None
-    for k in range(0, 450, 3):
-        T = walls.flight(k / 30)
-        result = mapper.process(walls.stamp(k), walls.see(T, truth, 0.1, rng), walls.CAMERA)
-        if result.pose is not None:
-            d = difference(T, result.pose.T_map_camera)
-            errors.append(np.linalg.norm(d[:3]))
-            squares.append(d @ np.linalg.solve(result.pose.covariance, d) / 6.0)
-    return {
-        'pose mm': 1e3 * rms(errors),
-        'NEES': float(np.mean(squares)),
-        'quarantined': len(result.quarantined) if result else 0,
-    }
-
-
-def _recorded_tags(name: str) -> Callable[[], Figures]:
-    def scene() -> Figures:
-        recording = tagslam.load(Path(os.environ['THERMAL_FIDUCIAL_DATA']) / 'tagslam' / name)
-        try:
-            markers, refinement = tagslam.solve(recording, 1)
-        except AttributeError:
-            return {'placed': 0.0, 'views': 0.0, 'px over theirs': np.inf, 'from theirs mm': np.inf}
-        ours, theirs, views = tagslam.compare(recording, markers, refinement)
-        placed = len(markers.keys() & recording.T_map_marker.keys())
-        apart = [
-            np.linalg.norm((inverse(recording.T_map_marker[key]) @ markers[key].T_map_marker)[:3, 3])
-            for key in markers.keys() & recording.T_map_marker.keys()
-        ]
-        return {'placed': placed, 'views': views, 'px over theirs': ours / theirs, 'from theirs mm': 1e3 * rms(apart)}
-
-    return scene
-
-
-SCENES: dict[str, Callable[[], Figures]] = {
-    'wall': wall,
-    'small markers': small_markers,
-    'chain': chain,
-    'moved markers': moved_marker,
-}
-if 'THERMAL_FIDUCIAL_DATA' in os.environ:
-    SCENES |= {'carpet': carpet, 'board': board} | {
-        f'tags {name}': _recorded_tags(name) for name in ('test_16', 'test_22')
-    }
 
 
 @dataclass(frozen=True)
@@ -288,14 +54,14 @@ MECHANISMS = {
         {'localization:marker_weights': lambda errors, *_: np.ones(len(errors))},
     ),
     'weights by the map': Mechanism(
-        ('chain',),
-        ('localization:_map_weights',),
-        {'localization:_map_weights': lambda sight, *_: np.ones(len(sight.markers))},
+        ('uneven map', 'chain'),
+        ('localization:_Frame._map_weights',),
+        {'localization:_Frame._map_weights': lambda self, *_: np.ones(len(self.sight.markers))},
     ),
     'alternative pose': Mechanism(
         ('small markers', 'chain', 'tags test_16'),
-        ('localization:_alternative',),
-        {'localization:_alternative': _ignored},
+        ('localization:_Frame.alternative',),
+        {'localization:_Frame.alternative': _ignored},
     ),
     'errors that delay makes': Mechanism(
         ('board', 'wall'), ('motion',), {'motion:CameraMotion.delay_covariance': lambda *_: np.zeros((6, 6))}
@@ -313,16 +79,13 @@ MECHANISMS = {
     ),
     'two cameras of a candidate': Mechanism(
         ('small markers', 'tags test_16'),
-        ('candidates:_choose',),
+        ('candidates:_ViewArrays._choose',),
         {'mapper:MarkerMapper._without_pose': lambda self, frame, refusal: (False, {})},
     ),
-    'correlation time': Mechanism(
-        ('wall', 'chain'),
-        ('residual_checks:correlation_time',),
-        {'bundle_adjustment:correlation_time': lambda *_: 1.0},
-    ),
     'two places': Mechanism(
-        ('wall', 'tags test_16'), ('residual_checks:two_places',), {'bundle_adjustment:two_places': lambda *_: False}
+        ('two sheets', 'tags test_16'),
+        ('bundle_adjustment:two_places',),
+        {'bundle_adjustment:two_places': lambda *_: False},
     ),
     'shape of markers': Mechanism(
         ('wall', 'chain'),
@@ -330,15 +93,14 @@ MECHANISMS = {
         {'bundle_adjustment:_shape_covariances': lambda problem, *_: np.zeros((len(problem.ids), 6, 6))},
     ),
     'priors': Mechanism(
-        ('chain', 'moved markers'), ('snapshot:prior_poses',), {'frame_memory:prior_poses': lambda *_: {}}
+        ('second flight', 'chain'), ('snapshot:prior_poses',), {'frame_memory:prior_poses': lambda *_: {}}
     ),
     'quarantine': Mechanism(
-        ('moved markers',), ('trust:Trust.judge', 'trust:inconsistent'), {'trust:Trust.judge': lambda *_: {}}
+        ('moved markers', 'two sheets'),
+        ('trust:Trust.judge', 'trust:inconsistent'),
+        {'trust:Trust.judge': lambda *_: False},
     ),
-    'correction of who stands on the map': Mechanism(
-        ('chain',), ('correction',), {'frame_memory:correction': lambda *_: np.eye(4)}
-    ),
-    'robust scale in rounds': Mechanism(('tags test_16', 'wall'), (), {'bundle_adjustment:_ROUNDS': 1}),
+    'robust scale in rounds': Mechanism(('optimistic corners', 'wall'), (), {'bundle_adjustment:_ROUNDS': 1}),
     'three trials a frame': Mechanism(('carpet',), (), {'new_markers:TRIALS': 10**9}),
     'best-known proposers': Mechanism(('carpet',), (), {'localization:_PROPOSERS': 10**9}),
 }

@@ -203,9 +203,8 @@ class _Chain:
             self._prior.set_clock_offset(offset)
         snapshot = self.mapper.snapshot() if self.mapper.refinement_due(stamp_ns) else None
         refinement = None if snapshot is None else refine(snapshot)
-        jump = None if refinement is None else self.mapper.apply(refinement)
-        if jump is not None and jump.moves_poses:
-            self.filter.move_map(jump.T_new_old)
+        if refinement is not None:
+            self.mapper.apply(refinement)
         return pose
 
 

@@ -8,7 +8,8 @@ from support.walls import CAMERA, flight, see, SIZE, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.error_model import (
-    corner_field,
+    corner_correlations,
+    corners_of_pose,
     map_of_pose,
     NO_SYSTEMATIC_ERRORS,
     scale_of_map,
@@ -20,6 +21,12 @@ from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import CORNER_FIELDS, corners_px
 
 ERRORS = SystematicErrors()
+
+
+def root_of_field(corners, errors):
+    """(n, n) root of the covariance of the errors of corners (n, 2), of either axis [px]."""
+    correlations = corner_correlations(corners, CAMERA.width, errors)
+    return errors.corner_px * np.linalg.cholesky(correlations + 1e-7 * np.eye(len(corners)))
 
 
 def located(poses, rows, size_std=0.0, size=SIZE):
@@ -41,7 +48,7 @@ def test_corners_that_are_wrong_over_the_whole_image_are_in_the_systematic_covar
         if not len(rows):
             continue
         corners = corners_px(rows).reshape(-1, 2)
-        root = np.linalg.cholesky(corner_field(corners, CAMERA.width, ERRORS) + 1e-9 * np.eye(len(corners)))
+        root = root_of_field(corners, ERRORS)
         moved = (corners + root @ rng.normal(size=corners.shape)).reshape(-1, 8)
         for name, column in zip(CORNER_FIELDS, moved.T, strict=True):
             rows[name] = column
@@ -104,7 +111,8 @@ def test_white_and_systematic_errors_are_apart():
 def test_a_model_without_errors_adds_nothing():
     scale = scale_of_map(np.ones((2, 3)), np.zeros((1, 3)), NO_SYSTEMATIC_ERRORS)
     assert not np.any(scale)
-    assert not np.any(corner_field(np.ones((3, 2)), 640, replace(ERRORS, corner_px=0.0)))
+    alike = corner_correlations(np.ones((3, 2)), 640, ERRORS)
+    assert not np.any(corners_of_pose(np.ones((3, 6, 2)), alike, replace(ERRORS, corner_px=0.0)))
 
 
 @pytest.mark.parametrize('true_px', [0.0, 0.08])
@@ -113,7 +121,7 @@ def test_the_bias_of_the_corners_is_learned_from_residuals_that_last(true_px):
     rng = np.random.default_rng(4)
     poses, model = wall(rng), replace(ERRORS, corner_px=max(true_px, 1e-6))
     grid = np.stack(np.meshgrid(np.linspace(0, 640, 21), np.linspace(0, 512, 17)), axis=-1).reshape(-1, 2)
-    root = np.linalg.cholesky(corner_field(grid, CAMERA.width, model) + 1e-9 * np.eye(len(grid)))
+    root = root_of_field(grid, model)
     field = (root @ rng.normal(size=grid.shape)) * (true_px > 0.0)
     m = MarkerMapper(
         MarkerMapperConfig(mode='localization'), MarkerMap({i: MapMarker(i, SIZE, True, T) for i, T in poses.items()})

@@ -647,7 +647,7 @@ def restamped(message, k):
     return later
 
 
-def test_a_live_mapper_refines_in_the_background_and_tells_the_correction(graph, map_file):
+def test_a_live_mapper_refines_in_the_background(graph, map_file):
     graph.listen(TransformStamped, 'map_correction')
     graph.listen(PoseWithCovarianceStamped, 'camera_pose')
     node = graph.add(MarkerMapperNode, live=True, map_file=str(map_file), refinement_period=0.1)
@@ -661,16 +661,13 @@ def test_a_live_mapper_refines_in_the_background_and_tells_the_correction(graph,
         graph.send('thermal/camera_info', info())
         asked, sent = False, 0
         # The background process takes seconds to start; until then each frame asks again.
-        while not graph.heard['map_correction']:
+        while not node.mapper.resets:
             graph.send('markers', restamped(other.heard['markers'][sent % 40], sent))
             sent += 1
             asked = asked or (sent > 30 and graph.call(Trigger, 'marker_mapper/refine', Trigger.Request()).success)
     finally:
         node.close()
-    assert node.mapper.resets >= 1
-    stamp, T_new_old = convert.correction_of(graph.heard['map_correction'][0])
-    assert stamp >= START
-    # The first marker is held, so the map stays where it is; flat pictures leave some centimetres to correct.
-    assert np.linalg.norm(T_new_old[:3, 3]) < 0.2
     assert asked
     assert len(graph.heard['camera_pose']) == sent
+    # Poses move with the map by no more than they claimed: whoever stands on them follows by itself.
+    assert not graph.heard['map_correction']

@@ -7,7 +7,7 @@ parameter; S. Schmidt, 1966), never the weights frame by frame: weights that cha
 the pose jump by what the markers are wrong by.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,7 +22,7 @@ class SystematicErrors:
     #: Corners [px]: model of the lens and bias of the detector, which last as long as the view. To begin with what a
     #: published calibration leaves of a board of 36 tags (means over cells of 60 px: 0.08 and 0.09 px; body poses from
     #: two cameras differ by 6.6 mm, NEES 2.4 without it, 0.9 with it, correlation 0.86 after 0.1 s, 0.36 after 4 s);
-    #: learned in flight from residuals that last (``CornerBias``). Enters poses from markers (:func:`corner_field`).
+    #: learned in flight from residuals that last (``CornerBias``). Enters poses from markers (:func:`corners_of_pose`).
     corner_px: float = 0.1
     #: Distance over which that error stays the same [share of the image's width]: a lens model is wrong by a smooth
     #: function. On the same board lengths of 0.1 to 0.25 fit, 0.5 leaves NEES 1.1, 1.0 leaves 1.25.
@@ -58,42 +58,55 @@ ODOMETRY_AT_WORST = np.repeat([0.3, 0.2], 3)
 INCONSISTENT_PX = 0.3
 
 
-def corner_field(corners: FloatArray, width: int, errors: SystematicErrors) -> FloatArray:
-    """Covariance (n, n) [px^2] of the systematic errors of n corners, of either axis alone.
+def corner_correlations(corners: FloatArray, width: int, errors: SystematicErrors) -> FloatArray:
+    """Correlations (n, n) of the systematic errors of n corners, of either axis alone.
 
     Parameters
     ----------
     corners : (n, 2) [px]
     width : of the image [px]
     """
-    squared = np.sum((corners[:, None] - corners) ** 2, axis=-1)
-    return np.asarray(errors.corner_px**2 * np.exp(-0.5 * squared / (errors.corner_length * width) ** 2))
+    u, v = corners[:, 0], corners[:, 1]
+    squared = (u[:, None] - u) ** 2 + (v[:, None] - v) ** 2
+    return np.asarray(np.exp(squared * (-0.5 / (errors.corner_length * width) ** 2)))
 
 
-def visible_share(J: FloatArray, corners: FloatArray, width: int, errors: SystematicErrors) -> float:
+def visible_share(J: FloatArray, correlations: FloatArray) -> float:
     """Share of the variance of the corners' systematic errors that a pose fitted to them leaves in the residuals.
 
     Parameters
     ----------
     J : (n, 2, 6) derivatives of n corners with respect to the pose
     """
-    field = corner_field(corners, width, replace(errors, corner_px=1.0))
-    Q = np.linalg.qr(J.reshape(-1, 6))[0].reshape(J.shape)
-    absorbed = float(np.sum(Q * np.tensordot(field, Q, axes=1)))
-    return 1.0 - absorbed / (2.0 * len(corners))
+    n = len(J)
+    Q = np.linalg.qr(J.reshape(2 * n, 6))[0].reshape(n, 12)
+    return 1.0 - float(np.sum(Q * (correlations @ Q))) / (2.0 * n)
 
 
-def corners_of_pose(gains: FloatArray, corners: FloatArray, width: int, errors: SystematicErrors) -> FloatArray:
-    """Covariance (m, m) that the systematic errors of corners (n, 2) make of a pose.
+def corners_of_pose(gains: FloatArray, correlations: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Covariance (m, m) that the systematic errors of n corners make of a pose.
 
     Parameters
     ----------
     gains : (n, m, 2) what a pixel of each corner moves the pose by
+    correlations : (n, n) of the errors
     """
-    if errors.corner_px == 0.0:
-        return np.zeros((gains.shape[1], gains.shape[1]))
-    mixed = np.tensordot(corner_field(corners, width, errors), gains, axes=1)
-    return np.asarray(np.einsum('nij,nkj->ik', gains, mixed))
+    n, m, _ = gains.shape
+    mixed = (correlations @ gains.reshape(n, 2 * m)).reshape(n, m, 2)
+    return np.asarray(errors.corner_px**2 * np.tensordot(gains, mixed, axes=([0, 2], [0, 2])))
+
+
+def noise_of_pose(gains: FloatArray, covariances: FloatArray, chi2: float) -> FloatArray:
+    """Covariance (6, 6) that the noise of n corners makes of a pose, at least as large as its residuals say.
+
+    Parameters
+    ----------
+    gains : (n, 6, 2) what a pixel of each corner moves the pose by
+    covariances : (n, 2, 2) [px^2]
+    chi2 : of the residuals
+    """
+    white = np.tensordot(gains, covariances @ np.swapaxes(gains, -1, -2), axes=([0, 2], [0, 1]))
+    return np.asarray(max(1.0, chi2 / max(2 * len(gains) - 6, 1)) * white)
 
 
 def scale_of_pose(moved: FloatArray, errors: SystematicErrors) -> FloatArray:
@@ -176,7 +189,7 @@ def delay_of_pose(velocity: FloatArray, acceleration: FloatArray, errors: System
     )
 
 
-def map_weights(pixels: FloatArray, noise: FloatArray, errors: SystematicErrors) -> FloatArray:
+def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors) -> FloatArray:
     """Weights (N,) of markers whose places in the map are uncertain by ``pixels`` (N,) [px] in the view at hand.
 
     They depend on each marker alone and change as slowly as the view does. Weighing with the covariance relative to the
@@ -188,6 +201,11 @@ def map_weights(pixels: FloatArray, noise: FloatArray, errors: SystematicErrors)
     """
     own = noise**2 + errors.decision_px**2
     return np.asarray(own / (own + pixels**2))
+
+
+def decision_weights(noise: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Weights (N,) of markers with corner noise (N,) [px] that make it what decisions rest on: noise and bias."""
+    return np.asarray(noise**2 / (noise**2 + errors.decision_px**2))
 
 
 def alike_odometry(covariance: FloatArray) -> FloatArray:
@@ -204,3 +222,14 @@ def bounded_odometry(covariance: FloatArray) -> FloatArray:
 def with_corner_errors(covariances: FloatArray, errors: SystematicErrors) -> FloatArray:
     """Corner covariances (..., 2, 2) [px^2] to decide between hypotheses with: noise, and what corners are off by."""
     return np.asarray(covariances + errors.decision_px**2 * np.eye(2))
+
+
+def with_map_errors(covariances: FloatArray, J: FloatArray, of_markers: FloatArray) -> FloatArray:
+    """Corner covariances (n, 4, 2, 2) [px^2] with the errors (n, 6, 6) of the markers, seen through J (n, 8, 6).
+
+    The four corners of a view share such an error; taken as independent, each must count four times, lest the four
+    average it away. Weighs the corners of a frame that is located in two maps (``mapping/correction.py``).
+    """
+    blocks = J.reshape(-1, 4, 2, 6)
+    shared = 4.0 * blocks @ of_markers[:, None] @ np.swapaxes(blocks, -1, -2)
+    return np.asarray(covariances + np.nan_to_num(shared))

@@ -5,6 +5,7 @@ about x, y, z), both expressed in the parent frame ``a`` of ``T_a_b``, so that t
 ``p = p_hat + d[:3]`` and ``R = exp(d[3:]) @ R_hat``.
 """
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -43,37 +44,52 @@ MAP_DTYPE = np.dtype(
 Markers = np.ndarray
 
 
+# All fields have four bytes: rows are rows of a table of numbers as well, which is read many times faster.
+_COLUMN = {name: column for column, name in enumerate(MARKER_DTYPE.names or ()) if name != 'id'}
+_CORNERS = [_COLUMN[name] for name in CORNER_FIELDS]
+_COVARIANCES = [_COLUMN[f'c{corner}{term}'] for corner in range(4) for term in ('uu', 'uv', 'uv', 'vv')]
+_BRANCHES = [_COLUMN[f'{prefix}{name}'] for prefix in ('', 'a') for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')]
+
+
 def columns(markers: Markers, names: tuple[str, ...]) -> FloatArray:
-    """Fields ``names`` of ``markers`` as a float64 matrix (N, len(names))."""
+    """Fields ``names``, all but the IDs, of ``markers`` as a float64 matrix (N, len(names))."""
+    if markers.dtype == MARKER_DTYPE:
+        return _numbers(markers, [_COLUMN[name] for name in names])
     return np.stack([markers[name].astype(np.float64) for name in names], axis=-1)
+
+
+def _numbers(markers: Markers, places: list[int]) -> FloatArray:
+    """Columns (N, len(places)) of the table that the rows are."""
+    table = np.ascontiguousarray(markers).view(_F4).reshape(len(markers), len(MARKER_DTYPE.names or ()))
+    return table.take(places, axis=1).astype(np.float64)
 
 
 def corners_px(markers: Markers) -> FloatArray:
     """Corners (N, 4, 2) [px] in the raw image, clockwise from the marker's top-left."""
-    return columns(markers, CORNER_FIELDS).reshape(-1, 4, 2)
+    return _numbers(markers, _CORNERS).reshape(-1, 4, 2)
 
 
 def corner_covariances(markers: Markers) -> FloatArray:
     """Corner covariances (N, 4, 2, 2) [px^2]."""
-    terms = columns(markers, CORNER_COVARIANCE_FIELDS).reshape(-1, 4, 3)
-    return np.stack([terms[..., [0, 1]], terms[..., [1, 2]]], axis=-2)
+    return _numbers(markers, _COVARIANCES).reshape(-1, 4, 2, 2)
 
 
 def usable(markers: Markers) -> Markers:
     """Rows with finite corners and covariances whose ID is there once: of two alike, nobody knows which is which."""
-    ids, counts = np.unique(markers['id'], return_counts=True)
-    twice = np.isin(markers['id'], ids[counts > 1])
-    finite = np.all(np.isfinite(corners_px(markers)), axis=(1, 2))
-    uu, uv, vv = np.moveaxis(columns(markers, CORNER_COVARIANCE_FIELDS).reshape(-1, 4, 3), -1, 0)
-    sound = np.all((uu > 0.0) & (uu * vv > uv * uv), axis=1)
-    return np.asarray(markers[~twice & finite & sound])
+    C = corner_covariances(markers)
+    finite = np.isfinite(corners_px(markers)).all(axis=(1, 2))
+    sound = (C[..., 0, 0] > 0.0) & (C[..., 0, 0] * C[..., 1, 1] > C[..., 0, 1] ** 2)
+    ids = markers['id'].tolist()
+    times = Counter(ids)
+    once = np.array([times[key] == 1 for key in ids], dtype=bool)
+    return np.asarray(markers[finite & sound.all(axis=1) & once])
 
 
-def marker_poses(rows: Markers, prefix: str) -> FloatArray:
-    """T_camera_marker (N, 4, 4) of the rows' pose ('') or alternative pose ('a'), NaN where there is none."""
-    q = columns(rows, tuple(f'{prefix}q{axis}' for axis in 'xyzw'))
+def marker_branches(rows: Markers) -> FloatArray:
+    """T_camera_marker (N, 2, 4, 4): the rows' poses and their alternatives, NaN where there is none."""
+    poses = _numbers(rows, _BRANCHES).reshape(-1, 2, 7)
     with np.errstate(invalid='ignore', divide='ignore'):
-        return transform_from_quaternion(columns(rows, tuple(f'{prefix}{axis}' for axis in 'xyz')), q)
+        return transform_from_quaternion(poses[..., :3], poses[..., 3:])
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
-from thermal_fiducial.core.mapping.mapper import MapJump, MapperResult, MarkerMap, MarkerMapper
+from thermal_fiducial.core.mapping.mapper import MapperResult, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Markers, Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
@@ -123,17 +123,14 @@ class Pipeline:
         update = None if mapping.pose is None else self.filter.add_pose(_published_pose(mapping.pose))
         if (offset := self.filter.camera_time_offset) is not None:
             self._odometry.set_clock_offset(offset)
-        jump = self._refine(stamp_ns)
-        if jump is not None and jump.moves_poses:
-            self.filter.move_map(as_published(jump.T_new_old))
-        if mapping.map_changed or jump is not None:
+        if self._refine(stamp_ns) or mapping.map_changed:
             self._share_map()
         return FrameResult(stamp_ns, markers=markers, mapping=mapping, update=update)
 
-    def _refine(self, stamp_ns: int) -> MapJump | None:
+    def _refine(self, stamp_ns: int) -> bool:
         snapshot = self.mapper.snapshot() if self.mapper.refinement_due(stamp_ns) else None
         refinement = None if snapshot is None else refine(snapshot)
-        return None if refinement is None else self.mapper.apply(refinement)
+        return refinement is not None and self.mapper.apply(refinement)
 
     def _share_map(self) -> None:
         """The detector looks for the markers of the map, as the ``marker_map`` topic gives them."""

@@ -10,7 +10,7 @@ from sensor_msgs.msg import PointCloud2
 from thermal_fiducial.config import LandingTargetConfig
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.mapping.landing_pad import for_mavros, pad_in_map
-from thermal_fiducial.core.measurements import marker_poses, Markers, usable
+from thermal_fiducial.core.measurements import marker_branches, Markers, usable
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros import clouds, convert, qos
 from thermal_fiducial.ros.node import OK, StageNode, WARN
@@ -64,7 +64,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         return len(self.config.landing_pad) == 1 and self.config.landing_target_frame == 'body'
 
     def _send_detected(self, stamp: int, rows: Markers) -> None:
-        (T_camera_pad,) = marker_poses(rows, '')
+        (T_camera_pad,) = marker_branches(rows)[:, 0]
         self._send_in_body(stamp, self._T_body_camera @ T_camera_pad)
 
     def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:

@@ -46,15 +46,12 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             self.console.event(f'marker {marker_id}', line)
         if self._result.learned:
             self._map.note_learned()
-        jump = self._map.refinement.step(stamp)
-        if jump is not None:
-            self._publish_jump(jump)
-        elif self._result.map_changed:
+        if self._map.refinement.step(stamp) or self._result.map_changed:
             self._publish_map()
 
     def _publish_jump(self, jump: MapJump | None) -> None:
-        """Publish a map that has moved, and how where poses move with it, with the stamp of the newest frame before."""
-        if jump is not None and jump.moves_poses:
+        """Publish a map that was taken over, and how poses move with it, with the stamp of the newest frame before."""
+        if jump is not None:
             self._poses.late.moved(jump.T_new_old)
             self._topics.publish_correction(jump.T_new_old, self._poses.late.newest_ns)
         self._publish_map()

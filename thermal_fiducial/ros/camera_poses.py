@@ -8,7 +8,7 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
-from thermal_fiducial.core.mapping.correction import LatePoses
+from thermal_fiducial.core.mapping.map_data import LatePoses
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.second_camera import SecondCamera
 from thermal_fiducial.core.measurements import CameraPose

@@ -1,6 +1,7 @@
 """Rows of numpy as point clouds, and back: markers of a frame, the marker map."""
 
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any
 
 from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion
@@ -79,9 +80,13 @@ def cloud_rows(message: PointCloud2, dtype: 'np.dtype[Any]', optional: Iterable[
     count = int(message.width) * int(message.height)
     if count > _MOST_ROWS:
         raise InputError(f'cloud of {count} points, not {_MOST_ROWS} at most')
-    source = _source_dtype(message, [fields[name] for name in names])
+    places = tuple((name, fields[name].offset, fields[name].datatype) for name in names)
+    source = _source_dtype(places, int(message.point_step), big_endian=bool(message.is_bigendian))
     if message.row_step != message.point_step * message.width or len(message.data) < count * message.point_step:
         raise InputError(f'cloud of {count} points of {message.point_step} bytes has {len(message.data)} bytes')
+    if source == dtype:
+        # Our own detector's.
+        return np.frombuffer(message.data, dtype, count).copy()
     result = np.zeros(count, dtype)
     if count:
         points = np.frombuffer(message.data, source, count)
@@ -93,18 +98,19 @@ def cloud_rows(message: PointCloud2, dtype: 'np.dtype[Any]', optional: Iterable[
     return result
 
 
-def _source_dtype(message: PointCloud2, fields: list[PointField]) -> 'np.dtype[Any]':
-    order, step = '>' if message.is_bigendian else '<', int(message.point_step)
+@lru_cache(maxsize=16)
+def _source_dtype(places: tuple[tuple[str, int, int], ...], step: int, *, big_endian: bool) -> 'np.dtype[Any]':
+    """The dtype of points of ``step`` bytes with fields of these names, offsets and types."""
+    order = '>' if big_endian else '<'
     try:
-        formats = [np.dtype(order + _POINT_TYPES[field.datatype]) for field in fields]
+        formats = [np.dtype(order + _POINT_TYPES[kind]) for _, _, kind in places]
+        names, offsets = [name for name, _, _ in places], [offset for _, offset, _ in places]
         # numpy adds them as numbers of 32 bits, and reads outside the points where the sum passes those.
-        if any(field.offset + kind.itemsize > step for field, kind in zip(fields, formats, strict=True)):
+        if any(offset + kind.itemsize > step for offset, kind in zip(offsets, formats, strict=True)):
             raise ValueError
-        offsets = [field.offset for field in fields]
-        names = [field.name for field in fields]
         return np.dtype({'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': step})
     except (KeyError, ValueError, OverflowError):
-        raise InputError(f'cloud with fields outside its points of {message.point_step} bytes') from None
+        raise InputError(f'cloud with fields outside its points of {step} bytes') from None
 
 
 def markers(message: PointCloud2) -> Markers:

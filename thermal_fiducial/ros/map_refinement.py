@@ -1,7 +1,6 @@
 """The joint refinement of a mapper, beside the frames: in a process of its own as soon as the map may change."""
 
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
-from thermal_fiducial.core.mapping.map_data import MapJump
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.errors import InputError
@@ -29,8 +28,8 @@ class MapRefinement:
         if self._worker is None and not self._mapper.frozen:
             self._worker = Background(refine) if self._live else Foreground(refine)
 
-    def step(self, stamp_ns: int) -> MapJump | None:
-        """After each frame: start a refinement where one is due, take over one that is done.
+    def step(self, stamp_ns: int) -> bool:
+        """After each frame: start a refinement where one is due, take over one that is done; whether one was.
 
         Raises
         ------
@@ -38,11 +37,11 @@ class MapRefinement:
             A refinement failed.
         """
         if self._worker is None:
-            return None
+            return False
         if not self._worker.busy and self._mapper.refinement_due(stamp_ns):
             self._begin(self._worker)
         refinement = self._worker.take()
-        return None if refinement is None else self._mapper.apply(refinement)
+        return refinement is not None and self._mapper.apply(refinement)
 
     def start(self) -> None:
         """Start a refinement now.

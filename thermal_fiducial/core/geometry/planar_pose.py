@@ -20,6 +20,7 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 
 __all__ = [
+    'CameraFit',
     'JointPose',
     'PlanarPoses',
     'choose_branches',
@@ -30,8 +31,8 @@ __all__ = [
     'solve_marker_poses',
 ]
 
-# Mahalanobis distance of a corner (99 % of a chi-square of two degrees of freedom) beyond which it loses weight.
-_INLIER = 3.0
+#: Mahalanobis distance of a corner (99 % of a chi-square of two degrees of freedom) beyond which it loses weight.
+INLIER = 3.0
 # Two branches whose chi-squares differ by less than this factor are ambiguous: then the prediction decides.
 _AMBIGUOUS_RATIO = 4.0
 
@@ -152,7 +153,7 @@ def choose_branches(
         sizes = np.array([entry[1] for entry in in_map if entry is not None])
         squares = se3.apply(T_map_marker, sizes[:, None, None] * marker_corners(1.0))
         images = Images.of(corners.only(known), whitening(corner_covs[known])).joined()
-        T_camera_map = starts[np.argmin(evaluate(starts, squares.reshape(1, -1, 3), images, _INLIER)[0])]
+        T_camera_map = starts[np.argmin(evaluate(starts, squares.reshape(1, -1, 3), images, INLIER)[0])]
     if T_camera_map is None:
         return poses
     # The larger the trace of R_1^T R_2, the smaller the angle between two rotations.
@@ -193,49 +194,80 @@ def solve_camera_pose(
         No markers, or no pose that sees them.
     """
     corners = np.asarray(corners, dtype=np.float64)
-    squares = np.asarray(corners_in_map, dtype=np.float64)
     if len(corners) == 0:
         raise InputError('no markers to compute a camera pose from')
-    W = whitening(np.asarray(covs, dtype=np.float64))
-    if weights is not None:
-        W = W * np.sqrt(np.asarray(weights, dtype=np.float64))[:, None, None, None]
-    images = Images.of(ImagePoints.at(corners.reshape(1, -1, 2), camera), W.reshape(1, -1, 2, 2))
-    # Turned about their middle, translation and rotation of the points hardly depend on each other.
-    middle = se3.transform(np.eye(3), squares.mean(axis=(0, 1)))
-    points = (squares - middle[:3, 3]).reshape(1, -1, 3)
-    starts = _starts(images, squares, points, middle, initial, compete)
-    T_camera_middle, chi2, information = fit(starts, points, images, _INLIER, alternatives=len(starts))
+    fitted = CameraFit(
+        corners, np.asarray(covs, dtype=np.float64), np.asarray(corners_in_map, dtype=np.float64), camera
+    )
+    weights = None if weights is None else np.asarray(weights, dtype=np.float64)
+    starts = np.zeros((0, 4, 4)) if initial is None else initial[None]
+    if compete or initial is None:
+        starts = np.concatenate([starts, fitted.from_single_markers(weights)])
+    T, chi2, information = fitted.solve(starts, weights)
     best = _likeliest(chi2, 8 * len(corners) - 6, initial is not None)
-    residuals = corners - camera.project(se3.apply(T_camera_middle[best], points).reshape(squares.shape))
+    residuals = corners - camera.project(se3.apply(se3.inverse(T[best]), fitted.squares.reshape(-1, 3))).reshape(
+        -1, 4, 2
+    )
     squared = np.sum(residuals**2, axis=-1)
     if not (np.isfinite(chi2[best]) and np.isfinite(squared).all()):
         raise InputError(f'no camera pose explains the {len(corners)} markers')
-    covariance = _of_camera(covariances(information[best]), T_camera_middle[best])
-    T_map_camera = middle @ se3.inverse(T_camera_middle[best])
-    return JointPose(T_map_camera, covariance, residuals, float(np.sqrt(squared.mean())), float(chi2[best]))
+    covariance = _of_camera(covariances(information[best]), T[best], fitted.middle)
+    return JointPose(T[best], covariance, residuals, float(np.sqrt(squared.mean())), float(chi2[best]))
+
+
+class CameraFit:
+    """What all fits of the camera to one frame's N markers of known pose have in common.
+
+    Parameters
+    ----------
+    corners : (N, 4, 2) [px] in the raw image
+    covs : (N, 4, 2, 2) [px^2]
+    squares : (N, 4, 3) [m] corners in the map, in the order of :func:`marker_corners`
+    """
+
+    def __init__(self, corners: FloatArray, covs: FloatArray, squares: FloatArray, camera: Camera) -> None:
+        self.squares = squares
+        #: (3,) between the markers: turned about it, translation and rotation hardly depend on each other
+        self.middle: FloatArray = squares.mean(axis=(0, 1))
+        self._T_map_middle = se3.transform(np.eye(3), self.middle)
+        self._points = (squares - self.middle).reshape(1, -1, 3)
+        self._corners = ImagePoints.at(corners.reshape(1, -1, 2), camera)
+        self._whitening = whitening(covs)
+
+    def solve(
+        self, T_map_camera: FloatArray, weights: FloatArray | None = None, inlier: float = INLIER
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Camera poses from starts (B, 4, 4), of which the best is wanted.
+
+        Parameters
+        ----------
+        weights : (N,) factors on the information of each marker; default 1
+        inlier : Mahalanobis distance up to which errors are squared; beyond, their influence falls to nothing
+
+        Returns
+        -------
+        T_map_camera (B, 4, 4), robust chi squares (B,), and information (B, 6, 6) of the map in the camera, turned
+        about the middle of the markers.
+        """
+        starts, images = se3.inverse(T_map_camera) @ self._T_map_middle, self._images(weights)
+        T_camera_middle, chi2, information = fit(starts, self._points, images, inlier, alternatives=len(starts))
+        return self._T_map_middle @ se3.inverse(T_camera_middle), chi2, information
+
+    def from_single_markers(self, weights: FloatArray | None) -> FloatArray:
+        """T_map_camera (2, 4, 4): those two of the markers' poses that explain all markers best."""
+        others = _camera_starts(self._corners.x.reshape(-1, 4, 2), self.squares)
+        cost = evaluate(others @ self._T_map_middle, self._points, self._images(weights), INLIER)[0]
+        return np.asarray(se3.inverse(others[np.argsort(cost)[:2]]))
+
+    def _images(self, weights: FloatArray | None) -> Images:
+        W = self._whitening if weights is None else self._whitening * np.sqrt(weights)[:, None, None, None]
+        return Images.of(self._corners, W.reshape(1, -1, 2, 2))
 
 
 def _likeliest(chi2: FloatArray, freedom: int, predicted: bool) -> int:
     """Of poses of chi-squares (B,): the best, but the first, if that is ``predicted`` and not clearly worse."""
     best = int(np.argmin(chi2))
     return 0 if predicted and chi2[0] <= _AMBIGUOUS_RATIO * max(chi2[best], freedom) else best
-
-
-def _starts(
-    images: Images,
-    squares: FloatArray,
-    points: FloatArray,
-    middle: FloatArray,
-    initial: FloatArray | None,
-    compete: bool,
-) -> FloatArray:
-    """T_camera_middle (B, 4, 4): ``initial``, if given, then the two of the markers' poses that explain all best."""
-    known = [] if initial is None else [se3.inverse(initial) @ middle]
-    if initial is not None and not compete:
-        return np.stack(known)
-    others = _camera_starts(images.normalised.reshape(-1, 4, 2), squares) @ middle
-    cost = evaluate(others, points, images, _INLIER)[0]
-    return np.stack([*known, *others[np.argsort(cost)[:2]]])
 
 
 def _camera_starts(normalised: FloatArray, squares: FloatArray) -> FloatArray:
@@ -247,15 +279,15 @@ def _camera_starts(normalised: FloatArray, squares: FloatArray) -> FloatArray:
     return (ippe_square(normalised, sizes) @ se3.inverse(T_map_square)[:, None]).reshape(-1, 4, 4)
 
 
-def _of_camera(covariance: FloatArray, T_camera_body: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of the camera in the body, in the body's axes, from that of the body in the camera.
+def _of_camera(covariance: FloatArray, T_map_camera: FloatArray, middle: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of the camera in the map from that of the map in the camera, turned about its ``middle``.
 
-    With ``t -> t + d`` and ``R -> exp(w) R`` of the body, the camera, at ``-R^T t``, moves by ``R^T (t x w' - d)``,
-    w' = -w, and turns by ``-R^T w``.
+    With ``t -> t + d`` and ``R -> exp(w) R`` of the map in the camera, the camera, at ``-R^T t`` from the middle, moves
+    by ``R^T (t x w' - d)``, w' = -w, and turns by ``-R^T w``.
     """
-    R_t = T_camera_body[:3, :3].T
+    R = T_map_camera[:3, :3]
     A = np.zeros((6, 6))
-    A[:3, :3] = A[3:, 3:] = -R_t
-    A[:3, 3:] = -R_t @ se3.skew(T_camera_body[:3, 3])
+    A[:3, :3] = A[3:, 3:] = -R
+    A[:3, 3:] = -R @ se3.skew(R.T @ (middle - T_map_camera[:3, 3]))
     with np.errstate(invalid='ignore'):
         return np.asarray(A @ covariance @ A.T)

@@ -5,8 +5,6 @@ about x y z), both in the map frame. With ``p_camera = R' (R_m c + t_m - t)`` fo
 ``dp_camera = R' (dt_m - [R_m c]x dr_m - dt + [R_m c + t_m - t]x dr)``.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 import numpy.typing as npt
 
@@ -16,12 +14,6 @@ from thermal_fiducial.core.types import FloatArray
 
 #: Corners of a marker of side 2, clockwise from its top-left.
 _UNIT_CORNERS = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
-_ITERATIONS = 15
-# A step below this [m, rad] changes no digit that anybody reads.
-_CONVERGED = 1e-8
-
-#: Whitened residuals (m,) at a pose, measured minus predicted, and the derivative (m, 6) of the prediction.
-Evaluation = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 
 def retract(T: npt.ArrayLike, d: npt.ArrayLike) -> FloatArray:
@@ -92,35 +84,3 @@ def whitening(covariances: FloatArray) -> FloatArray:
     W[..., 1, 0] = -b / (a * rest)
     W[..., 1, 1] = 1.0 / rest
     return W
-
-
-def shared_covariances(J: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Corner covariances (n, 4, 2, 2) [px^2] to weight with, of pose errors (n, 6, 6) seen through J (n, 8, 6).
-
-    The four corners of a view share such an error; taken as independent, each must count four times, lest the four
-    average it away.
-    """
-    blocks = J.reshape(-1, 4, 2, 6)
-    return np.asarray(4.0 * blocks @ covariances[:, None] @ np.swapaxes(blocks, -1, -2))
-
-
-def fit_pose(T: FloatArray, evaluate: Evaluation) -> tuple[FloatArray, float]:
-    """Pose (4, 4) with the smallest sum of squares near ``T``, and that sum; inf where ``T`` has none."""
-    r, J = evaluate(T)
-    cost = float(r @ r)
-    if not np.isfinite(cost):
-        return T, np.inf
-    damping = 1e-4
-    for _ in range(_ITERATIONS):
-        H = J.T @ J
-        step = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-12 * np.trace(H)), J.T @ r)
-        trial = retract(T, step)
-        r_trial, J_trial = evaluate(trial)
-        trial_cost = float(r_trial @ r_trial)
-        if trial_cost <= cost:
-            T, r, J, cost, damping = trial, r_trial, J_trial, trial_cost, 0.1 * damping
-        else:
-            damping *= 10.0
-        if np.max(np.abs(step)) < _CONVERGED:
-            break
-    return T, cost

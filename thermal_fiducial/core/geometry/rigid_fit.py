@@ -1,10 +1,11 @@
-"""Poses of rigid bodies of known points from their noisy images: Levenberg-Marquardt on a batch.
+"""Poses by Levenberg-Marquardt on a batch; above all those of rigid bodies of known points from their noisy images.
 
-The lens is taken out once: at the measured pixel its distortion is undone, and what a small deviation there means in
-pixels is folded into the whitening. What is left to be minimised is a pinhole projection. The weight of a residual is
-right to the order of residual over focal length, and a residual of zero stays zero.
+For images the lens is taken out once: at the measured pixel its distortion is undone, and what a small deviation there
+means in pixels is folded into the whitening. What is left to be minimised is a pinhole projection. The weight of a
+residual is right to the order of residual over focal length, and a residual of zero stays zero.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +32,7 @@ _SKEW = se3.skew(np.eye(3)).reshape(3, 9)
 _MINUS_SKEW = -_SKEW
 
 #: At poses (B, 4, 4): cost (B,), gradient (B, 6), information (B, 6, 6).
-_Evaluation = tuple[FloatArray, FloatArray, FloatArray]
+Evaluation = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,9 +70,7 @@ class Images:
         return np.asarray(self.normalised - p[..., :2] / np.where(p[..., 2:] > _NEAR, p[..., 2:], np.nan))
 
 
-def fit(
-    T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf, alternatives: int = 1
-) -> _Evaluation:
+def fit(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf, alternatives: int = 1) -> Evaluation:
     """Poses of bodies in the camera with the least squared errors, from starts ``T`` (B, 4, 4).
 
     Parameters
@@ -85,10 +84,26 @@ def fit(
     T_camera_body (B, 4, 4), costs (B,), inf from an unusable start, and information matrices (B, 6, 6) of translation
     and rotation in the camera frame.
     """
+    return minimise(T, lambda T: evaluate(T, points, images, inlier), alternatives)
+
+
+def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alternatives: int = 1) -> Evaluation:
+    """Poses with the least costs, from starts ``T`` (B, 4, 4).
+
+    Parameters
+    ----------
+    evaluated : of poses the cost, half its gradient and half its Gauss-Newton Hessian for steps of the origin and
+        rotations about it, both in the parent frame
+    alternatives : so many starts in a row are of the same body, and matter only where they may be the best
+
+    Returns
+    -------
+    Poses (B, 4, 4), costs (B,), inf from an unusable start, and information matrices (B, 6, 6).
+    """
     possible: BoolArray = np.asarray(np.isfinite(T).all(axis=(-1, -2)))
     if not possible.all():
         T = np.where(possible[:, None, None], T, _AHEAD)
-    cost, gradient, information = evaluate(T, points, images, inlier)
+    cost, gradient, information = evaluated(T)
     possible = possible & np.isfinite(cost)
     if not possible.all():
         information = np.where(possible[:, None, None], information, np.eye(6))
@@ -97,26 +112,33 @@ def fit(
     active = possible
     for steps in range(_MAX_STEPS):
         step = _solve(information, damping, gradient)
-        gain = np.sum(step * gradient, axis=-1)
-        best = np.repeat(cost.reshape(-1, alternatives).min(axis=1), alternatives)
+        best = cost
+        if alternatives > 1:
+            best = np.repeat(cost.reshape(-1, alternatives).min(axis=1), alternatives)
+        gain = np.einsum('bi,bi->b', step, gradient)
         last = gain < np.maximum(_LAST_GAIN, _LAST_SHARE * (cost - np.minimum(best, _REFUTED)))
-        given_up = (damping > _HOPELESS) | ((cost > _REFUTED + _TIMES_THE_BEST * best) & (steps > 0))
+        if steps > 0:
+            active = active & (damping <= _HOPELESS) & (cost <= _REFUTED + _TIMES_THE_BEST * best)
         trial = _moved(T, -step)
-        T = np.where((active & last & ~given_up)[:, None, None], trial, T)
-        active = active & ~last & ~given_up
+        done = active & last
+        if done.any():
+            T, active = np.where(done[:, None, None], trial, T), active & ~last
         if not active.any():
             break
-        new = evaluate(trial, points, images, inlier)
+        new = evaluated(trial)
         better = active & (new[0] <= cost)
-        T = np.where(better[:, None, None], trial, T)
-        cost = np.where(better, new[0], cost)
-        gradient = np.where(better[:, None], new[1], gradient)
-        information = np.where(better[:, None, None], new[2], information)
+        if better.all():
+            T, (cost, gradient, information) = trial, new
+        else:
+            T = np.where(better[:, None, None], trial, T)
+            cost = np.where(better, new[0], cost)
+            gradient = np.where(better[:, None], new[1], gradient)
+            information = np.where(better[:, None, None], new[2], information)
         damping *= np.where(better, 0.1, 10.0)
     return T, np.where(possible, cost, np.inf), information
 
 
-def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> _Evaluation:
+def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> Evaluation:
     """Robust squared error at poses (B, 4, 4), inf where a point is behind the camera, and its derivatives.
 
     Of a whitened error d, the cost is d^2 up to ``inlier`` and ``inlier^2 (1 + 2 log(d / inlier))`` beyond.

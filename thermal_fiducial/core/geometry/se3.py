@@ -214,8 +214,11 @@ def transform_from_quaternion(position: npt.ArrayLike, q_xyzw: npt.ArrayLike) ->
 
 def rotation_angle(R: npt.ArrayLike) -> FloatArray:
     """Angle (...) [rad] of rotation matrices (..., 3, 3)."""
-    phi = so3_log(R)
-    return np.asarray(np.sqrt((phi * phi).sum(axis=-1)))
+    R = np.asarray(R, dtype=np.float64)
+    # Twice the sine is the length of what makes R asymmetric, twice the cosine its trace less one.
+    x, y, z = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
+    return np.asarray(np.arctan2(np.sqrt(x * x + y * y + z * z), trace - 1.0))
 
 
 def in_quadrilaterals(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:

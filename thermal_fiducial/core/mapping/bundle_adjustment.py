@@ -17,9 +17,8 @@ from thermal_fiducial.core.error_model import scale_of_map, SystematicErrors
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
-from thermal_fiducial.core.mapping.residual_checks import correlation_time, two_places
 from thermal_fiducial.core.mapping.snapshot import Snapshot
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray
 
 MAX_ITERATIONS = 25
 # Decrease of the cost, in chi squares of the actual noise, that ends the iteration: the last step is a third of the
@@ -33,6 +32,10 @@ _SAMPLES = 32
 _AT_ONCE = 8
 # Each round takes the corners' variance anew from the residuals.
 _ROUNDS = 4
+# Outlying views of a marker, in number and as a share, of which something can be said; and the share of their squared
+# error that one other pose must explain. Of ten views of noise six parameters explain 0.08; motion blur that lasts for
+# some frames, 0.5.
+_FEWEST, _LEAST, _EXPLAINED = 10, 0.1, 0.8
 
 
 @dataclass(frozen=True)
@@ -52,8 +55,8 @@ class AdjustedMap:
     variance_factor: float
     #: marker ID to the share of its views that are outliers
     outliers: dict[int, float]
-    #: adjusted markers whose views don't belong to one marker that hangs still
-    inconsistent: tuple[int, ...]
+    #: of adjusted markers whose views don't belong to one marker that hangs still, the same
+    inconsistent: dict[int, float]
     iterations: int
     map_revision: int
 
@@ -104,11 +107,12 @@ def _result(
     unknowns = 6 * (len(problem.stamps) + np.count_nonzero(~problem.held))
     full = weights == 1.0
     factor = float(np.sum(now.chi2[full]) / max(8 * np.count_nonzero(full) - unknowns, 1))
-    noise = max(factor, 1.0) * correlation_time(now.r[full], problem.marker[full])
     system = problem.equations.reduced(problem.normal(now, scale)[0])
     if system is None:
         return None
-    covariances = system.covariances(noise, np.stack([snapshot.markers[key].covariance for key in problem.ids]))
+    covariances = system.covariances(
+        max(factor, 1.0), np.stack([snapshot.markers[key].covariance for key in problem.ids])
+    )
     positions = now.state.T_map_marker[:, :3, 3]
     covariances += _shape_covariances(problem, system, now, weights, snapshot.errors)
     covariances += scale_of_map(positions, positions[problem.held], snapshot.errors)
@@ -116,6 +120,8 @@ def _result(
         return None
     free = [(i, key) for i, key in enumerate(problem.ids) if not problem.held[i]]
     outlying = np.bincount(problem.marker, ~full) / np.bincount(problem.marker)
+    outliers = dict(zip(problem.ids, outlying.tolist(), strict=True))
+    views = {key: problem.marker == i for i, key in free}
     return AdjustedMap(
         {
             key: replace(snapshot.markers[key], T_map_marker=now.state.T_map_marker[i], covariance=covariances[i])
@@ -126,8 +132,8 @@ def _result(
         float(np.sqrt(np.sum(now.squared_px) / (4 * n))),
         now.cost(scale) / max(factor, 1.0),
         factor,
-        dict(zip(problem.ids, outlying.tolist(), strict=True)),
-        tuple(key for i, key in free if two_places(*now.of_views(problem.marker == i), ~full[problem.marker == i])),
+        outliers,
+        {key: outliers[key] for key, own in views.items() if two_places(*now.of_views(own), ~full[own])},
         iterations,
         snapshot.map_revision,
     )
@@ -154,3 +160,25 @@ def _shape_covariances(
         _, steps = system.solve(of_frames, of_markers)
         covariances += steps @ np.swapaxes(steps, -1, -2) / _SAMPLES
     return covariances
+
+
+def two_places(residuals: FloatArray, J: FloatArray, outlying: BoolArray) -> bool:
+    """Whether one other pose of a marker explains most of its outlying views: it was moved, or is there twice.
+
+    Parameters
+    ----------
+    residuals, J : (n, 8), (n, 8, 6), whitened, of all views of one marker, J with respect to its pose
+    outlying : (n,)
+    """
+    # A marker in the plane of a camera, of a map that has gone wrong, has no residual.
+    outlying = outlying & np.isfinite(residuals).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
+    count = np.count_nonzero(outlying)
+    if count < _FEWEST or count < _LEAST * len(residuals):
+        return False
+    # Each view counts alike, however far off it is: the linear step is then good enough to decide.
+    norms = np.linalg.norm(residuals[outlying], axis=-1)
+    r = (residuals[outlying] / norms[:, None]).ravel()
+    A = (J[outlying] / norms[:, None, None]).reshape(-1, 6)
+    step, *_ = np.linalg.lstsq(A, r, rcond=None)
+    left = r - A @ step
+    return bool(left @ left < (1.0 - _EXPLAINED) * count)

@@ -13,7 +13,8 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import correlated_sum, SystematicErrors, with_corner_errors
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import fit_pose, linearise
+from thermal_fiducial.core.geometry.reprojection import linearise
+from thermal_fiducial.core.geometry.rigid_fit import Evaluation, minimise
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.keyframes import Displacement
 from thermal_fiducial.core.types import FloatArray, IntArray
@@ -159,7 +160,7 @@ class Candidate:
         pairs = [view.viewpoint.poses[:, None] @ view.branches for view in (self.views[0], self.views[-1])]
         starts = np.concatenate([pair.reshape(-1, 4, 4) for pair in pairs])
         starts = starts[np.all(np.isfinite(starts), axis=(1, 2))]
-        return sorted((_fit(start, self.size, self.views, camera) for start in starts), key=lambda fit: fit.cost)
+        return _ViewArrays(self.views, self.size, camera).fits(starts)
 
 
 @dataclass(frozen=True)
@@ -172,76 +173,117 @@ class _MarkerFit:
     from_cameras: FloatArray
 
 
-def _fit(start: FloatArray, size: float, views: list[MarkerView], camera: Camera) -> _MarkerFit:
-    """Fit of one marker to views; of a camera's two poses the one that suits the marker better is taken."""
-    chosen = _choose(start, size, views, camera)
-    fit = _fit_chosen(start, size, views, chosen, camera)
-    for _ in range(_CHOICES):
-        previous, chosen = chosen, _choose(fit.T, size, views, camera)
-        if np.array_equal(previous, chosen):
-            break
-        fit = _fit_chosen(fit.T, size, views, chosen, camera)
-    return fit
+@dataclass(frozen=True)
+class _Seen:
+    """Views of S markers."""
+
+    #: (S, n, 8) [px]
+    uv: FloatArray
+    #: (S, n, 8, 6)
+    J_camera: FloatArray
+    J_marker: FloatArray
+    #: (S, n, 6, 6)
+    camera_covariances: FloatArray
+    #: (S, n, 8, 8) that make the residuals unit white, and the logarithms (S, n) of their covariances' determinants
+    W: FloatArray
+    log_determinants: FloatArray
 
 
-def _choose(T: FloatArray, size: float, views: list[MarkerView], camera: Camera) -> IntArray:
-    """Which of its two camera poses suits each of n views, (n,), for a marker at T."""
-    n = len(views)
-    if all(len(view.viewpoint.poses) == 1 for view in views):
-        return np.zeros(n, dtype=np.int64)
-    T_map_camera = np.concatenate([view.viewpoint.T_map_camera for view in views])
-    uv, J, _ = linearise(camera, T_map_camera, np.broadcast_to(T, (2 * n, 4, 4)), np.full(2 * n, size))
-    covariances = np.concatenate([view.viewpoint.covariances for view in views])
-    W, log_determinants = _whitening([view for view in views for _ in range(2)], J, covariances)
-    r = W @ (np.repeat([view.corners for view in views], 2, axis=0) - uv).reshape(-1, 8, 1)
-    cost = (np.sum(r**2, axis=(1, 2)) + log_determinants).reshape(n, 2)
-    return np.asarray(np.argmin(np.where(np.isfinite(cost), cost, np.inf), axis=1), dtype=np.int64)
+class _ViewArrays:
+    """n views of one marker as arrays, to which its pose is fitted from S starts (S, 4, 4) at a time."""
 
+    def __init__(self, views: Sequence[MarkerView], size: float, camera: Camera) -> None:
+        self._camera, self._size = camera, size
+        self._corners = np.stack([view.corners for view in views]).reshape(-1, 8)
+        covariances = np.stack([view.corner_covariances for view in views])
+        self._noise = with_corner_errors(covariances, SystematicErrors())
+        self._T_map_camera = np.stack([view.viewpoint.T_map_camera for view in views])
+        self._covariances = np.stack([view.viewpoint.covariances for view in views])
+        self._common = np.stack([view.viewpoint.common for view in views])
+        self._doubtful = any(len(view.viewpoint.poses) > 1 for view in views)
 
-def _fit_chosen(
-    start: FloatArray, size: float, views: list[MarkerView], chosen: IntArray, camera: Camera
-) -> _MarkerFit:
-    n = len(views)
-    T_map_camera = np.stack([view.viewpoint.T_map_camera[i] for view, i in zip(views, chosen, strict=True)])
-    camera_covariances = np.stack([view.viewpoint.covariances[i] for view, i in zip(views, chosen, strict=True)])
-    corners = np.stack([view.corners for view in views])
-    sizes = np.full(n, size)
-    _, J, _ = linearise(camera, T_map_camera, np.broadcast_to(start, (n, 4, 4)), sizes)
-    W, log_determinants = _whitening(views, J, camera_covariances)
-    if not np.isfinite(log_determinants).all():
-        return _MarkerFit(start, np.inf, np.inf, np.zeros((6, 6)), np.zeros((6, 6)))
+    def fits(self, starts: FloatArray) -> list[_MarkerFit]:
+        """Fits from all starts, the best first; of a camera's two poses the one that suits the marker better counts."""
+        T, chosen = starts, self._choose(starts)
+        for _ in range(_CHOICES):
+            begun = self._seen(T, chosen)
+            T, chi2 = self._minimised(T, chosen, begun)
+            previous, chosen = chosen, self._choose(T)
+            if np.array_equal(previous, chosen):
+                break
+        cost = chi2 + np.sum(begun.log_determinants, axis=-1)
+        ended = self._seen(T, previous)
+        fits = [self._fit(T[k], chi2[k], cost[k], begun.W[k] @ ended.J_camera[k], begun.W[k] @ ended.J_marker[k],
+                          ended.camera_covariances[k]) for k in range(len(T))]  # fmt: skip
+        return sorted(fits, key=lambda fit: fit.cost)
 
-    def evaluate(T: FloatArray) -> tuple[FloatArray, FloatArray]:
-        uv, _, J = linearise(camera, T_map_camera, np.broadcast_to(T, (n, 4, 4)), sizes)
-        return (W @ (corners - uv).reshape(n, 8, 1)).ravel(), (W @ J).reshape(-1, 6)
+    def _seen(self, T: FloatArray, chosen: IntArray) -> _Seen:
+        """The views of markers at T (S, 4, 4) from the chosen (S, n) of each camera's poses.
 
-    T, chi2 = fit_pose(start, evaluate)
-    if not np.isfinite(chi2):
-        return _MarkerFit(T, np.inf, np.inf, np.zeros((6, 6)), np.zeros((6, 6)))
-    _, J_camera, J_marker = linearise(camera, T_map_camera, np.broadcast_to(T, (n, 4, 4)), sizes)
-    J_camera, J_marker = W @ J_camera, W @ J_marker
-    noise = np.linalg.inv(np.einsum('vri,vrj->ij', J_marker, J_marker))
-    gains = -noise @ np.einsum('vri,vrj->vij', J_marker, J_camera)
-    common = np.stack([view.viewpoint.common for view in views])
-    from_cameras = correlated_sum(gains, camera_covariances) + correlated_sum(gains, common)
-    return _MarkerFit(T, chi2, chi2 + float(np.sum(log_determinants)), noise, from_cameras)
+        A residual comes of the corners' noise, of the systematic part, and of the camera's own pose, which moves all
+        four corners together. What cannot be, a corner in the plane of the camera, has an infinite determinant.
+        """
+        covariances = self._covariances[np.arange(chosen.shape[1]), chosen]
+        uv, J_camera, J_marker = self._linearised(T, chosen)
+        possible = np.all(np.abs(J_camera) < _STEEPEST, axis=(-1, -2))
+        J_sound = np.where(possible[..., None, None], J_camera, 0.0)
+        C = J_sound @ covariances @ np.swapaxes(J_sound, -1, -2)
+        for corner in range(4):
+            both = slice(2 * corner, 2 * corner + 2)
+            C[..., both, both] += self._noise[:, corner]
+        L = np.linalg.cholesky(C)
+        log_determinants = 2.0 * np.sum(np.log(np.einsum('...ii->...i', L)), axis=-1)
+        log_determinants = np.where(possible, log_determinants, np.inf)
+        return _Seen(uv, J_camera, J_marker, covariances, np.linalg.inv(L), log_determinants)
 
+    def _linearised(self, T: FloatArray, chosen: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Corners (S, n, 8) [px], and their derivatives (S, n, 8, 6) by the cameras and by the marker."""
+        T_map_camera = self._T_map_camera[np.arange(chosen.shape[1]), chosen]
+        T_map_marker = np.broadcast_to(T[:, None], T_map_camera.shape).reshape(-1, 4, 4)
+        sizes = np.full(chosen.size, self._size)
+        uv, J_camera, J_marker = linearise(self._camera, T_map_camera.reshape(-1, 4, 4), T_map_marker, sizes)
+        shape = *chosen.shape, 8
+        return uv.reshape(shape), J_camera.reshape(*shape, 6), J_marker.reshape(*shape, 6)
 
-def _whitening(
-    views: Sequence[MarkerView], J_camera: FloatArray, camera_covariances: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Matrices (n, 8, 8) that make the residuals of n views unit white, and the logarithms of their determinants (n,).
+    def _choose(self, T: FloatArray) -> IntArray:
+        """Which of its two camera poses suits each view, (S, n), for a marker at T."""
+        first = np.zeros((len(T), len(self._corners)), dtype=np.int64)
+        if not self._doubtful:
+            return first
+        costs = []
+        for choice in (first, first + 1):
+            seen = self._seen(T, choice)
+            r = seen.W @ (seen.uv - self._corners)[..., None]
+            costs.append(np.sum(r * r, axis=(-1, -2)) + seen.log_determinants)
+        return np.asarray(np.argmin(np.where(np.isfinite(costs), costs, np.inf), axis=0))
 
-    A residual comes of the corners' noise, of the systematic part, and of the camera's own pose, which moves all four
-    corners together. The determinant is infinite of a view that cannot be: a corner lies in the plane of the camera.
-    """
-    n = len(views)
-    possible = np.all(np.abs(J_camera) < _STEEPEST, axis=(1, 2))
-    J_camera = np.where(possible[:, None, None], J_camera, 0.0)
-    C = J_camera @ camera_covariances @ np.swapaxes(J_camera, -1, -2)
-    corner = np.arange(4)
-    noise = with_corner_errors(np.stack([view.corner_covariances for view in views]), SystematicErrors())
-    C.reshape(n, 4, 2, 4, 2)[:, corner, :, corner] += np.swapaxes(noise, 0, 1)
-    L = np.linalg.cholesky(C)
-    log_determinants = 2.0 * np.sum(np.log(np.einsum('nii->ni', L)), axis=-1)
-    return np.linalg.inv(L), np.where(possible, log_determinants, np.inf)
+    def _minimised(self, T: FloatArray, chosen: IntArray, begun: _Seen) -> tuple[FloatArray, FloatArray]:
+        """Poses (S, 4, 4) from starts, and their chi squares (S,), inf where there is none."""
+
+        def evaluated(T: FloatArray) -> Evaluation:
+            uv, _, J = self._linearised(T, chosen)
+            r = (begun.W @ (uv - self._corners)[..., None]).reshape(len(T), -1, 1)
+            J = (begun.W @ J).reshape(len(T), -1, 6)
+            J_transposed, chi2 = np.swapaxes(J, -1, -2), np.sum(r * r, axis=(1, 2))
+            return np.where(np.isfinite(chi2), chi2, np.inf), (J_transposed @ r)[..., 0], J_transposed @ J
+
+        possible = np.all(np.isfinite(begun.log_determinants), axis=-1)
+        T, chi2, _ = minimise(T, evaluated, alternatives=len(T))
+        return T, np.where(possible, chi2, np.inf)
+
+    def _fit(
+        self,
+        T: FloatArray,
+        chi2: float,
+        cost: float,
+        J_camera: FloatArray,
+        J_marker: FloatArray,
+        camera_covariances: FloatArray,
+    ) -> _MarkerFit:
+        """What came of one start, with whitened derivatives (n, 8, 6)."""
+        if not np.isfinite(chi2):
+            return _MarkerFit(T, np.inf, np.inf, np.zeros((6, 6)), np.zeros((6, 6)))
+        noise = np.linalg.inv(np.einsum('vri,vrj->ij', J_marker, J_marker))
+        gains = -noise @ np.einsum('vri,vrj->vij', J_marker, J_camera)
+        from_cameras = correlated_sum(gains, camera_covariances) + correlated_sum(gains, self._common)
+        return _MarkerFit(T, float(chi2), float(cost), noise, from_cameras)

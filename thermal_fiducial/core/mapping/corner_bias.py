@@ -37,11 +37,14 @@ class CornerBias:
         last, self._last = self._last, (stamp_ns, ids, residuals)
         if last is None or not 0 < stamp_ns - last[0] < _SUCCESSIVE_NS or len(ids) < FEWEST_MARKERS:
             return
-        _, now, before = np.intersect1d(ids, last[1], return_indices=True)
-        if len(now) < FEWEST_MARKERS:
+        before, residuals_before = last[1], last[2]
+        if not np.array_equal(ids, before):
+            _, now, then = np.intersect1d(ids, before, return_indices=True)
+            residuals, residuals_before = residuals[now], residuals_before[then]
+        if len(residuals) < FEWEST_MARKERS:
             return
         # Moved markers last as well: none counts for more than what makes it inconsistent.
-        products = np.mean(residuals[now] * last[2][before], axis=(1, 2))
+        products = np.mean(residuals * residuals_before, axis=(1, 2))
         product = float(np.mean(np.clip(products, -(INCONSISTENT_PX**2), INCONSISTENT_PX**2)))
         self._weight = BIAS_MEMORY * self._weight + visible
         self._sum = BIAS_MEMORY * self._sum + product

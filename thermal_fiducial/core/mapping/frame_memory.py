@@ -1,6 +1,5 @@
-"""Frames that the mapper remembers: keyframes for the refinement, and the last ones, which show where it is now."""
+"""Frames that the mapper remembers for the joint refinement, and when that is due."""
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -8,17 +7,13 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import alike_odometry, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap
-from thermal_fiducial.core.mapping.correction import correction
 from thermal_fiducial.core.mapping.keyframes import CameraRig, Displacement, Keyframe, KeyframeStore
-from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.odometry_prior import PredictedCamera
 from thermal_fiducial.core.mapping.snapshot import prior_poses, Snapshot
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers
 from thermal_fiducial.core.types import FloatArray
 
-# Last frames that show how the map has moved where the robot is, each so many-th of them: neighbours show the same.
-_RECENT, _EVERY = 10, 3
 # A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
 _GROWTH, _FEW = 0.2, 15
 #: Views of markers that a refinement in flight takes: a second or two of a slow core.
@@ -40,21 +35,17 @@ class FrameMemory:
     def __init__(self, budget: int, marker_map: MarkerMap) -> None:
         self._keyframes = KeyframeStore(budget)
         self._cameras: list[Camera] = []
-        #: what the map learned from last; None: nothing yet
-        self.last: Keyframe | None = None
-        self._recent: deque[Keyframe] = deque(maxlen=_RECENT)
-        self._belief: FloatArray | None = None
+        #: when the map last learned from known markers [ns]; None: not yet
+        self.last_ns: int | None = None
         self._priors = prior_poses(marker_map.markers)
         self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(marker_map.markers)
         self._added_then, self._refined_views = 0, 0
 
     def keep(self, rows: Markers, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> None:
         """Keep a frame whose camera is known; of one marker alone a refinement can learn nothing."""
-        self.last = keyframe = self._keyframe(rows, pose, camera, predicted)
-        self._belief = None if predicted is None else predicted.pose.covariance
-        self._recent.append(keyframe)
+        self.last_ns = pose.stamp_ns
         if len(rows) >= 2:
-            self._keyframes.add(keyframe)
+            self._keyframes.add(self._keyframe(rows, pose, camera, predicted))
 
     def bridge(self, rows: Markers, camera: Camera, predicted: PredictedCamera, *, first: bool) -> None:
         """Keep a frame without a known marker.
@@ -97,17 +88,9 @@ class FrameMemory:
             errors,
         )
 
-    def move(
-        self, refinement: AdjustedMap, before: Mapping[int, MapMarker], now: Mapping[int, MapMarker]
-    ) -> tuple[Displacement, FloatArray]:
-        """Go along with a refinement: how the map has moved at each time, and T_new_old (4, 4) where the robot is."""
-        displacement = self._keyframes.move(refinement.keyframes)
-        if self.last is None:
-            return displacement, np.eye(4)
-        T_new_old = correction(tuple(self._recent)[::_EVERY], self._cameras, before, now, self._belief)
-        self._recent = deque((frame.moved(T_new_old) for frame in self._recent), maxlen=_RECENT)
-        self.last = self.last.moved(T_new_old)
-        return displacement, T_new_old
+    def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
+        """Go along with a refinement, poses (4, 4) by stamp: how the map has moved at each time."""
+        return self._keyframes.move(adjusted)
 
     def _keyframe(self, rows: Markers, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> Keyframe:
         frame = Keyframe(

@@ -54,10 +54,6 @@ class Keyframe:
         """Whether odometry knows anything of it."""
         return bool(np.any(self.information))
 
-    def moved(self, T_new_old: FloatArray) -> 'Keyframe':
-        """The keyframe in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-        return replace(self, T_map_rig=T_new_old @ self.T_map_rig, T_odometry=T_new_old @ self.T_odometry)
-
 
 def packed(frames: Sequence[Keyframe]) -> tuple[FloatArray | IntArray, ...]:
     """Keyframes as a few large arrays: thousands of small ones take a process long to hand to another."""

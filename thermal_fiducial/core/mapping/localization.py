@@ -4,35 +4,29 @@ S. Khattak, C. Papachristos, K. Alexis, "Marker based thermal-inertial localizat
 filled environments", ISVC 2018.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from thermal_fiducial.core.error_model import (
+    corner_correlations,
     corners_of_pose,
     correlated_sum,
-    INCONSISTENT_PX,
+    decision_weights,
     map_of_pose,
     map_weights,
+    noise_of_pose,
     scale_of_pose,
     SystematicErrors,
     visible_share,
-    with_corner_errors,
 )
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
-from thermal_fiducial.core.geometry.reprojection import (
-    corners_of,
-    difference,
-    fit_pose,
-    linearise,
-    reproject,
-    whitening,
-)
+from thermal_fiducial.core.geometry.planar_pose import CameraFit, INLIER
+from thermal_fiducial.core.geometry.reprojection import difference, reproject, retract
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
-from thermal_fiducial.core.mapping.located import Location, PoseErrors, Refusal, Sight
+from thermal_fiducial.core.mapping.located import Location, PoseErrors, Refusal, Reprojected, Sight
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.errors import InputError
 
 #: Difference of chi square that refutes the worse of two poses: odds of e^-10.
 DECISIVE = 20.0
@@ -64,43 +58,101 @@ def locate(
     hypotheses = _hypotheses(sight, camera, prior)
     if not len(hypotheses):
         return Refusal('no usable pose of any known marker')
-    try:
-        T, weights = _joint_pose(sight, running_errors, camera, hypotheses[0], model)
-    except InputError:
+    frame = _Frame(sight, camera, model)
+    first = frame.joint_pose(hypotheses[0], running_errors)
+    if not np.all(np.isfinite(first.seen.residuals)):
         return Refusal(f'no camera pose explains {_names(sight)}')
-    other = _alternative(sight, weights, camera, T, hypotheses, model)
-    spread = np.zeros((6, 6))
-    if other is not None:
-        if rotation_angle(T[:3, :3].T @ other[:3, :3]) < SAME_POSE:
-            apart = difference(other, T)
-            spread = np.outer(apart, apart)
-        elif prior is None:
-            poses = np.stack([T, other])
-            each = [pose_errors(sight, weights, camera, pose, model) for pose in poses]
-            covariances = np.stack([errors.white + errors.systematic for errors in each])
-            return Refusal(f'planar ambiguity of {_names(sight)} unsettled', poses, covariances)
-        elif _distance(other, prior) < _distance(T, prior):
-            T = other
-    errors = pose_errors(sight, weights, camera, T, model)
-    if not (np.all(np.isfinite(errors.white)) and np.all(np.isfinite(errors.systematic))):
+    T_other = frame.alternative(first, hypotheses)
+    found = first if T_other is None else _either(frame, first, T_other, prior)
+    if isinstance(found, Location) and not np.all(np.isfinite(found.covariance)):
         return Refusal(f'the pose from {_names(sight)} is not determined')
-    errors = replace(errors, systematic=errors.systematic + spread, relative=errors.relative + spread)
-    return Location(T, errors, weights, sight.corners - reproject(camera, T, sight.points))
+    return found
 
 
-def _joint_pose(
-    sight: Sight, running_errors: FloatArray, camera: Camera, start: FloatArray, model: SystematicErrors
-) -> tuple[FloatArray, FloatArray]:
-    """Steps 3 to 6: the pose (4, 4) from all markers jointly, weighted with (N,) by map and errors, and refined."""
-    by_map = _map_weights(sight, start, camera, model)
-    first = solve_camera_pose(sight.corners, sight.covariances, sight.points, camera, start, by_map, compete=False)
-    weights = by_map * marker_weights(_errors_px(first.residuals_px), running_errors, model)
-    T = first.T_map_camera
-    if np.any(weights < by_map):
-        T = solve_camera_pose(
-            sight.corners, sight.covariances, sight.points, camera, T, weights, compete=False
-        ).T_map_camera
-    return T, weights
+def _either(frame: '_Frame', found: Location, T_other: FloatArray, prior: FloatArray | None) -> Location | Refusal:
+    """One of two poses that the corners allow; without a prior they are refused, unless they are nearly the same."""
+    T = found.T_map_camera
+    if rotation_angle(T[:3, :3].T @ T_other[:3, :3]) < SAME_POSE:
+        apart = difference(T_other, T)
+        return replace(found, errors=found.errors.with_alternative(apart))
+    other = frame.refined(T_other, frame.sight.reprojected(frame.camera, T_other), found.weights)
+    if prior is None:
+        covariances = np.stack([found.covariance, other.covariance])
+        return Refusal(f'planar ambiguity of {_names(frame.sight)} unsettled', np.stack([T, T_other]), covariances)
+    turns = rotation_angle(prior[:3, :3].T @ np.stack([T, T_other])[:, :3, :3])
+    return other if turns[1] < turns[0] else found
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """The known markers of a frame, with what all fits of the camera to them have in common."""
+
+    sight: Sight
+    camera: Camera
+    model: SystematicErrors
+
+    @cached_property
+    def _fit(self) -> CameraFit:
+        return CameraFit(self.sight.corners, self.sight.covariances, self.sight.points, self.camera)
+
+    def joint_pose(self, start: FloatArray, running_errors: FloatArray) -> Location:
+        """Steps 3 to 6: the pose from all markers jointly, weighted by map and errors, and refined."""
+        by_map = self._map_weights(start)
+        T = self._fit.solve(start[None], by_map)[0][0]
+        seen = self.sight.reprojected(self.camera, T)
+        return self.refined(T, seen, by_map * marker_weights(seen.errors_px, running_errors, self.model))
+
+    def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location:
+        """Where a step of Gauss and Newton with ``weights`` (N,) of the markers leads from a pose (4, 4) near by.
+
+        The same linearisation gives the covariances, of an estimate that is linear in corners, map and scale there.
+        """
+        n, residuals = len(weights), seen.residuals[..., None]
+        information = np.linalg.inv(self.sight.covariances) * weights[:, None, None, None]
+        squared = np.sum(residuals * (information @ residuals), axis=(-2, -1))
+        robust = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
+        J = seen.J_camera.reshape(8 * n, 6)
+        weighted = (information / robust @ seen.J_camera).reshape(8 * n, 6)
+        try:
+            gains = np.linalg.inv(J.T @ weighted) @ weighted.T
+        except np.linalg.LinAlgError:
+            nothing = np.full((6, 6), np.nan)
+            return Location(T_map_camera, PoseErrors(nothing, nothing, nothing), weights, seen)
+        step = gains @ seen.residuals.ravel()
+        errors = pose_errors(self.sight, gains, float(squared.sum()), seen, T_map_camera, self.camera.width, self.model)
+        seen = replace(seen, residuals=seen.residuals - (J @ step).reshape(n, 4, 2))
+        return Location(retract(T_map_camera, step), errors, weights, seen)
+
+    def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
+        """Another pose (4, 4) that the corners do not refute; None when there is none."""
+        if self._extent > WIDE:
+            return None
+        T = found.T_map_camera
+        apart = rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE
+        if not np.any(apart):
+            return None
+        weights = found.weights * decision_weights(self.sight.noise_px, self.model)
+        starts = np.stack([T, hypotheses[apart][0]])
+        (T, other), chi2, _ = self._fit.solve(starts, weights, inlier=np.inf)
+        refuted = chi2[1] - chi2[0] > DECISIVE * max(1.0, chi2[0] / (8 * len(weights) - 6))
+        return None if refuted or np.max(np.abs(other - T)) < 1e-6 else other
+
+    def _map_weights(self, T_map_camera: FloatArray) -> FloatArray:
+        """Weights (N,) of the markers by how well the map knows each."""
+        sight = self.sight
+        variances = np.diagonal(sight.map_covariances, axis1=-2, axis2=-1)
+        if not np.any(variances):
+            return np.ones(len(sight.markers))
+        # A third of the variance is along each axis; a corner is 0.7 sides from the centre.
+        apart = variances[:, :3].sum(axis=-1) / 3.0 + sight.sizes**2 * variances[:, 3:].sum(axis=-1) / 9.0
+        distances = np.linalg.norm(sight.T_map_marker[:, :3, 3] - T_map_camera[:3, 3], axis=-1)
+        return map_weights(sight.noise_px, self.camera.focal_px * np.sqrt(apart) / distances, self.model)
+
+    @property
+    def _extent(self) -> float:
+        """Angle that the markers fill of the view [rad]."""
+        corners = self.sight.corners.reshape(-1, 2)
+        return float(np.linalg.norm(np.ptp(corners, axis=0)) / self.camera.focal_px)
 
 
 def marker_weights(errors: FloatArray, running_errors: FloatArray, model: SystematicErrors) -> FloatArray:
@@ -115,36 +167,34 @@ def marker_weights(errors: FloatArray, running_errors: FloatArray, model: System
 
 
 def pose_errors(
-    sight: Sight, weights: FloatArray, camera: Camera, T_map_camera: FloatArray, model: SystematicErrors
+    sight: Sight,
+    gains: FloatArray,
+    chi2: float,
+    seen: Reprojected,
+    T_map_camera: FloatArray,
+    width: int,
+    model: SystematicErrors,
 ) -> PoseErrors:
-    """What a camera pose is uncertain by that was estimated with ``weights`` (N,) of the markers.
+    """What a camera pose is uncertain by.
 
-    The estimate is linear in corners, map and scale near its optimum: noise of the corners goes in as white, at least
-    as large as the residuals say; errors of the map's markers with unknown correlations; errors of corners and scale
-    as the error model has them.
+    Noise of the corners goes in as white, at least as large as the residuals say; errors of the map's markers with
+    unknown correlations; errors of corners and scale as the error model has them.
+
+    Parameters
+    ----------
+    gains : (6, 8 N) what a pixel of each coordinate moves the pose by
+    chi2 : of the residuals
+    width : of the image [px]
     """
     n = len(sight.markers)
-    T = np.broadcast_to(T_map_camera, (n, 4, 4))
-    uv, J_camera, J_marker = linearise(camera, T, sight.T_map_marker, sight.sizes)
-    blocks, of_marker = J_camera.reshape(n, 4, 2, 6), J_marker.reshape(n, 4, 2, 6)
-    information = np.linalg.inv(sight.covariances) * weights[:, None, None, None]
-    weighted = information @ blocks
-    A = np.sum(np.moveaxis(blocks, -1, -2) @ weighted, axis=(0, 1))
-    try:
-        gains = np.linalg.inv(A) @ np.moveaxis(weighted, -1, -2)
-    except np.linalg.LinAlgError:
-        nothing = np.full((6, 6), np.nan)
-        return PoseErrors(nothing, nothing, nothing)
-    white = np.sum(gains @ sight.covariances @ np.moveaxis(gains, -1, -2), axis=(0, 1))
-    residuals = (sight.corners - uv)[..., None]
-    chi2 = float(np.sum(residuals * (information @ residuals)))
-    white *= max(1.0, chi2 / max(8 * n - 6, 1))
-    map_gains = -np.sum(gains @ of_marker, axis=1)
-    at = sight.corners.reshape(-1, 2)
-    corners = corners_of_pose(gains.reshape(4 * n, 6, 2), at, camera.width, model)
-    visible = visible_share(J_camera.reshape(-1, 2, 6), at, camera.width, model)
-    arms = corners_of(sight.sizes) @ np.swapaxes(sight.T_map_marker[:, :3, :3], -1, -2)
-    scale = scale_of_pose(np.sum(gains @ (of_marker[..., :3] @ arms[..., None]), axis=(0, 1))[:, 0], model)
+    by_corner = np.swapaxes(gains.reshape(6, 4 * n, 2), 0, 1)
+    white = noise_of_pose(by_corner, sight.covariances.reshape(-1, 2, 2), chi2)
+    correlations = corner_correlations(sight.corners.reshape(-1, 2), width, model)
+    corners = corners_of_pose(by_corner, correlations, model)
+    visible = visible_share(seen.J_camera.reshape(-1, 2, 6), correlations)
+    arms = sight.points - sight.T_map_marker[:, None, :3, 3]
+    scale = scale_of_pose(gains @ np.einsum('nckj,ncj->nck', seen.J_marker[..., :3], arms).ravel(), model)
+    map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ seen.J_marker.reshape(n, 8, 6)
     of_map = map_of_pose(map_gains, sight.map_covariances, sight.T_map_marker[:, :3, 3], T_map_camera[:3, 3])
     relative = white + correlated_sum(map_gains, sight.relative_covariances)
     return PoseErrors(white, of_map + corners + scale, relative, visible)
@@ -165,72 +215,6 @@ def _hypotheses(sight: Sight, camera: Camera, prior: FloatArray | None) -> Float
     return np.asarray(poses[np.argsort(cost, kind='stable')])
 
 
-def _map_weights(sight: Sight, T_map_camera: FloatArray, camera: Camera, model: SystematicErrors) -> FloatArray:
-    """Weights (N,) of the markers by how well the map knows each."""
-    if not np.any(sight.map_covariances):
-        return np.ones(len(sight.markers))
-    T = np.broadcast_to(T_map_camera, (len(sight.markers), 4, 4))
-    _, _, J = linearise(camera, T, sight.T_map_marker, sight.sizes)
-    pixels = np.sqrt(np.nan_to_num(np.einsum('nij,njk,nik->n', J, sight.map_covariances, J) / 8.0))
-    noise = np.sqrt(np.trace(sight.covariances, axis1=-2, axis2=-1).mean(axis=-1) / 2.0)
-    return map_weights(pixels, noise, model)
-
-
-def _alternative(
-    sight: Sight, weights: FloatArray, camera: Camera, T: FloatArray, hypotheses: FloatArray, model: SystematicErrors
-) -> FloatArray | None:
-    """Another pose (4, 4) that the corners do not refute; None when there is none."""
-    apart = rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE
-    if not np.any(apart) or _extent(sight, camera) > WIDE:
-        return None
-    n = len(sight.markers)
-    W = whitening(with_corner_errors(sight.covariances, model)) * np.sqrt(weights)[:, None, None, None]
-
-    def evaluate(T: FloatArray) -> tuple[FloatArray, FloatArray]:
-        uv, J, _ = linearise(camera, np.broadcast_to(T, (n, 4, 4)), sight.T_map_marker, sight.sizes)
-        return (W @ (sight.corners - uv)[..., None]).ravel(), (W @ J.reshape(n, 4, 2, 6)).reshape(-1, 6)
-
-    r, _ = evaluate(T)
-    chi2 = float(r @ r)
-    other, chi2_other = fit_pose(hypotheses[apart][0], evaluate)
-    refuted = chi2_other - chi2 > DECISIVE * max(1.0, chi2 / (8 * n - 6))
-    return None if refuted or np.max(np.abs(other - T)) < 1e-6 else other
-
-
-def _extent(sight: Sight, camera: Camera) -> float:
-    """Angle that the markers fill of the view [rad]."""
-    corners = sight.corners.reshape(-1, 2)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    return float(np.linalg.norm(high - low) / camera.focal_px)
-
-
-def _errors_px(residuals: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(np.mean(np.sum(residuals**2, axis=-1), axis=-1)))
-
-
-def _distance(T: FloatArray, prior: FloatArray) -> float:
-    return float(rotation_angle(prior[:3, :3].T @ T[:3, :3]))
-
-
 def _names(sight: Sight) -> str:
     ids = [marker.id for marker in sight.markers]
     return f'marker {ids[0]}' if len(ids) == 1 else 'markers ' + ', '.join(str(i) for i in ids)
-
-
-def reprojection_errors(sight: Sight, camera: Camera, T_map_camera: FloatArray) -> FloatArray:
-    """Rms error (N,) [px] of each marker; that of one behind the camera is the image's width."""
-    residuals = sight.corners - reproject(camera, T_map_camera, sight.points)
-    squared = np.mean(np.sum(residuals**2, axis=-1), axis=-1)
-    return np.sqrt(np.where(np.isfinite(squared), squared, float(camera.width) ** 2))
-
-
-def expected_errors(sight: Sight, location: Location, camera: Camera) -> FloatArray:
-    """Rms error (N,) [px] that the noise, the pose and the map's own uncertainty explain."""
-    n = len(sight.markers)
-    T = np.broadcast_to(location.T_map_camera, (n, 4, 4))
-    _, J_camera, J_marker = linearise(camera, T, sight.T_map_marker, sight.sizes)
-    noise = np.trace(sight.covariances, axis1=-2, axis2=-1).sum(axis=-1)
-    pose = np.sum(J_camera @ location.covariance * J_camera, axis=(1, 2))
-    marker = np.sum(J_marker @ sight.map_covariances * J_marker, axis=(1, 2))
-    variance = 0.25 * (noise + pose + marker)
-    return np.asarray(np.sqrt(np.nan_to_num(variance) + INCONSISTENT_PX**2))

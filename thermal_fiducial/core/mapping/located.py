@@ -1,16 +1,18 @@
 """The known markers of a frame, and what they say of where the camera is: records of the localization."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import positive
+from thermal_fiducial.core.error_model import INCONSISTENT_PX, positive
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import corners_in_map
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise
+from thermal_fiducial.core.mapping.candidates import Viewpoint
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.mapping.odometry_prior import PredictedCamera
-from thermal_fiducial.core.measurements import CameraPose, Markers
+from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, marker_branches, Markers
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
 #: Attitudes known no better than this [rad] are not published: their covariances, of first order, mean nothing.
@@ -29,9 +31,19 @@ class Sight:
     #: (N, 2, 4, 4) both branches of T_camera_marker, NaN where there is none
     branches: FloatArray
 
-    def select(self, chosen: BoolArray) -> 'Sight':
-        """The chosen (N,) markers alone."""
-        markers = [marker for marker, keep in zip(self.markers, chosen, strict=True) if keep]
+    @classmethod
+    def of(cls, rows: Markers, markers: Mapping[int, MapMarker]) -> 'Sight':
+        """Of rows whose IDs are all among ``markers``."""
+        known = [markers[key] for key in rows['id'].tolist()]
+        return cls(known, corners_px(rows), corner_covariances(rows), marker_branches(rows))
+
+    @cached_property
+    def trusted(self) -> 'Sight':
+        """Those that are not in quarantine."""
+        chosen = [marker.trusted for marker in self.markers]
+        if all(chosen):
+            return self
+        markers = [marker for marker in self.markers if marker.trusted]
         return Sight(markers, self.corners[chosen], self.covariances[chosen], self.branches[chosen])
 
     @cached_property
@@ -43,6 +55,11 @@ class Sight:
     def sizes(self) -> FloatArray:
         """(N,) [m]."""
         return np.array([marker.size for marker in self.markers])
+
+    @cached_property
+    def noise_px(self) -> FloatArray:
+        """(N,) standard deviation of a coordinate of the corners of each, rms."""
+        return np.asarray(np.sqrt(0.5 * np.trace(self.covariances, axis1=-2, axis2=-1).mean(axis=-1)))
 
     @cached_property
     def points(self) -> FloatArray:
@@ -61,6 +78,38 @@ class Sight:
         best = covariances[np.argmin(np.trace(covariances, axis1=1, axis2=2))]
         return positive(covariances - best)
 
+    def reprojected(self, camera: Camera, T_map_camera: FloatArray) -> 'Reprojected':
+        """The markers of the map as a camera at (4, 4) should see them."""
+        n = len(self.markers)
+        T = np.broadcast_to(T_map_camera, (n, 4, 4))
+        uv, J_camera, J_marker = linearise(camera, T, self.T_map_marker, self.sizes)
+        return Reprojected(self.corners - uv, J_camera.reshape(n, 4, 2, 6), J_marker.reshape(n, 4, 2, 6))
+
+    def expected_errors(self, seen: 'Reprojected', pose_covariance: FloatArray) -> FloatArray:
+        """Rms error (N,) [px] that the noise, the camera's pose and the map's own uncertainty explain."""
+        n = len(self.markers)
+        noise = np.trace(self.covariances, axis1=-2, axis2=-1).sum(axis=-1)
+        J_camera, J_marker = seen.J_camera.reshape(n, 8, 6), seen.J_marker.reshape(n, 8, 6)
+        pose = np.sum(J_camera @ pose_covariance * J_camera, axis=(1, 2))
+        marker = np.sum(J_marker @ self.map_covariances * J_marker, axis=(1, 2))
+        return np.asarray(np.sqrt(0.25 * np.nan_to_num(noise + pose + marker) + INCONSISTENT_PX**2))
+
+
+@dataclass(frozen=True)
+class Reprojected:
+    """Corners of N markers against what map and camera pose make them."""
+
+    #: (N, 4, 2) measured minus predicted [px], NaN behind the camera
+    residuals: FloatArray
+    #: (N, 4, 2, 6) derivatives of the predictions with respect to the camera's pose and the marker's
+    J_camera: FloatArray
+    J_marker: FloatArray
+
+    @property
+    def errors_px(self) -> FloatArray:
+        """Rms error (N,) [px] of each marker; NaN behind the camera."""
+        return np.asarray(np.sqrt(np.mean(np.sum(self.residuals**2, axis=-1), axis=-1)))
+
 
 @dataclass(frozen=True)
 class PoseErrors:
@@ -75,6 +124,11 @@ class PoseErrors:
     #: share of the variance of the corners' systematic errors that the residuals show: the pose takes up the rest
     visible: float = 0.0
 
+    def with_alternative(self, apart: FloatArray) -> 'PoseErrors':
+        """The same where a pose that is ``apart`` (6,) may be the true one as well."""
+        spread = np.outer(apart, apart)
+        return replace(self, systematic=self.systematic + spread, relative=self.relative + spread)
+
 
 @dataclass(frozen=True)
 class Location:
@@ -84,13 +138,19 @@ class Location:
     errors: PoseErrors
     #: (N,) weights of the markers, 1 for one as good as the rest
     weights: FloatArray
-    #: (N, 4, 2) measured minus predicted [px]
-    residuals: FloatArray
+    #: the N markers from there
+    seen: Reprojected
+
+    @property
+    def viewpoint(self) -> Viewpoint:
+        """The camera for new markers: what is not relative to the map is an error that all their views share."""
+        viewpoint = Viewpoint.known(self.T_map_camera, self.errors.relative)
+        return replace(viewpoint, common=positive(self.covariance - self.errors.relative))
 
     @property
     def rms_px(self) -> float:
         """Re-projection error, rms over the corners [px]."""
-        return float(np.sqrt(np.mean(np.sum(self.residuals**2, axis=-1))))
+        return float(np.sqrt(np.mean(self.seen.errors_px**2)))
 
     @property
     def covariance(self) -> FloatArray:
@@ -133,9 +193,8 @@ class LocatedFrame:
     #: (N,) of MARKER_DTYPE, and (N,) which of them are in the map
     rows: Markers
     is_known: BoolArray
-    #: the K known ones, and (K,) which of them are trusted
+    #: the known ones
     known: Sight
-    trusted: BoolArray
     #: where odometry has the camera
     predicted: PredictedCamera | None
     outcome: Located | Refusal
@@ -144,6 +203,18 @@ class LocatedFrame:
     def new(self) -> Markers:
         """Rows of the markers that are not in the map."""
         return self.rows[~self.is_known]
+
+    def known_errors(self, location: Location) -> tuple[list[MapMarker], FloatArray, FloatArray]:
+        """The K known markers, their errors (K,) [px], rms, and what noise, pose and map explain of them (K,).
+
+        The error of one behind the camera is the image's width.
+        """
+        known = self.known
+        seen = location.seen
+        if known.trusted is not known:
+            seen = known.reprojected(self.camera, location.T_map_camera)
+        errors = np.where(np.isfinite(seen.errors_px), seen.errors_px, float(self.camera.width))
+        return known.markers, errors, known.expected_errors(seen, location.covariance)
 
     @property
     def pose(self) -> CameraPose | None:

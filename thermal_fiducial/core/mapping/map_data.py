@@ -1,12 +1,12 @@
 """The marker map as data: what is known of each marker, in which frame, and what the mapper answers to a frame."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
-from thermal_fiducial.core.measurements import CameraPose, MAP_DTYPE
+from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation
+from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS, MAP_DTYPE
 from thermal_fiducial.core.types import FloatArray
 
 
@@ -60,6 +60,14 @@ class MarkerMap:
         """A map that shares the (immutable) markers but not the table of them."""
         return replace(self, markers=dict(self.markers))
 
+    def adjust(self, adjusted: Mapping[int, MapMarker]) -> None:
+        """Take poses and covariances over for those markers that poses may rest on."""
+        for marker_id, marker in adjusted.items():
+            own = self.markers.get(marker_id)
+            if own is not None and own.trusted:
+                self.markers[marker_id] = replace(own, T_map_marker=marker.T_map_marker, covariance=marker.covariance)
+        self.revision += 1
+
     def geometry(self) -> dict[int, tuple[FloatArray, float]]:
         """Marker ID to (T_map_marker, size): what a detector needs to look for them."""
         return {marker.id: (marker.T_map_marker, marker.size) for marker in self.markers.values()}
@@ -99,7 +107,7 @@ class MapperResult:
     #: all markers in quarantine
     quarantined: tuple[int, ...] = ()
     map_revision: int = 0
-    #: how often a refinement has moved the map
+    #: how often the map was refined, or another was taken over
     map_resets: int = 0
     #: why each of them is there, with numbers
     quarantine_reasons: dict[int, str] = field(default_factory=dict)
@@ -114,18 +122,37 @@ class MapperResult:
 
 @dataclass(frozen=True)
 class MapJump:
-    """A refinement moved the map: poses published before and after don't compare as they are."""
+    """Another map was taken over: poses published before and after don't compare as they are."""
 
     map_revision: int
-    #: how often this has happened
+    #: how often maps were taken over or refined
     resets: int
-    #: (4, 4) moves poses near the robot from the old map to the new: T_new = T_new_old @ T_old
+    #: (4, 4) moves poses from the old map to the new: T_new = T_new_old @ T_old
     T_new_old: FloatArray
 
-    @property
-    def moves_poses(self) -> bool:
-        """Whether poses near the robot move at all: most refinements leave them where they are."""
-        return bool(np.any(self.T_new_old != np.eye(4)))
+
+class LatePoses:
+    """Poses of frames that arrive after the map has moved: in the map that their stamp stands for."""
+
+    def __init__(self) -> None:
+        #: stamp of the newest frame so far
+        self.newest_ns = 0
+        self._moved_ns = 0
+        self._T_new_old: FloatArray = np.eye(4)
+
+    def add(self, stamp_ns: int) -> None:
+        """Take in the stamp of a frame; one of long before is that of a clock that was set back."""
+        self.newest_ns = max(stamp_ns, self.newest_ns) if stamp_ns >= self.newest_ns - LATEST_NS else stamp_ns
+
+    def moved(self, T_new_old: FloatArray) -> None:
+        """The map has moved by (4, 4), after the newest frame."""
+        self._moved_ns, self._T_new_old = self.newest_ns, T_new_old
+
+    def as_of_its_stamp(self, pose: CameraPose) -> CameraPose:
+        """``pose``, found in the map of now, in the map of its stamp."""
+        if 0 <= self._moved_ns - pose.stamp_ns <= LATEST_NS:
+            return in_moved_map(pose, inverse(self._T_new_old))
+        return pose
 
 
 def _fill(rows: np.ndarray, names: Collection[str], values: FloatArray) -> None:

@@ -2,13 +2,11 @@
 
 from collections.abc import Mapping
 
-import numpy as np
-
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.candidates import Candidate, MarkerView, Viewpoint
 from thermal_fiducial.core.mapping.keyframes import Displacement
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.measurements import corner_covariances, corners_px, marker_poses, Markers
+from thermal_fiducial.core.measurements import corner_covariances, corners_px, marker_branches, Markers
 from thermal_fiducial.core.types import FloatArray
 
 #: Candidates that are judged in one frame: bounds its time when many are new.
@@ -16,24 +14,33 @@ TRIALS = 3
 
 
 class NewMarkers:
-    """All markers on trial."""
+    """All markers on trial.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    size, sizes : side of a marker [m], and by ID of those that differ
+    """
+
+    def __init__(self, size: float, sizes: Mapping[int, float]) -> None:
+        self._size, self._sizes = size, sizes
         self.candidates: dict[int, Candidate] = {}
 
-    def add(self, stamp_ns: int, rows: Markers, sizes: Mapping[int, float], viewpoint: Viewpoint) -> list[Candidate]:
-        """Show a frame's rows to their candidates, markers of ``sizes`` [m]; those candidates."""
-        branches = np.stack([marker_poses(rows, ''), marker_poses(rows, 'a')], axis=1)
-        corners, covariances = corners_px(rows), corner_covariances(rows)
+    def show(
+        self, stamp_ns: int, rows: Markers, camera: Camera, viewpoint: Viewpoint
+    ) -> tuple[list[MapMarker], dict[int, str]]:
+        """Show a frame's rows to their candidates.
+
+        Returns
+        -------
+        Those that the views have settled by now, as markers of the map, and what the others wait for, in words by ID.
+        """
+        branches, corners, covariances = marker_branches(rows), corners_px(rows), corner_covariances(rows)
         shown = []
         for i, marker_id in enumerate(rows['id'].tolist()):
-            candidate = self.candidates.setdefault(marker_id, Candidate(marker_id, sizes[marker_id]))
+            size = self._sizes.get(marker_id, self._size)
+            candidate = self.candidates.setdefault(marker_id, Candidate(marker_id, size))
             candidate.add(MarkerView(stamp_ns, viewpoint, corners[i], covariances[i], branches[i]))
             shown.append(candidate)
-        return shown
-
-    def judge(self, stamp_ns: int, shown: list[Candidate], camera: Camera) -> list[MapMarker]:
-        """Those of the candidates whose views have settled their poses by now."""
         placed = []
         for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:
             if not candidate.untried:
@@ -42,7 +49,8 @@ class NewMarkers:
             candidate.reason = placement.reason
             if placement.T_map_marker is not None:
                 placed.append(entry(stamp_ns, candidate, placement.T_map_marker, placement.covariance))
-        return placed
+                del self.candidates[candidate.id]
+        return placed, {c.id: c.reason for c in shown if c.id in self.candidates}
 
     def move(self, displacement: Displacement) -> None:
         """The map moved: each candidate's views move with the frames of their time."""

@@ -29,23 +29,12 @@ class _Record:
 
 
 class Trust:
-    """Running errors and disagreement of every marker seen so far."""
+    """Running errors and disagreement of every marker seen so far, and the standings of a map's ``markers``."""
 
-    def __init__(self) -> None:
+    def __init__(self, markers: Mapping[int, MapMarker]) -> None:
         self._records: dict[int, _Record] = {}
         #: markers in quarantine, each with the reason in words
-        self.quarantined: dict[int, str] = {}
-
-    def start(self, markers: Mapping[int, MapMarker]) -> None:
-        """Take over the standings of a map."""
         self.quarantined = {key: FROM_FILE for key, marker in markers.items() if not marker.trusted}
-
-    def set_standing(self, markers: dict[int, MapMarker], marker_id: int, reason: str) -> None:
-        """Trust one of ``markers`` again, or put it in quarantine for a reason."""
-        markers[marker_id] = replace(markers[marker_id], trusted=not reason)
-        self.quarantined.pop(marker_id, None)
-        if reason:
-            self.quarantined[marker_id] = reason
 
     def running_errors(self, markers: Iterable[MapMarker]) -> np.ndarray:
         """Running rms re-projection error of each of ``markers`` [px]."""
@@ -63,26 +52,55 @@ class Trust:
             gain = max(1.0 / record.observations, MEMORY)
             record.mean_square_px += gain * (float(error) ** 2 - record.mean_square_px)
 
-    def judge(self, markers: Iterable[MapMarker], disagrees: Iterable[bool]) -> dict[int, bool]:
-        """Take in which of ``markers`` disagree with the others in one frame.
+    def judge(
+        self, markers: dict[int, MapMarker], known: list[MapMarker], errors_px: np.ndarray, explained_px: np.ndarray
+    ) -> bool:
+        """Put those of ``markers`` in quarantine that persistently disagree; whether any standing changed.
 
-        Returns
-        -------
-        Marker ID to its new standing (trusted or not), for those whose standing changes.
+        Parameters
+        ----------
+        known : the N of them that a frame shows
+        errors_px, explained_px : (N,) their re-projection errors, and what is to be expected of them
         """
-        changes: dict[int, bool] = {}
-        for marker, bad in zip(markers, disagrees, strict=True):
+        if len(known) < 2:
+            return False
+        changed = False
+        ratios = errors_px / explained_px
+        for marker, bad, error, ratio in zip(
+            known, inconsistent(ratios > DISAGREEMENT, known).tolist(), errors_px, ratios, strict=True
+        ):
             record = self._record(marker)
             record.disagreement += MEMORY * (float(bad) - record.disagreement)
             if marker.trusted and record.disagreement > QUARANTINE:
-                changes[marker.id] = False
+                in_frames = f'in most of the last {1.0 / MEMORY:.0f} frames'
+                self._set_standing(markers, marker.id, f'{error:.1f} px off, {ratio:.1f} sigma, {in_frames}')
             elif not marker.trusted and record.disagreement < RELEASE:
-                changes[marker.id] = True
-        return changes
+                self._set_standing(markers, marker.id, '')
+            else:
+                continue
+            changed = True
+        return changed
 
-    def flag(self, marker: MapMarker) -> None:
-        """Take it from a joint adjustment that ``marker`` disagrees: it is trusted again when it has long agreed."""
-        self._record(marker).disagreement = 1.0
+    def flag(self, markers: dict[int, MapMarker], outliers: Mapping[int, float]) -> None:
+        """Quarantine what a joint adjustment contradicts: it is trusted again when it has long agreed.
+
+        Parameters
+        ----------
+        outliers : ID to the share of its views that contradict the others
+        """
+        for marker_id, share in outliers.items():
+            if marker_id not in markers or not markers[marker_id].trusted:
+                continue
+            self._record(markers[marker_id]).disagreement = 1.0
+            reason = f'{100.0 * share:.0f} % of its views contradict the joint refinement'
+            self._set_standing(markers, marker_id, reason)
+
+    def _set_standing(self, markers: dict[int, MapMarker], marker_id: int, reason: str) -> None:
+        """Trust one of ``markers`` again, or put it in quarantine for a reason."""
+        markers[marker_id] = replace(markers[marker_id], trusted=not reason)
+        self.quarantined.pop(marker_id, None)
+        if reason:
+            self.quarantined[marker_id] = reason
 
     def forget(self, ids: Iterable[int]) -> None:
         """Start anew with ``ids``: their poses have changed."""
@@ -98,12 +116,13 @@ class Trust:
         return record
 
 
-def inconsistent(disagrees: np.ndarray, trusted: np.ndarray, markers: list[MapMarker]) -> np.ndarray:
+def inconsistent(disagrees: np.ndarray, markers: list[MapMarker]) -> np.ndarray:
     """Which of the disagreeing markers are to blame, (N,) bool.
 
     Among three or more the majority decides, which a robust pose already follows. Of two that disagree a fixed one
     is believed, then the one seen more often by far; else it is open and neither is blamed.
     """
+    trusted = np.array([marker.trusted for marker in markers], dtype=bool)
     if np.count_nonzero(trusted) != 2 or not np.any(disagrees & trusted):
         return disagrees
     a, b = np.flatnonzero(trusted)
