@@ -13,7 +13,7 @@ from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import CORNER_COVARIANCE_FIELDS, MAP_DTYPE, MARKER_DTYPE, Odometry
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.images import image_to_array
-from thermal_fiducial.ros import clouds, convert, odometry_bytes
+from thermal_fiducial.ros import clouds, convert, message_bytes
 
 STAMP = 1_700_000_000_123_456_789
 HEAD = convert.header(STAMP, 'frame')
@@ -262,7 +262,7 @@ def test_poses_and_odometry_come_back():
     odometry = Odometry(STAMP, random_pose(rng), rng.normal(size=3), rng.normal(size=3), A @ A.T, B @ B.T)
     message = convert.odometry_frames('map', 'base_link')
     convert.fill_odometry(message, odometry)
-    taken = odometry_bytes.odometry(serialize_message(message))
+    taken = message_bytes.odometry(serialize_message(message))
     pose = convert.camera_pose(sent(convert.pose_with_covariance(odometry.T_map_body, A @ A.T, HEAD)))
     # A quaternion in between: the last digits of the rotation may differ.
     np.testing.assert_allclose(taken.T_map_body, odometry.T_map_body, atol=1e-15)

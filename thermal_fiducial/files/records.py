@@ -1,6 +1,6 @@
 """Records out of messages, from rclpy or from a bag, checked at the door."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 import math
 from typing import Any
 
@@ -55,7 +55,7 @@ def camera(message: Any) -> Camera:
         raise InputError(f'camera_info: {error}') from None
 
 
-def is_imu_reading(turn: Iterable[float], force: Iterable[float]) -> bool:
+def is_imu_reading(turn: Sequence[float], force: Sequence[float]) -> bool:
     """Whether an IMU can have measured it [rad/s, m/s^2]."""
     # Plain numbers: of six of them, 200 times a second, numpy takes three times as long. NaN is below no bound.
     return all(abs(x) <= _FASTEST_TURN for x in turn) and all(abs(x) <= _LARGEST_FORCE for x in force)
@@ -75,10 +75,15 @@ def imu_sample(message: Any) -> ImuSample:
         (REP-145).
     """
     w, a = message.angular_velocity, message.linear_acceleration
-    turn, force = (w.x, w.y, w.z), (a.x, a.y, a.z)
+    missing = message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0
+    return checked_imu_sample(stamp_ns(message.header.stamp), (w.x, w.y, w.z), (a.x, a.y, a.z), missing=bool(missing))
+
+
+def checked_imu_sample(stamp: int, turn: Sequence[float], force: Sequence[float], *, missing: bool) -> ImuSample:
+    """:func:`imu_sample` of its numbers; ``missing``: the driver marks one of the measurements as not there."""
     if not is_imu_reading(turn, force):
-        finite = all(math.isfinite(x) for x in turn + force)
+        finite = all(math.isfinite(x) for x in (*turn, *force))
         raise InputError('IMU message beyond what any IMU measures' if finite else 'IMU message that is not finite')
-    if message.angular_velocity_covariance[0] == -1.0 or message.linear_acceleration_covariance[0] == -1.0:
+    if missing:
         raise InputError('IMU message without angular velocity or without acceleration')
-    return ImuSample(stamp_ns(message.header.stamp), np.array(turn), np.array(force))
+    return ImuSample(stamp, np.array(turn), np.array(force))

@@ -10,7 +10,7 @@ from std_srvs.srv import Trigger
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.map_corrections import MapCorrections
-from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros import convert, message_bytes, qos
 from thermal_fiducial.ros.filter_memory import FilterMemory
 from thermal_fiducial.ros.filter_outputs import FilterOutputs
 from thermal_fiducial.ros.filter_status import FilterStatus
@@ -29,7 +29,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.filter = PoseEkf(self.config)
         self._status = FilterStatus(self.filter, self.console)
         self._corrections = MapCorrections(self.config.max_delay)
-        self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT)
+        self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT, raw=True)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
         self.subscribe(TransformStamped, 'map_correction', self._on_map_correction, qos.RESULT)
         self._frames = RobotFrames(self, self._mount)
@@ -46,9 +46,9 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.filter.configure(self.config)
         self.filter.reset('the camera is elsewhere on the robot')
 
-    def _on_imu(self, message: Imu) -> None:
-        self._frames.note_imu_frame(message.header.frame_id)
-        odometry = self.filter.add_imu(convert.imu_sample(message))
+    def _on_imu(self, message: bytes) -> None:
+        self._frames.note_imu_frame(message_bytes.frame_id(message))
+        odometry = self.filter.add_imu(message_bytes.imu_sample(message))
         self._status.after_imu()
         if odometry is not None:
             lost, jumps = self.filter.lost, self._status.jumps

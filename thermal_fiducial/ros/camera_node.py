@@ -4,6 +4,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from nav_msgs.msg import Odometry as OdometryMessage
+from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, TimeReference
 
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
@@ -12,7 +13,7 @@ from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.ros import convert, odometry_bytes, qos
+from thermal_fiducial.ros import convert, message_bytes, qos
 from thermal_fiducial.ros.node import StageNode
 from thermal_fiducial.ros.robot_frames import RobotFrames
 
@@ -25,13 +26,14 @@ class CameraStageNode(StageNode[Config]):
     def __init__(self, name: str, kind: type[Config], **kwargs: Any) -> None:
         super().__init__(name, kind, **kwargs)
         self._camera: Camera | None = None
+        self._camera_info = b''
         self._calibrations = 0
         #: the filter's latest states
         self.odometry = MotionPrior(self.config.camera_time_offset)
 
     def follow_hints(self) -> None:
         """Subscribe to calibration and odometry; after the node's main input."""
-        self.subscribe(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
+        self.subscribe(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT, raw=True)
         self.subscribe(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT, raw=True)
         RobotFrames(self, lambda: self.configure(self.config))
         self.subscribe(TimeReference, 'camera_clock', self._on_camera_clock, qos.RESULT)
@@ -68,12 +70,12 @@ class CameraStageNode(StageNode[Config]):
 
     def _on_odometry(self, message: bytes) -> None:
         """A few of these are wanted at frame rate, and only they are read."""
-        self.odometry.add(odometry_bytes.stamp_ns(message), partial(self._read_odometry, message))
+        self.odometry.add(message_bytes.stamp_ns(message), partial(self._read_odometry, message))
 
     def _read_odometry(self, message: bytes) -> Odometry | None:
         """A hint that cannot be used is dropped, not the frame that asks for it."""
         try:
-            return odometry_bytes.odometry(message)
+            return message_bytes.odometry(message)
         except InputError as error:
             self.refuse(str(error))
             return None
@@ -81,11 +83,22 @@ class CameraStageNode(StageNode[Config]):
     def _on_camera_clock(self, message: TimeReference) -> None:
         self.odometry.set_clock_offset(convert.clock_offset(message))
 
-    def _on_camera_info(self, message: CameraInfo) -> None:
-        camera = convert.camera(message)
+    def _on_camera_info(self, message: bytes) -> None:
+        """Most drivers send the same calibration with each frame: only another one is read, and checked."""
+        if message[message_bytes.BEHIND_STAMP :] == self._camera_info:
+            return
+        camera = convert.camera(_read(message))
+        self._camera_info = message[message_bytes.BEHIND_STAMP :]
         if self._camera is not None and camera.matches(self._camera):
             return
         self._camera = camera
         self._calibrations += 1
         if self._calibrations > 1:
             self.get_logger().warning('camera_info has changed: the new calibration is used from here on')
+
+
+def _read(message: bytes) -> CameraInfo:
+    try:
+        return deserialize_message(message, CameraInfo)
+    except RuntimeError as error:
+        raise InputError(f'camera_info cannot be read: {error}') from None

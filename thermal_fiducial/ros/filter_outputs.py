@@ -14,6 +14,7 @@ from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.bridge import FlightControllerBridge
 from thermal_fiducial.ros.counting import CountingNode
+from thermal_fiducial.ros.message_bytes import StateBytes
 from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.transforms import TransformBroadcaster
 
@@ -36,9 +37,10 @@ class FilterOutputs:
         self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None], frames: RobotFrames
     ) -> None:
         self._config, self._frames = config, frames
-        #: one message that is filled again and again, seen as two
-        self._message = convert.odometry_frames(config.map_frame, config.base_frame)
-        self._pose_message = PoseWithCovarianceStamped(header=self._message.header, pose=self._message.pose)
+        #: messages that are filled again and again
+        self._state = StateBytes(config.map_frame, config.base_frame)
+        #: stamp of the latest state; 0 before there is one
+        self.stamp_ns = 0
         self._path: deque[tuple[int, Pose]] = deque(maxlen=_PATH_LENGTH)
         self._pose = node.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
         self._odometry = node.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
@@ -61,24 +63,19 @@ class FilterOutputs:
         if (T_imu_base := self._frames.T_imu_base) is not None:
             odometry = in_frame(odometry, T_imu_base)
             smooth = None if smooth is None else in_frame(smooth, T_imu_base)
-        convert.fill_odometry(self._message, odometry)
+        self.stamp_ns = odometry.stamp_ns
+        self._state.fill(odometry)
         if self._config.publish_lost or not lost:
-            self._pose.send(self._pose_message)
-        self._odometry.send(self._message)
+            self._pose.send(self._state.pose)
+        self._odometry.send(self._state.odometry)
         if self._transforms is not None and not lost:
             self._transforms.send(odometry, smooth)
         if smooth is not None:
-            convert.fill_odometry(self._message, smooth)
-            self._smooth_odometry.send(self._message)
+            self._state.fill(smooth)
+            self._smooth_odometry.send(self._state.odometry)
         if not lost:
             self._bridge.send(smooth or odometry, jumps)
         self._extend_path(odometry)
-
-    @property
-    def stamp_ns(self) -> int:
-        """Of the latest state; 0 before there is one."""
-        stamp = self._message.header.stamp
-        return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
     def send_clock(self, camera_stamp_ns: int, offset: float | None) -> None:
         """Publish the offset [s] of the camera's clock at a frame, where it is known."""

@@ -1,0 +1,131 @@
+"""Messages from their bytes, and bytes of messages."""
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import Imu
+
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros import convert, message_bytes
+
+
+def state(**other):
+    rng = np.random.default_rng(3)
+    T_map_body = se3.transform(se3.so3_exp(rng.standard_normal(3)), rng.standard_normal(3))
+    values = dict(zip(('velocity_body', 'angular_velocity_body'), rng.standard_normal((2, 3)), strict=True))
+    A, B = rng.standard_normal((2, 6, 6))
+    covariances = {'pose_covariance': A @ A.T, 'twist_covariance': B @ B.T}
+    return Odometry(
+        **{'stamp_ns': 1_700_000_000_123_456_789, 'T_map_body': T_map_body, **values, **covariances, **other}
+    )
+
+
+def sent(odometry, frame_id='map', child_frame_id='base_link'):
+    message = convert.odometry_frames(frame_id, child_frame_id)
+    convert.fill_odometry(message, odometry)
+    return message
+
+
+@pytest.mark.parametrize('length', range(9))
+def test_is_what_the_message_says(length):
+    """Names of any length, as what follows them is aligned."""
+    for names in (('m' * length, 'base_link'), ('map', 'b' * length)):
+        said, message = state(), serialize_message(sent(state(), *names))
+        read = message_bytes.odometry(message)
+        assert read.stamp_ns == said.stamp_ns == message_bytes.stamp_ns(message)
+        # A quaternion in between: the last digits of the rotation may differ.
+        np.testing.assert_allclose(read.T_map_body, said.T_map_body, atol=1e-15)
+        for name in ('velocity_body', 'angular_velocity_body', 'pose_covariance', 'twist_covariance'):
+            np.testing.assert_array_equal(getattr(read, name), getattr(said, name))
+
+
+@pytest.mark.parametrize('name', ['velocity_body', 'pose_covariance', 'twist_covariance'])
+def test_what_is_not_finite_is_refused(name):
+    broken = np.full_like(getattr(state(), name), np.nan)
+    with pytest.raises(InputError, match='finite'):
+        message_bytes.odometry(serialize_message(sent(state(**{name: broken}))))
+
+
+def test_what_is_no_quaternion_is_refused():
+    message = sent(state())
+    message.pose.pose.orientation.w += 0.7
+    with pytest.raises(InputError, match='quaternion'):
+        message_bytes.odometry(serialize_message(message))
+
+
+@pytest.mark.parametrize('name', ['pose_covariance', 'twist_covariance'])
+@pytest.mark.parametrize('covariance', [np.zeros((6, 6)), -np.eye(6), 1e30 * np.eye(6), np.ones((6, 6))])
+def test_what_is_no_covariance_is_refused(name, covariance):
+    with pytest.raises(InputError, match='odometry with a covariance'):
+        message_bytes.odometry(serialize_message(sent(state(**{name: covariance}))))
+
+
+@pytest.mark.parametrize('cut', [0, 3, 8, 20, 100, -8])
+def test_bytes_that_are_no_message_are_refused(cut):
+    message = serialize_message(sent(state()))
+    for broken in (message[:cut], b'\x00\x00' + message[2:]):
+        with pytest.raises(InputError, match='odometry of'):
+            message_bytes.odometry(broken)
+
+
+def test_names_of_impossible_length_are_refused():
+    message = bytearray(serialize_message(sent(state())))
+    message[12:16] = (2**32 - 1).to_bytes(4, 'little')
+    with pytest.raises(InputError, match='cut short'):
+        message_bytes.odometry(bytes(message))
+
+
+def test_names_of_kilobytes_are_not_kept():
+    with pytest.raises(InputError, match='bytes'):
+        message_bytes.stamp_ns(serialize_message(sent(state(), 'x' * 10_000)))
+
+
+@pytest.mark.parametrize('length', range(9))
+def test_bytes_of_a_state_are_those_of_its_messages(length):
+    for names in (('m' * length, 'base_link'), ('map', 'b' * length)):
+        written, message = message_bytes.StateBytes(*names), sent(state(), *names)
+        written.fill(state())
+        # As read again: what serialisation leaves between the fields is anything.
+        assert len(written.odometry) == len(serialize_message(message))
+        assert deserialize_message(written.odometry, type(message)) == message
+        pose = PoseWithCovarianceStamped(header=message.header, pose=message.pose)
+        assert len(written.pose) == len(serialize_message(pose))
+        assert deserialize_message(written.pose, PoseWithCovarianceStamped) == pose
+
+
+def imu_message(frame, **changes):
+    message = Imu(header=convert.header(1_700_000_000_123_456_789, frame))
+    message.angular_velocity = convert.vector(np.array([0.1, -0.2, 0.3]))
+    message.linear_acceleration = convert.vector(np.array([1.0, -2.0, 9.0]))
+    message.orientation.w = 0.5
+    for name, value in changes.items():
+        getattr(message, name)[0] = value
+    return message
+
+
+@pytest.mark.parametrize('frame', ['', 'imu', 'imu_link', 'robot_1/imu'])
+def test_an_imu_message_is_what_it_says(frame):
+    message = imu_message(frame)
+    read, said = message_bytes.imu_sample(serialize_message(message)), convert.imu_sample(message)
+    assert read.stamp_ns == said.stamp_ns
+    np.testing.assert_array_equal(read.angular_velocity, said.angular_velocity)
+    np.testing.assert_array_equal(read.linear_acceleration, said.linear_acceleration)
+    assert message_bytes.frame_id(serialize_message(message)) == frame
+
+
+@pytest.mark.parametrize('name', ['angular_velocity_covariance', 'linear_acceleration_covariance'])
+def test_an_imu_message_that_says_it_measures_nothing_is_refused(name):
+    with pytest.raises(InputError, match='without angular velocity'):
+        message_bytes.imu_sample(serialize_message(imu_message('imu', **{name: -1.0})))
+
+
+def test_an_imu_message_that_is_cut_short_is_refused():
+    whole = serialize_message(imu_message('imu_link'))
+    for length in range(0, len(whole), 7):
+        with pytest.raises(InputError):
+            message_bytes.imu_sample(whole[:length])
+    with pytest.raises(InputError, match='frame_id'):
+        message_bytes.frame_id(whole[:14])

@@ -1,0 +1,155 @@
+"""Messages at the rate of an IMU, read from their bytes and written as such: making messages of them takes longer.
+
+The encoding is that of ROS 2 (Object Management Group, "DDS Interoperability Wire Protocol", plain CDR,
+little-endian): four bytes that say so, then the fields one after the other, each aligned to its own size.
+"""
+
+import struct
+
+import numpy as np
+
+from thermal_fiducial.core.geometry.plausibility import checked_covariance
+from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
+from thermal_fiducial.core.measurements import ImuSample, Odometry
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files import records
+from thermal_fiducial.ros import convert
+
+_HEADER, _LITTLE_ENDIAN = 4, b'\x00\x01'
+_STAMP, _LENGTH, _NUMBERS = struct.Struct('<iI'), struct.Struct('<I'), np.dtype('<f8')
+#: Where the frames begin; all that comes before them is the stamp.
+BEHIND_STAMP = _HEADER + _STAMP.size
+# Position, quaternion, their covariance, then velocity, turn rate, their covariance.
+_POSE, _ODOMETRY = 7 + 36, 7 + 36 + 6 + 36
+# Orientation and its covariance, turn rate and its covariance, specific force and its covariance.
+_IMU = 4 + 9 + 3 + 9 + 3 + 9
+# Hundreds of messages are kept: numbers have 712 bytes, and nobody's frames have names of kilobytes.
+_LONGEST = 8192
+# Nothing that sees markers is faster [m/s, rad/s].
+_FASTEST = 1000.0
+
+
+def stamp_ns(message: bytes, what: str = 'odometry') -> int:
+    """Stamp of the header of a message, which is called ``what``.
+
+    Raises
+    ------
+    InputError
+        Of another encoding, too short or too long, or with a stamp that is none.
+    """
+    if len(message) > _LONGEST:
+        raise InputError(f'{what} of {len(message)} bytes')
+    if len(message) < BEHIND_STAMP or message[:2] != _LITTLE_ENDIAN:
+        raise InputError(f'{what} of an encoding that is not known')
+    return convert.checked_stamp(*_STAMP.unpack_from(message, _HEADER))
+
+
+def odometry(message: bytes) -> Odometry:
+    """State of the robot, for whoever can do without it.
+
+    Raises
+    ------
+    InputError
+        A value that is not finite or beyond the bounds, a quaternion or a covariance that is none.
+    """
+    stamp = stamp_ns(message)
+    numbers = _numbers(message, 2, _ODOMETRY, 'odometry').astype(np.float64)
+    twist = numbers[43:49]
+    if not np.abs(twist).max() < _FASTEST:
+        raise InputError('odometry with a twist that is not finite or beyond all bounds')
+    covariances = np.stack([numbers[7:43], numbers[49:]]).reshape(2, 6, 6)
+    covariances = checked_covariance(covariances, 'odometry with a covariance')
+    T_map_body = convert.transform_of_values(numbers[:7], 'odometry')
+    return Odometry(stamp, T_map_body, twist[:3], twist[3:], covariances[0], covariances[1])
+
+
+def imu_sample(message: bytes) -> ImuSample:
+    """One IMU measurement.
+
+    Raises
+    ------
+    InputError
+        As :func:`thermal_fiducial.files.records.imu_sample`, or an encoding that is not known.
+    """
+    stamp = stamp_ns(message, 'IMU message')
+    numbers = _numbers(message, 1, _IMU, 'IMU message').tolist()
+    return records.checked_imu_sample(
+        stamp, numbers[13:16], numbers[25:28], missing=numbers[16] == -1.0 or numbers[28] == -1.0
+    )
+
+
+def frame_id(message: bytes) -> str:
+    """The frame that the header of a message names.
+
+    Raises
+    ------
+    InputError
+        Cut short, or not UTF-8.
+    """
+    try:
+        length = int(_LENGTH.unpack_from(message, BEHIND_STAMP)[0])
+        begin = BEHIND_STAMP + _LENGTH.size
+        return message[begin : begin + length].rstrip(b'\x00').decode()
+    except (struct.error, UnicodeDecodeError):
+        raise InputError('message with a frame_id that cannot be read') from None
+
+
+def _numbers(message: bytes, names: int, count: int, what: str) -> FloatArray:
+    """``count`` numbers behind the stamp and so many ``names`` of frames."""
+    try:
+        place = BEHIND_STAMP
+        for _ in range(names):
+            place = _aligned(place, _LENGTH.size)
+            place += _LENGTH.size + int(_LENGTH.unpack_from(message, place)[0])
+        return np.frombuffer(message, _NUMBERS, count, _aligned(place, _NUMBERS.itemsize))
+    except (struct.error, ValueError):
+        raise InputError(f'{what} of {len(message)} bytes is cut short') from None
+
+
+def _aligned(place: int, size: int) -> int:
+    """The next place that is a multiple of a size, counted from behind the header."""
+    return place + -(place - _HEADER) % size
+
+
+class StateBytes:
+    """The robot's state as nav_msgs/Odometry and as geometry_msgs/PoseWithCovarianceStamped, in memory of its own."""
+
+    def __init__(self, frame: str, child_frame: str) -> None:
+        self._odometry, self._numbers = _blank((frame, child_frame), _ODOMETRY)
+        self._pose, self._pose_numbers = _blank((frame,), _POSE)
+
+    def fill(self, odometry: Odometry) -> None:
+        """Take over a state."""
+        numbers, stamp = self._numbers, divmod(int(odometry.stamp_ns), 1_000_000_000)
+        numbers[0:3] = odometry.T_map_body[:3, 3]
+        numbers[3:7] = quaternion_from_rotation(odometry.T_map_body[:3, :3])
+        numbers[7:43] = odometry.pose_covariance.ravel()
+        numbers[43:46] = odometry.velocity_body
+        numbers[46:49] = odometry.angular_velocity_body
+        numbers[49:] = odometry.twist_covariance.ravel()
+        self._pose_numbers[:] = numbers[:_POSE]
+        for message in (self._odometry, self._pose):
+            _STAMP.pack_into(message, _HEADER, *stamp)
+
+    @property
+    def odometry(self) -> bytes:
+        """The whole state."""
+        return bytes(self._odometry)
+
+    @property
+    def pose(self) -> bytes:
+        """Its pose."""
+        return bytes(self._pose)
+
+
+def _blank(frames: tuple[str, ...], count: int) -> tuple[bytearray, FloatArray]:
+    """A message with names of ``frames`` and ``count`` zeros, and a view of these."""
+    message = bytearray(_LITTLE_ENDIAN + bytes(BEHIND_STAMP - len(_LITTLE_ENDIAN)))
+    for frame in frames:
+        name = frame.encode() + b'\x00'
+        message += bytes(_aligned(len(message), _LENGTH.size) - len(message)) + _LENGTH.pack(len(name)) + name
+    message += bytes(_aligned(len(message), _NUMBERS.itemsize) - len(message))
+    begin = len(message)
+    message += bytes(count * _NUMBERS.itemsize)
+    return message, np.frombuffer(message, _NUMBERS, count, begin)
