@@ -242,10 +242,10 @@ def _image_rate() -> Any:
 
 def _realtime_priority() -> Any:
     text = (
-        'Priority of the nodes under SCHED_FIFO, where the user may (rtprio in limits.conf), that of the filter one '
-        'more; 0: ordinary processes.'
+        'Priority of the camera under SCHED_FIFO, where the user may (rtprio in limits.conf); detector, mapper and '
+        'filter have one, two and three more; 0: ordinary processes.'
     )
-    return param(1, text, minimum=0, maximum=98)
+    return param(1, text, minimum=0, maximum=96)
 
 
 def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:

@@ -28,6 +28,8 @@ _OPENCV = (4, 10)
 class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
     """Finds markers; with the map and the filter's odometry it looks where they must be."""
 
+    stage = 1
+
     def __init__(self, **kwargs: Any) -> None:
         _require_opencv()
         super().__init__('aruco_detector', ArucoDetectorConfig, **kwargs)

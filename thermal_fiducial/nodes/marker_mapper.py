@@ -18,6 +18,8 @@ from thermal_fiducial.ros.run import run
 class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
     """Algorithm 1 of the paper behind topics and services; saves the map on request and on shutdown."""
 
+    stage = 2
+
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('marker_mapper', MarkerMapperConfig, **kwargs)
         self._map = MapServices(self, self._publish_jump)

@@ -22,9 +22,10 @@ from thermal_fiducial.ros.run import run
 class PoseEkfNode(StageNode[PoseEkfConfig]):
     """The filter behind topics."""
 
+    stage = 3
+
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('pose_ekf', PoseEkfConfig, **kwargs)
-        self.realtime_priority += self.realtime_priority > 0  # a pose takes a millisecond, a frame tens of them
         self._memory = FilterMemory(self)
         self.filter = PoseEkf(self.config)
         self._status = FilterStatus(self.filter, self.console)

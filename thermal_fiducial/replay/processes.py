@@ -33,7 +33,7 @@ _SILENCE_S, _GLANCE_S = 1.5, 0.05
 #: With less time than this to the next message, nothing is written to disk before it.
 _SPARE_NS = 2_000_000
 #: What measures must not wait for what is measured: priority of the player, where the user may.
-_PRIORITY = 3
+_PRIORITY = 5
 #: Messages read ahead; a piece of a bag takes 25 ms to read.
 _AHEAD = 60
 _KINDS = {IMAGE_TOPIC: 'image', COMPRESSED_TOPIC: 'image', IMU_TOPIC: 'imu'}

@@ -49,6 +49,9 @@ class StageNode(CountingNode, Generic[Config]):
         A parameter that no node has, of the wrong type, out of range, or not among the choices.
     """
 
+    #: how many stages a frame has behind it when it comes here: what is nearly done goes before what begins
+    stage = 0
+
     def __init__(self, name: str, kind: type[Config], *, live: bool = True, **kwargs: Any) -> None:
         super().__init__(name, **kwargs)
         self.live = live
@@ -67,8 +70,9 @@ class StageNode(CountingNode, Generic[Config]):
             self.frame_prefix = f'{self.get_namespace()}/'.lstrip('/')
             frames = {name: getattr(self.config, name, '') for name in _ROBOT_FRAMES}
             self.derive(**{name: self.frame_prefix + frame for name, frame in frames.items() if frame})
+        asked = int(getattr(self.config, 'realtime_priority', 0))
         #: of its process under SCHED_FIFO; 0: ordinary
-        self.realtime_priority = int(getattr(self.config, 'realtime_priority', 0))
+        self.realtime_priority = asked + self.stage if asked else 0
         #: what was configured and cannot be used, in words; the node does without it
         self.faults: list[str] = []
         self.refused = 0
