@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import islice
 import math
 
 import numpy as np
@@ -15,23 +14,21 @@ from thermal_fiducial.core.filter.hypotheses import Hypotheses, NO_GRAVITY
 from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
 from thermal_fiducial.core.filter.initialization import FEWEST_SAMPLES, WINDOW_SECONDS
-from thermal_fiducial.core.filter.innovations import PoseUpdate
+from thermal_fiducial.core.filter.innovations import PoseLog, PoseUpdate
 from thermal_fiducial.core.filter.recovery import Hypothesis
 from thermal_fiducial.core.filter.smoothing import SmoothOutput
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
 from thermal_fiducial.core.filter.state_output import odometry
+from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
 
 _SECOND_NS = 1_000_000_000
 #: Why the filter begins anew, or a pose has to wait.
 CLOCK_JUMPED = "the IMU's clock has jumped"
 #: An offset known to this [s] moves a marker by a pixel or two in the fastest flights.
 _KNOWN_OFFSET_STD = 0.003
-#: Poses over which the normalised innovation squared is averaged for the diagnostics.
-_NIS_POSES = 30
-#: Verdicts on poses that are kept.
-_VERDICTS = 300
 
 
 class PoseEkf:
@@ -63,8 +60,7 @@ class PoseEkf:
         config = self._config
         self._noise = ImuNoiseMonitor(config.imu)
         self._history = History(self._hypotheses, config.max_delay + WINDOW_SECONDS, config.camera_time_offset)
-        self._verdicts: dict[int, PoseUpdate] = {}
-        self._accepted = self._refused = 0
+        self._log = PoseLog()
         self._imu_fault = ''
         self._smoother = SmoothOutput(config.smoothing_time) if config.smoothing_time > 0.0 else None
         #: the latest odometry without steps; None unless ``smoothing_time`` asks for it
@@ -116,7 +112,7 @@ class PoseEkf:
         self._history.insert(pose)
         self._take_in()
         waiting = PoseUpdate(pose.stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
-        return self._verdicts.get(pose.stamp_ns, waiting)
+        return self._log.latest.get(pose.stamp_ns, waiting)
 
     def _in_present_clock(self, pose: CameraPose) -> CameraPose:
         """``pose`` without the steps of the camera's clock, of which it may show another one."""
@@ -156,10 +152,12 @@ class PoseEkf:
 
     def _unusable(self, pose: CameraPose) -> str:
         """Why a pose cannot be used; empty if it can."""
-        if not (np.isfinite(pose.T_map_camera).all() and np.isfinite(pose.covariance).all()):
+        if not np.isfinite(pose.T_map_camera).all():
             return 'refused: not finite'
-        if not _is_covariance(pose.covariance):
-            return 'refused: covariance is not positive definite'
+        try:
+            checked_covariance(pose.covariance, 'covariance')
+        except InputError as error:
+            return f'refused: {error}'
         history, imu = self._history, self._history.imu
         if not imu:
             return 'refused: no IMU yet'
@@ -173,16 +171,7 @@ class PoseEkf:
 
     def _take_in(self) -> None:
         for update in self._history.take_in():
-            self._decide(update)
-
-    def _decide(self, update: PoseUpdate) -> None:
-        known = self._verdicts.pop(update.stamp_ns, None)
-        if known is None:
-            self._accepted += update.accepted
-            self._refused += update.refused
-        self._verdicts[update.stamp_ns] = update
-        while len(self._verdicts) > _VERDICTS:
-            del self._verdicts[next(iter(self._verdicts))]
+            self._log.add(update)
 
     # --- output ---------------------------------------------------------------------------------------
 
@@ -204,7 +193,7 @@ class PoseEkf:
     @property
     def decided(self) -> Mapping[int, PoseUpdate]:
         """Stamp of the camera to the latest verdict on its pose, for the latest poses."""
-        return self._verdicts
+        return self._log.latest
 
     @property
     def state(self) -> NavigationState | None:
@@ -263,7 +252,7 @@ class PoseEkf:
         return f'coasting for {coasting:.1f} s' if coasting > 0.5 else 'tracking'
 
     def _why_waiting(self) -> str:
-        latest = next(reversed(self._verdicts.values()), None)
+        latest = next(reversed(self._log.latest.values()), None)
         if latest is None or latest.reason != NO_GRAVITY:
             return 'waiting for markers'
         force = self._history.imu.imu[-FEWEST_SAMPLES:, 3:].mean(axis=0)
@@ -290,20 +279,14 @@ class PoseEkf:
         estimate = self._hypotheses.estimate(main)
         return usable_seconds(estimate, self._history.imu.last_densities, self._config.lost_position_std)
 
-    def _mean_nis(self) -> float:
-        """Of the latest accepted poses, per degree of freedom: 1 is consistent, less is cautious."""
-        latest = islice(reversed(self._verdicts.values()), _NIS_POSES)
-        values = [update.nis / 6.0 for update in latest if update.accepted and not math.isnan(update.nis)]
-        return float(np.mean(values or math.nan))
-
     def diagnostics(self) -> dict[str, float]:
         """How the filter is, in numbers (SI units)."""
         rate, force = self._noise.vibration
         numbers = {
-            'poses accepted': float(self._accepted),
-            'poses refused': float(self._refused),
+            'poses accepted': float(self._log.accepted),
+            'poses refused': float(self._log.refused),
             'IMU samples refused': float(self._imu_refused),
-            'NIS per d.o.f.': self._mean_nis(),
+            'NIS per d.o.f.': self._log.mean_nis(),
             'vibration rad/s/sqrt(Hz)': rate,
             'vibration m/s^2/sqrt(Hz)': force,
         }
@@ -328,10 +311,3 @@ class PoseEkf:
             'accelerometer scale error': float(np.abs(state.scale[1]).max()),
             'map tilt': math.asin(float(np.hypot(*state.gravity[:2])) / self._config.gravity),
         }
-
-
-def _is_covariance(matrix: FloatArray) -> bool:
-    """Whether (6, 6) is symmetric, up to rounding, and positive definite."""
-    if (np.abs(matrix - matrix.T) > 1e-12 + 1e-6 * np.abs(matrix)).any():
-        return False
-    return bool(np.linalg.eigvalsh(matrix)[0] > 0.0)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import islice
 import math
 import re
 
@@ -11,6 +12,8 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 #: Name of that line among the filter's figures.
 INNOVATIONS = 'innovations'
+#: Verdicts that are kept, and poses over which the normalised innovation squared is averaged for the diagnostics.
+_KEPT, _NIS_POSES = 300, 30
 _REFUSED = '!'
 _ONE = re.compile(rf'(\d+):([\d.e+-]+)({_REFUSED}?)')
 
@@ -34,6 +37,31 @@ class PoseUpdate:
     def refused(self) -> bool:
         """Whether it was compared with the estimate and found beyond the gate."""
         return not self.accepted and not math.isnan(self.nis)
+
+
+class PoseLog:
+    """The latest verdicts, in the order in which they were spoken, and how many there were."""
+
+    def __init__(self) -> None:
+        #: stamp of the camera to the latest verdict on its pose
+        self.latest: dict[int, PoseUpdate] = {}
+        self.accepted = self.refused = 0
+
+    def add(self, update: PoseUpdate) -> None:
+        """Take note of a verdict; a pose that is weighed again, as another one came late, counts once."""
+        known = self.latest.pop(update.stamp_ns, None)
+        if known is None:
+            self.accepted += update.accepted
+            self.refused += update.refused
+        self.latest[update.stamp_ns] = update
+        if len(self.latest) > _KEPT:
+            del self.latest[next(iter(self.latest))]
+
+    def mean_nis(self) -> float:
+        """Of the latest accepted poses, per degree of freedom: 1 is consistent, less is cautious; NaN before any."""
+        latest = islice(reversed(self.latest.values()), _NIS_POSES)
+        values = [update.nis / 6.0 for update in latest if update.accepted and not math.isnan(update.nis)]
+        return float(np.mean(values or math.nan))
 
 
 @dataclass(frozen=True)

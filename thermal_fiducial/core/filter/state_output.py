@@ -13,6 +13,8 @@ from thermal_fiducial.core.types import FloatArray
 _AT_REST = np.zeros((12, 12))
 _AT_REST[6:9, VELOCITY] = np.eye(3)
 _AT_REST[9:, 9:] = -np.eye(3)
+#: Places of the rate's variances in such a matrix, row by row.
+_RATE_VARIANCES = slice(9 * 13, None, 13)
 
 
 def odometry(
@@ -37,13 +39,12 @@ def odometry(
     J[0:3, POSITION] = J[3:6, ROTATION] = R
     J[6:9, ROTATION] = (velocity_body @ SKEW).reshape(3, 3)
     covariance = J @ joint @ J.T
-    twist_covariance = covariance[6:, 6:]
-    twist_covariance[(3, 4, 5), (3, 4, 5)] += rate_variance
+    covariance.reshape(-1)[_RATE_VARIANCES] += rate_variance
     return Odometry(
         prediction.stamp_ns,
         state.T_map_body,
         velocity_body,
         state.corrected(imu)[:3],
         covariance[:6, :6],
-        twist_covariance,
+        covariance[6:, 6:],
     )
