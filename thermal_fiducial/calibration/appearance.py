@@ -1,24 +1,26 @@
-"""What boards look like around one of their points, in steps of their grid."""
+"""What boards look like around their points, in steps of their grid."""
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from scipy.special import ndtr
 
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, IntArray
 
 # Least reach of a window [px].
 _LEAST_REACH = 2.7
 # Ground beside a disc that its window shows [px].
 _GROUND = 4.0
 _MOST_INSET = 0.3
-# A blurred edge is over after so many standard deviations.
-_TAIL = 3.0
+# A blurred edge is over after so many standard deviations, for a window's size, and as good as nothing is left of it.
+_TAIL, _NOTHING_LEFT = 3.0, 5.0
+# Where a disc has fewer neighbours than another: none is seen from so far [steps].
+_NOWHERE = 1e3
 
 
 class Appearance(Protocol):
-    """A pattern around a point, between two levels."""
+    """A pattern around each of P points, between two levels."""
 
     @property
     def bent(self) -> bool:
@@ -33,17 +35,29 @@ class Appearance(Protocol):
         """Whether ``width`` is to be found."""
 
     @property
-    def least_seen(self) -> float:
+    def least_visible(self) -> float:
         """Share of its window that must lie in the image."""
 
-    def at(self, node: FloatArray, board: FloatArray) -> 'Appearance':
-        """What it looks like at ``node`` (2,) among the nodes (N, 2) of a board."""
+    def at(self, nodes: FloatArray, board: FloatArray) -> Self:
+        """What it looks like at ``nodes`` (P, 2) among the nodes (N, 2) of a board."""
 
-    def reach(self, spacing: float, blur: float | None) -> float:
-        """How far [steps] a window reaches where points are ``spacing`` [px] apart; blur [px] where it is known."""
+    def rows(self, index: IntArray) -> Self:
+        """What it looks like at some of the points."""
 
-    def shape(self, place: FloatArray, blur: FloatArray, width: float) -> FloatArray:
-        """Pattern (N,) at places (N, 2) relative to the point, blurred by ``blur`` (2,) along the axes [steps]."""
+    def reach(self, spacing: FloatArray, blur: FloatArray | None) -> FloatArray:
+        """How far (P,) [steps] windows reach where points are ``spacing`` (P,) [px] apart; blur (P,) [px] if known."""
+
+    def shape(
+        self, places: FloatArray, blur: FloatArray, width: FloatArray, free: int
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pattern (P, N) at places (P, N, 2) relative to the points, and its derivatives (free, P, N).
+
+        Parameters
+        ----------
+        blur : (P, 2) along the axes [steps]
+        width : (P,)
+        free : derivatives are by the place (2), the logarithm of the blur and the width: the first so many of them
+        """
 
 
 @dataclass(frozen=True)
@@ -55,32 +69,73 @@ class SquaresMeet:
 
     Parameters
     ----------
-    parity : -1 where the squares are the other way round
+    parity : (P,) -1 where the squares are the other way round
     """
 
-    parity: float = 1.0
+    parity: FloatArray = field(default_factory=lambda: np.ones(1))
     bent = True
     width = 0.0
     width_free = True
-    least_seen = 0.5
+    least_visible = 0.5
 
-    def at(self, node: FloatArray, board: FloatArray) -> 'SquaresMeet':
+    def at(self, nodes: FloatArray, board: FloatArray) -> 'SquaresMeet':
         """See :class:`Appearance`."""
-        return SquaresMeet(1.0 - 2.0 * float(np.sum(node) % 2))
+        return SquaresMeet(1.0 - 2.0 * (nodes.sum(axis=1) % 2))
 
-    def reach(self, spacing: float, blur: float | None) -> float:
+    def rows(self, index: IntArray) -> 'SquaresMeet':
         """See :class:`Appearance`."""
-        return max(0.45, _LEAST_REACH / spacing)
+        return SquaresMeet(self.parity[index])
 
-    def shape(self, place: FloatArray, blur: FloatArray, width: float) -> FloatArray:
+    def reach(self, spacing: FloatArray, blur: FloatArray | None) -> FloatArray:
+        """See :class:`Appearance`."""
+        return np.maximum(0.45, _LEAST_REACH / spacing)
+
+    def shape(
+        self, places: FloatArray, blur: FloatArray, width: FloatArray, free: int
+    ) -> tuple[FloatArray, FloatArray]:
         """See :class:`Appearance`; where ``width`` is negative, the squares of the other colour draw back."""
-        sign = 1.0 if width >= 0.0 else -1.0
-        inset = min(abs(width), _MOST_INSET)
-        x, y = place[:, 0] / blur[0], sign * self.parity * place[:, 1] / blur[1]
-        (near_x, near_y), (far_x, far_y) = inset / blur, (1.0 - inset) / blur
-        ahead = (ndtr(x - near_x) - ndtr(x - far_x)) * (ndtr(y - near_y) - ndtr(y - far_y))
-        behind = (ndtr(-x - near_x) - ndtr(-x - far_x)) * (ndtr(-y - near_y) - ndtr(-y - far_y))
-        return np.asarray(sign * (2.0 * (ahead + behind) - 1.0))
+        sign = np.where(width >= 0.0, 1.0, -1.0)
+        inset = np.minimum(np.abs(width), _MOST_INSET)
+        turned = sign * self.parity
+        along = _bands(places[..., 0], inset, blur[:, 0], free)
+        across = _bands(places[..., 1] * turned[:, None], inset, blur[:, 1], free)
+        scale = (2.0 * sign)[:, None]
+        values = scale * (along[0] * across[0]).sum(axis=0) - sign[:, None]
+        # By place, each along its own axis; by blur and width, which both axes have in common.
+        slopes = [scale * (along[1] * across[0]).sum(axis=0)]
+        slopes.append((scale * turned[:, None]) * (along[0] * across[1]).sum(axis=0))
+        for number in range(2, free):
+            slopes.append(scale * (along[number] * across[0] + along[0] * across[number]).sum(axis=0))
+        if free > 3:
+            slopes[3] *= (sign * (np.abs(width) < _MOST_INSET))[:, None]
+        return values, np.stack(slopes)
+
+
+def _bands(places: FloatArray, inset: FloatArray, blur: FloatArray, free: int) -> FloatArray:
+    """Blurred bands ahead of a line and behind it, at ``places`` (P, N) beside it [steps]: (4, 2, P, N).
+
+    The bands, then their derivatives by the place, the logarithm of the blur and the inset, the last two where
+    ``free`` is more than 2.
+    """
+    value, by_place, by_log_blur, by_inset = bands = np.zeros((4, 2, *places.shape))
+    to_far = (1.0 - inset - np.abs(places).max(axis=1)) / blur
+    for side, sign in enumerate((1.0, -1.0)):
+        for end, line in ((1.0, inset), (-1.0, 1.0 - inset)):
+            if end < 0.0 and to_far.min() > _NOTHING_LEFT:
+                continue
+            beyond = (sign * places - line[:, None]) / blur[:, None]
+            value[side] += end * ndtr(beyond)
+            density = _density(beyond)
+            by_place[side] += density * (end * sign / blur)[:, None]
+            if free > 2:
+                by_log_blur[side] -= end * beyond * density
+                by_inset[side] -= density / blur[:, None]
+    return bands
+
+
+def _density(x: FloatArray) -> FloatArray:
+    """Density of the standard normal distribution."""
+    return np.asarray(np.exp(-0.5 * x * x) * (1.0 / np.sqrt(2.0 * np.pi)))
 
 
 @dataclass(frozen=True)
@@ -90,36 +145,75 @@ class Disc:
     Parameters
     ----------
     width : radius [steps]
-    others : (K, 2) where its neighbours are, relative to it [steps]: blurred they reach into its window
+    others : (P, K, 2) where its neighbours are, relative to it [steps]: blurred they reach into its window
     """
 
     width: float
-    others: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    others: FloatArray = field(default_factory=lambda: np.zeros((1, 0, 2)))
     bent = False
     width_free = False
     #: the whole disc: a part of it does not show its middle
-    least_seen = 0.9
+    least_visible = 0.9
 
-    def at(self, node: FloatArray, board: FloatArray) -> 'Disc':
+    def at(self, nodes: FloatArray, board: FloatArray) -> 'Disc':
+        """See :class:`Appearance`; the nearest neighbours come first."""
+        away = board - nodes[:, None]
+        distance = np.where(np.abs(away).max(axis=-1) == 1.0, np.hypot(away[..., 0], away[..., 1]), _NOWHERE)
+        order = np.argsort(distance, axis=1, kind='stable')[:, :8]
+        near = np.take_along_axis(distance, order, 1)[..., None] < _NOWHERE
+        return Disc(self.width, np.where(near, np.take_along_axis(away, order[..., None], 1), _NOWHERE))
+
+    def rows(self, index: IntArray) -> 'Disc':
         """See :class:`Appearance`."""
-        away = board - node
-        near = np.max(np.abs(away), axis=1) == 1.0
-        return Disc(self.width, away[near])
+        return Disc(self.width, self.others[index])
 
-    def reach(self, spacing: float, blur: float | None) -> float:
+    def reach(self, spacing: FloatArray, blur: FloatArray | None) -> FloatArray:
         """See :class:`Appearance`; the next disc stays outside, but for its blur."""
         most = 1.0 - self.width - 1.0 / spacing
-        enough = 2.0 * self.width + 1.0 / spacing if blur is None else self.width + max(_GROUND, _TAIL * blur) / spacing
-        return max(min(enough, most), _LEAST_REACH / spacing)
+        if blur is None:
+            enough = 2.0 * self.width + 1.0 / spacing
+        else:
+            enough = self.width + np.maximum(_GROUND, _TAIL * blur) / spacing
+        return np.maximum(np.minimum(enough, most), _LEAST_REACH / spacing)
 
-    def shape(self, place: FloatArray, blur: FloatArray, width: float) -> FloatArray:
+    def shape(
+        self, places: FloatArray, blur: FloatArray, width: FloatArray, free: int
+    ) -> tuple[FloatArray, FloatArray]:
         """See :class:`Appearance`."""
-        # Farther than this, nothing of a neighbour is seen.
-        seen = np.abs(place).max() + width + _TAIL * float(blur.max())
-        near = self.others[np.hypot(self.others[:, 0], self.others[:, 1]) < seen]
-        # A row a disc: sums run over long rows then, many times faster than over short ones.
-        x = np.concatenate([place[None, :, 0], place[:, 0] - near[:, :1]])
-        y = np.concatenate([place[None, :, 1], place[:, 1] - near[:, 1:]])
-        radius = np.sqrt(x * x + y * y) + 1e-9
-        across = radius / np.maximum(np.sqrt((x / blur[0]) ** 2 + (y / blur[1]) ** 2), 1e-9)
-        return np.asarray(ndtr((width - radius) / across).sum(axis=0))
+        values, slopes = _disc(places, blur[:, None], width[:, None], free)
+        visible = width + _NOTHING_LEFT * blur.max(axis=1)
+        # Neighbours are a step away or more: pixels near the middle see nothing of them.
+        from_middle = np.hypot(places[..., 0], places[..., 1])
+        point, pixel = np.nonzero(from_middle > (1.0 - visible)[:, None])
+        away = places[point, pixel][:, None] - self.others[point]
+        row, neighbour = np.nonzero(np.hypot(away[..., 0], away[..., 1]) < visible[point][:, None])
+        point, pixel = point[row], pixel[row]
+        more, more_slopes = _disc(away[row, neighbour], blur[point], width[point], free)
+        for total, part in zip((values, *slopes), (more, *more_slopes), strict=True):
+            total += np.bincount(point * total.shape[1] + pixel, part, total.size).reshape(total.shape)
+        return values, slopes
+
+
+def _disc(places: FloatArray, blur: FloatArray, width: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
+    """Disc (...) at places (..., 2) relative to its middle, and its derivatives as of :class:`Appearance`.
+
+    Parameters
+    ----------
+    blur : (..., 2)
+    width : (...) radius
+    """
+    x, y = places[..., 0], places[..., 1]
+    x_blur, y_blur = x / blur[..., 0] ** 2, y / blur[..., 1] ** 2
+    radius = np.sqrt(x * x + y * y) + 1e-9
+    # Distance from the middle in blurs of the direction, and distance from the edge in the same.
+    steps = np.sqrt(x * x_blur + y * y_blur) + 1e-9
+    outwards = width / radius - 1.0
+    inside = outwards * steps
+    density = _density(inside)
+    by_blur, by_radius = outwards / steps * density, width * steps / radius**3 * density
+    slopes = np.empty((free, *x.shape))
+    slopes[0] = x_blur * by_blur - x * by_radius
+    slopes[1] = y_blur * by_blur - y * by_radius
+    if free > 2:
+        slopes[2] = -inside * density
+    return np.asarray(ndtr(inside)), slopes

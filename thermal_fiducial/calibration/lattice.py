@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from thermal_fiducial.calibration.keypoints import Keypoints
 from thermal_fiducial.calibration.placement import BoardNodes, GridRefusal
-from thermal_fiducial.calibration.surface import local_surface, REACH
+from thermal_fiducial.calibration.surface import local_surfaces, REACH
 from thermal_fiducial.core.types import FloatArray, IntArray
 
 #: Place in a grid, (along its first axis, along its second).
@@ -126,34 +126,36 @@ class Grower:
         return grid
 
     def _add(self, grid: dict[Node, int], reach: int, asked: dict[Node, int], off: list[float]) -> bool:
-        """Add the points ``reach`` steps from the grid; whether there were any.
+        """Add the points ``reach`` steps from the grid, all expected from what it is before; whether there were any.
 
         Parameters
         ----------
         asked : support of each place that was looked at before: with the same the answer is the same
         off : how far each point that was added lay from where it was expected [steps]
         """
+        places = [node for node in _beside(grid, reach) if asked.get(node) != len(_support(grid, node))]
+        if not places:
+            return False
+        asked.update((node, len(_support(grid, node))) for node in places)
+        nodes, pixels = np.array(list(grid), dtype=np.float64), self._pixels[list(grid.values())]
+        surfaces = local_surfaces(nodes, pixels, np.array(places, dtype=np.float64))
         before = len(grid)
-        for node in {n: None for known in grid for n in _around(known, reach) if n not in grid}:
-            support = _support(grid, node)
-            if asked.get(node) == len(support):
-                continue
-            asked[node] = len(support)
-            found = self._next(grid, node, support)
+        for row in np.flatnonzero(surfaces.determined).tolist():
+            found = self._next(grid, places[row], surfaces.centres[row], surfaces.steps[row])
             if found is not None:
-                grid[node] = found[0]
+                grid[places[row]] = found[0]
                 off.append(found[1])
         return len(grid) > before
 
-    def _next(self, grid: dict[Node, int], node: Node, support: list[Node]) -> tuple[int, float] | None:
-        """Keypoint at ``node`` and how far it is off [steps], predicted from the nodes of ``support``."""
-        pixels = self._pixels[[grid[n] for n in support]]
-        surface = local_surface(np.array(support, dtype=np.float64), pixels, np.array(node, dtype=np.float64))
-        if surface is None:
+    def _next(
+        self, grid: dict[Node, int], node: Node, centre: FloatArray, steps: FloatArray
+    ) -> tuple[int, float] | None:
+        """Keypoint at ``node``, expected at ``centre`` with ``steps`` to the next, and how far it is off [steps]."""
+        radius = _TOLERANCE * float(np.linalg.norm(steps, axis=0).max())
+        nearby = self._tree.query_ball_point(centre, radius)
+        if not nearby:
             return None
-        radius = _TOLERANCE * float(np.linalg.norm(surface.steps, axis=0).max())
-        nearby = self._tree.query_ball_point(surface.centre, radius)
-        off = np.linalg.norm(np.linalg.solve(surface.steps, (self._pixels[nearby] - surface.centre).T), axis=0)
+        off = np.linalg.norm(np.linalg.solve(steps, (self._pixels[nearby] - centre).T), axis=0)
         used = set(grid.values())
         for away, index in sorted(zip(off.tolist(), nearby, strict=True)):
             if away <= _TOLERANCE and index not in used and self._fits(grid, node, index):
@@ -170,6 +172,11 @@ class Grower:
 def _around(node: Node, reach: int) -> list[Node]:
     a, b = node
     return [(a + reach, b), (a - reach, b), (a, b + reach), (a, b - reach)]
+
+
+def _beside(grid: dict[Node, int], reach: int) -> list[Node]:
+    """Places ``reach`` steps from a point of the grid that have none, each once."""
+    return list({node: None for known in grid for node in _around(known, reach) if node not in grid})
 
 
 def _support(grid: dict[Node, int], node: Node) -> list[Node]:

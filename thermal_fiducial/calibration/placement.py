@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import correlate2d
+from scipy.signal import correlate
 
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
@@ -98,7 +98,7 @@ class BoardNodes:
     def _overlaps(self, grid: IntArray) -> list[FloatArray]:
         """Points that each view of the board has in common with a grid, for each shift."""
         occupied = _occupancy(grid)
-        return [correlate2d(occupied, _occupancy(view.nodes(self._outline))) for view in self._views]
+        return [np.rint(correlate(occupied, _occupancy(view.nodes(self._outline)))) for view in self._views]
 
 
 def goes_on(beyond: int) -> str:

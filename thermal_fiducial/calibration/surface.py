@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 # How far the points that predict another one lie away from it, in steps of the grid.
 REACH = 3
@@ -14,55 +14,68 @@ ROUGHLY, CLOSELY = 0.03, 0.00001
 
 
 @dataclass(frozen=True)
-class Surface:
-    """A grid around one of its nodes: pixel = centre + steps n + bend t(n), t its second and third powers.
+class Surfaces:
+    """A grid around each of P places in it: pixel = centre + steps n + bend t(n), t its second and third powers.
 
     Parameters
     ----------
-    centre : (2,) pixel of the node
-    steps : (2, 2) to the next nodes along the two axes, by columns [px]
-    bend : (2, 7) [px]
+    determined : (P,) whether the points around a place determine its surface
+    centres : (P, 2) pixel of each place
+    steps : (P, 2, 2) to the next nodes along the two axes, by columns [px]
+    bends : (P, 2, 7) [px]
     """
 
-    centre: FloatArray
+    determined: BoolArray
+    centres: FloatArray
     steps: FloatArray
-    bend: FloatArray
+    bends: FloatArray
 
-    def place(self, offset: FloatArray) -> FloatArray:
-        """Places (N, 2) in the grid, relative to the node, of offsets (N, 2) in the image [px]."""
-        inverse = np.linalg.inv(self.steps)
-        place = offset @ inverse.T
+    def rows(self, index: IntArray) -> 'Surfaces':
+        """Some of them."""
+        return Surfaces(self.determined[index], self.centres[index], self.steps[index], self.bends[index])
+
+    def places(self, offsets: FloatArray) -> FloatArray:
+        """Places (P, N, 2) in the grid, relative to each place, of offsets (P, N, 2) in the image [px]."""
+        inverse = np.linalg.inv(self.steps).swapaxes(-1, -2)
+        bends = self.bends.swapaxes(-1, -2)
+        places = offsets @ inverse
         for _ in range(2):
-            bent = _bends(place) @ self.bend.T
-            place = (offset - bent) @ inverse.T
-        return np.asarray(place)
+            places = (offsets - _terms(places)[..., 3:] @ bends) @ inverse
+        return np.asarray(places)
 
 
-def _bends(place: FloatArray) -> FloatArray:
-    """Terms (N, 7) of second and third order."""
-    a, b = place.T
-    return np.column_stack([a * a, a * b, b * b, a**3, a * a * b, a * b * b, b**3])
+def _terms(away: FloatArray) -> FloatArray:
+    """Terms (..., 10) of orders zero to three of places (..., 2)."""
+    a, b = away[..., 0], away[..., 1]
+    aa, bb = a * a, b * b
+    terms = np.empty((*a.shape, 10))
+    for column, term in enumerate((1.0, a, b, aa, a * b, bb, aa * a, aa * b, a * bb, bb * b)):
+        terms[..., column] = term
+    return terms
 
 
-def local_surface(nodes: FloatArray, pixels: FloatArray, node: FloatArray, ridge: float = ROUGHLY) -> Surface | None:
-    """Surface around ``node`` through points (N, 2) near it, the nearer the closer; None where they don't say.
+def local_surfaces(nodes: FloatArray, pixels: FloatArray, places: FloatArray, ridge: float = ROUGHLY) -> Surfaces:
+    """Surfaces around ``places`` (P, 2) through points near them, the nearer the closer.
 
     Parameters
     ----------
-    nodes, pixels : (N, 2) of the grid; those farther than :data:`REACH` do not count
+    nodes, pixels : (N, 2) of the grid; those farther than :data:`REACH` from a place do not count there
     ridge : :data:`ROUGHLY` or :data:`CLOSELY`
     """
-    away = nodes - node
-    near = np.max(np.abs(away), axis=1) <= REACH
-    a, b = away[near].T
-    weight = 1.0 / (1.0 + a * a + b * b) ** 2
-    design = np.column_stack([np.ones_like(a), a, b, _bends(away[near])]) * weight[:, None]
-    normal = design.T @ design
-    if len(a) < 3 or np.linalg.det(normal[:3, :3]) < 1e-4 * normal[0, 0] ** 3:
-        return None
-    normal[range(3, 10), range(3, 10)] += ridge * weight.max() ** 2
-    surface = np.linalg.solve(normal, design.T @ (pixels[near] * weight[:, None]))
-    steps = surface[1:3].T
-    if abs(np.linalg.det(steps)) < 1.0:
-        return None
-    return Surface(surface[0], steps, surface[3:].T)
+    away = nodes - places[:, None]
+    along, across = away[..., 0], away[..., 1]
+    near = np.maximum(np.abs(along), np.abs(across)) <= REACH
+    weight = near / (1.0 + along * along + across * across) ** 2
+    weighted = _terms(away) * weight[..., None]
+    transposed = weighted.swapaxes(-1, -2)
+    normal = transposed @ weighted
+    plane = np.linalg.det(normal[:, :3, :3])
+    determined = (near.sum(axis=1) >= 3) & (plane >= 1e-4 * normal[:, 0, 0] ** 3)
+    curved = np.arange(3, 10)
+    normal[:, curved, curved] += ridge * weight.max(axis=1, initial=0.0)[:, None] ** 2
+    normal[~determined] = np.eye(10)
+    solution = np.linalg.solve(normal, transposed @ (pixels * weight[..., None]))
+    surface: FloatArray = np.asarray(solution.swapaxes(-1, -2), dtype=np.float64)
+    steps = surface[..., 1:3]
+    determined &= np.abs(np.linalg.det(steps)) >= 1.0
+    return Surfaces(determined, surface[..., 0], steps, surface[..., 3:])

@@ -1,0 +1,157 @@
+"""Pixels around the points of a board, with the ground they lie on taken out."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from thermal_fiducial.calibration.appearance import Appearance
+from thermal_fiducial.calibration.surface import Surfaces
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+
+# Points closer than this [px] are too close to give sub-pixel points.
+_LEAST_SPACING = 5.0
+_LEAST_PIXELS = 12
+# Bounds of the blur [px].
+_BLUR_BOUNDS = (0.2, 60.0)
+# Where contrast reverses, at this share of the neighbours' or less, nothing shows where the point is.
+_LEAST_CONTRAST = 0.25
+# Nodes whose contrast shows that of another, in steps, how many of them, and how firmly the slope is held down.
+_NEAR, _LEAST_NEIGHBOURS, _SLOPE_RIDGE = 2, 4, 0.1
+
+
+@dataclass(frozen=True)
+class PointWindows:
+    """Pixels around P points, in rows of N; rows with fewer are filled up with pixels of no weight.
+
+    Parameters
+    ----------
+    appearance : of each point
+    index : (P,) which points they are
+    starts : (P, 2) [px]
+    places : (P, N, 2) on the board, relative to ``starts`` [steps]
+    counts : (P, N) times their weight, what the ground explains taken out
+    weight : (P, N)
+    ground : (P, N, 3) orthonormal: what level and slope explain
+    inverse : (P, 2, 2) steps of the grid by pixels
+    scale : (P, 2) steps along the axes in a pixel
+    expected : (P, N) contrast that the neighbours lead one to expect, or 1 everywhere
+    """
+
+    appearance: Appearance
+    index: IntArray
+    starts: FloatArray
+    places: FloatArray
+    counts: FloatArray
+    weight: FloatArray
+    ground: FloatArray
+    inverse: FloatArray
+    scale: FloatArray
+    expected: FloatArray
+
+    def rows(self, index: IntArray) -> 'PointWindows':
+        """Those of some of the points."""
+        parts = {name: values[index] for name, values in vars(self).items() if name != 'appearance'}
+        return PointWindows(self.appearance.rows(index), **parts)
+
+    def pattern(self, parameters: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
+        """Pattern (P, N) above ground, weighted, and its derivatives (P, N, free) by the first parameters.
+
+        Parameters
+        ----------
+        parameters : (P, 4) offset of the point [px], logarithm of the blur [px], width [steps]
+        """
+        places = self.places - (self.inverse @ parameters[:, :2, None]).swapaxes(1, 2)
+        log_blur = parameters[:, 2, None]
+        low, high = np.log(_BLUR_BOUNDS)
+        blur = np.exp(np.clip(log_blur, low, high)) * self.scale
+        values, slopes = self.appearance.shape(places, blur, parameters[:, 3], free)
+        slopes[2:3] *= (low < log_blur) & (log_blur < high)
+        columns = np.empty((*values.shape, 1 + free))
+        columns[..., 0] = values
+        for pixel_axis in range(2):
+            towards = self.inverse[:, :, pixel_axis, None]
+            columns[..., 1 + pixel_axis] = -slopes[0] * towards[:, 0] - slopes[1] * towards[:, 1]
+        columns[..., 3:] = np.moveaxis(slopes[2:], 0, -1)
+        columns *= (self.weight * self.expected)[..., None]
+        columns -= self.ground @ (self.ground.swapaxes(1, 2) @ columns)
+        return columns[..., 0], columns[..., 1:]
+
+
+def windows_around(
+    image: Float32Array, starts: FloatArray, surfaces: Surfaces, appearance: Appearance, blur: FloatArray | None
+) -> PointWindows:
+    """Pixels within the reach of the pattern, with weights that fall towards the border; of points that have enough.
+
+    Parameters
+    ----------
+    starts : (P, 2) [px]
+    blur : (P,) [px] where it is known
+    """
+    spacing = np.linalg.norm(surfaces.steps, axis=1).min(axis=1)
+    index = np.flatnonzero(surfaces.determined & (spacing >= _LEAST_SPACING))
+    starts, surfaces, appearance = starts[index], surfaces.rows(index), appearance.rows(index)
+    reach = appearance.reach(spacing[index], None if blur is None else blur[index])
+    inverse: FloatArray = np.asarray(np.linalg.inv(surfaces.steps), dtype=np.float64)
+    pixels, in_box = _box(image, starts, 1.2 * reach[:, None] * np.abs(surfaces.steps).sum(axis=2))
+    offsets = pixels - starts[:, None]
+    places = surfaces.places(offsets) if appearance.bent else offsets @ inverse.swapaxes(1, 2)
+    away = (places[..., 0] ** 2 + places[..., 1] ** 2) / (reach * reach)[:, None]
+    inside = in_box & (away < 1.0)
+    whole = np.pi * reach**2 * np.abs(np.linalg.det(surfaces.steps))
+    count = inside.sum(axis=1)
+    enough = np.flatnonzero(count >= np.maximum(_LEAST_PIXELS, appearance.least_visible * whole))
+    # Pixels of the window first, in their order.
+    order = np.argsort(~inside[enough], axis=1, kind='stable')[:, : count[enough].max(initial=0)]
+    weight = np.sqrt(np.where(inside, 1.0 - away, 0.0))[enough[:, None], order]
+    offsets, places, pixels = (values[enough[:, None], order] for values in (offsets, places, pixels))
+    v, u = np.where(weight[..., None] > 0.0, pixels, 0.0)[..., ::-1].astype(np.int64).transpose(2, 0, 1)
+    counts = image[v, u].astype(np.float64) * weight
+    ground = np.linalg.qr(np.concatenate([np.ones_like(offsets[..., :1]), offsets], axis=2) * weight[..., None])[0]
+    counts -= (ground @ (ground.swapaxes(1, 2) @ counts[..., None]))[..., 0]
+    return PointWindows(
+        appearance=appearance.rows(enough),
+        index=index[enough],
+        starts=starts[enough],
+        places=places,
+        counts=counts,
+        weight=weight,
+        ground=ground,
+        inverse=inverse[enough],
+        scale=np.linalg.norm(inverse[enough], axis=2),
+        expected=np.ones_like(weight),
+    )
+
+
+def _box(image: Float32Array, starts: FloatArray, extent: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Pixels (P, N, 2) around each start in a box as large as the largest, and which lie in its own and the image."""
+    half = np.ceil(extent.max(axis=0, initial=0.0)).astype(np.int64) + 1
+    v, u = np.mgrid[-half[1] : half[1] + 1, -half[0] : half[0] + 1]
+    pixels = np.rint(starts)[:, None] + np.stack([u.reshape(-1), v.reshape(-1)], axis=1)
+    low = np.maximum(starts - extent, 0.0)
+    high = np.minimum(starts + extent, np.array(image.shape[::-1]) - 1.0)
+    inside = (pixels >= low[:, None]) & (pixels <= high[:, None])
+    return pixels, np.asarray(inside[..., 0] & inside[..., 1])
+
+
+def with_expected_contrast(
+    windows: PointWindows, nodes: FloatArray, known: FloatArray, contrast: FloatArray
+) -> PointWindows:
+    """Windows with the contrast, linear over each, that is expected by neighbours; of points that have enough.
+
+    Parameters
+    ----------
+    nodes : (P, 2) of all points
+    known, contrast : (K, 2) nodes of points with a contrast (K,)
+    """
+    away = known - nodes[windows.index][:, None]
+    near = np.abs(away).max(axis=-1) <= _NEAR
+    design = np.concatenate([np.ones_like(away[..., :1]), away], axis=2) * near[..., None]
+    normal = design.swapaxes(1, 2) @ design + np.diag([0.0, _SLOPE_RIDGE, _SLOPE_RIDGE])
+    enough = near.sum(axis=1) >= _LEAST_NEIGHBOURS
+    normal[~enough] = np.eye(3)
+    level_and_slope = np.linalg.solve(normal, design.swapaxes(1, 2) @ contrast[:, None])
+    level = level_and_slope[:, 0, 0]
+    largest = np.where(near, np.abs(contrast), 0.0).max(axis=1, initial=0.0)
+    kept = np.flatnonzero(enough & (np.abs(level) >= _LEAST_CONTRAST * largest))
+    expected = level[:, None] + (windows.places @ level_and_slope[:, 1:])[..., 0]
+    return replace(windows, expected=expected).rows(kept)
