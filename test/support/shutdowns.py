@@ -116,6 +116,8 @@ def killed(path, log, rng):
 
 
 def main(folder, count, seed, way):
+    # Under nohup it is ignored, by the nodes too: a trial of hangups alone would never end.
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
     folder = Path(folder)
     path, log, rng = folder / 'maps' / 'hall.yaml', folder / 'log', np.random.default_rng(int(seed))
     path.parent.mkdir()

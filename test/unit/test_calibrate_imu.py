@@ -5,6 +5,8 @@ import pytest
 from support import small_bag
 import yaml
 
+pytest.importorskip('allantools')
+
 from thermal_fiducial.calibration.allan_deviation import fit_noise
 from thermal_fiducial.calibration.preintegration import ImuTrack
 from thermal_fiducial.cli.main import main

@@ -1,16 +1,21 @@
 """The documents say what the code does, and stay short."""
 
+import argparse
+from importlib import import_module
 from pathlib import Path
 import re
+import shlex
 
 import documents
 import pytest
 
+from thermal_fiducial.cli.main import COMMANDS, MODULES
 from thermal_fiducial.config import NODES, OPTIONAL_NODES
 
 ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / 'README.md'
 LINK = re.compile(r'\]\(([^)#\s]+)')
+PAGES = [README, *sorted((ROOT / 'doc').rglob('*.md'))]
 
 
 @pytest.mark.ros
@@ -30,8 +35,28 @@ def test_the_readme_is_short():
     assert len(README.read_text().splitlines()) <= 150
 
 
-@pytest.mark.parametrize('page', [README, *sorted((ROOT / 'doc').rglob('*.md'))], ids=lambda page: page.name)
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
 def test_links_lead_to_files(page):
     links = [link for link in LINK.findall(page.read_text(encoding='utf-8')) if '://' not in link]
     missing = [link for link in links if not (page.parent / link).exists()]
     assert missing == []
+
+
+def shown(program):
+    """Words after ``program`` of each line of the documents that runs it."""
+    found = []
+    for page in PAGES:
+        for block in re.findall(r'^ *```\w*\n(.*?)^ *```$', page.read_text(encoding='utf-8'), re.DOTALL | re.MULTILINE):
+            lines = block.replace('\\\n', ' ').splitlines()
+            calls = [line.split(program, 1)[1] for line in lines if line.lstrip().startswith(program)]
+            found += [pytest.param(shlex.split(call, comments=True), id=f'{page.stem}: {call}') for call in calls]
+    return found
+
+
+@pytest.mark.parametrize('words', shown('thermal-fiducial '))
+def test_commands_in_the_documents_are_understood(words):
+    command, *arguments = words
+    assert command in COMMANDS
+    parser = argparse.ArgumentParser()
+    import_module(f'thermal_fiducial.cli.{MODULES.get(command, command.replace("-", "_"))}').add_arguments(parser)
+    assert parser.parse_args(arguments)

@@ -7,14 +7,11 @@ import subprocess
 from xml.etree import ElementTree
 
 import cv2
-import ezdxf
 import numpy as np
-import pypdfium2
 import pytest
 from shapely import affinity
 from shapely.geometry import box, Point, Polygon
 from shapely.ops import unary_union
-import svgpathtools
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.detection.patterns import marker_bits
@@ -28,6 +25,10 @@ from thermal_fiducial.fabrication.verification import acrylic_at, agree, problem
 from thermal_fiducial.fabrication.writers import write
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map
+
+ezdxf = pytest.importorskip('ezdxf')
+pypdfium2 = pytest.importorskip('pypdfium2')
+svgpathtools = pytest.importorskip('svgpathtools')
 
 BITS = marker_bits(load_dictionary('STENCIL_4X4_100'))
 # Geometry in a file is the pattern to this: DXF holds 16 digits, SVG 9 decimals.

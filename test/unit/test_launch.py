@@ -1,6 +1,7 @@
 """The launch files, run against stand-ins: ``launch`` itself is on the robot only."""
 
 from pathlib import Path
+import re
 import runpy
 import sys
 from types import ModuleType, SimpleNamespace
@@ -213,6 +214,17 @@ def test_arguments_of_others_are_named(launched):
     _, (log, *nodes) = launched('localization.launch.py', fcu_url='udp://:14540')
     assert 'fcu_url' in log.msg
     assert [node.executable for node in nodes] == NODES
+
+
+def test_launches_in_the_documents_name_files_and_arguments_that_exist(launched):
+    pages = [ROOT / 'README.md', *(ROOT / 'doc').rglob('*.md')]
+    text = ' '.join(page.read_text(encoding='utf-8') for page in pages).replace('\\\n', ' ')
+    calls = re.findall(r'ros2 launch thermal_fiducial (\S+\.launch\.py)((?: +\w+:=[^\s`]+)*)', text)
+    assert len(calls) >= 8
+    for file, words in calls:
+        arguments = dict(word.split(':=', 1) for word in words.split())
+        _, actions = launched(file, **(arguments | {'params_file': ''}))
+        assert [action.msg for action in actions if action.kind == 'log'] == []
 
 
 def test_without_rviz_the_nodes_start_and_it_is_said(launched, monkeypatch):

@@ -296,6 +296,18 @@ def test_the_drawing_shows_the_faces_as_the_camera_sees_them(poses, turn, invert
     assert ('along x' in front.get_title()) == inverted
 
 
+def test_all_of_a_drawing_is_within_the_picture(poses):
+    # Two metres by two and one high: the drawing from above is as high as the picture.
+    places = [2.8, 0.7, 1.5], [4.4, 0.36, 0.8], [4.1, 0.33, 1.65], [2.9, -0.7, 0.97], [3.8, -0.93, 1.6]
+    turned = [transform(so3_exp([0.0, 0.0, 0.2]) @ poses[2][:3, :3], place) for place in places]
+    markers = {i: MapMarker(i, 0.3, True, T, covariance=1e-5 * np.eye(6)) for i, T in enumerate(turned)}
+    figure = draw_map(MarkerMap(markers))
+    FigureCanvasAgg(figure).draw()
+    for axis in figure.axes:
+        assert axis.title.get_window_extent().y1 <= figure.bbox.y1
+        assert axis.xaxis.label.get_window_extent().y0 >= figure.legends[0].get_window_extent().y1
+
+
 def test_labels_of_a_drawing_of_one_wall_stand_apart(poses):
     # Eight markers over 6 m, 12 cm out of their plane: seen from the side they are a line.
     places = [[4.0 + 0.017 * k, 0.9 * k - 3.0, 0.2 * k] for k in range(8)]

@@ -10,12 +10,15 @@ import yaml
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.report.charts import euler_deg, near, visible_spans
 from thermal_fiducial.report.evaluation import evaluate
 from thermal_fiducial.report.overview import cards
 from thermal_fiducial.report.page import evaluate_run, write_report
 from thermal_fiducial.report.run_folder import read_run
 from thermal_fiducial.report.tables import number, tables
+
+pytest.importorskip('plotly')
+
+from thermal_fiducial.report.charts import euler_deg, near, visible_spans
 from thermal_fiducial.report.time_plots import thinned
 
 

@@ -7,9 +7,12 @@ import shutil
 import subprocess
 
 import numpy as np
-import plotly.graph_objects as go
 import pytest
 from support.run_folders import make_run
+
+pytest.importorskip('plotly')
+
+import plotly.graph_objects as go
 
 from thermal_fiducial.report.page import evaluate_run, write_page, write_report
 from thermal_fiducial.report.time_plots import FIDUCIAL, FUSED

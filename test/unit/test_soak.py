@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Image
+
+pytest.importorskip('psutil')
+
 from soak.flying import soak
 from soak.laps import lap, Laps, Repeated
 from soak.minutes import faults, Minute

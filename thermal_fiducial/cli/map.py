@@ -114,6 +114,7 @@ def _show(args: argparse.Namespace) -> int:
     title = f'{args.map}: {marker_map.dictionary}, frame {marker_map.frame_id}, revision {marker_map.revision}'
     headers = 'ID', 'size m', 'x m', 'y m', 'z m', 'faces', 'sigma mm', 'deg', 'error px', 'seen', 'standing'
     table = table_of(title, headers, left=['faces', 'standing'])
+    table.columns[headers.index('faces')].no_wrap = True
     for key in sorted(marker_map.markers):
         m = marker_map.markers[key]
         x, y, z = m.T_map_marker[:3, 3]
@@ -137,7 +138,7 @@ def _facing(normal: FloatArray) -> str:
     """Where a marker looks, in words: the nearest axis, and how far off it is."""
     axis = int(np.argmax(np.abs(normal)))
     off = np.rad2deg(np.arccos(np.clip(abs(normal[axis]), -1.0, 1.0)))
-    return f'{"-" if normal[axis] < 0 else "+"}{"xyz"[axis]}' + (f' {off:.0f} deg off' if off >= 0.5 else '')
+    return f'{"-" if normal[axis] < 0 else "+"}{"xyz"[axis]}' + (f' {off:.0f}°' if off >= 0.5 else '')
 
 
 def _check(args: argparse.Namespace) -> int:

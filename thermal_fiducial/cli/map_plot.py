@@ -55,6 +55,8 @@ def draw_map(marker_map: MarkerMap, cloud: FloatArray | None = None) -> Figure:
     handles = [Line2D([], [], color=colour, label=standing) for standing, colour in _STANDINGS.items()]
     title = f'{len(marker_map.markers)} markers, normals, ellipses of three sigma enlarged {_ENLARGED:g} times'
     figure.legend(handles=handles, title=title, loc='outside lower center', ncols=len(handles))
+    # Views of equal scale reach their places at the second time; at the first, a title is cut off.
+    figure.draw_without_rendering()
     return figure
 
 

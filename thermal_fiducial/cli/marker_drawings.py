@@ -201,4 +201,5 @@ def _write_all(drawings: Sequence[Drawing], args: argparse.Namespace, others: Se
             if kind == 'dxf' and not agree(read_dxf(path), drawing):
                 raise InputError(f'{path}: what was read back is not what was written')
         notes = '\n  '.join(('', *drawing.notes))
-        print(f'{args.out / stem}: {drawing.width:.1f} x {drawing.height:.1f} mm, {drawing.parts} parts{notes}')
+        parts = '1 part' if drawing.parts == 1 else f'{drawing.parts} parts'
+        print(f'{args.out / stem}: {drawing.width:.1f} x {drawing.height:.1f} mm, {parts}{notes}')

@@ -18,8 +18,13 @@ def table_of(title: str, headers: Sequence[str], left: Sequence[str] = ()) -> Ta
 
 
 def show(table: Table) -> None:
-    """Print a table; where the window is narrower than its words, lines run over instead of losing some."""
+    """Print a table; where the window is narrower than its words, closer, and at last lines run over."""
     console = Console()
+    if _least_width(console, table) > console.width:
+        table.collapse_padding = True
+        # Else rich takes from the widest column, and cuts its words.
+        for column in table.columns:
+            column.width = column.min_width
     console.width = max(console.width, _least_width(console, table))
     console.print(table)
 

@@ -115,12 +115,13 @@ def screen(snapshot: LiveState) -> 'RenderableType':
     figures.add_column()
     for reading in snapshot.readings:
         figures.add_row(reading.name, Text(reading.value or '–', style='bold'), reading.unit)
-    nodes = Table(show_header=False, box=None, padding=(0, 2), title='Nodes', title_justify='left')
+    nodes = Table(show_header=False, box=None, padding=(0, 2))
     for node, level, message in snapshot.nodes:
         nodes.add_row(node, Text(message, style=_LEVELS[min(level, 2)], overflow='fold'))
-    refusals = Table(show_header=False, box=None, padding=(0, 2), title='Last refusals', title_justify='left')
+    refusals = Table(show_header=False, box=None, padding=(0, 2))
     for age, why in snapshot.refusals:
         refusals.add_row(f'{age:.0f} s ago', Text(why, overflow='fold'))
     if not snapshot.refusals:
         refusals.add_row('none')
-    return Group(head, figures, '', nodes, '', refusals)
+    titles = [Text(f'\n{title}', style='bold') for title in ('Nodes', 'Last refusals')]
+    return Group(head, figures, titles[0], nodes, titles[1], refusals)
