@@ -127,8 +127,8 @@ def test_the_map_is_published_again_when_a_service_has_replaced_it(graph, map_fi
 
 
 def test_a_quarantined_marker_is_named_with_its_reason_once():
-    before = MapperResult(1, None, '', quarantined=(3,), quarantine_reasons={3: 'old'})
-    now = MapperResult(2, None, '', quarantined=(3, 7), quarantine_reasons={3: 'old', 7: '9.1 px off, 12.3 sigma'})
+    before = MapperResult(1, None, '', quarantine_reasons={3: 'old'})
+    now = MapperResult(2, None, '', quarantine_reasons={3: 'old', 7: '9.1 px off, 12.3 sigma'})
     assert map_status.news(before, now) == {7: 'marker 7 quarantined: 9.1 px off, 12.3 sigma'}
     assert map_status.news(now, before) == {7: 'marker 7 is trusted again'}
     assert map_status.state(now, '', frozen=False)[1] == 'quarantined: 3, 7'

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import skew
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,9 @@ class SystematicErrors:
     delay_half_square_std: float = 25e-6
 
 
+#: 99.9 % of chi square of six and of eight degrees of freedom, of a pose and of a view of a marker: what is farther off
+#: than promised errors come.
+CHI2_OF_POSE, CHI2_OF_VIEW = 22.5, 26.1
 #: For data that have no systematic errors: simulated corners.
 NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0)
 #: Share of the variance of the best marker in view that all others have in common with it, as parts of a rigid map: the
@@ -106,7 +109,23 @@ def noise_of_pose(gains: FloatArray, covariances: FloatArray, chi2: float) -> Fl
     chi2 : of the residuals
     """
     white = np.tensordot(gains, covariances @ np.swapaxes(gains, -1, -2), axes=([0, 2], [0, 1]))
-    return np.asarray(max(1.0, chi2 / max(2 * len(gains) - 6, 1)) * white)
+    return noise_factor(chi2, 2 * len(gains) - 6) * white
+
+
+def noise_factor(chi2: float, freedom: int) -> float:
+    """Ratio of the variance of residuals to the promised one, at least 1: covariances that promise too much grow by it.
+
+    Parameters
+    ----------
+    chi2 : of the residuals
+    freedom : residuals less what was estimated from them
+    """
+    return max(1.0, chi2 / max(freedom, 1))
+
+
+def alternative_of_pose(apart: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a pose where another that is ``apart`` (6,) from it may be the true one as well."""
+    return np.asarray(np.outer(apart, apart))
 
 
 def scale_of_pose(moved: FloatArray, errors: SystematicErrors) -> FloatArray:
@@ -183,10 +202,7 @@ def scale_of_map(positions: FloatArray, held: FloatArray, errors: SystematicErro
 
 def delay_of_pose(velocity: FloatArray, acceleration: FloatArray, errors: SystematicErrors) -> FloatArray:
     """Covariance (6, 6) of a pose whose image is late by an unknown delay, from its velocity and acceleration (6,)."""
-    return np.asarray(
-        errors.delay_std**2 * np.outer(velocity, velocity)
-        + errors.delay_half_square_std**2 * np.outer(acceleration, acceleration)
-    )
+    return clock_of_pose(velocity, errors.delay_std) + clock_of_pose(acceleration, errors.delay_half_square_std)
 
 
 def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors) -> FloatArray:
@@ -201,6 +217,30 @@ def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors)
     """
     own = noise**2 + errors.decision_px**2
     return np.asarray(own / (own + pixels**2))
+
+
+def clock_of_pose(velocity: FloatArray, time_offset_std: float) -> FloatArray:
+    """Covariance (6, 6) of a pose of velocity (6,) whose clock is known to ``time_offset_std`` [s]."""
+    return np.asarray(time_offset_std**2 * np.outer(velocity, velocity))
+
+
+def shape_of_corners(precisions: FloatArray, views: IntArray, errors: SystematicErrors) -> FloatArray:
+    """Standard deviations (M,) [px] of what corners of M markers are off by in all of their views alike.
+
+    Parameters
+    ----------
+    precisions : (M,) sum over the views of a marker of its corners' inverse variance [1/px^2]
+    views : (M,) how many they are
+    """
+    return np.asarray(errors.marker_shape * np.sqrt(views / precisions))
+
+
+def divided_prior(covariance: FloatArray, count: int) -> FloatArray:
+    """Covariance (6, 6) of one of ``count`` markers that are known from before, without how their errors hang together.
+
+    Each so many times as large, they are an upper bound of the joint covariance whatever that is.
+    """
+    return count * covariance
 
 
 def decision_weights(noise: FloatArray, errors: SystematicErrors) -> FloatArray:

@@ -8,6 +8,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 
 from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.types import SECOND_NS
 
 # Frames come no later than this; nothing older is kept [ns].
 _KEPT_NS = 500_000_000
@@ -28,13 +29,13 @@ class MotionPrior:
     def __init__(self, camera_time_offset: float = 0.0) -> None:
         self._stamps_ns: list[int] = []
         self._readers: list[Callable[[], Odometry | None]] = []
-        self._offset_ns = round(camera_time_offset * 1e9)
+        self._offset_ns = round(camera_time_offset * SECOND_NS)
         #: whether the filter has estimated the offset of the clocks: before that it is the parameter's
         self.clock_is_known = False
 
     def set_clock_offset(self, seconds: float) -> None:
         """Take over the filter's estimate, t_odometry = t_camera + ``seconds`` [s]."""
-        self._offset_ns = round(seconds * 1e9)
+        self._offset_ns = round(seconds * SECOND_NS)
         self.clock_is_known = True
 
     def in_odometry_clock(self, camera_stamp_ns: int) -> int:

@@ -84,7 +84,8 @@ def require_usable(camera: Camera) -> Camera:
 
 def _require_invertible(camera: Camera) -> None:
     size = np.array([camera.width, camera.height], dtype=np.float64)
-    pixels = size * np.array([[0.5, 0.5], [0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]])
+    half_way = 0.5 * np.array([[0, 0], [-1, -1], [1, -1], [1, 1], [-1, 1]])
+    pixels = 0.5 * size * (1.0 + half_way)
     with np.errstate(all='ignore'):
         error = np.abs(camera.distort(camera.normalise(pixels)) - pixels).max()
     if not error < _ROUND_TRIP_PX:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import CHI2_OF_POSE, CHI2_OF_VIEW
 from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
 from thermal_fiducial.core.geometry.se3 import skew
 from thermal_fiducial.core.mapping.keyframes import CameraRig
@@ -12,10 +13,6 @@ from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquatio
 from thermal_fiducial.core.mapping.snapshot import gauge, Snapshot
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
-#: Chi square of a view (8 residuals) up to which it counts in full: 99.9 % of consistent ones.
-ROBUST_CHI2 = 26.1
-#: Chi square of a pose from odometry (6 residuals) up to which it counts in full.
-ROBUST_ODOMETRY = 22.5
 # Chi square of a view that no pose near the present one explains.
 _BEHIND_CHI2 = 1e8
 
@@ -50,12 +47,12 @@ class Linearised:
 
     def weights(self, scale: float) -> FloatArray:
         """Robust weights (n,) of the views, for corners of ``scale`` times their variance."""
-        return _robust_weights(self.chi2, ROBUST_CHI2 * scale)
+        return _robust_weights(self.chi2, CHI2_OF_VIEW * scale)
 
     def cost(self, scale: float) -> float:
         """Robust sum of squares."""
-        of_views = np.sum(_robust_cost(self.chi2, ROBUST_CHI2 * scale))
-        of_rigs = np.sum(_robust_cost(self.rig_chi2, ROBUST_ODOMETRY))
+        of_views = np.sum(_robust_cost(self.chi2, CHI2_OF_VIEW * scale))
+        of_rigs = np.sum(_robust_cost(self.rig_chi2, CHI2_OF_POSE))
         return float(of_views + of_rigs + np.sum(self.marker_chi2))
 
 
@@ -167,7 +164,7 @@ class MapProblem:
         weights = now.weights(scale)[:, None, None]
         of_rig, of_marker = (weights * np.swapaxes(J, -1, -2) for J in (now.J_rig, now.J_marker))
         r = now.r[..., None]
-        odometry = self.odometry.information * _robust_weights(now.rig_chi2, ROBUST_ODOMETRY)[:, None, None]
+        odometry = self.odometry.information * _robust_weights(now.rig_chi2, CHI2_OF_POSE)[:, None, None]
         blocks = Blocks(
             rig=self.over_frames(of_rig @ now.J_rig) + odometry,
             marker=self.over_markers(of_marker @ now.J_marker) + self.known.information,

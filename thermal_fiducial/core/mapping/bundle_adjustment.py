@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import scale_of_map, SystematicErrors
+from thermal_fiducial.core.error_model import noise_factor, scale_of_map, shape_of_corners, SystematicErrors
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
@@ -106,13 +106,12 @@ def _result(
     n, weights = len(problem.frame), now.weights(scale)
     unknowns = 6 * (len(problem.stamps) + np.count_nonzero(~problem.held))
     full = weights == 1.0
-    factor = float(np.sum(now.chi2[full]) / max(8 * np.count_nonzero(full) - unknowns, 1))
+    chi2, freedom = float(np.sum(now.chi2[full])), int(8 * np.count_nonzero(full) - unknowns)
+    widened = noise_factor(chi2, freedom)
     system = problem.equations.reduced(problem.normal(now, scale)[0])
     if system is None:
         return None
-    covariances = system.covariances(
-        max(factor, 1.0), np.stack([snapshot.markers[key].covariance for key in problem.ids])
-    )
+    covariances = system.covariances(widened, np.stack([snapshot.markers[key].covariance for key in problem.ids]))
     positions = now.state.T_map_marker[:, :3, 3]
     covariances += _shape_covariances(problem, system, now, weights, snapshot.errors)
     covariances += scale_of_map(positions, positions[problem.held], snapshot.errors)
@@ -130,8 +129,8 @@ def _result(
         dict(zip(problem.stamps, now.state.T_map_rig, strict=True)),
         float(np.sqrt(np.sum(before.squared_px) / (4 * n))),
         float(np.sqrt(np.sum(now.squared_px) / (4 * n))),
-        now.cost(scale) / max(factor, 1.0),
-        factor,
+        now.cost(scale) / widened,
+        chi2 / max(freedom, 1),
         outliers,
         {key: outliers[key] for key, own in views.items() if two_places(*now.of_views(own), ~full[own])},
         iterations,
@@ -150,7 +149,8 @@ def _shape_covariances(
     if errors.marker_shape == 0.0:
         return np.zeros((len(problem.ids), 6, 6))
     precision = np.bincount(problem.marker, 0.5 * np.mean(np.sum(problem.W**2, axis=(2, 3)), axis=1))
-    std = errors.marker_shape * np.sqrt(np.bincount(problem.marker) / precision)
+    views = np.bincount(problem.marker).astype(np.int64)
+    std = shape_of_corners(precision.astype(np.float64), views, errors)
     rng, covariances = np.random.default_rng(0), np.zeros((len(problem.ids), 6, 6))
     for _ in range(_SAMPLES // _AT_ONCE):
         samples = std[:, None, None, None] * rng.standard_normal((len(problem.ids), 4, 2, _AT_ONCE))

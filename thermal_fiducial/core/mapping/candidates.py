@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import correlated_sum, SystematicErrors, with_corner_errors
+from thermal_fiducial.core.error_model import correlated_sum, noise_factor, SystematicErrors, with_corner_errors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import linearise
 from thermal_fiducial.core.geometry.rigid_fit import Evaluation, minimise
@@ -134,7 +134,7 @@ class Candidate:
         best = fits[0]
         if not best.chi2 <= INCONSISTENT * len(self.views):
             return Placement(None, nothing, f'marker {self.id}: its views contradict each other')
-        scale = max(1.0, best.chi2 / (8 * len(self.views) - 6))
+        scale = noise_factor(best.chi2, 8 * len(self.views) - 6)
         others = [fit for fit in fits[1:] if rotation_angle(fit.T[:3, :3].T @ best.T[:3, :3]) > SAME_FIT]
         if others and others[0].cost - best.cost < DECISIVE * scale:
             return Placement(None, nothing, f'planar ambiguity of marker {self.id} unsettled')

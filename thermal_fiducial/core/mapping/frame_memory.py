@@ -7,12 +7,13 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import alike_odometry, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.mapping.candidates import Viewpoint
 from thermal_fiducial.core.mapping.keyframes import CameraRig, Displacement, Keyframe, KeyframeStore
 from thermal_fiducial.core.mapping.map_data import MarkerMap
-from thermal_fiducial.core.mapping.odometry_prior import PredictedCamera
+from thermal_fiducial.core.mapping.odometry_prior import growth, PredictedCamera
 from thermal_fiducial.core.mapping.snapshot import prior_poses, Snapshot
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 # A refinement is worth its time when so many keyframes have come since the last one, as a share of it and in number.
 _GROWTH, _FEW = 0.2, 15
@@ -36,19 +37,21 @@ class FrameMemory:
         self._keyframes = KeyframeStore(budget)
         self._cameras: list[Camera] = []
         #: when the map last learned from known markers [ns]; None: not yet
-        self.last_ns: int | None = None
+        self._last_ns: int | None = None
+        #: the odometry when the first marker was seen of those that nothing else joins to the map
+        self._gap: CameraPose | None = None
         self._priors = prior_poses(marker_map.markers)
         self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(marker_map.markers)
         self._added_then, self._refined_views = 0, 0
 
     def keep(self, rows: Markers, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> None:
         """Keep a frame whose camera is known; of one marker alone a refinement can learn nothing."""
-        self.last_ns = pose.stamp_ns
+        self._last_ns, self._gap = pose.stamp_ns, None
         if len(rows) >= 2:
             self._keyframes.add(self._keyframe(rows, pose, camera, predicted))
 
-    def bridge(self, rows: Markers, camera: Camera, predicted: PredictedCamera, *, first: bool) -> None:
-        """Keep a frame without a known marker.
+    def bridge(self, rows: Markers, camera: Camera, predicted: PredictedCamera, *, first: bool) -> Viewpoint:
+        """Keep a frame without a known marker; from where its markers are seen.
 
         Nothing but the odometry joins its markers to the map. Once, for the ``first`` of them, that counts in full: its
         error is the same for all that follow, which hang together through the markers themselves.
@@ -60,12 +63,21 @@ class FrameMemory:
             self._keyframes.add(replace(keyframe, information=information))
         elif len(rows) >= 2:
             self._keyframes.add(keyframe)
+        if self._gap is None:
+            self._gap = predicted.pose
+        # What the odometry had gathered when the gap's first marker came is the same for all its views.
+        viewpoint = Viewpoint.known(predicted.pose.T_map_camera, growth(self._gap, predicted))
+        return replace(viewpoint, common=self._gap.covariance)
+
+    def bridgeable(self, stamp_ns: int, longest: float) -> bool:
+        """Whether known markers were in view not more than ``longest`` [s] before."""
+        return self._last_ns is not None and 0 <= stamp_ns - self._last_ns <= longest * SECOND_NS
 
     def refinement_due(self, stamp_ns: int, period: float, markers: int) -> bool:
         """Whether a refinement is worth its time, ``period`` [s] after the last or more, for so many markers."""
         if not self._keyframes.frames or period == 0.0:
             return False
-        if stamp_ns - self._refined_ns < max(period, _PERIOD_A_VIEW * self._refined_views) * 1e9:
+        if stamp_ns - self._refined_ns < max(period, _PERIOD_A_VIEW * self._refined_views) * SECOND_NS:
             return False
         enough = self._keyframes.added - self._added_then >= _GROWTH * self._refined_frames + _FEW
         return enough or markers > self._refined_markers

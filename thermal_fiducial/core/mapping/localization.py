@@ -16,6 +16,7 @@ from thermal_fiducial.core.error_model import (
     decision_weights,
     map_of_pose,
     map_weights,
+    noise_factor,
     noise_of_pose,
     scale_of_pose,
     SystematicErrors,
@@ -134,7 +135,7 @@ class _Frame:
         weights = found.weights * decision_weights(self.sight.noise_px, self.model)
         starts = np.stack([T, hypotheses[apart][0]])
         (T, other), chi2, _ = self._fit.solve(starts, weights, inlier=np.inf)
-        refuted = chi2[1] - chi2[0] > DECISIVE * max(1.0, chi2[0] / (8 * len(weights) - 6))
+        refuted = chi2[1] - chi2[0] > DECISIVE * noise_factor(float(chi2[0]), 8 * len(weights) - 6)
         return None if refuted or np.max(np.abs(other - T)) < 1e-6 else other
 
     def _map_weights(self, T_map_camera: FloatArray) -> FloatArray:

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import INCONSISTENT_PX, positive
+from thermal_fiducial.core.error_model import alternative_of_pose, INCONSISTENT_PX, positive
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise
 from thermal_fiducial.core.mapping.candidates import Viewpoint
@@ -126,7 +126,7 @@ class PoseErrors:
 
     def with_alternative(self, apart: FloatArray) -> 'PoseErrors':
         """The same where a pose that is ``apart`` (6,) may be the true one as well."""
-        spread = np.outer(apart, apart)
+        spread = alternative_of_pose(apart)
         return replace(self, systematic=self.systematic + spread, relative=self.relative + spread)
 
 

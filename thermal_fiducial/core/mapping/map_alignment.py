@@ -60,6 +60,14 @@ def align(resting: Mapping[int, MapMarker], moving: Mapping[int, MapMarker]) -> 
     return Alignment(T, dict(zip(common, residuals.tolist(), strict=True)), outliers)
 
 
+def jump(new: Mapping[int, MapMarker], old: Mapping[int, MapMarker]) -> FloatArray | None:
+    """T_new_old (4, 4) of two maps of one place; None where they have no marker in common, or one of two sizes."""
+    try:
+        return align(new, old).T
+    except InputError:
+        return None
+
+
 def _distances(T: FloatArray, target: FloatArray, source: FloatArray) -> FloatArray:
     """Rms distance (K,) of the corners (K, 4, 3) of each marker."""
     return np.asarray(np.sqrt(np.mean(np.sum((apply(T, source) - target) ** 2, axis=-1), axis=-1)))

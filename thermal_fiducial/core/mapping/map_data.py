@@ -104,15 +104,18 @@ class MapperResult:
     residuals_px: dict[int, float] = field(default_factory=dict)
     #: markers on trial in view: ID to what each waits for
     candidates: dict[int, str] = field(default_factory=dict)
-    #: all markers in quarantine
-    quarantined: tuple[int, ...] = ()
     map_revision: int = 0
     #: how often the map was refined, or another was taken over
     map_resets: int = 0
-    #: why each of them is there, with numbers
+    #: all markers in quarantine: ID to why it is there, with numbers
     quarantine_reasons: dict[int, str] = field(default_factory=dict)
     #: the map took something in: a new marker, or what the known ones were seen like
     learned: bool = False
+
+    @property
+    def quarantined(self) -> tuple[int, ...]:
+        """IDs of all markers in quarantine."""
+        return tuple(sorted(self.quarantine_reasons))
 
     @property
     def in_view(self) -> frozenset[int]:

@@ -21,16 +21,15 @@ from thermal_fiducial.core.mapping.candidates import Candidate, Viewpoint
 from thermal_fiducial.core.mapping.frame_memory import FrameMemory, VIEWS
 from thermal_fiducial.core.mapping.localizer import Localizer
 from thermal_fiducial.core.mapping.located import Located, LocatedFrame, Location, Refusal, Sight
-from thermal_fiducial.core.mapping.map_alignment import align
+from thermal_fiducial.core.mapping.map_alignment import jump
 from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.new_markers import entry, NewMarkers
-from thermal_fiducial.core.mapping.odometry_prior import contradicts, growth, predicted_camera, PredictedCamera
+from thermal_fiducial.core.mapping.odometry_prior import contradicts, predicted_camera, PredictedCamera
 from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.core.mapping.trust import Trust
-from thermal_fiducial.core.measurements import CameraPose, Markers, usable
+from thermal_fiducial.core.measurements import Markers, usable
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.errors import InputError
 
 __all__ = ['MapJump', 'MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
 
@@ -72,10 +71,7 @@ class MarkerMapper:
         -------
         The jump from the old map to the new by the markers that both have; None where they have none.
         """
-        try:
-            T_new_old = align(marker_map.markers, self.map.markers).T
-        except InputError:
-            T_new_old = None
+        T_new_old = jump(marker_map.markers, self.map.markers)
         self._begin(replace(marker_map, revision=max(self.map.revision, marker_map.revision) + 1))
         self.resets += 1
         return None if T_new_old is None else MapJump(self.map.revision, self.resets, T_new_old)
@@ -87,7 +83,6 @@ class MarkerMapper:
         self._localizer = Localizer()
         #: whether odometry has been in this map
         self._odometry_agreed = False
-        self._gap: CameraPose | None = None
         self._memory = FrameMemory(self.config.keyframe_budget, self._initial)
 
     def process(
@@ -109,9 +104,8 @@ class MarkerMapper:
         # Step 2: known and new markers.
         is_known = np.array([key in self.map.markers for key in markers['id'].tolist()], dtype=bool)
         known = Sight.of(markers[is_known], self.map.markers)
-        predicted = None
-        if prior is not None:
-            predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, self.config.time_offset_std)
+        offset_std = self.config.time_offset_std
+        predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
         outcome = self._locate(stamp_ns, known.trusted, camera, predicted)
         return LocatedFrame(stamp_ns, camera, markers, is_known, known, predicted, outcome)
@@ -143,7 +137,7 @@ class MarkerMapper:
                 # A marker that was moved, or that hangs in two places: what it teaches would spoil the map.
                 return self._result(frame, False, {}, dict.fromkeys(frame.new['id'].tolist(), CONTRADICTED))
             self._odometry_agreed |= not contradicted
-        self._localizer.last, self._gap = pose, None
+        self._localizer.last = pose
         # Step 7: errors updated.
         residuals, changed = self._update_errors(frame, location)
         # Step 8: new markers placed relative to the camera.
@@ -174,26 +168,16 @@ class MarkerMapper:
 
     def _without_pose(self, frame: LocatedFrame, refusal: Refusal) -> tuple[bool, Waiting]:
         """What a frame without a pose may still teach of new markers."""
-        predicted, last_ns = frame.predicted, self._memory.last_ns
+        predicted, longest = frame.predicted, self.config.bridge_duration
         if self.frozen or not len(frame.new):
             return False, {}
         if refusal.alternatives is not None and refusal.covariances is not None:
             return self._place_new(frame, Viewpoint(refusal.alternatives, refusal.covariances))
-        if predicted is None or last_ns is None:
+        if predicted is None or not self._memory.bridgeable(frame.stamp_ns, longest):
             return False, {}
-        if not 0 <= frame.stamp_ns - last_ns <= self.config.bridge_duration * 1e9:
-            return False, {}
-        return self._bridge(frame, predicted)
-
-    def _bridge(self, frame: LocatedFrame, predicted: PredictedCamera) -> tuple[bool, Waiting]:
-        """Place new markers from the odometry while no known one is in view."""
+        # No known marker is in view: the odometry says where the camera is.
         first = not any(key in self._new.candidates for key in frame.new['id'].tolist())
-        self._memory.bridge(frame.new, frame.camera, predicted, first=first)
-        if self._gap is None:
-            self._gap = predicted.pose
-        # What the odometry had gathered when the gap's first marker came is the same for all its views.
-        viewpoint = Viewpoint.known(predicted.pose.T_map_camera, growth(self._gap, predicted))
-        return self._place_new(frame, replace(viewpoint, common=self._gap.covariance))
+        return self._place_new(frame, self._memory.bridge(frame.new, frame.camera, predicted, first=first))
 
     def refinement_due(self, stamp_ns: int) -> bool:
         """Whether enough has been seen since the last joint refinement for another to be worth its time."""
@@ -258,16 +242,8 @@ class MarkerMapper:
     def _result(
         self, frame: LocatedFrame, changed: bool, residuals: dict[int, float], waiting: Waiting
     ) -> MapperResult:
+        learned = not self.frozen and bool(changed or residuals)
         return MapperResult(
-            frame.stamp_ns,
-            frame.pose,
-            frame.outcome.reason,
-            changed,
-            residuals,
-            waiting,
-            tuple(sorted(self._trust.quarantined)),
-            self.map.revision,
-            self.resets,
-            dict(self._trust.quarantined),
-            not self.frozen and bool(changed or residuals),
-        )
+            frame.stamp_ns, frame.pose, frame.outcome.reason, changed, residuals, waiting, self.map.revision,
+            self.resets, dict(self._trust.quarantined), learned,
+        )  # fmt: skip

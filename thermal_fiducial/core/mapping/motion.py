@@ -9,7 +9,7 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import delay_of_pose, SystematicErrors
 from thermal_fiducial.core.geometry.reprojection import difference
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 # Poses farther apart than this say nothing of the velocity [s].
 _STALE_S = 0.15
@@ -25,7 +25,7 @@ class CameraMotion:
 
     def delay_covariance(self, stamp_ns: int, T_map_camera: FloatArray, errors: SystematicErrors) -> FloatArray:
         """Covariance (6, 6), ROS convention, that the motion up to this pose adds to it."""
-        dt = (stamp_ns - self._stamp_ns) * 1e-9
+        dt = (stamp_ns - self._stamp_ns) / SECOND_NS
         velocity, covariance = None, np.zeros((6, 6))
         if self._T_map_camera is not None and 0.0 < dt < _STALE_S:
             velocity = difference(T_map_camera, self._T_map_camera) / dt

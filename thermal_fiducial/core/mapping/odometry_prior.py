@@ -10,12 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import bounded_odometry, positive
+from thermal_fiducial.core.error_model import bounded_odometry, clock_of_pose, positive
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.geometry.se3 import skew, so3_exp, transform
 from thermal_fiducial.core.measurements import CameraPose, Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: A state of the filter stands for frames up to this far from it [ns].
 NEAR_NS = 300_000_000
@@ -33,7 +33,7 @@ class PredictedCamera:
 
 
 def predicted_camera(
-    prior: MotionPrior, camera_stamp_ns: int, T_body_camera: FloatArray, time_offset_std: float
+    prior: MotionPrior | None, camera_stamp_ns: int, T_body_camera: FloatArray, time_offset_std: float
 ) -> PredictedCamera | None:
     """The camera at the frame ``camera_stamp_ns``; None where odometry has no state near it.
 
@@ -42,6 +42,8 @@ def predicted_camera(
     prior : the filter's states, and the offset of the two clocks
     time_offset_std : how far that offset may be wrong while the filter has not estimated it [s]
     """
+    if prior is None:
+        return None
     instant_ns = prior.in_odometry_clock(camera_stamp_ns)
     odometry = prior.nearest(instant_ns)
     if odometry is None or abs(instant_ns - odometry.stamp_ns) >= NEAR_NS:
@@ -52,14 +54,14 @@ def predicted_camera(
     if not prior.clock_is_known:
         rate = R @ odometry.angular_velocity_body
         velocity = R @ odometry.velocity_body + np.cross(rate, R @ T_body_camera[:3, 3])
-        motion = np.concatenate([velocity, rate])
-        pose = replace(pose, covariance=pose.covariance + time_offset_std**2 * np.outer(motion, motion))
+        unknown = clock_of_pose(np.concatenate([velocity, rate]), time_offset_std)
+        pose = replace(pose, covariance=pose.covariance + unknown)
     return PredictedCamera(pose, turn @ odometry.twist_covariance @ turn.T)
 
 
 def camera_pose(odometry: Odometry, stamp_ns: int, T_body_camera: FloatArray) -> CameraPose:
     """The camera where the odometry, its velocities constant, has it at ``stamp_ns``, with its covariance."""
-    dt = (stamp_ns - odometry.stamp_ns) * 1e-9
+    dt = (stamp_ns - odometry.stamp_ns) / SECOND_NS
     step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
     T_map_body = odometry.T_map_body @ step
     A = np.eye(6)
@@ -79,6 +81,6 @@ def growth(first: CameraPose, predicted: PredictedCamera) -> FloatArray:
     Errors of odometry that grow add up like independent ones at most as the difference of the covariances says; and a
     displacement is off by no more than the speed is, all the time.
     """
-    seconds = (predicted.pose.stamp_ns - first.stamp_ns) * 1e-9
+    seconds = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS
     bounds = positive(predicted.pose.covariance - first.covariance), seconds**2 * predicted.velocity_covariance
     return min(bounds, key=lambda covariance: float(np.trace(covariance)))

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import CHI2_OF_POSE
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, skew
 from thermal_fiducial.core.mapping.odometry_prior import predicted_camera
@@ -21,8 +22,6 @@ from thermal_fiducial.core.types import FloatArray
 _CARRIED_NS = 70_000_000
 #: The second camera stands in when the first has had no pose for this long [ns].
 _ALONE_NS = 120_000_000
-#: Poses that differ by more than this, squared Mahalanobis, are not of one robot (99.9 % of chi-square, 6 d.o.f.).
-_GATE = 22.5
 
 
 class SecondCamera:
@@ -81,7 +80,7 @@ def seen_from(pose: CameraPose, T_camera_other: FloatArray) -> CameraPose:
 def intersection(first: CameraPose, second: CameraPose) -> CameraPose | None:
     """Both poses of one instant as one, each with half its information; None where they contradict each other."""
     apart = difference(second.T_map_camera, first.T_map_camera)
-    if apart @ np.linalg.solve(first.covariance + second.covariance, apart) > _GATE:
+    if apart @ np.linalg.solve(first.covariance + second.covariance, apart) > CHI2_OF_POSE:
         return None
     informations = [0.5 * np.linalg.inv(pose.covariance) for pose in (first, second)]
     covariance = np.linalg.inv(informations[0] + informations[1])

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import NO_SYSTEMATIC_ERRORS, SystematicErrors
+from thermal_fiducial.core.error_model import divided_prior, NO_SYSTEMATIC_ERRORS, SystematicErrors
 from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe, packed, unpacked
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import BoolArray, FloatArray
@@ -55,11 +55,10 @@ def _snapshot(markers: Mapping[int, MapMarker], keyframes: tuple[Any, ...], *res
 def prior_poses(markers: Mapping[int, MapMarker]) -> dict[int, tuple[FloatArray, FloatArray]]:
     """Pose and covariance (6, 6) of markers that are known from before the keyframes, as a refinement may use them.
 
-    Only each marker's own covariance is kept in a map, not how the errors of two hang together. Divided among n
-    markers (each covariance n times as large) they are an upper bound of the joint covariance whatever that is.
+    Only each marker's own covariance is kept in a map, not how the errors of two hang together.
     """
     known = [m for m in markers.values() if not m.fixed and np.any(m.covariance)]
-    return {m.id: (m.T_map_marker, len(known) * m.covariance) for m in known}
+    return {m.id: (m.T_map_marker, divided_prior(m.covariance, len(known))) for m in known}
 
 
 def gauge(markers: list[MapMarker]) -> BoolArray:
