@@ -165,6 +165,16 @@ def test_a_map_that_has_not_changed_makes_no_history(path):
     assert map_history.entries(path) == []
 
 
+def test_an_edit_that_changes_nothing_makes_no_history(path, capsys):
+    assert main(['map', 'fix', str(path), '0']) == 0
+    before, history = path.read_bytes(), map_history.entries(path)
+    capsys.readouterr()
+    assert main(['map', 'fix', str(path), '0']) == 0
+    assert 'so already' in capsys.readouterr().out
+    assert path.read_bytes() == before
+    assert map_history.entries(path) == history
+
+
 @pytest.mark.parametrize(
     'arguments',
     [

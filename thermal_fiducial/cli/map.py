@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 import re
 from typing import TypeAlias
@@ -21,7 +22,7 @@ from thermal_fiducial.files.atomic import locked
 from thermal_fiducial.files.csv_rows import csv_rows
 from thermal_fiducial.files.dictionary import not_in_dictionary
 from thermal_fiducial.files.map_format import upgraded
-from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.marker_map import dump_map, load_map
 from thermal_fiducial.map_tools import map_editing
 
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
@@ -29,7 +30,7 @@ Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Sub-commands of ``map``."""
-    parser.add_argument('--marker-size', type=float, metavar='M', help='side of markers whose entry has none [m]')
+    parser.add_argument('--marker-size', type=_side, metavar='M', help='side of markers whose entry has none [m]')
     parser.add_argument(
         '--marker-size-override', action='append', default=[], metavar='ID:M', help='side of one marker [m]'
     )
@@ -93,18 +94,32 @@ def _load(args: argparse.Namespace, path: Path | None = None) -> MarkerMap:
     return load_map(path or args.map, args.marker_size, size_overrides(tuple(args.marker_size_override)))
 
 
+def _side(text: str) -> float:
+    try:
+        side = float(text)
+    except ValueError:
+        side = 0.0
+    if not 0.0 < side < 100.0:
+        raise argparse.ArgumentTypeError(f'{text!r} is no side in metres')
+    return side
+
+
 def _edit(args: argparse.Namespace, action: str, change: Callable[[MarkerMap], MarkerMap]) -> int:
     """Change the map where nobody else can do so meanwhile."""
-    read = map_history.digest(args.map)
-    edited = change(_load(args))
     while True:
+        read = map_history.digest(args.map)
+        before = _load(args)
+        edited = change(before)
+        if dump_map(edited) == dump_map(replace(before, revision=edited.revision)):
+            # A version for each time that somebody says the same would push those that differ out of the history.
+            print(f'{args.map}: {action}: it is so already')
+            return 0
         try:
             map_history.save_with_history(args.map, edited, action, read)
             break
         except map_history.ChangedMeanwhileError:
             # An edit says what to do, not what comes out: on top of what another one has made it is as good.
-            read = map_history.digest(args.map)
-            edited = change(_load(args))
+            continue
     print(f'{args.map}: {action}; revision {edited.revision}, {len(edited.markers)} markers')
     return 0
 
