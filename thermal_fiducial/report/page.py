@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.atomic import write_atomically
 from thermal_fiducial.report.evaluation import evaluate, Evaluation
 from thermal_fiducial.report.run_folder import read_run, SUMMARY
 
@@ -92,7 +93,7 @@ def write_page(evaluation: Evaluation, numbers: dict[str, Any], bag: Path | None
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file.
+    """Write a file, whole or not at all, and never into a pipe or a device.
 
     Raises
     ------
@@ -100,6 +101,6 @@ def write_text(path: Path, text: str) -> None:
         It cannot be written.
     """
     try:
-        path.write_text(text, encoding='utf-8')
+        write_atomically(path, text)
     except OSError as error:
         raise InputError(f'{path}: {error.strerror}') from None
