@@ -42,9 +42,9 @@ class DirectGraph:
     def _joined(self, kind: type) -> type:
         """The class of a node whose outputs send through here from the first message on."""
 
-        def advertise(node: Any, *arguments: Any) -> Any:
-            output = kind.advertise(node, *arguments)
-            output.send = lambda message: self.send(output.topic, message)
+        def advertise(node: Any, message_kind: type, *arguments: Any) -> Any:
+            output = kind.advertise(node, message_kind, *arguments)
+            output.send = lambda sent: self.send(output.topic, _message(sent, message_kind))
             return output
 
         return type(kind.__name__, (kind,), {'advertise': advertise})
@@ -79,6 +79,11 @@ class DirectGraph:
         """End all nodes."""
         for name in list(self.nodes):
             self.kill(name)
+
+
+def _message(sent: Any, kind: type) -> Any:
+    """What a node sends, as others read it: nodes also publish the bytes of a message."""
+    return deserialize_message(bytes(sent), kind) if isinstance(sent, (bytes, bytearray)) else sent
 
 
 def _deliver(subscription: Any, message: Any) -> None:
