@@ -2,7 +2,8 @@
 // Draws the figures in the colours of the page, lets those over time share their axis, and marks where one reads.
 (() => {
   const dark = window.matchMedia('(prefers-color-scheme: dark)');
-  const touch = window.matchMedia('(pointer: coarse)');
+  // Where nothing can hover, Plotly shows its buttons all the time.
+  const touch = window.matchMedia('(pointer: coarse), (hover: none)');
   const narrow = window.matchMedia('(max-width: 760px)');
   const timed = [];
   const drawn = [];
