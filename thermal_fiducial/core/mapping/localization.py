@@ -5,7 +5,6 @@ filled environments", ISVC 2018.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -59,7 +58,7 @@ def locate(
     hypotheses = _hypotheses(sight, camera, prior)
     if not len(hypotheses):
         return Refusal('no usable pose of any known marker')
-    frame = _Frame(sight, camera, model)
+    frame = _Frame(sight, camera, model, CameraFit(sight.corners, sight.covariances, sight.points, camera))
     first = frame.joint_pose(hypotheses[0], running_errors)
     if not np.all(np.isfinite(first.seen.residuals)):
         return Refusal(f'no camera pose explains {_names(sight)}')
@@ -91,15 +90,12 @@ class _Frame:
     sight: Sight
     camera: Camera
     model: SystematicErrors
-
-    @cached_property
-    def _fit(self) -> CameraFit:
-        return CameraFit(self.sight.corners, self.sight.covariances, self.sight.points, self.camera)
+    fit: CameraFit
 
     def joint_pose(self, start: FloatArray, running_errors: FloatArray) -> Location:
         """Steps 3 to 6: the pose from all markers jointly, weighted by map and errors, and refined."""
         by_map = self._map_weights(start)
-        T = self._fit.solve(start[None], by_map)[0][0]
+        T = self.fit.solve(start[None], by_map)[0][0]
         seen = self.sight.reprojected(self.camera, T)
         return self.refined(T, seen, by_map * marker_weights(seen.errors_px, running_errors, self.model))
 
@@ -126,7 +122,8 @@ class _Frame:
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
         """Another pose (4, 4) that the corners do not refute; None when there is none."""
-        if self._extent > WIDE:
+        width, height = np.ptp(self.sight.corners, axis=(0, 1)) / self.camera.focal_px
+        if np.hypot(width, height) > WIDE:
             return None
         T = found.T_map_camera
         apart = rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE
@@ -134,7 +131,7 @@ class _Frame:
             return None
         weights = found.weights * decision_weights(self.sight.noise_px, self.model)
         starts = np.stack([T, hypotheses[apart][0]])
-        (T, other), chi2, _ = self._fit.solve(starts, weights, inlier=np.inf)
+        (T, other), chi2, _ = self.fit.solve(starts, weights, inlier=np.inf)
         refuted = chi2[1] - chi2[0] > DECISIVE * noise_factor(float(chi2[0]), 8 * len(weights) - 6)
         return None if refuted or np.max(np.abs(other - T)) < 1e-6 else other
 
@@ -148,12 +145,6 @@ class _Frame:
         apart = variances[:, :3].sum(axis=-1) / 3.0 + sight.sizes**2 * variances[:, 3:].sum(axis=-1) / 9.0
         distances = np.linalg.norm(sight.T_map_marker[:, :3, 3] - T_map_camera[:3, 3], axis=-1)
         return map_weights(sight.noise_px, self.camera.focal_px * np.sqrt(apart) / distances, self.model)
-
-    @property
-    def _extent(self) -> float:
-        """Angle that the markers fill of the view [rad]."""
-        corners = self.sight.corners.reshape(-1, 2)
-        return float(np.linalg.norm(np.ptp(corners, axis=0)) / self.camera.focal_px)
 
 
 def marker_weights(errors: FloatArray, running_errors: FloatArray, model: SystematicErrors) -> FloatArray:

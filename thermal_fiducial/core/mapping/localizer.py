@@ -49,7 +49,10 @@ class Localizer:
         running_errors : (N,) re-projection error of each marker so far [px]
         expected : (4, 4) T_map_camera by the odometry, if there is any
         """
-        location = locate(sight, running_errors, camera, self._prior(stamp_ns, expected), errors)
+        last = self.last
+        if expected is None and last is not None and 0 < stamp_ns - last.stamp_ns < CONTINUITY_NS:
+            expected = last.T_map_camera
+        location = locate(sight, running_errors, camera, expected, errors)
         if isinstance(location, Refusal):
             return location
         ids = np.array([marker.id for marker in sight.markers])
@@ -61,9 +64,3 @@ class Localizer:
         return Located(
             location, CameraPose(stamp_ns, location.T_map_camera, covariance, systematic, used, location.rms_px)
         )
-
-    def _prior(self, stamp_ns: int, expected: FloatArray | None) -> FloatArray | None:
-        """T_map_camera that is expected from the filter or, for a short while, from the last pose."""
-        if expected is None and self.last is not None and 0 < stamp_ns - self.last.stamp_ns < CONTINUITY_NS:
-            return self.last.T_map_camera
-        return expected

@@ -31,11 +31,24 @@ class Sight:
     #: (N, 2, 4, 4) both branches of T_camera_marker, NaN where there is none
     branches: FloatArray
 
+    #: (N, 4, 4), (N,) [m] and (N, 6, 6): poses, sides and covariances of the markers in the map
+    T_map_marker: FloatArray
+    sizes: FloatArray
+    map_covariances: FloatArray
+
     @classmethod
     def of(cls, rows: Markers, markers: Mapping[int, MapMarker]) -> 'Sight':
         """Of rows whose IDs are all among ``markers``."""
         known = [markers[key] for key in rows['id'].tolist()]
-        return cls(known, corners_px(rows), corner_covariances(rows), marker_branches(rows))
+        return cls(
+            known,
+            corners_px(rows),
+            corner_covariances(rows),
+            marker_branches(rows),
+            np.array([marker.T_map_marker for marker in known]).reshape(-1, 4, 4),
+            np.array([marker.size for marker in known]),
+            np.array([marker.covariance for marker in known]).reshape(-1, 6, 6),
+        )
 
     @cached_property
     def trusted(self) -> 'Sight':
@@ -43,18 +56,8 @@ class Sight:
         chosen = [marker.trusted for marker in self.markers]
         if all(chosen):
             return self
-        markers = [marker for marker in self.markers if marker.trusted]
-        return Sight(markers, self.corners[chosen], self.covariances[chosen], self.branches[chosen])
-
-    @cached_property
-    def T_map_marker(self) -> FloatArray:
-        """(N, 4, 4)."""
-        return np.stack([marker.T_map_marker for marker in self.markers])
-
-    @cached_property
-    def sizes(self) -> FloatArray:
-        """(N,) [m]."""
-        return np.array([marker.size for marker in self.markers])
+        arrays = self.corners, self.covariances, self.branches, self.T_map_marker, self.sizes, self.map_covariances
+        return Sight([marker for marker in self.markers if marker.trusted], *(array[chosen] for array in arrays))
 
     @cached_property
     def noise_px(self) -> FloatArray:
@@ -65,11 +68,6 @@ class Sight:
     def points(self) -> FloatArray:
         """(N, 4, 3) corners in the map [m]."""
         return corners_in_map(self.T_map_marker, self.sizes)
-
-    @cached_property
-    def map_covariances(self) -> FloatArray:
-        """(N, 6, 6) of the markers' poses in the map."""
-        return np.stack([marker.covariance for marker in self.markers])
 
     @cached_property
     def relative_covariances(self) -> FloatArray:

@@ -24,7 +24,7 @@ from thermal_fiducial.core.mapping.located import Located, LocatedFrame, Locatio
 from thermal_fiducial.core.mapping.map_alignment import jump
 from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.new_markers import entry, NewMarkers
-from thermal_fiducial.core.mapping.odometry_prior import contradicts, predicted_camera, PredictedCamera
+from thermal_fiducial.core.mapping.odometry_prior import contradicts, predicted_camera
 from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.core.mapping.trust import Trust
 from thermal_fiducial.core.measurements import Markers, usable
@@ -107,19 +107,15 @@ class MarkerMapper:
         offset_std = self.config.time_offset_std
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
-        outcome = self._locate(stamp_ns, known.trusted, camera, predicted)
+        sight = known.trusted
+        outcome: Located | Refusal = Refusal('no known marker in view')
+        if sight.markers:
+            expected = None if predicted is None else predicted.pose.T_map_camera
+            running_errors = self._trust.running_errors(sight.markers)
+            outcome = self._localizer.locate(stamp_ns, sight, running_errors, camera, expected, self._errors)
+        elif not self.map.markers:
+            outcome = Refusal('the map has no marker: give a map file with at least one')
         return LocatedFrame(stamp_ns, camera, markers, is_known, known, predicted, outcome)
-
-    def _locate(
-        self, stamp_ns: int, sight: Sight, camera: Camera, predicted: PredictedCamera | None
-    ) -> Located | Refusal:
-        if not self.map.markers:
-            return Refusal('the map has no marker: give a map file with at least one')
-        if not sight.markers:
-            return Refusal('no known marker in view')
-        running_errors = self._trust.running_errors(sight.markers)
-        expected = None if predicted is None else predicted.pose.T_map_camera
-        return self._localizer.locate(stamp_ns, sight, running_errors, camera, expected, self._errors)
 
     @property
     def _errors(self) -> SystematicErrors:
