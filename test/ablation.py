@@ -162,7 +162,7 @@ def _place(path: str) -> Any:
 
 
 def _nothing_found(*_: Any) -> Any:
-    return _place('found:Found').none()
+    return _place('known_markers:Found').none()
 
 
 def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
@@ -178,9 +178,7 @@ def _no_covariance(_: Any, corners_px: Any, *__: Any) -> Any:
     return np.zeros((len(corners_px), 4, 2, 2))
 
 
-_READOUT = tuple(
-    f'frame:{name}' for name in ('delays', 'stretch', 'displacement', 'expected_displacement', 'seen_displacement')
-)
+_READOUT = tuple(f'frame:{name}' for name in ('delays', 'stretch', 'displacement', 'rolling_displacement'))
 _SCALES = _place('search:SearchScales')
 _ALL_IN_THE_SEARCH = {'finding:_next_scales': lambda *_, **__: _SCALES.ALL}
 _DISPLAYED = 'corner_estimates:DisplayedSides', 'corner_estimates:_outward'
@@ -222,12 +220,12 @@ MECHANISMS = {
     'columns of the frame': Mechanism('slow, 0.1 K, guided', (), {'frame:without_columns': lambda counts, _: counts}),
     'following': Mechanism(
         'slow, 0.1 K, blind',
-        ('guided:Followed',),
-        {'finding:Followed.of': lambda *_: _place('guided:Followed').none()},
+        ('finding:Followed',),
+        {'finding:Followed.of': lambda *_: _place('finding:Followed').none()},
     ),
     'search near predictions': Mechanism(
         'fast, 0.5 K, guided',
-        ('guided:near_prediction', 'guided:_shifted', 'guided:_confirmed'),
+        ('finding:near_prediction', 'finding:_shifted', 'finding:_confirmed'),
         {'finding:near_prediction': _nothing_found},
     ),
     'branches by the map': Mechanism('slow, 0.1 K, guided', (), {'detector:choose_branches': lambda poses, *_: poses}),

@@ -7,10 +7,9 @@ import pytest
 
 from thermal_fiducial.core.detection.frame import (
     delays,
-    expected_displacement,
     Frame,
     Places,
-    seen_displacement,
+    rolling_displacement,
     stretch,
 )
 from thermal_fiducial.core.detection.twist import Twist
@@ -60,17 +59,17 @@ def test_corners_are_found_where_their_rows_show_them():
     off = seen - places.at.px
     assert np.abs(off).max() > 5.0
     # 0.003 and 0.004 px is what the third order leaves, 0.06 px would be what the bent ways do.
-    np.testing.assert_allclose(seen_displacement(places, TWIST, FRAME, seen[..., 1]), off, atol=0.01)
-    np.testing.assert_allclose(expected_displacement(places, TWIST, FRAME), off, atol=0.01)
+    np.testing.assert_allclose(rolling_displacement(places, TWIST, FRAME, seen[..., 1]), off, atol=0.01)
+    np.testing.assert_allclose(rolling_displacement(places, TWIST, FRAME), off, atol=0.01)
 
 
 def test_nothing_moves_when_all_rows_are_read_at_once():
     places, at_once = places_of(points()), replace(FRAME, readout=0.0)
     for result in (
-        expected_displacement(places, TWIST, at_once),
-        expected_displacement(places, None, FRAME),
-        seen_displacement(places, TWIST, at_once, places.at.px[..., 1]),
-        seen_displacement(places, None, FRAME, places.at.px[..., 1]),
+        rolling_displacement(places, TWIST, at_once),
+        rolling_displacement(places, None, FRAME),
+        rolling_displacement(places, TWIST, at_once, places.at.px[..., 1]),
+        rolling_displacement(places, None, FRAME, places.at.px[..., 1]),
     ):
         np.testing.assert_array_equal(result, np.zeros_like(places.at.px))
 
@@ -79,6 +78,6 @@ def test_nothing_moves_when_all_rows_are_read_at_once():
 def test_what_runs_with_the_read_out_leaves_longer_ways(speed):
     places = places_of(np.array([[[-0.1, -0.1, 1], [0.1, -0.1, 1], [0.1, 0.1, 1], [-0.1, 0.1, 1]]]))
     falling = Twist(np.array([0.0, -speed, 0, 0, 0, 0]), np.eye(12))
-    rate = FRAME.readout / 511 * places.velocity(falling)[..., 1]
+    rate = FRAME.readout / 511 * (places.flow @ falling.value)[..., 1]
     np.testing.assert_allclose(stretch(places, falling, FRAME), 1.0 / (1.0 - rate), rtol=1e-12)
     assert np.all((stretch(places, falling, FRAME) > 1.0) == (speed > 0.0))

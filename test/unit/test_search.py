@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import Frame
+from thermal_fiducial.core.detection.known_markers import Found
 from thermal_fiducial.core.detection.patterns import Decoder, marker_bits, Reading, shrunk
 from thermal_fiducial.core.detection.quads import noise_of
 from thermal_fiducial.core.detection.search import BlindSearch, inside_out, SearchScales

@@ -27,7 +27,7 @@ from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transfo
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.mapper import MapperResult, MarkerMap, MarkerMapper
-from thermal_fiducial.core.measurements import CameraPose, ImuSample, Markers, Odometry
+from thermal_fiducial.core.measurements import ImuSample, Markers, Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 
@@ -120,7 +120,10 @@ class Pipeline:
             return FrameResult(stamp_ns, withheld=frame.reason or 'no camera_info')
         markers = self.detector.detect(stamp_ns, frame.counts, self.camera, self._odometry)
         mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry)
-        update = None if mapping.pose is None else self.filter.add_pose(_published_pose(mapping.pose))
+        update = None
+        if (pose := mapping.pose) is not None:
+            published = replace(pose, T_map_camera=as_published(pose.T_map_camera), marker_ids=(), rms_px=0.0)
+            update = self.filter.add_pose(published)
         if (offset := self.filter.camera_time_offset) is not None:
             self._odometry.set_clock_offset(offset)
         if self._refine(stamp_ns) or mapping.map_changed:
@@ -146,7 +149,3 @@ class Pipeline:
                 if row['trusted']
             }
         )
-
-
-def _published_pose(pose: CameraPose) -> CameraPose:
-    return replace(pose, T_map_camera=as_published(pose.T_map_camera), marker_ids=(), rms_px=0.0)

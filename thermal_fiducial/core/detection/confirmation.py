@@ -12,10 +12,10 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.alignment import aligned
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
-from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import Frame
+from thermal_fiducial.core.detection.known_markers import Found
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
-from thermal_fiducial.core.detection.quads import halved
+from thermal_fiducial.core.detection.quads import halfway, halved
 from thermal_fiducial.core.detection.refining import RefinedMarkers, sides_px
 from thermal_fiducial.core.detection.search import accepted
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
@@ -47,8 +47,8 @@ _NOISY = 8.0
 _SEEN_PX = 60.0
 # Widest cells of markers too small for their sides to be measured [px]; deviation of a corner by the pattern [cells].
 _WIDEST_CELL_PX, _DEVIATION_CELLS = 2.5, 0.2
-# Nearer to the border of the image than this a marker may be cut off [px].
-_BORDER_PX = 1.0
+#: Nearer to the border of the image than this a marker may be cut off, by its refined corners [px].
+BORDER_PX = 1.0
 
 
 def confirmed(
@@ -93,7 +93,7 @@ def _read(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
     sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
     if sides.min() < _WIDE_CELL_PX * decoder.cells:
         return decoder.read(image, quads)
-    return decoder.read(halved(image), 0.5 * (quads - 0.5))
+    return decoder.read(halved(image), halfway(quads))
 
 
 def speaks_for_itself(reading: Reading, decoder: Decoder) -> BoolArray:
@@ -127,7 +127,7 @@ def with_corners_by_pattern(
     reading = decoder.read(frame.image, corners)
     good = (reading.ids == found.ids[small]) & (reading.turns == 0) & speaks_for_itself(reading, decoder)
     good &= accepted(reading, frame.noise, decoder.correctable, config)
-    good &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)
+    good &= frame.camera.contains(corners, BORDER_PX).all(axis=1)
     which, corners, shift = small[good], corners[good], shift[good]
     by_pattern[which] = True
     covariances = (_DEVIATION_CELLS * cell[which, None, None, None]) ** 2 * np.broadcast_to(np.eye(2), (4, 2, 2))
@@ -142,7 +142,7 @@ def with_corners_by_pattern(
             refined,
             observed=refined.observed.with_others(which, observed),
             corners=refined.corners.with_others(which, at_stamp),
-            places=refined.places.moved(refined.places.at.at_pixels(px)),
+            places=replace(refined.places, at=refined.places.at.at_pixels(px)),
         ),
         by_pattern,
     )

@@ -11,15 +11,13 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.confirmation import confirmed, with_corners_by_pattern
+from thermal_fiducial.core.detection.confirmation import BORDER_PX, confirmed, with_corners_by_pattern
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind, edges_behind_border, model, sides_of
-from thermal_fiducial.core.detection.finding import Findings
-from thermal_fiducial.core.detection.found import among, Found, places_of
-from thermal_fiducial.core.detection.frame import Frame, Places
-from thermal_fiducial.core.detection.guided import Followed
-from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
+from thermal_fiducial.core.detection.finding import Findings, Followed
+from thermal_fiducial.core.detection.frame import Frame
+from thermal_fiducial.core.detection.known_markers import among, ExpectedMarkers, Found, places_of
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.refining import RefinedMarkers, Refiner, sides_px
 from thermal_fiducial.core.detection.tracking import MotionTrack
@@ -46,8 +44,6 @@ _DEVIATION = 0.1
 # Four corners that err together, each with a covariance of its own, claim what they have in common four times too well.
 _CORNERS = 4.0
 _COLUMNS, _HALF = 6, 6
-# Nearer to the border of the image than this a marker may be cut off [px].
-_BORDER_PX = 1.0
 # A marker that was read off its corners by less than this need not be read again [cells].
 _READ_THERE = 0.1
 # Standard deviation of motion blur below which a marker looks as if it stood still [cells].
@@ -160,7 +156,10 @@ class CornerEstimator:
         found, followed = findings.found, findings.followed
         if len(found.ids) == 0:
             return _none(frame.twist)
-        places = _places(frame, found, followed, in_map, sizes)
+        places = followed.places
+        if not np.array_equal(found.ids, followed.ids):
+            known = [] if in_map is None else [(in_map.ids, in_map.depth)]
+            places = places_of(frame, found, sizes, *known, (followed.ids, followed.places.depth))
         refined = self._refiner.refine(frame, found, places, track, config)
         keep = self._confirmed(frame, found, refined, followed, config)
         if frame.displayed and not keep.all():
@@ -193,17 +192,7 @@ class CornerEstimator:
             standing = frame.displayed & (blur < _STANDING * sides_px(expected.corners_px) / self._decoder.cells)
             image = view.round_markers(there, others)
             keep[others] = confirmed(image, expected, observed, self._decoder, config, standing_picture=standing)
-        return np.asarray(keep & frame.camera.contains(refined.observed.corners_px, _BORDER_PX).all(axis=1))
-
-
-def _places(
-    frame: Frame, found: Found, followed: Followed, in_map: ExpectedMarkers | None, sizes: FloatArray
-) -> Places:
-    """Where the markers are: those that were followed, where they were followed to."""
-    if np.array_equal(found.ids, followed.ids):
-        return followed.places
-    known = [] if in_map is None else [(in_map.ids, in_map.depth)]
-    return places_of(frame, found, sizes, *known, (followed.ids, followed.places.depth))
+        return np.asarray(keep & frame.camera.contains(refined.observed.corners_px, BORDER_PX).all(axis=1))
 
 
 def _none(twist: Twist | None) -> MarkerEstimates:

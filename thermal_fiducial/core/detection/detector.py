@@ -10,9 +10,8 @@ from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.detection.corner_estimates import CornerEstimator, MarkerEstimates
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.finding import Findings, FrameHistory, MarkerFinder
-from thermal_fiducial.core.detection.found import among, depths
 from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes, MarkersOfMap
+from thermal_fiducial.core.detection.known_markers import among, depths, KnownMarkers
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
 from thermal_fiducial.core.detection.tracking import FramePrediction, MotionTrack, Predictor, TrackedMarkers
@@ -57,11 +56,11 @@ class MarkerDetector:
         bits = marker_bits(dictionary)
         decoder = Decoder(bits, int(dictionary.maxCorrectionBits))
         self._count = decoder.count
-        self._sizes = MarkerSizes(config.marker_size, size_overrides(config.marker_size_overrides))
-        self._finder = MarkerFinder(decoder, self._sizes)
+        self._sizes = config.marker_size, size_overrides(config.marker_size_overrides)
+        self._finder = MarkerFinder(decoder)
         self._estimator = CornerEstimator(decoder, bits)
         self._partial = PartialMarkerSearch(decoder, bits)
-        self._known = KnownMarkers({})
+        self._known = KnownMarkers({}, *self._sizes)
         self._mount(config)
 
     def configure(self, config: ArucoDetectorConfig) -> None:
@@ -77,11 +76,12 @@ class MarkerDetector:
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
         """Markers that are known: ID to (T_map_marker, side [m])."""
-        self._known = KnownMarkers({key: entry for key, entry in marker_map.items() if 0 <= key < self._count})
+        of_dictionary = {key: entry for key, entry in marker_map.items() if 0 <= key < self._count}
+        self._known = KnownMarkers(of_dictionary, *self._sizes)
 
     def size(self, marker_id: int) -> float:
         """Side of a marker [m]: of the map, or of the overrides, or the common one."""
-        return float(self._sizes.of(np.array([marker_id]), self._known)[0])
+        return float(self._known.sizes(np.array([marker_id]))[0])
 
     def detect(self, stamp_ns: int, counts: Counts | Gray, camera: Camera, prior: MotionPrior | None = None) -> Markers:
         """Markers of one frame, sorted by ID; an empty array when there are none.
@@ -98,9 +98,11 @@ class MarkerDetector:
             prediction = self._predictor.predict(stamp_ns, prior, history.track, config.max_odometry_age)
             keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
             frame = Frame.of(stamp_ns, counts, camera, prediction.twist, config, keep_columns=keep_columns)
-            expected = _expected(known, prediction, camera, config)
-            findings = self._finder.find(frame, history, MarkersOfMap(known, expected), config)
-            sizes = self._sizes.of(findings.found.ids, known)
+            expected = None
+            if prediction.T_camera_map is not None and len(known.ids) and config.guided:
+                expected = known.expected(prediction.T_camera_map, camera, config.min_side_px)
+            findings = self._finder.find(frame, history, known, expected, config)
+            sizes = known.sizes(findings.found.ids)
             estimates = self._estimator.estimate(frame, findings, expected, sizes, history.track, config)
             poses = self._poses(estimates.ids, estimates.corners, estimates.at, prediction.T_camera_map)
             corners = estimates.corners
@@ -114,7 +116,7 @@ class MarkerDetector:
         self, ids: IntArray, corners: RefinedCorners, at: ImagePoints, T_camera_map: FloatArray | None
     ) -> PlanarPoses:
         """Both poses of each marker, the likelier first."""
-        poses = planar_poses(at, corners.covariances, self._sizes.of(ids, self._known))
+        poses = planar_poses(at, corners.covariances, self._known.sizes(ids))
         T_camera_map = T_camera_map if len(self._known.ids) else None
         return choose_branches(poses, at, corners.covariances, self._known.entries(ids), T_camera_map)
 
@@ -140,7 +142,7 @@ class MarkerDetector:
         ids, history = estimates.ids, self._history
         # Motion that came from what turned out to be no markers is none.
         twist = estimates.twist if len(ids) else frame.twist
-        depth = depths(poses.T_camera_marker[:, 0], self._sizes.of(ids, self._known))
+        depth = depths(poses.T_camera_marker[:, 0], self._known.sizes(ids))
         markers = TrackedMarkers(ids, estimates.x, depth, estimates.corners.contrast / frame.noise)
         return FrameHistory(
             history.track.after(frame.stamp_ns, twist, markers),
@@ -149,15 +151,6 @@ class MarkerDetector:
             findings.since_blind,
             findings.scales,
         )
-
-
-def _expected(
-    known: KnownMarkers, prediction: FramePrediction, camera: Camera, config: ArucoDetectorConfig
-) -> ExpectedMarkers | None:
-    """Markers of the map where they should be; None where nothing says so."""
-    if prediction.T_camera_map is None or len(known.ids) == 0 or not config.guided:
-        return None
-    return known.expected(prediction.T_camera_map, camera, config.min_side_px)
 
 
 def marker_rows(

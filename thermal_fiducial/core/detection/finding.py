@@ -1,4 +1,8 @@
-"""Markers of a frame: followed, known ones near their predicted places, and blindly when that is due."""
+"""Markers of a frame: followed, known ones near their predicted places, and blindly when that is due.
+
+A marker that is looked for at its place is accepted by its own evidence alone: its pattern, in its expected place and
+attitude, must correlate with the image clearly, and better than any other marker's or any other turn of its own.
+"""
 
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
@@ -6,27 +10,34 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.found import among, Found, merged, places_of
-from thermal_fiducial.core.detection.frame import Frame, seen_displacement
-from thermal_fiducial.core.detection.guided import Followed, near_prediction
-from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, KnownMarkers, MarkerSizes, MarkersOfMap
-from thermal_fiducial.core.detection.patterns import Decoder
+from thermal_fiducial.core.detection.frame import Frame, Places, rolling_displacement
+from thermal_fiducial.core.detection.known_markers import (
+    among,
+    CUT_OFF_PX,
+    ExpectedMarkers,
+    Found,
+    KnownMarkers,
+    merged,
+    places_of,
+)
+from thermal_fiducial.core.detection.lag import lag_tail_maps, markers_deblurred, REMAINING
+from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS, Reading
+from thermal_fiducial.core.detection.refining import BLUR_THAT_MATTERS_PX, CLEAR_CNR
 from thermal_fiducial.core.detection.search import BlindSearch, SearchScales
-from thermal_fiducial.core.detection.tracking import MotionTrack
-from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.detection.tracking import MotionTrack, TrackedMarkers
+from thermal_fiducial.core.detection.twist import Twist
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 # A frame's markers are remembered for about so many frames, and make sure of the kind when so many more are of it.
 _FRAMES, _SURE = 30, 6.0
 # Share of the map's expected markers that, when observed, shows that the prediction holds.
 _ENOUGH = 0.5
-# Contrast over noise beyond which a marker shows at full and at half the resolution.
-_CLEAR = 20.0
-# Nearer to the border of the image than this a marker is not expected to be observed [px].
-_BORDER_PX = 2.0
 # Where not all markers are known, or not all observed that should be, a blind search follows at least every so many
 # frames.
 _INCOMPLETE = 2
+# Correlation with its pattern of a marker that is still where motion has carried it, seen through the lag.
+_STILL_SIMILAR = 0.7
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +75,57 @@ class FrameHistory:
     scales: SearchScales = SearchScales.ALL
 
 
+@dataclass(frozen=True, slots=True)
+class Followed:
+    """N markers where the motion since the last frame has carried them.
+
+    Parameters
+    ----------
+    ids : (N,)
+    places : at the stamp
+    cnr : (N,) contrast-to-noise ratio of a pixel
+    certain : (N,) whether the frame shows them there beyond doubt
+    """
+
+    ids: IntArray
+    places: Places
+    cnr: FloatArray
+    certain: BoolArray
+
+    @staticmethod
+    def none() -> 'Followed':
+        """No markers."""
+        x, J = np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2))
+        places = Places(ImagePoints(x, x, J, J), np.zeros((0, 4)), np.zeros((0, 4, 2, 6)))
+        return Followed(np.zeros(0, dtype=np.int64), places, np.zeros(0), np.zeros(0, dtype=bool))
+
+    @staticmethod
+    def of(last: TrackedMarkers, frame: Frame) -> 'Followed':
+        """Those of the last frame, carried on; nothing is known yet of whether they are seen."""
+        places = Places.of(ImagePoints.seen_at(last.x, frame.camera), last.depth)
+        return Followed(last.ids, places, last.cnr, np.zeros(len(last.ids), dtype=bool))
+
+    def only(self, keep: BoolArray) -> 'Followed':
+        """Those of the markers ``keep`` (N,)."""
+        if keep.all():
+            return self
+        return Followed(self.ids[keep], self.places.only(keep), self.cnr[keep], self.certain[keep])
+
+    def seen(self, frame: Frame, twist: Twist, decoder: Decoder, config: ArucoDetectorConfig) -> 'Followed':
+        """Those that the frame shows: they look like themselves more than like any other marker."""
+        if len(self.ids) == 0:
+            return self
+        shown = self.places.at.px + self.places.lag_blur(twist, frame.lag)
+        shown += rolling_displacement(self.places, twist, frame)
+        likeness = decoder.likeness(frame.image, shown)
+        similarity = likeness.correlation * np.sign(self.cnr)
+        alike = (likeness.best == 4 * self.ids) & (similarity > _STILL_SIMILAR)
+        alike &= frame.camera.contains(shown).all(axis=1)
+        certain = similarity >= config.guided_min_correlation
+        certain &= similarity - likeness.runner_up >= config.guided_min_margin
+        return Followed(self.ids, self.places, self.cnr, certain).only(alike)
+
+
 class Findings(NamedTuple):
     """What is found in a frame."""
 
@@ -91,33 +153,46 @@ class MarkerFinder:
     Parameters
     ----------
     decoder : of the dictionary
-    sizes : sides of the markers
     """
 
-    def __init__(self, decoder: Decoder, sizes: MarkerSizes) -> None:
-        self._decoder, self._sizes = decoder, sizes
+    def __init__(self, decoder: Decoder) -> None:
+        self._decoder = decoder
         self._search = BlindSearch(decoder)
 
-    def find(self, frame: Frame, history: FrameHistory, of_map: MarkersOfMap, config: ArucoDetectorConfig) -> Findings:
-        """Markers to a pixel or two, at the frame's stamp."""
-        near = self._near(frame, history, of_map, config)
+    def find(
+        self,
+        frame: Frame,
+        history: FrameHistory,
+        known: KnownMarkers,
+        in_map: ExpectedMarkers | None,
+        config: ArucoDetectorConfig,
+    ) -> Findings:
+        """Markers to a pixel or two, at the frame's stamp; ``in_map``: where those of the map should be, if known."""
+        near = self._near(frame, history, known, in_map, config)
         since_blind, interval = history.since_blind + 1, config.blind_interval
-        if of_map.expected is None or not near.complete:
+        if in_map is None or not near.complete:
             interval = min(interval, _INCOMPLETE)
-        if (near.complete or (near.holds and of_map.expected is not None)) and since_blind < interval:
+        if (near.complete or (near.holds and in_map is not None)) and since_blind < interval:
             return Findings(near.found, near.followed, since_blind, history.scales)
         scales = _next_scales(history, complete=near.complete)
-        blind = self._blind(frame, history, near.found, scales, of_map.known, config)
+        blind = self._blind(frame, history, near.found, scales, known, config)
         return Findings(merged(near.found, blind), near.followed, 0, scales)
 
-    def _near(self, frame: Frame, history: FrameHistory, of_map: MarkersOfMap, config: ArucoDetectorConfig) -> _Near:
+    def _near(
+        self,
+        frame: Frame,
+        history: FrameHistory,
+        known: KnownMarkers,
+        in_map: ExpectedMarkers | None,
+        config: ArucoDetectorConfig,
+    ) -> _Near:
         """Markers where they should be: followed from the last frame, and others of the map."""
         if frame.twist is None or not config.guided:
             return _Near(Found.none(), Followed.none(), complete=False, holds=False)
         last = Followed.of(history.track.expected(frame.stamp_ns, frame.twist), frame)
-        expected = _expected(frame.camera, last, of_map)
+        expected = _expected(frame.camera, last, known, in_map)
         followed = last.only(among(last.ids, expected.ids)).seen(frame, frame.twist, self._decoder, config)
-        found = followed.found()
+        found = Found(followed.ids, followed.places.at.px, followed.cnr, np.ones(len(followed.ids), dtype=bool))
         new = ~among(expected.ids, followed.ids)
         if new.any():
             near = near_prediction(frame, frame.twist, expected.only(new), self._decoder, config)
@@ -152,24 +227,67 @@ class MarkerFinder:
         """Markers where they would be if all rows were seen at once."""
         if frame.readout == 0.0 or len(found.ids) == 0:
             return found
-        places = places_of(frame, found, self._sizes.of(found.ids, known))
-        rolling = seen_displacement(places, frame.twist, frame, found.corners_px[..., 1])
+        places = places_of(frame, found, known.sizes(found.ids))
+        rolling = rolling_displacement(places, frame.twist, frame, found.corners_px[..., 1])
         return replace(found, corners_px=found.corners_px - rolling)
 
 
 def _next_scales(history: FrameHistory, *, complete: bool) -> SearchScales:
     """Both resolutions; where all that is expected is seen, so clearly that either shows it, only one, in turn."""
-    if not (complete and history.track.all_clearer_than(_CLEAR)):
+    if not (complete and history.track.all_clearer_than(CLEAR_CNR)):
         return SearchScales.ALL
     return SearchScales.FAINT if history.scales == SearchScales.FINE else SearchScales.FINE
 
 
-def _expected(camera: Camera, last: Followed, of_map: MarkersOfMap) -> ExpectedMarkers:
+def _expected(camera: Camera, last: Followed, known: KnownMarkers, in_map: ExpectedMarkers | None) -> ExpectedMarkers:
     """The map's markers and the last frame's others."""
     at = last.places.at
     others = ExpectedMarkers(last.ids, at.px, at.x, last.places.depth)
-    new: BoolArray = np.asarray(camera.contains(at.px, _BORDER_PX).all(axis=1))
-    if of_map.expected is None:
+    new: BoolArray = np.asarray(camera.contains(at.px, CUT_OFF_PX).all(axis=1))
+    if in_map is None:
         return others.only(new)
-    new &= ~among(last.ids, of_map.known.ids)
-    return of_map.expected.joined(others.only(new)) if new.any() else of_map.expected
+    new &= ~among(last.ids, known.ids)
+    return in_map.joined(others.only(new)) if new.any() else in_map
+
+
+def near_prediction(
+    frame: Frame,
+    twist: Twist,
+    expected: ExpectedMarkers,
+    decoder: Decoder,
+    config: ArucoDetectorConfig,
+) -> Found:
+    """Those of the ``expected`` markers that the frame shows near where they are expected."""
+    places = Places.of(ImagePoints.at(expected.corners_px, frame.camera), expected.depth)
+    shift, rolling = places.lag_blur(twist, frame.lag), rolling_displacement(places, twist, frame)
+    ids, corners = expected.ids, expected.corners_px + rolling
+    blurred = np.abs(shift).max(axis=(1, 2)) > BLUR_THAT_MATTERS_PX
+    scene = frame.image
+    if blurred.any():
+        scene = markers_deblurred(frame.image, corners[blurred], lag_tail_maps(corners[blurred], shift[blurred]))
+    left = np.where(blurred[:, None, None], REMAINING * shift, shift)
+    shown = _shifted(scene, ids, corners + left, decoder)
+    reading = decoder.read(scene, shown)
+    good = _confirmed(reading, ids, frame.noise, config)
+    corners = (shown - left - rolling)[good]
+    return Found(ids[good], corners, reading.contrast[good] / frame.noise, np.ones(len(corners), dtype=bool))
+
+
+def _shifted(image: Float32Array, ids: IntArray, corners: FloatArray, decoder: Decoder) -> FloatArray:
+    """Corners (N, 4, 2) moved to where their patterns correlate best, between the places by the centre of gravity."""
+    cell = np.linalg.norm(corners[:, 2] - corners[:, 0], axis=-1) / (np.sqrt(2.0) * decoder.cells)
+    step = cell[:, None, None] * NEAR_CELLS
+    tried = (corners[:, None] + step[:, :, None]).reshape(-1, 4, 2)
+    similarity = np.abs(decoder.match(image, tried, np.repeat(ids, len(NEAR_CELLS)))).reshape(len(ids), -1)
+    return np.asarray(corners + most_similar(similarity, step)[:, None])
+
+
+def _confirmed(reading: Reading, ids: IntArray, noise: float, config: ArucoDetectorConfig) -> BoolArray:
+    similarity = np.abs(reading.correlation)
+    return np.asarray(
+        (reading.ids == ids)
+        & (reading.turns == 0)
+        & (similarity >= config.guided_min_correlation)
+        & (similarity - reading.runner_up >= config.guided_min_margin)
+        & (np.abs(reading.contrast) >= config.guided_min_contrast * noise)
+    )

@@ -75,21 +75,9 @@ class Places:
         """Those of the markers ``keep``."""
         return Places(self.at.only(keep), self.depth[keep], self.flow[keep])
 
-    def moved(self, at: ImagePoints) -> 'Places':
-        """The same some pixels away."""
-        return Places(at, self.depth, self.flow)
-
-    def velocity(self, twist: Twist) -> FloatArray:
-        """Of the image (N, 4, 2) [px/s]."""
-        return np.asarray(self.flow @ twist.value)
-
     def lag_blur(self, twist: Twist, lag: float) -> FloatArray:
         """Mean displacement (N, 4, 2) [px] by a lag [s]."""
         return np.asarray(-lag * (self.flow @ twist.ago(lag)))
-
-    def lag_tail(self, twist: Twist, lag: float) -> FloatArray:
-        """Displacement (N, 4, 2) [px] in so long a time as the lag, as it places the image's lag tail."""
-        return np.asarray(-lag * (self.flow @ twist.ago(LAG_TAIL_AGE * lag)))
 
     def unknown(self, twist: Twist, lag: float) -> FloatArray:
         """Covariances (N, 4, 2, 2) [px^2] of the motion blur by what is unknown of the twist.
@@ -107,12 +95,13 @@ def delays(rows: FloatArray, frame: Frame) -> FloatArray:
 
 def stretch(places: Places, twist: Twist, frame: Frame) -> FloatArray:
     """How much longer (N, 4) ways in the image are for what runs with the read-out, or shorter against it."""
-    return np.asarray(1.0 / (1.0 - frame.readout / (frame.camera.height - 1) * places.velocity(twist)[..., 1]))
+    velocity = places.flow @ twist.value
+    return np.asarray(1.0 / (1.0 - frame.readout / (frame.camera.height - 1) * velocity[..., 1]))
 
 
 def lag_tail(places: Places, twist: Twist, frame: Frame) -> FloatArray:
-    """:meth:`Places.lag_tail` (N, 4, 2) [px] in an image whose rows are seen one after the other."""
-    still = places.lag_tail(twist, frame.lag)
+    """Displacement (N, 4, 2) [px] in so long a time as the lag, as it places the image's lag tail."""
+    still: FloatArray = np.asarray(-frame.lag * (places.flow @ twist.ago(LAG_TAIL_AGE * frame.lag)))
     return still * stretch(places, twist, frame)[..., None] if frame.readout > 0.0 else still
 
 
@@ -127,16 +116,13 @@ def displacement(places: Places, twist: Twist, frame: Frame, seconds: FloatArray
     return np.asarray(later * (flow @ twist.value - (frame.lag - 0.5 * later) * (flow @ twist.acceleration)))
 
 
-def expected_displacement(places: Places, twist: Twist | None, frame: Frame) -> FloatArray:
-    """The same (N, 4, 2) [px] for the rows in which corners will be seen, lag included."""
+def rolling_displacement(
+    places: Places, twist: Twist | None, frame: Frame, rows: FloatArray | None = None
+) -> FloatArray:
+    """The same (N, 4, 2) [px] for the ``rows`` (N, 4) in which corners are seen; None: will be seen, lag included."""
     if frame.readout == 0.0 or twist is None:
         return np.zeros_like(places.at.px)
-    rows = places.at.px[..., 1] + places.lag_blur(twist, frame.lag)[..., 1]
-    return displacement(places, twist, frame, delays(rows, frame) * stretch(places, twist, frame))
-
-
-def seen_displacement(places: Places, twist: Twist | None, frame: Frame, rows: FloatArray) -> FloatArray:
-    """The same (N, 4, 2) [px] for the ``rows`` (N, 4) in which corners are seen."""
-    if frame.readout == 0.0 or twist is None:
-        return np.zeros_like(places.at.px)
-    return displacement(places, twist, frame, delays(rows, frame))
+    if rows is not None:
+        return displacement(places, twist, frame, delays(rows, frame))
+    lagging = places.at.px[..., 1] + places.lag_blur(twist, frame.lag)[..., 1]
+    return displacement(places, twist, frame, delays(lagging, frame) * stretch(places, twist, frame))

@@ -1,21 +1,101 @@
-"""The markers of a map, and where a camera at a pose should see them."""
+"""Markers of a frame that were found, and those of a map where a camera at a pose should see them."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.found import among
+from thermal_fiducial.core.detection.frame import Frame, Places
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.planar_pose import ippe_square, marker_corners
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
+#: Nearer to the border of the image than this a marker may be cut off, before its corners are refined [px].
+CUT_OFF_PX = 2.0
+#: Middles of outlines of one marker, in one another, are nearer than this share of the larger one's diagonal.
+TOGETHER = 0.35
 # A marker turned further from the camera than this shows too little to be expected.
 _MAX_TILT_COSINE = 0.2
 _NEXT = np.array([1, 2, 3, 0])
+# Corners of a marker of side 1 in its plane.
+_FACE = marker_corners(1.0)[:, :2]
 # A marker predicted as far inside the image as this is not cut by its border [px].
 _WHOLE_PX = 10.0
+
+
+def among(ids: IntArray, others: IntArray) -> BoolArray:
+    """Which of ``ids`` (N,) are among ``others`` (M,)."""
+    return np.asarray((ids[:, None] == others).any(axis=1))
+
+
+def pairs(ids: IntArray, others: IntArray) -> tuple[IntArray, IntArray]:
+    """Places, in ``ids`` (N,) and in ``others`` (M,), of the IDs that both have."""
+    first, second = np.nonzero(ids[:, None] == others)
+    return first, second
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """Markers that a search found.
+
+    Parameters
+    ----------
+    ids : (N,)
+    corners_px : (N, 4, 2) clockwise from the marker's top-left, to a pixel or two
+    cnr : (N,) contrast-to-noise ratio of a pixel; negative where black is warmer than white
+    expected : (N,) whether it was looked for where it was found
+    """
+
+    ids: IntArray
+    corners_px: FloatArray
+    cnr: FloatArray
+    expected: BoolArray
+
+    def only(self, keep: BoolArray | IntArray) -> 'Found':
+        """Those of the markers ``keep``."""
+        return Found(self.ids[keep], self.corners_px[keep], self.cnr[keep], self.expected[keep])
+
+    @staticmethod
+    def none() -> 'Found':
+        """No markers."""
+        return Found(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros(0), np.zeros(0, dtype=bool))
+
+
+def merged(first: Found, second: Found) -> Found:
+    """All markers of ``first``, and those of ``second`` that it does not have and that lie elsewhere."""
+    if len(second.ids) == 0:
+        return first
+    apart = np.linalg.norm(second.corners_px.mean(axis=1)[:, None] - first.corners_px.mean(axis=1), axis=-1)
+    extent = np.linalg.norm(first.corners_px[:, 2] - first.corners_px[:, 0], axis=-1)
+    new = ~among(second.ids, first.ids) & (apart > TOGETHER * extent).all(axis=1)
+    return Found(
+        np.concatenate([first.ids, second.ids[new]]),
+        np.concatenate([first.corners_px, second.corners_px[new]]),
+        np.concatenate([first.cnr, second.cnr[new]]),
+        np.concatenate([first.expected | among(first.ids, second.ids[second.expected]), second.expected[new]]),
+    )
+
+
+def places_of(frame: Frame, found: Found, sizes: FloatArray, *known: tuple[IntArray, FloatArray]) -> Places:
+    """Where markers of sides (N,) [m] are: of those that are ``known``, by ID, the corners' depths (K, 4) [m].
+
+    The others may be tilted wrongly: seen obliquely and approached, such a marker would be blurred across instead of
+    along.
+    """
+    at = ImagePoints.at(found.corners_px, frame.camera)
+    depth = depths(ippe_square(at.x, sizes)[:, 0], sizes)
+    for ids, depth_of_known in known:
+        one, other = pairs(ids, found.ids)
+        depth[other] = depth_of_known[one]
+    return Places.of(at, depth)
+
+
+def depths(T_camera_marker: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Depths (N, 4) [m] of the corners of markers."""
+    depth = T_camera_marker[:, 2, 3, None] + sizes[:, None] * (T_camera_marker[:, 2, :2] @ _FACE.T)
+    return np.fmax(np.where(np.isfinite(depth), depth, 1.0), 0.1)
 
 
 class ExpectedMarkers(NamedTuple):
@@ -60,9 +140,16 @@ class KnownMarkers:
     Parameters
     ----------
     markers : ID to (T_map_marker, side [m])
+    common, overrides : sides of the others [m]: of all, and of some by their IDs
     """
 
-    def __init__(self, markers: Mapping[int, tuple[FloatArray, float]]) -> None:
+    def __init__(
+        self,
+        markers: Mapping[int, tuple[FloatArray, float]],
+        common: float = 1.0,
+        overrides: Mapping[int, float] | None = None,
+    ) -> None:
+        self._common, self._overrides = common, overrides or {}
         #: (M,)
         self.ids = np.array(sorted(markers), dtype=np.int64)
         self._entries = dict(markers)
@@ -83,7 +170,7 @@ class KnownMarkers:
         facing = (normal * centre).sum(axis=1) < -_MAX_TILT_COSINE * np.sqrt((centre * centre).sum(axis=1))
         span = corners.take(_NEXT, axis=1) - corners
         large = ((span * span).sum(axis=-1) >= min_side_px**2).all(axis=1)
-        seen = np.flatnonzero(camera.contains(corners, 2.0).all(axis=1) & facing & large)
+        seen = np.flatnonzero(camera.contains(corners, CUT_OFF_PX).all(axis=1) & facing & large)
         points = points[seen]
         return ExpectedMarkers(self.ids[seen], corners[seen], points[..., :2] / points[..., 2:], points[..., 2])
 
@@ -108,29 +195,8 @@ class KnownMarkers:
         """T_map_marker (4, 4) and side [m] of each of the IDs (N,), None of those that are not among them."""
         return [self._entries.get(marker_id) for marker_id in ids.tolist()]
 
-
-class MarkersOfMap(NamedTuple):
-    """The markers of the map in a frame."""
-
-    known: KnownMarkers
-    #: where they should be; None: nothing says where
-    expected: ExpectedMarkers | None
-
-
-class MarkerSizes:
-    """Sides of markers: of the map, or of the overrides, or the common one.
-
-    Parameters
-    ----------
-    common, overrides : sides [m], of some by their IDs
-    """
-
-    def __init__(self, common: float, overrides: Mapping[int, float]) -> None:
-        self._common, self._overrides = common, overrides
-
-    def of(self, ids: IntArray, known: KnownMarkers) -> FloatArray:
-        """Sides (N,) of markers ``ids`` (N,) [m]."""
-        entries = zip(ids.tolist(), known.entries(ids), strict=True)
-        return np.array(
-            [self._overrides.get(key, self._common) if entry is None else entry[1] for key, entry in entries]
-        )
+    def sizes(self, ids: IntArray) -> FloatArray:
+        """Sides (N,) [m] of markers (N,): of the map, or of the overrides, or the common one."""
+        own = [self._overrides.get(marker_id, self._common) for marker_id in ids.tolist()]
+        in_map = self.entries(ids)
+        return np.array([size if entry is None else entry[1] for size, entry in zip(own, in_map, strict=True)])

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from thermal_fiducial.core.geometry.ippe import cross_in_plane
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Interpolation of lag tails where edges are measured: a linear one blurs them more than the image that they are taken
@@ -70,12 +71,8 @@ def _square_in_sides(shift: FloatArray, corners: FloatArray) -> FloatArray:
     """Squares (N,) of shifts (N, 2) in mean sides of markers (N, 4, 2): of a tilted one these are not alike."""
     a, b = corners[:, 1] - corners[:, 3], corners[:, 2] - corners[:, 0]
     # Twice the sides are a + b and b - a.
-    right, down = _cross(shift, b - a), _cross(a + b, shift)
-    return np.asarray((right * right + down * down) / _cross(a, b) ** 2)
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    right, down = cross_in_plane(shift, b - a), cross_in_plane(a + b, shift)
+    return np.asarray((right * right + down * down) / cross_in_plane(a, b) ** 2)
 
 
 def common_error(

@@ -28,7 +28,7 @@ from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import PartialMarkers
 from thermal_fiducial.core.detection.lag import model_error
-from thermal_fiducial.core.detection.patterns import Decoder
+from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
 from thermal_fiducial.core.detection.visible_cells import VisibleCells
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -39,9 +39,8 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, Gray, IntArray
 _NARROWEST_PX, _COARSE_PX = 5.0, 8.0
 # So many markers at most, the largest, are looked for in a frame: more show little more.
 _MOST = 2
-# Places near the prediction that are tried, in cells; others are so far apart, as far as so many standard deviations of
-# the prediction reach, but at least and at most so far.
-_NEAR = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]), axis=-1).reshape(-1, 2)
+# Places farther from the prediction that are tried [cells]: so far apart, as far as so many standard deviations of the
+# prediction reach, but at least and at most so far.
 _APART, _UNSURE, _LEAST_REACH, _REACH = 0.7, 2.5, 1.4, 4.9
 # Least number of cells in view, and of those by which any other marker differs, lest a stain make it another.
 _CELLS, _DIFFERENT = 16, 2
@@ -175,7 +174,7 @@ class PartialMarkerSearch:
 
         if similar(np.zeros((1, 2)))[0] > _THERE:
             return marker.T_camera_marker
-        at, near = np.zeros(2), cell_px * _NEAR
+        at, near = np.zeros(2), cell_px * NEAR_CELLS
         similarity = similar(near)
         if similarity.max() < _SIMILAR:
             far = cell_px * _around(marker.unsure_cells)
@@ -183,8 +182,7 @@ class PartialMarkerSearch:
             similarity = similar(at + near)
         if similarity.max() < _HINT:
             return None
-        weight = np.maximum(similarity - 0.8 * similarity.max(), 0.0)
-        shift = at + weight @ near / max(float(weight.sum()), 1e-9)
+        shift = at + most_similar(similarity[None], near[None])[0]
         seen = np.flatnonzero(layer.camera.contains(px))
         J = pose_jacobian(marker.T_camera_marker, points[seen], layer.camera)[..., :3].reshape(-1, 3)
         step = np.linalg.lstsq(J, np.tile(shift, len(seen)), rcond=1e-3)[0]

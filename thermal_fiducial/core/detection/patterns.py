@@ -19,8 +19,20 @@ _OUTSIDE = 0.4
 _OUTSIDE_PX = 2.5
 # Correlation below which nothing is a marker whatever surrounds it.
 _SIMILAR = 0.5
-# Samples along a cell, in its middle, away from blurred edges.
-_SAMPLES = np.array([0.3, 0.5, 0.7])
+#: Samples along a cell, in its middle, away from blurred edges.
+CELL_SAMPLES = np.array([0.3, 0.5, 0.7])
+
+
+#: Places (9, 2) round a prediction that are tried [cells], and similarity, as a share of the best, that counts nothing.
+NEAR_CELLS = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]), axis=-1).reshape(-1, 2)
+_UNLIKE = 0.8
+
+
+def most_similar(similarity: FloatArray, places: FloatArray) -> FloatArray:
+    """Where (N, 2), between ``places`` (N, P, 2), a similarity (N, P) is greatest: by its centre of gravity."""
+    weight = np.maximum(similarity - _UNLIKE * similarity.max(axis=1, keepdims=True), 0.0)
+    mean = np.einsum('np,npk->nk', weight, places)
+    return np.asarray(mean / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9))
 
 
 def marker_bits(dictionary: cv2.aruco.Dictionary) -> Gray:
@@ -114,10 +126,10 @@ class Decoder:
         #: (M,) by how much a perfect view of each marker correlates better with itself than with any other
         self.isolation = 1.0 - likeness.max(axis=1)
         self._patterns = patterns.astype(np.float32)
-        share = ((np.arange(self.cells)[:, None] + _SAMPLES) / self.cells).ravel()
+        share = ((np.arange(self.cells)[:, None] + CELL_SAMPLES) / self.cells).ravel()
         self._samples = bilinear(*(axis.ravel() for axis in np.meshgrid(share, share))).astype(np.float32)
         self._along_sides, self._away = _beside_sides(self.cells)
-        mean = np.kron(np.eye(self.cells), np.full((len(_SAMPLES), 1), 1.0 / len(_SAMPLES)))
+        mean = np.kron(np.eye(self.cells), np.full((len(CELL_SAMPLES), 1), 1.0 / len(CELL_SAMPLES)))
         self._cells_of_samples = (np.kron(mean, mean) @ self._detrend).astype(np.float32)
 
     def read(self, image: Float32Array, quads: FloatArray, allowed: BoolArray | None = None) -> Reading:

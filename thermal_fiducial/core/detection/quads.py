@@ -50,6 +50,11 @@ def halved(counts: Float32Array) -> Float32Array:
     return np.asarray(cv2.resize(counts, (width, height), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
+def halfway(places: FloatArray) -> FloatArray:
+    """Places (..., 2) in pixels of half the resolution."""
+    return 0.5 * (places - 0.5)
+
+
 def without_columns(counts: Float32Array, noise: float) -> Float32Array:
     """``counts`` without the offsets of its columns.
 

@@ -12,15 +12,14 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.refinement import refine_corners, RefinedCorners
-from thermal_fiducial.core.detection.found import Found
 from thermal_fiducial.core.detection.frame import (
     delays,
-    expected_displacement,
     Frame,
     lag_tail,
     Places,
-    seen_displacement,
+    rolling_displacement,
 )
+from thermal_fiducial.core.detection.known_markers import Found
 from thermal_fiducial.core.detection.lag import (
     common_error,
     lag_tail_maps,
@@ -40,9 +39,11 @@ BLUR_THAT_MATTERS_PX = 0.4
 # of the side; without it the tail of the lag passes for a symmetric blur, which displaces corners by so much of the
 # square of the motion blur over a cell.
 _NOISE_OF_DEBLURRING, _COST_OF_BLUR = 6.5, 0.22
-# Contrast over noise below which a marker is faint. A clearer one is deblurred whatever its motion, as its corners are
-# so good that even a short tail shows in what they have in common; but not where there is hardly any [px].
-_CLEAR, _HARDLY_BLURRED_PX = 20.0, 0.2
+#: Contrast over noise below which a marker is faint; a clearer one shows at full and at half the resolution.
+CLEAR_CNR = 20.0
+# A clear marker is deblurred whatever its motion, as its corners are so good that even a short tail shows in what they
+# have in common; but not where there is hardly any [px].
+_HARDLY_BLURRED_PX = 0.2
 # Columns of pixels used of a cell; all of a faint marker's count.
 _COLUMNS, _COLUMNS_FAINT = 6, 12
 _ROUNDS = 2
@@ -126,7 +127,7 @@ class Refiner:
         track : the frames before, which with the corners give the twist
         """
         cell = sides_px(found.corners_px) / self._behind.shape[2]
-        columns = _COLUMNS if np.abs(found.cnr).min() > _CLEAR else _COLUMNS_FAINT
+        columns = _COLUMNS if np.abs(found.cnr).min() > CLEAR_CNR else _COLUMNS_FAINT
         twist = frame.twist
         for _ in range(_ROUNDS):
             view = self._view(frame, places, twist, cell, found.cnr)
@@ -152,7 +153,7 @@ class Refiner:
         mean = 0.25 * lag_blur.sum(axis=1)
         deblur = worth_deblurring((mean * mean).sum(axis=1), cell, self._behind.shape[2], cnr)
         removed = (1.0 - REMAINING) * old * deblur[:, None, None]
-        shift = lag_blur - removed + expected_displacement(places, twist, frame)
+        shift = lag_blur - removed + rolling_displacement(places, twist, frame)
         tails = LagTails(lag_tail_maps(places.at.px + shift, old), deblur) if deblur.any() else None
         return DeblurredView(frame.image, tails, shift, removed, mean * np.where(deblur, SPREAD, 1.0)[:, None])
 
@@ -178,15 +179,15 @@ class Refiner:
             twist = track.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
         if twist is None:
             unsure = doubted + self._never_seen(frame, places, seen, unknown_twist())
-            return RefinedMarkers(view, seen, replace(seen, covariances=unsure), places.moved(at), None)
+            return RefinedMarkers(view, seen, replace(seen, covariances=unsure), replace(places, at=at), None)
         lag_blur = places.lag_blur(twist, frame.lag)
-        rolling = seen_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
+        rolling = rolling_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
         corners = seen.corners_px - lag_blur + view.removed - rolling
         unknown = places.unknown(twist, frame.lag) + model_error(lag_blur, places.at.px, self._behind.shape[2])
         if frame.twist is None:
             unknown = unknown + self._never_seen(frame, places, seen, twist)
         refined = replace(seen, corners_px=corners, covariances=doubted + unknown)
-        return RefinedMarkers(view, seen, refined, places.moved(at.at_pixels(corners)), twist)
+        return RefinedMarkers(view, seen, refined, replace(places, at=at.at_pixels(corners)), twist)
 
     def _never_seen(self, frame: Frame, places: Places, seen: RefinedCorners, twist: Twist) -> FloatArray:
         """Covariances (N, 4, 2, 2) [px^2] by a motion that the frames before show nothing of."""
@@ -199,7 +200,7 @@ class Refiner:
 def worth_deblurring(square: FloatArray, cell: FloatArray, cells: int, cnr: FloatArray) -> BoolArray:
     """For which markers with squares of the blur (N,) and cells (N,) [px] it costs more than deblurring's noise."""
     systematic, noise = _COST_OF_BLUR * square / cell, _NOISE_OF_DEBLURRING / np.sqrt(cells * cell)
-    worth = (np.abs(cnr) > _CLEAR) | (systematic * np.abs(cnr) > noise)
+    worth = (np.abs(cnr) > CLEAR_CNR) | (systematic * np.abs(cnr) > noise)
     return np.asarray(worth & (square > _HARDLY_BLURRED_PX**2))
 
 

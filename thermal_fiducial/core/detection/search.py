@@ -7,10 +7,18 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.alignment import aligned
-from thermal_fiducial.core.detection.found import among, Found
 from thermal_fiducial.core.detection.frame import Frame
+from thermal_fiducial.core.detection.known_markers import among, CUT_OFF_PX, Found, TOGETHER
 from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
-from thermal_fiducial.core.detection.quads import dark, dark_in_picture, find_quads, halved, Scale, without_columns
+from thermal_fiducial.core.detection.quads import (
+    dark,
+    dark_in_picture,
+    find_quads,
+    halfway,
+    halved,
+    Scale,
+    without_columns,
+)
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # Full resolution sees small and blurred markers; half resolution, without the pattern of columns, faint ones.
@@ -22,12 +30,8 @@ _FAINT_OF_CLEAR = _FAINT._replace(floor=4.0)
 # Correlation beyond which an outline needs no alignment, and from which, by such a margin, it is worth one.
 _CLEAR = 0.95
 _HINT, _HINT_MARGIN = 0.5, 0.06
-# Middles of outlines of one marker, in one another, are nearer than this share of the larger one's diagonal.
-_TOGETHER = 0.35
 # Width of a plate round its marker [cells], and what motion blur may add.
 _PLATE_CELLS = 1.6
-# Nearer to the border of the image than this [px] a marker may be cut off.
-_BORDER = 2.0
 # Shortest side of a marker in a picture for a display, which has little noise, over that in raw counts: of one that is
 # seen obliquely, the other sides are longer.
 _PICTURE_SIDE = 0.25
@@ -85,7 +89,7 @@ class BlindSearch:
         pull = SearchScales.FAINT in scales
         reading, quads = self._read(frame, half, (fine, faint), allowed, seen.ids if pull else None)
         good = accepted(reading, frame.noise, self._decoder.correctable, config) & _large(quads, min_side_px)
-        good &= _whole(quads, frame.image, _BORDER)
+        good &= _whole(quads, frame.image)
         if not good.any():
             return Found.none()
         good &= ~inside_out(reading, quads, good, distinct(reading, frame.noise, config))
@@ -108,7 +112,7 @@ class BlindSearch:
         # Blur may leave nothing to be seen of a border between two white ones but the outline of the whole plate.
         fine, faint = (_with_shrunk(quads, decoder.cells) for quads in outlines)
         quads = np.concatenate([fine, faint])
-        reading = _joined(decoder.read(frame.image, fine, allowed), decoder.read(half, _halfway(faint), allowed))
+        reading = _joined(decoder.read(frame.image, fine, allowed), decoder.read(half, halfway(faint), allowed))
         rough = _NONE if seen is None else _rough(reading, quads, seen)
         if len(rough) == 0:
             return reading, quads
@@ -117,8 +121,8 @@ class BlindSearch:
             pulled = aligned(frame.image, quads[rough], ids, turns, decoder, noisy=False)
             again = decoder.read(frame.image, pulled, allowed)
         else:
-            halfway = aligned(half, _halfway(quads[rough]), ids, turns, decoder)
-            pulled, again = 2.0 * halfway + 0.5, decoder.read(half, halfway, allowed)
+            in_half = aligned(half, halfway(quads[rough]), ids, turns, decoder)
+            pulled, again = 2.0 * in_half + 0.5, decoder.read(half, in_half, allowed)
         return _joined(reading, again), np.concatenate([quads, pulled])
 
 
@@ -140,7 +144,7 @@ def _faint_quads(
     """Quadrilaterals of faint markers (Q, 4, 2) at half the resolution, in pixels of the full one."""
     scale = _FAINT if scales == SearchScales.ALL else _FAINT_OF_CLEAR
     masks = [dark(half if kind > 0.0 else -half, 0.5 * noise, scale) for kind in kinds]
-    found = [find_quads(mask, 0.5 * min_side_px + 2.0, _halfway(hidden)) for mask in masks]
+    found = [find_quads(mask, 0.5 * min_side_px + 2.0, halfway(hidden)) for mask in masks]
     return np.asarray(2.0 * np.concatenate(found) + 0.5)
 
 
@@ -160,11 +164,6 @@ def _chosen(reading: Reading, quads: FloatArray, places: IntArray, noise: float)
     turned = (np.arange(4) - reading.turns[places][:, None]) % 4
     corners = np.take_along_axis(quads[places], turned[..., None], axis=1)
     return Found(reading.ids[places], corners, reading.contrast[places] / noise, np.zeros(len(places), dtype=bool))
-
-
-def _halfway(quads: FloatArray) -> FloatArray:
-    """Corners (..., 2) in pixels of half the resolution."""
-    return 0.5 * (quads - 0.5)
 
 
 def _grown(quads: FloatArray, factor: float) -> FloatArray:
@@ -221,17 +220,18 @@ def inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: B
     similarity, centre = np.abs(reading.correlation), quads.mean(axis=1)
     across = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)
     apart = np.linalg.norm(centre[mine, None] - centre[others], axis=-1)
-    together = apart < _TOGETHER * np.maximum(across[mine, None], across[others])
+    together = apart < TOGETHER * np.maximum(across[mine, None], across[others])
     opposite = reading.correlation[mine, None] * reading.correlation[others] < 0.0
     result = np.zeros(len(good), dtype=bool)
     result[mine] = (together & opposite & (similarity[others] > similarity[mine, None])).any(axis=1)
     return result
 
 
-def _whole(quads: FloatArray, image: Float32Array, border: float) -> BoolArray:
-    """Which quadrilaterals (Q, 4, 2) lie in the image, ``border`` away from its edges."""
+def _whole(quads: FloatArray, image: Float32Array) -> BoolArray:
+    """Which quadrilaterals (Q, 4, 2) lie in the image, clear of its edges."""
     height, width = image.shape
-    return np.asarray(((quads >= border) & (quads <= (width - 1 - border, height - 1 - border))).all(axis=(1, 2)))
+    last = width - 1 - CUT_OFF_PX, height - 1 - CUT_OFF_PX
+    return np.asarray(((quads >= CUT_OFF_PX) & (quads <= last)).all(axis=(1, 2)))
 
 
 def _once(reading: Reading, quads: FloatArray, good: BoolArray, drop_duplicates: bool) -> IntArray:

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.found import pairs
+from thermal_fiducial.core.detection.known_markers import pairs
 from thermal_fiducial.core.detection.twist import (
     carried,
     corrected,
@@ -230,27 +230,19 @@ class Predictor:
             return FramePrediction(track.predict(stamp_ns, []), None, math.inf)
         odometry_ns = prior.in_odometry_clock(stamp_ns)
         clock_std_s = 0.0 if prior.clock_is_known else _UNKNOWN_CLOCK_S
-        states = self._states(odometry_ns, prior)
+        states = prior.between(odometry_ns - _LAGS_BEFORE * self._lag_ns, odometry_ns + self._lag_ns, _STATES)
+        if not states and (other := prior.nearest(odometry_ns)) is not None:
+            states = [other]
+        states = [state for state in states if plausible(state)]
         twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)
         nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
-        if nearest is None or twist is None or abs(odometry_ns - nearest.stamp_ns) * 1e-9 > max_age_s:
+        dt = math.inf if nearest is None else (odometry_ns - nearest.stamp_ns) * 1e-9
+        if nearest is None or twist is None or abs(dt) > max_age_s:
             return FramePrediction(twist, None, math.inf)
-        T_map_camera = _carried_on(odometry_ns, nearest, self._T_body_camera, twist)
-        moved = clock_std_s * float(np.linalg.norm(nearest.velocity_body))
-        position_std_m = math.sqrt(np.trace(nearest.pose_covariance[:3, :3]) + moved**2)
+        # The nearest pose, carried on with the camera's twist.
+        step = dt * twist.ago(0.5 * dt)
+        moved = se3.transform(se3.so3_exp(step[3:]), step[:3])
+        T_map_camera = nearest.T_map_body @ self._T_body_camera @ moved
+        off = clock_std_s * float(np.linalg.norm(nearest.velocity_body))
+        position_std_m = math.sqrt(np.trace(nearest.pose_covariance[:3, :3]) + off**2)
         return FramePrediction(twist, se3.inverse(T_map_camera), position_std_m)
-
-    def _states(self, odometry_ns: int, prior: MotionPrior) -> list[Odometry]:
-        """The filter's states while a frame came about, or the nearest."""
-        states = prior.between(odometry_ns - _LAGS_BEFORE * self._lag_ns, odometry_ns + self._lag_ns, _STATES)
-        if not states and (nearest := prior.nearest(odometry_ns)) is not None:
-            states = [nearest]
-        return [state for state in states if plausible(state)]
-
-
-def _carried_on(odometry_ns: int, odometry: Odometry, T_body_camera: FloatArray, twist: Twist) -> FloatArray:
-    """T_map_camera (4, 4) at a frame, from the odometry near it carried on with the camera's twist."""
-    dt = (odometry_ns - odometry.stamp_ns) * 1e-9
-    mean = twist.ago(0.5 * dt)
-    moved = se3.transform(se3.so3_exp(mean[3:] * dt), mean[:3] * dt)
-    return np.asarray(odometry.T_map_body @ T_body_camera @ moved)

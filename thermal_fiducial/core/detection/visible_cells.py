@@ -9,11 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.patterns import Decoder, sampled
+from thermal_fiducial.core.detection.patterns import CELL_SAMPLES, Decoder, sampled
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
-# Samples along a cell, in its middle, away from blurred edges.
-_SAMPLES = np.array([0.3, 0.5, 0.7])
 # Samples on either side of a line between cells, so far from it [cells].
 _BESIDE = np.array([0.2, 0.35])
 # Samples nearer to the border of the image are not seen [px].
@@ -69,7 +67,7 @@ class VisibleCells:
         # Upright, one cell off.
         moved = np.stack([_moved(ringed[::4], *step).reshape(decoder.count, -1) for step in _NEXT])
         self._steps_beside = self._between(moved)
-        share = ((np.arange(cells)[:, None] - 1.0 + _SAMPLES) / decoder.cells).ravel()
+        share = ((np.arange(cells)[:, None] - 1.0 + CELL_SAMPLES) / decoder.cells).ravel()
         b, a = np.meshgrid(share, share, indexing='ij')
         order = np.arange(len(share) ** 2).reshape(cells, 3, cells, 3).swapaxes(1, 2).ravel()
         #: (9 C, 2) shares of the sides at which the C cells are sampled, nine times each
@@ -146,7 +144,7 @@ def _line_places(cells: int) -> FloatArray:
     """Places (12 P, 2), in cells from the marker's first, beside the lines between ``cells`` squared and their next."""
     before, line = np.meshgrid(np.arange(cells - 1), np.arange(cells))
     across = before[..., None, None, None] + np.stack([-_BESIDE, _BESIDE])[:, :, None]
-    along = line[..., None, None, None] + _SAMPLES - 1.0
+    along = line[..., None, None, None] + CELL_SAMPLES - 1.0
     across, along = np.broadcast_arrays(across, along)
     beside = np.stack([across, along], axis=-1)
     above = np.swapaxes(beside[..., ::-1], 0, 1)

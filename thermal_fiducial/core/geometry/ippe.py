@@ -52,8 +52,8 @@ def _homography_derivative(c: FloatArray, sizes: FloatArray) -> tuple[FloatArray
     """Derivative (N, 2, 2) [1/m] at, and image (N, 2) of, the centre under the homography of a square to ``c``."""
     back, left = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2]
     excess = c[:, 0] - c[:, 1] - left
-    determinant = _cross(back, left)
-    g, h = (_cross(excess, left) / determinant)[:, None], (_cross(back, excess) / determinant)[:, None]
+    determinant = cross_in_plane(back, left)
+    g, h = (cross_in_plane(excess, left) / determinant)[:, None], (cross_in_plane(back, excess) / determinant)[:, None]
     right, down = c[:, 1] - c[:, 0] + g * c[:, 1], c[:, 3] - c[:, 0] + h * c[:, 3]
     depth = 1.0 + 0.5 * (g + h)
     v = (c[:, 0] + 0.5 * (right + down)) / depth
@@ -61,7 +61,8 @@ def _homography_derivative(c: FloatArray, sizes: FloatArray) -> tuple[FloatArray
     return J, np.asarray(v)
 
 
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+def cross_in_plane(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products (N,) of vectors (N, 2)."""
     return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
 
 

@@ -101,7 +101,11 @@ class FrameCleaner:
         image = self._telemetry.cut(counts)
         if min(image.shape) < 16:
             raise InputError(f'frame of {image.shape[1]}x{image.shape[0]} pixels is too small')
-        return _right_aligned(image.astype(np.uint16), self.config.bits) & np.uint16((1 << self.config.bits) - 1)
+        # Some drivers shift counts up: in no living picture the lowest bits are zero in all pixels.
+        used = int(np.bitwise_or.reduce(image[:: FreezeDetector.ROW_STEP], axis=None))
+        shift = (used & -used).bit_length() - 1
+        down = shift if used >> self.config.bits and shift >= _SHIFTED else 0
+        return (image.astype(np.uint16) >> np.uint16(down)) & np.uint16((1 << self.config.bits) - 1)
 
     def _stale(self, stamp_ns: int, image: Counts, *, coarse: bool) -> str:
         if self._freeze.repeats(image, coarse=coarse):
@@ -125,13 +129,6 @@ class FrameCleaner:
                 self._found = found
                 self._filler = BadPixelFiller(np.concatenate([self._known_bad, found]), self._shape)
         self._filler.fill(image)
-
-
-def _right_aligned(image: Counts, bits: int) -> Counts:
-    """The image, shifted where a driver has shifted it: in no living picture the lowest bits are zero in all pixels."""
-    used = int(np.bitwise_or.reduce(image[:: FreezeDetector.ROW_STEP], axis=None))
-    shift = (used & -used).bit_length() - 1
-    return image >> np.uint16(shift) if used >> bits and shift >= _SHIFTED else image
 
 
 class _TelemetryRows:

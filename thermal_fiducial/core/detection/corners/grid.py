@@ -18,9 +18,11 @@ from thermal_fiducial.core.detection.corners.segments import (
     KEPT_VARIANCE,
     measure,
     REACHED,
+    robust_weights,
+    SCATTER_COUNTS,
 )
 from thermal_fiducial.core.detection.corners.sides import blurred_step, blurs, columns_across, half_width, NODES, Sides
-from thermal_fiducial.core.detection.frame import expected_displacement, Frame, lag_tail, Places
+from thermal_fiducial.core.detection.frame import Frame, lag_tail, Places, rolling_displacement
 from thermal_fiducial.core.detection.lag import EXACT, LAG_TAIL_AGE, lag_tail_maps, markers_deblurred, REMAINING, SPREAD
 from thermal_fiducial.core.detection.refining import sides_px, worth_deblurring
 from thermal_fiducial.core.detection.twist import interaction
@@ -32,8 +34,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 _EVERY_PX, _FEWEST, _MOST = 3.0, 6, 24
 # So many blurs from its ends, and from its neighbours, an edge is a straight step.
 _QUIET = 2.0
-# Weight of an edge falls off beyond this many standard deviations, in so many rounds.
-_OUTLIER, _ROUNDS = 2.5, 3
+# Weights of edges are found in so many rounds.
+_ROUNDS = 3
 # Standard deviation of an edge's place that no image noise explains: its optics and its cut [px].
 _FLOOR_PX = 0.015
 # How far a pose may be off before it is adjusted, as a shift of each edge [px].
@@ -198,13 +200,12 @@ def _solved(
         weighted = A.T * robust
         step = np.linalg.solve(weighted @ A + prior, weighted @ target)
         left = np.abs(target - A @ step)
-        scale = max(1.4826 * _median(left[used]), 1.0)
-        robust = 1.0 / np.maximum(left / (_OUTLIER * scale), 1.0) ** 2
-    kept = used & (robust > 0.99)
+        robust = robust_weights(left[None], used[None])[0]
+    kept = used & (robust == 1.0)
     number = int(kept.sum())
     chi2 = float(np.sum(left[kept] ** 2)) / KEPT_VARIANCE
     free = max(number - 6, 0)
-    information = weighted @ A * ((free + 24.0) / (chi2 + 24.0))
+    information = weighted @ A * ((free + SCATTER_COUNTS) / (chi2 + SCATTER_COUNTS))
     moved = se3.transform(se3.so3_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3])
     return PoseFit(
         moved,
@@ -214,14 +215,9 @@ def _solved(
         int(used.sum()),
         number,
         chi2 / max(free, 1),
-        _median(contrast[used]),
-        math.sqrt(_median(noise[used])),
+        float(np.median(contrast[used])),
+        math.sqrt(np.median(noise[used])),
     )
-
-
-def _median(values: FloatArray) -> float:
-    """The upper median of a few values (K,)."""
-    return float(np.sort(values)[len(values) // 2])
 
 
 def plain_layer(frame: Frame, window: FloatArray, blur_px: float, factor: int) -> Layer:
@@ -267,7 +263,7 @@ def _displaced(frame: Frame, points: FloatArray, removed: float) -> FloatArray:
     shift = (frame.camera.distort_linearised(x)[1] @ (interaction(x, depth) @ back)[..., None])[..., 0]
     if frame.readout == 0.0:
         return np.asarray(shift)
-    return np.asarray(shift + expected_displacement(places_of_points(points, frame.camera), twist, frame)[0])
+    return np.asarray(shift + rolling_displacement(places_of_points(points, frame.camera), twist, frame)[0])
 
 
 def _lag_blur(frame: Frame, window: FloatArray) -> FloatArray:

@@ -21,6 +21,10 @@ HOPELESS = 1e6
 # Weight of a pixel or segment falls off beyond this many standard deviations.
 _PIXEL_OUTLIER = 4.5
 _SEGMENT_OUTLIER = 2.5
+# Standard deviation of normal variables over the median of their absolute values.
+_MAD = 1.4826
+#: So many segments, beyond the unknowns, make their scatter count as much as the noise of their pixels.
+SCATTER_COUNTS = 24.0
 #: Variance of a standard normal variable of which no more than that is kept.
 KEPT_VARIANCE = 0.911
 # Standard deviation of a corner that no image noise explains: the optics' blur is not quite a Gaussian [px]; and of
@@ -59,9 +63,9 @@ class _SegmentFit(NamedTuple):
     contrast_variance: FloatArray
     product_variance: FloatArray
     level: FloatArray
-    #: sum of squared residuals, and number of pixels
-    square: FloatArray
     number: FloatArray
+    #: variances of pixels: of a marker's typical segment, or a segment's own where that is much larger
+    noise: FloatArray
 
 
 def measure(
@@ -89,19 +93,19 @@ def measure(
     X[3] *= weight
     X = X.reshape(_PLANES, -1, cells * len(reach))
     moments = _moments(X)
-    fit = _fit(_by_marker(moments, cells, of_each))
-    noise = _noise(fit)
-    inliers = np.abs(_residuals(fit, X, cells, of_each)) <= _by_segment(_PIXEL_OUTLIER * np.sqrt(noise), cells, of_each)
+    fit = _fit(moments, cells, of_each)
+    lines = fit.level, fit.contrast, fit.product, _PIXEL_OUTLIER * np.sqrt(fit.noise)
+    level, contrast, product, limit = (_by_segment(each, cells, of_each) for each in lines)
+    inliers = np.abs(X[3] - level * X[0] - contrast * X[1] - product * X[2]) <= limit
     touched = np.flatnonzero(~inliers.all(axis=0))
     if len(touched):
         part = X[..., touched]
         part[:4] *= inliers[:, touched]
         moments[:, touched] = _moments(part)
-        fit = _fit(_by_marker(moments, cells, of_each))
-        noise = _noise(fit)
+        fit = _fit(moments, cells, of_each)
     farthest = np.empty((len(reach) // of_each, cells, of_each))
     farthest[:] = reach.reshape(-1, 1, of_each)
-    return _judged(fit, noise, farthest.reshape(noise.shape))
+    return _judged(fit, farthest.reshape(fit.noise.shape))
 
 
 def _moments(X: Float32Array) -> Float32Array:
@@ -114,21 +118,17 @@ def _moments(X: Float32Array) -> Float32Array:
     return np.asarray(np.add.reduce(X, axis=1))
 
 
-def _by_marker(values: Float32Array, cells: int, sides: int) -> FloatArray:
-    """Of segments (..., m E) as (..., N, S)."""
-    by_side = values.reshape(len(values), cells, -1, sides).swapaxes(1, 2)
-    return np.array(by_side, dtype=np.float64, order='C').reshape(len(values), -1, sides * cells)
-
-
 def _by_segment(values: FloatArray, cells: int, sides: int) -> Float32Array:
     """Of markers (N, S) as (m E,)."""
     return np.array(values.reshape(-1, cells, sides).swapaxes(0, 1), dtype=np.float32, order='C').ravel()
 
 
-def _fit(moments: FloatArray) -> _SegmentFit:
-    """Least squares of the counts on (1, model, derivative), of segments with :func:`_moments` (10, ...)."""
-    number, x, y, z, xx, xy, yy, xz, yz, zz = moments
-    x_mean, y_mean, z_mean = moments[1:4] / np.maximum(number, 1.0)
+def _fit(moments: Float32Array, cells: int, sides: int) -> _SegmentFit:
+    """Least squares of the counts on (1, model, derivative), by marker (N, S), with :func:`_moments` (10, m E)."""
+    by_marker = moments.reshape(len(moments), cells, -1, sides).swapaxes(1, 2)
+    sums = np.array(by_marker, dtype=np.float64, order='C').reshape(len(moments), -1, sides * cells)
+    number, x, y, z, xx, xy, yy, xz, yz, zz = sums
+    x_mean, y_mean, z_mean = sums[1:4] / np.maximum(number, 1.0)
     # Without their means the columns leave two unknowns.
     ridge = 1e-6 * number + 1e-6
     a, b, c = xx - x * x_mean + ridge, xy - x * y_mean, yy - y * y_mean + ridge
@@ -138,27 +138,16 @@ def _fit(moments: FloatArray) -> _SegmentFit:
     contrast, product = c * p - b * q, a * q - b * p
     square = np.maximum(zz - z * z_mean - contrast * p - product * q, 0.0)
     level = z_mean - contrast * x_mean - product * y_mean
-    return _SegmentFit(contrast, product, c, a, level, square, number)
+    own = square / np.maximum(number - 3.0, 1.0)
+    typical = median_of(own, number > 4.5)
+    noise = np.where(own > 2.5 * typical, own, typical) + 1e-3
+    return _SegmentFit(contrast, product, c, a, level, number, noise)
 
 
-def _residuals(fit: _SegmentFit, X: Float32Array, cells: int, sides: int) -> Float32Array:
-    """What the model leaves of the pixels (pixels, segments)."""
-    level, contrast, product = (_by_segment(each, cells, sides) for each in (fit.level, fit.contrast, fit.product))
-    return np.asarray(X[3] - level * X[0] - contrast * X[1] - product * X[2])
-
-
-def _noise(fit: _SegmentFit) -> FloatArray:
-    """Variances of pixels (N, S): of a marker's typical segment, or a segment's own where that is much larger."""
-    free = fit.number - 3.0
-    own = fit.square / np.maximum(free, 1.0)
-    typical = _median(own, free > 1.5)
-    return np.where(own > 2.5 * typical, own, typical) + 1e-3
-
-
-def _judged(fit: _SegmentFit, noise: FloatArray, reach: FloatArray) -> Segments:
+def _judged(fit: _SegmentFit, reach: FloatArray) -> Segments:
     """Which segments measure anything, within their reach (N, S)."""
-    contrast, product, usable = fit.contrast, fit.product, fit.number > 4.5
-    typical = _median(contrast, usable)
+    contrast, product, noise, usable = fit.contrast, fit.product, fit.noise, fit.number > 4.5
+    typical = median_of(contrast, usable)
     own = noise * fit.contrast_variance
     scale = np.sign(typical) / np.maximum(np.abs(typical), 1e-6)
     relative, unsure = contrast * scale, 2.0 * np.sqrt(own) * np.abs(scale)
@@ -170,7 +159,7 @@ def _judged(fit: _SegmentFit, noise: FloatArray, reach: FloatArray) -> Segments:
     return Segments(shift, np.where(usable, noise * fit.product_variance / (safe * safe), HOPELESS), contrast, noise)
 
 
-def _median(values: FloatArray, good: BoolArray) -> FloatArray:
+def median_of(values: FloatArray, good: BoolArray) -> FloatArray:
     """Medians (N, 1) of the good ones of values (N, S), 0 where there is none."""
     number = good.sum(axis=1)
     order = np.sort(np.where(good, values, np.inf), axis=1)
@@ -200,16 +189,15 @@ def adjust(
         covariance = np.linalg.inv(weighted @ A + prior)
         moved = covariance @ (weighted @ shift[..., None])
         left = np.abs(shift - (A @ moved)[..., 0])
-        scale = np.maximum(1.4826 * _median(left, used), 1.0)
-        former, robust = robust, 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
+        former, robust = robust, robust_weights(left, used)
         if np.abs(robust - former).max() < _SETTLED:
             break
         weighted = turned * robust[:, None]
-    kept = used & (robust > 0.99)
+    kept = used & (robust == 1.0)
     chi2 = (left * left * kept).sum(axis=1) / KEPT_VARIANCE
     free = np.maximum(kept.sum(axis=1) - 8.0, 0.0)
     # The scatter of the segments corrects the noise of their pixels, as far as there are enough of them.
-    covariance = covariance * ((chi2 + 24.0) / (free + 24.0))[:, None, None] + _FLOOR
+    covariance = covariance * ((chi2 + SCATTER_COUNTS) / (free + SCATTER_COUNTS))[:, None, None] + _FLOOR
     known = as_squares(at, moved, covariance)
     # Corners that constrain one another err together. Taken for independent, they would claim so much too much.
     together = (8.0 / (8.0 - known.constrained))[:, None, None, None]
@@ -217,6 +205,12 @@ def adjust(
     # A side of an outline that is no square's is that of something else.
     doubt = known.doubt * (0.25 * sides.along.reshape(-1, 4).sum(axis=1)) ** 2
     return known.moved.reshape(-1, 4, 2), blocks + _COMMON_FLOOR, doubt
+
+
+def robust_weights(left: FloatArray, used: BoolArray) -> FloatArray:
+    """Weights (N, S) of residuals over their deviations, by the scatter of those ``used`` of each marker."""
+    scale = np.maximum(_MAD * median_of(left, used), 1.0)
+    return np.asarray(1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2)
 
 
 def _design(sides: Sides) -> FloatArray:
