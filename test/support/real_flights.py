@@ -73,19 +73,22 @@ def april_board(camera='cam0', sigma_px=BOARD_SIGMA_PX, seconds=40.0, every=1) -
 
 
 @cache
-def carpet(name, sigma_px=CARPET_SIGMA_PX) -> CornerFlight:
-    """A flight over the carpet. Its reference is smoothed from the poses of all corners, on the map of all corners."""
+def carpet(name, sigma_px=CARPET_SIGMA_PX, seconds=np.inf) -> CornerFlight:
+    """A flight over the carpet, or the beginning of it.
+
+    Its reference is smoothed from the poses of all corners, on the map of all corners.
+    """
     place = folder(name)
     rig = yaml.safe_load((place / 'rig.yaml').read_text())
     entry, size = rig['cameras']['cam0'], rig['marker_size']
     lens = _lens(entry)
-    frames = _frames(place / 'detections.csv', size, lens, sigma_px)
+    frames = _frames(place / 'detections.csv', size, lens, sigma_px, seconds)
     T_body_camera = transform_from_quaternion(entry['camera_position'], entry['camera_orientation'])
     marker_map = batch_map(name, sigma_px)
     rich = {stamp: rows for stamp, rows in frames.items() if len(rows) >= _FEWEST_MARKERS}
     stamps, cameras = _camera_poses(rich, lens, marker_map)
     reference = _smoothed(stamps, cameras) @ inverse(T_body_camera)
-    samples = _samples(place / 'imu.csv')
+    samples = _samples(place / 'imu.csv', seconds)
     return CornerFlight(name, samples, frames, lens, T_body_camera, marker_map, stamps, reference, size)
 
 

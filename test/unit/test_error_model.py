@@ -115,8 +115,10 @@ def test_a_model_without_errors_adds_nothing():
     assert not np.any(corners_of_pose(np.ones((3, 6, 2)), alike, replace(ERRORS, corner_px=0.0)))
 
 
-@pytest.mark.parametrize('true_px', [0.0, 0.08])
-def test_the_bias_of_the_corners_is_learned_from_residuals_that_last(true_px):
+# Without a field the estimate falls from its start at 0.1 px, and is within the bound of none after 450 frames; after
+# 300 it is too low for a field of 0.08 px, so that one that learned nothing of the field would fail with it too.
+@pytest.mark.parametrize(('true_px', 'frames'), [(0.0, 600), (0.08, 300)])
+def test_the_bias_of_the_corners_is_learned_from_residuals_that_last(true_px, frames):
     """Corners with noise of 0.1 px, and with a smooth field over the image or without."""
     rng = np.random.default_rng(4)
     poses, model = wall(rng), replace(ERRORS, corner_px=max(true_px, 1e-6))
@@ -126,7 +128,7 @@ def test_the_bias_of_the_corners_is_learned_from_residuals_that_last(true_px):
     m = MarkerMapper(
         MarkerMapperConfig(mode='localization'), MarkerMap({i: MapMarker(i, SIZE, True, T) for i, T in poses.items()})
     )
-    for k in range(600):
+    for k in range(frames):
         rows = see(flight(k / 30), poses, 0.1, rng)
         corners = corners_px(rows).reshape(-1, 2)
         nearest = np.argmin(np.sum((corners[:, None] - grid) ** 2, axis=-1), axis=1)
