@@ -168,6 +168,21 @@ def test_a_grid_that_goes_on_is_refused(target, described, radius, views):
             described.find(counts, GUESS)
 
 
+def test_the_grid_of_another_scale_shows_that_the_board_goes_on():
+    """Seen steeply, 29 of 30 points are a grid at one scale; at another all 35 of the larger board are."""
+    counts, _ = picture(SYMMETRIC.points[:, :2], Heat(), np.random.default_rng(4), radius=0.27, fill=0.75)
+    with pytest.raises(BoardNotFound, match='5 more points'):
+        CircleGrid(6, 5, 1.0, 0.54, asymmetric=False).find(counts, GUESS)
+
+
+def test_points_that_were_looked_for_too_far_off_are_found_from_those_around_them():
+    """Seen steeply, discs at the ends of longer rows start 7 px off: without them the place of the board is unclear."""
+    shares, error = look(LONGER_ROWS, Heat(), (6,), 0.27, fill=0.75)
+    assert np.all(shares == 1.0)
+    # As in test_circles.
+    assert np.sqrt(np.mean(error**2)) < 0.02
+
+
 def test_a_hole_shows_which_way_round_the_board_is():
     counts, truth = picture(WITH_A_HOLE.points[:, :2], Heat(), np.random.default_rng(8), radius=0.27)
     sighting = WITH_A_HOLE.find(counts, GUESS)

@@ -5,7 +5,7 @@ contrast that fades, or reverses, over a board stops it.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -39,18 +39,22 @@ class BoardPoints:
     points : (N,) their index on the board
     pixels : (N, 2) where they are, to a pixel or a tenth of their spacing
     beyond_nodes, beyond_pixels : (B, 2) points that continue the grid where the board has none
+    larger_nodes, larger_pixels : (L, 2) a grid that has more of the board's points than these, and goes on beyond it
     """
 
     points: IntArray
     pixels: FloatArray
     beyond_nodes: IntArray
     beyond_pixels: FloatArray
+    larger_nodes: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    larger_pixels: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | GridRefusal:
     """Most complete sighting of a board among several sets of keypoints, or why there is none."""
     best: BoardPoints | None = None
     refusal = GridRefusal('no regular grid of points')
+    larger, larger_pixels, covered = np.zeros((0, 2), np.int64), np.zeros((0, 2)), 0
     for keypoints in views:
         for grid in Grower(keypoints).grids():
             nodes = np.array(list(grid), dtype=np.int64)
@@ -58,10 +62,14 @@ def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | G
             placed = board.place(_facing(nodes, pixels))
             if isinstance(placed, GridRefusal):
                 refusal = max(refusal, placed, key=lambda other: other.points)
+                if placed.covered > covered:
+                    larger, larger_pixels, covered = nodes, pixels, placed.covered
             elif best is None or len(placed.points) > len(best.points):
                 best = BoardPoints(placed.points, pixels[placed.rows], placed.beyond_nodes, pixels[placed.beyond])
         if best is not None and len(best.points) == len(board.nodes):
             break
+    if best is not None and covered > len(best.points):
+        return replace(best, larger_nodes=larger, larger_pixels=larger_pixels)
     return best or refusal
 
 

@@ -20,10 +20,14 @@ _QUARTER = np.array([[0, -1], [1, 0]])
 
 @dataclass(frozen=True)
 class GridRefusal:
-    """Why a grid is not the board, in words, and how many points it has: of several the largest says most."""
+    """Why a grid is not the board, in words, and how many points it has: of several the largest says most.
+
+    Where it goes on beyond the board, ``covered`` is how many of the board's points it has.
+    """
 
     reason: str
     points: int = 0
+    covered: int = 0
 
 
 @dataclass(frozen=True)
@@ -75,7 +79,7 @@ class BoardNodes:
         if most < _LEAST_SHARE * count:
             return GridRefusal(f'a grid of {len(grid)} points that is not like the board', len(grid))
         if beyond > _BEYOND * count + 1.0 or (beyond > 0 and most - second < _CLEAR * self._margin):
-            return GridRefusal(goes_on(beyond), len(grid))
+            return GridRefusal(goes_on(beyond), len(grid), int(most))
         if most - second < _CLEAR * self._margin:
             return GridRefusal(f'{most:.0f} of {count} points found, which may lie in more than one place', len(grid))
         best = int(np.argmax([overlap.max() for overlap in overlaps]))

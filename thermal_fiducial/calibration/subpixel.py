@@ -56,13 +56,23 @@ def refine(
             return np.full_like(pixels, np.nan)
         if last:
             return fits.pixels
-        pixels = np.where(found[:, None], fits.pixels, pixels)
+        pixels = _next_starts(nodes, pixels, fits.pixels)
         if shared is None:
             log_blur = _plane(nodes[found], fits.log_blur[found], nodes)
             shared = _Shared(log_blur, np.full(len(nodes), np.median(fits.width[found])))
         else:
             contrast = fits.contrast
     raise AssertionError('the last round returns')
+
+
+def _next_starts(nodes: FloatArray, starts: FloatArray, refined: FloatArray) -> FloatArray:
+    """Where the next round starts (N, 2): lost points where those around them say, else where they did before."""
+    found = np.isfinite(refined[:, 0])
+    lost = np.flatnonzero(~found)
+    surfaces = local_surfaces(nodes[found], refined[found], nodes[lost])
+    starts = np.where(found[:, None], refined, starts)
+    starts[lost[surfaces.determined]] = surfaces.centres[surfaces.determined]
+    return starts
 
 
 class _Shared(NamedTuple):

@@ -178,7 +178,10 @@ def _sighting(
     every = np.concatenate([board.nodes, found.beyond_nodes]).astype(np.float64)
     pixels = refine(image, nodes, np.concatenate([found.pixels, found.beyond_pixels]), every, appearance)
     good, count = np.isfinite(pixels[:, 0]), len(found.points)
-    beyond = int(np.sum(good[count:]))
+    # So is a grid that shows more of the board, among keypoints of another scale, but goes on.
+    larger = found.larger_nodes.astype(np.float64)
+    of_larger = refine(image, larger, found.larger_pixels, larger, appearance) if len(larger) else found.larger_pixels
+    beyond = max(int(np.sum(good[count:])), int(np.sum(np.isfinite(of_larger[:, 0]))) - len(points))
     if beyond >= another:
         raise BoardNotFound(goes_on(beyond))
     kept = found.points[good[:count]]
