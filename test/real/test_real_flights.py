@@ -59,7 +59,10 @@ def test_the_fused_pose_stays_with_the_markers_by_their_systematic_error(camera,
 #: Eight seconds have 13 gaps of more than 0.1 s; the error behind the longest ones is looked at at night.
 each_carpet = pytest.mark.parametrize(
     ('name', 'seconds'),
-    [('carpet_mountain', 8.0), *(pytest.param(name, WHOLE, marks=pytest.mark.nightly) for name in real_flights.CARPETS)],
+    [
+        ('carpet_mountain', 8.0),
+        *(pytest.param(name, WHOLE, marks=pytest.mark.nightly) for name in real_flights.CARPETS),
+    ],
 )
 
 
