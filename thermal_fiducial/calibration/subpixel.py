@@ -178,7 +178,7 @@ def _well_determined(windows: PointWindows, state: '_State') -> BoolArray:
 
 @dataclass(frozen=True)
 class _State:
-    """Parameters (P, 4) of fits, of which ``free`` are sought, and what the counts say there.
+    """Parameters (P, 4) of fits, of which ``free`` are estimated, and what the counts say there.
 
     Parameters
     ----------
