@@ -54,7 +54,7 @@ def test_unreadable_files(tmp_path):
     with pytest.raises(InputError, match='No such file'):
         load_tum(tmp_path / 'none')
     (tmp_path / 'binary').write_bytes(b'\xff\xfe\x00')
-    with pytest.raises(InputError, match='not a text file'):
+    with pytest.raises(InputError, match='is not text'):
         load_tum(tmp_path / 'binary')
     with pytest.raises(InputError):
         save_tum(tmp_path / 'no' / 'folder', [], np.zeros((0, 3)), np.zeros((0, 4)))
