@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.error_model import correlated_sum, with_map_errors
+from thermal_fiducial.core.error_model import correlated_sum
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
@@ -60,15 +60,6 @@ def test_whitening_makes_the_covariance_a_unit():
     C = A @ np.swapaxes(A, -1, -2) + 0.1 * np.eye(2)
     W = whitening(C)
     np.testing.assert_allclose(W @ C @ np.swapaxes(W, -1, -2), np.broadcast_to(np.eye(2), C.shape), atol=1e-12)
-
-
-def test_shared_errors_count_once_however_many_corners_show_them():
-    """The information of the four corners together is no more than what the shared error leaves."""
-    J = np.tile(np.eye(2, 6), (1, 4, 1)).reshape(1, 8, 6)
-    C = np.diag([1.0, 1.0, 0.0, 0.0, 0.0, 0.0])[None]
-    shared = with_map_errors(np.zeros((1, 4, 2, 2)), J, C)
-    information = np.sum(np.linalg.inv(shared[0]), axis=0)
-    np.testing.assert_allclose(np.linalg.inv(information), np.eye(2), atol=1e-12)
 
 
 @pytest.mark.parametrize('correlation', [-0.9, 0.0, 0.5, 1.0])

@@ -262,14 +262,3 @@ def bounded_odometry(covariance: FloatArray) -> FloatArray:
 def with_corner_errors(covariances: FloatArray, errors: SystematicErrors) -> FloatArray:
     """Corner covariances (..., 2, 2) [px^2] to decide between hypotheses with: noise, and what corners are off by."""
     return np.asarray(covariances + errors.decision_px**2 * np.eye(2))
-
-
-def with_map_errors(covariances: FloatArray, J: FloatArray, of_markers: FloatArray) -> FloatArray:
-    """Corner covariances (n, 4, 2, 2) [px^2] with the errors (n, 6, 6) of the markers, seen through J (n, 8, 6).
-
-    The four corners of a view share such an error; taken as independent, each must count four times, lest the four
-    average it away. Weighs the corners of a frame that is located in two maps (``mapping/correction.py``).
-    """
-    blocks = J.reshape(-1, 4, 2, 6)
-    shared = 4.0 * blocks @ of_markers[:, None] @ np.swapaxes(blocks, -1, -2)
-    return np.asarray(covariances + np.nan_to_num(shared))

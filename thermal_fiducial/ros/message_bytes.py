@@ -11,7 +11,7 @@ import numpy as np
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
 from thermal_fiducial.core.measurements import ImuSample, Odometry
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import records
 from thermal_fiducial.ros import convert
@@ -121,7 +121,7 @@ class StateBytes:
 
     def fill(self, odometry: Odometry) -> None:
         """Take over a state."""
-        numbers, stamp = self._numbers, divmod(int(odometry.stamp_ns), 1_000_000_000)
+        numbers, stamp = self._numbers, divmod(int(odometry.stamp_ns), SECOND_NS)
         numbers[0:3] = odometry.T_map_body[:3, 3]
         numbers[3:7] = quaternion_from_rotation(odometry.T_map_body[:3, :3])
         numbers[7:43] = odometry.pose_covariance.ravel()

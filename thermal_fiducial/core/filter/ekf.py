@@ -21,10 +21,9 @@ from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_O
 from thermal_fiducial.core.filter.state_output import odometry
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 
-_SECOND_NS = 1_000_000_000
 #: Why the filter begins anew, or a pose has to wait.
 CLOCK_JUMPED = "the IMU's clock has jumped"
 #: An offset known to this [s] moves a marker by a pixel or two in the fastest flights.
@@ -91,7 +90,7 @@ class PoseEkf:
         if not buffer:
             self._history.append(sample.stamp_ns, imu, np.zeros(6))
             return None
-        seconds = (sample.stamp_ns - buffer.newest_ns) / _SECOND_NS
+        seconds = (sample.stamp_ns - buffer.newest_ns) / SECOND_NS
         self._history.append(sample.stamp_ns, imu, self._noise.densities(imu, seconds))
         self._take_in()
         output = self._output(imu)
@@ -162,9 +161,9 @@ class PoseEkf:
         if not imu:
             return 'refused: no IMU yet'
         due_ns = history.due_ns(pose, history.main)
-        if due_ns - imu.newest_ns > self._config.max_imu_gap * _SECOND_NS:
+        if due_ns - imu.newest_ns > self._config.max_imu_gap * SECOND_NS:
             return 'refused: far ahead of the IMU'
-        oldest_ns = max(imu.oldest_ns, imu.newest_ns - round(self._config.max_delay * _SECOND_NS))
+        oldest_ns = max(imu.oldest_ns, imu.newest_ns - round(self._config.max_delay * SECOND_NS))
         if due_ns <= oldest_ns or history.is_forgotten(pose):
             return 'refused: too late'
         return 'refused: stamp repeated' if history.holds(pose.stamp_ns) else ''
@@ -216,7 +215,7 @@ class PoseEkf:
         return self._clock_offset(main)
 
     def _clock_offset(self, main: Hypothesis) -> float:
-        steps = self._camera_clock.ahead_ns / _SECOND_NS
+        steps = self._camera_clock.ahead_ns / SECOND_NS
         return self._config.camera_time_offset + main.prediction.state.time_offset - steps
 
     def _time_offset_std(self, main: Hypothesis) -> float:
@@ -260,7 +259,7 @@ class PoseEkf:
         return f'poses contradict gravity: the IMU says {words} m/s^2; its axes, sign, units? camera_orientation?'
 
     def _coasting(self, main: Hypothesis) -> float:
-        return (self._history.imu.newest_ns - main.accepted_ns) / _SECOND_NS
+        return (self._history.imu.newest_ns - main.accepted_ns) / SECOND_NS
 
     @property
     def lost(self) -> bool:

@@ -16,9 +16,7 @@ from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.filter.update import MotionAtPose
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
-from thermal_fiducial.core.types import FloatArray
-
-_SECOND_NS = 1_000_000_000
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 
 class History:
@@ -29,7 +27,7 @@ class History:
 
     def __init__(self, hypotheses: Hypotheses, seconds: float, camera_time_offset: float) -> None:
         self._hypotheses = hypotheses
-        self._kept_ns, self._offset_ns = round(seconds * _SECOND_NS), round(camera_time_offset * _SECOND_NS)
+        self._kept_ns, self._offset_ns = round(seconds * SECOND_NS), round(camera_time_offset * SECOND_NS)
         self.imu = ImuBuffer()
         self._poses: list[CameraPose] = []
         self._beliefs = [Belief()]
@@ -100,15 +98,14 @@ class History:
     def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None) -> int:
         """Instant of a pose in the clock of the IMU by a hypothesis's estimate of the offset."""
         offset = hypothesis.prediction.origin.state.time_offset if hypothesis else 0.0
-        return pose.stamp_ns + self._offset_ns + round(offset * _SECOND_NS)
+        return pose.stamp_ns + self._offset_ns + round(offset * SECOND_NS)
 
     def main_at(self, pose: CameraPose) -> tuple[Hypothesis, MotionAtPose] | None:
         """The estimate and the motion at the instant of a pose that is not to be taken in."""
         for belief in reversed(self._beliefs):
             time_ns = min(self.due_ns(pose, belief.main), self.imu.newest_ns)
             if belief.main and belief.main.prediction.stamp_ns <= time_ns:
-                there = self._hypotheses.carried(belief.main, self.imu, time_ns)
-                return there, self.imu.motion(time_ns, there.accepted_ns)
+                return self._at(belief.main, pose)
         return None
 
     def move_map(self, T_new_old: FloatArray) -> None:
@@ -154,21 +151,19 @@ class History:
         belief = self.belief._replace(pose_stamp_ns=pose.stamp_ns)
         if not belief.hypotheses:
             return self._begun(belief, pose)
-        main, decided = belief.main, [PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)]
-        at_pose = main and self._at(main, pose)
-        motion = at_pose and self.imu.motion(at_pose.prediction.stamp_ns, at_pose.accepted_ns)
-        if at_pose and motion:
-            main, update = self._hypotheses.weigh(at_pose, pose, motion)
-            decided = [update]
-        alternative = belief.alternative
-        if alternative:
-            alternative = self._at(alternative, pose)
-            its_motion = self.imu.motion(alternative.prediction.stamp_ns, alternative.accepted_ns)
-            alternative, _ = self._hypotheses.weigh(alternative, pose, its_motion)
-        belief = belief._replace(main=main, alternative=alternative)
-        if at_pose and motion and alternative is None and not decided[0].accepted:
-            belief = self._with_alternative(belief, at_pose, pose, motion)
-        return self._settled(belief, decided)
+        update = PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)
+        refused = None
+        if belief.main:
+            at_pose, motion = self._at(belief.main, pose)
+            main, update = self._hypotheses.weigh(at_pose, motion, pose)
+            belief = belief._replace(main=main)
+            refused = None if update.accepted else (at_pose, motion)
+        if belief.alternative:
+            alternative, _ = self._hypotheses.weigh(*self._at(belief.alternative, pose), pose)
+            belief = belief._replace(alternative=alternative)
+        elif refused:
+            belief = self._with_alternative(belief, *refused, pose)
+        return self._settled(belief, [update])
 
     def _unfold(self, pose: CameraPose) -> None:
         """Go back before what was folded later than a pose's instant."""
@@ -177,10 +172,11 @@ class History:
                 return
             self._forget_belief()
 
-    def _at(self, hypothesis: Hypothesis, pose: CameraPose) -> Hypothesis:
-        """A hypothesis at the instant of a pose; where it is now, if it is beyond that by what it learned since."""
+    def _at(self, hypothesis: Hypothesis, pose: CameraPose) -> tuple[Hypothesis, MotionAtPose]:
+        """A hypothesis at the instant of a pose, where it is if it is beyond that by now, and its motion there."""
         time_ns = max(self.due_ns(pose, hypothesis), hypothesis.prediction.stamp_ns)
-        return self._hypotheses.carried(hypothesis, self.imu, min(time_ns, self.imu.newest_ns))
+        there = self._hypotheses.carried(hypothesis, self.imu, min(time_ns, self.imu.newest_ns))
+        return there, self.imu.motion(there.prediction.stamp_ns, there.accepted_ns)
 
     def _begun(self, belief: Belief, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
         time_ns = max(self.due_ns(pose, None), self.imu.oldest_ns)
@@ -189,7 +185,7 @@ class History:
         decided = [PoseUpdate(pose.stamp_ns, False, 'initialising' if begun else NO_GRAVITY, math.nan)]
         return self._settled(belief._replace(alternative=begun), decided) if begun else (belief, decided)
 
-    def _with_alternative(self, belief: Belief, at_pose: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> Belief:
+    def _with_alternative(self, belief: Belief, at_pose: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> Belief:
         """With an alternative that begins with a pose that the estimate refuses, if one can."""
         time_ns = at_pose.prediction.stamp_ns
         window = self.imu.window(time_ns, WINDOW_SECONDS)

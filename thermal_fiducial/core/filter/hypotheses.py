@@ -24,9 +24,8 @@ from thermal_fiducial.core.filter.state import (
 )
 from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_innovation, PoseUpdater, slide
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-_SECOND_NS = 1_000_000_000
 #: why a pose was refused that no attitude of a robot under gravity explains
 NO_GRAVITY = 'refused: contradicts gravity'
 #: The motion since the origin is folded into the covariance after so long [ns], as the biases walk meanwhile.
@@ -65,7 +64,7 @@ class Hypotheses:
         """State and whole covariance at the hypothesis's instant."""
         return hypothesis.prediction.estimate(self._walks)
 
-    def weigh(self, hypothesis: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> tuple[Hypothesis, PoseUpdate]:
+    def weigh(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> tuple[Hypothesis, PoseUpdate]:
         """A hypothesis after a pose at its instant, and the verdict on the pose."""
         estimate = self.estimate(hypothesis)
         measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
@@ -94,7 +93,7 @@ class Hypotheses:
     def _is_stale(self, hypothesis: Hypothesis) -> bool:
         """Whether it has gone without poses for too long to be corrected."""
         coasted_ns = hypothesis.prediction.stamp_ns - hypothesis.accepted_ns
-        return coasted_ns > self._config.reinitialise_after * _SECOND_NS
+        return coasted_ns > self._config.reinitialise_after * SECOND_NS
 
     def from_nothing(self, pose: CameraPose, time_ns: int, window: FloatArray) -> Hypothesis | None:
         """A hypothesis that begins with a pose; None where no robot under gravity could be there.

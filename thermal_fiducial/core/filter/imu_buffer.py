@@ -6,9 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.core.filter.update import MotionAtPose
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-_SECOND_NS = 1_000_000_000
 #: Samples of so long [s] before and after a pose show its motion, if they have come: the noise of one would not.
 _MOTION_SECONDS = 0.05
 #: Room for so many samples to begin with: five seconds at 200 Hz.
@@ -58,7 +57,7 @@ class ImuBuffer:
     @property
     def last_step_seconds(self) -> float:
         """Length of the step that ends with the last sample [s]."""
-        return (self._stamps_ns[-1] - self._stamps_ns[-2]) / _SECOND_NS
+        return (self._stamps_ns[-1] - self._stamps_ns[-2]) / SECOND_NS
 
     def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
         """Add a sample (6,) and the densities (6,) of the step that ends with it."""
@@ -89,7 +88,7 @@ class ImuBuffer:
             imu[0], imu[-1] = self.at(begin_ns), self.at(end_ns)
             stamps_ns[0], stamps_ns[-1] = begin_ns, end_ns
         times_ns = np.array(stamps_ns)
-        seconds = (times_ns[1:] - times_ns[:-1]) / _SECOND_NS
+        seconds = (times_ns[1:] - times_ns[:-1]) / SECOND_NS
         return Steps(0.5 * (imu[:-1] + imu[1:]), seconds, self._rows[first + 1 : last + 1, 1])
 
     def at(self, time_ns: int) -> FloatArray:
@@ -104,7 +103,7 @@ class ImuBuffer:
 
     def window(self, until_ns: int, seconds: float) -> FloatArray:
         """Samples (N, 6) of the last ``seconds`` up to an instant, the last one at it."""
-        first = bisect_left(self._stamps_ns, until_ns - round(seconds * _SECOND_NS))
+        first = bisect_left(self._stamps_ns, until_ns - round(seconds * SECOND_NS))
         return np.vstack((self._rows[first : bisect_left(self._stamps_ns, until_ns), 0], self.at(until_ns)))
 
     def motion(self, time_ns: int, accepted_ns: int) -> MotionAtPose:
@@ -114,13 +113,13 @@ class ImuBuffer:
         """
         stamps_ns, imu = self._stamps_ns, self._rows[:, 0]
         index = max(bisect_left(stamps_ns, time_ns), 1)
-        seconds = (stamps_ns[index] - stamps_ns[index - 1]) / _SECOND_NS
+        seconds = (stamps_ns[index] - stamps_ns[index - 1]) / SECOND_NS
         each_side = max(min(round(_MOTION_SECONDS / seconds), len(stamps_ns) - index, index), 1)
         samples = imu[index - each_side : index + each_side]
         density = self._rows[index, 1]
         return MotionAtPose(
             imu=samples.mean(axis=0),
             rate_variance=float(density[0]) ** 2 / (seconds * len(samples)),
-            velocity_variance=float(density[3]) ** 2 * (time_ns - accepted_ns) / _SECOND_NS,
+            velocity_variance=float(density[3]) ** 2 * (time_ns - accepted_ns) / SECOND_NS,
             turning=float(np.linalg.norm(imu[index, :3] - imu[index - 1, :3])) / seconds,
         )

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core.filter.imu_buffer import Steps
-from thermal_fiducial.core.filter.rotation_integrals import rotation_integrals, SKEW
+from thermal_fiducial.core.filter.rotation_integrals import rotation_integrals
+from thermal_fiducial.core.geometry.se3 import SKEW
 from thermal_fiducial.core.types import FloatArray
 
 #: Columns of ``error``: the error before, biases and matrices of the sensors, noise.

@@ -11,9 +11,8 @@ from typing import NamedTuple
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.prediction import Prediction
 from thermal_fiducial.core.filter.state import POSITION
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-_SECOND_NS = 1_000_000_000
 #: An alternative must agree with so many times more poses than the estimate: one whose clock is wrong accepts some when
 #: the robot slows down.
 _PREFERRED = 4
@@ -129,11 +128,11 @@ class Belief(NamedTuple):
 
     def _why_reset(self, main: Hypothesis, other: Hypothesis, config: PoseEkfConfig) -> str:
         """Why the alternative ``other`` should replace ``main``, in words; empty: it should not."""
-        if other.accepted_ns - main.accepted_ns > config.reinitialise_after * _SECOND_NS:
+        if other.accepted_ns - main.accepted_ns > config.reinitialise_after * SECOND_NS:
             return f'no pose was accepted for {config.reinitialise_after:.0f} s'
         if main.position_std > config.lost_position_std:
             return 'the pose was lost, and markers are seen again'
-        lasting = other.accepted_ns - other.started_ns >= config.reset_after * _SECOND_NS
+        lasting = other.accepted_ns - other.started_ns >= config.reset_after * SECOND_NS
         against = main.hits - self.hits_before
         agreed = other.hits >= max(2 * other.misses, _PREFERRED * against, other.needed)
         return 'the poses contradict the estimate and agree with each other' if lasting and agreed else ''

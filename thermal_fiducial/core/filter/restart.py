@@ -6,9 +6,8 @@ import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-_SECOND_NS = 1_000_000_000
 #: Older poses [s] say nothing any more of where the robot is.
 HINT_SECONDS = 10.0
 #: A robot under control may be this far from its last pose [m], and so much farther for each second since [m/s].
@@ -44,7 +43,7 @@ class RestartHint:
 
     def contradiction(self, pose: CameraPose) -> float:
         """Distance [m] from the last pose of one that cannot be right by it; 0 where it may be."""
-        seconds = (pose.stamp_ns - self._last.stamp_ns) / _SECOND_NS
+        seconds = (pose.stamp_ns - self._last.stamp_ns) / SECOND_NS
         if not 0.0 <= seconds <= HINT_SECONDS or self._contradictions >= _PROOF:
             return 0.0
         position = (pose.T_map_camera @ self._T_camera_body)[:3, 3]

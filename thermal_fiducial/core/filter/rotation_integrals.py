@@ -5,11 +5,10 @@ from math import factorial
 import numpy as np
 import numpy.typing as npt
 
+from thermal_fiducial.core.geometry.se3 import skew
 from thermal_fiducial.core.types import FloatArray
 
-#: (3, 9): a vector (..., 3) times this is its cross-product matrix, row by row.
-SKEW = np.array(((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0)), float)
-_IDENTITY = np.eye(3).reshape(9)
+_IDENTITY = np.eye(3)
 #: Gamma_m = c[m, 0] 1 + c[m, 1] skew + c[m, 2] skew^2; series (terms, 9) of c in the negative square of the angle.
 _TERMS = np.arange(14)
 _SERIES = np.array(
@@ -35,12 +34,11 @@ def rotation_integrals(angles: npt.ArrayLike) -> FloatArray:
     """
     phi = np.asarray(angles, float)
     squares = (phi * phi).sum(axis=-1)
-    skew = phi @ SKEW
-    matrix = skew.reshape(*phi.shape, 3)
-    basis = np.empty((*phi.shape, 9))
-    basis[..., 0, :], basis[..., 1, :] = _IDENTITY, skew
-    basis[..., 2, :] = (matrix @ matrix).reshape(skew.shape)
-    return np.asarray(_coefficients(squares) @ basis).reshape(*phi.shape, 3, 3)
+    basis = np.empty((*phi.shape, 3, 3))
+    basis[..., 0, :, :] = _IDENTITY
+    basis[..., 1, :, :] = matrix = skew(phi)
+    basis[..., 2, :, :] = matrix @ matrix
+    return np.asarray(_coefficients(squares) @ basis.reshape(*phi.shape, 9)).reshape(basis.shape)
 
 
 def _coefficients(squares: FloatArray) -> FloatArray:

@@ -3,8 +3,8 @@
 import numpy as np
 
 from thermal_fiducial.core.filter.prediction import Prediction
-from thermal_fiducial.core.filter.rotation_integrals import SKEW
 from thermal_fiducial.core.filter.state import GYROSCOPE_BIAS, POSITION, ROTATION, VELOCITY
+from thermal_fiducial.core.geometry.se3 import skew
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray
 
@@ -37,7 +37,7 @@ def odometry(
     # (p, theta) of the map are R times the error of the robot frame; v_body moves with both nu and phi.
     J = _AT_REST.copy()
     J[0:3, POSITION] = J[3:6, ROTATION] = R
-    J[6:9, ROTATION] = (velocity_body @ SKEW).reshape(3, 3)
+    J[6:9, ROTATION] = skew(velocity_body)
     covariance = J @ joint @ J.T
     covariance.reshape(-1)[_RATE_VARIANCES] += rate_variance
     return Odometry(

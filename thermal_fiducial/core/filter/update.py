@@ -8,7 +8,7 @@ import numpy as np
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
 from thermal_fiducial.core.filter.pose_noise import BodyPose
-from thermal_fiducial.core.filter.rotation_integrals import rotation_integrals, SKEW
+from thermal_fiducial.core.filter.rotation_integrals import rotation_integrals
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
     CORE,
@@ -75,7 +75,7 @@ def slide(state: NavigationState, imu: FloatArray) -> FloatArray:
     """Change (9,) of the core with time: X(t + s) = X(t) Exp(slide s), as a sample ``imu`` (6,) shows it."""
     moved, velocity = np.empty(9), state.velocity_body
     moved[:6] = state.corrected(imu)
-    moved[VELOCITY] += state.gravity @ state.R_map_body - (moved[ROTATION] @ SKEW).reshape(3, 3) @ velocity
+    moved[VELOCITY] += state.gravity @ state.R_map_body - skew(moved[ROTATION]) @ velocity
     moved[POSITION] = velocity
     return moved
 
@@ -88,7 +88,7 @@ def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> Body
     # d p_body = d p_camera + d theta x lever, both in the map; then into the robot frame, rotation first.
     J = np.zeros((6, 6))
     J[:3, 3:] = J[3:, :3] = R.T
-    J[3:, 3:] = R.T @ (lever @ -SKEW).reshape(3, 3)
+    J[3:, 3:] = -R.T @ skew(lever)
     return BodyPose(pose.stamp_ns, T_map_body, scale**2 * (J @ pose.covariance @ J.T))
 
 

@@ -20,6 +20,8 @@ Real = TypeVar('Real', FloatArray, Float32Array)
 
 # Below this angle [rad] the Taylor series is exact to double precision (the next term is angle^6 / 5040).
 SMALL_ANGLE = 1e-2
+#: (3, 9): vectors (..., 3) times this are their cross-product matrices, row by row.
+SKEW = np.array(((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0)), float)
 # Of a corner of a quadrilateral, the next and the opposite one.
 _NEXT, _OPPOSITE = np.array([1, 2, 3, 0]), np.array([2, 3, 0, 1])
 
@@ -36,11 +38,7 @@ def skew(v: npt.ArrayLike) -> FloatArray:
     (..., 3, 3) with ``skew(v) @ w == cross(v, w)``
     """
     v = np.asarray(v, dtype=np.float64)
-    matrix = np.zeros((*v.shape, 3))
-    matrix[..., 0, 1], matrix[..., 0, 2] = -v[..., 2], v[..., 1]
-    matrix[..., 1, 0], matrix[..., 1, 2] = v[..., 2], -v[..., 0]
-    matrix[..., 2, 0], matrix[..., 2, 1] = -v[..., 1], v[..., 0]
-    return matrix
+    return np.asarray((v @ SKEW).reshape(*v.shape, 3))
 
 
 def _series(angle: FloatArray, exact: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
