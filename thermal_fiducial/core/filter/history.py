@@ -59,6 +59,9 @@ class History:
     def _forget_old(self) -> None:
         """Forget what no pose may reach any more."""
         horizon_ns = self.imu.newest_ns - self._kept_ns
+        if self.belief.stamp_ns < horizon_ns and self.belief.main is None:
+            # A start that has seen no pose since: where it is by now is all that counts.
+            self._beliefs = [self.belief._replace(alternative=self.alternative)]
         while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
             del self._beliefs[0]
         oldest = self._beliefs[0]

@@ -1,0 +1,22 @@
+"""What the filter keeps of samples and poses."""
+
+from support.flights import config, Flight
+
+from thermal_fiducial.core.filter.history import History
+from thermal_fiducial.core.filter.hypotheses import Hypotheses
+
+
+def test_a_start_without_further_poses_keeps_no_more_than_a_flight_does():
+    """One marker in passing, then none for long: samples must not gather until the next comes."""
+    flight, kept = Flight(seed=1, seconds=8.0, imu_rate=50.0), 0.5
+    history = History(Hypotheses(config()), kept, 0.0)
+    pose = flight.poses[10]
+    for sample in flight.samples():
+        imu = [*sample.angular_velocity, *sample.linear_acceleration]
+        history.append(sample.stamp_ns, imu, [1e-3] * 6)
+        if not history.holds(pose.stamp_ns) and sample.stamp_ns > pose.stamp_ns and len(history.imu) < 50:
+            history.insert(pose)
+        history.take_in()
+    assert history.belief.alternative is not None
+    # Blocks of twice what is kept, and a sample.
+    assert len(history.imu) <= 2 * kept * 50 + 2
