@@ -1,7 +1,9 @@
+import re
+
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Rosbag1Writer
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from thermal_fiducial.errors import InputError
@@ -167,7 +169,9 @@ def test_folder_without_metadata(tmp_path):
 def test_broken_metadata(tmp_path, text):
     folder = write(tmp_path / 'bag')
     (folder / 'metadata.yaml').write_text(text)
-    with pytest.raises(InputError, match=r'bag: the bag cannot be read|bag/metadata\.yaml: .*not valid YAML'):
+    with pytest.raises(
+        InputError, match=r'bag: the bag cannot be read|bag/metadata\.yaml: .*(not valid YAML|not a set of fields)'
+    ):
         read_all(folder)
 
 
@@ -248,3 +252,63 @@ def test_writer_refuses(tmp_path):
         pass
     with BagWriter(tmp_path / 'b') as bag, pytest.raises(InputError, match='unknown'):
         bag.write('a', 1, b'', 'mine/msg/Thing')
+
+
+# --- bags that are meant to hurt ----------------------------------------------------------------------
+
+
+def compressed(path, mode, data):
+    """A bag of one string of ``data``, compressed as ``mode`` says."""
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection('/a', STRING, typestore=STORE)
+        writer.write(connection, 1, STORE.serialize_cdr(string(data), STRING))
+    return path
+
+
+@pytest.mark.parametrize('mode', [CompressionMode.STORAGE, CompressionMode.MESSAGE, CompressionMode.FILE])
+def test_compressed_bags_are_read_but_none_that_expands_without_bound(tmp_path, mode):
+    (message,) = read_all(compressed(tmp_path / 'good', mode, 'as recorded'))
+    assert message.data == 'as recorded'
+    bomb = compressed(tmp_path / 'bomb', mode, 'x' * (40 << 20))
+    with pytest.raises(InputError, match=r'bomb: the bag cannot be read: \d+ compressed bytes expand to more than'):
+        read_all(bomb)
+
+
+@pytest.mark.parametrize('kind', [Rosbag1Writer.CompressionFormat.BZ2, Rosbag1Writer.CompressionFormat.LZ4])
+def test_chunks_of_ros_1_expand_as_little(tmp_path, kind):
+    old = get_typestore(Stores.ROS1_NOETIC)
+    for name, text in (('good', 'as recorded'), ('bomb', 'x' * (40 << 20))):
+        writer = Rosbag1Writer(tmp_path / f'{name}.bag')
+        writer.set_compression(kind)
+        with writer:
+            connection = writer.add_connection('/a', STRING, typestore=old)
+            writer.write(connection, 1, old.serialize_ros1(old.types[STRING](data=text), STRING))
+    assert [message.data for message in read_all(tmp_path / 'good.bag')] == ['as recorded']
+    with pytest.raises(InputError, match='expand to more than'):
+        read_all(tmp_path / 'bomb.bag')
+
+
+@pytest.mark.parametrize(
+    ('field', 'value'),
+    [
+        ('nanoseconds_since_epoch', '-1'),
+        ('nanoseconds_since_epoch', 'noon'),
+        ('nanoseconds', '1.5'),
+        ('message_count', 'many'),
+        ('message_count', str(2**70)),
+        ('name', '17'),
+        ('name', '~'),
+        ('type', '[]'),
+    ],
+)
+def test_metadata_that_is_none_is_refused(tmp_path, field, value):
+    path = write(tmp_path / 'bag', count=2)
+    file = path / 'metadata.yaml'
+    file.write_text(re.sub(rf'\b{field}: .*', f'{field}: {value}', file.read_text()))
+    with (
+        pytest.raises(InputError, match=r'bag: the bag cannot be read: its metadata|bag/metadata.yaml: line \d+: '),
+        BagReader(path),
+    ):
+        pass

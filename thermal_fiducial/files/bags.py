@@ -20,8 +20,8 @@ from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestor
 from rosbags.typesys.store import Typestore
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.reading import require_regular
-from thermal_fiducial.files.schema import load_yaml
+from thermal_fiducial.files.bag_checks import check_announced, check_file, check_metadata
+from thermal_fiducial.files.decompression import bound_decompression
 
 IMAGE_TOPIC = 'thermal/image_raw'
 COMPRESSED_TOPIC = 'thermal/image_raw/compressed'
@@ -36,10 +36,6 @@ INTERFACE_TOPICS = (IMAGE_TOPIC, COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, IMU_TOPIC,
 #: The same for what nodes publish; other programs' topics may end alike (``marker_map/markers``), so that these are
 #: left alone where several do.
 _COMMON_NAMES = (MARKERS_TOPIC, CAMERA_POSE_TOPIC)
-
-#: Of the files of bags; what else lies in their folder is not opened.
-_SUFFIXES = ('.mcap', '.db3', '.bag', '.zstd')
-_ROS1_BEGIN = b'#ROSBAG V2.0\n'
 
 STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 
@@ -131,16 +127,6 @@ def parse_remaps(arguments: Iterable[str]) -> dict[str, str]:
     return remaps
 
 
-def _check_file(path: Path) -> None:
-    """Raise InputError for what the library would wait for, or read whole, before it finds that it is no bag."""
-    if path.suffix in _SUFFIXES:
-        require_regular(path)
-    if path.suffix == '.bag':
-        with path.open('rb') as file:
-            if file.read(len(_ROS1_BEGIN)) != _ROS1_BEGIN:
-                raise InputError(f'{path}: no bag of ROS 1 (2.0)')
-
-
 class BagReader:
     """A recorded bag, opened by ``with``.
 
@@ -168,15 +154,16 @@ class BagReader:
         if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
             raise InputError(f'{self.path}: no bag, the folder has no metadata.yaml')
         if self.path.is_dir():
-            # What hurts a parser is refused before the library reads it.
-            load_yaml(self.path / 'metadata.yaml')
+            check_metadata(self.path / 'metadata.yaml')
         for file in sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]:
-            _check_file(file)
+            check_file(file)
+        bound_decompression()
         with self._readable():
             reader = Rosbag1Reader(self.path) if self.path.suffix == '.bag' else Rosbag2Reader(self.path)
             reader.open()
         self._reader = reader
         try:
+            check_announced(self.path, reader)
             if reader.message_count == 0:
                 raise InputError(f'{self.path}: the bag is empty')
             self._names = resolve_topics({connection.topic for connection in reader.connections}, self._remap)

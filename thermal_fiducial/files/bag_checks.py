@@ -1,0 +1,50 @@
+"""What is asked of a bag before its library reads it, and of what the library then says of it."""
+
+from pathlib import Path
+
+from rosbags.rosbag1 import Reader as Rosbag1Reader
+from rosbags.rosbag2 import Reader as Rosbag2Reader
+
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.reading import require_regular
+from thermal_fiducial.files.schema import load_yaml
+
+#: Of the files of bags; what else lies in their folder is not opened.
+_SUFFIXES = ('.mcap', '.db3', '.bag', '.zstd')
+_ROS1_BEGIN = b'#ROSBAG V2.0\n'
+_LARGEST_NUMBER = 2**63
+
+
+def check_file(path: Path) -> None:
+    """Raise InputError for what the library would wait for, or read whole, before it finds that it is no bag."""
+    if path.suffix in _SUFFIXES:
+        require_regular(path)
+    if path.suffix == '.bag':
+        with path.open('rb') as file:
+            if file.read(len(_ROS1_BEGIN)) != _ROS1_BEGIN:
+                raise InputError(f'{path}: no bag of ROS 1 (2.0)')
+
+
+def check_metadata(path: Path) -> None:
+    """Raise InputError for what hurts the library's parser, or is no number where it counts on one."""
+    root = load_yaml(path).mapping()
+    information = root['rosbag2_bagfile_information'].mapping() if 'rosbag2_bagfile_information' in root else {}
+    # What is missing, the library names.
+    for name, part in (('duration', 'nanoseconds'), ('starting_time', 'nanoseconds_since_epoch')):
+        numbers = information[name].mapping() if name in information else {}
+        if part in numbers:
+            numbers[part].integer(0, _LARGEST_NUMBER)
+    if 'message_count' in information:
+        information['message_count'].integer(0, _LARGEST_NUMBER)
+
+
+def check_announced(path: Path, reader: Rosbag1Reader | Rosbag2Reader) -> None:
+    """Raise InputError where what a bag says of itself is of another kind: metadata.yaml may hold anything."""
+    numbers = [reader.start_time, reader.duration, reader.message_count]
+    numbers += [connection.msgcount for connection in reader.connections]
+    # As many nanoseconds as 64 bits have, and one: the library's end is behind the last message.
+    if not all(type(number) is int and 0 <= number <= _LARGEST_NUMBER for number in numbers):
+        raise InputError(f'{path}: the bag cannot be read: its metadata has times or counts that are none')
+    names = [name for connection in reader.connections for name in (connection.topic, connection.msgtype)]
+    if not all(isinstance(name, str) and name.isprintable() for name in names):
+        raise InputError(f'{path}: the bag cannot be read: its metadata has topics or types that are no names')
