@@ -6,14 +6,13 @@ All are read in one process of bounded memory, so that none can take more unnoti
 import os
 from pathlib import Path
 import resource
-import struct
 import subprocess
 import sys
 import time
-import zlib
 
 import numpy as np
 import pytest
+from support.empty_picture import png
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
@@ -167,18 +166,6 @@ def test_clouds_that_promise_more_than_they_hold(tmp_path, count):
 def test_a_cloud_without_a_header(tmp_path):
     (tmp_path / 'a.ply').write_bytes(os.urandom(100_000))
     assert 'no header' in refused(load_cloud, tmp_path / 'a.ply')
-
-
-def png(width, height):
-    """A picture of zeros that is small only as a file."""
-
-    def chunk(kind, data):
-        return struct.pack('>I', len(data)) + kind + data + struct.pack('>I', zlib.crc32(kind + data))
-
-    head = struct.pack('>IIBBBBB', width, height, 16, 0, 0, 0, 0)
-    return (
-        b'\x89PNG\r\n\x1a\n' + chunk(b'IHDR', head) + chunk(b'IDAT', zlib.compress(bytes(1000))) + chunk(b'IEND', b'')
-    )
 
 
 @pytest.mark.parametrize('size', [(65_000, 65_000), (30_000, 30_000), (2**31 - 1, 1), (0, 0)])

@@ -1,10 +1,15 @@
 """Recorded pictures in the place of a camera."""
 
+import os
+import struct
+import subprocess
+import sys
 import time
 
 import cv2
 import numpy as np
 import pytest
+from support.empty_picture import png
 
 from thermal_fiducial.cameras.pictures import Pictures
 from thermal_fiducial.cameras.source import EndOfFramesError
@@ -99,3 +104,36 @@ def test_what_is_no_source_is_refused(tmp_path):
     (tmp_path / 'a.avi').write_bytes(b'no video')
     with pytest.raises(InputError, match='no 16-bit'):
         Pictures(str(tmp_path / 'a.avi'))
+
+
+def test_pictures_larger_than_any_camera_takes_are_refused_before_they_are_read(tmp_path):
+    """65,000 x 65,000 pixels of 16 bits are 8 GB; in a process of its own, as OpenCV reads its limit when loaded."""
+    (tmp_path / 'huge.png').write_bytes(png(65_000, 65_000))
+    pages = tmp_path / 'huge.tif'
+    cv2.imwrite(str(pages), PICTURES[0])
+    tiff = pages.read_bytes()
+    for tag, side in ((256, 64), (257, 48)):
+        tiff = tiff.replace(struct.pack('<HHII', tag, 3, 1, side), struct.pack('<HHII', tag, 3, 1, 65_000))
+    pages.write_bytes(tiff)
+    program = (
+        'import resource, sys, time\n'
+        'from thermal_fiducial.cameras.pictures import Pictures\nfrom thermal_fiducial.errors import InputError\n'
+        'before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()\n'
+        'for path in sys.argv[1:]:\n'
+        '    try:\n        Pictures(path)\n    except InputError as error:\n        print(error)\n'
+        'print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before, time.process_time() - start)\n'
+    )
+    words = [sys.executable, '-c', program, str(tmp_path), str(pages)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    *lines, figures = done.stdout.splitlines()
+    assert lines == [f'camera {path}: no 16-bit grey picture in it' for path in (tmp_path, pages)]
+    kilobytes, seconds = map(float, figures.split())
+    # As of every other file: see test_hostile_files.
+    assert kilobytes < 200 << 10
+    assert seconds < 1.0
+
+
+def test_what_never_ends_is_no_video(tmp_path):
+    os.mkfifo(tmp_path / 'pipe.tif')
+    with pytest.raises(InputError, match='not a regular file'):
+        Pictures(str(tmp_path / 'pipe.tif'))

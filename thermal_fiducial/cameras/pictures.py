@@ -1,7 +1,7 @@
 """Recorded 16-bit pictures in the place of a camera: a folder of them (flirpy's, for instance), or a video."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 import time
 from typing import Any
@@ -12,10 +12,14 @@ import numpy as np
 from thermal_fiducial.cameras.source import CapturedFrame, EndOfFramesError, now_ns
 from thermal_fiducial.core.types import Counts
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.images import read_picture, without_libraries_lines
+from thermal_fiducial.files.reading import require_regular
 
 _PICTURES = ('.png', '.tif', '.tiff', '.pgm')
 _STACKS = ('.tif', '.tiff')
 _PATIENCE_S = 0.2
+#: Pages of a TIFF in memory at a time: a flight has 10,000, of 655 KB each.
+_PAGES = 30
 
 
 class Pictures:
@@ -82,11 +86,12 @@ class Pictures:
     def _files(self) -> Iterator[Any]:
         for path in sorted(self._path.iterdir()):
             if path.suffix.lower() in _PICTURES:
-                yield cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+                yield _picture(path)
 
     def _video(self) -> Iterator[Any]:
+        require_regular(self._path)
         if self._path.suffix.lower() in _STACKS:
-            yield from cv2.imreadmulti(str(self._path), flags=cv2.IMREAD_UNCHANGED)[1]
+            yield from self._pages()
             return
         video = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
         video.set(cv2.CAP_PROP_CONVERT_RGB, 0)
@@ -95,3 +100,24 @@ class Pictures:
                 yield picture[1]
         finally:
             video.release()
+
+    def _pages(self) -> Iterator[Any]:
+        pages: Sequence[Any] = [None]
+        begin = 0
+        while pages:
+            try:
+                with without_libraries_lines():
+                    pages = cv2.imreadmulti(str(self._path), begin, _PAGES, flags=cv2.IMREAD_UNCHANGED)[1]
+            except cv2.error:
+                yield None
+                return
+            yield from pages
+            begin += _PAGES
+
+
+def _picture(path: Path) -> Any:
+    """The pixels of a file, None where it has none that a camera may have taken."""
+    try:
+        return read_picture(path, cv2.IMREAD_UNCHANGED)
+    except InputError:
+        return None

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.types import Counts, Gray
+from thermal_fiducial.core.types import Counts, Gray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import read_bytes
 
@@ -82,7 +82,7 @@ def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
     """
     data = np.frombuffer(read_bytes(path, _LARGEST_FILE_BYTES), np.uint8)
     try:
-        with _without_libraries_lines():
+        with without_libraries_lines():
             pixels = cv2.imdecode(data, flags) if data.size else None
     except cv2.error as error:
         reason = 'it is too large' if 'PIXELS' in str(error) or 'WIDTH' in str(error) else 'it is broken'
@@ -93,7 +93,7 @@ def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
 
 
 @contextmanager
-def _without_libraries_lines() -> Iterator[None]:
+def without_libraries_lines() -> Iterator[None]:
     """Keep what libpng and others write about a broken picture, past OpenCV, off the console of a command."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
@@ -107,10 +107,10 @@ def _without_libraries_lines() -> Iterator[None]:
 
 def stamp_to_ns(stamp: Any) -> int:
     """Integer nanoseconds of a builtin_interfaces/msg/Time."""
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+    return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)
 
 
 def header_stamp_ns(cdr: bytes) -> int:
     """Stamp of a serialised message that begins with a header (4 bytes of encapsulation before it)."""
     seconds, nanoseconds = struct.unpack_from('<iI' if cdr[1] else '>iI', cdr, 4)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+    return int(seconds) * SECOND_NS + int(nanoseconds)
