@@ -15,7 +15,7 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import TimeReference
 from support import small_bag
 from support.direct_graph import DirectGraph
-from support.messages import FRAME_NS, frames, imu, IMU_NS, info, pose, START
+from support.messages import FRAME_NS, frames, imu, IMU_NS, info, odometry, pose, START
 
 from fuzz.findings import Finding, timed
 from fuzz.mutations import mutate_message
@@ -148,13 +148,11 @@ def _good_messages(graph: DirectGraph) -> dict[str, list[Any]]:
         graph.send('/thermal/image_raw', message)
         found['/thermal/image_raw'].append(message)
     state = State(START, np.eye(4), np.zeros(3), np.zeros(3), 1e-6 * np.eye(6), 1e-6 * np.eye(6))
-    odometry = convert.odometry_frames('map', 'base_link')
-    convert.fill_odometry(odometry, state)
     found['/thermal/image'] = found['/thermal/image_raw']
     found['/thermal/camera_info'] = [info()]
     found['/imu/data'] = [imu(k) for k in range(5)]
     found['/camera_pose'] = [pose(k) for k in range(5)]
-    found['/odometry'] = [odometry]
+    found['/odometry'] = [odometry(state)]
     found['/map_correction'] = [convert.transform_message(np.eye(4), START, 'map', 'map_before')]
     clock = convert.header(START + FRAME_NS, 'camera')
     found['/camera_clock'] = [

@@ -1,5 +1,7 @@
 """Messages for the nodes, as rclpy has them: the frames, IMU samples and poses of :mod:`support.small_bag`."""
 
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 import numpy as np
 from sensor_msgs.msg import Imu
 
@@ -33,3 +35,19 @@ def pose(k, T=None):
     head = convert.header(START + k * IMU_NS, 'map')
     T_map_camera = small_bag.T_BODY_CAMERA if T is None else T
     return convert.pose_with_covariance(T_map_camera, np.diag([1e-6] * 3 + [1e-7] * 3), head)
+
+
+def odometry(state, frame_id='map', child_frame_id='base_link'):
+    """The message of a state, field by field: what the filter writes as bytes."""
+    message = Odometry(header=convert.header(state.stamp_ns, frame_id), child_frame_id=child_frame_id)
+    message.pose.pose = convert.pose(state.T_map_body)
+    message.pose.covariance[:] = state.pose_covariance.ravel()
+    message.twist.twist.linear = convert.vector(state.velocity_body)
+    message.twist.twist.angular = convert.vector(state.angular_velocity_body)
+    message.twist.covariance[:] = state.twist_covariance.ravel()
+    return message
+
+
+def pose_of(odometry):
+    """The pose alone of such a message."""
+    return PoseWithCovarianceStamped(header=odometry.header, pose=odometry.pose)

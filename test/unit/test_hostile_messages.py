@@ -10,7 +10,7 @@ import pytest
 from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2, TimeReference
 from std_srvs.srv import Trigger
 from support import small_bag
-from support.messages import FRAME_NS, frames, imu, IMU_NS, info, pose, START
+from support.messages import FRAME_NS, frames, imu, IMU_NS, info, odometry, pose, START
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.config import ArucoDetectorConfig
@@ -126,12 +126,6 @@ def state(stamp_ns, **other):
     """What a filter says at ``stamp_ns`` of a robot in the flight of the frames."""
     T_map_body = small_bag.true_pose((stamp_ns - START) * 1e-9)
     return replace(State(stamp_ns, T_map_body, np.zeros(3), np.zeros(3), GOOD, GOOD), **other)
-
-
-def odometry(values):
-    message = convert.odometry_frames('map', 'base_link')
-    convert.fill_odometry(message, values)
-    return message
 
 
 HOSTILE_STATES = {

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu
+from support.messages import odometry, pose_of
 
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import Odometry
@@ -23,17 +24,11 @@ def state(**other):
     )
 
 
-def sent(odometry, frame_id='map', child_frame_id='base_link'):
-    message = convert.odometry_frames(frame_id, child_frame_id)
-    convert.fill_odometry(message, odometry)
-    return message
-
-
 @pytest.mark.parametrize('length', range(9))
 def test_is_what_the_message_says(length):
     """Names of any length, as what follows them is aligned."""
     for names in (('m' * length, 'base_link'), ('map', 'b' * length)):
-        said, message = state(), serialize_message(sent(state(), *names))
+        said, message = state(), serialize_message(odometry(state(), *names))
         read = message_bytes.odometry(message)
         assert read.stamp_ns == said.stamp_ns == message_bytes.stamp_ns(message)
         # A quaternion in between: the last digits of the rotation may differ.
@@ -46,11 +41,11 @@ def test_is_what_the_message_says(length):
 def test_what_is_not_finite_is_refused(name):
     broken = np.full_like(getattr(state(), name), np.nan)
     with pytest.raises(InputError, match='finite'):
-        message_bytes.odometry(serialize_message(sent(state(**{name: broken}))))
+        message_bytes.odometry(serialize_message(odometry(state(**{name: broken}))))
 
 
 def test_what_is_no_quaternion_is_refused():
-    message = sent(state())
+    message = odometry(state())
     message.pose.pose.orientation.w += 0.7
     with pytest.raises(InputError, match='quaternion'):
         message_bytes.odometry(serialize_message(message))
@@ -60,19 +55,19 @@ def test_what_is_no_quaternion_is_refused():
 @pytest.mark.parametrize('covariance', [np.zeros((6, 6)), -np.eye(6), 1e30 * np.eye(6), np.ones((6, 6))])
 def test_what_is_no_covariance_is_refused(name, covariance):
     with pytest.raises(InputError, match='odometry with a covariance'):
-        message_bytes.odometry(serialize_message(sent(state(**{name: covariance}))))
+        message_bytes.odometry(serialize_message(odometry(state(**{name: covariance}))))
 
 
 @pytest.mark.parametrize('cut', [0, 3, 8, 20, 100, -8])
 def test_bytes_that_are_no_message_are_refused(cut):
-    message = serialize_message(sent(state()))
+    message = serialize_message(odometry(state()))
     for broken in (message[:cut], b'\x00\x00' + message[2:]):
         with pytest.raises(InputError, match='odometry of'):
             message_bytes.odometry(broken)
 
 
 def test_names_of_impossible_length_are_refused():
-    message = bytearray(serialize_message(sent(state())))
+    message = bytearray(serialize_message(odometry(state())))
     message[12:16] = (2**32 - 1).to_bytes(4, 'little')
     with pytest.raises(InputError, match='cut short'):
         message_bytes.odometry(bytes(message))
@@ -80,18 +75,18 @@ def test_names_of_impossible_length_are_refused():
 
 def test_names_of_kilobytes_are_not_kept():
     with pytest.raises(InputError, match='bytes'):
-        message_bytes.stamp_ns(serialize_message(sent(state(), 'x' * 10_000)))
+        message_bytes.stamp_ns(serialize_message(odometry(state(), 'x' * 10_000)))
 
 
 @pytest.mark.parametrize('length', range(9))
 def test_bytes_of_a_state_are_those_of_its_messages(length):
     for names in (('m' * length, 'base_link'), ('map', 'b' * length)):
-        written, message = message_bytes.StateBytes(*names), sent(state(), *names)
+        written, message = message_bytes.StateBytes(*names), odometry(state(), *names)
         written.fill(state())
         # As read again: what serialisation leaves between the fields is anything.
         assert len(written.odometry) == len(serialize_message(message))
         assert deserialize_message(written.odometry, type(message)) == message
-        pose = PoseWithCovarianceStamped(header=message.header, pose=message.pose)
+        pose = pose_of(message)
         assert len(written.pose) == len(serialize_message(pose))
         assert deserialize_message(written.pose, PoseWithCovarianceStamped) == pose
 

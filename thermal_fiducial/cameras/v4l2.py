@@ -10,7 +10,7 @@ import numpy as np
 
 from thermal_fiducial.cameras import v4l2_api as api
 from thermal_fiducial.cameras.source import CapturedFrame
-from thermal_fiducial.core.types import Counts
+from thermal_fiducial.core.types import Counts, SECOND_NS
 from thermal_fiducial.errors import InputError
 
 #: Pixel formats of one 16-bit word a pixel; Y16 is asked for, a driver may answer with another one.
@@ -131,7 +131,7 @@ class V4l2Camera:
             capture = self._call(api.S_PARM, parameters).capture
         period = capture.timeperframe
         if period.numerator and period.denominator:
-            self._period_ns = round(1e9 * period.numerator / period.denominator)
+            self._period_ns = round(SECOND_NS * period.numerator / period.denominator)
             offered = period.denominator / period.numerator
             if self._rate > 0.0 and abs(offered / self._rate - 1.0) > _RATE_TOLERANCE:
                 raise InputError(f'{self.name} offers {offered:.4g} Hz, not {self._rate:.4g}')
@@ -174,7 +174,7 @@ class V4l2Camera:
         monotonic, realtime = self._kernel.clocks_ns()
         stamp = realtime
         if buffer.flags & api.FLAG_TIMESTAMP_MASK == api.FLAG_TIMESTAMP_MONOTONIC:
-            stamp += buffer.timestamp.sec * 1_000_000_000 + buffer.timestamp.usec * 1000 - monotonic
+            stamp += buffer.timestamp.sec * SECOND_NS + buffer.timestamp.usec * 1000 - monotonic
             if buffer.flags & api.FLAG_SOURCE_MASK == api.FLAG_SOURCE_START_OF_EXPOSURE:
                 return int(stamp)
         return int(stamp - self._period_ns)

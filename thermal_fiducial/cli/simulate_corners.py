@@ -7,6 +7,7 @@ import numpy as np
 
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.files.flight_bags import write_recording
 from thermal_fiducial.files.recordings import Corners, Recording
 from thermal_fiducial.files.rig_files import Rig
@@ -49,6 +50,6 @@ def write_corner_flight(
     InputError
         ``out`` exists or cannot be written.
     """
-    late = IMAGE_DELAY_NS * 1e-9
+    late = IMAGE_DELAY_NS / SECOND_NS
     write_recording(out, simulated_recording(flight, noise), noise.claimed_px, late, storage, progress)
     write_side_files(out, flight)

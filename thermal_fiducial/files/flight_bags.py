@@ -12,6 +12,7 @@ import yaml
 from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
 from thermal_fiducial.core.measurements import Markers
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import bag_messages
 from thermal_fiducial.files.bags import (
@@ -52,7 +53,7 @@ def write_recording(
     """
     if recording.corners and recording.rig.marker_size <= 0.0:
         raise InputError('the recording does not say how large its markers are: give --marker-size')
-    late_ns = round((late + recording.rig.time_offset) * 1e9)
+    late_ns = round((late + recording.rig.time_offset) * SECOND_NS)
     parts = [_imu(recording), _frames(recording, sigma_px, late_ns), _truth(recording)]
     writer = BagWriter(out, storage)
     try:

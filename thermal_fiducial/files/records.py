@@ -9,6 +9,7 @@ import numpy as np
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.plausibility import require_usable
 from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
 
 # What no IMU measures: seven times the widest gyroscopes' range [rad/s], and four times the widest accelerometers'.
@@ -28,9 +29,9 @@ def stamp_ns(stamp: Any) -> int:
 
 def checked_stamp(seconds: int, nanoseconds: int) -> int:
     """:func:`stamp_ns` of its two numbers."""
-    if seconds < 0 or nanoseconds >= 1_000_000_000:
+    if seconds < 0 or nanoseconds >= SECOND_NS:
         raise InputError(f'stamp of {seconds} s and {nanoseconds} ns')
-    return seconds * 1_000_000_000 + nanoseconds
+    return seconds * SECOND_NS + nanoseconds
 
 
 def camera(message: Any) -> Camera:

@@ -4,6 +4,8 @@ from typing import Any
 
 from rosbags.typesys import get_typestore, Stores
 
+from thermal_fiducial.core.types import SECOND_NS
+
 CAMERA_FRAME, BODY_FRAME, MAP_FRAME = 'thermal_camera_optical', 'base_link', 'map'
 
 _TYPES = get_typestore(Stores.ROS2_JAZZY).types
@@ -16,5 +18,5 @@ def make(kind: str, *args: Any, **fields: Any) -> Any:
 
 def header(stamp_ns: int, frame_id: str) -> Any:
     """std_msgs/msg/Header."""
-    time = make('builtin_interfaces/msg/Time', *divmod(int(stamp_ns), 1_000_000_000))
+    time = make('builtin_interfaces/msg/Time', *divmod(int(stamp_ns), SECOND_NS))
     return make('std_msgs/msg/Header', stamp=time, frame_id=frame_id)

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import text_lines
 
-_NS = 1_000_000_000
 # What an integer of 64 bits holds in nanoseconds: the year 2262.
 _LATEST_S = 9_200_000_000
 # Of a position [m], as in the messages.
@@ -22,7 +21,7 @@ _LIMIT_BYTES = 500_000_000
 
 def tum_line(stamp_ns: int, position: Iterable[float], orientation_xyzw: Iterable[float]) -> str:
     """One line without its end: nine decimals of the stamp, values to the nanometre."""
-    seconds, rest = divmod(int(stamp_ns), _NS)
+    seconds, rest = divmod(int(stamp_ns), SECOND_NS)
     values = ' '.join(f'{float(value):.9f}' for value in (*position, *orientation_xyzw))
     return f'{seconds}.{rest:09d} {values}'
 
@@ -75,7 +74,7 @@ def _row(path: str | Path, number: int, line: str) -> tuple[int, list[float]]:
         seconds = Decimal(words[0])
         if not abs(seconds) < _LATEST_S:
             raise InputError(f'{path} line {number}: {words[0][:40]} is no stamp')
-        stamp = int((seconds * _NS).to_integral_value())
+        stamp = int((seconds * SECOND_NS).to_integral_value())
         values = [float(word) for word in words[1:]]
     except InputError:
         raise

@@ -16,7 +16,7 @@ from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.core.measurements import corners_px, Markers
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 # Passes over all frames: more than any chain of markers needs of which each is seen with the last alone.
 _MAX_PASSES = 50
@@ -75,7 +75,7 @@ def build_map(
 
 def _stamp(k: int) -> int:
     """Stamp of frame k, in every pass the same; seconds apart, since unordered frames have no continuity."""
-    return (k + 1) * 1_000_000_000
+    return (k + 1) * SECOND_NS
 
 
 def _settle(mapper: MarkerMapper, camera: Camera) -> bool:

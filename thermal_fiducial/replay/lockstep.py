@@ -12,6 +12,7 @@ from typing import Any
 from rclpy.context import Context
 from rclpy.serialization import deserialize_message
 
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagMessage
 from thermal_fiducial.nodes.aruco_detector import ArucoDetector
@@ -26,7 +27,6 @@ from thermal_fiducial.ros.counting import CountingNode
 from thermal_fiducial.ros.node import StageNode
 from thermal_fiducial.ros.run import initialise, make_executor
 
-_SECOND_NS = 1_000_000_000
 _KINDS: dict[str, type[StageNode[Any]]] = {
     'tau2_camera': Tau2Camera,
     'aruco_detector': ArucoDetector,
@@ -108,19 +108,19 @@ class _Graph:
         outputs = {topic: self._player.advertise(PLAYED[topic][0], topic, PLAYED[topic][1]) for topic in played}
         self._connect()
         self._settle(bag.start_ns, files)
-        next_diagnosis = bag.start_ns + _SECOND_NS
+        next_diagnosis = bag.start_ns + SECOND_NS
         last_ns = bag.start_ns
         for message in bag.messages(played):
             while message.stamp_ns >= next_diagnosis:
                 self._diagnose(next_diagnosis, files)
                 progress(next_diagnosis - bag.start_ns)
-                next_diagnosis += _SECOND_NS
+                next_diagnosis += SECOND_NS
             _check(message)
             outputs[message.topic].send(message.cdr)
             self._settle(message.stamp_ns, files)
             last_ns = message.stamp_ns
         # Not a second later: rates would count the time after the end.
-        self._diagnose(max(last_ns, next_diagnosis - _SECOND_NS + 1), files)
+        self._diagnose(max(last_ns, next_diagnosis - SECOND_NS + 1), files)
 
     def _diagnose(self, time_ns: int, files: Sink) -> None:
         for stage in self._stages:

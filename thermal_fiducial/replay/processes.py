@@ -8,6 +8,7 @@ from typing import Any
 
 from rclpy.context import Context
 
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.files.bags import (
     BagMessage,
     CAMERA_INFO_TOPIC,
@@ -135,8 +136,8 @@ class _Player:
             if elapsed >= next_check:
                 nodes.check()
                 progress(elapsed)
-                next_check = elapsed + 1_000_000_000
-        seconds = (time.monotonic_ns() - self._start_ns) * 1e-9
+                next_check = elapsed + SECOND_NS
+        seconds = (time.monotonic_ns() - self._start_ns) / SECOND_NS
         used = {node: total - cpu[node] for node, total in nodes.cpu_seconds().items()}
         self._drain(nodes)
         self._latency.write(self._files.folder / 'latency.csv')
@@ -152,7 +153,7 @@ class _Player:
         heard, idle = -1, 0
         while idle * _GLANCE_S < _SILENCE_S:
             nodes.check()
-            self._spin_until(time.monotonic_ns() + round(_GLANCE_S * 1e9))
+            self._spin_until(time.monotonic_ns() + round(_GLANCE_S * SECOND_NS))
             if heard != (heard := sum(source.count for source in self._results())):
                 idle = 0
             idle += not nodes.working
@@ -177,7 +178,7 @@ class _Player:
                 self._executor.spin_once(timeout_sec=0.0)
                 self._file_one()
             else:
-                self._executor.spin_once(timeout_sec=left * 1e-9)
+                self._executor.spin_once(timeout_sec=left / SECOND_NS)
 
     def _file_one(self) -> None:
         topic, data, now = self._arrived.popleft()

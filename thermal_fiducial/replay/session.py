@@ -11,6 +11,7 @@ from typing import Any
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.map_data import MarkerMap
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map, save_map
@@ -166,7 +167,7 @@ def _summary(options: Options, settings: Settings, bag: BagReader, files: RunFil
         'transport': options.transport,
         'mode': settings.marker_mapper.mode,
         'start_ns': bag.start_ns,
-        'duration_s': bag.duration_ns * 1e-9,
+        'duration_s': bag.duration_ns / SECOND_NS,
         'messages_in': {topic: bag.message_count([topic]) for topic in PLAYED if topic in bag.topics},
         'messages_out': dict(sorted(files.counts.items())),
         'frames_with_markers': files.frames_with_markers,

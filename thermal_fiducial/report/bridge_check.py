@@ -10,7 +10,7 @@ from enum import Enum
 import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import so3_log
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
 from thermal_fiducial.report.bridge_record import BridgeRecord
 
 GRAVITY = 9.81
@@ -89,7 +89,7 @@ def _values(record: BridgeRecord) -> list[Finding]:
 
 
 def _rate(record: BridgeRecord) -> list[Finding]:
-    steps = np.diff(np.sort(record.stamps_ns)) * 1e-9
+    steps = np.diff(np.sort(record.stamps_ns)) / SECOND_NS
     mean = steps.mean()
     rate, gap = (1.0 / mean if mean > 0.0 else 0.0), steps.max()
     seen = f'{rate:.1f} Hz, longest gap {gap * 1e3:.0f} ms'
@@ -125,7 +125,7 @@ def _stamps(record: BridgeRecord) -> list[Finding]:
 def _age(record: BridgeRecord) -> list[Finding]:
     if not record.live:
         return [Finding('age', Level.UNTESTED, 'recorded', 'Only a live check compares stamps with the clock.')]
-    age = (record.arrivals_ns - record.stamps_ns) * 1e-9
+    age = (record.arrivals_ns - record.stamps_ns) / SECOND_NS
     typical, worst = float(np.median(age)), float(np.percentile(age, 99))
     seen = f'{typical * 1e3:.1f} ms, 99 % below {worst * 1e3:.1f} ms'
     if typical < -0.002:
@@ -184,7 +184,7 @@ def _specific_force_in_map(record: BridgeRecord) -> FloatArray | None:
 
 def _turns(record: BridgeRecord) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Turn rates (N-1, 3) of the poses in the body, the same by the messages' twists, and where steps are usable."""
-    dt = np.diff(record.stamps_ns) * 1e-9
+    dt = np.diff(record.stamps_ns) / SECOND_NS
     usable = (dt > 1e-4) & (dt < PX4_START)
     R = record.rotations
     turn = so3_log(np.swapaxes(R[:-1], -1, -2) @ R[1:]) / np.where(usable, dt, 1.0)[:, None]
@@ -218,7 +218,7 @@ def _velocity(record: BridgeRecord) -> list[Finding]:
 
     Over one message it needn't be: corrections by markers, of millimetres, are as large as the motion.
     """
-    t = (record.stamps_ns - record.stamps_ns[0]) * 1e-9
+    t = (record.stamps_ns - record.stamps_ns[0]) / SECOND_NS
     end = np.searchsorted(t, t + MOVE_SECONDS)
     begin = np.flatnonzero(end < len(t))
     end = end[begin]
@@ -271,7 +271,7 @@ def _covariance(record: BridgeRecord) -> list[Finding]:
 
 def _jumps(record: BridgeRecord) -> list[Finding]:
     """Steps of the position that the speed doesn't explain."""
-    dt = np.diff(record.stamps_ns) * 1e-9
+    dt = np.diff(record.stamps_ns) / SECOND_NS
     claimed = 0.5 * (record.velocities[:-1] + record.velocities[1:])
     expected = (record.rotations[:-1] @ claimed[..., None])[..., 0] * dt[:, None]
     jumps = np.linalg.norm(np.diff(record.positions, axis=0) - expected, axis=1)

@@ -16,6 +16,7 @@ from evo.core.filters import FilterException
 from evo.core.trajectory import PoseTrajectory3D
 import numpy as np
 
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.page import evaluate_run, write_text
@@ -152,7 +153,7 @@ def evo_numbers(estimate: Trajectory, truth: Trajectory) -> dict[str, dict[str, 
 
 
 def _of_evo(trajectory: Trajectory) -> PoseTrajectory3D:
-    return PoseTrajectory3D(poses_se3=list(trajectory.T_map_body), timestamps=trajectory.stamps_ns * 1e-9)
+    return PoseTrajectory3D(poses_se3=list(trajectory.T_map_body), timestamps=trajectory.stamps_ns / SECOND_NS)
 
 
 def _statistics(metric: Any, truth: PoseTrajectory3D, estimate: PoseTrajectory3D, scale: float) -> dict[str, float]:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.report import metrics
 from thermal_fiducial.report.availability import at_frames, Available, available
 from thermal_fiducial.report.interruptions import Interruption, interruptions
@@ -50,11 +50,11 @@ class Evaluation:
 
     def seconds(self, stamps_ns: IntArray) -> FloatArray:
         """Time of the plots [s]."""
-        return np.asarray((stamps_ns - self.start_ns) * 1e-9)
+        return np.asarray((stamps_ns - self.start_ns) / SECOND_NS)
 
     def seconds_at(self, stamp_ns: int) -> float:
         """Time of the plots [s] of one stamp."""
-        return (stamp_ns - self.start_ns) * 1e-9
+        return (stamp_ns - self.start_ns) / SECOND_NS
 
     @property
     def covariances(self) -> tuple[metrics.Errors, FloatArray] | None:

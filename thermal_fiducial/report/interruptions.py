@@ -6,7 +6,7 @@ from enum import Enum
 import numpy as np
 
 from thermal_fiducial.core.imaging.frame_cleaner import SHUTTER
-from thermal_fiducial.core.types import BoolArray, IntArray
+from thermal_fiducial.core.types import BoolArray, IntArray, SECOND_NS
 from thermal_fiducial.report.metrics import Errors, FRAME_NS, steps
 from thermal_fiducial.report.run_folder import Run
 from thermal_fiducial.report.trajectory import Trajectory
@@ -45,7 +45,7 @@ class Interruption:
     @property
     def seconds(self) -> float:
         """Its length."""
-        return (self.end_ns - self.start_ns) * 1e-9
+        return (self.end_ns - self.start_ns) / SECOND_NS
 
     @property
     def is_shutter(self) -> bool:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from thermal_fiducial.core.mapping.landing_pad import from_mavros
-from thermal_fiducial.core.types import BoolArray, IntArray
+from thermal_fiducial.core.types import BoolArray, IntArray, SECOND_NS
 from thermal_fiducial.report.bridge_check import Finding, Level
 from thermal_fiducial.report.bridge_record import BridgeRecord, LandingRecord
 
@@ -29,7 +29,7 @@ def check_landing(robot: BridgeRecord) -> list[Finding]:
 
 
 def _rate(record: LandingRecord) -> Finding:
-    gaps = np.diff(np.sort(record.stamps_ns)) * 1e-9
+    gaps = np.diff(np.sort(record.stamps_ns)) / SECOND_NS
     if not len(gaps) or gaps.max() > LONGEST_GAP:
         seen = f'gap of {gaps.max():.1f} s' if len(gaps) else 'one message'
         text = 'ArduPilot wants one a second: is the pad in view all the way down?'
@@ -75,4 +75,4 @@ def _nearest(stamps_ns: IntArray, of_ns: IntArray) -> tuple[IntArray, BoolArray]
     before = np.maximum(after - 1, 0)
     earlier = np.abs(of_ns[order[before]] - stamps_ns) < np.abs(of_ns[order[after]] - stamps_ns)
     nearest = order[np.where(earlier, before, after)]
-    return nearest, np.abs(of_ns[nearest] - stamps_ns) < _NEAR * 1e9
+    return nearest, np.abs(of_ns[nearest] - stamps_ns) < _NEAR * SECOND_NS

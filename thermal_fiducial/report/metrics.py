@@ -15,13 +15,13 @@ import numpy as np
 
 from thermal_fiducial.core.filter.innovations import Innovations
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.report.trajectory import Trajectory
 
 #: Interval of the jitter: a period of the camera [ns].
 FRAME_NS = 33_333_333
 #: Interval of the relative pose error [ns].
-RELATIVE_NS = 1_000_000_000
+RELATIVE_NS = SECOND_NS
 #: Truth is not interpolated over holes longer than this [ns].
 TRUTH_HOLE_NS = 200_000_000
 #: 95 % point of chi-square, by degrees of freedom; and where 95 % lie of a pose's, as much below as above.
@@ -158,7 +158,7 @@ def relative_pose_error(e: Errors, interval_ns: int = RELATIVE_NS) -> dict[str, 
     step = inverse(e.estimate[i]) @ e.estimate[j]
     E = inverse(true_step) @ step
     return {
-        'interval_s': interval_ns * 1e-9,
+        'interval_s': interval_ns / SECOND_NS,
         'position_mm': 1e3 * _rms(np.linalg.norm(E[:, :3, 3], axis=1)),
         'attitude_deg': float(np.rad2deg(_rms(np.linalg.norm(so3_log(E[:, :3, :3]), axis=1)))),
     }
@@ -219,7 +219,7 @@ def output(trajectory: Trajectory) -> dict[str, float]:
     step_mm = 1e3 * steps(trajectory)
     return {
         'poses': len(trajectory),
-        'rate_hz': 1e9 / float(np.median(dt)),
+        'rate_hz': SECOND_NS / float(np.median(dt)),
         'longest_pause_ms': 1e-6 * float(dt.max()),
         'step_p95_mm': float(np.percentile(step_mm, 95)),
         'step_max_mm': float(step_mm.max()),

@@ -9,7 +9,7 @@ import numpy as np
 
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
-from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.marker_map import load_map
@@ -105,7 +105,7 @@ def _camera_time_offset_ns(path: Path) -> int:
         return 0
     nodes = load_plain(path)
     try:
-        return round(float(nodes['/pose_ekf']['ros__parameters']['camera_time_offset']) * 1e9)
+        return round(float(nodes['/pose_ekf']['ros__parameters']['camera_time_offset']) * SECOND_NS)
     except (KeyError, TypeError, ValueError, OverflowError):
         raise InputError(f'{path}: no camera_time_offset of pose_ekf in it') from None
 

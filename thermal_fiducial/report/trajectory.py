@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, TRUTH_TOPIC
 from thermal_fiducial.files.trajectory_file import load_tum
@@ -87,4 +87,4 @@ def read_truth(path: Path) -> Trajectory:
 def _pose_row(message: object) -> tuple[int, ...]:
     stamp = message.header.stamp  # type: ignore[attr-defined]
     p, q = message.pose.pose.position, message.pose.pose.orientation  # type: ignore[attr-defined]
-    return (stamp.sec * 1_000_000_000 + stamp.nanosec, p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+    return (stamp.sec * SECOND_NS + stamp.nanosec, p.x, p.y, p.z, q.x, q.y, q.z, q.w)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.report.frames import annotated, bag_of, views, write
@@ -77,7 +77,7 @@ def write_video(
 
 
 def _rate(reader: BagReader, count: int) -> float:
-    seconds = reader.duration_ns * 1e-9
+    seconds = reader.duration_ns / SECOND_NS
     return round(count / seconds, 2) if count > 2 and seconds > 0.0 else _FALLBACK_RATE
 
 
@@ -92,7 +92,7 @@ def _captioned(run: Run, reader: BagReader) -> Iterator[Frame]:
         if last is None:
             continue
         picture = annotated(last, run.detections, view.stamp_ns) if view.pixels is not None else last.copy()
-        lines = [f'{(view.stamp_ns - start_ns) * 1e-9:6.2f} s  {view.reason}', _place(run, view.stamp_ns)]
+        lines = [f'{(view.stamp_ns - start_ns) / SECOND_NS:6.2f} s  {view.reason}', _place(run, view.stamp_ns)]
         for row, line in enumerate(lines):
             write(picture, line, (8, picture.shape[0] - 10 - _LINE_PX * (len(lines) - 1 - row)))
         # H.264 with halved colours wants even sizes.

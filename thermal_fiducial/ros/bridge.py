@@ -14,9 +14,10 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.measurements import Odometry
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.counting import CountingNode
+from thermal_fiducial.ros.message_bytes import StateBytes
 
 #: Turns forward-left-up axes into forward-right-down ones, and back.
 FLU_TO_FRD = np.array([1.0, -1.0, -1.0])
@@ -34,8 +35,7 @@ class FlightControllerBridge:
     """
 
     def __init__(self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None]) -> None:
-        self._config = config
-        self._period_ns = round(1e9 / config.bridge_rate) if config.bridge_rate > 0.0 else 0
+        self._period_ns = round(SECOND_NS / config.bridge_rate) if config.bridge_rate > 0.0 else 0
         self._due_ns = 0
         self._px4: Any = None
         if not self._period_ns:
@@ -50,11 +50,12 @@ class FlightControllerBridge:
             else:
                 self._px4_odometry = node.advertise(self._px4, PX4_TOPIC, qos.RESULT)
 
-    def send(self, odometry: Odometry, resets: int) -> None:
+    def send(self, odometry: Odometry, written: StateBytes, resets: int) -> None:
         """Publish ``odometry`` if its turn has come.
 
         Parameters
         ----------
+        written : the same as bytes
         resets : how often the pose has jumped; autopilots that know of a counter take the jump over with it
         """
         stamp = odometry.stamp_ns
@@ -63,10 +64,8 @@ class FlightControllerBridge:
         # In step with the IMU, however its period divides ours; reset after a gap or a clock that was set back.
         on_time = abs(stamp - self._due_ns) < self._period_ns
         self._due_ns = (self._due_ns if on_time else stamp) + self._period_ns
-        message = convert.odometry_frames(self._config.map_frame, self._config.base_frame)
-        convert.fill_odometry(message, odometry)
-        self._odometry.send(message)
-        self._pose.send(PoseWithCovarianceStamped(header=message.header, pose=message.pose))
+        self._odometry.send(written.odometry)
+        self._pose.send(written.pose)
         if self._px4 is not None:
             self._px4_odometry.send(px4_odometry(self._px4, odometry, resets))
 

@@ -20,7 +20,6 @@ from geometry_msgs.msg import (
     TransformStamped,
     Vector3,
 )
-from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +29,8 @@ from std_msgs.msg import Header
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
-from thermal_fiducial.core.measurements import CameraPose, Odometry
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 
 # What a bag without ROS needs as well.
@@ -49,7 +48,7 @@ _LARGEST_CLOCK_OFFSET = 10.0
 
 def clock_reference(camera_stamp_ns: int, offset: float) -> TimeReference:
     """The instant of a frame in both clocks, for t_imu = t_camera + ``offset`` [s]."""
-    imu_stamp_ns = camera_stamp_ns + round(offset * 1e9)
+    imu_stamp_ns = camera_stamp_ns + round(offset * SECOND_NS)
     return TimeReference(header=header(imu_stamp_ns, ''), time_ref=header(camera_stamp_ns, '').stamp, source='camera')
 
 
@@ -61,7 +60,7 @@ def clock_offset(message: TimeReference) -> float:
     InputError
         Clocks that are farther apart than any the filter follows.
     """
-    offset = (stamp_ns(message.header.stamp) - stamp_ns(message.time_ref)) * 1e-9
+    offset = (stamp_ns(message.header.stamp) - stamp_ns(message.time_ref)) / SECOND_NS
     if abs(offset) > _LARGEST_CLOCK_OFFSET:
         raise InputError(f'camera_clock that is {offset:.6g} s off')
     return offset
@@ -69,7 +68,7 @@ def clock_offset(message: TimeReference) -> float:
 
 def header(stamp: int, frame_id: str) -> Header:
     """Header with a stamp in nanoseconds."""
-    seconds, nanoseconds = divmod(int(stamp), 1_000_000_000)
+    seconds, nanoseconds = divmod(int(stamp), SECOND_NS)
     return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame_id)
 
 
@@ -157,29 +156,6 @@ def camera_pose(message: PoseWithCovarianceStamped) -> CameraPose:
     T_map_camera = transform_of(message.pose.pose, 'camera_pose')
     covariance = checked_covariance(np.array(message.pose.covariance).reshape(6, 6), 'camera_pose with a covariance')
     return CameraPose(stamp_ns(message.header.stamp), T_map_camera, covariance)
-
-
-def odometry_frames(frame_id: str, child_frame_id: str) -> OdometryMessage:
-    """Odometry message with the pose in ``frame_id`` and the twist in ``child_frame_id``, both to be filled in."""
-    message = OdometryMessage(child_frame_id=child_frame_id)
-    message.header.frame_id = frame_id
-    return message
-
-
-def fill_odometry(message: OdometryMessage, odometry: Odometry) -> None:
-    """Set everything of ``message`` but its frames: at the rate of an IMU, making messages anew counts."""
-    stamp = message.header.stamp
-    stamp.sec, stamp.nanosec = divmod(int(odometry.stamp_ns), 1_000_000_000)
-    place, twist = message.pose.pose, message.twist.twist
-    position, orientation = place.position, place.orientation
-    position.x, position.y, position.z = odometry.T_map_body[:3, 3].tolist()
-    orientation.x, orientation.y, orientation.z, orientation.w = quaternion_from_rotation(
-        odometry.T_map_body[:3, :3]
-    ).tolist()
-    message.pose.covariance[:] = odometry.pose_covariance.ravel()
-    twist.linear.x, twist.linear.y, twist.linear.z = odometry.velocity_body.tolist()
-    twist.angular.x, twist.angular.y, twist.angular.z = odometry.angular_velocity_body.tolist()
-    message.twist.covariance[:] = odometry.twist_covariance.ravel()
 
 
 def vector(v: FloatArray) -> Vector3:

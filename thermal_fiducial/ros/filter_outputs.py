@@ -37,7 +37,6 @@ class FilterOutputs:
         self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None], frames: RobotFrames
     ) -> None:
         self._config, self._frames = config, frames
-        #: messages that are filled again and again
         self._state = StateBytes(config.map_frame, config.base_frame)
         #: stamp of the latest state; 0 before there is one
         self.stamp_ns = 0
@@ -74,7 +73,8 @@ class FilterOutputs:
             self._state.fill(smooth)
             self._smooth_odometry.send(self._state.odometry)
         if not lost:
-            self._bridge.send(smooth or odometry, jumps)
+            # Filled with the smooth one last, where there is one.
+            self._bridge.send(smooth or odometry, self._state, jumps)
         self._extend_path(odometry)
 
     def send_clock(self, camera_stamp_ns: int, offset: float | None) -> None:

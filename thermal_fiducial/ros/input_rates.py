@@ -8,9 +8,9 @@ from collections import deque
 from collections.abc import Sequence
 from statistics import median
 
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.ros.counting import Input
 
-_SECOND_NS = 1_000_000_000
 #: Looks, a second apart, over which a rate is averaged: a shutter event of half a second is 5 % of it.
 _WINDOW = 10
 #: Looks in a row with messages that make an input a steady one, and the first of them that show its rate.
@@ -35,7 +35,7 @@ class _Watch:
     def look(self, time_ns: int) -> None:
         """Take in the count at a time; one that does not advance (a paused clock) says nothing of the rate."""
         count = self.source.count
-        before_ns, before = self._looks[-1] if self._looks else (time_ns - _SECOND_NS, 0)
+        before_ns, before = self._looks[-1] if self._looks else (time_ns - SECOND_NS, 0)
         came = count > before
         self.silent = 0 if came else self.silent + 1
         if not self.is_steady:
@@ -43,7 +43,7 @@ class _Watch:
         if time_ns < before_ns:
             self._looks.clear()
         elif time_ns > before_ns and came and len(self._first_rates) < _STEADY:
-            self._first_rates.append((count - before) / (time_ns - before_ns) * _SECOND_NS)
+            self._first_rates.append((count - before) / (time_ns - before_ns) * SECOND_NS)
         self._looks.append((time_ns, count))
 
     @property
@@ -60,7 +60,7 @@ class _Watch:
     def rate(self) -> float:
         """Over the window [Hz]; 0 before there is one."""
         (first_ns, first), (last_ns, last) = (self._looks[0], self._looks[-1]) if self._looks else ((0, 0), (0, 0))
-        return (last - first) / (last_ns - first_ns) * _SECOND_NS if last_ns > first_ns else 0.0
+        return (last - first) / (last_ns - first_ns) * SECOND_NS if last_ns > first_ns else 0.0
 
     @property
     def first_rate(self) -> float:

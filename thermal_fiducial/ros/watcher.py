@@ -13,6 +13,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros import clouds, convert, qos
 from thermal_fiducial.ros.live_status import LiveStatus
@@ -39,7 +40,7 @@ class Watcher:
             node.create_subscription(kind, topic, take, profile)
 
     def _age(self, head: Any) -> float:
-        return 1e-9 * (self._node.get_clock().now().nanoseconds - convert.stamp_ns(head.stamp))
+        return (self._node.get_clock().now().nanoseconds - convert.stamp_ns(head.stamp)) / SECOND_NS
 
     def _on_odometry(self, message: Odometry) -> None:
         variances = np.asarray(message.pose.covariance).reshape(6, 6).diagonal()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import lfilter
 
-from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.sim.spline_trajectory import GRAVITY, Path
 
 
@@ -71,9 +71,9 @@ class Delivery:
         burst = np.ceil(times[kept] / self.period).astype(np.int64)
         first = np.searchsorted(burst, burst)
         seconds = burst * self.period + (np.arange(len(kept)) - first) * self.spacing
-        stamps = np.round(seconds * 1e9).astype(np.int64)
+        stamps = np.round(seconds * SECOND_NS).astype(np.int64)
         for moment in self.steps_back:
-            place = int(np.searchsorted(stamps, moment * 1e9))
+            place = int(np.searchsorted(stamps, moment * SECOND_NS))
             if 0 < place < len(stamps):
                 stamps[place] = stamps[place - 1] - 1_000_000
         return kept, stamps
@@ -142,7 +142,7 @@ class ImuModel:
         rates += shaken.normal(0.0, self.gyroscope_rattle, rates.shape)
         forces += shaken.normal(0.0, self.accelerometer_rattle, forces.shape)
         jitter = np.clip(shaken.normal(0.0, self.stamp_jitter, len(times)), -0.4 / self.rate, 0.4 / self.rate)
-        stamps = stamps_ns + np.round(jitter * 1e9).astype(np.int64)
+        stamps = stamps_ns + np.round(jitter * SECOND_NS).astype(np.int64)
         record = ImuRecord(stamps, rates, forces, gyroscope_bias, accelerometer_bias)
         return record if self.delivery is None else record.delivered(self.delivery, times, int(stamps_ns[0]))
 

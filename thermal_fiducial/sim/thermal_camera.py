@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.types import BoolArray, Counts, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Counts, FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.sim.imu import ImuRecord
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.render import Quality, Renderer
@@ -82,13 +82,13 @@ class FlightPlan:
     def stamp_ns(self, index: int) -> int:
         """The camera's stamp of it."""
         late = self.scenario.stamp_jitter * (np.random.default_rng([self.seed, 9, index]).exponential() - 1.0)
-        return START_NS + round((self.frame_time(index) - self.scenario.camera_time_offset + late) * 1e9)
+        return START_NS + round((self.frame_time(index) - self.scenario.camera_time_offset + late) * SECOND_NS)
 
     def imu_stamps(self) -> tuple[FloatArray, IntArray]:
         """Times [s] and true stamps [ns] of the IMU's samples."""
         rate = self.scenario.imu.rate
         ticks = np.arange(int(self.seconds * rate) + 1, dtype=np.int64)
-        nanoseconds = np.round(ticks * (1e9 / rate)).astype(np.int64)
+        nanoseconds = np.round(ticks * (SECOND_NS / rate)).astype(np.int64)
         return np.asarray(nanoseconds * 1e-9), nanoseconds + START_NS
 
 

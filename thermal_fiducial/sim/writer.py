@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import yaml
 
-from thermal_fiducial.core.types import IntArray
+from thermal_fiducial.core.types import IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, TRUTH_TOPIC
 from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry
@@ -129,7 +129,7 @@ def _noting_corners(frames: Iterable[SimFrame], lines: list[str]) -> Iterator[Si
 
 def _camera_events(frames: Iterable[SimFrame], flight: FlightPlan) -> Iterator[_Event]:
     for frame in frames:
-        arrival = START_NS + round(frame.seconds * 1e9) + IMAGE_DELAY_NS
+        arrival = START_NS + round(frame.seconds * SECOND_NS) + IMAGE_DELAY_NS
         yield _Event(arrival, CAMERA_INFO_TOPIC, messages.camera_info(flight.scenario.lens, frame.stamp_ns))
         yield _Event(arrival, IMAGE_TOPIC, messages.image(frame, eight_bit=flight.scenario.sensor.full_scale < 256))
 
