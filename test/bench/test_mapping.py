@@ -1,5 +1,8 @@
 """What a frame costs the mapper in a large map, and what an hour of mapping leaves in memory."""
 
+from concurrent.futures import ProcessPoolExecutor
+import multiprocessing
+import os
 from pathlib import Path
 import time
 
@@ -8,6 +11,7 @@ from support.crowds import crowd, frames, mapped, SIZE
 from support.walls import CAMERA, flight, FRAME_NS, see, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 
@@ -27,27 +31,37 @@ def milliseconds(marker_map, seen, mode):
     return min(took)
 
 
-def resident_mb():
-    """Memory of this process [MB]."""
-    return int(Path('/proc/self/statm').read_text().split()[1]) * 4096 / 1e6
+def resident_mb(process='self'):
+    """Memory of a process [MB]."""
+    return int(Path(f'/proc/{process}/statm').read_text().split()[1]) * 4096 / 1e6
 
 
-def an_hour():
-    """Keyframes kept, refinements, largest error of a marker [mm], memory [MB] after 6 minutes and after an hour."""
+def an_hour(elsewhere):
+    """Keyframes kept, refinements, largest error of a marker [mm], and memory [MB] after 6 minutes and after an hour.
+
+    As in the node, refinements run in another process: what their arrays leave of the heap is not the mapper's memory.
+
+    Parameters
+    ----------
+    elsewhere : that process
+    """
     rng = np.random.default_rng(0)
     poses = wall(rng)
     m = MarkerMapper(MarkerMapperConfig(), MarkerMap({0: MapMarker(0, 0.3, True, poses[0])}))
     seen = [see(flight(k / 5), poses, 0.05, rng) for k in range(300)]
-    memory = {}
+    processes, memory = ('self', elsewhere.submit(os.getpid).result()), []
     for k in range(HOUR):
         stamp = (k + 1) * INTERVAL_NS
         m.process(stamp, seen[k % len(seen)], CAMERA)
         if m.refinement_due(stamp):
-            assert m.refine() is not None or len(m.map.markers) == 1
+            refinement = elsewhere.submit(refine, m.snapshot()).result()
+            assert refinement is not None or len(m.map.markers) == 1
+            if refinement is not None:
+                m.apply(refinement)
         if k + 1 in (HOUR // 10, HOUR):
-            memory[k + 1] = resident_mb()
+            memory.append([resident_mb(process) for process in processes])
     errors = [np.linalg.norm(marker.T_map_marker[:3, 3] - poses[i][:3, 3]) for i, marker in m.map.markers.items()]
-    return len(m.snapshot().keyframes), m.resets, 1e3 * max(errors), memory[HOUR // 10], memory[HOUR]
+    return len(m.snapshot().keyframes), m.resets, 1e3 * max(errors), *memory
 
 
 def test_scale_of_the_map(benchmark, write_table):
@@ -62,10 +76,12 @@ def test_scale_of_the_map(benchmark, write_table):
         small, large = np.min(pairs, axis=0)
         rows.append((f'time of a frame, {mode}', f'{small:.2f} ms', f'{large:.2f} ms', f'{large / small:.2f}'))
         ratios.append(large / small)
-    kept, refinements, error, early, late = benchmark.pedantic(an_hour, rounds=1)
+    with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as elsewhere:
+        kept, refinements, error, early, late = benchmark.pedantic(an_hour, args=(elsewhere,), rounds=1)
     what = f'an hour of mapping: {kept} keyframes, {refinements} refinements, largest error {error:.1f} mm'
-    rows.append((what, f'{early:.0f} MB after 6 min', f'{late:.0f} MB after 60 min', ''))
+    for row, before, after in zip((what, 'process of the refinements'), early, late, strict=True):
+        rows.append((row, f'{before:.0f} MB after 6 min', f'{after:.0f} MB after 60 min', ''))
     write_table('mapping', rows)
     assert max(ratios) <= 1.2
-    assert late < early + 5.0
+    assert late[0] < early[0] + 5.0
     assert error < 1.0

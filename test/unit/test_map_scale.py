@@ -1,5 +1,6 @@
 """Maps of many markers and mapping for hours: what a frame costs, and what is kept."""
 
+from dataclasses import replace
 import pickle
 import sys
 
@@ -83,3 +84,30 @@ def test_memory_does_not_grow_once_the_budget_is_used_up(budget, doubtful, full,
     assert len(m.snapshot().keyframes) <= budget + 2 * 3
     # All that it holds, as bytes.
     assert max(held[1:]) < 1.1 * held[0]
+
+
+def test_markers_seen_in_passing_fill_no_memory():
+    """False positives come with any ID, once."""
+    poses = wall(np.random.default_rng(0), 4)
+    m = MarkerMapper(MarkerMapperConfig(), MarkerMap({0: MapMarker(0, 0.3, True, poses[0])}))
+    for k in range(30):
+        once = {10 + 50 * k + i: poses[1] for i in range(50)}
+        T = look([-3.0, 0.0, 1.5], [0.0, 0.0, 1.5])
+        m.process(stamp(k), see(T, {0: poses[0]} | once, 0.05, np.random.default_rng(k)), CAMERA)
+    # The latest of them are still on trial.
+    assert sorted(m.candidates) == list(range(510, 1510))
+
+
+def test_calibrations_that_change_all_the_time_fill_no_memory():
+    """A driver that estimates the focal length: each keyframe keeps that of its frame, and nothing else does."""
+    rng = np.random.default_rng(0)
+    poses = wall(rng, 4)
+    m = MarkerMapper(MarkerMapperConfig(keyframe_budget=12), MarkerMap({0: MapMarker(0, 0.3, True, poses[0])}))
+    for k in range(60):
+        camera = replace(CAMERA, K=CAMERA.K * [[1.0 + 0.004 * k], [1.0 + 0.004 * k], [1.0]])
+        T = look([-3.0 + 0.5 * np.sin(k), np.sin(0.9 * k), 1.5], [0.0, 0.0, 1.5])
+        m.process(stamp(k), see(T, poses, 0.05, rng, camera=camera), camera)
+    snapshot = m.snapshot()
+    assert len(snapshot.rig.cameras) <= 13
+    # Corners of 0.05 px along either axis; with the focal length of the next frame it would be a pixel.
+    assert m.refine().rms_px < 0.1

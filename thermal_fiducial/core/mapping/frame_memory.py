@@ -119,9 +119,14 @@ class FrameMemory:
         return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)
 
     def _index(self, camera: Camera) -> int:
-        """Index of ``camera`` among those seen so far: a calibration may change, or frames of several cameras come."""
+        """Index of ``camera`` among those of the keyframes: a calibration may change, or frames of several come.
+
+        One that no keyframe needs any more makes room for the next: there are no more than keyframes.
+        """
         for index, known in enumerate(self._cameras):
             if camera is known or camera.matches(known):
                 return index
-        self._cameras.append(camera)
-        return len(self._cameras) - 1
+        used = {int(index) for frame in self._keyframes.frames.values() for index in frame.cameras[:1]}
+        free = next((index for index in range(len(self._cameras)) if index not in used), len(self._cameras))
+        self._cameras[free:] = [camera, *self._cameras[free + 1 :]]
+        return free

@@ -11,6 +11,9 @@ from thermal_fiducial.core.types import FloatArray
 
 #: Candidates that are judged in one frame: bounds its time when many are new.
 TRIALS = 3
+#: Candidates at most, more than the largest dictionaries have markers in use: what was seen in passing, or is none at
+#: all, is forgotten before it fills the memory, that of the longest ago first.
+MOST = 1000
 
 
 class NewMarkers:
@@ -50,6 +53,8 @@ class NewMarkers:
             if placement.T_map_marker is not None:
                 placed.append(entry(stamp_ns, candidate, placement.T_map_marker, placement.covariance))
                 del self.candidates[candidate.id]
+        while len(self.candidates) > MOST:
+            del self.candidates[min(self.candidates, key=lambda key: self.candidates[key].views[-1].stamp_ns)]
         return placed, {c.id: c.reason for c in shown if c.id in self.candidates}
 
     def move(self, displacement: Displacement) -> None:
