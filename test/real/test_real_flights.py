@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from support import real_flights
-from support.corner_runs import fly
+from support.corner_runs import fly, rms
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('real_data')]
 
@@ -71,12 +71,17 @@ def test_an_imu_in_bursts_with_gaps_does_not_break_the_filter(name, seconds):
     flight = real_flights.carpet(name, seconds=seconds)
     run = fly(flight)
     assert run.resets == 0
-    # Measured: 3 and 2 %. One corner in a hundred of these recordings is 1.6 px off, and gaps have heavy tails.
-    assert run.refused < 0.06
+    # Measured: 1.0 and 1.9 %, 3.3 % of the first 8 s with the start. One corner in a hundred of these recordings is
+    # 1.6 px off, and gaps have heavy tails.
+    assert run.refused < (0.03 if seconds == WHOLE else 0.06)
     # Between the gaps the fused pose is as near to the reference as the markers' claim of 3 mm; the clocks of this rig
     # differ by 10 ms, which the reference doesn't know: 2.5 mm at 0.25 m/s.
     score = run.published.score(flight)
     assert score.median_mm < 6.0
+    # At every instant it is nearer than the latest pose of the markers, 30 ms late: a half is asked, 0.33 measured.
+    moving = run.published.stamps_ns[run.published.stamps_ns > run.published.stamps_ns[0] + 2_000_000_000]
+    published = np.linalg.norm(run.published.at(moving).errors(flight)[:, :3], axis=1)
+    assert rms(published) < 0.5 * rms(run.latest_marker_errors(moving))
     # At the ends of gaps of half a second it is off by as much as it claims, not by more: at most four sigma.
     errors = np.linalg.norm(run.published.errors(flight)[:, :3], axis=1)
     claimed = np.sqrt(np.trace(run.published.covariance[:, :3, :3], axis1=1, axis2=2))

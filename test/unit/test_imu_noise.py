@@ -90,6 +90,21 @@ def test_what_a_gap_hides_follows_from_the_motion_around_it(gap, even):
     assert np.all(claimed < 10.0 * true)
 
 
+def test_a_gap_hides_the_jumps_that_are_seen_behind_gaps_alone():
+    # As of a recorded drone: each burst of samples shows one and the same motion, behind the gap it is another.
+    sigma = np.repeat((0.2, 0.5), 3)
+    monitor = ImuNoiseMonitor(LINEAR)
+    for motion in np.random.default_rng(7).normal(size=(60, 6)) * sigma:
+        behind_gap = monitor.densities(GRAVITY + motion, 0.067)[[0, 3]] ** 2
+        for _ in range(9):
+            monitor.densities(GRAVITY + motion * 1.01, 0.005)
+    # A jump of variance 2 sigma^2 at an unknown instant: the mean over the gap is off by a twelfth of that.
+    true = 2.0 * sigma[[0, 3]] ** 2 / 12.0 * 0.067
+    # Wide by at most 10, as above: it may be anything else than a jump.
+    assert np.all(behind_gap > true / 1.5)
+    assert np.all(behind_gap < 10.0 * true)
+
+
 def test_a_gap_of_a_drone_at_rest_hides_little():
     claimed, _ = hidden(lambda t: np.zeros((len(t), 6)), np.arange(400) / 200.0, 0.033)
     # no more than the noise of the data sheet, which is in it

@@ -101,7 +101,7 @@ class StructureFunction:
     "Random Functions and Turbulence", 1971). Where it grows as tau^a, the mean over a step of T seconds differs from
     that of the samples at its ends by a variance of D(T) (1 / (a + 2) - 1 / 4): a quarter of D(T) for vibration, a
     twelfth for Brownian motion, nothing for motion that is linear in time. Motion is the smoother the shorter one
-    looks: with the exponent at T itself it is an upper bound.
+    looks: with the exponent between T and 2 T it is an upper bound.
     """
 
     def __init__(self) -> None:
@@ -137,9 +137,12 @@ class StructureFunction:
         """Squared densities of the noise that a step of ``seconds`` between two samples makes."""
         place = math.log2(seconds / _SHORTEST_LAG)
         lower = min(max(int(place), 0), len(_LAGS) - 2)
-        D = np.maximum(self._measured[lower : lower + 2], _LEAST_MOTION[lower : lower + 2])
-        exponent = np.clip(np.log2(D[1] / D[0]), 0.0, 2.0)
-        at_step = D[0] * 2.0 ** (exponent * (place - lower))
+        into = min(max(place - lower, 0.0), 1.0)
+        log_D = np.log2(np.maximum(self._measured[lower : lower + 3], _LEAST_MOTION[lower : lower + 3]))
+        slopes = np.clip(log_D[1:] - log_D[:-1], 0.0, 2.0)
+        at_step = 2.0 ** (log_D[1] + slopes[0] * (place - lower - 1))
+        # From one step to two of them.
+        exponent = slopes[0] + into * (slopes[-1] - slopes[0])
         # The errors of steps in a row share a sample: they add up twice as fast if all is vibration.
         shared = 1.0 + np.maximum(1.0 - exponent, 0.0)
         rate, force = (at_step * (1.0 / (exponent + 2.0) - 0.25) * shared * seconds).tolist()
