@@ -55,16 +55,13 @@ MECHANISMS = {
     ),
     'weights by the map': Mechanism(
         ('uneven map', 'chain'),
-        ('localization:_Frame._map_weights',),
-        {'localization:_Frame._map_weights': lambda self, *_: np.ones(len(self.sight.markers))},
+        ('localization:_Frame.map_weights',),
+        {'localization:_Frame.map_weights': lambda self, *_: np.ones(len(self.sight.markers))},
     ),
     'alternative pose': Mechanism(
         ('small markers', 'chain', 'tags test_16'),
         ('localization:_Frame.alternative',),
         {'localization:_Frame.alternative': _ignored},
-    ),
-    'errors that delay makes': Mechanism(
-        ('board', 'wall'), ('motion',), {'motion:CameraMotion.delay_covariance': lambda *_: np.zeros((6, 6))}
     ),
     'contradiction of odometry': Mechanism(
         ('chain', 'tags test_22'), ('odometry_prior:contradicts',), {'mapper:contradicts': lambda *_: False}
@@ -97,8 +94,8 @@ MECHANISMS = {
     ),
     'quarantine': Mechanism(
         ('moved markers', 'two sheets'),
-        ('trust:Trust.judge', 'trust:inconsistent'),
-        {'trust:Trust.judge': lambda *_: False},
+        ('trust:Trust.update', 'trust:inconsistent'),
+        {'trust:inconsistent': lambda disagrees, _: np.zeros_like(disagrees)},
     ),
     'robust scale in rounds': Mechanism(('optimistic corners', 'wall'), (), {'bundle_adjustment:_ROUNDS': 1}),
     'three trials a frame': Mechanism(('carpet',), (), {'new_markers:TRIALS': 10**9}),

@@ -20,7 +20,7 @@ def view(stamp_ns, T_map_camera, covariance=1e-3):
     """A marker seen in the middle of the image, from a camera that may not have seen it there."""
     branch = transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 2.0])
     corners = CAMERA.project((branch[:3, :3] @ marker_corners(SIZE).T).T + branch[:3, 3])
-    viewpoint = Viewpoint.known(T_map_camera, covariance * np.eye(6))
+    viewpoint = Viewpoint.known(T_map_camera, covariance * np.eye(6), np.zeros((6, 6)))
     return MarkerView(stamp_ns, viewpoint, corners, np.tile(1e-4 * np.eye(2), (4, 1, 1)), np.stack([branch] * 2))
 
 

@@ -32,23 +32,18 @@ class SystematicErrors:
     decision_px: float = 0.1
     #: Common relative error of the markers' sides and of the focal length: ways of measuring tags on one carpet differ
     #: by 1.2 %, a laser cutter's kerf of 0.3 mm is 0.1 %, and a calibration with a board is good to 0.1 to 0.3 %.
-    #: Enters poses from markers (:func:`scale_of_pose`) and the map (:func:`scale_of_map`).
+    #: Enters poses from markers (:func:`of_single_error`) and the map (:func:`scale_of_map`).
     marker_size_std: float = 0.003
     #: Corners of one marker in all of its views [share of the corners' noise]: its shape and the model of its edges.
     #: As measured on rendered flights with three lenses and 0.5 to 9 K. Enters the covariance of a joint adjustment.
     marker_shape: float = 0.7
-    #: Delay of an image [s] beside a constant one, which belongs to the clocks, and half of its mean square [s^2]: what
-    #: the detector's lag is not. As measured on rendered flights whose lag was integrated in 4 to 16 steps of a frame.
-    #: Enters poses from markers (:func:`delay_of_pose`).
-    delay_std: float = 0.15e-3
-    delay_half_square_std: float = 25e-6
 
 
 #: 99.9 % of chi square of six and of eight degrees of freedom, of a pose and of a view of a marker: what is farther off
 #: than promised errors come.
 CHI2_OF_POSE, CHI2_OF_VIEW = 22.5, 26.1
 #: For data that have no systematic errors: simulated corners.
-NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0)
+NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0)
 #: Share of the variance of the best marker in view that all others have in common with it, as parts of a rigid map: the
 #: place where they all come from, the gauge. Of maps from flights past eight markers nearly all is common; the rest
 #: covers markers that were surveyed one by one.
@@ -74,29 +69,26 @@ def corner_correlations(corners: FloatArray, width: int, errors: SystematicError
     return np.asarray(np.exp(squared * (-0.5 / (errors.corner_length * width) ** 2)))
 
 
-def visible_share(J: FloatArray, correlations: FloatArray) -> float:
-    """Share of the variance of the corners' systematic errors that a pose fitted to them leaves in the residuals.
+def corners_of_pose(
+    gains: FloatArray, J: FloatArray, correlations: FloatArray, errors: SystematicErrors
+) -> tuple[FloatArray, float]:
+    """What the systematic errors of n corners make of a pose that is fitted to them.
 
     Parameters
     ----------
-    J : (n, 2, 6) derivatives of n corners with respect to the pose
-    """
-    n = len(J)
-    Q = np.linalg.qr(J.reshape(2 * n, 6))[0].reshape(n, 12)
-    return 1.0 - float(np.sum(Q * (correlations @ Q))) / (2.0 * n)
-
-
-def corners_of_pose(gains: FloatArray, correlations: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Covariance (m, m) that the systematic errors of n corners make of a pose.
-
-    Parameters
-    ----------
-    gains : (n, m, 2) what a pixel of each corner moves the pose by
+    gains : (n, 6, 2) what a pixel of each corner moves the pose by
+    J : (n, 2, 6) derivatives of the corners with respect to the pose
     correlations : (n, n) of the errors
+
+    Returns
+    -------
+    Covariance (6, 6) of the pose, and the share of the errors' variance that the pose leaves in the residuals.
     """
-    n, m, _ = gains.shape
-    mixed = (correlations @ gains.reshape(n, 2 * m)).reshape(n, m, 2)
-    return np.asarray(errors.corner_px**2 * np.tensordot(gains, mixed, axes=([0, 2], [0, 2])))
+    n = len(gains)
+    mixed = (correlations @ gains.reshape(n, 12)).reshape(n, 6, 2)
+    covariance = errors.corner_px**2 * np.tensordot(gains, mixed, axes=([0, 2], [0, 2]))
+    Q = np.linalg.qr(J.reshape(2 * n, 6))[0].reshape(n, 12)
+    return covariance, 1.0 - float(np.sum(Q * (correlations @ Q))) / (2.0 * n)
 
 
 def noise_of_pose(gains: FloatArray, covariances: FloatArray, chi2: float) -> FloatArray:
@@ -123,14 +115,16 @@ def noise_factor(chi2: float, freedom: int) -> float:
     return max(1.0, chi2 / max(freedom, 1))
 
 
-def alternative_of_pose(apart: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of a pose where another that is ``apart`` (6,) from it may be the true one as well."""
-    return np.asarray(np.outer(apart, apart))
+def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
+    """Covariance (m, m) of what moves by ``moved`` (m,) for each unit of one error: scale, clock, or another pose.
 
-
-def scale_of_pose(moved: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Covariance (m, m) of a pose that moves by ``moved`` (m,) when all markers grow to twice their size."""
-    return np.asarray(errors.marker_size_std**2 * np.outer(moved, moved))
+    Parameters
+    ----------
+    std : of the error: ``marker_size_std`` of poses that move as all markers grow to twice their size [share], how far
+        a clock may be off of poses by their velocity [s]; of a pose that may as well be another one, 1 of what is
+        between them
+    """
+    return np.asarray(std**2 * np.outer(moved, moved))
 
 
 def map_of_pose(
@@ -200,11 +194,6 @@ def scale_of_map(positions: FloatArray, held: FloatArray, errors: SystematicErro
     return covariances
 
 
-def delay_of_pose(velocity: FloatArray, acceleration: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Covariance (6, 6) of a pose whose image is late by an unknown delay, from its velocity and acceleration (6,)."""
-    return clock_of_pose(velocity, errors.delay_std) + clock_of_pose(acceleration, errors.delay_half_square_std)
-
-
 def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors) -> FloatArray:
     """Weights (N,) of markers whose places in the map are uncertain by ``pixels`` (N,) [px] in the view at hand.
 
@@ -217,11 +206,6 @@ def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors)
     """
     own = noise**2 + errors.decision_px**2
     return np.asarray(own / (own + pixels**2))
-
-
-def clock_of_pose(velocity: FloatArray, time_offset_std: float) -> FloatArray:
-    """Covariance (6, 6) of a pose of velocity (6,) whose clock is known to ``time_offset_std`` [s]."""
-    return np.asarray(time_offset_std**2 * np.outer(velocity, velocity))
 
 
 def shape_of_corners(precisions: FloatArray, views: IntArray, errors: SystematicErrors) -> FloatArray:

@@ -112,7 +112,7 @@ class CameraPose:
     T_map_camera: FloatArray
     #: (6, 6), ROS convention, in ``map`` [m, rad]
     covariance: FloatArray
-    #: (6, 6) the part of ``covariance`` that the next frames share: errors of map, scale, lens and delay
+    #: (6, 6) the part of ``covariance`` that the next frames share: errors of map, scale and lens
     systematic_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     #: markers that it rests on
     marker_ids: tuple[int, ...] = field(default=())

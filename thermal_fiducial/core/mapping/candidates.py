@@ -53,9 +53,9 @@ class Viewpoint:
         return self.T_map_camera if np.any(self.T_map_camera[0] != self.T_map_camera[1]) else self.T_map_camera[:1]
 
     @classmethod
-    def known(cls, T_map_camera: FloatArray, covariance: FloatArray) -> 'Viewpoint':
-        """A camera pose (4, 4) without doubt, and its covariance (6, 6)."""
-        return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2))
+    def known(cls, T_map_camera: FloatArray, covariance: FloatArray, common: FloatArray) -> 'Viewpoint':
+        """A camera pose (4, 4) without doubt, by how much its views may differ (6, 6), and what they share (6, 6)."""
+        return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2), common)
 
 
 @dataclass(frozen=True)

@@ -22,15 +22,12 @@ class CornerBias:
     variance of what lasts, as far as the pose does not take it up.
     """
 
-    def __init__(self, model: SystematicErrors) -> None:
+    def __init__(self) -> None:
+        #: standard deviation [px]
+        self.px = SystematicErrors().corner_px
         self._weight = BIAS_PRIOR
-        self._sum = BIAS_PRIOR * model.corner_px**2
+        self._sum = BIAS_PRIOR * self.px**2
         self._last: tuple[int, IntArray, FloatArray] | None = None
-
-    @property
-    def px(self) -> float:
-        """Standard deviation [px]."""
-        return math.sqrt(max(self._sum / self._weight, 0.0))
 
     def add(self, stamp_ns: int, ids: IntArray, residuals: FloatArray, visible: float) -> None:
         """Take in residuals (N, 4, 2) [px] of one frame, of which ``visible`` is what a pose leaves of the error."""
@@ -48,3 +45,4 @@ class CornerBias:
         product = float(np.mean(np.clip(products, -(INCONSISTENT_PX**2), INCONSISTENT_PX**2)))
         self._weight = BIAS_MEMORY * self._weight + visible
         self._sum = BIAS_MEMORY * self._sum + product
+        self.px = math.sqrt(max(self._sum / self._weight, 0.0))

@@ -66,8 +66,7 @@ class FrameMemory:
         if self._gap is None:
             self._gap = predicted.pose
         # What the odometry had gathered when the gap's first marker came is the same for all its views.
-        viewpoint = Viewpoint.known(predicted.pose.T_map_camera, growth(self._gap, predicted))
-        return replace(viewpoint, common=self._gap.covariance)
+        return Viewpoint.known(predicted.pose.T_map_camera, growth(self._gap, predicted), self._gap.covariance)
 
     def bridgeable(self, stamp_ns: int, longest: float) -> bool:
         """Whether known markers were in view not more than ``longest`` [s] before."""

@@ -11,21 +11,21 @@ import numpy as np
 from thermal_fiducial.core.error_model import (
     corner_correlations,
     corners_of_pose,
-    correlated_sum,
     decision_weights,
     map_of_pose,
     map_weights,
     noise_factor,
     noise_of_pose,
-    scale_of_pose,
+    of_single_error,
     SystematicErrors,
-    visible_share,
 )
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit, INLIER
 from thermal_fiducial.core.geometry.reprojection import difference, reproject, retract
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
-from thermal_fiducial.core.mapping.located import Location, PoseErrors, Refusal, Reprojected, Sight
+from thermal_fiducial.core.mapping.candidates import Viewpoint
+from thermal_fiducial.core.mapping.located import Location, Refusal, Reprojected, Sight
+from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
 #: Difference of chi square that refutes the worse of two poses: odds of e^-10.
@@ -41,7 +41,12 @@ _PROPOSERS = 6
 
 
 def locate(
-    sight: Sight, running_errors: FloatArray, camera: Camera, prior: FloatArray | None, model: SystematicErrors
+    stamp_ns: int,
+    sight: Sight,
+    running_errors: FloatArray,
+    camera: Camera,
+    prior: FloatArray | None,
+    model: SystematicErrors,
 ) -> Location | Refusal:
     """Camera pose from N known markers.
 
@@ -58,27 +63,38 @@ def locate(
     hypotheses = _hypotheses(sight, camera, prior)
     if not len(hypotheses):
         return Refusal('no usable pose of any known marker')
-    frame = _Frame(sight, camera, model, CameraFit(sight.corners, sight.covariances, sight.points, camera))
-    first = frame.joint_pose(hypotheses[0], running_errors)
-    if not np.all(np.isfinite(first.seen.residuals)):
+    fit = CameraFit(sight.corners, sight.covariances, sight.points, camera)
+    frame = _Frame(stamp_ns, sight, camera, model, fit)
+    # Steps 3 and 4: the pose from all markers jointly, weighted by the map.
+    by_map = frame.map_weights(hypotheses[0])
+    T = fit.solve(hypotheses[:1], by_map)[0][0]
+    seen = sight.reprojected(camera, T)
+    if not np.all(np.isfinite(seen.residuals)):
         return Refusal(f'no camera pose explains {_names(sight)}')
-    T_other = frame.alternative(first, hypotheses)
-    found = first if T_other is None else _either(frame, first, T_other, prior)
-    if isinstance(found, Location) and not np.all(np.isfinite(found.covariance)):
-        return Refusal(f'the pose from {_names(sight)} is not determined')
-    return found
+    # Steps 5 and 6: refined with the weights of their errors.
+    found = frame.refined(T, seen, by_map * marker_weights(seen.errors_px, running_errors, model))
+    T_other = None if found is None else frame.alternative(found, hypotheses)
+    if found is None or T_other is None:
+        return found or Refusal(f'the pose from {_names(sight)} is not determined')
+    return _either(frame, found, T_other, prior)
 
 
 def _either(frame: '_Frame', found: Location, T_other: FloatArray, prior: FloatArray | None) -> Location | Refusal:
     """One of two poses that the corners allow; without a prior they are refused, unless they are nearly the same."""
-    T = found.T_map_camera
+    pose = found.pose
+    T = pose.T_map_camera
     if rotation_angle(T[:3, :3].T @ T_other[:3, :3]) < SAME_POSE:
-        apart = difference(T_other, T)
-        return replace(found, errors=found.errors.with_alternative(apart))
+        spread = of_single_error(difference(T_other, T))
+        systematic = pose.systematic_covariance + spread
+        pose = replace(pose, covariance=pose.covariance + spread, systematic_covariance=systematic)
+        return replace(found, pose=pose, spread=spread)
     other = frame.refined(T_other, frame.sight.reprojected(frame.camera, T_other), found.weights)
+    if other is None:
+        return found
     if prior is None:
-        covariances = np.stack([found.covariance, other.covariance])
-        return Refusal(f'planar ambiguity of {_names(frame.sight)} unsettled', np.stack([T, T_other]), covariances)
+        covariances = np.stack([pose.covariance, other.pose.covariance])
+        viewpoint = Viewpoint(np.stack([T, T_other]), covariances)
+        return Refusal(f'planar ambiguity of {_names(frame.sight)} unsettled', viewpoint)
     turns = rotation_angle(prior[:3, :3].T @ np.stack([T, T_other])[:, :3, :3])
     return other if turns[1] < turns[0] else found
 
@@ -87,22 +103,17 @@ def _either(frame: '_Frame', found: Location, T_other: FloatArray, prior: FloatA
 class _Frame:
     """The known markers of a frame, with what all fits of the camera to them have in common."""
 
+    stamp_ns: int
     sight: Sight
     camera: Camera
     model: SystematicErrors
     fit: CameraFit
 
-    def joint_pose(self, start: FloatArray, running_errors: FloatArray) -> Location:
-        """Steps 3 to 6: the pose from all markers jointly, weighted by map and errors, and refined."""
-        by_map = self._map_weights(start)
-        T = self.fit.solve(start[None], by_map)[0][0]
-        seen = self.sight.reprojected(self.camera, T)
-        return self.refined(T, seen, by_map * marker_weights(seen.errors_px, running_errors, self.model))
-
-    def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location:
+    def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
         """Where a step of Gauss and Newton with ``weights`` (N,) of the markers leads from a pose (4, 4) near by.
 
         The same linearisation gives the covariances, of an estimate that is linear in corners, map and scale there.
+        None where the markers do not determine it.
         """
         n, residuals = len(weights), seen.residuals[..., None]
         information = np.linalg.inv(self.sight.covariances) * weights[:, None, None, None]
@@ -113,19 +124,54 @@ class _Frame:
         try:
             gains = np.linalg.inv(J.T @ weighted) @ weighted.T
         except np.linalg.LinAlgError:
-            nothing = np.full((6, 6), np.nan)
-            return Location(T_map_camera, PoseErrors(nothing, nothing, nothing), weights, seen)
+            return None
         step = gains @ seen.residuals.ravel()
-        errors = pose_errors(self.sight, gains, float(squared.sum()), seen, T_map_camera, self.camera.width, self.model)
-        seen = replace(seen, residuals=seen.residuals - (J @ step).reshape(n, 4, 2))
-        return Location(retract(T_map_camera, step), errors, weights, seen)
+        after = replace(seen, residuals=seen.residuals - (J @ step).reshape(n, 4, 2))
+        return self._location(T_map_camera, step, gains, float(squared.sum()), after, weights)
+
+    def _location(
+        self,
+        T_map_camera: FloatArray,
+        step: FloatArray,
+        gains: FloatArray,
+        chi2: float,
+        seen: Reprojected,
+        weights: FloatArray,
+    ) -> Location | None:
+        """A ``step`` (6,) from a pose (4, 4), with what it is uncertain by; None where that has no bounds.
+
+        Noise of the corners goes in as white, at least as large as the residuals say; errors of the map's markers with
+        unknown correlations; errors of corners and scale as the error model has them.
+
+        Parameters
+        ----------
+        gains : (6, 8 N) what a pixel of each coordinate moves the pose by
+        chi2 : of the residuals
+        """
+        n, sight, model = len(weights), self.sight, self.model
+        by_corner = np.swapaxes(gains.reshape(6, 4 * n, 2), 0, 1)
+        white = noise_of_pose(by_corner, sight.covariances.reshape(-1, 2, 2), chi2)
+        correlations = corner_correlations(sight.corners.reshape(-1, 2), self.camera.width, model)
+        of_corners, visible = corners_of_pose(by_corner, seen.J_camera.reshape(-1, 2, 6), correlations, model)
+        arms = sight.points - sight.T_map_marker[:, None, :3, 3]
+        grown = gains @ np.einsum('nckj,ncj->nck', seen.J_marker[..., :3], arms).ravel()
+        of_scale = of_single_error(grown, model.marker_size_std)
+        map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ seen.J_marker.reshape(n, 8, 6)
+        of_map = map_of_pose(map_gains, sight.map_covariances, sight.T_map_marker[:, :3, 3], T_map_camera[:3, 3])
+        systematic = of_map + of_corners + of_scale
+        if not np.all(np.isfinite(white + systematic)):
+            return None
+        ids, rms_px = tuple(marker.id for marker in sight.markers), float(np.sqrt(np.mean(seen.errors_px**2)))
+        T = retract(T_map_camera, step)
+        pose = CameraPose(self.stamp_ns, T, white + systematic, systematic, ids, rms_px)
+        return Location(pose, sight, seen, weights, map_gains, visible, np.zeros((6, 6)))
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
         """Another pose (4, 4) that the corners do not refute; None when there is none."""
         width, height = np.ptp(self.sight.corners, axis=(0, 1)) / self.camera.focal_px
         if np.hypot(width, height) > WIDE:
             return None
-        T = found.T_map_camera
+        T = found.pose.T_map_camera
         apart = rotation_angle(T[:3, :3].T @ hypotheses[:, :3, :3]) > SAME_POSE
         if not np.any(apart):
             return None
@@ -135,7 +181,7 @@ class _Frame:
         refuted = chi2[1] - chi2[0] > DECISIVE * noise_factor(float(chi2[0]), 8 * len(weights) - 6)
         return None if refuted or np.max(np.abs(other - T)) < 1e-6 else other
 
-    def _map_weights(self, T_map_camera: FloatArray) -> FloatArray:
+    def map_weights(self, T_map_camera: FloatArray) -> FloatArray:
         """Weights (N,) of the markers by how well the map knows each."""
         sight = self.sight
         variances = np.diagonal(sight.map_covariances, axis1=-2, axis2=-1)
@@ -156,40 +202,6 @@ def marker_weights(errors: FloatArray, running_errors: FloatArray, model: System
     combined = 0.5 * (errors**2 + np.where(running_errors > 0.0, running_errors, errors) ** 2)
     reference = max(float(np.median(combined)), model.decision_px**2)
     return np.asarray(np.minimum(1.0, reference / np.maximum(combined, 1e-12)))
-
-
-def pose_errors(
-    sight: Sight,
-    gains: FloatArray,
-    chi2: float,
-    seen: Reprojected,
-    T_map_camera: FloatArray,
-    width: int,
-    model: SystematicErrors,
-) -> PoseErrors:
-    """What a camera pose is uncertain by.
-
-    Noise of the corners goes in as white, at least as large as the residuals say; errors of the map's markers with
-    unknown correlations; errors of corners and scale as the error model has them.
-
-    Parameters
-    ----------
-    gains : (6, 8 N) what a pixel of each coordinate moves the pose by
-    chi2 : of the residuals
-    width : of the image [px]
-    """
-    n = len(sight.markers)
-    by_corner = np.swapaxes(gains.reshape(6, 4 * n, 2), 0, 1)
-    white = noise_of_pose(by_corner, sight.covariances.reshape(-1, 2, 2), chi2)
-    correlations = corner_correlations(sight.corners.reshape(-1, 2), width, model)
-    corners = corners_of_pose(by_corner, correlations, model)
-    visible = visible_share(seen.J_camera.reshape(-1, 2, 6), correlations)
-    arms = sight.points - sight.T_map_marker[:, None, :3, 3]
-    scale = scale_of_pose(gains @ np.einsum('nckj,ncj->nck', seen.J_marker[..., :3], arms).ravel(), model)
-    map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ seen.J_marker.reshape(n, 8, 6)
-    of_map = map_of_pose(map_gains, sight.map_covariances, sight.T_map_marker[:, :3, 3], T_map_camera[:3, 3])
-    relative = white + correlated_sum(map_gains, sight.relative_covariances)
-    return PoseErrors(white, of_map + corners + scale, relative, visible)
 
 
 def _hypotheses(sight: Sight, camera: Camera, prior: FloatArray | None) -> FloatArray:

@@ -1,12 +1,12 @@
 """The known markers of a frame, and what they say of where the camera is: records of the localization."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import alternative_of_pose, INCONSISTENT_PX, positive
+from thermal_fiducial.core.error_model import correlated_sum, INCONSISTENT_PX, positive
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise
 from thermal_fiducial.core.mapping.candidates import Viewpoint
@@ -69,13 +69,6 @@ class Sight:
         """(N, 4, 3) corners in the map [m]."""
         return corners_in_map(self.T_map_marker, self.sizes)
 
-    @cached_property
-    def relative_covariances(self) -> FloatArray:
-        """(N, 6, 6) the same without what the best-known one is uncertain by: the error that all of them share."""
-        covariances = self.map_covariances
-        best = covariances[np.argmin(np.trace(covariances, axis1=1, axis2=2))]
-        return positive(covariances - best)
-
     def reprojected(self, camera: Camera, T_map_camera: FloatArray) -> 'Reprojected':
         """The markers of the map as a camera at (4, 4) should see them."""
         n = len(self.markers)
@@ -103,57 +96,47 @@ class Reprojected:
     J_camera: FloatArray
     J_marker: FloatArray
 
-    @property
+    @cached_property
     def errors_px(self) -> FloatArray:
         """Rms error (N,) [px] of each marker; NaN behind the camera."""
         return np.asarray(np.sqrt(np.mean(np.sum(self.residuals**2, axis=-1), axis=-1)))
 
 
 @dataclass(frozen=True)
-class PoseErrors:
-    """Covariances (6, 6) of a camera pose, ROS convention, by where its errors come from."""
-
-    #: noise of the corners, new in each frame
-    white: FloatArray
-    #: the map, the scale, the lens and the bias of the corners: as good as the same in the frames that follow
-    systematic: FloatArray
-    #: noise, and the map without the error that all markers in view share: how well it is placed among them
-    relative: FloatArray
-    #: share of the variance of the corners' systematic errors that the residuals show: the pose takes up the rest
-    visible: float = 0.0
-
-    def with_alternative(self, apart: FloatArray) -> 'PoseErrors':
-        """The same where a pose that is ``apart`` (6,) may be the true one as well."""
-        spread = alternative_of_pose(apart)
-        return replace(self, systematic=self.systematic + spread, relative=self.relative + spread)
-
-
-@dataclass(frozen=True)
 class Location:
-    """Where the camera is."""
+    """Where the camera is, how well that is known, and by what."""
 
-    T_map_camera: FloatArray
-    errors: PoseErrors
-    #: (N,) weights of the markers, 1 for one as good as the rest
-    weights: FloatArray
-    #: the N markers from there
+    pose: CameraPose
+    #: the N markers that it rests on, and how they look from there
+    sight: Sight
     seen: Reprojected
+    #: (N,) their weights, 1 for one as good as the rest
+    weights: FloatArray
+    #: (N, 6, 6) what a displacement of each moves the pose by
+    map_gains: FloatArray
+    #: share of the variance of the corners' systematic errors that the residuals show: the pose takes up the rest
+    visible: float
+    #: (6, 6) the part of the covariance by which another pose may be the true one as well
+    spread: FloatArray
+
+    @property
+    def reason(self) -> str:
+        """Why the pose is not published, in words; empty where it is."""
+        std = float(np.sqrt(np.trace(self.pose.covariance[3:, 3:])))
+        listed = ', '.join(str(key) for key in self.pose.marker_ids)
+        return f'known to {np.rad2deg(std):.0f} degrees only, by marker {listed}' if std > VAGUE else ''
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """The camera for new markers: what is not relative to the map is an error that all their views share."""
-        viewpoint = Viewpoint.known(self.T_map_camera, self.errors.relative)
-        return replace(viewpoint, common=positive(self.covariance - self.errors.relative))
+        """The camera for new markers: what is not relative to the map is an error that all their views share.
 
-    @property
-    def rms_px(self) -> float:
-        """Re-projection error, rms over the corners [px]."""
-        return float(np.sqrt(np.mean(self.seen.errors_px**2)))
-
-    @property
-    def covariance(self) -> FloatArray:
-        """(6, 6), ROS convention, of all errors together."""
-        return self.errors.white + self.errors.systematic
+        Of the map that is what the best-known marker in view is uncertain by.
+        """
+        pose, of_map = self.pose, self.sight.map_covariances
+        best = of_map[np.argmin(np.trace(of_map, axis1=1, axis2=2))]
+        relative = pose.covariance - pose.systematic_covariance + self.spread
+        relative = relative + correlated_sum(self.map_gains, positive(of_map - best))
+        return Viewpoint.known(pose.T_map_camera, relative, positive(pose.covariance - relative))
 
 
 @dataclass(frozen=True)
@@ -161,25 +144,8 @@ class Refusal:
     """Why nobody knows where the camera is, in words."""
 
     reason: str
-    #: (2, 4, 4) the two poses of an unsettled ambiguity, where it is that, and (2, 6, 6) their covariances
-    alternatives: FloatArray | None = None
-    covariances: FloatArray | None = None
-
-
-@dataclass(frozen=True)
-class Located:
-    """Where the camera was."""
-
-    location: Location
-    #: the same for others, with a covariance that allows for what lasts and for the camera's motion
-    pose: CameraPose
-
-    @property
-    def reason(self) -> str:
-        """Why the pose is not published, in words; empty where it is."""
-        std = float(np.sqrt(np.trace(self.location.covariance[3:, 3:])))
-        listed = ', '.join(str(key) for key in self.pose.marker_ids)
-        return f'known to {np.rad2deg(std):.0f} degrees only, by marker {listed}' if std > VAGUE else ''
+    #: where the camera may be, if that is one of the two poses of an ambiguity
+    viewpoint: Viewpoint | None = None
 
 
 @dataclass(frozen=True)
@@ -195,24 +161,22 @@ class LocatedFrame:
     known: Sight
     #: where odometry has the camera
     predicted: PredictedCamera | None
-    outcome: Located | Refusal
+    outcome: Location | Refusal
 
     @property
     def new(self) -> Markers:
         """Rows of the markers that are not in the map."""
         return self.rows[~self.is_known]
 
-    def known_errors(self, location: Location) -> tuple[list[MapMarker], FloatArray, FloatArray]:
-        """The K known markers, their errors (K,) [px], rms, and what noise, pose and map explain of them (K,).
+    def known_errors(self, location: Location) -> tuple[FloatArray, FloatArray]:
+        """Errors (K,) [px], rms, of the K known markers, and what noise, pose and map explain of them (K,).
 
         The error of one behind the camera is the image's width.
         """
-        known = self.known
-        seen = location.seen
-        if known.trusted is not known:
-            seen = known.reprojected(self.camera, location.T_map_camera)
+        known, pose = self.known, location.pose
+        seen = location.seen if known.trusted is known else known.reprojected(self.camera, pose.T_map_camera)
         errors = np.where(np.isfinite(seen.errors_px), seen.errors_px, float(self.camera.width))
-        return known.markers, errors, known.expected_errors(seen, location.covariance)
+        return errors, known.expected_errors(seen, pose.covariance)
 
     @property
     def pose(self) -> CameraPose | None:

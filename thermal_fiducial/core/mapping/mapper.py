@@ -18,16 +18,17 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, Viewpoint
+from thermal_fiducial.core.mapping.corner_bias import CornerBias
 from thermal_fiducial.core.mapping.frame_memory import FrameMemory, VIEWS
-from thermal_fiducial.core.mapping.localizer import Localizer
-from thermal_fiducial.core.mapping.located import Located, LocatedFrame, Location, Refusal, Sight
+from thermal_fiducial.core.mapping.localization import locate
+from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_alignment import jump
 from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.new_markers import entry, NewMarkers
 from thermal_fiducial.core.mapping.odometry_prior import contradicts, predicted_camera
 from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.core.mapping.trust import Trust
-from thermal_fiducial.core.measurements import Markers, usable
+from thermal_fiducial.core.measurements import CameraPose, Markers, usable
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray
 
@@ -35,6 +36,8 @@ __all__ = ['MapJump', 'MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
 
 #: Why nothing is learned from a frame that has a pose.
 CONTRADICTED = 'the known markers in view contradict the odometry'
+#: A pose of the past decides between alternative poses for this long [ns].
+CONTINUITY_NS = 300_000_000
 #: What new markers in view wait for, in words by ID.
 Waiting = dict[int, str]
 
@@ -80,7 +83,9 @@ class MarkerMapper:
         self._initial, self.map = marker_map.copy(), marker_map.copy()
         self._new = NewMarkers(self.config.marker_size, size_overrides(self.config.marker_size_overrides))
         self._trust = Trust(self.map.markers)
-        self._localizer = Localizer()
+        self._bias = CornerBias()
+        #: the last pose that nothing contradicted
+        self._last: CameraPose | None = None
         #: whether odometry has been in this map
         self._odometry_agreed = False
         self._memory = FrameMemory(self.config.keyframe_budget, self._initial)
@@ -108,32 +113,35 @@ class MarkerMapper:
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
         sight = known.trusted
-        outcome: Located | Refusal = Refusal('no known marker in view')
+        outcome: Location | Refusal = Refusal('no known marker in view')
         if sight.markers:
-            expected = None if predicted is None else predicted.pose.T_map_camera
+            last = self._last
+            near = last is not None and 0 < stamp_ns - last.stamp_ns < CONTINUITY_NS
+            expected = predicted.pose if predicted is not None else last if near else None
+            T_expected = None if expected is None else expected.T_map_camera
             running_errors = self._trust.running_errors(sight.markers)
-            outcome = self._localizer.locate(stamp_ns, sight, running_errors, camera, expected, self._errors)
+            outcome = locate(stamp_ns, sight, running_errors, camera, T_expected, self._errors)
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
         return LocatedFrame(stamp_ns, camera, markers, is_known, known, predicted, outcome)
 
     @property
     def _errors(self) -> SystematicErrors:
-        return SystematicErrors(self._localizer.corner_bias_px, marker_size_std=self.config.marker_size_std)
+        return SystematicErrors(self._bias.px, marker_size_std=self.config.marker_size_std)
 
     def learn(self, frame: LocatedFrame) -> MapperResult:
         """The second half: errors, standings and new markers, from the frame that was located last."""
         if isinstance(frame.outcome, Refusal):
             changed, waiting = self._without_pose(frame, frame.outcome)
             return self._result(frame, changed, {}, waiting)
-        location, pose = frame.outcome.location, frame.outcome.pose
+        location, pose = frame.outcome, frame.outcome.pose
         if frame.predicted is not None:
             contradicted = contradicts(pose.T_map_camera, pose.covariance, frame.predicted.pose)
             if contradicted and self._odometry_agreed:
                 # A marker that was moved, or that hangs in two places: what it teaches would spoil the map.
                 return self._result(frame, False, {}, dict.fromkeys(frame.new['id'].tolist(), CONTRADICTED))
             self._odometry_agreed |= not contradicted
-        self._localizer.last = pose
+        self._last = pose
         # Step 7: errors updated.
         residuals, changed = self._update_errors(frame, location)
         # Step 8: new markers placed relative to the camera.
@@ -146,13 +154,13 @@ class MarkerMapper:
 
     def _update_errors(self, frame: LocatedFrame, location: Location) -> tuple[dict[int, float], bool]:
         """Re-projection error [px] by ID of each known marker, and whether any standing changed by them."""
-        markers, errors, explained = frame.known_errors(location)
-        self._trust.add_errors(markers, errors)
+        self._bias.add(frame.stamp_ns, np.array(location.pose.marker_ids), location.seen.residuals, location.visible)
+        known, (errors, explained) = frame.known.markers, frame.known_errors(location)
+        changed = self._trust.update(self.map.markers, known, errors, explained)
         if not self.frozen:
-            for marker in markers:
-                self.map.markers[marker.id] = marker.seen(frame.stamp_ns, self._trust.running_error(marker))
-        changed = self._trust.judge(self.map.markers, markers, errors, explained)
-        return {marker.id: error for marker, error in zip(markers, errors.tolist(), strict=True)}, changed
+            for marker, running in zip(known, self._trust.running_errors(known).tolist(), strict=True):
+                self.map.markers[marker.id] = self.map.markers[marker.id].seen(frame.stamp_ns, running)
+        return {marker.id: error for marker, error in zip(known, errors.tolist(), strict=True)}, changed
 
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, Waiting]:
         """Show new markers to their candidates; whether any entered the map, and what the others wait for."""
@@ -167,8 +175,8 @@ class MarkerMapper:
         predicted, longest = frame.predicted, self.config.bridge_duration
         if self.frozen or not len(frame.new):
             return False, {}
-        if refusal.alternatives is not None and refusal.covariances is not None:
-            return self._place_new(frame, Viewpoint(refusal.alternatives, refusal.covariances))
+        if refusal.viewpoint is not None:
+            return self._place_new(frame, refusal.viewpoint)
         if predicted is None or not self._memory.bridgeable(frame.stamp_ns, longest):
             return False, {}
         # No known marker is in view: the odometry says where the camera is.
@@ -212,14 +220,13 @@ class MarkerMapper:
         self.map.adjust(refinement.markers)
         self._trust.flag(self.map.markers, refinement.inconsistent)
         self._new.move(self._memory.move(refinement.keyframes))
-        self._localizer.map_changed()
         self.resets += 1
         return True
 
     @property
     def corner_bias_px(self) -> float:
         """Systematic error of the corners, as learned so far [px]."""
-        return self._localizer.corner_bias_px
+        return self._bias.px
 
     @property
     def candidates(self) -> dict[int, Candidate]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import bounded_odometry, clock_of_pose, positive
+from thermal_fiducial.core.error_model import bounded_odometry, of_single_error, positive
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.geometry.se3 import skew, so3_exp, transform
 from thermal_fiducial.core.measurements import CameraPose, Odometry
@@ -54,7 +54,7 @@ def predicted_camera(
     if not prior.clock_is_known:
         rate = R @ odometry.angular_velocity_body
         velocity = R @ odometry.velocity_body + np.cross(rate, R @ T_body_camera[:3, 3])
-        unknown = clock_of_pose(np.concatenate([velocity, rate]), time_offset_std)
+        unknown = of_single_error(np.concatenate([velocity, rate]), time_offset_std)
         pose = replace(pose, covariance=pose.covariance + unknown)
     return PredictedCamera(pose, turn @ odometry.twist_covariance @ turn.T)
 

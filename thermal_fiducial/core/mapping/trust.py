@@ -40,36 +40,31 @@ class Trust:
         """Running rms re-projection error of each of ``markers`` [px]."""
         return np.sqrt([self._record(marker).mean_square_px for marker in markers])
 
-    def running_error(self, marker: MapMarker) -> float:
-        """Running rms re-projection error of ``marker`` [px]."""
-        return float(np.sqrt(self._record(marker).mean_square_px))
-
-    def add_errors(self, markers: Iterable[MapMarker], errors_px: np.ndarray) -> None:
-        """Take in the rms error [px] of each of ``markers`` in one frame."""
-        for marker, error in zip(markers, errors_px, strict=True):
-            record = self._record(marker)
-            record.observations += 1
-            gain = max(1.0 / record.observations, MEMORY)
-            record.mean_square_px += gain * (float(error) ** 2 - record.mean_square_px)
-
-    def judge(
+    def update(
         self, markers: dict[int, MapMarker], known: list[MapMarker], errors_px: np.ndarray, explained_px: np.ndarray
     ) -> bool:
-        """Put those of ``markers`` in quarantine that persistently disagree; whether any standing changed.
+        """Take in a frame, after which those of ``markers`` that persistently disagree are in quarantine.
 
         Parameters
         ----------
-        known : the N of them that a frame shows
-        errors_px, explained_px : (N,) their re-projection errors, and what is to be expected of them
+        known : the N of them that the frame shows
+        errors_px, explained_px : (N,) their re-projection errors, rms, and what is to be expected of them
+
+        Returns
+        -------
+        Whether any standing changed.
         """
+        records = [self._record(marker) for marker in known]
+        for record, error in zip(records, errors_px.tolist(), strict=True):
+            record.observations += 1
+            gain = max(1.0 / record.observations, MEMORY)
+            record.mean_square_px += gain * (error**2 - record.mean_square_px)
         if len(known) < 2:
             return False
-        changed = False
         ratios = errors_px / explained_px
-        for marker, bad, error, ratio in zip(
-            known, inconsistent(ratios > DISAGREEMENT, known).tolist(), errors_px, ratios, strict=True
-        ):
-            record = self._record(marker)
+        blamed = inconsistent(ratios > DISAGREEMENT, known)
+        changed = False
+        for marker, record, bad, error, ratio in zip(known, records, blamed, errors_px, ratios, strict=True):
             record.disagreement += MEMORY * (float(bad) - record.disagreement)
             if marker.trusted and record.disagreement > QUARANTINE:
                 in_frames = f'in most of the last {1.0 / MEMORY:.0f} frames'
