@@ -1,5 +1,6 @@
 """What a run folder holds, read into arrays."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import json
 from pathlib import Path
@@ -14,7 +15,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.plain_yaml import load_plain
-from thermal_fiducial.files.reading import read_text
+from thermal_fiducial.files.reading import one_line, read_text
 from thermal_fiducial.report.output_bag import read_output, RecordedOutput
 from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
 
@@ -74,15 +75,15 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
     """
     if not path.is_dir():
         raise InputError(f'{path}: no such run folder')
-    missing = [name for name in (FUSED, FIDUCIAL) if not (path / name).is_file()]
+    missing = [name for name in (FUSED, FIDUCIAL) if not (path / name).exists()]
     if missing:
         raise InputError(f'{path} is no run folder: it has no {missing[0]}')
     own_truth = path / TRUTH
-    if truth is None and own_truth.is_file():
+    if truth is None and own_truth.exists():
         truth = own_truth
     if true_map is None and truth is not None:
         beside = (truth if truth.is_dir() else truth.parent) / TRUE_MAP
-        true_map = beside if beside.is_file() else None
+        true_map = beside if beside.exists() else None
     offset_ns = _camera_time_offset_ns(path / PARAMETERS)
     return Run(
         path=path,
@@ -91,7 +92,7 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
         detections=_detections(path / DETECTIONS),
         latencies=_latencies(path / LATENCY),
         output=read_output(path / OUTPUT, offset_ns),
-        marker_map=load_map(path / MARKER_MAP) if (path / MARKER_MAP).is_file() else None,
+        marker_map=load_map(path / MARKER_MAP) if (path / MARKER_MAP).exists() else None,
         summary=_summary(path / SUMMARY),
         truth=None if truth is None else read_truth(truth),
         true_map=None if true_map is None else load_map(true_map),
@@ -101,7 +102,7 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
 
 def _camera_time_offset_ns(path: Path) -> int:
     """t_imu - t_camera that the filter was given."""
-    if not path.is_file():
+    if not path.exists():
         return 0
     nodes = load_plain(path)
     try:
@@ -111,20 +112,45 @@ def _camera_time_offset_ns(path: Path) -> int:
 
 
 def _summary(path: Path) -> dict[str, Any]:
-    if not path.is_file():
+    if not path.exists():
         return {}
     try:
         content = json.loads(read_text(path))
     except (ValueError, RecursionError) as error:
-        raise InputError(f'{path}: {error}') from None
+        raise InputError(f'{path}: {one_line(error)}') from None
     if not isinstance(content, dict):
         raise InputError(f'{path}: not a JSON object')
+    for name, is_kind in _SUMMARY_KINDS.items():
+        if name in content and not is_kind(content[name]):
+            raise InputError(f'{path}: {name} is of another kind')
     return content
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and abs(value) < _LARGEST_WHOLE
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and value.isprintable()
+
+
+def _is_table_of(is_kind: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: isinstance(value, dict) and all(map(_is_text, value)) and all(map(is_kind, value.values()))
+
+
+#: What the report reads of a summary; anything else in it is left as it is.
+_SUMMARY_KINDS: dict[str, Callable[[Any], bool]] = {
+    **dict.fromkeys(('bag', 'bag_path', 'mode', 'transport'), _is_text),
+    'duration_s': _is_number,
+    'cpu_percent': _is_table_of(_is_number),
+    'diagnostics': _is_table_of(_is_table_of(_is_text)),
+    'remaps': _is_table_of(_is_text),
+}
 
 
 def _rows(path: Path, kinds: dict[str, type]) -> list[list[Any]]:
     """Columns ``kinds`` (name to type) of a CSV file, empty where there is no file."""
-    if not path.is_file():
+    if not path.exists():
         return [[] for _ in kinds]
     rows: list[list[Any]] = []
     for number, cells in named_rows(path, tuple(kinds)):
