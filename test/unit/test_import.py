@@ -1,5 +1,8 @@
 """Recordings of CSV files become bags that replay takes."""
 
+import os
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -95,7 +98,8 @@ def test_the_rig_becomes_parameters(ours):
 
 def test_camera_poses_with_their_covariance(ours):
     (ours / 'cam1.csv').unlink()
-    covariance = np.arange(36.0)
+    A = np.random.default_rng(0).normal(size=(6, 6))
+    covariance = (A @ A.T).ravel()
     words = ','.join(map(str, [1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0, *covariance]))
     (ours / 'camera_pose.csv').write_text(f'{FRAMES[0]},{words}\n')
     assert run(ours) == 0
@@ -182,6 +186,13 @@ def corrupt(path, change):
         ('rig.yaml', lambda text: text.replace('width: 640', 'width: wide'), ('rig.yaml: line', 'cam1: width', 'wide')),
         ('rig.yaml', lambda text: text.replace('radtan', 'cubic'), ('rig.yaml', 'cubic')),
         ('rig.yaml', lambda text: text.replace('marker_size: 0.3', ''), ('--marker-size',)),
+        ('rig.yaml', lambda text: text.replace('DICT_4X4_50', '/dev/zero'), ('/dev/zero', 'dictionary')),
+        ('imu.csv', lambda text: text.replace('1700000000', '9000000000'), ('imu.csv line 2', 'stamp')),
+        ('imu.csv', lambda text: text.replace('000000,0.1', ',0.1'), ('imu.csv', '5e-09 s apart', 'nanoseconds')),
+        ('imu.csv', lambda text: re.sub('1,2,.*', '0.1,0.2,1', text), ('imu.csv', 'in g')),
+        ('imu.csv', lambda text: text.replace(',0.3,', ',40,'), ('imu.csv', 'degrees')),
+        ('cam1.csv', lambda text: text.replace(',20,', ',1e30,', 1), ('cam1.csv line 2', 'measured')),
+        ('cam1.csv', lambda text: re.sub('(?m)$', ',0', text), ('cam1.csv line 2', 'measured')),
     ],
 )
 def test_what_is_broken_is_named(ours, capsys, name, change, words):
@@ -215,3 +226,25 @@ def test_a_transform_that_is_none(ours, capsys):
     (ours / 'rig.yaml').write_text(yaml.safe_dump(rig(T_body_camera=[1.0] * 16)))
     assert run(ours) == 2
     assert 'no rigid transform' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('variance', [0.0, -1.0, 1e300])
+def test_poses_without_a_covariance_are_refused(ours, capsys, variance):
+    numbers = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, *(variance * np.eye(6)).ravel()]
+    (ours / 'camera_pose.csv').write_text(','.join(map(str, [FRAMES[0], *numbers])) + '\n')
+    assert run(ours) == 2
+    assert 'camera_pose.csv: pose with a covariance with a variance of' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('name', ['imu.csv', 'cam1.csv', 'camera_pose.csv', 'reference.tum'])
+def test_what_is_no_file_is_not_taken_for_nothing(ours, capsys, name):
+    (ours / name).unlink(missing_ok=True)
+    os.mkfifo(ours / name)
+    assert run(ours) == 2
+    assert f'{name}: not a regular file' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('options', [('--marker-size', 'nan'), ('--marker-size', '-1'), ('--camchain', 'chain.yaml')])
+def test_options_that_cannot_be_used(ours, capsys, options):
+    assert run(ours, *options) == 2
+    assert options[0] in capsys.readouterr().err

@@ -10,6 +10,7 @@ from thermal_fiducial.files.bags import STORAGES
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.flight_bags import frame_count, write_recording
 from thermal_fiducial.files.recordings import read_recording
+from thermal_fiducial.files.rig_files import LARGEST_MARKER_M
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,6 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, write, say how to replay."""
+    if args.marker_size is not None and not 0.0 < args.marker_size <= LARGEST_MARKER_M:
+        raise InputError(f'--marker-size {args.marker_size:g} is not between 0 and {LARGEST_MARKER_M:g} m')
     if not (0.0 < args.sigma_px < 100.0 and 0.0 <= args.late < 10.0):
         raise InputError('--sigma-px is between 0 and 100, --late between 0 and 10')
     recording = read_recording(args.folder, args.camera, args.camchain, args.imu)
@@ -48,8 +51,9 @@ def run(args: argparse.Namespace) -> int:
     if args.marker_size is not None:
         rig = replace(rig, marker_size=args.marker_size)
     if args.dictionary is not None:
-        load_dictionary(args.dictionary)
         rig = replace(rig, dictionary=args.dictionary)
+    if rig.dictionary:
+        load_dictionary(rig.dictionary)
     recording = replace(recording, rig=rig)
     total, done = max(frame_count(recording), 1), 0
     with progress_bar(f'import {args.folder.name}') as share:

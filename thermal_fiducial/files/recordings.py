@@ -17,9 +17,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
-from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import csv_rows
 from thermal_fiducial.files.images import read_picture
@@ -29,6 +30,12 @@ from thermal_fiducial.files.trajectory_file import load_tum
 
 #: Of markers, more than any dictionary has; of a quaternion, as in maps.
 _IDS, _NORM_TOLERANCE = 100_000, 0.01
+#: Messages have seconds of 32 bits.
+_LATEST_NS = 2**31 * SECOND_NS
+#: Of corners [px]: a marker may reach out of a picture, but not by more than the largest has.
+_FARTHEST_CORNER, _LARGEST_SIGMA = 1e5, 100.0
+#: Of an IMU's samples: time between them [s], force at rest in g, and how fast hardly anything turns [rad/s].
+_STEPS_S, _IN_G, _FAST = (2e-5, 1.0), (0.8, 1.2), 35.0
 
 
 @dataclass(frozen=True)
@@ -92,12 +99,15 @@ def read_recording(
     """
     if not folder.is_dir():
         raise InputError(f'{folder}: no such folder')
-    if (folder / 'imu.csv').is_file():
+    is_kalibr = (folder / 'imu0.csv').exists()
+    if (camchain or imu) and not is_kalibr:
+        raise InputError(f"{folder}: no imu0.csv: --camchain and --imu are for Kalibr's layout")
+    if (folder / 'imu.csv').exists():
         return _ours(folder, camera)
-    asl = next((place for place in (folder, folder / 'mav0') if (place / 'imu0' / 'data.csv').is_file()), None)
+    asl = next((place for place in (folder, folder / 'mav0') if (place / 'imu0' / 'data.csv').exists()), None)
     if asl is not None:
         return _asl(asl, camera)
-    if (folder / 'imu0.csv').is_file():
+    if is_kalibr:
         return _kalibr(folder, camera, camchain, imu)
     raise InputError(f'{folder}: no imu.csv (ours), imu0/data.csv (EuRoC) or imu0.csv (Kalibr)')
 
@@ -106,15 +116,15 @@ def _ours(folder: Path, camera: str) -> Recording:
     rig = of_rig(folder / 'rig.yaml', camera)
     reference = folder / 'reference.tum'
     truth = None
-    if reference.is_file():
+    if reference.exists():
         stamps, positions, quaternions = load_tum(reference)
         truth = stamps, transform_from_quaternion(positions, quaternions)
     samples = _samples(folder / 'imu.csv')
     poses = folder / 'camera_pose.csv'
-    if poses.is_file():
+    if poses.exists():
         return Recording(rig, samples, poses=_poses(poses), truth=truth)
     files = [folder / name for name in (f'{camera}.csv', 'detections.csv')]
-    detections = next((path for path in files if path.is_file()), None)
+    detections = next((path for path in files if path.exists()), None)
     if detections is None:
         raise InputError(f'{folder}: no {camera}.csv, detections.csv or camera_pose.csv')
     return Recording(rig, samples, corners=list(_corners(detections)), truth=truth)
@@ -128,7 +138,7 @@ def _asl(folder: Path, camera: str) -> Recording:
     ]
     truth = None
     reference = folder / 'state_groundtruth_estimate0' / 'data.csv'
-    if reference.is_file():
+    if reference.exists():
         # Position, then the quaternion with w first.
         stamps, values = _table(reference, 8)
         truth = stamps, transform_from_quaternion(values[:, :3], values[:, [4, 5, 6, 3]])
@@ -197,7 +207,7 @@ def _table(
 
 def _stamp(where: str, word: str) -> int:
     # As many digits as 64 bits have; the length first, since a word of thousands of them is no number.
-    if not (word.isascii() and word.isdigit() and len(word) <= 19 and int(word) < 2**63):
+    if not (word.isascii() and word.isdigit() and len(word) <= 19 and int(word) < _LATEST_NS):
         raise InputError(f'{where}: {word[:40]!r} is no stamp in nanoseconds')
     return int(word)
 
@@ -214,11 +224,33 @@ def _numbers(where: str, words: list[str]) -> list[float]:
 
 def _samples(path: Path) -> list[ImuSample]:
     stamps, values = _table(path, 7, lambda row: is_imu_reading(row[:3], row[3:6]))
+    _check_units(path, stamps, values)
     return [ImuSample(int(stamp), row[:3], row[3:6]) for stamp, row in zip(stamps, values, strict=True)]
 
 
+def _check_units(path: Path, stamps: IntArray, values: FloatArray) -> None:
+    """Raise InputError for stamps, turn rates or forces that are most likely in another unit."""
+    step = float(np.median(np.diff(np.sort(stamps)))) / SECOND_NS if len(stamps) > 1 else _STEPS_S[1]
+    if not _STEPS_S[0] <= step <= _STEPS_S[1]:
+        raise InputError(f'{path}: samples {step:.3g} s apart: are the stamps in nanoseconds?')
+    if _IN_G[0] < (force := float(np.median(np.linalg.norm(values[:, 3:6], axis=1)))) < _IN_G[1]:
+        raise InputError(f'{path}: accelerations of {force:.2f} m/s^2 on average: are they in g?')
+    if (turn := float(np.percentile(np.linalg.norm(values[:, :3], axis=1), 90))) > _FAST:
+        raise InputError(f'{path}: a tenth of the turn rates above {turn:.0f} rad/s: are they in degrees a second?')
+
+
+def _is_detection(row: list[float]) -> bool:
+    """Whether it is an ID, eight coordinates and, where there is more, a standard deviation."""
+    corners, sigma = row[1:9], row[9:10]
+    return (
+        row[0] in range(_IDS)
+        and max(map(abs, corners)) < _FARTHEST_CORNER
+        and all(0 < s < _LARGEST_SIGMA for s in sigma)
+    )
+
+
 def _corners(path: Path) -> Iterator[Corners]:
-    stamps, values = _table(path, 10, lambda row: row[0] in range(_IDS))
+    stamps, values = _table(path, 10, _is_detection)
     order = np.argsort(stamps, kind='stable')
     stamps, values = stamps[order], values[order]
     for rows in np.split(np.arange(len(stamps)), np.flatnonzero(np.diff(stamps)) + 1):
@@ -227,8 +259,13 @@ def _corners(path: Path) -> Iterator[Corners]:
         yield Corners(int(stamps[rows[0]]), frame[:, 0].astype(np.int64), frame[:, 1:9].reshape(-1, 4, 2), sigma)
 
 
+def _is_pose(row: list[float]) -> bool:
+    return max(map(abs, row[:3])) < LARGEST_COORDINATE and abs(math.hypot(*row[3:7]) - 1.0) < _NORM_TOLERANCE
+
+
 def _poses(path: Path) -> list[CameraPose]:
-    stamps, values = _table(path, 44, lambda row: abs(math.hypot(*row[3:7]) - 1.0) < _NORM_TOLERANCE)
+    stamps, values = _table(path, 44, _is_pose)
     T_map_camera = transform_from_quaternion(values[:, :3], values[:, 3:7])
-    rows = zip(stamps, T_map_camera, values[:, 7:43].reshape(-1, 6, 6), strict=True)
+    covariances = checked_covariance(values[:, 7:43].reshape(-1, 6, 6), f'{path}: pose with a covariance')
+    rows = zip(stamps, T_map_camera, covariances, strict=True)
     return [CameraPose(int(stamp), T, covariance) for stamp, T, covariance in rows]

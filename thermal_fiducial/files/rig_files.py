@@ -24,7 +24,7 @@ NOISE_NAMES = (
 )
 # Of these, in any of their units: no sensor that anybody flies comes near.
 _LARGEST_NOISE = 100.0
-_LONGEST_SIDE, _LARGEST_MARKER_M, _LARGEST_OFFSET_S = 65_535, 100.0, 1.0
+_LONGEST_SIDE, LARGEST_MARKER_M, _LARGEST_OFFSET_S = 65_535, 100.0, 1.0
 #: OpenCV's head, as some of EuRoC's files have it, is no YAML of version 1.1.
 _OPENCV_HEAD = '%YAML:1.0'
 
@@ -67,7 +67,7 @@ def of_rig(path: Path, camera: str) -> Rig:
         orientation = _needed(entry, 'camera_orientation')
         position = _numbers(_needed(entry, 'camera_position'), 3, LARGEST_COORDINATE)
         T_body_camera = transform_from_quaternion(position, _unit(orientation))
-    size = top['marker_size'].number(0.0, _LARGEST_MARKER_M) if 'marker_size' in top else 0.0
+    size = top['marker_size'].number(0.0, LARGEST_MARKER_M) if 'marker_size' in top else 0.0
     dictionary = top['dictionary'].text() if 'dictionary' in top else ''
     return Rig(lens, T_body_camera, _noise(top.get('imu')), _offset(fields, 'time_offset'), size, dictionary)
 
@@ -125,7 +125,9 @@ def _document(path: Path) -> Value:
 def _needed(value: Value, name: str) -> Value:
     fields = value.mapping()
     if name not in fields:
-        raise value.error(f'no {name}; it has {", ".join(list(fields)[:20]) or "nothing"}')
+        raise value.error(
+            f'no {name if name.isprintable() else repr(name)}; it has {", ".join(list(fields)[:20]) or "nothing"}'
+        )
     return fields[name]
 
 
