@@ -139,7 +139,7 @@ def test_derivatives_by_scale_and_misalignment_against_differences():
 def test_scale_errors_and_misalignments_are_found():
     poses, imu = recording(SCENARIO, 40.0, 1)
     axes = 0.005 * np.random.default_rng(3).normal(size=AXES)
-    result = calibrate_camera_imu(poses[::2], imu.corrected(axes), START_NS, ImuNoise())
+    result = calibrate_camera_imu(poses[::3], imu.corrected(axes), START_NS, ImuNoise())
     # What takes away the errors of the samples: the negative of what was put in, but for its square.
     assert np.all(np.abs(result.axes + axes) < 4.0 * result.axes_sigma + 5e-5)
     # A level flight shows these; that it is level leaves most of the accelerometer's at their prior.
@@ -209,7 +209,7 @@ def test_derivatives_of_the_batch_against_differences():
 def test_noiseless_recording_gives_the_extrinsics_back():
     scenario = replace(SCENARIO, imu=NO_NOISE)
     poses, imu = recording(scenario, 20.0, 2, sigma_m=0.0, sigma_rad=0.0)
-    result = calibrate_camera_imu(poses, imu, START_NS, ImuNoise())
+    result = calibrate_camera_imu(poses[::3], imu, START_NS, ImuNoise())
     error = np.abs(error_of(result, scenario))
     # Samples between frames are interpolated: 1e-5 rad, a few hundredths of a millimetre, some microseconds.
     assert np.all(error[:3] < 2e-5)
@@ -262,7 +262,7 @@ READOUT = 0.016
 def test_noiseless_rolling_recording_gives_the_readout_time_back():
     scenario = replace(SCENARIO, imu=NO_NOISE)
     frames, camera, imu = rolling_recording(scenario, 13.0, 2, READOUT, sigma_px=0.0)
-    result = calibrate_rolling_camera_imu(frames[::2], camera, imu, START_NS, ImuNoise())
+    result = calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, ImuNoise())
     error = np.abs(error_of(result, scenario))
     # As without a read-out: samples are interpolated. A microsecond at 1000 px/s is 0.001 px.
     assert abs(result.readout_time - READOUT) < 1e-6
@@ -274,7 +274,7 @@ def test_noiseless_rolling_recording_gives_the_readout_time_back():
 @pytest.mark.parametrize('readout', [0.0, READOUT])
 def test_readout_time_and_extrinsics_within_their_errors(readout):
     frames, camera, imu = rolling_recording(SCENARIO, 15.0, 1, readout, sigma_px=0.1)
-    result = calibrate_rolling_camera_imu(frames[::2], camera, imu, START_NS, ImuNoise())
+    result = calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, ImuNoise())
     assert 1e-5 < result.readout_sigma < 1e-4
     # Four standard deviations; exactly zero where it is not clearly more.
     assert abs(result.readout_time - readout) < 4.0 * result.readout_sigma
@@ -314,6 +314,6 @@ def test_white_noise_is_what_the_samples_show():
 
 def test_poses_alone_say_nothing_of_the_readout_time():
     poses, imu = recording(SCENARIO, 20.0, 1)
-    result = calibrate_camera_imu(poses, imu, START_NS, ImuNoise())
+    result = calibrate_camera_imu(poses[::3], imu, START_NS, ImuNoise())
     assert result.readout_time == 0.0
     assert np.isinf(result.readout_sigma)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy.linalg import solveh_banded
 
+from thermal_fiducial.calibration.banded_equations import BandedEquations
 from thermal_fiducial.calibration.preintegration import AXES, ImuTrack, Increments, preintegrate
 from thermal_fiducial.calibration.rolling import RowMoments
 from thermal_fiducial.config import ImuNoise
@@ -28,8 +28,8 @@ _COARSE_STEP = 0.002
 _MAX_STEPS = 15
 # Change of the shared unknowns [rad, m, s] that no digit of the answer shows.
 _CONVERGED = 1e-7
-# Parts of a recording that are left out one by one; steps from the whole's solution, and when they are enough.
-_GROUPS, _JACKKNIFE_STEPS, _JACKKNIFE_CONVERGED = 8, 6, 1e-6
+# Parts of a recording that are left out one by one.
+_GROUPS = 8
 # Mahalanobis distance of a pose (six degrees of freedom, 99 %) beyond which it loses weight.
 _INLIER = 4.1
 # What biases may be at most, as a prior on the first state [rad/s, m/s^2].
@@ -167,15 +167,19 @@ class Problem:
         What errs for seconds on end (a lens that is off in a part of the image, an IMU whose errors the model does not
         have) is no white noise, and no covariance of white noise knows of it. Delete-a-group jackknife, B. Efron, "The
         jackknife, the bootstrap and other resampling plans", 1982; never narrower than the covariance of white noise.
+        An answer is a step from the whole's solution: further ones change a deviation by less than a hundredth.
         """
+        of_samples = self._of_samples(solution.state)
         edges = np.linspace(0, len(self._stamps), _GROUPS + 1).astype(int).tolist()
-        answers = np.array([self._difference(solution.state, first, last) for first, last in pairwise(edges)])
-        variance = (_GROUPS - 1) * np.mean((answers - answers.mean(axis=0)) ** 2, axis=0)
+        answers = np.array([self._step_without(solution.state, of_samples, *pair) for pair in pairwise(edges)])
+        variance = (_GROUPS - 1) * np.var(answers, axis=0)
+        # The direction of gravity is not asked for.
+        variance[7:9] = 0.0
         wider = np.sqrt(np.maximum(1.0, variance / np.diag(solution.covariance)))
         return replace(solution, covariance=solution.covariance * np.outer(wider, wider))
 
-    def _difference(self, state: State, first: int, last: int) -> FloatArray:
-        """How the shared unknowns (25,) change without the frames from ``first`` to ``last``."""
+    def _step_without(self, state: State, of_samples: BandedEquations, first: int, last: int) -> FloatArray:
+        """Step (25,) of the shared unknowns without the frames from ``first`` to ``last``."""
         problem = copy(self)
         problem._root = self._root.copy()
         problem._root[first:last] = 0.0
@@ -185,15 +189,9 @@ class Problem:
             residual = self._rows.residual.copy()
             residual[first:last] = 0.0
             problem._rows = replace(self._rows, residual=residual)
-        before = state
-        for _ in range(_JACKKNIFE_STEPS):
-            state, change, _ = problem.improved(state)
-            if change < _JACKKNIFE_CONVERGED:
-                break
-        turn = se3.so3_log(before.R_body_camera.T @ state.R_body_camera)
-        down = np.zeros(2)  # The direction of gravity is not asked for.
-        parts = (turn, state.p_body_camera - before.p_body_camera, [state.offset - before.offset], down)
-        return np.concatenate([*parts, [state.readout - before.readout], state.axes - before.axes])
+        normal = of_samples.copy()
+        problem._add_poses(state, normal)
+        return normal.solved()[1]
 
     def camera_poses(self, state: State, frames: IntArray, delays: FloatArray) -> FloatArray:
         """T_map_camera (K, 4, 4) by ``delays`` (K,) [s] after ``frames`` (K,)."""
@@ -204,28 +202,23 @@ class Problem:
 
     def improved(self, state: State) -> tuple[State, float, FloatArray]:
         """The next state, the largest change of a shared unknown, and the covariance (25, 25) of these."""
-        count = len(self._stamps)
-        H = np.zeros((count, 2, _STATE, _STATE))  # of each state with itself, and with the next one
-        B = np.zeros((count, _STATE, _SHARED))
-        C, c = np.zeros((_SHARED, _SHARED)), np.zeros(_SHARED)
-        g = np.zeros((count, _STATE))
-        self._add_poses(state, H, B, C, g, c)
-        self._add_imu(state, H, B, C, g, c)
-        H[0, 0, 9:, 9:] += np.diag(1.0 / _BIAS_PRIOR**2)
-        g[0, 9:] += state.bias[0] / _BIAS_PRIOR**2
-        prior = _READOUT_HELD if self._rows is None else _READOUT_PRIOR
-        C[9, 9] += 1.0 / prior**2
-        c[9] += state.readout / prior**2
-        C[range(10, _SHARED), range(10, _SHARED)] += 1.0 / _AXES_PRIOR**2
-        c[10:] += state.axes / _AXES_PRIOR**2
-        solved = solveh_banded(_band(H), np.concatenate([g.reshape(-1, 1), B.reshape(-1, _SHARED)], axis=1), lower=True)
-        by_shared = solved[:, 1:]
-        flat = B.reshape(-1, _SHARED)
-        reduced = C - flat.T @ by_shared
-        covariance = np.linalg.inv(reduced)
-        shared = -covariance @ (c - flat.T @ solved[:, 0])
-        own = (-solved[:, 0] - by_shared @ shared).reshape(count, _STATE)
+        normal = self._of_samples(state)
+        self._add_poses(state, normal)
+        own, shared, covariance = normal.solved()
         return self.moved(state, own, shared), float(np.abs(shared).max()), covariance
+
+    def _of_samples(self, state: State) -> BandedEquations:
+        """What the IMU's samples and prior knowledge say."""
+        normal = BandedEquations.empty(len(self._stamps), _STATE, _SHARED)
+        self._add_imu(state, normal)
+        normal.H[0, 0, 9:, 9:] += np.diag(1.0 / _BIAS_PRIOR**2)
+        normal.g[0, 9:] += state.bias[0] / _BIAS_PRIOR**2
+        prior = _READOUT_HELD if self._rows is None else _READOUT_PRIOR
+        normal.C[9, 9] += 1.0 / prior**2
+        normal.c[9] += state.readout / prior**2
+        normal.C[range(10, _SHARED), range(10, _SHARED)] += 1.0 / _AXES_PRIOR**2
+        normal.c[10:] += state.axes / _AXES_PRIOR**2
+        return normal
 
     def pose_errors(self, state: State) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Predicted minus measured (N, 6), and its derivatives by state (N, 6, 15) and shared unknowns (N, 6, 25)."""
@@ -270,9 +263,7 @@ class Problem:
         spread = 1.4826 * float(np.median(np.abs(late - np.median(late))))
         return float(np.sqrt(max(0.0, spread**2 - np.median(1.0 / square[fast]))))
 
-    def _add_poses(
-        self, state: State, H: FloatArray, B: FloatArray, C: FloatArray, g: FloatArray, c: FloatArray
-    ) -> None:
+    def _add_poses(self, state: State, normal: BandedEquations) -> None:
         error, own, shared = self.pose_errors(state)
         root = self._whitening(shared[:, :, 6])
         e = (root @ error[:, :, None])[:, :, 0]
@@ -281,27 +272,21 @@ class Problem:
         if self._rows is not None:
             twist = weight * shared[:, :, 6]
             information = np.einsum('ni,nij,nj->', twist, self._beyond, twist)
-            C[9, 9] += information
-            c[9] += information * (state.readout - self._about) - np.sum(weight * twist * self._rows.residual)
+            normal.C[9, 9] += information
+            normal.c[9] += information * (state.readout - self._about) - np.sum(weight * twist * self._rows.residual)
         e, own, shared = weight * e, weight[:, :, None] * (root @ own), weight[:, :, None] * (root @ shared)
-        H[:, 0] += np.swapaxes(own, 1, 2) @ own
-        B += np.swapaxes(own, 1, 2) @ shared
-        C += np.einsum('nij,nik->jk', shared, shared)
-        g += (np.swapaxes(own, 1, 2) @ e[:, :, None])[:, :, 0]
-        c += np.einsum('nij,ni->j', shared, e)
+        normal.add_states(slice(None), own, shared, e)
+        normal.add_shared(shared, e)
 
-    def _add_imu(self, state: State, H: FloatArray, B: FloatArray, C: FloatArray, g: FloatArray, c: FloatArray) -> None:
+    def _add_imu(self, state: State, normal: BandedEquations) -> None:
         increments = preintegrate(
             self._imu.corrected(state.axes), self._stamps + state.offset, state.bias[:-1], self._noise
         )
         e, first, second, shared = imu_errors(state, increments, self._noise)
         for index, J in ((slice(None, -1), first), (slice(1, None), second)):
-            H[index, 0] += np.swapaxes(J, 1, 2) @ J
-            B[index] += np.swapaxes(J, 1, 2) @ shared
-            g[index] += (np.swapaxes(J, 1, 2) @ e[:, :, None])[:, :, 0]
-        H[:-1, 1] += np.swapaxes(second, 1, 2) @ first
-        C += np.einsum('nij,nik->jk', shared, shared)
-        c += np.einsum('nij,ni->j', shared, e)
+            normal.add_states(index, J, shared, e)
+        normal.H[:-1, 1] += np.swapaxes(second, 1, 2) @ first
+        normal.add_shared(shared, e)
 
     def moved(self, state: State, own: FloatArray, shared: FloatArray) -> State:
         """``state`` after a step of each frame's own unknowns (N, 15) and of the shared ones (25,)."""
@@ -371,15 +356,3 @@ def imu_errors(
     walk = np.array([max(noise.gyroscope_random_walk, 1e-9)] * 3 + [max(noise.accelerometer_random_walk, 1e-9)] * 3)
     root[:, 9:, 9:] = (1.0 / (walk * np.sqrt(dt)))[:, :, None] * np.eye(6)
     return (root @ error[:, :, None])[:, :, 0], root @ first, root @ second, root @ shared
-
-
-def _band(H: FloatArray) -> FloatArray:
-    """Lower band (2 * 15, 15 N) of the block tridiagonal matrix, as LAPACK stores it."""
-    count = len(H)
-    band = np.zeros((2 * _STATE, count, _STATE))
-    column = np.arange(_STATE)
-    for row in range(_STATE):
-        inside = column <= row
-        band[row - column[inside], :, column[inside]] = H[:, 0, row, inside].T
-        band[_STATE + row - column, :, column] = H[:, 1, row, :].T
-    return band.reshape(2 * _STATE, -1)

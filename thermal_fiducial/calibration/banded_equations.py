@@ -1,0 +1,73 @@
+"""Normal equations of states in a band, each held to the next one, and of the unknowns that all of them share."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy.linalg import solveh_banded
+
+from thermal_fiducial.core.types import FloatArray
+
+
+@dataclass(frozen=True)
+class BandedEquations:
+    """Those of a Gauss-Newton step, to which each measurement adds.
+
+    Parameters
+    ----------
+    H : (N, 2, S, S) of each of N states with itself, and with the next one
+    B : (N, S, K) of the states with the K shared unknowns
+    C : (K, K) of the shared unknowns
+    g, c : (N, S) and (K,) gradients by the states and by the shared unknowns
+    """
+
+    H: FloatArray
+    B: FloatArray
+    C: FloatArray
+    g: FloatArray
+    c: FloatArray
+
+    @classmethod
+    def empty(cls, states: int, size: int, shared: int) -> Self:
+        """Those of so many states of ``size`` unknowns each, of which nothing is known."""
+        H, B = np.zeros((states, 2, size, size)), np.zeros((states, size, shared))
+        return cls(H, B, np.zeros((shared, shared)), np.zeros((states, size)), np.zeros(shared))
+
+    def copy(self) -> Self:
+        """The same, to which more can be added."""
+        return type(self)(*(values.copy() for values in vars(self).values()))
+
+    def add_states(self, index: slice, J: FloatArray, by_shared: FloatArray, error: FloatArray) -> None:
+        """Add whitened errors (M, E) with their derivatives (M, E, S) by the states ``index``, and (M, E, K)."""
+        transposed = np.swapaxes(J, 1, 2)
+        self.H[index, 0] += transposed @ J
+        self.B[index] += transposed @ by_shared
+        self.g[index] += (transposed @ error[:, :, None])[:, :, 0]
+
+    def add_shared(self, by_shared: FloatArray, error: FloatArray) -> None:
+        """Add what the same errors say of the shared unknowns alone."""
+        flat = by_shared.reshape(-1, len(self.c))
+        self.C[...] += flat.T @ flat
+        self.c[...] += flat.T @ error.ravel()
+
+    def solved(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Steps of the states (N, S) and of the shared unknowns (K,), and the covariance (K, K) of the latter."""
+        flat = self.B.reshape(-1, len(self.c))
+        solved = solveh_banded(_band(self.H), np.column_stack([self.g.ravel(), flat]), lower=True)
+        by_shared = solved[:, 1:]
+        covariance = np.linalg.inv(self.C - flat.T @ by_shared)
+        shared = -covariance @ (self.c - flat.T @ solved[:, 0])
+        own = (-solved[:, 0] - by_shared @ shared).reshape(self.g.shape)
+        return own, shared, covariance
+
+
+def _band(H: FloatArray) -> FloatArray:
+    """Lower band (2 S, S N) of the block tridiagonal matrix, as LAPACK stores it."""
+    count, size = len(H), H.shape[-1]
+    band = np.zeros((2 * size, count, size))
+    column = np.arange(size)
+    for row in range(size):
+        inside = column <= row
+        band[row - column[inside], :, column[inside]] = H[:, 0, row, inside].T
+        band[size + row - column, :, column] = H[:, 1, row, :].T
+    return band.reshape(2 * size, -1)
