@@ -1,4 +1,6 @@
 from itertools import combinations
+from pathlib import Path
+import re
 
 import numpy as np
 import pytest
@@ -147,3 +149,18 @@ def test_search_depends_on_its_seed_only():
 def test_search_refuses_what_cannot_be(bits, distance):
     with pytest.raises(InputError):
         search(bits, distance, seed=1, restarts=2)
+
+
+@pytest.mark.parametrize(('name', 'bits_apart'), [('STENCIL_4X4_100', 0), ('STENCIL_5X5_100', 1)])
+def test_the_readme_names_the_markers_that_are_like_the_negative_of_another(name, bits_apart):
+    bits = marker_bits(load_dictionary(name))
+    readme = (Path(__file__).resolve().parents[2] / 'README.md').read_text(encoding='utf-8')
+    (listed,) = re.findall(rf'In `{name}`\s+these\b([^.]*)\.', readme)
+    pairs = [(int(a), int(b), bits_apart) for a, b in re.findall(r'(\d+)\s+and\s+(\d+)', listed)]
+    assert pairs == negatives(bits, distances(bits)[0])
+
+
+@pytest.mark.parametrize('name', ['STENCIL_4X4_80_SIGNED', 'STENCIL_5X5_100_SIGNED'])
+def test_signed_dictionaries_have_no_such_markers(name):
+    bits = marker_bits(load_dictionary(name))
+    assert negatives(bits, distances(bits)[0]) == []
