@@ -137,15 +137,22 @@ KEYS = {
     'cv2': 'python3-opencv',
     'PIL': 'python3-pil',
     'filterpy': 'python3-filterpy-pip',
+    'rosbags': 'python3-rosbags-pip',
     'tf2_ros': 'tf2_ros_py',
 }
-#: Not in Ubuntu: from pip, for those who replay bags, cut markers, align clouds or show trajectories.
-FROM_PIP = {'rosbags', 'ezdxf', 'small_gicp', 'plyfile', 'pypcd4', 'usb', 'allantools', 'dask', 'distributed'} | {
+#: Without a key of rosdep: from pip, for those who cut markers, align clouds or show trajectories; lz4 with rosbags.
+FROM_PIP = {
+    'small_gicp',
+    'plyfile',
+    'pypcd4',
+    'allantools',
+    'dask',
+    'distributed',
     'av',
     'evo',
     'plotly',
     'svgwrite',
-}
+} | {'lz4'}
 #: Of the user's workspace, where they are asked for.
 OPTIONAL = {'px4_msgs', 'aruco_opencv_msgs', 'apriltag_msgs', 'vision_msgs', 'foxglove_msgs'}
 

@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         import distributed  # noqa: F401
     except ImportError:
-        raise InputError("needs the extra 'batch': pip install thermal_fiducial[batch]") from None
+        raise InputError("needs the extra 'batch': pip install '.[batch]' in the package's folder") from None
     from thermal_fiducial.replay.many_bags import Batch, run_batch, workers
     from thermal_fiducial.replay.session import Options
 

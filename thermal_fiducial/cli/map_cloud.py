@@ -45,7 +45,7 @@ def _align(args: argparse.Namespace) -> int:
     try:
         alignment = align_to_cloud(marker_map.markers.values(), cloud, initial, args.reach)
     except ImportError as error:
-        raise InputError("map align needs the extra 'cloud': pip install thermal_fiducial[cloud]") from error
+        raise InputError("map align needs the extra 'cloud': pip install '.[cloud]' in the package's folder") from error
     _tell(alignment)
     if args.out:
         save_alignment(args.out, alignment.T, args.cloud.name, marker_map.frame_id)

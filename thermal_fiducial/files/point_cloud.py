@@ -17,7 +17,7 @@ from thermal_fiducial.files.schema import load_yaml
 _COUNTS = re.compile(rb'^(?:element +\S+|POINTS|WIDTH|HEIGHT) +([0-9]{1,18})[0-9]*\s*$', re.MULTILINE)
 _PACKED = re.compile(rb'^DATA +binary_compressed', re.MULTILINE)
 _HEADER_BYTES = 65_536
-_NEEDED = "reading point clouds needs the extra 'cloud': pip install thermal_fiducial[cloud]"
+_NEEDED = "reading point clouds needs the extra 'cloud': pip install '.[cloud]' in the package's folder"
 
 
 def load_cloud(path: str | Path) -> FloatArray:
