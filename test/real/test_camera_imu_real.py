@@ -8,9 +8,9 @@ import pytest
 from support.real_flights import april_board
 
 from thermal_fiducial.calibration.camera_imu import calibrate_camera_imu
+from thermal_fiducial.calibration.joint_pose import solve_camera_pose
 from thermal_fiducial.calibration.preintegration import ImuTrack
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px
 

@@ -11,8 +11,8 @@ import numpy as np
 from support import real_flights, tagslam, walls
 from support.corner_runs import rms
 from support.scenes import motion_prior
+from thermal_fiducial.calibration.joint_pose import solve_camera_pose
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, transform
 from thermal_fiducial.core.mapping.bundle_adjustment import refine

@@ -16,10 +16,10 @@ import yaml
 
 from support.batch_map import adjust
 from support.corner_runs import CornerFlight
+from thermal_fiducial.calibration.joint_pose import solve_camera_pose
 from thermal_fiducial.config import ImuNoise, MarkerMapperConfig
 from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform, transform_from_quaternion
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap

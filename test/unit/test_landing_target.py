@@ -6,10 +6,10 @@ import pytest
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, so3_exp, transform
-from thermal_fiducial.core.mapping.landing_pad import from_mavros
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
 from thermal_fiducial.nodes.landing_target import LandingTarget
 from thermal_fiducial.ros import clouds, convert, qos
+from thermal_fiducial.ros.landing_pad import from_mavros
 from thermal_fiducial.ros.node import ERROR, OK, WARN
 
 pytestmark = pytest.mark.ros

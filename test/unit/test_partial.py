@@ -8,6 +8,7 @@ from support import approach
 from support.close_views import BITS, BLUR_WITH_PIXEL, CAMERAS, draw, plate, pose
 from support.scenes import motion_prior
 
+from thermal_fiducial.calibration.joint_pose import solve_camera_pose
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corners.grid import adjusted, grid_edges, Layer
 from thermal_fiducial.core.detection.frame import Frame
@@ -16,7 +17,7 @@ from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_camera_pose
+from thermal_fiducial.core.geometry.planar_pose import marker_corners
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, Odometry
 from thermal_fiducial.sim.spline_trajectory import SplineTrajectory
 from thermal_fiducial.sim.thermal_camera import render_frames

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from thermal_fiducial.calibration.joint_pose import solve_camera_pose
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import (
     choose_branches,
     ippe_square,
     marker_corners,
-    solve_camera_pose,
     solve_marker_poses,
 )
 from thermal_fiducial.errors import InputError

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from thermal_fiducial.calibration.joint_pose import solve_camera_pose
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.planar_pose import solve_camera_pose
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise, whitening
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray

@@ -9,10 +9,10 @@ from sensor_msgs.msg import PointCloud2
 
 from thermal_fiducial.config import LandingTargetConfig
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
-from thermal_fiducial.core.mapping.landing_pad import for_mavros, pad_in_map
 from thermal_fiducial.core.measurements import marker_branches, Markers, usable
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros import clouds, convert, qos
+from thermal_fiducial.ros.landing_pad import for_mavros, pad_in_map
 from thermal_fiducial.ros.node import OK, StageNode, WARN
 from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.run import run

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from thermal_fiducial.core.mapping.landing_pad import from_mavros
 from thermal_fiducial.core.types import BoolArray, IntArray, SECOND_NS
 from thermal_fiducial.report.bridge_check import Finding, Level
 from thermal_fiducial.report.bridge_record import BridgeRecord, LandingRecord
+from thermal_fiducial.ros.landing_pad import from_mavros
 
 #: ArduPilot wants a target once a second; both autopilots forget one that they have not heard of for some seconds.
 LONGEST_GAP = 1.0

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.geometry.ippe import cross_in_plane
+from thermal_fiducial.core.geometry.planar_pose import cross_in_plane
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 #: Interpolation of lag tails where edges are measured: a linear one blurs them more than the image that they are taken

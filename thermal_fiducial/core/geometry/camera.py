@@ -59,7 +59,7 @@ class Camera:
         object.__setattr__(self, 'K', K)
         object.__setattr__(self, 'D', filled)
 
-    @property
+    @cached_property
     def focal_px(self) -> float:
         """Geometric mean of the two focal lengths [px]."""
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))

@@ -9,32 +9,25 @@ then rotation, in the parent frame.
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.ippe import ippe_square, marker_corners
-from thermal_fiducial.core.geometry.reprojection import whitening
-from thermal_fiducial.core.geometry.rigid_fit import covariances, evaluate, fit, Images
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints, inverse_2x2
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners, whitening
+from thermal_fiducial.core.geometry.rigid_fit import covariances, evaluate, Images, minimise
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
-from thermal_fiducial.errors import InputError
 
 __all__ = [
     'CameraFit',
-    'JointPose',
     'PlanarPoses',
     'choose_branches',
     'ippe_square',
     'marker_corners',
     'planar_poses',
-    'solve_camera_pose',
     'solve_marker_poses',
 ]
 
 #: Mahalanobis distance of a corner (99 % of a chi-square of two degrees of freedom) beyond which it loses weight.
 INLIER = 3.0
-# Two branches whose chi-squares differ by less than this factor are ambiguous: then the prediction decides.
-_AMBIGUOUS_RATIO = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,22 +67,6 @@ class PlanarPoses:
         return PlanarPoses(*(array[rows, branches] for array in arrays))
 
 
-@dataclass(frozen=True, slots=True)
-class JointPose:
-    """The camera in the map from all corners of a frame."""
-
-    #: (4, 4)
-    T_map_camera: FloatArray
-    #: (6, 6), ROS convention, in the map [m, rad]
-    covariance: FloatArray
-    #: (N, 4, 2) measured minus predicted
-    residuals_px: FloatArray
-    #: rms over all corners (length of the 2-vector)
-    rms_px: float
-    #: robust weighted squared error; with honest covariances, chi-square of 8 N - 6 degrees of freedom
-    chi2: float
-
-
 def solve_marker_poses(
     corners_px: FloatArray, corner_covs: FloatArray, sizes: FloatArray, camera: Camera
 ) -> PlanarPoses:
@@ -107,9 +84,9 @@ def solve_marker_poses(
 def planar_poses(corners: ImagePoints, corner_covs: FloatArray, sizes: FloatArray) -> PlanarPoses:
     """:func:`solve_marker_poses` of corners (N, 4) that are known in both coordinates."""
     images = Images.of(corners, whitening(corner_covs)).repeated(2)
-    points = np.repeat(sizes[:, None, None] * marker_corners(1.0), 2, axis=0)
+    points = np.repeat(marker_corners(sizes), 2, axis=0)
     starts = ippe_square(corners.x, sizes).reshape(-1, 4, 4)
-    T, cost, information = fit(starts, points, images, alternatives=2)
+    T, cost, information = minimise(starts, lambda T: evaluate(T, points, images), alternatives=2)
     residuals = images.residuals(T, points)[..., None]
     facing = np.sum(T[:, :3, 2] * T[:, :3, 3], axis=-1) < 0.0
     chi2 = np.sum((images.whitening @ residuals) ** 2, axis=(-3, -2, -1))
@@ -151,7 +128,7 @@ def choose_branches(
         if T_camera_map is not None:
             starts = np.concatenate([starts, T_camera_map[None]])
         sizes = np.array([entry[1] for entry in in_map if entry is not None])
-        squares = se3.apply(T_map_marker, sizes[:, None, None] * marker_corners(1.0))
+        squares = corners_in_map(T_map_marker, sizes)
         images = Images.of(corners.only(known), whitening(corner_covs[known])).joined()
         T_camera_map = starts[np.argmin(evaluate(starts, squares.reshape(1, -1, 3), images, INLIER)[0])]
     if T_camera_map is None:
@@ -162,57 +139,6 @@ def choose_branches(
     nearer = np.zeros(len(ambiguous), dtype=bool)
     nearer[known] = likeness[:, 1] > likeness[:, 0]
     return poses.swapped(nearer & ambiguous)
-
-
-def solve_camera_pose(
-    corners: npt.ArrayLike,
-    covs: npt.ArrayLike,
-    corners_in_map: npt.ArrayLike,
-    camera: Camera,
-    initial: FloatArray | None = None,
-    weights: npt.ArrayLike | None = None,
-    compete: bool = True,
-) -> JointPose:
-    """Pose of the camera from N markers of known pose jointly.
-
-    Both planar poses of every marker compete as the start (the one that explains all markers best wins), and so
-    does ``initial``, which also wins a tie between the branches of a lone marker. The error is the squared Mahalanobis
-    distance d of each corner up to c = 3, and ``c^2 (1 + 2 log(d / c))`` beyond, so that outliers lose all influence.
-
-    Parameters
-    ----------
-    corners : (N, 4, 2) [px] in the raw image
-    covs : (N, 4, 2, 2) [px^2]
-    corners_in_map : (N, 4, 3) [m] squares, in the order of :func:`marker_corners`
-    initial : (4, 4) predicted T_map_camera
-    weights : (N,) factors on the information of each marker; default 1
-    compete : False: ``initial`` is good, nothing else need be tried
-
-    Raises
-    ------
-    InputError
-        No markers, or no pose that sees them.
-    """
-    corners = np.asarray(corners, dtype=np.float64)
-    if len(corners) == 0:
-        raise InputError('no markers to compute a camera pose from')
-    fitted = CameraFit(
-        corners, np.asarray(covs, dtype=np.float64), np.asarray(corners_in_map, dtype=np.float64), camera
-    )
-    weights = None if weights is None else np.asarray(weights, dtype=np.float64)
-    starts = np.zeros((0, 4, 4)) if initial is None else initial[None]
-    if compete or initial is None:
-        starts = np.concatenate([starts, fitted.from_single_markers(weights)])
-    T, chi2, information = fitted.solve(starts, weights)
-    best = _likeliest(chi2, 8 * len(corners) - 6, initial is not None)
-    residuals = corners - camera.project(se3.apply(se3.inverse(T[best]), fitted.squares.reshape(-1, 3))).reshape(
-        -1, 4, 2
-    )
-    squared = np.sum(residuals**2, axis=-1)
-    if not (np.isfinite(chi2[best]) and np.isfinite(squared).all()):
-        raise InputError(f'no camera pose explains the {len(corners)} markers')
-    covariance = _of_camera(covariances(information[best]), T[best], fitted.middle)
-    return JointPose(T[best], covariance, residuals, float(np.sqrt(squared.mean())), float(chi2[best]))
 
 
 class CameraFit:
@@ -226,11 +152,10 @@ class CameraFit:
     """
 
     def __init__(self, corners: FloatArray, covs: FloatArray, squares: FloatArray, camera: Camera) -> None:
-        self.squares = squares
-        #: (3,) between the markers: turned about it, translation and rotation hardly depend on each other
-        self.middle: FloatArray = squares.mean(axis=(0, 1))
-        self._T_map_middle = se3.transform(np.eye(3), self.middle)
-        self._points = (squares - self.middle).reshape(1, -1, 3)
+        # Turned about the middle between the markers, translation and rotation hardly depend on each other.
+        middle = squares.mean(axis=(0, 1))
+        self._T_map_middle = se3.transform(np.eye(3), middle)
+        self._points = (squares - middle).reshape(1, -1, 3)
         self._corners = ImagePoints.at(corners.reshape(1, -1, 2), camera)
         self._whitening = whitening(covs)
 
@@ -250,44 +175,80 @@ class CameraFit:
         about the middle of the markers.
         """
         starts, images = se3.inverse(T_map_camera) @ self._T_map_middle, self._images(weights)
-        T_camera_middle, chi2, information = fit(starts, self._points, images, inlier, alternatives=len(starts))
+        T_camera_middle, chi2, information = minimise(
+            starts, lambda T: evaluate(T, self._points, images, inlier), alternatives=len(starts)
+        )
         return self._T_map_middle @ se3.inverse(T_camera_middle), chi2, information
 
-    def from_single_markers(self, weights: FloatArray | None) -> FloatArray:
-        """T_map_camera (2, 4, 4): those two of the markers' poses that explain all markers best."""
-        others = _camera_starts(self._corners.x.reshape(-1, 4, 2), self.squares)
-        cost = evaluate(others @ self._T_map_middle, self._points, self._images(weights), INLIER)[0]
-        return np.asarray(se3.inverse(others[np.argsort(cost)[:2]]))
+    def costs(self, T_map_camera: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+        """Robust chi squares (B,) at camera poses (B, 4, 4), inf where a marker would be behind the camera."""
+        starts = se3.inverse(T_map_camera) @ self._T_map_middle
+        return evaluate(starts, self._points, self._images(weights), INLIER)[0]
 
     def _images(self, weights: FloatArray | None) -> Images:
         W = self._whitening if weights is None else self._whitening * np.sqrt(weights)[:, None, None, None]
         return Images.of(self._corners, W.reshape(1, -1, 2, 2))
 
 
-def _likeliest(chi2: FloatArray, freedom: int, predicted: bool) -> int:
-    """Of poses of chi-squares (B,): the best, but the first, if that is ``predicted`` and not clearly worse."""
-    best = int(np.argmin(chi2))
-    return 0 if predicted and chi2[0] <= _AMBIGUOUS_RATIO * max(chi2[best], freedom) else best
+def ippe_square(normalised: FloatArray, sizes: FloatArray) -> FloatArray:
+    """Both poses (N, 2, 4, 4) of squares from normalised image corners (N, 4, 2) and sides (N,) [m], in closed form.
 
-
-def _camera_starts(normalised: FloatArray, squares: FloatArray) -> FloatArray:
-    """T_camera_map (2 N, 4, 4) from both poses of each square (N, 4, 3) [m] of normalised corners (N, 4, 2)."""
-    right, up = squares[:, 1] - squares[:, 0], squares[:, 0] - squares[:, 3]
-    sizes = np.linalg.norm(right, axis=-1)
-    x, y = right / sizes[:, None], up / np.linalg.norm(up, axis=-1, keepdims=True)
-    T_map_square = se3.transform(np.stack([x, y, np.cross(x, y)], axis=-1), squares.mean(axis=1))
-    return (ippe_square(normalised, sizes) @ se3.inverse(T_map_square)[:, None]).reshape(-1, 4, 4)
-
-
-def _of_camera(covariance: FloatArray, T_map_camera: FloatArray, middle: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of the camera in the map from that of the map in the camera, turned about its ``middle``.
-
-    With ``t -> t + d`` and ``R -> exp(w) R`` of the map in the camera, the camera, at ``-R^T t`` from the middle, moves
-    by ``R^T (t x w' - d)``, w' = -w, and turns by ``-R^T w``.
+    T. Collins, A. Bartoli, "Infinitesimal plane-based pose estimation", IJCV 2014, section 4.1: with J the derivative
+    of the homography at the square's centre, v the centre's image and R_v the rotation of the optical axis to it,
+    ``J t_z = [I | -v] R_v R'`` leaves R' up to the sign of the tilt. Corners that have no homography, three of them on
+    a line or NaN, give NaN. Unlike OpenCV's SOLVEPNP_IPPE_SQUARE this also holds for an exactly front-parallel square.
     """
-    R = T_map_camera[:3, :3]
-    A = np.zeros((6, 6))
-    A[:3, :3] = A[3:, 3:] = -R
-    A[:3, 3:] = -R @ se3.skew(R.T @ (middle - T_map_camera[:3, 3]))
-    with np.errstate(invalid='ignore'):
-        return np.asarray(A @ covariance @ A.T)
+    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
+        J, v = _homography_derivative(normalised, sizes)
+        R_v = _axis_to(v)
+        A = inverse_2x2(R_v[:, :2, :2] - v[:, :, None] * R_v[:, 2:, :2]) @ J
+        gram = np.swapaxes(A, -1, -2) @ A
+        a, b, c = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
+        gamma = np.sqrt(0.5 * (a + c + np.hypot(a - c, 2.0 * b)))[:, None]
+        # R' has the columns (upper, +-tilt), of unit length and orthogonal, and their cross product.
+        upper = A / gamma[..., None]
+        h = 1.0 - gram[:, [0, 1], [0, 1]] / gamma**2
+        tilt = np.sqrt(np.maximum(h, 0.0))
+        tilt[:, 1] = np.copysign(tilt[:, 1], -b)
+        R = np.empty((len(v), 2, 3, 3))
+        R[:, :, :2, :2] = upper[:, None]
+        R[:, 0, 2, :2], R[:, 1, 2, :2] = tilt, -tilt
+        x, y = R[..., 0], R[..., 1]
+        R[..., 2] = x[..., [1, 2, 0]] * y[..., [2, 0, 1]] - x[..., [2, 0, 1]] * y[..., [1, 2, 0]]
+        poses = np.zeros((len(v), 2, 4, 4))
+        poses[..., :3, :3] = R_v[:, None] @ R
+        poses[..., :2, 3] = (v / gamma)[:, None]
+        poses[..., 2, 3] = 1.0 / gamma
+    poses[..., 3, 3] = 1.0
+    return poses
+
+
+def _homography_derivative(c: FloatArray, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivative (N, 2, 2) [1/m] at, and image (N, 2) of, the centre under the homography of a square to ``c``.
+
+    P. Heckbert, "Fundamentals of texture mapping and image warping", 1989.
+    """
+    back, left = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2]
+    excess = c[:, 0] - c[:, 1] - left
+    determinant = cross_in_plane(back, left)
+    g, h = (cross_in_plane(excess, left) / determinant)[:, None], (cross_in_plane(back, excess) / determinant)[:, None]
+    right, down = c[:, 1] - c[:, 0] + g * c[:, 1], c[:, 3] - c[:, 0] + h * c[:, 3]
+    depth = 1.0 + 0.5 * (g + h)
+    v = (c[:, 0] + 0.5 * (right + down)) / depth
+    J = np.stack([right - g * v, h * v - down], axis=-1) / (depth * sizes[:, None])[..., None]
+    return J, np.asarray(v)
+
+
+def cross_in_plane(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products (N,) of vectors (N, 2)."""
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def _axis_to(v: FloatArray) -> FloatArray:
+    """Shortest rotations (N, 3, 3) of the optical axis to the directions (v, 1), v (N, 2)."""
+    z = 1.0 / np.sqrt(1.0 + np.sum(v * v, axis=-1))[:, None]
+    d = v * z
+    R = np.empty((len(v), 3, 3))
+    R[:, :2, :2] = np.eye(2) - d[:, :, None] * (d / (1.0 + z))[:, None, :]
+    R[:, :2, 2], R[:, 2, :2], R[:, 2, 2] = d, -d, z[:, 0]
+    return R

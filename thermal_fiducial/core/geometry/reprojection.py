@@ -32,14 +32,14 @@ def difference(T: npt.ArrayLike, T_reference: npt.ArrayLike) -> FloatArray:
     return np.concatenate([T[..., :3, 3] - T_reference[..., :3, 3], rotation], axis=-1)
 
 
-def corners_of(sizes: npt.ArrayLike) -> FloatArray:
-    """Corners (..., 4, 3) [m] of markers of ``sizes`` (...) in their own frames."""
+def marker_corners(sizes: npt.ArrayLike) -> FloatArray:
+    """Corners (..., 4, 3) [m] of markers of ``sizes`` (...) in their own frames, clockwise from the top-left."""
     return np.asarray(0.5 * np.asarray(sizes, dtype=np.float64)[..., None, None] * _UNIT_CORNERS)
 
 
 def corners_in_map(T_map_marker: FloatArray, sizes: npt.ArrayLike) -> FloatArray:
     """Corners (..., 4, 3) [m] in the map of markers with poses (..., 4, 4) and ``sizes`` (...)."""
-    corners = corners_of(sizes) @ np.swapaxes(T_map_marker[..., :3, :3], -1, -2)
+    corners = marker_corners(sizes) @ np.swapaxes(T_map_marker[..., :3, :3], -1, -2)
     return np.asarray(corners + T_map_marker[..., None, :3, 3])
 
 
@@ -65,7 +65,7 @@ def linearise(
     """
     n = len(T_map_camera)
     R_camera_map = np.swapaxes(T_map_camera[:, :3, :3], -1, -2)[:, None]
-    arms = corners_of(sizes) @ np.swapaxes(T_map_marker[:, :3, :3], -1, -2)
+    arms = marker_corners(sizes) @ np.swapaxes(T_map_marker[:, :3, :3], -1, -2)
     points = arms + (T_map_marker[:, :3, 3] - T_map_camera[:, :3, 3])[:, None]
     uv, projection = camera.project_jacobian((R_camera_map @ points[..., None])[..., 0])
     J = projection @ R_camera_map

@@ -65,26 +65,9 @@ class Images:
         return Images(*(a.reshape(1, -1, *a.shape[2:]) for a in (self.whitening, self.target, self.normalised)))
 
     def residuals(self, T: FloatArray, points: FloatArray) -> FloatArray:
-        """Measured minus predicted (B, K, 2) in normalised coordinates, NaN behind the camera: see :func:`fit`."""
+        """Measured minus predicted (B, K, 2) in normalised coordinates, NaN behind the camera."""
         p = se3.apply(T, points)
         return np.asarray(self.normalised - p[..., :2] / np.where(p[..., 2:] > _NEAR, p[..., 2:], np.nan))
-
-
-def fit(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf, alternatives: int = 1) -> Evaluation:
-    """Poses of bodies in the camera with the least squared errors, from starts ``T`` (B, 4, 4).
-
-    Parameters
-    ----------
-    points : (B or 1, K, 3) [m] in their bodies
-    inlier : Mahalanobis distance up to which errors are squared; beyond, their influence falls to nothing
-    alternatives : so many starts in a row are of the same body, and matter only where they may be the best
-
-    Returns
-    -------
-    T_camera_body (B, 4, 4), costs (B,), inf from an unusable start, and information matrices (B, 6, 6) of translation
-    and rotation in the camera frame.
-    """
-    return minimise(T, lambda T: evaluate(T, points, images, inlier), alternatives)
 
 
 def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alternatives: int = 1) -> Evaluation:
@@ -139,8 +122,9 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
 
 
 def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> Evaluation:
-    """Robust squared error at poses (B, 4, 4), inf where a point is behind the camera, and its derivatives.
+    """Robust squared error at poses (B, 4, 4) of bodies in the camera, inf where a point is behind it, and derivatives.
 
+    ``points`` are (B or 1, K, 3) [m] in their bodies.
     Of a whitened error d, the cost is d^2 up to ``inlier`` and ``inlier^2 (1 + 2 log(d / inlier))`` beyond.
     """
     rotated = points @ np.swapaxes(T[:, :3, :3], -1, -2)

@@ -21,7 +21,7 @@ from thermal_fiducial.core.error_model import (
 )
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit, INLIER
-from thermal_fiducial.core.geometry.reprojection import difference, reproject, retract
+from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
 from thermal_fiducial.core.mapping.candidates import Viewpoint
 from thermal_fiducial.core.mapping.located import Location, Refusal, Reprojected, Sight
@@ -34,8 +34,6 @@ DECISIVE = 20.0
 SAME_POSE = np.deg2rad(2.0)
 #: Markers that fill more of the view than this [rad] show perspective: their pose has no alternative.
 WIDE = np.deg2rad(25.0)
-# Re-projection error at which a hypothesis stops getting worse [px]: single-marker poses are rough.
-_HYPOTHESIS_PX = 3.0
 # Markers that propose hypotheses: with many in view the largest are precise enough, and the rest only votes.
 _PROPOSERS = 6
 
@@ -60,10 +58,10 @@ def locate(
     -------
     The location, or why there is none.
     """
-    hypotheses = _hypotheses(sight, camera, prior)
+    fit = CameraFit(sight.corners, sight.covariances, sight.points, camera)
+    hypotheses = _hypotheses(sight, fit, prior)
     if not len(hypotheses):
         return Refusal('no usable pose of any known marker')
-    fit = CameraFit(sight.corners, sight.covariances, sight.points, camera)
     frame = _Frame(stamp_ns, sight, camera, model, fit)
     # Steps 3 and 4: the pose from all markers jointly, weighted by the map.
     by_map = frame.map_weights(hypotheses[0])
@@ -204,7 +202,7 @@ def marker_weights(errors: FloatArray, running_errors: FloatArray, model: System
     return np.asarray(np.minimum(1.0, reference / np.maximum(combined, 1e-12)))
 
 
-def _hypotheses(sight: Sight, camera: Camera, prior: FloatArray | None) -> FloatArray:
+def _hypotheses(sight: Sight, fit: CameraFit, prior: FloatArray | None) -> FloatArray:
     """Camera poses (H, 4, 4) from either branch of each of the largest markers and from the prior, the best first."""
     largest = np.argsort(-np.sum(np.ptp(sight.corners, axis=1), axis=-1), kind='stable')[:_PROPOSERS]
     branches = sight.branches[largest].reshape(-1, 4, 4)
@@ -212,11 +210,7 @@ def _hypotheses(sight: Sight, camera: Camera, prior: FloatArray | None) -> Float
     poses = poses[np.all(np.isfinite(poses), axis=(1, 2))]
     if prior is not None:
         poses = np.concatenate([poses, prior[None]])
-    uv = reproject(camera, poses[:, None], sight.points)
-    squared = np.sum((uv - sight.corners) ** 2, axis=(-2, -1)) / 4.0
-    squared = np.where(np.isfinite(squared), squared, 1e12)
-    cost = np.sum(np.log1p(squared / _HYPOTHESIS_PX**2), axis=-1)
-    return np.asarray(poses[np.argsort(cost, kind='stable')])
+    return np.asarray(poses[np.argsort(fit.costs(poses), kind='stable')])
 
 
 def _names(sight: Sight) -> str:
