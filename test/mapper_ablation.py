@@ -71,12 +71,12 @@ MECHANISMS = {
     ),
     'bridging': Mechanism(
         ('chain', 'tags test_22'),
-        ('mapper:MarkerMapper._bridge', 'odometry_prior:growth'),
-        {'mapper:MarkerMapper._bridge': lambda *_: (False, {})},
+        ('frame_memory:FrameMemory.bridge', 'frame_memory:FrameMemory.bridgeable', 'odometry_prior:growth'),
+        {'frame_memory:FrameMemory.bridgeable': lambda *_, **__: False},
     ),
     'two cameras of a candidate': Mechanism(
         ('small markers', 'tags test_16'),
-        ('candidates:_ViewArrays._choose',),
+        ('marker_views:MarkerViews._choose',),
         {'mapper:MarkerMapper._without_pose': lambda self, frame, refusal: (False, {})},
     ),
     'two places': Mechanism(
@@ -98,7 +98,7 @@ MECHANISMS = {
         {'trust:inconsistent': lambda disagrees, _: np.zeros_like(disagrees)},
     ),
     'robust scale in rounds': Mechanism(('optimistic corners', 'wall'), (), {'bundle_adjustment:_ROUNDS': 1}),
-    'three trials a frame': Mechanism(('carpet',), (), {'new_markers:TRIALS': 10**9}),
+    'three trials a frame': Mechanism(('carpet',), (), {'candidates:TRIALS': 10**9}),
     'best-known proposers': Mechanism(('carpet',), (), {'localization:_PROPOSERS': 10**9}),
 }
 

@@ -88,6 +88,15 @@ def carpet() -> Figures:
     return figures
 
 
+def _errors(what: str, poses: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> Figures:
+    """Of true poses, poses and covariances: errors of position, and NEES per degree of freedom."""
+    apart = [(difference(T, truth), P) for truth, T, P in poses]
+    return {
+        f'{what} mm': 1e3 * rms([np.linalg.norm(d[:3]) for d, _ in apart]),
+        f'{what} NEES': float(np.mean([d @ np.linalg.solve(P, d) / 6.0 for d, P in apart])),
+    }
+
+
 def board() -> Figures:
     """Every other frame of a real calibration flight before 36 tags, on the map of the board."""
     flight = real_flights.april_board('cam0')
@@ -97,30 +106,21 @@ def board() -> Figures:
         camera_position=tuple(flight.T_body_camera[:3, 3]),
         camera_orientation=tuple(quaternion_from_rotation(flight.T_body_camera[:3, :3])),
     )
-    mapper = MarkerMapper(config, flight.marker_map)
-    stamps, ours, squares = [], [], []
+    mapper, located = MarkerMapper(config, flight.marker_map), []
     for stamp, rows in list(flight.frames.items())[::2]:
         pose = mapper.process(stamp, rows, flight.camera).pose
-        if pose is None or not flight.reference_ns[0] <= stamp <= flight.reference_ns[-1]:
-            continue
-        truth = flight.truth([stamp])[0] @ flight.T_body_camera
-        d = difference(truth, pose.T_map_camera)
-        ours.append(np.linalg.norm(d[:3]))
-        squares.append(d @ np.linalg.solve(pose.covariance, d) / 6.0)
-        stamps.append(stamp)
-    return {'located': len(stamps), 'mm': 1e3 * rms(ours), 'NEES': float(np.mean(squares))}
+        if pose is not None and flight.reference_ns[0] <= stamp <= flight.reference_ns[-1]:
+            located.append((flight.truth([stamp])[0] @ flight.T_body_camera, pose.T_map_camera, pose.covariance))
+    return {'located': len(located), **_errors('pose', located)}
 
 
 def _figures_of_maps(maps: list[tuple[MarkerMap, dict[int, np.ndarray]]]) -> Figures:
     """Of maps and the true poses of their markers, all but the first: how many are placed, and how well."""
-    errors, squares = [], []
-    for marker_map, truth in maps:
-        for key, marker in marker_map.markers.items():
-            if key:
-                d = difference(truth[key], marker.T_map_marker)
-                errors.append(np.linalg.norm(d[:3]))
-                squares.append(d @ np.linalg.solve(marker.covariance, d) / 6.0)
-    return {'placed': len(errors), 'map mm': 1e3 * rms(errors), 'map NEES': float(np.mean(squares))}
+    placed = [(truth[key], marker) for marker_map, truth in maps for key, marker in marker_map.markers.items() if key]
+    return {
+        'placed': len(placed),
+        **_errors('map', [(T, marker.T_map_marker, marker.covariance) for T, marker in placed]),
+    }
 
 
 def wall() -> Figures:
@@ -196,24 +196,18 @@ def moved_marker() -> Figures:
     covariance = np.diag([0.002**2] * 3 + [0.002**2] * 3)
     marker_map = MarkerMap({i: MapMarker(i, walls.SIZE, i == 0, T, covariance * (i > 0)) for i, T in in_map.items()})
     mapper = MarkerMapper(MarkerMapperConfig(mode='localization'), marker_map)
-    errors, squares, result = [], [], None
+    located, result = [], None
     for k in range(0, 450, 3):
         T = walls.flight(k / 30)
         result = mapper.process(walls.stamp(k), walls.see(T, truth, 0.1, rng), walls.CAMERA)
         if result.pose is not None:
-            d = difference(T, result.pose.T_map_camera)
-            errors.append(np.linalg.norm(d[:3]))
-            squares.append(d @ np.linalg.solve(result.pose.covariance, d) / 6.0)
-    return {
-        'pose mm': 1e3 * rms(errors),
-        'NEES': float(np.mean(squares)),
-        'quarantined': len(result.quarantined) if result else 0,
-    }
+            located.append((T, result.pose.T_map_camera, result.pose.covariance))
+    return {**_errors('pose', located), 'quarantined': len(result.quarantined) if result else 0}
 
 
 def uneven_map() -> Figures:
     """Markers surveyed to a millimetre, and between them markers measured by hand to 3 cm."""
-    errors, squares = [], []
+    located = []
     fine, rough = np.diag([0.001**2] * 6), np.diag([0.03**2] * 3 + [0.02**2] * 3)
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -225,12 +219,10 @@ def uneven_map() -> Figures:
         mapper = MarkerMapper(MarkerMapperConfig(mode='localization'), marker_map)
         for k in range(0, 450, 6):
             T = walls.flight(k / 30)
-            result = mapper.process(walls.stamp(k), walls.see(T, truth, 0.1, rng), walls.CAMERA)
-            if result.pose is not None:
-                d = difference(T, result.pose.T_map_camera)
-                errors.append(np.linalg.norm(d[:3]))
-                squares.append(d @ np.linalg.solve(result.pose.covariance, d) / 6.0)
-    return {'pose mm': 1e3 * rms(errors), 'NEES': float(np.mean(squares))}
+            pose = mapper.process(walls.stamp(k), walls.see(T, truth, 0.1, rng), walls.CAMERA).pose
+            if pose is not None:
+                located.append((T, pose.T_map_camera, pose.covariance))
+    return _errors('pose', located)
 
 
 def second_flight() -> Figures:

@@ -8,7 +8,8 @@ from support.small_bag import CAMERA as STRAIGHT
 
 from thermal_fiducial.core.geometry.planar_pose import marker_corners
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
-from thermal_fiducial.core.mapping.candidates import Candidate, MarkerView, Viewpoint
+from thermal_fiducial.core.mapping.candidates import Candidate
+from thermal_fiducial.core.mapping.marker_views import MarkerView, Viewpoint
 
 # What lies far beside the axis a lens with distortion throws farthest.
 CAMERA = replace(STRAIGHT, D=np.array([-0.3, 0.12, 0.0, 0.0, -0.02]))

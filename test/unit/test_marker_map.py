@@ -145,6 +145,19 @@ def test_unusable_rows_are_left_out():
     assert len(result.pose.marker_ids) == len(rows) - 2
 
 
+def test_new_markers_without_a_pose_wait():
+    """Of corners that no square explains the detector knows the ID alone."""
+    rng = np.random.default_rng(3)
+    poses = wall(rng)
+    m = mapper(known(poses, [0]))
+    for k in range(0, 150, 6):
+        rows = see(flight(k / 30), poses, 0.05, rng)
+        for name in ('x', 'y', 'z', 'ax', 'ay', 'az'):
+            rows[name][rows['id'] == 1] = np.nan
+        assert m.process(stamp(k), rows, CAMERA).pose is not None
+    assert sorted(m.map.markers) == [0, 2, 3, 4, 5, 6, 7]
+
+
 def test_a_moved_marker_is_quarantined_and_the_rest_flies_on():
     rng = np.random.default_rng(8)
     poses = wall(rng)

@@ -7,9 +7,9 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import alike_odometry, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.mapping.candidates import Viewpoint
 from thermal_fiducial.core.mapping.keyframes import CameraRig, Displacement, Keyframe, KeyframeStore
 from thermal_fiducial.core.mapping.map_data import MarkerMap
+from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.odometry_prior import growth, PredictedCamera
 from thermal_fiducial.core.mapping.snapshot import prior_poses, Snapshot
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers

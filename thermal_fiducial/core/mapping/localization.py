@@ -23,8 +23,8 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit, INLIER
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
-from thermal_fiducial.core.mapping.candidates import Viewpoint
 from thermal_fiducial.core.mapping.located import Location, Refusal, Reprojected, Sight
+from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
@@ -91,7 +91,7 @@ def _either(frame: '_Frame', found: Location, T_other: FloatArray, prior: FloatA
         return found
     if prior is None:
         covariances = np.stack([pose.covariance, other.pose.covariance])
-        viewpoint = Viewpoint(np.stack([T, T_other]), covariances)
+        viewpoint = Viewpoint(np.stack([T, T_other]), covariances, np.zeros((6, 6)))
         return Refusal(f'planar ambiguity of {_names(frame.sight)} unsettled', viewpoint)
     turns = rotation_angle(prior[:3, :3].T @ np.stack([T, T_other])[:, :3, :3])
     return other if turns[1] < turns[0] else found

@@ -9,8 +9,8 @@ import numpy as np
 from thermal_fiducial.core.error_model import correlated_sum, INCONSISTENT_PX, positive
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise
-from thermal_fiducial.core.mapping.candidates import Viewpoint
 from thermal_fiducial.core.mapping.map_data import MapMarker
+from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.odometry_prior import PredictedCamera
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, marker_branches, Markers
 from thermal_fiducial.core.types import BoolArray, FloatArray

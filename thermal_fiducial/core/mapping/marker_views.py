@@ -1,0 +1,178 @@
+"""A marker's pose fitted to its views, each from a camera whose own pose is uncertain or one of two."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.core.error_model import correlated_sum, SystematicErrors, with_corner_errors
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.reprojection import linearise
+from thermal_fiducial.core.geometry.rigid_fit import Evaluation, minimise
+from thermal_fiducial.core.types import FloatArray, IntArray
+
+# A corner that moves faster in the image than this is hardly before the camera at all [px/m, px/rad].
+_STEEPEST = 1e6
+# How often a fit may change its mind about the cameras' poses.
+_CHOICES = 4
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """Where a camera is, or the two places where it may be."""
+
+    #: (2, 4, 4) twice the same where there is no doubt
+    T_map_camera: FloatArray
+    #: (2, 6, 6) of either, ROS convention: by how much views may differ from each other
+    covariances: FloatArray
+    #: (6, 6) error that all views share (of odometry over a gap): it moves the marker, but no view against another
+    common: FloatArray
+
+    @property
+    def poses(self) -> FloatArray:
+        """The one or two (k, 4, 4) different poses."""
+        return self.T_map_camera if np.any(self.T_map_camera[0] != self.T_map_camera[1]) else self.T_map_camera[:1]
+
+    @classmethod
+    def known(cls, T_map_camera: FloatArray, covariance: FloatArray, common: FloatArray) -> 'Viewpoint':
+        """A camera pose (4, 4) without doubt, by how much its views may differ (6, 6), and what they share (6, 6)."""
+        return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2), common)
+
+
+@dataclass(frozen=True)
+class MarkerView:
+    """A marker in one frame."""
+
+    stamp_ns: int
+    viewpoint: Viewpoint
+    #: (4, 2) [px]
+    corners: FloatArray
+    #: (4, 2, 2) [px^2]
+    corner_covariances: FloatArray
+    #: (2, 4, 4) both branches of T_camera_marker, the better one first
+    branches: FloatArray
+
+
+@dataclass(frozen=True)
+class FittedPoses:
+    """Poses of a marker that fits to n views ended in, the best of the S first."""
+
+    #: (S, 4, 4)
+    T: FloatArray
+    #: (S,) of the residuals, and minus twice the logarithm of the likelihood: comparable whatever their covariances are
+    chi2: FloatArray
+    cost: FloatArray
+    #: (n, 8, 6) derivatives of the best one's whitened residuals by the poses of camera and marker
+    J_camera: FloatArray
+    J_marker: FloatArray
+    #: (n, 6, 6) of its cameras, and the part that they share
+    camera_covariances: FloatArray
+    common: FloatArray
+
+    def covariance(self, noise: float) -> FloatArray:
+        """(6, 6) of the best one: ``noise`` times what the corners promise, and the errors of the cameras' poses."""
+        white = np.linalg.inv(np.einsum('vri,vrj->ij', self.J_marker, self.J_marker))
+        gains = -white @ np.einsum('vri,vrj->vij', self.J_marker, self.J_camera)
+        from_cameras = correlated_sum(gains, self.camera_covariances) + correlated_sum(gains, self.common)
+        return np.asarray(noise * white + from_cameras)
+
+
+@dataclass(frozen=True)
+class _Weights:
+    """Of n views of S markers, as decided from where the markers and their cameras were taken to be."""
+
+    #: (S, n, 8, 8) by which residuals become unit white, and the logarithms (S, n) of their covariances' determinants
+    W: FloatArray
+    log_determinants: FloatArray
+    #: (S, n) minus twice the logarithm of each view's likelihood there
+    costs: FloatArray
+
+
+class MarkerViews:
+    """n views of one marker as arrays."""
+
+    def __init__(self, views: Sequence[MarkerView], size: float, camera: Camera) -> None:
+        self._camera, self._size = camera, size
+        self._corners = np.stack([view.corners for view in views]).reshape(-1, 8)
+        covariances = np.stack([view.corner_covariances for view in views])
+        self._noise = with_corner_errors(covariances, SystematicErrors())
+        self._T_map_camera = np.stack([view.viewpoint.T_map_camera for view in views])
+        self._covariances = np.stack([view.viewpoint.covariances for view in views])
+        self._common = np.stack([view.viewpoint.common for view in views])
+        self._doubtful = any(len(view.viewpoint.poses) > 1 for view in views)
+
+    def fit(self, starts: FloatArray) -> FittedPoses:
+        """The marker from all starts (S, 4, 4); of a camera's two poses the one that suits it better counts."""
+        T, chosen = starts, self._choose(starts)
+        for _ in range(_CHOICES):
+            begun = self._weights(T, chosen)
+            T, chi2 = self._minimised(T, chosen, begun)
+            used, chosen = chosen, self._choose(T)
+            if np.array_equal(used, chosen):
+                break
+        cost = chi2 + np.sum(begun.log_determinants, axis=-1)
+        order = np.argsort(cost, kind='stable')
+        best, T_map_camera, covariances = order[0], *self._cameras(used)
+        _, J_camera, J_marker = self._linearised(T, T_map_camera)
+        W = begun.W[best]
+        return FittedPoses(
+            T[order], chi2[order], cost[order],
+            W @ J_camera[best], W @ J_marker[best], covariances[best], self._common,
+        )  # fmt: skip
+
+    def _choose(self, T: FloatArray) -> IntArray:
+        """Which of its two camera poses suits each view, (S, n), for a marker at T."""
+        first = np.zeros((len(T), len(self._corners)), dtype=np.int64)
+        if not self._doubtful:
+            return first
+        costs = [self._weights(T, choice).costs for choice in (first, first + 1)]
+        return np.asarray(np.argmin(np.where(np.isfinite(costs), costs, np.inf), axis=0))
+
+    def _cameras(self, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
+        """The chosen (S, n) of each camera's poses (S, n, 4, 4), and their covariances (S, n, 6, 6)."""
+        views = np.arange(chosen.shape[1])
+        return self._T_map_camera[views, chosen], self._covariances[views, chosen]
+
+    def _linearised(self, T: FloatArray, T_map_camera: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Residuals (S, n, 8) [px] of markers at T, and derivatives (S, n, 8, 6) by the cameras and by the marker."""
+        shape = *T_map_camera.shape[:2], 8
+        T_map_marker = np.broadcast_to(T[:, None], T_map_camera.shape).reshape(-1, 4, 4)
+        sizes = np.full(len(T_map_marker), self._size)
+        uv, J_camera, J_marker = linearise(self._camera, T_map_camera.reshape(-1, 4, 4), T_map_marker, sizes)
+        return self._corners - uv.reshape(shape), J_camera.reshape(*shape, 6), J_marker.reshape(*shape, 6)
+
+    def _weights(self, T: FloatArray, chosen: IntArray) -> _Weights:
+        """Of the views of markers at T (S, 4, 4) from the chosen (S, n) of each camera's poses.
+
+        A residual comes of the corners' noise, of the systematic part, and of the camera's own pose, which moves all
+        four corners together. What cannot be, a corner in the plane of the camera, has an infinite determinant.
+        """
+        T_map_camera, covariances = self._cameras(chosen)
+        r, J_camera, _ = self._linearised(T, T_map_camera)
+        possible = np.all(np.abs(J_camera) < _STEEPEST, axis=(-1, -2))
+        J_sound = np.where(possible[..., None, None], J_camera, 0.0)
+        C = J_sound @ covariances @ np.swapaxes(J_sound, -1, -2)
+        for corner in range(4):
+            both = slice(2 * corner, 2 * corner + 2)
+            C[..., both, both] += self._noise[:, corner]
+        L = np.linalg.cholesky(C)
+        log_determinants = 2.0 * np.sum(np.log(np.einsum('...ii->...i', L)), axis=-1)
+        log_determinants = np.where(possible, log_determinants, np.inf)
+        W = np.linalg.inv(L)
+        r = W @ r[..., None]
+        return _Weights(W, log_determinants, np.sum(r * r, axis=(-1, -2)) + log_determinants)
+
+    def _minimised(self, T: FloatArray, chosen: IntArray, begun: _Weights) -> tuple[FloatArray, FloatArray]:
+        """Poses (S, 4, 4) from starts, and their chi squares (S,), inf where there is none."""
+        T_map_camera, _ = self._cameras(chosen)
+
+        def evaluated(T: FloatArray) -> Evaluation:
+            r, _, J = self._linearised(T, T_map_camera)
+            r, J = (begun.W @ r[..., None]).reshape(len(T), -1, 1), (begun.W @ J).reshape(len(T), -1, 6)
+            J_transposed, chi2 = np.swapaxes(J, -1, -2), np.sum(r * r, axis=(1, 2))
+            # Residuals are measured minus predicted: the gradient is that of their squares.
+            return np.where(np.isfinite(chi2), chi2, np.inf), -(J_transposed @ r)[..., 0], J_transposed @ J
+
+        possible = np.all(np.isfinite(begun.log_determinants), axis=-1)
+        T, chi2, _ = minimise(T, evaluated, alternatives=len(T))
+        return T, np.where(possible, chi2, np.inf)
