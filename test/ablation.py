@@ -170,10 +170,6 @@ def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
     return _place('corners.squares:Squared')(seen, covariance, none, none, none)
 
 
-def _none_of(first: Any, *_: Any, **__: Any) -> Any:
-    return np.zeros(len(first), dtype=bool)
-
-
 def _no_covariance(_: Any, corners_px: Any, *__: Any) -> Any:
     return np.zeros((len(corners_px), 4, 2, 2))
 
@@ -196,7 +192,7 @@ MECHANISMS = {
     ),
     'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
-    'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'refining:worth_deblurring': _none_of}),
+    'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'refining:_OF_CLEAR': (6, np.inf)}),
     'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(
         'fast, 8 K, blind', ('lag:model_error',), {'refining:model_error': _no_covariance}

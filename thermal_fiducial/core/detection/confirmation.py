@@ -22,14 +22,12 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
 # Cells at least this wide are read at half the resolution, where a pixel has half the noise and less blur.
 _WIDE_CELL_PX = 8.0
-# Correlation at the refined corners: of a marker with sharp sides, and (less when faint) of one with softer sides.
+# Correlation at the refined corners.
 _SIMILAR = 0.82
-_CLEARLY_SIMILAR = 0.9
-_FAINT, _PER_CNR = 0.7, 0.07
-# The same of a marker in a picture for a display, which shows what is none: there textures of everyday things look like
-# patterns of few bits, at contrasts at which a marker is all but free of noise. Of 19 false positives of four such
-# dictionaries in 100 pictures the best had 0.90.
-_SIMILAR_IN_PICTURE = 0.92
+# The same in a picture for a display, less of a faint marker. Textures of everyday things look like patterns of few
+# bits there, at contrasts at which a marker is all but free of noise. Of 19 false positives of four such dictionaries
+# in 100 pictures the best had 0.90.
+_SIMILAR_IN_PICTURE, _FAINT, _PER_CNR = 0.92, 0.7, 0.07
 # Share of a marker's isolation by which it must stand out among all others. That speaks for itself where markers differ
 # in so many bits that this many wrong ones can be corrected; noise and clutter often look a little like one of the few
 # patterns of a 4 x 4 dictionary.
@@ -40,7 +38,6 @@ _MANY_BITS = 3
 _WHITE = (0.4, 1.75)
 # Corner deviation [px] times contrast over noise times root of the side [px]: 4 to 7 for four clean sides.
 _SHARP = 7.5
-_SOFT = 12.0
 # Contrast over noise beyond which corners deviate by what optics and plates really are, and not by noise.
 _NOISY = 8.0
 # Pixels along a side that the refinement uses of a long one.
@@ -81,11 +78,9 @@ def confirmed(
     side = np.linalg.norm(refined.corners_px[:, 2] - refined.corners_px[:, 0], axis=-1) / np.sqrt(2.0)
     deviation = np.sort(np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1)), axis=1)[:, 2]
     softness = deviation * np.minimum(contrast, _NOISY) * np.sqrt(np.minimum(side, _SEEN_PX))
-    sharp = softness <= _SHARP
-    soft = (softness <= _SOFT) & (similarity >= np.minimum(_CLEARLY_SIMILAR, _FAINT + _PER_CNR * contrast))
     known = (similarity >= config.guided_min_correlation) & (similarity - reading.runner_up >= config.guided_min_margin)
     there = np.abs(refined.corners_px - found.corners_px).max(axis=(1, 2)) < 0.7 * side / decoder.cells
-    return np.asarray(same & ((found.expected & known & there) | (alike & (sharp | soft))))
+    return np.asarray(same & ((found.expected & known & there) | (alike & (softness <= _SHARP))))
 
 
 def _read(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:

@@ -102,7 +102,7 @@ class DisplayedSides:
         blur = blurs(sides.normal[self._bits // 2], blur_px, refined.view.spread)
         value, slope, weight = model(sides, self._behind[ids], blur)
         weight *= self._white[ids].reshape(-1, self._bits).T
-        counts = sides.counts(refined.view.image, refined.view.lag_tails)
+        counts = sides.counts(refined.view.image, refined.view.to_tails)
         return measure(counts, (value, slope, weight), REACHED * blur[0])
 
 

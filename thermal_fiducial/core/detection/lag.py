@@ -13,17 +13,16 @@ is as far from the image as the velocity of tau + m / 2 ago has carried it.
 """
 
 import math
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from thermal_fiducial.core.geometry.planar_pose import cross_in_plane
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
 
-#: Interpolation of lag tails where edges are measured: a linear one blurs them more than the image that they are taken
-#: from, a cubic one displaces them by up to 0.04 px.
-EXACT = cv2.INTER_LANCZOS4
+# Interpolation of lag tails where edges are measured: a linear one blurs them more than the image that they are taken
+# from, a cubic one displaces them by up to 0.04 px.
+_EXACT = cv2.INTER_LANCZOS4
 # Pixels round a marker in which its edges and what surrounds it are looked at: 10 across its sides at most, and two
 # that they may be off.
 _MARGIN_PX = 12
@@ -97,47 +96,31 @@ def common_error(
     return np.asarray(covariance * np.minimum(shown / np.maximum(variance, 1e-12), 1.0)[..., None, None])
 
 
-class LagTails(NamedTuple):
-    """Where the image shows what pixels round N markers saw one lag tail's age ago, to be taken out of them."""
+def without_lag_tails(counts: Float32Array, pixel: IntArray, image: Float32Array, to_tails: FloatArray) -> Float32Array:
+    """``counts`` (..., N Q) of pixels of the flat image, as many of each marker, without their lag tails.
 
-    #: (N, 2, 3) affine maps of pixels to their lag tails
-    maps: FloatArray
-    #: (N,) of which markers they are taken out
-    unwanted: BoolArray
+    Of a few columns of pixels it takes a fourth of the time of the whole windows round the markers.
 
-    def only(self, keep: BoolArray | IntArray) -> 'LagTails':
-        """Those of the markers ``keep``."""
-        return LagTails(self.maps[keep], self.unwanted[keep])
-
-    def taken_out(self, counts: Float32Array, pixel: IntArray, image: Float32Array) -> Float32Array:
-        """``counts`` (..., N Q) of pixels of the flat image, as many of each marker, without their lag tails.
-
-        Of a few columns of pixels it takes a fourth of the time of the whole windows round the markers.
-        """
-        if not self.unwanted.any():
-            return counts
-        shape = (-1, len(self.maps), counts.shape[-1] // len(self.maps))
-        mine = pixel.reshape(shape)[:, self.unwanted].astype(np.int32)
-        v, u = (places.astype(np.float32) for places in np.divmod(mine, np.int32(image.shape[1])))
-        to_tail = self.maps[self.unwanted].astype(np.float32)[..., None]
-        to_u, to_v = (
-            (to_tail[:, row, 0] * u + to_tail[:, row, 1] * v + to_tail[:, row, 2]).reshape(len(mine), -1)
-            for row in (0, 1)
-        )
-        lag_tail = cv2.remap(image, to_u, to_v, EXACT, borderMode=cv2.BORDER_REPLICATE).reshape(mine.shape)
-        freed = counts.reshape(shape).copy()
-        freed[:, self.unwanted] += np.float32(_GAIN - 1.0) * (freed[:, self.unwanted] - lag_tail)
-        return freed.reshape(counts.shape)
+    Parameters
+    ----------
+    to_tails : (N, 2, 3) affine maps of pixels to where the image shows what these saw one lag tail's age ago
+    """
+    by_marker = pixel.reshape(-1, len(to_tails), pixel.shape[-1] // len(to_tails)).astype(np.int32)
+    v, u = (places.astype(np.float32) for places in np.divmod(by_marker, np.int32(image.shape[1])))
+    maps = to_tails.astype(np.float32)[..., None]
+    to_u, to_v = (
+        (maps[:, row, 0] * u + maps[:, row, 1] * v + maps[:, row, 2]).reshape(len(by_marker), -1) for row in (0, 1)
+    )
+    lag_tail = cv2.remap(image, to_u, to_v, _EXACT, borderMode=cv2.BORDER_REPLICATE).reshape(counts.shape)
+    return np.asarray(counts + np.float32(_GAIN - 1.0) * (counts - lag_tail))
 
 
-def markers_deblurred(
-    image: Float32Array, corners_px: FloatArray, maps: FloatArray, interpolation: int = cv2.INTER_CUBIC
-) -> Float32Array:
+def markers_deblurred(image: Float32Array, corners_px: FloatArray, maps: FloatArray) -> Float32Array:
     """``image`` with the windows round N markers with corners (N, 4, 2) freed of lag tails, by ``maps`` to these.
 
     To read cells a cubic interpolation will do, which takes a fifth of the time of an exact one.
     """
-    result, flags = image.copy(), interpolation | cv2.WARP_INVERSE_MAP
+    result, flags = image.copy(), cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     height, width = image.shape
     finite = np.isfinite(corners_px).all(axis=(1, 2)) & np.isfinite(maps).all(axis=(1, 2))
     corners_px, maps = corners_px[finite], maps[finite]

@@ -5,8 +5,7 @@ between its cells that are in view, inside and along its sides, then show its po
 outside the image as well.
 """
 
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,13 +13,11 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corner_estimates import DISPLACED
 from thermal_fiducial.core.detection.corners.grid import (
     adjusted,
-    deblurred_layer,
     grid_edges,
-    GridEdges,
     Layer,
+    layer_of,
     on_marker,
     places_of_points,
-    plain_layer,
     pose_jacobian,
     PoseFit,
 )
@@ -50,10 +47,8 @@ _SIMILAR, _MARGIN, _EVIDENCE = 0.8, 0.5, 25.0
 _THERE, _HINT = 0.95, 0.55
 # Least share of the edges in view that show a step like the others', and agree with the pose.
 _SHOWN, _AGREEING = 0.7, 0.6
-# Steps on the coarse layer, and one along all edges after which there need be no other [px]; those on the fine layer,
-# the first with so much more blur, to catch edges from farther away, and the last step of a pose that has settled [px].
-_COARSE_STEPS, _NEAR_PX = 3, 0.3
-_STEPS, _WIDE, _SETTLED_PX = 8, 1.5, 0.1
+# Adjustments on the fine layer at most, and the last step of a pose that has settled [px].
+_STEPS, _SETTLED_PX = 9, 0.1
 # A corner that is known no better shows nothing, nor one so far outside the image, in image widths [px].
 _KNOWN_PX, _OUTSIDE = 8.0, 1.0
 # Standard deviation of what displaces a corner of a marker's window, whatever the edges say [px].
@@ -131,18 +126,23 @@ class PartialMarkerSearch:
     ) -> RefinedCorners | None:
         points = on_marker(self._visible.places, marker.size)
         factor = int(2 ** np.clip(np.floor(np.log2(marker.cell_px / _COARSE_PX)), 0, 3))
-        coarse = plain_layer(frame, marker.seen(), config.blur_px, factor)
+        coarse = layer_of(frame, marker.seen(), config.blur_px, factor)
         T = self._moved(marker, points, coarse, marker.cell_px / factor)
         if T is None:
             return None
         pattern = grid_edges(self._bits[marker.id])
-        rough = _settled(T, marker.size, pattern, [coarse] * _COARSE_STEPS, _NEAR_PX)
+        rough = adjusted(T, marker.size, pattern, coarse)
         if rough is None or not self._recognised(rough, marker, coarse, allowed, frame.noise, config):
             return None
-        fine = deblurred_layer(frame, marker.seen(), rough.contrast, config.blur_px, self._cells)
-        layers = [replace(fine, blur=_WIDE * fine.blur), *[fine] * _STEPS]
-        fit = _settled(rough.T_camera_marker, marker.size, pattern, layers, _SETTLED_PX)
-        if fit is None or fit.moved_px > _SETTLED_PX or not _agrees(fit):
+        fine, fit = layer_of(frame, marker.seen(), config.blur_px), rough
+        for _ in range(_STEPS):
+            step = adjusted(fit.T_camera_marker, marker.size, pattern, fine)
+            if step is None:
+                return None
+            fit = step
+            if fit.moved_px < _SETTLED_PX:
+                break
+        if fit.moved_px > _SETTLED_PX or not _agrees(fit):
             return None
         return _corners(frame, marker, fit, self._cells)
 
@@ -209,16 +209,6 @@ class PartialMarkerSearch:
             and likeness.evidence >= _EVIDENCE
             and likeness.contrast * np.sign(rough.contrast) >= config.guided_min_contrast * noise
         )
-
-
-def _settled(T: FloatArray, size: float, pattern: GridEdges, layers: list[Layer], short_px: float) -> PoseFit | None:
-    """A pose adjusted on one layer after the other, until on the last a step is short."""
-    fit = adjusted(T, size, pattern, layers[0])
-    for before, layer in pairwise(layers):
-        if fit is None or (before is layers[-1] and fit.moved_px < short_px):
-            break
-        fit = adjusted(fit.T_camera_marker, size, pattern, layer)
-    return fit
 
 
 def _agrees(fit: PoseFit) -> bool:

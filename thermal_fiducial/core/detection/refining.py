@@ -23,7 +23,6 @@ from thermal_fiducial.core.detection.known_markers import Found
 from thermal_fiducial.core.detection.lag import (
     common_error,
     lag_tail_maps,
-    LagTails,
     markers_deblurred,
     model_error,
     REMAINING,
@@ -35,17 +34,11 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 
 #: Blur by lag below which the shape of an edge doesn't change [px].
 BLUR_THAT_MATTERS_PX = 0.4
-# What both ways to measure blurred corners cost: deblurring adds noise, in pixels times contrast over noise times root
-# of the side; without it the tail of the lag passes for a symmetric blur, which displaces corners by so much of the
-# square of the motion blur over a cell.
-_NOISE_OF_DEBLURRING, _COST_OF_BLUR = 6.5, 0.22
 #: Contrast over noise below which a marker is faint; a clearer one shows at full and at half the resolution.
 CLEAR_CNR = 20.0
-# A clear marker is deblurred whatever its motion, as its corners are so good that even a short tail shows in what they
-# have in common; but not where there is hardly any [px].
-_HARDLY_BLURRED_PX = 0.2
-# Columns of pixels used of a cell; all of a faint marker's count.
-_COLUMNS, _COLUMNS_FAINT = 6, 12
+# Columns of pixels used of a cell, all of a faint marker's; and blur [px] up to which the lag tail stays in the frame,
+# where the model takes it for a symmetric one: among faint markers that costs less than the noise of taking it out.
+_OF_CLEAR, _OF_FAINT = (6, 0.2), (12, 1.0)
 _ROUNDS = 2
 _NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
 
@@ -54,9 +47,9 @@ _NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
 class DeblurredView:
     """A frame in which the motion blur of N markers is short."""
 
-    #: as it is, and what is to be taken out of it
     image: Float32Array
-    lag_tails: LagTails | None
+    #: (N, 2, 3) affine maps of pixels to their lag tails, which are to be taken out; None: there is hardly any blur
+    to_tails: FloatArray | None
     #: (N, 4, 2) where the corners appear in the view, off their places at the stamp [px]
     shift: FloatArray
     #: (N, 4, 2) how much of the motion blur's shift is taken out
@@ -66,15 +59,14 @@ class DeblurredView:
 
     def only(self, keep: BoolArray) -> 'DeblurredView':
         """That of the markers ``keep`` (N,)."""
-        tails = None if self.lag_tails is None else self.lag_tails.only(keep)
-        return DeblurredView(self.image, tails, self.shift[keep], self.removed[keep], self.spread[keep])
+        to_tails = None if self.to_tails is None else self.to_tails[keep]
+        return DeblurredView(self.image, to_tails, self.shift[keep], self.removed[keep], self.spread[keep])
 
     def round_markers(self, corners_px: FloatArray, which: IntArray) -> Float32Array:
         """The image freed of lag tails round those of the markers ``which``, with corners (N, 4, 2)."""
-        if self.lag_tails is None or not self.lag_tails.unwanted[which].any():
+        if self.to_tails is None:
             return self.image
-        which = which[self.lag_tails.unwanted[which]]
-        return markers_deblurred(self.image, corners_px[which], self.lag_tails.maps[which])
+        return markers_deblurred(self.image, corners_px[which], self.to_tails[which])
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,36 +118,20 @@ class Refiner:
         places : where they roughly are at the stamp
         track : the frames before, which with the corners give the twist
         """
-        cell = sides_px(found.corners_px) / self._behind.shape[2]
-        columns = _COLUMNS if np.abs(found.cnr).min() > CLEAR_CNR else _COLUMNS_FAINT
+        columns, hardly = _OF_CLEAR if np.abs(found.cnr).min() > CLEAR_CNR else _OF_FAINT
         twist = frame.twist
         for _ in range(_ROUNDS):
-            view = self._view(frame, places, twist, cell, found.cnr)
+            view = _view(frame, places, twist, hardly)
             start = places.at.moved(view.shift, frame.camera)
             behind = self._behind[found.ids]
             blur = config.blur_px, view.spread
-            seen = refine_corners(view.image, start, frame.camera, behind, *blur, columns, view.lag_tails)
+            seen = refine_corners(view.image, start, frame.camera, behind, *blur, columns, view.to_tails)
             refinement = self._at_stamp(frame, found, places, view, seen, twist, track)
             change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)
             if refinement.twist is None or change.max(initial=0.0) < BLUR_THAT_MATTERS_PX:
                 break
             twist, places = refinement.twist, refinement.places
         return refinement
-
-    def _view(
-        self, frame: Frame, places: Places, twist: Twist | None, cell: FloatArray, cnr: FloatArray
-    ) -> DeblurredView:
-        """The frame with the known motion blur of all markers, taken out where that is worth its noise."""
-        if twist is None:
-            lag_blur = old = np.zeros_like(places.at.px)
-        else:
-            lag_blur, old = places.lag_blur(twist, frame.lag), lag_tail(places, twist, frame)
-        mean = 0.25 * lag_blur.sum(axis=1)
-        deblur = worth_deblurring((mean * mean).sum(axis=1), cell, self._behind.shape[2], cnr)
-        removed = (1.0 - REMAINING) * old * deblur[:, None, None]
-        shift = lag_blur - removed + rolling_displacement(places, twist, frame)
-        tails = LagTails(lag_tail_maps(places.at.px + shift, old), deblur) if deblur.any() else None
-        return DeblurredView(frame.image, tails, shift, removed, mean * np.where(deblur, SPREAD, 1.0)[:, None])
 
     def _at_stamp(
         self,
@@ -197,11 +173,16 @@ class Refiner:
         return common_error(since[..., None, None] * places.flow, twist.covariance_ago(frame.lag), unsharpness, cell)
 
 
-def worth_deblurring(square: FloatArray, cell: FloatArray, cells: int, cnr: FloatArray) -> BoolArray:
-    """For which markers with squares of the blur (N,) and cells (N,) [px] it costs more than deblurring's noise."""
-    systematic, noise = _COST_OF_BLUR * square / cell, _NOISE_OF_DEBLURRING / np.sqrt(cells * cell)
-    worth = (np.abs(cnr) > CLEAR_CNR) | (systematic * np.abs(cnr) > noise)
-    return np.asarray(worth & (square > _HARDLY_BLURRED_PX**2))
+def _view(frame: Frame, places: Places, twist: Twist | None, hardly_px: float) -> DeblurredView:
+    """The frame with the known motion blur of all markers, to be taken out where it matters."""
+    lag_blur = np.zeros_like(places.at.px) if twist is None else places.lag_blur(twist, frame.lag)
+    mean, rolling = 0.25 * lag_blur.sum(axis=1), rolling_displacement(places, twist, frame)
+    if twist is None or (mean * mean).sum(axis=1).max() <= hardly_px**2:
+        return DeblurredView(frame.image, None, lag_blur + rolling, np.zeros_like(lag_blur), mean)
+    tail = lag_tail(places, twist, frame)
+    removed = (1.0 - REMAINING) * tail
+    shift = lag_blur - removed + rolling
+    return DeblurredView(frame.image, lag_tail_maps(places.at.px + shift, tail), shift, removed, SPREAD * mean)
 
 
 def sides_px(corners: FloatArray) -> FloatArray:

@@ -16,7 +16,6 @@ from thermal_fiducial.core.detection.twist import (
     corrected,
     growth,
     interaction,
-    joined,
     line_through,
     plausible,
     RANDOM,
@@ -114,16 +113,14 @@ class MotionTrack:
         odometry_ns : the frame's stamp in their clock, if that is not the camera's
         clock_std_s : standard deviation of that stamp [s]
         """
-        dt = self._since(stamp_ns)
-        before = None
+        odometry_ns = stamp_ns if odometry_ns is None else odometry_ns
+        if len(odometry) >= _ENOUGH_STATES:
+            return line_through(odometry_ns, odometry, self.from_body, clock_std_s)
+        dt, before = self._since(stamp_ns), None
         # Markers show that the twist holds: one that went wrong would hide them from then on.
         saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_S * 1e9
         if self.twist is not None and dt is not None and saw_lately:
             before = carried(self.twist, dt)
-        odometry_ns = stamp_ns if odometry_ns is None else odometry_ns
-        if len(odometry) >= _ENOUGH_STATES:
-            observed = line_through(odometry_ns, odometry, self.from_body, clock_std_s)
-            return joined(before or unknown_twist(), observed)
         if len(odometry) == 0 or abs(odometry_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
             return before
         seen, later = transferred(odometry[-1], self.from_body), (odometry[-1].stamp_ns - odometry_ns) * 1e-9

@@ -137,14 +137,6 @@ def line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatArr
     return Twist(values.sum(axis=0) / len(t) - middle * acceleration, covariance, acceleration)
 
 
-def joined(first: Twist, second: Twist) -> Twist:
-    """What two independent estimates show together: of covariances P and R the gain P inv(P + R)."""
-    gain = np.linalg.solve(first.covariance + second.covariance, first.covariance).T
-    change = gain @ np.concatenate([second.value - first.value, second.acceleration - first.acceleration])
-    P = gain @ second.covariance
-    return Twist(first.value + change[:6], 0.5 * (P + P.T), first.acceleration + change[6:])
-
-
 def corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later: float) -> Twist:
     """Twist when its value so much later is known by ``information`` (6, 6), times the value ``weighted`` (6,).
 

@@ -22,10 +22,7 @@ from thermal_fiducial.core.detection.corners.segments import (
     SCATTER_COUNTS,
 )
 from thermal_fiducial.core.detection.corners.sides import blurred_step, blurs, columns_across, half_width, NODES, Sides
-from thermal_fiducial.core.detection.frame import Frame, lag_tail, Places, rolling_displacement
-from thermal_fiducial.core.detection.lag import EXACT, LAG_TAIL_AGE, lag_tail_maps, markers_deblurred, REMAINING, SPREAD
-from thermal_fiducial.core.detection.refining import sides_px, worth_deblurring
-from thermal_fiducial.core.detection.twist import interaction
+from thermal_fiducial.core.detection.frame import Frame, Places, rolling_displacement
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
@@ -220,57 +217,25 @@ def _solved(
     )
 
 
-def plain_layer(frame: Frame, window: FloatArray, blur_px: float, factor: int) -> Layer:
+def layer_of(frame: Frame, window: FloatArray, blur_px: float, factor: int = 1) -> Layer:
     """The frame at one resolution in ``factor``, as blurred as it is round a ``window`` (4, 3) in the camera."""
     camera = _coarser(frame.camera, factor)
-    image = frame.image
+    image, lag_blur = frame.image, np.zeros(2)
     if factor > 1:
         cropped = image[: camera.height * factor, : camera.width * factor]
         image = np.asarray(cv2.resize(cropped, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
     blur = math.hypot(blur_px / factor, math.sqrt((1.0 - 1.0 / factor**2) / 12.0))
+    if frame.twist is not None:
+        lag_blur = places_of_points(window, frame.camera).lag_blur(frame.twist, frame.lag)[0].mean(axis=0) / factor
 
     def displacement(points: FloatArray) -> FloatArray:
-        return _displaced(frame, points, 0.0) / factor
+        if frame.twist is None:
+            return np.zeros((len(points), 2))
+        places = places_of_points(points, frame.camera)
+        shift = places.lag_blur(frame.twist, frame.lag) + rolling_displacement(places, frame.twist, frame)
+        return np.asarray(shift[0] / factor)
 
-    return Layer(image, camera, displacement, blur, _lag_blur(frame, window) / factor)
-
-
-def deblurred_layer(frame: Frame, window: FloatArray, contrast: float, blur_px: float, cells: int) -> Layer:
-    """The frame as it is; without old lag tails round the window (4, 3), where that is worth its noise."""
-    places, twist = places_of_points(window, frame.camera), frame.twist
-    mean = _lag_blur(frame, window)
-    cnr = np.array([contrast / frame.noise])
-    cell = sides_px(places.at.px) / cells
-    if twist is None or not worth_deblurring(np.array([mean @ mean]), cell, cells, cnr)[0]:
-        return plain_layer(frame, window, blur_px, 1)
-    shown = places.at.px + _displaced(frame, window, 1.0 - REMAINING)
-    image = markers_deblurred(frame.image, shown, lag_tail_maps(shown, lag_tail(places, twist, frame)), EXACT)
-
-    def displacement(points: FloatArray) -> FloatArray:
-        return _displaced(frame, points, 1.0 - REMAINING)
-
-    return Layer(image, frame.camera, displacement, blur_px, SPREAD * mean)
-
-
-def _displaced(frame: Frame, points: FloatArray, removed: float) -> FloatArray:
-    """By how much points (P, 3) in the camera appear displaced (P, 2) [px], such a share of lag tails taken out."""
-    twist, lag = frame.twist, frame.lag
-    if twist is None:
-        return np.zeros((len(points), 2))
-    depth = np.maximum(points[:, 2], _LEAST_DEPTH)
-    x = points[:, :2] / depth[:, None]
-    back = -lag * (twist.ago(lag) - removed * twist.ago(LAG_TAIL_AGE * lag))
-    shift = (frame.camera.distort_linearised(x)[1] @ (interaction(x, depth) @ back)[..., None])[..., 0]
-    if frame.readout == 0.0:
-        return np.asarray(shift)
-    return np.asarray(shift + rolling_displacement(places_of_points(points, frame.camera), twist, frame)[0])
-
-
-def _lag_blur(frame: Frame, window: FloatArray) -> FloatArray:
-    """Mean motion blur (2,) [px] of what is seen of a marker, whose window is (4, 3) in the camera."""
-    if frame.twist is None:
-        return np.zeros(2)
-    return np.asarray(places_of_points(window, frame.camera).lag_blur(frame.twist, frame.lag)[0].mean(axis=0))
+    return Layer(image, camera, displacement, blur, lag_blur)
 
 
 def _coarser(camera: Camera, factor: int) -> Camera:

@@ -11,7 +11,6 @@ import numpy as np
 
 from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED
 from thermal_fiducial.core.detection.corners.sides import blurs, half_width, model, sides_of
-from thermal_fiducial.core.detection.lag import LagTails
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
@@ -66,7 +65,7 @@ def refine_corners(
     blur_px: float,
     lag_blur_px: FloatArray | None = None,
     columns: int = 6,
-    lag_tails: LagTails | None = None,
+    to_tails: FloatArray | None = None,
 ) -> RefinedCorners:
     """Corners of N markers, refined.
 
@@ -78,16 +77,16 @@ def refine_corners(
     blur_px : standard deviation of optics and pixel
     lag_blur_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
     columns : of pixels, in a segment
-    lag_tails : to be taken out of the image; none when left out
+    to_tails : (N, 2, 3) maps of pixels to lag tails that are to be taken out; none when left out
     """
     lag_blur = np.zeros((len(corners.px), 2)) if lag_blur_px is None else lag_blur_px
-    found, step = _pass(image, corners, camera, behind, blur_px, lag_blur, columns, lag_tails)
+    found, step = _pass(image, corners, camera, behind, blur_px, lag_blur, columns, to_tails)
     which = np.arange(len(step))
     for _ in range(_PASSES - 1):
         which = which[step > np.where(found.doubt[which] > 0.0, _STILL_PX, _SETTLED_PX)]
         if len(which) == 0:
             break
-        tails = None if lag_tails is None else lag_tails.only(which)
+        tails = None if to_tails is None else to_tails[which]
         start = corners.only(which).moved(found.corners_px[which] - corners.px[which], camera)
         again, step = _pass(image, start, camera, behind[which], blur_px, lag_blur[which], columns, tails)
         found = found.with_others(which, again)
@@ -102,14 +101,14 @@ def _pass(
     blur_px: float,
     lag_blur: FloatArray,
     columns: int,
-    lag_tails: LagTails | None,
+    to_tails: FloatArray | None,
 ) -> tuple[RefinedCorners, FloatArray]:
     """Where one linearised adjustment moves the corners, and the longest step (N,) of each marker."""
     cells = behind.shape[2]
     half = half_width(math.hypot(blur_px, math.sqrt(float((lag_blur * lag_blur).sum(axis=1).max()))))
     sides = sides_of(start.x, camera, image.shape, cells, columns, half)
     blur = blurs(sides.normal[cells // 2], blur_px, lag_blur)
-    segments = measure(sides.counts(image, lag_tails), model(sides, behind, blur), REACHED * blur[0])
+    segments = measure(sides.counts(image, to_tails), model(sides, behind, blur), REACHED * blur[0])
     shift, covariances, doubt = adjust(sides, segments, _PRIOR_PX, start)
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]

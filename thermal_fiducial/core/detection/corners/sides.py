@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.lag import LagTails
+from thermal_fiducial.core.detection.lag import without_lag_tails
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
@@ -58,10 +58,10 @@ class Sides:
     #: (E,) length [px]
     along: FloatArray
 
-    def counts(self, image: Float32Array, lag_tails: LagTails | None = None) -> Float32Array:
-        """Of the pixels (M, C, m, E), without the ``lag_tails`` of N markers, if there are any."""
+    def counts(self, image: Float32Array, to_tails: FloatArray | None = None) -> Float32Array:
+        """Of the pixels (M, C, m, E), without lag tails where maps ``to_tails`` (N, 2, 3) say where these are."""
         counts = image.ravel().take(self.pixel, mode='clip')
-        return counts if lag_tails is None else lag_tails.taken_out(counts, self.pixel, image)
+        return counts if to_tails is None else without_lag_tails(counts, self.pixel, image, to_tails)
 
 
 def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, columns: int, half: int) -> Sides:
