@@ -88,7 +88,7 @@ class LensFit:
     def covariance(self, camera: Camera, T: FloatArray) -> FloatArray:
         """Of fx fy cx cy and all coefficients, those held included, with the noise that the residuals show."""
         free, self._free = self._free, np.arange(len(self._prior))
-        information, _ = self._banded_equations(camera, T, np.inf, 0.0)
+        information, _ = self._normal_equations(camera, T, np.inf, 0.0)
         self._free = free
         error = self.error(camera, T)
         variance = float(np.sum(error**2)) / max(1, error.size - len(information))
@@ -132,7 +132,7 @@ class LensFit:
         noise = self._noise(camera, T)
         cost, damping = self._cost(camera, T, noise), 1e-3
         for _ in range(_MAX_STEPS):
-            information, gradient = self._banded_equations(camera, T, _HUBER * noise, noise)
+            information, gradient = self._normal_equations(camera, T, _HUBER * noise, noise)
             while damping < _HOPELESS:
                 damped = information + damping * np.diag(np.diag(information) + 1e-12)
                 moved = self.moved(camera, T, -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64))
@@ -155,7 +155,7 @@ class LensFit:
         misfit = float(np.sum(np.where(size <= limit, 0.5 * size**2, limit * (size - 0.5 * limit))))
         return misfit + 0.5 * noise**2 * float(self._prior[self._free] @ camera_parameters(camera)[self._free] ** 2)
 
-    def _banded_equations(
+    def _normal_equations(
         self, camera: Camera, T: FloatArray, limit: float, noise: float
     ) -> tuple[FloatArray, FloatArray]:
         error = self.error(camera, T)
