@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 
+from support.lens_planes import plane_points
 from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -35,12 +36,10 @@ def draw(camera, grid, T, size=0.3, samples=4, blur=BLUR):
     # Strips of rows bound the lag tail.
     for first in range(0, camera.height, 32):
         v = rows[first * samples : (first + 32) * samples]
-        x = camera.normalise(np.stack(np.meshgrid(fine, v), axis=-1))
-        rays = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
-        on_plane = se3.apply(se3.inverse(T), rays * (T[:3, 2] @ T[:3, 3] / (rays @ T[:3, 2]))[..., None])
+        x, y = plane_points(camera, T, fine, v)
         cells = len(grid) - 2
-        column = np.clip(np.floor((on_plane[..., 0] / size + 0.5) * cells) + 1, 0, cells + 1).astype(int)
-        row = np.clip(np.floor((0.5 - on_plane[..., 1] / size) * cells) + 1, 0, cells + 1).astype(int)
+        column = np.clip(np.floor((x / size + 0.5) * cells) + 1, 0, cells + 1).astype(int)
+        row = np.clip(np.floor((0.5 - y / size) * cells) + 1, 0, cells + 1).astype(int)
         shares = grid[row, column].reshape(len(v) // samples, samples, camera.width, samples)
         image[first : first + 32] = shares.mean(axis=(1, 3))
     return cv2.GaussianBlur(image, (0, 0), blur) if blur > 0.0 else image

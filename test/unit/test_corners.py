@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from support.lens_planes import plane_points
 
 from thermal_fiducial.core.detection.corners.refinement import refine_corners
 from thermal_fiducial.core.detection.corners.sides import edges_behind
@@ -36,14 +37,12 @@ def draw(camera, marker_id, T, size, contrast=200.0, around=1.0):
     high = np.minimum(np.ceil(corners.max(axis=0)).astype(int) + 13, (camera.width, camera.height))
     u = low[0] + (np.arange((high[0] - low[0]) * SAMPLES) + 0.5) / SAMPLES - 0.5
     v = low[1] + (np.arange((high[1] - low[1]) * SAMPLES) + 0.5) / SAMPLES - 0.5
-    x = camera.normalise(np.stack(np.meshgrid(u, v), axis=-1))
-    rays = np.concatenate([x, np.ones((*x.shape[:-1], 1))], axis=-1)
-    on_plane = se3.apply(se3.inverse(T), rays * (T[:3, 2] @ T[:3, 3] / (rays @ T[:3, 2]))[..., None])
+    x, y = plane_points(camera, T, u, v)
     cells = BITS.shape[1] + 2
     plate = np.pad(np.pad(BITS[marker_id].astype(float), 1), 1, constant_values=1.0)
     grid = np.pad(plate, 1, constant_values=around)
-    column = np.clip(np.floor((on_plane[..., 0] / size + 0.5) * cells) + 2, 0, cells + 3).astype(int)
-    row = np.clip(np.floor((0.5 - on_plane[..., 1] / size) * cells) + 2, 0, cells + 3).astype(int)
+    column = np.clip(np.floor((x / size + 0.5) * cells) + 2, 0, cells + 3).astype(int)
+    row = np.clip(np.floor((0.5 - y / size) * cells) + 2, 0, cells + 3).astype(int)
     fine = grid[row, column].reshape(high[1] - low[1], SAMPLES, high[0] - low[0], SAMPLES)
     image = np.full((camera.height, camera.width), around, dtype=np.float32)
     image[low[1] : high[1], low[0] : high[0]] = fine.mean(axis=(1, 3))
