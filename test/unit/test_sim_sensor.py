@@ -6,6 +6,7 @@ import pytest
 from support.tiny import TINY
 
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.sim.render import Quality
 from thermal_fiducial.sim.sensor import FULL_SCALE, IDEAL, Sensor
 from thermal_fiducial.sim.thermal_camera import render_frames
 
@@ -64,7 +65,9 @@ def test_offset_drifts():
 
 
 def frames_of(behaviour, noise=True):
-    return list(render_frames(replace(TINY, sensor=replace(FFC, ffc_behaviour=behaviour)), noise=noise))
+    # How finely a frame is sampled has nothing to do with the shutter.
+    scenario = replace(TINY, sensor=replace(FFC, ffc_behaviour=behaviour))
+    return list(render_frames(scenario, noise=noise, quality=Quality(sub_frames=1, warm_up=0)))
 
 
 def test_frozen_shutter_repeats_counts_under_new_stamps():
