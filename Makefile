@@ -22,6 +22,8 @@ DOCS := $(VENV)/.docs
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
+# Dozens of processes start in the tests and nodes in a replay: without byte code each would compile the package anew.
+unexport PYTHONDONTWRITEBYTECODE
 # A notice of the theme about its successor.
 export NO_MKDOCS_2_WARNING := 1
 
