@@ -190,7 +190,7 @@ class _Chain:
     def add_imu(self, sample) -> Odometry | None:
         odometry = self.filter.add_imu(sample)
         if odometry is not None:
-            self._prior.add(odometry.stamp_ns, lambda: odometry)
+            self._prior.add(odometry.stamp_ns, odometry)
         return odometry
 
     def add_frame(self, stamp_ns) -> CameraPose | None:
@@ -232,10 +232,10 @@ def fly(flight, marker_map=None, *, mode='localization', late=0.03, left_out=(),
     late_ns = offset_ns + round(late * _SECOND_NS)
     arrivals += [(stamp + late_ns, 2, stamp) for stamp in frames]
     arrivals += [] if second is None else [(stamp + late_ns, 1, stamp) for stamp in second.frames]
-    published, poses = [], []
+    states, poses = [], []
     for _, kind, item in sorted(arrivals, key=lambda entry: entry[:2]):
         if kind == 0:
-            published.append(chain.add_imu(item))
+            states.append(chain.add_imu(item))
         elif kind == 1:
             chain.add_second_frame(item)
         else:
@@ -243,7 +243,7 @@ def fly(flight, marker_map=None, *, mode='localization', late=0.03, left_out=(),
     poses = [pose for pose in poses if pose is not None]
     return Run(
         flight,
-        _compared(flight, [_pose(o.stamp_ns, o.T_map_body, o.pose_covariance) for o in published if o]),
+        published(flight, [state for state in states if state]),
         _compared(flight, [_of_body(pose, flight) for pose in poses]),
         poses,
         chain.filter.resets,
@@ -251,6 +251,11 @@ def fly(flight, marker_map=None, *, mode='localization', late=0.03, left_out=(),
         late,
         chain.config,
     )
+
+
+def published(flight, states) -> Poses:
+    """Of the odometry at IMU samples, what can be compared."""
+    return _compared(flight, [_pose(state.stamp_ns, state.T_map_body, state.pose_covariance) for state in states])
 
 
 def _updated(flight, ekf, poses):

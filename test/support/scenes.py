@@ -30,5 +30,5 @@ def motion_prior(*states, clock_offset=0.0):
     if clock_offset is not None:
         prior.set_clock_offset(clock_offset)
     for state in states:
-        prior.add(state.stamp_ns, lambda state=state: state)
+        prior.add(state.stamp_ns, state)
     return prior

@@ -261,7 +261,7 @@ def test_poses_and_odometry_come_back():
     rng = np.random.default_rng(1)
     A, B = rng.normal(size=(2, 6, 6))
     odometry = Odometry(STAMP, random_pose(rng), rng.normal(size=3), rng.normal(size=3), A @ A.T, B @ B.T)
-    taken = message_bytes.odometry(serialize_message(messages.odometry(odometry)))
+    (taken,) = message_bytes.odometry([serialize_message(messages.odometry(odometry))])
     pose = convert.camera_pose(sent(convert.pose_with_covariance(odometry.T_map_body, A @ A.T, HEAD)))
     # A quaternion in between: the last digits of the rotation may differ.
     np.testing.assert_allclose(taken.T_map_body, odometry.T_map_body, atol=1e-15)

@@ -29,7 +29,7 @@ def test_is_what_the_message_says(length):
     """Names of any length, as what follows them is aligned."""
     for names in (('m' * length, 'base_link'), ('map', 'b' * length)):
         said, message = state(), serialize_message(odometry(state(), *names))
-        read = message_bytes.odometry(message)
+        (read,) = message_bytes.odometry([message])
         assert read.stamp_ns == said.stamp_ns == message_bytes.stamp_ns(message)
         # A quaternion in between: the last digits of the rotation may differ.
         np.testing.assert_allclose(read.T_map_body, said.T_map_body, atol=1e-15)
@@ -37,25 +37,34 @@ def test_is_what_the_message_says(length):
             np.testing.assert_array_equal(getattr(read, name), getattr(said, name))
 
 
+def test_many_at_once_are_what_each_is():
+    messages = [serialize_message(odometry(state(velocity_body=np.full(3, 0.1 * k)), 'm' * k)) for k in range(5)]
+    for one, message in zip(message_bytes.odometry(messages), messages, strict=True):
+        (alone,) = message_bytes.odometry([message])
+        # To the last bit: which states are read together must not matter.
+        for name in ('stamp_ns', 'T_map_body', 'velocity_body', 'angular_velocity_body', 'pose_covariance'):
+            np.testing.assert_array_equal(getattr(one, name), getattr(alone, name))
+
+
 @pytest.mark.parametrize('name', ['velocity_body', 'pose_covariance', 'twist_covariance'])
 def test_what_is_not_finite_is_refused(name):
     broken = np.full_like(getattr(state(), name), np.nan)
     with pytest.raises(InputError, match='finite'):
-        message_bytes.odometry(serialize_message(odometry(state(**{name: broken}))))
+        message_bytes.odometry([serialize_message(odometry(state(**{name: broken})))])
 
 
 def test_what_is_no_quaternion_is_refused():
     message = odometry(state())
     message.pose.pose.orientation.w += 0.7
     with pytest.raises(InputError, match='quaternion'):
-        message_bytes.odometry(serialize_message(message))
+        message_bytes.odometry([serialize_message(message)])
 
 
 @pytest.mark.parametrize('name', ['pose_covariance', 'twist_covariance'])
 @pytest.mark.parametrize('covariance', [np.zeros((6, 6)), -np.eye(6), 1e30 * np.eye(6), np.ones((6, 6))])
 def test_what_is_no_covariance_is_refused(name, covariance):
     with pytest.raises(InputError, match='odometry with a covariance'):
-        message_bytes.odometry(serialize_message(odometry(state(**{name: covariance}))))
+        message_bytes.odometry([serialize_message(odometry(state(**{name: covariance})))])
 
 
 @pytest.mark.parametrize('cut', [0, 3, 8, 20, 100, -8])
@@ -63,14 +72,14 @@ def test_bytes_that_are_no_message_are_refused(cut):
     message = serialize_message(odometry(state()))
     for broken in (message[:cut], b'\x00\x00' + message[2:]):
         with pytest.raises(InputError, match='odometry of'):
-            message_bytes.odometry(broken)
+            message_bytes.odometry([broken])
 
 
 def test_names_of_impossible_length_are_refused():
     message = bytearray(serialize_message(odometry(state())))
     message[12:16] = (2**32 - 1).to_bytes(4, 'little')
     with pytest.raises(InputError, match='cut short'):
-        message_bytes.odometry(bytes(message))
+        message_bytes.odometry([bytes(message)])
 
 
 def test_names_of_kilobytes_are_not_kept():

@@ -43,11 +43,21 @@ def test_many_are_thinned_out_evenly():
 
 
 def test_only_those_asked_for_are_read():
-    read, log = [], MotionPrior()
+    asked = []
+    log = MotionPrior(read=lambda chosen: asked.append(stamps(chosen)) or list(chosen))
     for state in states(10):
-        log.add(state.stamp_ns, lambda state=state: read.append(state.stamp_ns) or state)
+        log.add(state.stamp_ns, state)
     log.between(0, PERIOD_NS, 10)
-    assert read == [0, PERIOD_NS]
+    log.nearest(3 * PERIOD_NS)
+    assert asked == [[0, PERIOD_NS], [3 * PERIOD_NS]]
+
+
+def test_what_proves_to_be_unusable_is_missing():
+    log = MotionPrior(read=lambda chosen: [state for state in chosen if state.stamp_ns != PERIOD_NS])
+    for state in states(3):
+        log.add(state.stamp_ns, state)
+    assert stamps(log.between(0, 10**9, 10)) == [0, 2 * PERIOD_NS]
+    assert log.nearest(PERIOD_NS) is None
 
 
 def test_old_states_are_forgotten_and_a_clock_set_back_begins_anew():
@@ -55,17 +65,17 @@ def test_old_states_are_forgotten_and_a_clock_set_back_begins_anew():
     kept = stamps(log.between(0, 10**12, 10**6))
     # half a second at least, a second at most
     assert 100 <= len(kept) <= 201
-    log.add(0, lambda: STATE)
+    log.add(0, STATE)
     assert stamps(log.between(-1, 10**12, 10**6)) == [0]
 
 
 def test_stamps_that_do_not_go_on_fill_no_memory():
     log = MotionPrior()
     for k in range(10_000):
-        log.add(0, lambda k=k: replace(STATE, stamp_ns=k))
+        log.add(0, replace(STATE, stamp_ns=k))
     # Of one stamp the latest.
     assert stamps(log.between(-1, 1, 10**6)) == [9_999]
     for k in range(10_000):
-        log.add(k, lambda k=k: replace(STATE, stamp_ns=k))
+        log.add(k, replace(STATE, stamp_ns=k))
     assert 1000 <= len(log.between(-1, 10**12, 10**6)) <= 2000
     assert log.latest().stamp_ns == 9_999

@@ -39,7 +39,7 @@ def flying(speed):
     for k in range(41):
         T = transform(np.eye(3), [speed * 0.005 * k, 0.0, 0.0])
         state = Odometry(5 * MS * k, T, np.array([speed, 0.0, 0.0]), np.zeros(3), 1e-6 * np.eye(6), 1e-6 * np.eye(6))
-        prior.add(state.stamp_ns, lambda state=state: state)
+        prior.add(state.stamp_ns, state)
     return prior
 
 

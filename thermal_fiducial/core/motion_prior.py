@@ -5,7 +5,8 @@ stamps of their frames.
 """
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import SECOND_NS
@@ -19,16 +20,18 @@ _RESTART_NS = 1_000_000_000
 
 
 class MotionPrior:
-    """States in the order of their stamps, each read only when somebody wants it, and the camera's clock.
+    """States in the order of their stamps, read only when somebody wants them, and the camera's clock.
 
     Parameters
     ----------
     camera_time_offset : offset of the clocks to begin with, t_odometry = t_camera + offset [s]
+    read : states of what :meth:`add` was given, all at once; those that prove to be unusable are missing
     """
 
-    def __init__(self, camera_time_offset: float = 0.0) -> None:
+    def __init__(self, camera_time_offset: float = 0.0, read: Callable[[Sequence[Any]], list[Odometry]] = list) -> None:
         self._stamps_ns: list[int] = []
-        self._readers: list[Callable[[], Odometry | None]] = []
+        self._states: list[Any] = []
+        self._read = read
         self._offset_ns = round(camera_time_offset * SECOND_NS)
         #: whether the filter has estimated the offset of the clocks: before that it is the parameter's
         self.clock_is_known = False
@@ -42,38 +45,42 @@ class MotionPrior:
         """The instant of a frame in the clock of the odometry [ns]."""
         return camera_stamp_ns + self._offset_ns
 
-    def add(self, stamp_ns: int, read: Callable[[], Odometry | None]) -> None:
-        """Keep the state of a stamp, which ``read`` gives; None if that proves to be unusable."""
+    def add(self, stamp_ns: int, state: Any) -> None:
+        """Keep the state of a stamp, or what will be read as it."""
         if self._stamps_ns and stamp_ns < self._stamps_ns[-1] - _RESTART_NS:
-            self._stamps_ns, self._readers = [], []
+            self._stamps_ns, self._states = [], []
         place = bisect_left(self._stamps_ns, stamp_ns)
         if place < len(self._stamps_ns) and self._stamps_ns[place] == stamp_ns:
-            self._readers[place] = read
+            self._states[place] = state
             return
         self._stamps_ns.insert(place, stamp_ns)
-        self._readers.insert(place, read)
+        self._states.insert(place, state)
         # The states of an odometry whose stamps hardly go on would be kept for ever.
         if len(self._stamps_ns) > _MOST:
-            del self._stamps_ns[: _MOST // 2], self._readers[: _MOST // 2]
+            del self._stamps_ns[: _MOST // 2], self._states[: _MOST // 2]
         if self._stamps_ns[-1] - self._stamps_ns[0] > 2 * _KEPT_NS:
             old = bisect_left(self._stamps_ns, self._stamps_ns[-1] - _KEPT_NS)
-            del self._stamps_ns[:old], self._readers[:old]
+            del self._stamps_ns[:old], self._states[:old]
 
     def latest(self) -> Odometry | None:
         """The newest state; None when there is none."""
-        return self._readers[-1]() if self._readers else None
+        return self._one(len(self._states) - 1)
 
     def nearest(self, stamp_ns: int) -> Odometry | None:
         """The state whose stamp, in the clock of the odometry, is nearest."""
         place = bisect_left(self._stamps_ns, stamp_ns)
         around = range(max(place - 1, 0), min(place + 1, len(self._stamps_ns)))
         best = min(around, key=lambda index: abs(self._stamps_ns[index] - stamp_ns), default=None)
-        return None if best is None else self._readers[best]()
+        return self._one(-1 if best is None else best)
 
     def between(self, first_ns: int, last_ns: int, at_most: int) -> list[Odometry]:
         """States from the first to the last stamp, of more than ``at_most`` so many, as evenly apart as can be."""
         first, last = bisect_left(self._stamps_ns, first_ns), bisect_right(self._stamps_ns, last_ns)
         count = last - first
         kept = min(count, at_most)
-        states = [self._readers[first + place * (count - 1) // max(kept - 1, 1)]() for place in range(kept)]
-        return [state for state in states if state is not None]
+        chosen = [first + place * (count - 1) // max(kept - 1, 1) for place in range(kept)]
+        return self._read([self._states[place] for place in chosen]) if chosen else []
+
+    def _one(self, place: int) -> Odometry | None:
+        """The state at a place; None below the first."""
+        return next(iter(self._read([self._states[place]])), None) if place >= 0 else None

@@ -110,7 +110,7 @@ class Pipeline:
         odometry = self.filter.add_imu(sample)
         if odometry is not None:
             published = replace(odometry, T_map_body=as_published(odometry.T_map_body))
-            self._odometry.add(published.stamp_ns, lambda: published)
+            self._odometry.add(published.stamp_ns, published)
         return odometry
 
     def add_image(self, stamp_ns: int, counts: Counts | Gray) -> FrameResult:

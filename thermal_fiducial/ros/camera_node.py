@@ -1,6 +1,6 @@
 """Base of the nodes that look at markers: the camera's calibration, and the filter's odometry as a hint."""
 
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from nav_msgs.msg import Odometry as OdometryMessage
@@ -29,7 +29,7 @@ class CameraStageNode(StageNode[Config]):
         self._camera_info = b''
         self._calibrations = 0
         #: the filter's latest states
-        self.odometry = MotionPrior(self.config.camera_time_offset)
+        self.odometry = MotionPrior(self.config.camera_time_offset, self._read_odometry)
 
     def follow_hints(self) -> None:
         """Subscribe to calibration and odometry; after the node's main input."""
@@ -70,15 +70,17 @@ class CameraStageNode(StageNode[Config]):
 
     def _on_odometry(self, message: bytes) -> None:
         """A few of these are wanted at frame rate, and only they are read."""
-        self.odometry.add(message_bytes.stamp_ns(message), partial(self._read_odometry, message))
+        self.odometry.add(message_bytes.stamp_ns(message), message)
 
-    def _read_odometry(self, message: bytes) -> Odometry | None:
+    def _read_odometry(self, messages: Sequence[bytes]) -> list[Odometry]:
         """A hint that cannot be used is dropped, not the frame that asks for it."""
         try:
-            return message_bytes.odometry(message)
+            return message_bytes.odometry(messages)
         except InputError as error:
+            if len(messages) > 1:
+                return [state for message in messages for state in self._read_odometry([message])]
             self.refuse(str(error))
-            return None
+            return []
 
     def _on_camera_clock(self, message: TimeReference) -> None:
         self.odometry.set_clock_offset(convert.clock_offset(message))

@@ -6,7 +6,6 @@ Messages check nothing, so what comes in is checked here and what goes out is co
 
 from array import array
 from collections.abc import Iterable, Mapping
-import math
 from typing import Any
 
 from builtin_interfaces.msg import Time
@@ -92,14 +91,15 @@ def transform_of(message: Pose, what: str = 'pose') -> FloatArray:
 
 
 def transform_of_values(values: FloatArray, what: str = 'pose') -> FloatArray:
-    """:func:`transform_of` of position and quaternion x y z w (7,)."""
+    """:func:`transform_of` of positions and quaternions x y z w (..., 7)."""
+    position, quaternion = values[..., :3], values[..., 3:]
     # Before the norm: squares of what is far from one overflow.
-    sound = np.isfinite(values).all() and np.abs(values[3:]).max() < 2.0
-    if not sound or abs(math.sqrt(values[3:] @ values[3:]) - 1.0) > NORM_TOLERANCE:
+    sound = np.isfinite(values).all() and np.abs(quaternion).max() < 2.0
+    if not sound or np.abs(np.sqrt((quaternion * quaternion).sum(axis=-1)) - 1.0).max() > NORM_TOLERANCE:
         raise InputError(f'{what} that is not finite or has no unit quaternion')
-    if not np.abs(values[:3]).max() < LARGEST_COORDINATE:
-        raise InputError(f'{what} {np.abs(values[:3]).max():.3g} m away')
-    return transform_from_quaternion(values[:3], values[3:])
+    if not np.abs(position).max() < LARGEST_COORDINATE:
+        raise InputError(f'{what} {np.abs(position).max():.3g} m away')
+    return transform_from_quaternion(position, quaternion)
 
 
 # --- images -------------------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ The encoding is that of ROS 2 (Object Management Group, "DDS Interoperability Wi
 little-endian): four bytes that say so, then the fields one after the other, each aligned to its own size.
 """
 
+from collections.abc import Sequence
 import struct
 
 import numpy as np
@@ -45,23 +46,24 @@ def stamp_ns(message: bytes, what: str = 'odometry') -> int:
     return convert.checked_stamp(*_STAMP.unpack_from(message, _HEADER))
 
 
-def odometry(message: bytes) -> Odometry:
-    """State of the robot, for whoever can do without it.
+def odometry(messages: Sequence[bytes]) -> list[Odometry]:
+    """States of the robot, for whoever can do without them: N messages at once take little longer than one.
 
     Raises
     ------
     InputError
-        A value that is not finite or beyond the bounds, a quaternion or a covariance that is none.
+        One of them has a value that is not finite or beyond the bounds, a quaternion or a covariance that is none.
     """
-    stamp = stamp_ns(message)
-    numbers = _numbers(message, 2, _ODOMETRY, 'odometry').astype(np.float64)
-    twist = numbers[43:49]
-    if not np.abs(twist).max() < _FASTEST:
+    stamps = [stamp_ns(message) for message in messages]
+    numbers = np.stack([_numbers(message, 2, _ODOMETRY, 'odometry') for message in messages]).astype(np.float64)
+    twists = numbers[:, 43:49]
+    if not np.abs(twists).max() < _FASTEST:
         raise InputError('odometry with a twist that is not finite or beyond all bounds')
-    covariances = np.stack([numbers[7:43], numbers[49:]]).reshape(2, 6, 6)
+    covariances = np.stack([numbers[:, 7:43], numbers[:, 49:]], axis=1).reshape(-1, 2, 6, 6)
     covariances = checked_covariance(covariances, 'odometry with a covariance')
-    T_map_body = convert.transform_of_values(numbers[:7], 'odometry')
-    return Odometry(stamp, T_map_body, twist[:3], twist[3:], covariances[0], covariances[1])
+    T_map_body = convert.transform_of_values(numbers[:, :7], 'odometry')
+    columns = zip(stamps, T_map_body, twists, covariances, strict=True)
+    return [Odometry(stamp, T, twist[:3], twist[3:], pose, speed) for stamp, T, twist, (pose, speed) in columns]
 
 
 def imu_sample(message: bytes) -> ImuSample:

@@ -40,7 +40,7 @@ def checked_covariance(values: FloatArray, what: str) -> FloatArray:
         raise InputError(f'{what} with a variance of {_most_extreme(variances):.3g}')
     if not positive_definite(P).all():
         raise InputError(f'{what} that is not positive definite')
-    return values if np.allclose(P, values, rtol=_ROUNDING, atol=0.0) else np.asarray(P)
+    return values if (np.abs(P - values) <= _ROUNDING * np.abs(values)).all() else np.asarray(P)
 
 
 def _most_extreme(variances: FloatArray) -> float:
