@@ -162,7 +162,7 @@ def _place(path: str) -> Any:
 
 
 def _nothing_found(*_: Any) -> Any:
-    return _place('known_markers:Found').none()
+    return _place('known_markers:FoundMarkers').none()
 
 
 def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
@@ -216,8 +216,8 @@ MECHANISMS = {
     'columns of the frame': Mechanism('slow, 0.1 K, guided', (), {'frame:without_columns': lambda counts, _: counts}),
     'following': Mechanism(
         'slow, 0.1 K, blind',
-        ('finding:Followed',),
-        {'finding:Followed.of': lambda *_: _place('finding:Followed').none()},
+        ('finding:followed',),
+        {'finding:followed': _nothing_found},
     ),
     'search near predictions': Mechanism(
         'fast, 0.5 K, guided',

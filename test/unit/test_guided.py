@@ -50,12 +50,11 @@ def detector(**changes):
 
 def test_expected_markers_are_those_in_view():
     frame = frames(8.0, 1)[0]
-    ids, corners, x, depth = KnownMarkers(MAP).expected(se3.inverse(frame.T_map_camera), CAMERA, 12.0)
-    assert set(frame.corners_px) >= set(ids.tolist())
-    for marker_id, expected in zip(ids.tolist(), corners, strict=True):
-        np.testing.assert_allclose(expected, frame.corners_px[marker_id], atol=1e-6)
-    np.testing.assert_allclose(CAMERA.distort(x), corners, atol=1e-9)
-    assert np.all(depth > 1.0)
+    expected = KnownMarkers(MAP).expected(se3.inverse(frame.T_map_camera), CAMERA, 12.0)
+    assert set(frame.corners_px) >= set(expected.ids.tolist())
+    for marker_id, corners in zip(expected.ids.tolist(), expected.places(CAMERA).at.px, strict=True):
+        np.testing.assert_allclose(corners, frame.corners_px[marker_id], atol=1e-6)
+    assert np.all(expected.depth > 1.0)
     assert len(KnownMarkers({}).expected(np.eye(4), CAMERA, 12.0).ids) == 0
 
 

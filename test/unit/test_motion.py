@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.lag import (
     LAG_TAIL_AGE,
 )
-from thermal_fiducial.core.detection.tracking import MotionTrack, TrackedMarkers
+from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import interaction, plausible, transfer_from_body, transferred, Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -52,7 +53,7 @@ def test_tracker_finds_the_twist_from_two_frames():
     tracker, ids, dt = MotionTrack.of_rig(np.eye(4)), np.arange(5), 1 / 30
     later = moved(points, dt)
     x = [p[..., :2] / p[..., 2:] for p in (points, later)]
-    tracker = tracker.after(10**9, None, TrackedMarkers(ids, x[0], points[..., 2], np.full(5, 100.0)))
+    tracker = tracker.after(10**9, None, ExpectedMarkers(ids, x[0], points[..., 2], np.full(5, 100.0)))
     assert tracker.predict(10**9 + 10**10, []) is None
     found = tracker.correct(10**9 + round(dt * 1e9), None, ids, x[1], later[..., 2], np.full(5, 1e-5))
     # A finite step of a thirtieth of a second differs from the derivative in second order; the prior pulls a little.
@@ -79,7 +80,7 @@ def turning(stamp_ns, states, jitter_ns=0, seed=6):
         seen = points @ se3.so3_exp(0.5 * acceleration * (seen_ns * 1e-9) ** 2)
         x = seen[..., :2] / seen[..., 2:]
         twist = tracker.correct(stamp, tracker.predict(stamp, heard), ids, x, seen[..., 2], np.full(5, 1e-5))
-        tracker = tracker.after(stamp, twist, TrackedMarkers(ids, x, seen[..., 2], np.full(5, 100.0)))
+        tracker = tracker.after(stamp, twist, ExpectedMarkers(ids, x, seen[..., 2], np.full(5, 100.0)))
         yield twist, acceleration * (at - LAG)
 
 
@@ -94,7 +95,7 @@ def test_twist_is_that_of_the_time_that_smears():
         stamp = round(frame * dt * 1e9)
         x = seen[..., :2] / seen[..., 2:]
         twist = tracker.correct(stamp, tracker.predict(stamp, []), ids, x, seen[..., 2], np.full(5, 1e-5))
-        tracker = tracker.after(stamp, twist, TrackedMarkers(ids, x, seen[..., 2], np.full(5, 100.0)))
+        tracker = tracker.after(stamp, twist, ExpectedMarkers(ids, x, seen[..., 2], np.full(5, 100.0)))
     ages = [lag, lag * LAG_TAIL_AGE]
     # A frame ago it turned slower by 0.2 rad/s. What is left, that steps of 1/30 s curve, is half a thousandth of what
     # it turns in 10 ms: accelerations are expected to die down within a few frames.
@@ -127,7 +128,7 @@ def test_states_without_any_error_are_no_division_by_zero():
 
 def test_twist_of_a_late_frame_is_carried_back():
     points = np.random.default_rng(5).uniform([-0.6, -0.5, 2], [0.6, 0.5, 4], (5, 4, 3))
-    seen = TrackedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
+    seen = ExpectedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
     acceleration, tracker, now = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]), MotionTrack.of_rig(np.eye(4)), 10**9
     tracker = tracker.after(now, Twist(TWIST, 1e-6 * np.eye(12), acceleration), seen)
     ahead, back = (tracker.predict(now + dt_ns, []) for dt_ns in (30_000_000, -30_000_000))
@@ -145,7 +146,7 @@ def test_markers_are_expected_where_the_motion_carries_them():
     later, twist = moved(points, dt), Twist(TWIST, np.eye(6))
     tracker = MotionTrack.of_rig(np.eye(4))
     tracker = tracker.after(
-        0, twist, TrackedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
+        0, twist, ExpectedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
     )
     expected = tracker.expected(round(dt * 1e9), twist)
     # The stamp is a whole number of nanoseconds.
@@ -157,14 +158,14 @@ def test_markers_are_expected_where_the_motion_carries_them():
 def test_a_late_frame_disturbs_nothing_and_a_clock_set_back_is_followed():
     rng = np.random.default_rng(4)
     points, twist = rng.uniform([-0.8, -0.6, 2], [0.8, 0.6, 4], (5, 4, 3)), Twist(TWIST, np.eye(12))
-    seen = TrackedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
+    seen = ExpectedMarkers(np.arange(5), points[..., :2] / points[..., 2:], points[..., 2], np.ones(5))
     tracker, now = MotionTrack.of_rig(np.eye(4)), 10**9
     tracker = tracker.after(now, twist, seen)
     ahead = tracker.expected(now + 33_000_000, twist)
     # Whose own markers are expected where they were then.
     late, before = tracker.expected(now - 66_000_000, twist), moved(points, -0.066)
     np.testing.assert_allclose(late.x, before[..., :2] / before[..., 2:], atol=1e-8)
-    tracker = tracker.after(now - 66_000_000, None, TrackedMarkers.none())
+    tracker = tracker.after(now - 66_000_000, None, ExpectedMarkers.none())
     np.testing.assert_array_equal(tracker.expected(now + 33_000_000, twist).x, ahead.x)
     assert tracker.predict(now + 33_000_000, []) is not None
     tracker = tracker.after(now - 10**9, twist, seen)
@@ -184,12 +185,12 @@ def test_motion_that_shows_no_markers_is_forgotten():
     tracker = tracker.after(
         0,
         Twist(np.full(6, 9.0), np.eye(12)),
-        TrackedMarkers(np.arange(1), *(np.ones(s) for s in ((1, 4, 2), (1, 4), 1))),
+        ExpectedMarkers(np.arange(1), *(np.ones(s) for s in ((1, 4, 2), (1, 4), 1))),
     )
     for frame in range(1, 8):
         twist = tracker.predict(frame * period_ns, [])
         assert (twist is None) == (frame * period_ns > 150_000_000)
-        tracker = tracker.after(frame * period_ns, twist, TrackedMarkers.none())
+        tracker = tracker.after(frame * period_ns, twist, ExpectedMarkers.none())
     state = Odometry(8 * period_ns, np.eye(4), TWIST[:3], TWIST[3:], 1e-6 * np.eye(6), 1e-6 * np.eye(6))
     # The twist of which nothing is known pulls by its share of the variance.
     np.testing.assert_allclose(tracker.predict(8 * period_ns, [state]).value, TWIST, atol=1e-5)

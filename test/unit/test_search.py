@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import Found
+from thermal_fiducial.core.detection.frame import Frame, Places
+from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder, marker_bits, Reading, shrunk
 from thermal_fiducial.core.detection.quads import noise_of
 from thermal_fiducial.core.detection.search import BlindSearch, inside_out, SearchScales
-from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))
@@ -39,7 +39,7 @@ def frame_of(image):
 
 
 def search(image, config=None, allowed=EVERY):
-    return SEARCH.search(frame_of(image), allowed, config or ArucoDetectorConfig(), Found.none())
+    return SEARCH.search(frame_of(image), allowed, config or ArucoDetectorConfig(), FoundMarkers.none())
 
 
 @pytest.mark.parametrize('turn', range(4))
@@ -124,8 +124,10 @@ def test_edge_of_a_plate_is_no_markerinside_out(sign):
 def test_what_is_seen_already_is_not_sought():
     image = scene(21, 100.0, 2.0)
     image[300:396, 400:496] = scene(8, 100.0, 2.0)[138:234, 188:284]
-    seen = Found(np.array([21]), CORNERS[None], np.ones(1), np.ones(1, dtype=bool))
-    found = SEARCH.search(frame_of(image), EVERY, ArucoDetectorConfig(), seen)
+    frame, one = frame_of(image), np.ones(1, dtype=bool)
+    places = Places.of(ImagePoints.at(CORNERS[None], frame.camera), np.ones((1, 4)))
+    seen = FoundMarkers(np.array([21]), places, np.ones(1), one, one)
+    found = SEARCH.search(frame, EVERY, ArucoDetectorConfig(), seen)
     assert found.ids.tolist() == [8]
 
 
@@ -133,7 +135,7 @@ def test_what_is_seen_already_is_not_sought():
 @pytest.mark.parametrize('sign', [1.0, -1.0])
 def test_either_resolution_shows_a_clear_marker(scales, sign):
     image = scene(21, 50.0 * sign, 2.0)
-    found = SEARCH.search(frame_of(image), EVERY, ArucoDetectorConfig(), Found.none(), scales)
+    found = SEARCH.search(frame_of(image), EVERY, ArucoDetectorConfig(), FoundMarkers.none(), scales)
     assert found.ids.tolist() == [21]
 
 

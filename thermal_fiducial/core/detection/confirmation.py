@@ -13,7 +13,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.alignment import aligned
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import Found
+from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
 from thermal_fiducial.core.detection.quads import halfway, halved
 from thermal_fiducial.core.detection.refining import RefinedMarkers, sides_px
@@ -50,7 +50,8 @@ BORDER_PX = 1.0
 
 def confirmed(
     image: Float32Array,
-    found: Found,
+    found: FoundMarkers,
+    there: FloatArray,
     refined: RefinedCorners,
     decoder: Decoder,
     config: ArucoDetectorConfig,
@@ -64,6 +65,7 @@ def confirmed(
 
     Parameters
     ----------
+    there : (N, 4, 2) where the corners should appear [px]
     standing_picture : (N,) which are seen in a picture for a display, and not blurred by motion
     """
     if len(found.ids) == 0:
@@ -79,8 +81,8 @@ def confirmed(
     deviation = np.sort(np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1)), axis=1)[:, 2]
     softness = deviation * np.minimum(contrast, _NOISY) * np.sqrt(np.minimum(side, _SEEN_PX))
     known = (similarity >= config.guided_min_correlation) & (similarity - reading.runner_up >= config.guided_min_margin)
-    there = np.abs(refined.corners_px - found.corners_px).max(axis=(1, 2)) < 0.7 * side / decoder.cells
-    return np.asarray(same & ((found.expected & known & there) | (alike & (softness <= _SHARP))))
+    near = np.abs(refined.corners_px - there).max(axis=(1, 2)) < 0.7 * side / decoder.cells
+    return np.asarray(same & ((found.expected & known & near) | (alike & (softness <= _SHARP))))
 
 
 def _read(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
@@ -105,7 +107,7 @@ def _stands_out(reading: Reading, decoder: Decoder) -> BoolArray:
 
 def with_corners_by_pattern(
     frame: Frame,
-    found: Found,
+    found: FoundMarkers,
     refined: RefinedMarkers,
     lost: BoolArray,
     decoder: Decoder,

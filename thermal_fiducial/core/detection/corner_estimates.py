@@ -15,9 +15,8 @@ from thermal_fiducial.core.detection.confirmation import BORDER_PX, confirmed, w
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind, edges_behind_border, model, sides_of
-from thermal_fiducial.core.detection.finding import Findings, Followed
 from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import among, ExpectedMarkers, Found, places_of
+from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.refining import RefinedMarkers, Refiner, sides_px
 from thermal_fiducial.core.detection.tracking import MotionTrack
@@ -146,22 +145,15 @@ class CornerEstimator:
     def estimate(
         self,
         frame: Frame,
-        findings: Findings,
-        in_map: ExpectedMarkers | None,
-        sizes: FloatArray,
+        found: FoundMarkers,
         track: MotionTrack,
         config: ArucoDetectorConfig,
     ) -> MarkerEstimates:
-        """Those of the ``findings`` that their refined corners confirm, of markers of ``sizes`` (N,) [m]."""
-        found, followed = findings.found, findings.followed
+        """Those of the markers ``found`` that their refined corners confirm."""
         if len(found.ids) == 0:
             return _none(frame.twist)
-        places = followed.places
-        if not np.array_equal(found.ids, followed.ids):
-            known = [] if in_map is None else [(in_map.ids, in_map.depth)]
-            places = places_of(frame, found, sizes, *known, (followed.ids, followed.places.depth))
-        refined = self._refiner.refine(frame, found, places, track, config)
-        keep = self._confirmed(frame, found, refined, followed, config)
+        refined = self._refiner.refine(frame, found, track, config)
+        keep = self._confirmed(frame, found, refined, config)
         if frame.displayed and not keep.all():
             refined, small = with_corners_by_pattern(frame, found, refined, ~keep, self._decoder, config)
             keep = keep | small
@@ -176,22 +168,21 @@ class CornerEstimator:
         return MarkerEstimates(ids, corners, at, refined.places.at.x, refined.twist)
 
     def _confirmed(
-        self, frame: Frame, found: Found, refined: RefinedMarkers, followed: Followed, config: ArucoDetectorConfig
+        self, frame: Frame, found: FoundMarkers, refined: RefinedMarkers, config: ArucoDetectorConfig
     ) -> BoolArray:
         """Which markers look like themselves at their refined corners: how the motion is known does not matter."""
         view, observed = refined.view, refined.observed
         there = found.corners_px + view.shift
         off = np.abs(observed.corners_px - there).max(axis=(1, 2))
         read = off < _READ_THERE / self._decoder.cells * sides_px(found.corners_px)
-        keep = read & among(found.ids, followed.ids[followed.certain])
+        keep = read & found.certain
         others = np.flatnonzero(~keep)
         if len(others):
-            expected = replace(found, corners_px=there).only(others)
-            observed = observed.only(others)
             blur = np.sqrt(np.sum(view.spread[others] ** 2, axis=1))
-            standing = frame.displayed & (blur < _STANDING * sides_px(expected.corners_px) / self._decoder.cells)
-            image = view.round_markers(there, others)
-            keep[others] = confirmed(image, expected, observed, self._decoder, config, standing_picture=standing)
+            standing = frame.displayed & (blur < _STANDING * sides_px(there[others]) / self._decoder.cells)
+            image, found = view.round_markers(there, others), found.only(others)
+            observed, there = observed.only(others), there[others]
+            keep[others] = confirmed(image, found, there, observed, self._decoder, config, standing_picture=standing)
         return np.asarray(keep & frame.camera.contains(refined.observed.corners_px, BORDER_PX).all(axis=1))
 
 

@@ -11,10 +11,10 @@ from thermal_fiducial.core.detection.corner_estimates import CornerEstimator, Ma
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.finding import Findings, FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import among, depths, KnownMarkers
+from thermal_fiducial.core.detection.known_markers import among, depths, ExpectedMarkers, KnownMarkers
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
-from thermal_fiducial.core.detection.tracking import FramePrediction, MotionTrack, Predictor, TrackedMarkers
+from thermal_fiducial.core.detection.tracking import FramePrediction, MotionTrack, Predictor
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses, solve_marker_poses
@@ -102,8 +102,7 @@ class MarkerDetector:
             if prediction.T_camera_map is not None and len(known.ids) and config.guided:
                 expected = known.expected(prediction.T_camera_map, camera, config.min_side_px)
             findings = self._finder.find(frame, history, known, expected, config)
-            sizes = known.sizes(findings.found.ids)
-            estimates = self._estimator.estimate(frame, findings, expected, sizes, history.track, config)
+            estimates = self._estimator.estimate(frame, findings.found, history.track, config)
             poses = self._poses(estimates.ids, estimates.corners, estimates.at, prediction.T_camera_map)
             corners = estimates.corners
             rows = marker_rows(estimates.ids, corners.corners_px, corners.covariances, poses, corners.contrast)
@@ -143,7 +142,7 @@ class MarkerDetector:
         # Motion that came from what turned out to be no markers is none.
         twist = estimates.twist if len(ids) else frame.twist
         depth = depths(poses.T_camera_marker[:, 0], self._known.sizes(ids))
-        markers = TrackedMarkers(ids, estimates.x, depth, estimates.corners.contrast / frame.noise)
+        markers = ExpectedMarkers(ids, estimates.x, depth, estimates.corners.contrast / frame.noise)
         return FrameHistory(
             history.track.after(frame.stamp_ns, twist, markers),
             history.polarity.after(estimates.corners.contrast),

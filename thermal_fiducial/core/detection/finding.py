@@ -4,7 +4,7 @@ A marker that is looked for at its place is accepted by its own evidence alone: 
 attitude, must correlate with the image clearly, and better than any other marker's or any other turn of its own.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -14,19 +14,20 @@ from thermal_fiducial.core.detection.frame import Frame, Places, rolling_displac
 from thermal_fiducial.core.detection.known_markers import (
     among,
     CUT_OFF_PX,
+    depths,
     ExpectedMarkers,
-    Found,
+    FoundMarkers,
     KnownMarkers,
-    merged,
-    places_of,
+    pairs,
 )
 from thermal_fiducial.core.detection.lag import lag_tail_maps, markers_deblurred, REMAINING
 from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS, Reading
 from thermal_fiducial.core.detection.refining import BLUR_THAT_MATTERS_PX, CLEAR_CNR
 from thermal_fiducial.core.detection.search import BlindSearch, SearchScales
-from thermal_fiducial.core.detection.tracking import MotionTrack, TrackedMarkers
+from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist
-from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.camera import ImagePoints
+from thermal_fiducial.core.geometry.planar_pose import ippe_square
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 # A frame's markers are remembered for about so many frames, and make sure of the kind when so many more are of it.
@@ -75,76 +76,13 @@ class FrameHistory:
     scales: SearchScales = SearchScales.ALL
 
 
-@dataclass(frozen=True, slots=True)
-class Followed:
-    """N markers where the motion since the last frame has carried them.
-
-    Parameters
-    ----------
-    ids : (N,)
-    places : at the stamp
-    cnr : (N,) contrast-to-noise ratio of a pixel
-    certain : (N,) whether the frame shows them there beyond doubt
-    """
-
-    ids: IntArray
-    places: Places
-    cnr: FloatArray
-    certain: BoolArray
-
-    @staticmethod
-    def none() -> 'Followed':
-        """No markers."""
-        x, J = np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2))
-        places = Places(ImagePoints(x, x, J, J), np.zeros((0, 4)), np.zeros((0, 4, 2, 6)))
-        return Followed(np.zeros(0, dtype=np.int64), places, np.zeros(0), np.zeros(0, dtype=bool))
-
-    @staticmethod
-    def of(last: TrackedMarkers, frame: Frame) -> 'Followed':
-        """Those of the last frame, carried on; nothing is known yet of whether they are seen."""
-        places = Places.of(ImagePoints.seen_at(last.x, frame.camera), last.depth)
-        return Followed(last.ids, places, last.cnr, np.zeros(len(last.ids), dtype=bool))
-
-    def only(self, keep: BoolArray) -> 'Followed':
-        """Those of the markers ``keep`` (N,)."""
-        if keep.all():
-            return self
-        return Followed(self.ids[keep], self.places.only(keep), self.cnr[keep], self.certain[keep])
-
-    def seen(self, frame: Frame, twist: Twist, decoder: Decoder, config: ArucoDetectorConfig) -> 'Followed':
-        """Those that the frame shows: they look like themselves more than like any other marker."""
-        if len(self.ids) == 0:
-            return self
-        shown = self.places.at.px + self.places.lag_blur(twist, frame.lag)
-        shown += rolling_displacement(self.places, twist, frame)
-        likeness = decoder.likeness(frame.image, shown)
-        similarity = likeness.correlation * np.sign(self.cnr)
-        alike = (likeness.best == 4 * self.ids) & (similarity > _STILL_SIMILAR)
-        alike &= frame.camera.contains(shown).all(axis=1)
-        certain = similarity >= config.guided_min_correlation
-        certain &= similarity - likeness.runner_up >= config.guided_min_margin
-        return Followed(self.ids, self.places, self.cnr, certain).only(alike)
-
-
 class Findings(NamedTuple):
     """What is found in a frame."""
 
-    found: Found
-    #: those of the last frame that are observed again
-    followed: Followed
+    found: FoundMarkers
     #: of :class:`FrameHistory`
     since_blind: int
     scales: SearchScales
-
-
-class _Near(NamedTuple):
-    """What is found where it is expected."""
-
-    found: Found
-    followed: Followed
-    #: whether all that is expected is observed; and so much of it that the prediction must hold
-    complete: bool
-    holds: bool
 
 
 class MarkerFinder:
@@ -168,53 +106,77 @@ class MarkerFinder:
         config: ArucoDetectorConfig,
     ) -> Findings:
         """Markers to a pixel or two, at the frame's stamp; ``in_map``: where those of the map should be, if known."""
-        near = self._near(frame, history, known, in_map, config)
+        found, complete, holds = FoundMarkers.none(), False, False
+        if frame.twist is not None and config.guided:
+            found, number = self._guided(frame, frame.twist, history, known, in_map, config)
+            complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
+            holds = in_map is not None and number > 0 and len(found.ids) >= _ENOUGH * number
         since_blind, interval = history.since_blind + 1, config.blind_interval
-        if in_map is None or not near.complete:
+        if in_map is None or not complete:
             interval = min(interval, _INCOMPLETE)
-        if (near.complete or (near.holds and in_map is not None)) and since_blind < interval:
-            return Findings(near.found, near.followed, since_blind, history.scales)
-        scales = _next_scales(history, complete=near.complete)
-        blind = self._blind(frame, history, near.found, scales, known, config)
-        return Findings(merged(near.found, blind), near.followed, 0, scales)
+        if (complete or holds) and since_blind < interval:
+            return Findings(found, since_blind, history.scales)
+        scales = _next_scales(history, complete=complete)
+        blind = self._blind(frame, history, found, scales, known, in_map, config)
+        return Findings(found.with_others(blind), 0, scales)
 
-    def _near(
+    def _guided(
         self,
         frame: Frame,
+        twist: Twist,
         history: FrameHistory,
         known: KnownMarkers,
         in_map: ExpectedMarkers | None,
         config: ArucoDetectorConfig,
-    ) -> _Near:
-        """Markers where they should be: followed from the last frame, and others of the map."""
-        if frame.twist is None or not config.guided:
-            return _Near(Found.none(), Followed.none(), complete=False, holds=False)
-        last = Followed.of(history.track.expected(frame.stamp_ns, frame.twist), frame)
-        expected = _expected(frame.camera, last, known, in_map)
-        followed = last.only(among(last.ids, expected.ids)).seen(frame, frame.twist, self._decoder, config)
-        found = Found(followed.ids, followed.places.at.px, followed.cnr, np.ones(len(followed.ids), dtype=bool))
-        new = ~among(expected.ids, followed.ids)
+    ) -> tuple[FoundMarkers, int]:
+        """Markers where they should be, the last frame's and others of the map, and how many there should be."""
+        last = history.track.expected(frame.stamp_ns, twist)
+        places = last.places(frame.camera)
+        wanted: BoolArray = np.asarray(frame.camera.contains(places.at.px, CUT_OFF_PX).all(axis=1))
+        if in_map is None:
+            expected = last.only(wanted)
+        else:
+            others = wanted & ~among(last.ids, known.ids)
+            expected = in_map.joined(last.only(others)) if others.any() else in_map
+            wanted = among(last.ids, expected.ids)
+        if not wanted.all():
+            last, places = last.only(wanted), places.only(wanted)
+        found = followed(frame, twist, last, places, self._decoder, config)
+        new = ~among(expected.ids, found.ids)
         if new.any():
-            near = near_prediction(frame, frame.twist, expected.only(new), self._decoder, config)
-            found = merged(found, near)
-        number = len(expected.ids)
-        complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
-        return _Near(found, followed, complete, number > 0 and len(found.ids) >= _ENOUGH * number)
+            found = found.with_others(near_prediction(frame, twist, expected.only(new), self._decoder, config))
+        return found, len(expected.ids)
 
     def _blind(
         self,
         frame: Frame,
         history: FrameHistory,
-        found: Found,
+        found: FoundMarkers,
         scales: SearchScales,
         known: KnownMarkers,
+        in_map: ExpectedMarkers | None,
         config: ArucoDetectorConfig,
-    ) -> Found:
+    ) -> FoundMarkers:
         """Markers wherever they are, but for those that are ``found`` already."""
         kinds, allowed = history.polarity.kinds(config.polarity), self.allowed(known, config)
         blind = self._search.search(frame, allowed, config, found, scales, kinds)
-        blind = blind.only(history.polarity.possible(blind.cnr, config.polarity))
-        return self._without_rolling_shutter(frame, blind, known)
+        possible = history.polarity.possible(blind.cnr, config.polarity)
+        ids, corners = blind.ids[possible], blind.corners_px[possible]
+        if len(ids) == 0:
+            return FoundMarkers.none()
+        at, sizes = ImagePoints.at(corners, frame.camera), known.sizes(ids)
+        depth = depths(ippe_square(at.x, sizes)[:, 0], sizes)
+        if in_map is not None:
+            # Alone, one may be tilted wrongly: seen obliquely and approached, it would be blurred across, not along.
+            mapped, mine = pairs(in_map.ids, ids)
+            depth[mine] = in_map.depth[mapped]
+        places = Places.of(at, depth)
+        if frame.readout > 0.0:
+            # Where they would be if all rows were seen at once.
+            rolling = rolling_displacement(places, frame.twist, frame, corners[..., 1])
+            places = Places.of(ImagePoints.at(corners - rolling, frame.camera), depth)
+        no = np.zeros(len(ids), dtype=bool)
+        return FoundMarkers(ids, places, blind.cnr[possible], no, no)
 
     def allowed(self, known: KnownMarkers, config: ArucoDetectorConfig) -> BoolArray:
         """Which IDs of the dictionary may be found."""
@@ -222,14 +184,6 @@ class MarkerFinder:
         if len(wanted) == 0:
             return np.ones(self._decoder.count, dtype=bool)
         return np.asarray(np.isin(np.arange(self._decoder.count), wanted))
-
-    def _without_rolling_shutter(self, frame: Frame, found: Found, known: KnownMarkers) -> Found:
-        """Markers where they would be if all rows were seen at once."""
-        if frame.readout == 0.0 or len(found.ids) == 0:
-            return found
-        places = places_of(frame, found, known.sizes(found.ids))
-        rolling = rolling_displacement(places, frame.twist, frame, found.corners_px[..., 1])
-        return replace(found, corners_px=found.corners_px - rolling)
 
 
 def _next_scales(history: FrameHistory, *, complete: bool) -> SearchScales:
@@ -239,15 +193,26 @@ def _next_scales(history: FrameHistory, *, complete: bool) -> SearchScales:
     return SearchScales.FAINT if history.scales == SearchScales.FINE else SearchScales.FINE
 
 
-def _expected(camera: Camera, last: Followed, known: KnownMarkers, in_map: ExpectedMarkers | None) -> ExpectedMarkers:
-    """The map's markers and the last frame's others."""
-    at = last.places.at
-    others = ExpectedMarkers(last.ids, at.px, at.x, last.places.depth)
-    new: BoolArray = np.asarray(camera.contains(at.px, CUT_OFF_PX).all(axis=1))
-    if in_map is None:
-        return others.only(new)
-    new &= ~among(last.ids, known.ids)
-    return in_map.joined(others.only(new)) if new.any() else in_map
+def followed(
+    frame: Frame,
+    twist: Twist,
+    last: ExpectedMarkers,
+    places: Places,
+    decoder: Decoder,
+    config: ArucoDetectorConfig,
+) -> FoundMarkers:
+    """Those of the ``last`` frame's N markers, at ``places`` by now, that look like themselves there, lag and all."""
+    if len(last.ids) == 0:
+        return FoundMarkers.none()
+    shown = places.at.px + places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
+    likeness = decoder.likeness(frame.image, shown)
+    similarity = likeness.correlation * np.sign(last.cnr)
+    alike = (likeness.best == 4 * last.ids) & (similarity > _STILL_SIMILAR)
+    alike &= frame.camera.contains(shown).all(axis=1)
+    certain = similarity >= config.guided_min_correlation
+    certain &= similarity - likeness.runner_up >= config.guided_min_margin
+    found = FoundMarkers(last.ids, places, last.cnr, np.ones(len(alike), dtype=bool), certain)
+    return found if alike.all() else found.only(alike)
 
 
 def near_prediction(
@@ -256,11 +221,11 @@ def near_prediction(
     expected: ExpectedMarkers,
     decoder: Decoder,
     config: ArucoDetectorConfig,
-) -> Found:
+) -> FoundMarkers:
     """Those of the ``expected`` markers that the frame shows near where they are expected."""
-    places = Places.of(ImagePoints.at(expected.corners_px, frame.camera), expected.depth)
+    places = expected.places(frame.camera)
     shift, rolling = places.lag_blur(twist, frame.lag), rolling_displacement(places, twist, frame)
-    ids, corners = expected.ids, expected.corners_px + rolling
+    ids, corners = expected.ids, places.at.px + rolling
     blurred = np.abs(shift).max(axis=(1, 2)) > BLUR_THAT_MATTERS_PX
     scene = frame.image
     if blurred.any():
@@ -269,8 +234,9 @@ def near_prediction(
     shown = _shifted(scene, ids, corners + left, decoder)
     reading = decoder.read(scene, shown)
     good = _confirmed(reading, ids, frame.noise, config)
-    corners = (shown - left - rolling)[good]
-    return Found(ids[good], corners, reading.contrast[good] / frame.noise, np.ones(len(corners), dtype=bool))
+    at = ImagePoints.at((shown - left - rolling)[good], frame.camera)
+    places, no = Places.of(at, expected.depth[good]), np.zeros(len(at.px), dtype=bool)
+    return FoundMarkers(ids[good], places, reading.contrast[good] / frame.noise, ~no, no)
 
 
 def _shifted(image: Float32Array, ids: IntArray, corners: FloatArray, decoder: Decoder) -> FloatArray:

@@ -75,6 +75,14 @@ class Places:
         """Those of the markers ``keep``."""
         return Places(self.at.only(keep), self.depth[keep], self.flow[keep])
 
+    def joined(self, others: 'Places') -> 'Places':
+        """Those of ``others`` as well."""
+        one, other = self.at, others.at
+        pairs = (one.px, other.px), (one.x, other.x), (one.J, other.J), (one.inverse, other.inverse)
+        at = ImagePoints(*(np.concatenate(pair) for pair in pairs))
+        depth, flow = np.concatenate([self.depth, others.depth]), np.concatenate([self.flow, others.flow])
+        return Places(at, depth, flow)
+
     def lag_blur(self, twist: Twist, lag: float) -> FloatArray:
         """Mean displacement (N, 4, 2) [px] by a lag [s]."""
         return np.asarray(-lag * (self.flow @ twist.ago(lag)))

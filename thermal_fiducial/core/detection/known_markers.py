@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.frame import Frame, Places
+from thermal_fiducial.core.detection.frame import Places
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.planar_pose import ippe_square, marker_corners
+from thermal_fiducial.core.geometry.planar_pose import marker_corners
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 #: Nearer to the border of the image than this a marker may be cut off, before its corners are refined [px].
@@ -37,90 +37,101 @@ def pairs(ids: IntArray, others: IntArray) -> tuple[IntArray, IntArray]:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """Markers that a search found.
+class ExpectedMarkers:
+    """Where N markers should be.
 
     Parameters
     ----------
     ids : (N,)
-    corners_px : (N, 4, 2) clockwise from the marker's top-left, to a pixel or two
-    cnr : (N,) contrast-to-noise ratio of a pixel; negative where black is warmer than white
-    expected : (N,) whether it was looked for where it was found
+    x : (N, 4, 2) normalised corners
+    depth : (N, 4) of the corners [m]
+    cnr : (N,) contrast-to-noise ratio of a pixel when they were last seen, 0 of others
     """
 
     ids: IntArray
-    corners_px: FloatArray
+    x: FloatArray
+    depth: FloatArray
     cnr: FloatArray
-    expected: BoolArray
-
-    def only(self, keep: BoolArray | IntArray) -> 'Found':
-        """Those of the markers ``keep``."""
-        return Found(self.ids[keep], self.corners_px[keep], self.cnr[keep], self.expected[keep])
 
     @staticmethod
-    def none() -> 'Found':
+    def none() -> 'ExpectedMarkers':
         """No markers."""
-        return Found(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros(0), np.zeros(0, dtype=bool))
+        return ExpectedMarkers(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4)), np.zeros(0))
+
+    def only(self, keep: BoolArray | IntArray) -> 'ExpectedMarkers':
+        """Those of the markers ``keep``."""
+        return ExpectedMarkers(self.ids[keep], self.x[keep], self.depth[keep], self.cnr[keep])
+
+    def joined(self, others: 'ExpectedMarkers') -> 'ExpectedMarkers':
+        """Those of ``others`` as well."""
+        return ExpectedMarkers(
+            np.concatenate([self.ids, others.ids]),
+            np.concatenate([self.x, others.x]),
+            np.concatenate([self.depth, others.depth]),
+            np.concatenate([self.cnr, others.cnr]),
+        )
+
+    def places(self, camera: Camera) -> Places:
+        """Their places in the image of a camera."""
+        return Places.of(ImagePoints.seen_at(self.x, camera), self.depth)
 
 
-def merged(first: Found, second: Found) -> Found:
-    """All markers of ``first``, and those of ``second`` that it does not have and that lie elsewhere."""
-    if len(second.ids) == 0:
-        return first
-    apart = np.linalg.norm(second.corners_px.mean(axis=1)[:, None] - first.corners_px.mean(axis=1), axis=-1)
-    extent = np.linalg.norm(first.corners_px[:, 2] - first.corners_px[:, 0], axis=-1)
-    new = ~among(second.ids, first.ids) & (apart > TOGETHER * extent).all(axis=1)
-    return Found(
-        np.concatenate([first.ids, second.ids[new]]),
-        np.concatenate([first.corners_px, second.corners_px[new]]),
-        np.concatenate([first.cnr, second.cnr[new]]),
-        np.concatenate([first.expected | among(first.ids, second.ids[second.expected]), second.expected[new]]),
-    )
+@dataclass(frozen=True, slots=True)
+class FoundMarkers:
+    """N markers that a frame shows.
 
-
-def places_of(frame: Frame, found: Found, sizes: FloatArray, *known: tuple[IntArray, FloatArray]) -> Places:
-    """Where markers of sides (N,) [m] are: of those that are ``known``, by ID, the corners' depths (K, 4) [m].
-
-    The others may be tilted wrongly: seen obliquely and approached, such a marker would be blurred across instead of
-    along.
+    Parameters
+    ----------
+    ids : (N,)
+    places : to a pixel or two, at the frame's stamp
+    cnr : (N,) contrast-to-noise ratio of a pixel; negative where black is warmer than white
+    expected : (N,) whether it was looked for where it was found
+    certain : (N,) whether its pattern was read in this very place, beyond doubt
     """
-    at = ImagePoints.at(found.corners_px, frame.camera)
-    depth = depths(ippe_square(at.x, sizes)[:, 0], sizes)
-    for ids, depth_of_known in known:
-        one, other = pairs(ids, found.ids)
-        depth[other] = depth_of_known[one]
-    return Places.of(at, depth)
+
+    ids: IntArray
+    places: Places
+    cnr: FloatArray
+    expected: BoolArray
+    certain: BoolArray
+
+    @property
+    def corners_px(self) -> FloatArray:
+        """(N, 4, 2) clockwise from the marker's top-left."""
+        return self.places.at.px
+
+    @staticmethod
+    def none() -> 'FoundMarkers':
+        """No markers."""
+        x, J, no = np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros(0, dtype=bool)
+        places = Places(ImagePoints(x, x, J, J), np.zeros((0, 4)), np.zeros((0, 4, 2, 6)))
+        return FoundMarkers(np.zeros(0, dtype=np.int64), places, np.zeros(0), no, no)
+
+    def only(self, keep: BoolArray | IntArray) -> 'FoundMarkers':
+        """Those of the markers ``keep``."""
+        places = self.places.only(keep)
+        return FoundMarkers(self.ids[keep], places, self.cnr[keep], self.expected[keep], self.certain[keep])
+
+    def with_others(self, others: 'FoundMarkers') -> 'FoundMarkers':
+        """These, and those of ``others`` that are not among them and that lie elsewhere."""
+        if len(others.ids) == 0:
+            return self
+        apart = np.linalg.norm(others.corners_px.mean(axis=1)[:, None] - self.corners_px.mean(axis=1), axis=-1)
+        extent = np.linalg.norm(self.corners_px[:, 2] - self.corners_px[:, 0], axis=-1)
+        new = np.flatnonzero(~among(others.ids, self.ids) & (apart > TOGETHER * extent).all(axis=1))
+        return FoundMarkers(
+            np.concatenate([self.ids, others.ids[new]]),
+            self.places.joined(others.places.only(new)),
+            np.concatenate([self.cnr, others.cnr[new]]),
+            np.concatenate([self.expected, others.expected[new]]),
+            np.concatenate([self.certain, others.certain[new]]),
+        )
 
 
 def depths(T_camera_marker: FloatArray, sizes: FloatArray) -> FloatArray:
     """Depths (N, 4) [m] of the corners of markers."""
     depth = T_camera_marker[:, 2, 3, None] + sizes[:, None] * (T_camera_marker[:, 2, :2] @ _FACE.T)
     return np.fmax(np.where(np.isfinite(depth), depth, 1.0), 0.1)
-
-
-class ExpectedMarkers(NamedTuple):
-    """Places of N markers in a frame."""
-
-    #: (N,)
-    ids: IntArray
-    #: (N, 4, 2) in pixels, and normalised
-    corners_px: FloatArray
-    x: FloatArray
-    #: (N, 4) of the corners [m]
-    depth: FloatArray
-
-    def only(self, keep: BoolArray | IntArray) -> 'ExpectedMarkers':
-        """Those of the markers ``keep``."""
-        return ExpectedMarkers(self.ids[keep], self.corners_px[keep], self.x[keep], self.depth[keep])
-
-    def joined(self, others: 'ExpectedMarkers') -> 'ExpectedMarkers':
-        """Those of ``others`` as well."""
-        return ExpectedMarkers(
-            np.concatenate([self.ids, others.ids]),
-            np.concatenate([self.corners_px, others.corners_px]),
-            np.concatenate([self.x, others.x]),
-            np.concatenate([self.depth, others.depth]),
-        )
 
 
 class PartialMarkers(NamedTuple):
@@ -172,7 +183,7 @@ class KnownMarkers:
         large = ((span * span).sum(axis=-1) >= min_side_px**2).all(axis=1)
         seen = np.flatnonzero(camera.contains(corners, CUT_OFF_PX).all(axis=1) & facing & large)
         points = points[seen]
-        return ExpectedMarkers(self.ids[seen], corners[seen], points[..., :2] / points[..., 2:], points[..., 2])
+        return ExpectedMarkers(self.ids[seen], points[..., :2] / points[..., 2:], points[..., 2], np.zeros(len(seen)))
 
     def partially_visible(self, T_camera_map: FloatArray, camera: Camera, without: IntArray) -> PartialMarkers:
         """Those that show a face and may be partly in view, but for those of the IDs ``without``."""

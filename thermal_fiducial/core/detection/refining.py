@@ -19,7 +19,7 @@ from thermal_fiducial.core.detection.frame import (
     Places,
     rolling_displacement,
 )
-from thermal_fiducial.core.detection.known_markers import Found
+from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.lag import (
     common_error,
     lag_tail_maps,
@@ -105,8 +105,7 @@ class Refiner:
     def refine(
         self,
         frame: Frame,
-        found: Found,
-        places: Places,
+        found: FoundMarkers,
         track: MotionTrack,
         config: ArucoDetectorConfig,
     ) -> RefinedMarkers:
@@ -114,12 +113,10 @@ class Refiner:
 
         Parameters
         ----------
-        found : the markers
-        places : where they roughly are at the stamp
         track : the frames before, which with the corners give the twist
         """
         columns, hardly = _OF_CLEAR if np.abs(found.cnr).min() > CLEAR_CNR else _OF_FAINT
-        twist = frame.twist
+        twist, places = frame.twist, found.places
         for _ in range(_ROUNDS):
             view = _view(frame, places, twist, hardly)
             start = places.at.moved(view.shift, frame.camera)
@@ -136,7 +133,7 @@ class Refiner:
     def _at_stamp(
         self,
         frame: Frame,
-        found: Found,
+        found: FoundMarkers,
         places: Places,
         view: DeblurredView,
         seen: RefinedCorners,

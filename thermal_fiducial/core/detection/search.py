@@ -2,13 +2,14 @@
 
 from dataclasses import fields
 from enum import auto, Flag
+from typing import NamedTuple
 
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.alignment import aligned
 from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import among, CUT_OFF_PX, Found, TOGETHER
+from thermal_fiducial.core.detection.known_markers import among, CUT_OFF_PX, FoundMarkers, TOGETHER
 from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
 from thermal_fiducial.core.detection.quads import (
     dark,
@@ -46,6 +47,19 @@ class SearchScales(Flag):
     ALL = FINE | FAINT
 
 
+class Outlines(NamedTuple):
+    """N markers wherever they are: IDs (N,), corners (N, 4, 2) [px] and contrast-to-noise ratios (N,) of a pixel."""
+
+    ids: IntArray
+    corners_px: FloatArray
+    cnr: FloatArray
+
+    @staticmethod
+    def none() -> 'Outlines':
+        """No markers."""
+        return Outlines(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros(0))
+
+
 class BlindSearch:
     """Finds the markers of a dictionary wherever they are.
 
@@ -62,10 +76,10 @@ class BlindSearch:
         frame: Frame,
         allowed: BoolArray,
         config: ArucoDetectorConfig,
-        seen: Found,
+        seen: FoundMarkers,
         scales: SearchScales = SearchScales.ALL,
         kinds: tuple[float, ...] = (1.0, -1.0),
-    ) -> Found:
+    ) -> Outlines:
         """Markers with IDs ``allowed`` (M,), each ID once.
 
         Parameters
@@ -84,14 +98,14 @@ class BlindSearch:
             half = without_columns(halved(frame.image), 0.5 * frame.noise)
             faint = _faint_quads(half, frame.noise, scales, kinds, config.min_side_px, hidden)
         if len(fine) + len(faint) == 0:
-            return Found.none()
+            return Outlines.none()
         # At full resolution alone those are looked for that show clearly, if not now then in a frame to come.
         pull = SearchScales.FAINT in scales
         reading, quads = self._read(frame, half, (fine, faint), allowed, seen.ids if pull else None)
         good = accepted(reading, frame.noise, self._decoder.correctable, config) & _large(quads, min_side_px)
         good &= _whole(quads, frame.image)
         if not good.any():
-            return Found.none()
+            return Outlines.none()
         good &= ~inside_out(reading, quads, good, distinct(reading, frame.noise, config))
         return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), frame.noise)
 
@@ -159,11 +173,11 @@ def _large(quads: FloatArray, min_side_px: float) -> BoolArray:
     return np.asarray((np.sum(span * span, axis=-1) >= min_side_px**2).all(axis=1))
 
 
-def _chosen(reading: Reading, quads: FloatArray, places: IntArray, noise: float) -> Found:
+def _chosen(reading: Reading, quads: FloatArray, places: IntArray, noise: float) -> Outlines:
     """The markers at ``places`` among the quadrilaterals, their corners from the marker's own first one."""
     turned = (np.arange(4) - reading.turns[places][:, None]) % 4
     corners = np.take_along_axis(quads[places], turned[..., None], axis=1)
-    return Found(reading.ids[places], corners, reading.contrast[places] / noise, np.zeros(len(places), dtype=bool))
+    return Outlines(reading.ids[places], corners, reading.contrast[places] / noise)
 
 
 def _grown(quads: FloatArray, factor: float) -> FloatArray:

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.known_markers import pairs
+from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, pairs
 from thermal_fiducial.core.detection.twist import (
     carried,
     corrected,
@@ -27,7 +27,7 @@ from thermal_fiducial.core.detection.twist import (
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import FloatArray, IntArray
 
 # Frames farther apart show nothing of each other [s].
 _STALE_S = 0.15
@@ -48,33 +48,6 @@ _UNKNOWN_CLOCK_S = 0.03
 
 
 @dataclass(frozen=True, slots=True)
-class TrackedMarkers:
-    """Markers of a frame that the next one should show.
-
-    Parameters
-    ----------
-    ids : (N,)
-    x : (N, 4, 2) normalised corners
-    depth : (N, 4) [m]
-    cnr : (N,) contrast-to-noise ratio of a pixel
-    """
-
-    ids: IntArray
-    x: FloatArray
-    depth: FloatArray
-    cnr: FloatArray
-
-    def only(self, keep: BoolArray) -> 'TrackedMarkers':
-        """Those of the markers ``keep`` (N,)."""
-        return TrackedMarkers(self.ids[keep], self.x[keep], self.depth[keep], self.cnr[keep])
-
-    @staticmethod
-    def none() -> 'TrackedMarkers':
-        """No markers."""
-        return TrackedMarkers(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4)), np.zeros(0))
-
-
-@dataclass(frozen=True, slots=True)
 class MotionTrack:
     """The camera's twist over the frames, and the markers that it saw: what one frame leaves to the next.
 
@@ -90,7 +63,7 @@ class MotionTrack:
     lag: float
     stamp_ns: int | None = None
     twist: Twist | None = None
-    markers: TrackedMarkers = field(default_factory=TrackedMarkers.none)
+    markers: ExpectedMarkers = field(default_factory=ExpectedMarkers.none)
     last_seen_ns: int | None = None
 
     @staticmethod
@@ -128,16 +101,16 @@ class MotionTrack:
         information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + unsure))
         return corrected(before or unknown_twist(), information, information @ seen.value, later)
 
-    def expected(self, stamp_ns: int, twist: Twist) -> TrackedMarkers:
+    def expected(self, stamp_ns: int, twist: Twist) -> ExpectedMarkers:
         """The last frame's markers where the camera's motion since has carried them."""
         dt = self._since(stamp_ns)
         if dt is None or self.twist is None or len(self.markers.ids) == 0:
-            return TrackedMarkers.none()
+            return ExpectedMarkers.none()
         step = (0.5 * dt) * (twist.value + self.twist.value)
         moved = se3.inverse(se3.transform(se3.so3_exp(step[3:]), step[:3]))
         points = self.markers.depth[..., None] * (self.markers.x @ moved[:3, :2].T + moved[:3, 2]) + moved[:3, 3]
         depth = np.maximum(points[..., 2], 1e-3)
-        return TrackedMarkers(self.markers.ids, points[..., :2] / depth[..., None], depth, self.markers.cnr)
+        return ExpectedMarkers(self.markers.ids, points[..., :2] / depth[..., None], depth, self.markers.cnr)
 
     def correct(
         self,
@@ -180,7 +153,7 @@ class MotionTrack:
         """Whether there were markers, all of more contrast over noise."""
         return len(self.markers.ids) > 0 and bool(np.abs(self.markers.cnr).min() > cnr)
 
-    def after(self, stamp_ns: int, twist: Twist | None, markers: TrackedMarkers) -> 'MotionTrack':
+    def after(self, stamp_ns: int, twist: Twist | None, markers: ExpectedMarkers) -> 'MotionTrack':
         """The track with a frame's twist and markers; of a frame that comes late there is nothing to keep."""
         if self.stamp_ns is not None and 0 < self.stamp_ns - stamp_ns < _STALE_S * 1e9:
             return self
