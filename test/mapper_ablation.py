@@ -97,7 +97,6 @@ MECHANISMS = {
         ('trust:Trust.update', 'trust:inconsistent'),
         {'trust:inconsistent': lambda disagrees, _: np.zeros_like(disagrees)},
     ),
-    'robust scale in rounds': Mechanism(('optimistic corners', 'wall'), (), {'bundle_adjustment:_ROUNDS': 1}),
     'three trials a frame': Mechanism(('carpet',), (), {'candidates:TRIALS': 10**9}),
     'best-known proposers': Mechanism(('carpet',), (), {'localization:_PROPOSERS': 10**9}),
 }

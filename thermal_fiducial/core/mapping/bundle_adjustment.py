@@ -30,8 +30,6 @@ _MEDIAN_CHI2 = 7.34
 _SAMPLES = 32
 # Of these at a time: bounds the memory.
 _AT_ONCE = 8
-# Each round takes the corners' variance anew from the residuals.
-_ROUNDS = 4
 # Outlying views of a marker, in number and as a share, of which something can be said; and the share of their squared
 # error that one other pose must explain. Of ten views of noise six parameters explain 0.08; motion blur that lasts for
 # some frames, 0.5.
@@ -66,29 +64,22 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
     problem = MapProblem.build(snapshot)
     if problem is None:
         return None
-    before = now = problem.evaluate(problem.start)
-    scale, iterations = 0.0, 0
-    for _ in range(_ROUNDS):
-        previous, scale = scale, _scale(now.chi2)
-        if abs(scale - previous) < 0.05 * scale:
-            break
-        now, steps = _minimise(problem, now, scale)
-        iterations += steps
-    return _result(problem, snapshot, before, now, scale, iterations)
+    before = problem.evaluate(problem.start)
+    now, iterations = _minimise(problem, before)
+    return _result(problem, snapshot, before, now, iterations)
 
 
-def _minimise(problem: MapProblem, now: Linearised, scale: float) -> tuple[Linearised, int]:
-    """Levenberg-Marquardt; the minimum and the number of steps."""
-    cost = now.cost(scale)
-    damping, steps = 1e-5, 0
+def _minimise(problem: MapProblem, now: Linearised) -> tuple[Linearised, int]:
+    """Levenberg-Marquardt, the corners' variance anew from the residuals of each step; and the number of steps."""
+    scale, damping, steps = _scale(now.chi2), 1e-5, 0
     while steps < MAX_ITERATIONS and damping < 1e6:
         steps += 1
         trial = problem.step(now, scale, damping)
-        trial_cost = np.inf if trial is None else trial.cost(scale)
-        if trial is None or not trial_cost <= cost:
+        gain = -np.inf if trial is None else now.cost(scale) - trial.cost(scale)
+        if trial is None or not gain >= 0.0:
             damping *= 10.0
             continue
-        gain, now, cost, damping = cost - trial_cost, trial, trial_cost, max(0.1 * damping, 1e-9)
+        now, scale, damping = trial, _scale(trial.chi2), max(0.1 * damping, 1e-9)
         if gain <= _CONVERGED * scale:
             break
     return now, steps
@@ -100,9 +91,10 @@ def _scale(chi2: FloatArray) -> float:
 
 
 def _result(
-    problem: MapProblem, snapshot: Snapshot, before: Linearised, now: Linearised, scale: float, iterations: int
+    problem: MapProblem, snapshot: Snapshot, before: Linearised, now: Linearised, iterations: int
 ) -> AdjustedMap | None:
     """The outcome with its covariances; None where these do not exist."""
+    scale = _scale(now.chi2)
     n, weights = len(problem.frame), now.weights(scale)
     unknowns = 6 * (len(problem.stamps) + np.count_nonzero(~problem.held))
     full = weights == 1.0
