@@ -46,7 +46,7 @@ def _ignored(*_: Any, **__: Any) -> None:
 
 MECHANISMS = {
     'learned bias of corners': Mechanism(
-        ('board', 'moved markers'), ('corner_bias:CornerBias',), {'corner_bias:CornerBias.add': _ignored}
+        ('board', 'moved markers'), ('trust:CornerBias',), {'trust:CornerBias.add': _ignored}
     ),
     'weights by running errors': Mechanism(
         ('moved markers', 'board', 'carpet'),
@@ -67,12 +67,12 @@ MECHANISMS = {
         ('chain', 'tags test_22'), ('odometry_prior:contradicts',), {'mapper:contradicts': lambda *_: False}
     ),
     'odometry of keyframes': Mechanism(
-        ('chain', 'tags test_22'), (), {'frame_memory:alike_odometry': lambda covariance: 1e12 * covariance}
+        ('chain', 'tags test_22'), (), {'keyframes:alike_odometry': lambda covariance: 1e12 * covariance}
     ),
     'bridging': Mechanism(
         ('chain', 'tags test_22'),
-        ('frame_memory:FrameMemory.bridge', 'frame_memory:FrameMemory.bridgeable', 'odometry_prior:growth'),
-        {'frame_memory:FrameMemory.bridgeable': lambda *_, **__: False},
+        ('keyframes:FrameMemory.bridge', 'keyframes:FrameMemory.bridgeable', 'odometry_prior:growth'),
+        {'keyframes:FrameMemory.bridgeable': lambda *_, **__: False},
     ),
     'two cameras of a candidate': Mechanism(
         ('small markers', 'tags test_16'),
@@ -90,7 +90,7 @@ MECHANISMS = {
         {'bundle_adjustment:_shape_covariances': lambda problem, *_: np.zeros((len(problem.ids), 6, 6))},
     ),
     'priors': Mechanism(
-        ('second flight', 'chain'), ('snapshot:prior_poses',), {'frame_memory:prior_poses': lambda *_: {}}
+        ('second flight', 'chain'), ('snapshot:prior_poses',), {'keyframes:prior_poses': lambda *_: {}}
     ),
     'quarantine': Mechanism(
         ('moved markers', 'two sheets'),

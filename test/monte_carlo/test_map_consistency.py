@@ -7,9 +7,8 @@ from support.walls import CAMERA, flight, see, SIZE, wall
 
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
-from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.mapping.snapshot import Snapshot
+from thermal_fiducial.core.mapping.snapshot import CameraRig, Keyframe, Snapshot
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
 
 

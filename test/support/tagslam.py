@@ -14,10 +14,9 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, transform, transform_from_quaternion
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
-from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
-from thermal_fiducial.core.mapping.snapshot import Snapshot
+from thermal_fiducial.core.mapping.snapshot import CameraRig, Keyframe, Snapshot
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.map_tools.map_building import decide
 

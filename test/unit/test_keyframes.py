@@ -4,7 +4,8 @@ import numpy as np
 from support.walls import flight
 
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
-from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore
+from thermal_fiducial.core.mapping.keyframes import KeyframeStore
+from thermal_fiducial.core.mapping.snapshot import Keyframe
 
 
 def frame(stamp, T):

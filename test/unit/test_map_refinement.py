@@ -12,9 +12,8 @@ from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.adjustment_problem import MapProblem
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
-from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.mapping.snapshot import prior_poses, Snapshot
+from thermal_fiducial.core.mapping.snapshot import CameraRig, Keyframe, prior_poses, Snapshot
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
 
 

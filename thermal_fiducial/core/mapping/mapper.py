@@ -18,8 +18,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, entry, NewMarkers
-from thermal_fiducial.core.mapping.corner_bias import CornerBias
-from thermal_fiducial.core.mapping.frame_memory import FrameMemory, VIEWS
+from thermal_fiducial.core.mapping.keyframes import FrameMemory, VIEWS
 from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_alignment import jump
@@ -27,7 +26,7 @@ from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperRes
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.odometry_prior import contradicts, predicted_camera
 from thermal_fiducial.core.mapping.snapshot import Snapshot
-from thermal_fiducial.core.mapping.trust import Trust
+from thermal_fiducial.core.mapping.trust import CornerBias, Trust
 from thermal_fiducial.core.measurements import CameraPose, Markers, usable
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray

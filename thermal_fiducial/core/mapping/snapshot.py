@@ -1,15 +1,53 @@
 """What a joint refinement works on: markers and keyframes of one moment, and which of them it can adjust."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from thermal_fiducial.core.error_model import divided_prior, NO_SYSTEMATIC_ERRORS, SystematicErrors
-from thermal_fiducial.core.mapping.keyframes import CameraRig, Keyframe, packed, unpacked
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True)
+class CameraRig:
+    """Cameras that move as one; a single camera is its own rig."""
+
+    cameras: tuple[Camera, ...]
+    #: (C, 4, 4) T_rig_camera of each
+    T_rig_camera: FloatArray
+
+    @classmethod
+    def single(cls, camera: Camera) -> 'CameraRig':
+        """A rig of one camera."""
+        return cls((camera,), np.eye(4)[None])
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """What one frame showed, all markers of it, known or not."""
+
+    stamp_ns: int
+    T_map_rig: FloatArray
+    #: (k,)
+    ids: IntArray
+    #: (k, 4, 2) [px]
+    corners: FloatArray
+    #: (k, 4, 2, 2) [px^2]
+    covariances: FloatArray
+    #: (k,) index of the camera of the rig that saw each
+    cameras: IntArray
+    #: (4, 4) where the odometry has the rig, and (6, 6) how well it knows: information, zero without any
+    T_odometry: FloatArray = field(default_factory=lambda: np.eye(4))
+    information: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+
+    @property
+    def has_odometry(self) -> bool:
+        """Whether odometry knows anything of it."""
+        return bool(np.any(self.information))
 
 
 @dataclass(frozen=True)
@@ -28,7 +66,7 @@ class Snapshot:
 
     def __reduce__(self) -> tuple[Any, ...]:
         rest = (self.rig, self.priors, self.map_revision, self.errors)
-        return _snapshot, (self.markers, packed(self.keyframes), *rest)
+        return _snapshot, (self.markers, _packed(self.keyframes), *rest)
 
     @property
     def useful(self) -> list[Keyframe]:
@@ -49,7 +87,43 @@ class Snapshot:
 
 
 def _snapshot(markers: Mapping[int, MapMarker], keyframes: tuple[Any, ...], *rest: Any) -> Snapshot:
-    return Snapshot(markers, unpacked(*keyframes), *rest)
+    return Snapshot(markers, _unpacked(*keyframes), *rest)
+
+
+def _packed(frames: Sequence[Keyframe]) -> tuple[FloatArray | IntArray, ...]:
+    """Keyframes as a few large arrays: thousands of small ones take a process long to hand to another."""
+    return (
+        np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
+        np.array([frame.T_map_rig for frame in frames]).reshape(-1, 4, 4),
+        np.array([frame.T_odometry for frame in frames]).reshape(-1, 4, 4),
+        np.array([frame.information for frame in frames]).reshape(-1, 6, 6),
+        np.array([len(frame.ids) for frame in frames], dtype=np.int64),
+        *(
+            np.concatenate([getattr(frame, name) for frame in frames]) if frames else np.zeros(0)
+            for name in ('ids', 'corners', 'covariances', 'cameras')
+        ),
+    )
+
+
+def _unpacked(
+    stamps: IntArray,
+    T_map_rig: FloatArray,
+    T_odometry: FloatArray,
+    information: FloatArray,
+    counts: IntArray,
+    *views: FloatArray | IntArray,
+) -> tuple[Keyframe, ...]:
+    """The keyframes again."""
+    ends = np.cumsum(counts)[:-1]
+    parts = [np.split(array, ends) for array in views]
+    return (
+        tuple(
+            Keyframe(*fields)
+            for fields in zip(stamps.tolist(), T_map_rig, *parts, T_odometry, information, strict=True)
+        )
+        if len(stamps)
+        else ()
+    )
 
 
 def prior_poses(markers: Mapping[int, MapMarker]) -> dict[int, tuple[FloatArray, FloatArray]]:

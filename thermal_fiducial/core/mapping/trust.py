@@ -1,4 +1,4 @@
-"""Which markers of the map can be trusted: running errors, and quarantine of those that persistently disagree.
+"""What frames teach of the markers' errors: running ones, quarantine of who persistently disagrees, the corners' bias.
 
 A marker that was moved, hangs twice, or was put in the map wrongly re-projects badly against a pose that rests on the
 others. One bad frame is an outlier; most of a second of them is a fact about the marker.
@@ -6,10 +6,13 @@ others. One bad frame is an outlier; most of a second of them is a fact about th
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import INCONSISTENT_PX, SystematicErrors
 from thermal_fiducial.core.mapping.map_data import MapMarker
+from thermal_fiducial.core.types import FloatArray, IntArray
 
 #: Why a marker is in quarantine that came so with the map.
 FROM_FILE = 'in quarantine since before the map was loaded'
@@ -19,6 +22,12 @@ MEMORY = 0.05
 QUARANTINE, RELEASE = 0.7, 0.1
 #: Ratio of an error to what its covariance explains that counts as disagreement.
 DISAGREEMENT = 4.0
+#: Frames that the error to begin with is worth, and the weight that each new frame leaves to those before: 300 frames.
+BIAS_PRIOR, BIAS_MEMORY = 30.0, 1.0 - 1.0 / 300.0
+#: A pose takes up nearly all of the error of fewer markers.
+FEWEST_MARKERS = 3
+# Frames farther apart than this see the corners elsewhere in the image [ns].
+_SUCCESSIVE_NS = 150_000_000
 
 
 @dataclass
@@ -134,3 +143,36 @@ def _preference(a: MapMarker, b: MapMarker) -> int:
     if a.observations > 4 * b.observations:
         return 1
     return -1 if b.observations > 4 * a.observations else 0
+
+
+class CornerBias:
+    """Systematic error of the corners (lens, detector), from residuals that are still there in the next frame.
+
+    White noise of two frames is independent: the mean product of a corner's residuals in successive frames is the
+    variance of what lasts, as far as the pose does not take it up.
+    """
+
+    def __init__(self) -> None:
+        #: standard deviation [px]
+        self.px = SystematicErrors().corner_px
+        self._weight = BIAS_PRIOR
+        self._sum = BIAS_PRIOR * self.px**2
+        self._last: tuple[int, IntArray, FloatArray] | None = None
+
+    def add(self, stamp_ns: int, ids: IntArray, residuals: FloatArray, visible: float) -> None:
+        """Take in residuals (N, 4, 2) [px] of one frame, of which ``visible`` is what a pose leaves of the error."""
+        last, self._last = self._last, (stamp_ns, ids, residuals)
+        if last is None or not 0 < stamp_ns - last[0] < _SUCCESSIVE_NS or len(ids) < FEWEST_MARKERS:
+            return
+        before, residuals_before = last[1], last[2]
+        if not np.array_equal(ids, before):
+            _, now, then = np.intersect1d(ids, before, return_indices=True)
+            residuals, residuals_before = residuals[now], residuals_before[then]
+        if len(residuals) < FEWEST_MARKERS:
+            return
+        # Moved markers last as well: none counts for more than what makes it inconsistent.
+        products = np.mean(residuals * residuals_before, axis=(1, 2))
+        product = float(np.mean(np.clip(products, -(INCONSISTENT_PX**2), INCONSISTENT_PX**2)))
+        self._weight = BIAS_MEMORY * self._weight + visible
+        self._sum = BIAS_MEMORY * self._sum + product
+        self.px = math.sqrt(max(self._sum / self._weight, 0.0))
