@@ -6,6 +6,7 @@ contrast that fades, or reverses, over a board stops it.
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import product
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -15,6 +16,8 @@ from thermal_fiducial.calibration.placement import BoardNodes, GridRefusal
 from thermal_fiducial.calibration.surface import local_surfaces, REACH
 from thermal_fiducial.core.types import FloatArray, IntArray
 
+# Steps from a place to those that show where its point should be.
+_STEPS = tuple(product(range(-REACH, REACH + 1), repeat=2))
 #: Place in a grid, (along its first axis, along its second).
 Node = tuple[int, int]
 #: A keypoint, its two neighbours along one axis and the two along another.
@@ -141,10 +144,11 @@ class Grower:
         asked : support of each place that was looked at before: with the same the answer is the same
         off : how far each point that was added lay from where it was expected [steps]
         """
-        places = [node for node in _beside(grid, reach) if asked.get(node) != len(_support(grid, node))]
+        support = {node: _support(grid, node) for node in _beside(grid, reach)}
+        places = [node for node, count in support.items() if asked.get(node) != count]
         if not places:
             return False
-        asked.update((node, len(_support(grid, node))) for node in places)
+        asked.update((node, support[node]) for node in places)
         nodes, pixels = np.array(list(grid), dtype=np.float64), self._pixels[list(grid.values())]
         surfaces = local_surfaces(nodes, pixels, np.array(places, dtype=np.float64))
         before = len(grid)
@@ -187,6 +191,7 @@ def _beside(grid: dict[Node, int], reach: int) -> list[Node]:
     return list({node: None for known in grid for node in _around(known, reach) if node not in grid})
 
 
-def _support(grid: dict[Node, int], node: Node) -> list[Node]:
-    steps = range(-REACH, REACH + 1)
-    return [n for i in steps for j in steps if (n := (node[0] + i, node[1] + j)) in grid]
+def _support(grid: dict[Node, int], node: Node) -> int:
+    """How many points of the grid show where that of a ``node`` should be."""
+    a, b = node
+    return sum((a + i, b + j) in grid for i, j in _STEPS)
