@@ -21,6 +21,8 @@ SEEDS = (11, 12)
 each_seed = pytest.mark.parametrize('seed', [SEEDS[0], pytest.param(SEEDS[1], marks=pytest.mark.nightly)])
 #: Errors count from here on [s]: biases are known by then.
 SETTLED = 5.0
+#: Of the IMU [Hz]: that of a slow autopilot, of which a flight takes half as long as of 200 Hz.
+RATE = 100.0
 POOR_IMU = ImuNoise(accelerometer_noise_density=2e-2)
 #: Poses of several markers: a few millimetres and a fifth of a degree.
 GOOD_POSES = {'rotation_std': (0.003, 0.003, 0.001), 'translation_std': (0.0003, 0.0003, 0.003)}
@@ -28,7 +30,7 @@ GOOD_POSES = {'rotation_std': (0.003, 0.003, 0.001), 'translation_std': (0.0003,
 
 @cache
 def flight(seed, seconds=9.0, **changes):
-    return Flight(seed=seed, seconds=seconds, **dict(changes))
+    return Flight(seed=seed, seconds=seconds, imu_rate=RATE, **dict(changes))
 
 
 def seconds_of(pose):
@@ -111,8 +113,8 @@ def test_output_is_ten_times_smoother_than_the_poses_and_steps_by_millimetres():
     camera = np.array([pose.T_map_camera[:3, 3] for pose in data.poses])
     true_camera = data.motion.pose([seconds_of(pose) for pose in data.poses]) @ ekf.state.T_body_camera
     raw = np.diff(camera - true_camera[:, :3, 3], axis=0)
-    # 1/30 s is 6.7 samples of 200 Hz: seven are the stricter choice
-    assert rms(np.linalg.norm(error[7:] - error[:-7], axis=1)) < 0.1 * rms(np.linalg.norm(raw, axis=1))
+    # 1/30 s is 3.3 samples: four are the stricter choice
+    assert rms(np.linalg.norm(error[4:] - error[:-4], axis=1)) < 0.1 * rms(np.linalg.norm(raw, axis=1))
     assert np.percentile(np.linalg.norm(np.diff(error, axis=0), axis=1), 95) < 0.005
 
 
@@ -307,7 +309,7 @@ def gaps(request):
     """Errors (runs, 4), their squared distances in sigma (3 d.o.f.), and the errors 0.3 s after the gap."""
     distances, sigmas, after = [], [], []
     for seed in range(40, 40 + request.param):
-        data = Flight(seed=seed, seconds=13.0, imu_noise=POOR_IMU, **GOOD_POSES)
+        data = Flight(seed=seed, seconds=13.0, imu_rate=RATE, imu_noise=POOR_IMU, **GOOD_POSES)
         poses = [pose for pose in data.poses if not 7.0 < seconds_of(pose) < 12.0]
         ekf = PoseEkf(config(imu=POOR_IMU))
         states, _ = run(ekf, timeline(data.samples(), poses, 0.03))
@@ -333,7 +335,7 @@ def test_gaps_are_coasted_through(gaps):
 
 
 def test_lost_and_how_long_until_then():
-    data = Flight(seed=60, seconds=14.0, imu_noise=POOR_IMU, **GOOD_POSES)
+    data = Flight(seed=60, seconds=14.0, imu_rate=RATE, imu_noise=POOR_IMU, **GOOD_POSES)
     poses = [pose for pose in data.poses if seconds_of(pose) < 7.0]
     ekf = PoseEkf(config(imu=POOR_IMU, lost_position_std=0.15))
     promised = lost = None
@@ -374,7 +376,7 @@ def test_vibration_saturation_and_gaps_of_the_imu_are_survived():
     data = flight(SEEDS[1], seconds=11.0)
     rng = np.random.default_rng(8)
     shaken = data.imu + rng.normal(size=data.imu.shape) * np.repeat((0.1, 2.0), 3)
-    shaken[1400:1404, 3:] = 156.9
+    shaken[700:702, 3:] = 156.9
     samples = [
         replace(sample, angular_velocity=row[:3], linear_acceleration=row[3:])
         for sample, row, t in zip(data.samples(), shaken, data.t, strict=True)

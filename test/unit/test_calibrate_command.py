@@ -20,13 +20,13 @@ SMALL = Lens((382.0, 381.0), (161.0, 126.0), width=320, height=256)
 
 
 def test_camera_against_imu(tmp_path, capsys):
-    bag = recording(seconds=6.0).write(tmp_path / 'bag')
+    bag = recording(seconds=4.2).write(tmp_path / 'bag')
     marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
     out = tmp_path / 'extrinsics.yaml'
     assert main(['calibrate', 'camera-imu', str(bag), '--map', str(marker_map), '--out', str(out)]) == 0
     found = yaml.safe_load(out.read_text())['/**']['ros__parameters']
     R = se3.rotation_from_quaternion(found['camera_orientation'])
-    # Six seconds of gentle motion: enough for the rotation and the clock, hardly for the lever arm.
+    # Four seconds of gentle motion: enough for the rotation and the clock, hardly for the lever arm.
     assert np.degrees(se3.rotation_angle(R.T @ T_BODY_CAMERA[:3, :3])) < 1.0
     # These frames have no lag, but the detector undoes the 10 ms that a bolometer has.
     assert 0.0 < found['camera_time_offset'] < 0.02
