@@ -4,11 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
+from thermal_fiducial.core.detection.corner_errors import unknown_motion, wrong_lag
 from thermal_fiducial.core.detection.lag import (
-    common_error,
     lag_tail_maps,
     markers_deblurred,
-    model_error,
     REMAINING,
     without_lag_tails,
 )
@@ -93,36 +92,25 @@ def test_each_marker_is_freed_of_its_own_lag_tails():
 SQUARE = 60.0 * np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
 
 
-def test_model_error_leaves_the_common_shift_out():
+def test_a_wrong_lag_leaves_the_common_shift_out():
     common = np.broadcast_to([3.0, 0.0], (1, 4, 2))
     turning = common + 0.2 * np.array([[[0, -1], [1, 0], [0, 1], [-1, 0]]])
-    still = model_error(0.0 * common, SQUARE, 6)
-    np.testing.assert_array_equal(still, 0.0)
-    shape = model_error(turning, SQUARE, 6) - model_error(common, SQUARE, 6)
+    np.testing.assert_array_equal(wrong_lag(0.0 * common), 0.0)
+    shape = wrong_lag(turning) - wrong_lag(common)
     # The lag constant may be off by a third, which turns the marker by so much.
     np.testing.assert_allclose(np.trace(shape, axis1=-2, axis2=-1), (0.35 * 0.2) ** 2, rtol=1e-6)
-    assert np.all(model_error(common, 0.5 * SQUARE, 6) > model_error(common, SQUARE, 6) - 1e-12)
-
-
-@pytest.mark.parametrize('turn', [0.0, 0.7])
-def test_model_error_counts_the_cells_that_the_motion_blur_passes(turn):
-    """Seen from the side, a marker's cells are narrower one way; how it is turned in the image does not matter."""
-    R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    across, along = (np.broadcast_to(R @ shift, (1, 4, 2)) for shift in ([6.0, 0.0], [0.0, 6.0]))
-    tilted, narrow = (SQUARE * np.array(shape) @ R.T for shape in ([0.5, 1.0], [0.5, 0.5]))
-    whole = SQUARE @ R.T
-    np.testing.assert_allclose(model_error(across, tilted, 6), model_error(across, narrow, 6))
-    np.testing.assert_allclose(model_error(along, tilted, 6), model_error(along, whole, 6))
+    # Of another response edges are off by a fiftieth of the way, mostly along it.
+    np.testing.assert_allclose(wrong_lag(common)[0, 0], 0.5 * 0.06**2 * np.diag([2.0, 1.0]), rtol=1e-6)
 
 
 def test_an_unknown_motion_is_limited_by_sharp_edges_and_by_cells_that_can_be_read():
     displacement = np.tile(0.01 * 500.0 * np.eye(2, 6, k=3), (4, 4, 1, 1))
     cell = np.array([10.0, 10.0, 30.0, 10.0])
-    covariances = common_error(displacement, 1.5**2 * np.eye(6), np.array([0.015, 0.05, 0.1, 0.1]), cell)
+    covariances = unknown_motion(displacement, 1.5**2 * np.eye(6), np.array([0.015, 0.05, 0.1, 0.1]), cell)
     deviation = np.sqrt(covariances[..., 0, 0])
     # Of a faint marker, whose residuals show nothing, as much as the motion does, or 0.4 cells.
     np.testing.assert_allclose(deviation, np.broadcast_to([[0.3], [1.0], [7.5], [4.0]], (4, 4)), rtol=1e-6)
-    np.testing.assert_allclose(common_error(0.0 * displacement, np.eye(6), np.zeros(4), cell), 0.0)
+    np.testing.assert_allclose(unknown_motion(0.0 * displacement, np.eye(6), np.zeros(4), cell), 0.0)
 
 
 def test_windows_outside_or_without_numbers_are_skipped():

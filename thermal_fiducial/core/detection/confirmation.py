@@ -11,6 +11,7 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.alignment import aligned
+from thermal_fiducial.core.detection.corner_errors import OF_PATTERN_CELLS
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
@@ -42,8 +43,8 @@ _SHARP = 7.5
 _NOISY = 8.0
 # Pixels along a side that the refinement uses of a long one.
 _SEEN_PX = 60.0
-# Widest cells of markers too small for their sides to be measured [px]; deviation of a corner by the pattern [cells].
-_WIDEST_CELL_PX, _DEVIATION_CELLS = 2.5, 0.2
+# Widest cells of markers too small for their sides to be measured [px].
+_WIDEST_CELL_PX = 2.5
 #: Nearer to the border of the image than this a marker may be cut off, by its refined corners [px].
 BORDER_PX = 1.0
 
@@ -127,7 +128,7 @@ def with_corners_by_pattern(
     good &= frame.camera.contains(corners, BORDER_PX).all(axis=1)
     which, corners, shift = small[good], corners[good], shift[good]
     by_pattern[which] = True
-    covariances = (_DEVIATION_CELLS * cell[which, None, None, None]) ** 2 * np.broadcast_to(np.eye(2), (4, 2, 2))
+    covariances = (OF_PATTERN_CELLS * cell[which, None, None, None]) ** 2 * np.broadcast_to(np.eye(2), (4, 2, 2))
     contrast, doubt = reading.contrast[good], np.zeros(len(which))
     noise = np.full(len(which), frame.noise)
     observed = RefinedCorners(corners, covariances, contrast, noise, doubt)

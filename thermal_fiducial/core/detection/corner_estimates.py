@@ -12,6 +12,13 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.confirmation import BORDER_PX, confirmed, with_corners_by_pattern
+from thermal_fiducial.core.detection.corner_errors import (
+    OF_BENT_BLUR_PX,
+    OF_BENT_SCALE_PX,
+    OF_BORDER_PX,
+    OF_BORDERS_TOGETHER,
+    OF_LOCAL_PX,
+)
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind, edges_behind_border, model, sides_of
@@ -28,18 +35,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 # Half the window round a corner that is looked at by itself: in cells, and at most in pixels.
 _WINDOW_IN_CELLS, _LARGEST_WINDOW = 0.3, 5
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
-# Deviation of such a corner on thermal frames [px], and the step beyond which it has left its corner, in cells.
-_LOCAL_DEVIATION = 0.18
+# Step beyond which such a corner has left its own [cells].
 _LOST_CELLS = 0.4
-#: Displacement of sides by a bent scale [px]: if the middle of black and white lies anywhere from a fifth to four
-#: fifths of the step as it was, that of a step blurred by 0.66 px is off by up to 0.55, evenly spread.
-DISPLACED = 0.3
-# Deviation of a segment that no noise explains [px], and how much larger the variance of their mean is than if segments
-# erred by themselves: of rendered frames after the Tau 2's plateau equalisation, errors of the displacement found are
-# 3 to 4 of the sigmas that independent segments would have, of markers of 14 to 60 px seen at up to 70 degrees.
-_FLOOR, _TOGETHER = 0.05, 12.0
-# Deviation of a corner from what a bent scale does to steps, whose motion blur it bends too [px].
-_DEVIATION = 0.1
 # Four corners that err together, each with a covariance of its own, claim what they have in common four times too well.
 _CORNERS = 4.0
 _COLUMNS, _HALF = 6, 6
@@ -63,7 +60,7 @@ def local_corners(image: Float32Array, refined: RefinedCorners, cells: int) -> R
         found = cv2.cornerSubPix(image, points, (window, window), (-1, -1), _STOP).reshape(4, 2).astype(np.float64)
         near = np.abs(found - start).max(axis=1) < max(1.0, _LOST_CELLS * cell)
         corners[index, near] = found[near]
-    return replace(refined, corners_px=corners, covariances=refined.covariances + _LOCAL_DEVIATION**2 * np.eye(2))
+    return replace(refined, corners_px=corners, covariances=refined.covariances + OF_LOCAL_PX**2 * np.eye(2))
 
 
 class DisplayedSides:
@@ -79,16 +76,16 @@ class DisplayedSides:
             return refined.corners
         segments = self._across_border(frame, ids, refined, blur_px)
         known = segments.variance < HOPELESS
-        weight = np.where(known, 1.0 / (_TOGETHER * (segments.variance + _FLOOR**2)), 0.0)
+        weight = np.where(known, 1.0 / (OF_BORDERS_TOGETHER * (segments.variance + OF_BORDER_PX**2)), 0.0)
         # Where sides are out by one, the inner edges are in by one, of a border that is drawn too large with them.
         gain = 2.0 - 2.0 / (self._bits + 2.0)
         information = gain * gain * weight.sum(axis=1)
-        variance = 1.0 / (information + DISPLACED**-2)
+        variance = 1.0 / (information + OF_BENT_SCALE_PX**-2)
         displacement = variance * gain * np.sum(weight * segments.shift, axis=1)
         outward = _outward(refined.corners.corners_px)
         corners = refined.corners.corners_px - displacement[:, None, None] * outward
         unknown = _CORNERS * variance[:, None, None, None] * outward[..., :, None] * outward[..., None, :]
-        unknown = unknown + _DEVIATION**2 * np.eye(2)
+        unknown = unknown + OF_BENT_BLUR_PX**2 * np.eye(2)
         return replace(refined.corners, corners_px=corners, covariances=refined.corners.covariances + unknown)
 
     def _across_border(self, frame: Frame, ids: IntArray, refined: RefinedMarkers, blur_px: float) -> Segments:

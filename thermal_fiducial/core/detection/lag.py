@@ -17,7 +17,6 @@ import math
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.geometry.planar_pose import cross_in_plane
 from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
 
 # Interpolation of lag tails where edges are measured: a linear one blurs them more than the image that they are taken
@@ -34,66 +33,8 @@ _GAIN = 1.0 / (1.0 - _FORGOTTEN)
 #: What is left of the motion blur: its mean, and its standard deviation about that, as shares of the whole.
 REMAINING = 1.0 - _TAIL * _FORGOTTEN * _GAIN
 SPREAD = math.sqrt(1.0 - _TAIL**2 * _FORGOTTEN * _GAIN**2)
-_EYE = np.eye(2)
 #: Age, in time constants, of the velocity that has carried the lag tail as far as it is from the image.
 LAG_TAIL_AGE = 1.0 + 0.5 * _TAIL
-# How far the time constant may be off, and the displacement of an edge by a response that is no exponential: a share of
-# the motion blur, and one that grows with the square of the cells that the motion blur carries it.
-_LAG_UNSURE = 0.35
-_FORM_UNSURE, _FORM_UNSURE_IN_CELLS = 0.010, 0.011
-# Displacement [px] by motion blur over the residuals that it leaves of a model without it, in contrasts, and the
-# residuals that hardly grow with it any more: 0.015 without it, 0.05 where it is 1.5 px, 0.08 where it is 6 px.
-_BLUR_THAT_SHOWS, _BLURRED_OUT = 20.0, 0.055
-# The same of any marker that can be read, in cells: nine of ten are off by less than 0.65, seen without a motion.
-_READABLE = 0.4
-
-
-def model_error(lag_blur_px: FloatArray, corners_px: FloatArray, cells: int) -> FloatArray:
-    """Covariances (N, 4, 2, 2) [px^2] of what is wrong with an exponential lag of this time constant.
-
-    A wrong time constant displaces the corners along their motion blur (N, 4, 2). What they have in common no
-    marker shows, and covariances of single corners cannot say; it is a delay, and belongs to the filter's time
-    offset. The differences change the marker's shape. So does a response of another form, and the more the farther
-    it carries the neighbouring edges, one cell away, into one another: those of a marker with m ``cells`` and corners
-    (N, 4, 2).
-    """
-    common = 0.25 * lag_blur_px.sum(axis=1)
-    change = _LAG_UNSURE * (lag_blur_px - common[:, None])
-    carried = cells**2 * _square_in_sides(common, corners_px)
-    form = 0.5 * (_FORM_UNSURE**2 + (_FORM_UNSURE_IN_CELLS * carried) ** 2)[:, None, None]
-    common = common[:, :, None]
-    along = common * common.swapaxes(1, 2) + (common * common).sum(axis=1, keepdims=True) * _EYE
-    return np.asarray(change[..., :, None] * change[..., None, :] + (form * along)[:, None])
-
-
-def _square_in_sides(shift: FloatArray, corners: FloatArray) -> FloatArray:
-    """Squares (N,) of shifts (N, 2) in mean sides of markers (N, 4, 2): of a tilted one these are not alike."""
-    a, b = corners[:, 1] - corners[:, 3], corners[:, 2] - corners[:, 0]
-    # Twice the sides are a + b and b - a.
-    right, down = cross_in_plane(shift, b - a), cross_in_plane(a + b, shift)
-    return np.asarray((right * right + down * down) / cross_in_plane(a, b) ** 2)
-
-
-def common_error(
-    displacement: FloatArray, twist_covariance: FloatArray, unsharpness: FloatArray, cell_px: FloatArray
-) -> FloatArray:
-    """Covariances (N, 4, 2, 2) [px^2] of corners that a motion displaces of which little is known.
-
-    Edges that are sharp limit it, and that cells can be distinguished. It displaces all corners of a frame alike, which
-    covariances of single ones cannot say: what many of them say together may be off by more than theirs.
-
-    Parameters
-    ----------
-    displacement : (N, 4, 2, 6) derivative of the displacement by the twist [px]
-    twist_covariance : (6, 6)
-    unsharpness : (N,) residuals of pixels across the sides, in contrasts
-    cell_px : (N,) width of a cell
-    """
-    covariance = displacement @ twist_covariance @ np.swapaxes(displacement, -1, -2)
-    variance = 0.5 * np.trace(covariance, axis1=-2, axis2=-1)
-    sharp = np.where(unsharpness < _BLURRED_OUT, _BLUR_THAT_SHOWS * unsharpness, np.inf)
-    shown = np.minimum(sharp, _READABLE * cell_px)[:, None] ** 2
-    return np.asarray(covariance * np.minimum(shown / np.maximum(variance, 1e-12), 1.0)[..., None, None])
 
 
 def without_lag_tails(counts: Float32Array, pixel: IntArray, image: Float32Array, to_tails: FloatArray) -> Float32Array:

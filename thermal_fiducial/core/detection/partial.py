@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corner_estimates import DISPLACED
+from thermal_fiducial.core.detection.corner_errors import OF_BENT_SCALE_PX, OF_SIDES_PX, wrong_lag
 from thermal_fiducial.core.detection.corners.grid import (
     adjusted,
     grid_edges,
@@ -24,7 +24,6 @@ from thermal_fiducial.core.detection.corners.grid import (
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import PartialMarkers
-from thermal_fiducial.core.detection.lag import model_error
 from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
 from thermal_fiducial.core.detection.visible_cells import VisibleCells
 from thermal_fiducial.core.geometry import se3
@@ -51,8 +50,6 @@ _SHOWN, _AGREEING = 0.7, 0.6
 _STEPS, _SETTLED_PX = 9, 0.1
 # A corner that is known no better shows nothing, nor one so far outside the image, in image widths [px].
 _KNOWN_PX, _OUTSIDE = 8.0, 1.0
-# Standard deviation of what displaces a corner of a marker's window, whatever the edges say [px].
-_FLOOR_PX = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +141,7 @@ class PartialMarkerSearch:
                 break
         if fit.moved_px > _SETTLED_PX or not _agrees(fit):
             return None
-        return _corners(frame, marker, fit, self._cells)
+        return _corners(frame, marker, fit)
 
     def _expected(
         self, camera: Camera, marker_id: int, size: float, T_camera_marker: FloatArray, unsure_m: float
@@ -223,7 +220,7 @@ def _around(unsure_cells: float) -> FloatArray:
     return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
 
 
-def _corners(frame: Frame, marker: _Marker, fit: PoseFit, cells: int) -> RefinedCorners | None:
+def _corners(frame: Frame, marker: _Marker, fit: PoseFit) -> RefinedCorners | None:
     """The corners that follow from a marker's pose, with covariances (2, 2) that claim no more than is known of it.
 
     None where they are too uncertain, or too far outside the image.
@@ -234,7 +231,7 @@ def _corners(frame: Frame, marker: _Marker, fit: PoseFit, cells: int) -> Refined
     if not frame.camera.contains(corners, -limit).all():
         return None
     J = pose_jacobian(T, points, frame.camera)
-    information: FloatArray = np.asarray(np.linalg.inv(_pose_covariance(frame, marker, fit, cells)))
+    information: FloatArray = np.asarray(np.linalg.inv(_pose_covariance(frame, marker, fit)))
     blocks = _independent(J, information)
     deviation = np.sqrt(np.trace(blocks, axis1=1, axis2=2).max())
     if not deviation < _KNOWN_PX:
@@ -243,16 +240,16 @@ def _corners(frame: Frame, marker: _Marker, fit: PoseFit, cells: int) -> Refined
     return RefinedCorners(corners[None], blocks[None], *scalars)
 
 
-def _pose_covariance(frame: Frame, marker: _Marker, fit: PoseFit, cells: int) -> FloatArray:
+def _pose_covariance(frame: Frame, marker: _Marker, fit: PoseFit) -> FloatArray:
     """Covariance (6, 6) of a pose by its edges' noise, and by what displaces all of them alike or in some order."""
     T = fit.T_camera_marker
     window = on_marker(marker.window, marker.size)
     J = pose_jacobian(T, window, frame.camera).reshape(8, 6)
-    blocks = np.broadcast_to((DISPLACED if frame.displayed else _FLOOR_PX) ** 2 * np.eye(2), (4, 2, 2))
+    blocks = np.broadcast_to((OF_BENT_SCALE_PX if frame.displayed else OF_SIDES_PX) ** 2 * np.eye(2), (4, 2, 2))
     if frame.twist is not None:
         places = places_of_points(se3.apply(T, window), frame.camera)
         unknown = places.unknown(frame.twist, frame.lag)
-        blocks = blocks + unknown[0] + model_error(places.lag_blur(frame.twist, frame.lag), places.at.px, cells)[0]
+        blocks = blocks + unknown[0] + wrong_lag(places.lag_blur(frame.twist, frame.lag))[0]
     gain = np.linalg.pinv(J).reshape(6, 4, 2)
     systematic = np.einsum('ick,ckl,jcl->ij', gain, blocks, gain)
     return np.asarray(np.linalg.inv(fit.information) + systematic)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.core.detection.corner_errors import unknown_motion, wrong_lag
 from thermal_fiducial.core.detection.corners.refinement import refine_corners, RefinedCorners
 from thermal_fiducial.core.detection.frame import (
     delays,
@@ -21,10 +22,8 @@ from thermal_fiducial.core.detection.frame import (
 )
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.lag import (
-    common_error,
     lag_tail_maps,
     markers_deblurred,
-    model_error,
     REMAINING,
     SPREAD,
 )
@@ -156,7 +155,7 @@ class Refiner:
         lag_blur = places.lag_blur(twist, frame.lag)
         rolling = rolling_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
         corners = seen.corners_px - lag_blur + view.removed - rolling
-        unknown = places.unknown(twist, frame.lag) + model_error(lag_blur, places.at.px, self._behind.shape[2])
+        unknown = places.unknown(twist, frame.lag) + wrong_lag(lag_blur)
         if frame.twist is None:
             unknown = unknown + self._never_seen(frame, places, seen, twist)
         refined = replace(seen, corners_px=corners, covariances=doubted + unknown)
@@ -167,7 +166,7 @@ class Refiner:
         since = frame.lag - delays(seen.corners_px[..., 1], frame)
         unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), 1e-6)
         cell = sides_px(seen.corners_px) / self._behind.shape[2]
-        return common_error(since[..., None, None] * places.flow, twist.covariance_ago(frame.lag), unsharpness, cell)
+        return unknown_motion(since[..., None, None] * places.flow, twist.covariance_ago(frame.lag), unsharpness, cell)
 
 
 def _view(frame: Frame, places: Places, twist: Twist | None, hardly_px: float) -> DeblurredView:

@@ -13,13 +13,12 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from thermal_fiducial.core.detection.corner_errors import OF_CELL_EDGE_PX
 from thermal_fiducial.core.detection.corners.segments import (
     HOPELESS,
-    KEPT_VARIANCE,
     measure,
     REACHED,
-    robust_weights,
-    SCATTER_COUNTS,
+    robust_fit,
 )
 from thermal_fiducial.core.detection.corners.sides import blurred_step, blurs, columns_across, half_width, NODES, Sides
 from thermal_fiducial.core.detection.frame import Frame, Places, rolling_displacement
@@ -31,10 +30,6 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 _EVERY_PX, _FEWEST, _MOST = 3.0, 6, 24
 # So many blurs from its ends, and from its neighbours, an edge is a straight step.
 _QUIET = 2.0
-# Weights of edges are found in so many rounds.
-_ROUNDS = 3
-# Standard deviation of an edge's place that no image noise explains: its optics and its cut [px].
-_FLOOR_PX = 0.015
 # How far a pose may be off before it is adjusted, as a shift of each edge [px].
 _PRIOR_PX = 30.0
 # Depth of points that are no longer in front of the camera [m].
@@ -112,8 +107,6 @@ class PoseFit(NamedTuple):
     visible: int
     shown: int
     agreeing: int
-    #: mean square of the residuals of those that agree, over their variances
-    chi2: float
     contrast: float
     #: standard deviation of a pixel about the model [counts]
     noise: float
@@ -140,8 +133,21 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     if used.sum() < 6:
         return None
     J = _design(T, size, pattern, sides, modelled[2], layer.camera)
-    variance = measured.variance[0] + np.where(used, _FLOOR_PX**2, 0.0)
-    return _solved(T, J, measured.shift[0], variance, used, measured.contrast[0], measured.noise[0])
+    sharpness = np.where(used, 1.0 / np.sqrt(measured.variance[0] + OF_CELL_EDGE_PX**2), 0.0)
+    prior = J[used].T @ J[used] / (used.sum() * _PRIOR_PX**2)
+    prior += 1e-9 * np.diag(np.diag(prior))
+    fit = robust_fit((J * sharpness[:, None])[None], measured.shift * sharpness, used[None], prior)
+    step = fit.moved[0]
+    return PoseFit(
+        se3.transform(se3.so3_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3]),
+        (fit.information[0] - prior) * fit.trust[0],
+        float(np.abs(J[used] @ step).max()),
+        len(used),
+        int(used.sum()),
+        int(fit.kept.sum()),
+        float(np.median(measured.contrast[0][used])),
+        math.sqrt(np.median(measured.noise[0][used])),
+    )
 
 
 def _model(
@@ -176,45 +182,6 @@ def pose_jacobian(T: FloatArray, points: FloatArray, camera: Camera) -> FloatArr
     _, by_point = camera.project_jacobian(se3.apply(T, points))
     by_turn = -se3.skew(points @ T[:3, :3].T)
     return np.concatenate([by_point, by_point @ by_turn], axis=-1)
-
-
-def _solved(
-    T: FloatArray,
-    J: FloatArray,
-    shift: FloatArray,
-    variance: FloatArray,
-    used: BoolArray,
-    contrast: FloatArray,
-    noise: FloatArray,
-) -> PoseFit:
-    """The pose that explains the shifts (E,) of the edges best, outliers aside."""
-    sharpness = np.where(used, 1.0 / np.sqrt(variance), 0.0)
-    A, target = J * sharpness[:, None], shift * sharpness
-    prior = J[used].T @ J[used] / (used.sum() * _PRIOR_PX**2)
-    prior += 1e-9 * np.diag(np.diag(prior))
-    robust = np.ones(len(shift))
-    for _ in range(_ROUNDS):
-        weighted = A.T * robust
-        step = np.linalg.solve(weighted @ A + prior, weighted @ target)
-        left = np.abs(target - A @ step)
-        robust = robust_weights(left[None], used[None])[0]
-    kept = used & (robust == 1.0)
-    number = int(kept.sum())
-    chi2 = float(np.sum(left[kept] ** 2)) / KEPT_VARIANCE
-    free = max(number - 6, 0)
-    information = weighted @ A * ((free + SCATTER_COUNTS) / (chi2 + SCATTER_COUNTS))
-    moved = se3.transform(se3.so3_exp(step[3:]) @ T[:3, :3], T[:3, 3] + step[:3])
-    return PoseFit(
-        moved,
-        information,
-        float(np.abs(J[used] @ step).max()),
-        len(shift),
-        int(used.sum()),
-        number,
-        chi2 / max(free, 1),
-        float(np.median(contrast[used])),
-        math.sqrt(np.median(noise[used])),
-    )
 
 
 def layer_of(frame: Frame, window: FloatArray, blur_px: float, factor: int = 1) -> Layer:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, OF_SIDES_PX
 from thermal_fiducial.core.detection.corners.sides import ENDS, Sides, STARTS
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.geometry.camera import ImagePoints
@@ -23,13 +24,10 @@ _PIXEL_OUTLIER = 4.5
 _SEGMENT_OUTLIER = 2.5
 # Standard deviation of normal variables over the median of their absolute values.
 _MAD = 1.4826
-#: So many segments, beyond the unknowns, make their scatter count as much as the noise of their pixels.
-SCATTER_COUNTS = 24.0
-#: Variance of a standard normal variable of which no more than that is kept.
-KEPT_VARIANCE = 0.911
-# Standard deviation of a corner that no image noise explains: the optics' blur is not quite a Gaussian [px]; and of
-# what all four sides have in common of it, so that it leaves a square one.
-_FLOOR, _COMMON_FLOOR = 0.010**2 * np.eye(8), 0.005**2 * np.eye(2)
+# So many segments, beyond the unknowns, make their scatter count as much as the noise of their pixels.
+_SCATTER_COUNTS = 24.0
+# Variance of a standard normal variable of which no more than that is kept.
+_KEPT_VARIANCE = 0.911
 # Contrast of a segment over that of the marker: less is hidden, more is the edge of something else; and by how much the
 # contrast of a plate varies.
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
@@ -51,6 +49,19 @@ class Segments(NamedTuple):
     contrast: FloatArray
     #: variance of a pixel about the model
     noise: FloatArray
+
+
+class RobustFit(NamedTuple):
+    """N fits of P unknowns to S shifts."""
+
+    #: (N, P)
+    moved: FloatArray
+    #: (N, P, P) on it, with what was known before, if the deviations of the shifts are true
+    information: FloatArray
+    #: (N,) what the scatter of the shifts makes of it, as far as there are enough of them: a factor
+    trust: FloatArray
+    #: (N, S) those that are no outliers
+    kept: BoolArray
 
 
 class _SegmentFit(NamedTuple):
@@ -182,35 +193,42 @@ def adjust(
     """
     used = segments.variance < HOPELESS
     sharpness = 1.0 / np.sqrt(segments.variance)
-    A, shift = _design(sides) * sharpness[..., None], segments.shift * sharpness
-    weighted = turned = A.swapaxes(1, 2)
-    robust, prior = np.ones_like(shift), np.eye(8) / prior_px**2
-    for _ in range(_ROUNDS):
-        covariance = np.linalg.inv(weighted @ A + prior)
-        moved = covariance @ (weighted @ shift[..., None])
-        left = np.abs(shift - (A @ moved)[..., 0])
-        former, robust = robust, robust_weights(left, used)
-        if np.abs(robust - former).max() < _SETTLED:
-            break
-        weighted = turned * robust[:, None]
-    kept = used & (robust == 1.0)
-    chi2 = (left * left * kept).sum(axis=1) / KEPT_VARIANCE
-    free = np.maximum(kept.sum(axis=1) - 8.0, 0.0)
-    # The scatter of the segments corrects the noise of their pixels, as far as there are enough of them.
-    covariance = covariance * ((chi2 + SCATTER_COUNTS) / (free + SCATTER_COUNTS))[:, None, None] + _FLOOR
-    known = as_squares(at, moved, covariance)
+    fit = robust_fit(_design(sides) * sharpness[..., None], segments.shift * sharpness, used, np.eye(8) / prior_px**2)
+    covariance = np.linalg.inv(fit.information) / fit.trust[:, None, None] + OF_SIDES_PX**2 * np.eye(8)
+    known = as_squares(at, fit.moved[..., None], covariance)
     # Corners that constrain one another err together. Taken for independent, they would claim so much too much.
     together = (8.0 / (8.0 - known.constrained))[:, None, None, None]
     blocks = together * known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
     # A side of an outline that is no square's is that of something else.
     doubt = known.doubt * (0.25 * sides.along.reshape(-1, 4).sum(axis=1)) ** 2
-    return known.moved.reshape(-1, 4, 2), blocks + _COMMON_FLOOR, doubt
+    return known.moved.reshape(-1, 4, 2), blocks + OF_ALL_SIDES_PX**2 * np.eye(2), doubt
 
 
-def robust_weights(left: FloatArray, used: BoolArray) -> FloatArray:
-    """Weights (N, S) of residuals over their deviations, by the scatter of those ``used`` of each marker."""
-    scale = np.maximum(_MAD * median_of(left, used), 1.0)
-    return np.asarray(1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2)
+def robust_fit(A: FloatArray, shift: FloatArray, used: BoolArray, prior: FloatArray) -> RobustFit:
+    """Least squares of shifts (N, S) on A (N, S, P), both over their deviations, outliers aside.
+
+    Parameters
+    ----------
+    used : (N, S) which of them measure anything
+    prior : (P, P) or (N, P, P) information beforehand
+    """
+    weighted = turned = A.swapaxes(1, 2)
+    robust = np.ones_like(shift)
+    for _ in range(_ROUNDS):
+        information = weighted @ A + prior
+        moved = np.linalg.solve(information, weighted @ shift[..., None])
+        left = np.abs(shift - (A @ moved)[..., 0])
+        former = robust
+        scale = np.maximum(_MAD * median_of(left, used), 1.0)
+        robust = 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
+        if np.abs(robust - former).max() < _SETTLED:
+            break
+        weighted = turned * robust[:, None]
+    kept = used & (robust == 1.0)
+    chi2 = (left * left * kept).sum(axis=1) / _KEPT_VARIANCE
+    free = np.maximum(kept.sum(axis=1) - A.shape[2], 0.0)
+    trust = (free + _SCATTER_COUNTS) / (chi2 + _SCATTER_COUNTS)
+    return RobustFit(np.asarray(moved[..., 0]), np.asarray(information), np.asarray(trust), kept)
 
 
 def _design(sides: Sides) -> FloatArray:

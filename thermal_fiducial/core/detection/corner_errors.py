@@ -1,0 +1,75 @@
+"""What a corner may be off by for other reasons than noise of pixels: all that widens the covariance of one.
+
+Each has a unit and a source here, and enters where its name is used. How corners hang together is known of some: what
+all four sides share leaves a square one, a wrong lag displaces them along the motion.
+"""
+
+import numpy as np
+
+from thermal_fiducial.core.types import FloatArray
+
+#: A corner by its four sides, and a corner of a partially visible marker by the edges of its cells [px]: the blur of
+#: the optics is not quite a Gaussian. Rendered frames without noise.
+OF_SIDES_PX = 0.010
+#: What the four sides of a marker share of it [px].
+OF_ALL_SIDES_PX = 0.005
+#: An edge between two cells [px]: optics and cut. Drawn views of markers that the image cuts off.
+OF_CELL_EDGE_PX = 0.015
+#: A corner that is looked at by itself, on thermal frames [px]: blur rounds it.
+OF_LOCAL_PX = 0.18
+#: A corner by the whole pattern of a marker too small for its sides [cells].
+OF_PATTERN_CELLS = 0.2
+#: A side in a picture for a display, whose scale of counts is bent [px]: if the middle of black and white lies anywhere
+#: from a fifth to four fifths of the step as it was, that of a step blurred by 0.66 px is off by up to 0.55, evenly
+#: spread.
+OF_BENT_SCALE_PX = 0.3
+#: A corner there when the width of the border has shown that displacement [px]: it bends motion blur too.
+OF_BENT_BLUR_PX = 0.1
+#: A segment of a border there, and how much larger the variance of their mean is than if segments erred by themselves:
+#: of rendered frames after the Tau 2's plateau equalisation, errors of the displacement found are 3 to 4 of the sigmas
+#: that independent segments would have, of markers of 14 to 60 px seen at up to 70 degrees.
+OF_BORDER_PX, OF_BORDERS_TOGETHER = 0.05, 12.0
+#: The time constant of the lag, and the displacement of an edge by a response that is no exponential, both as shares of
+#: the motion blur. Rendered frames of a lag in steps, and of one of 14 ms taken for 10.
+OF_LAG, OF_LAG_FORM = 0.35, 0.02
+#: Displacement [px] by motion blur over the residuals that it leaves of a model without it, in contrasts, and the
+#: residuals that hardly grow with it any more: 0.015 without it, 0.05 where it is 1.5 px, 0.08 where it is 6 px.
+BLUR_THAT_SHOWS, BLURRED_OUT = 20.0, 0.055
+#: The same of any marker that can be read, in cells: nine of ten are off by less than 0.65, seen without a motion.
+READABLE_CELLS = 0.4
+
+
+def wrong_lag(lag_blur_px: FloatArray) -> FloatArray:
+    """Covariances (N, 4, 2, 2) [px^2] of what is wrong with an exponential lag of this time constant.
+
+    A wrong time constant displaces the corners along their motion blur (N, 4, 2). What they have in common no
+    marker shows, and covariances of single corners cannot say; it is a delay, and belongs to the filter's time
+    offset. The differences change the marker's shape. So does a response of another form.
+    """
+    common = 0.25 * lag_blur_px.sum(axis=1, keepdims=True)
+    change = OF_LAG * (lag_blur_px - common)
+    along = common[..., :, None] * common[..., None, :]
+    form = 0.5 * OF_LAG_FORM**2 * (along + (common * common).sum(axis=-1)[..., None, None] * np.eye(2))
+    return np.asarray(change[..., :, None] * change[..., None, :] + form)
+
+
+def unknown_motion(
+    displacement: FloatArray, twist_covariance: FloatArray, unsharpness: FloatArray, cell_px: FloatArray
+) -> FloatArray:
+    """Covariances (N, 4, 2, 2) [px^2] of corners that a motion displaces of which little is known.
+
+    Edges that are sharp limit it, and that cells can be distinguished. It displaces all corners of a frame alike, which
+    covariances of single ones cannot say: what many of them say together may be off by more than theirs.
+
+    Parameters
+    ----------
+    displacement : (N, 4, 2, 6) derivative of the displacement by the twist [px]
+    twist_covariance : (6, 6)
+    unsharpness : (N,) residuals of pixels across the sides, in contrasts
+    cell_px : (N,) width of a cell
+    """
+    covariance = displacement @ twist_covariance @ np.swapaxes(displacement, -1, -2)
+    variance = 0.5 * np.trace(covariance, axis1=-2, axis2=-1)
+    sharp = np.where(unsharpness < BLURRED_OUT, BLUR_THAT_SHOWS * unsharpness, np.inf)
+    shown = np.minimum(sharp, READABLE_CELLS * cell_px)[:, None] ** 2
+    return np.asarray(covariance * np.minimum(shown / np.maximum(variance, 1e-12), 1.0)[..., None, None])
