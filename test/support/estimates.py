@@ -8,13 +8,13 @@ from support.flights import config
 from thermal_fiducial.core.filter.initialization import blank_state
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
 from thermal_fiducial.core.filter.state import Estimate, SIZE
-from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian, so3_log
+from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian_inverse, so3_log
 
 
 def difference(state, other):
     """Error coordinates that carry ``state`` to ``other``."""
     rotation = so3_log(state.R_map_body.T @ other.R_map_body)
-    J = np.linalg.inv(state.R_map_body @ so3_left_jacobian(rotation))
+    J = so3_left_jacobian_inverse(rotation) @ state.R_map_body.T
     extrinsics = other.T_body_camera @ np.linalg.inv(state.T_body_camera)
     phi = so3_log(extrinsics[:3, :3])
     return np.concatenate(
@@ -27,7 +27,7 @@ def difference(state, other):
             other.gravity[:2] - state.gravity[:2],
             [other.time_offset - state.time_offset],
             phi,
-            np.linalg.inv(so3_left_jacobian(phi)) @ extrinsics[:3, 3],
+            so3_left_jacobian_inverse(phi) @ extrinsics[:3, 3],
             other.systematic - state.systematic,
         )
     )

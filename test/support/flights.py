@@ -11,7 +11,14 @@ import numpy as np
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.initialization import WHITE_STD
-from thermal_fiducial.core.geometry.se3 import rotation_angle, skew, so3_exp, so3_left_jacobian, so3_log, transform
+from thermal_fiducial.core.geometry.se3 import (
+    rotation_angle,
+    skew,
+    so3_exp,
+    so3_left_jacobian_inverse,
+    so3_log,
+    transform,
+)
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
 
 GRAVITY = 9.80665
@@ -56,7 +63,7 @@ class Motion:
     def imu(self, t):
         """(..., 6) true rate and specific force in the body."""
         phi, phi_dot = self._sum(self.rotation, t, 0), self._sum(self.rotation, t, 1)
-        rate = so3_left_jacobian(-phi) @ phi_dot[..., None]
+        rate = np.linalg.solve(so3_left_jacobian_inverse(-phi), phi_dot[..., None])
         lift = self._sum(self.position, t, 2) + np.array([0.0, 0.0, GRAVITY])
         force = np.swapaxes(so3_exp(phi), -1, -2) @ lift[..., None]
         return np.concatenate((rate, force), axis=-2)[..., 0]
@@ -194,7 +201,7 @@ def state_error(flight: Flight, state, t: float, index: int):
     rotation = so3_log(state.R_map_body.T @ truth[:3, :3])
     velocity = state.R_map_body.T @ (flight.motion.velocity(t) - state.velocity)
     position = state.R_map_body.T @ (truth[:3, 3] - state.position)
-    inverse_jacobian = np.linalg.inv(so3_left_jacobian(rotation))
+    inverse_jacobian = so3_left_jacobian_inverse(rotation)
     vectors = (rotation, inverse_jacobian @ velocity, inverse_jacobian @ position)
     return np.concatenate((*vectors, flight.bias[index] - state.bias))
 

@@ -141,6 +141,8 @@ def map_of_pose(
     covariances, positions : (N, 6, 6), (N, 3) of the markers
     camera_position : (3,)
     """
+    if not np.any(covariances):
+        return np.zeros((6, 6))
     best = int(np.argmin(np.trace(covariances, axis1=1, axis2=2)))
     arms = np.concatenate([positions, camera_position[None]]) - positions[best]
     A = np.tile(np.eye(6), (len(arms), 1, 1))

@@ -156,7 +156,7 @@ class CameraFit:
         middle = squares.mean(axis=(0, 1))
         self._T_map_middle = se3.transform(np.eye(3), middle)
         self._points = (squares - middle).reshape(1, -1, 3)
-        self._corners = ImagePoints.at(corners.reshape(1, -1, 2), camera)
+        self._corners = ImagePoints.seen_at(camera.normalise(corners.reshape(1, -1, 2)), camera)
         self._whitening = whitening(covs)
 
     def solve(

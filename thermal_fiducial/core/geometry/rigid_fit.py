@@ -12,6 +12,7 @@ import numpy as np
 
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
+from thermal_fiducial.core.geometry.reprojection import retract
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
 _MAX_STEPS = 20
@@ -27,9 +28,7 @@ _NEAR = 1e-6
 _AHEAD = se3.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.0])
 # Variance of a parameter, over what it would be with the others known, from which it counts as unknown.
 _UNKNOWN = 1e13
-# v @ _SKEW is skew(v), its rows one after the other.
-_SKEW = se3.skew(np.eye(3)).reshape(3, 9)
-_MINUS_SKEW = -_SKEW
+_MINUS_SKEW = -se3.SKEW
 
 #: At poses (B, 4, 4): cost (B,), gradient (B, 6), information (B, 6, 6).
 Evaluation = tuple[FloatArray, FloatArray, FloatArray]
@@ -102,7 +101,7 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
         last = gain < np.maximum(_LAST_GAIN, _LAST_SHARE * (cost - np.minimum(best, _REFUTED)))
         if steps > 0:
             active = active & (damping <= _HOPELESS) & (cost <= _REFUTED + _TIMES_THE_BEST * best)
-        trial = _moved(T, -step)
+        trial = retract(T, -step)
         done = active & last
         if done.any():
             T, active = np.where(done[:, None, None], trial, T), active & ~last
@@ -163,20 +162,6 @@ def covariances(information: FloatArray) -> FloatArray:
     known = np.all((own > 0.0) & (own < _UNKNOWN), axis=-1)
     covariance = 0.5 * (inflation + np.swapaxes(inflation, -1, -2)) / scale
     return np.where(known[..., None, None], covariance, np.inf)
-
-
-def _moved(T: FloatArray, step: FloatArray) -> FloatArray:
-    """Poses (B, 4, 4) after steps (B, 6): translation added, rotation from the left.
-
-    The rotation is that of Cayley's transform, which differs from the exponential in the third order only.
-    """
-    half = 0.5 * step[:, 3:]
-    K = (half @ _SKEW).reshape(-1, 3, 3)
-    moved = T.copy()
-    turn = (2.0 / (1.0 + np.sum(half * half, axis=-1)))[:, None, None] * (K + K @ K)
-    moved[:, :3, :3] += turn @ T[:, :3, :3]
-    moved[:, :3, 3] += step[:, :3]
-    return moved
 
 
 def _solve(information: FloatArray, damping: FloatArray, gradient: FloatArray) -> FloatArray:

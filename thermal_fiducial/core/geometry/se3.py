@@ -41,25 +41,6 @@ def skew(v: npt.ArrayLike) -> FloatArray:
     return np.asarray((v @ SKEW).reshape(*v.shape, 3))
 
 
-def _series(angle: FloatArray, exact: FloatArray, coefficients: tuple[float, ...]) -> FloatArray:
-    """Choose the Taylor polynomial in angle^2 where the closed form would divide by nearly zero."""
-    a2 = angle * angle
-    polynomial = np.zeros_like(a2)
-    for coefficient in reversed(coefficients):
-        polynomial = polynomial * a2 + coefficient
-    return np.where(angle < SMALL_ANGLE, polynomial, exact)
-
-
-def _left_jacobian_coefficients(angle: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(1-cos(a))/a^2 and (a-sin(a))/a^3."""
-    a = np.where(angle < SMALL_ANGLE, 1.0, angle)
-    half = np.sin(0.5 * a)
-    return (
-        _series(angle, 2.0 * half * half / a**2, (1 / 2, -1 / 24, 1 / 720, -1 / 40320)),
-        _series(angle, (a - np.sin(a)) / a**3, (1 / 6, -1 / 120, 1 / 5040, -1 / 362880)),
-    )
-
-
 def so3_exp(phi: npt.ArrayLike) -> FloatArray:
     """Rotation matrix (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     phi = np.asarray(phi, dtype=np.float64)
@@ -111,22 +92,13 @@ def _log_of_one(R: FloatArray) -> FloatArray:
     return np.array((scale * x, scale * y, scale * z))
 
 
-def so3_left_jacobian(phi: npt.ArrayLike) -> FloatArray:
-    """J_l (..., 3, 3) with ``exp(phi + d) ~ exp(J_l(phi) d) exp(phi)`` (Sola et al., eq. 145)."""
-    phi = np.asarray(phi, dtype=np.float64)
-    angle = np.linalg.norm(phi, axis=-1)
-    b, c = _left_jacobian_coefficients(angle)
-    K = skew(phi)
-    return np.asarray(np.eye(3) + b[..., None, None] * K + c[..., None, None] * (K @ K))
-
-
 def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
-    """Inverse of :func:`so3_left_jacobian` (Sola et al., eq. 146), for norms below 2 pi."""
+    """Inverse (..., 3, 3) of J_l with ``exp(phi + d) ~ exp(J_l d) exp(phi)``, for norms below 2 pi (Sola, eq. 146)."""
     phi = np.asarray(phi, dtype=np.float64)
-    angle = np.linalg.norm(phi, axis=-1)
-    a = np.where(angle < SMALL_ANGLE, 1.0, angle)
-    exact = 1.0 / a**2 - 1.0 / (2.0 * a * np.tan(0.5 * a))
-    c = _series(angle, exact, (1 / 12, 1 / 720, 1 / 30240))
+    squared = np.sum(phi * phi, axis=-1)
+    near = squared < SMALL_ANGLE**2
+    a = np.sqrt(np.where(near, 1.0, squared))
+    c = np.where(near, 1 / 12 + squared * (1 / 720 + squared / 30240), 1.0 / a**2 - 1.0 / (2.0 * a * np.tan(0.5 * a)))
     K = skew(phi)
     return np.asarray(np.eye(3) - 0.5 * K + c[..., None, None] * (K @ K))
 
