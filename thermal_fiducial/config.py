@@ -188,7 +188,14 @@ def _mode() -> Any:
 
 
 def _camera_position() -> Any:
-    return param((0.0, 0.0, 0.0), 'Position of the camera in base_link (the IMU frame).', unit='m', length=3)
+    return param(
+        (0.0, 0.0, 0.0),
+        'Position of the camera in base_link (the IMU frame).',
+        unit='m',
+        length=3,
+        minimum=-10.0,
+        maximum=10.0,
+    )
 
 
 def _camera_orientation() -> Any:

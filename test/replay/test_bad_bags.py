@@ -168,6 +168,8 @@ def test_an_unknown_dictionary(replay, recording, tmp_path):
     params = tmp_path / 'other.yaml'
     params.write_text('/**: {ros__parameters: {dictionary: DICT_9X9_9}}')
     fails(replay(recording.write(tmp_path / 'bag'), params=params), 'DICT_9X9_9')
+    params.write_text('/**: {ros__parameters: {dictionary: dict_4x4_50}}')
+    fails(replay(tmp_path / 'bag', params=params), 'did you mean DICT_4X4_50?')
 
 
 @pytest.mark.parametrize('text', ['format: other', 'markers: [', '\x00', 'format: thermal_fiducial/marker_map'])
@@ -230,3 +232,56 @@ def test_an_error_of_a_node_itself_is_said_and_no_success(replay, recording, tmp
     status, lines = replay(recording.write(tmp_path / 'bag'))
     assert status == 1
     assert lines[-1] == 'aruco_detector: internal error: ZeroDivisionError: nobody foresaw this'
+
+
+def other_clock(message):
+    stamp = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec - 3_000_000_000
+    return small_bag.replaced(message, header=small_bag.header(stamp, message.header.frame_id))
+
+
+def in_g(message):
+    force = message.linear_acceleration
+    scaled = {axis: getattr(force, axis) / 9.80665 for axis in 'xyz'}
+    return small_bag.replaced(message, linear_acceleration=small_bag.replaced(force, **scaled))
+
+
+@pytest.mark.parametrize(
+    ('damage', 'words'),
+    [(other_clock, 'camera and IMU have two clocks: poses are 2.9'), (in_g, 'poses contradict gravity: the IMU says')],
+)
+def test_without_a_single_pose_the_reason_is_said(replay, recording, tmp_path, damage, words):
+    events = [(s, t, damage(m) if t == IMU_TOPIC else m) for s, t, m in recording.events]
+    status, (line,) = replay(small_bag.Recording(events).write(tmp_path / 'bag'))
+    assert status == 0
+    assert line.startswith('warning: no pose went out. ')
+    assert f'pose_ekf: {words}' in line
+
+
+def test_camera_info_of_another_resolution(replay, recording, tmp_path):
+    def small(message):
+        return small_bag.replaced(message, width=320, height=256, k=np.array([372.0, 0, 160, 0, 372, 128, 0, 0, 1]))
+
+    events = [(s, t, small(m) if t == CAMERA_INFO_TOPIC else m) for s, t, m in recording.events]
+    fails(replay(small_bag.Recording(events).write(tmp_path / 'bag')), '640x512', 'camera_info of 320x256')
+
+
+def test_a_map_in_another_frame_and_parameters_of_others_are_doubted(replay, recording, tmp_path):
+    bag = recording.write(tmp_path / 'bag')
+    other = tmp_path / 'world.yaml'
+    other.write_text((tmp_path / 'map.yaml').read_text().replace('frame_id: map', 'frame_id: world'))
+    params = tmp_path / 'theirs.yaml'
+    params.write_text('their_node: {ros__parameters: {rate: 1}}')
+    status, lines = replay(bag, map_file=other, params=params)
+    assert status == 0
+    assert any("world.yaml: the map is in frame 'world'" in line for line in lines)
+    assert any('theirs.yaml: nothing in it is for our nodes: it is for their_node' in line for line in lines)
+
+
+def test_a_camera_a_hundred_metres_from_the_imu_is_refused(replay, recording, tmp_path):
+    params = tmp_path / 'other.yaml'
+    params.write_text('/**: {ros__parameters: {camera_position: [100.0, 0.0, 0.0]}}')
+    fails(replay(recording.write(tmp_path / 'bag'), params=params), 'camera_position', '-10.0 .. 10.0')
+
+
+def test_a_file_that_is_no_bag(replay, tmp_path):
+    fails(replay(tmp_path / 'map.yaml'), 'map.yaml: no bag: neither a folder nor a file .mcap')

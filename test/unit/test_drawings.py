@@ -420,3 +420,11 @@ def test_commands_write_what_they_say(tmp_path, capsys):
     # Two markers of 130 mm with 40 mm between them.
     assert [marker.T_map_marker[0, 3] for marker in board.markers.values()] == pytest.approx([-0.085, 0.085])
     assert board.markers[0].size == pytest.approx(0.13)
+
+
+def test_sizes_in_metres_and_a_file_in_the_place_of_the_folder_are_named(tmp_path, capsys):
+    assert main(['markers', 'make', '--ids', '1', '--size', '0.3', '--out', str(tmp_path / 'plates')]) == 2
+    assert 'a marker of 0.3 mm: sizes are in millimetres' in capsys.readouterr().err
+    (tmp_path / 'file').write_text('')
+    assert main(['markers', 'make', '--ids', '1', '--out', str(tmp_path / 'file')]) == 2
+    assert f'{tmp_path}/file: File exists' in capsys.readouterr().err

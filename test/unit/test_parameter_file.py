@@ -49,8 +49,11 @@ def test_an_unknown_name_is_refused_in_a_section_of_ours(tmp_path, section):
 
 def test_a_section_of_another_node_is_its_own_matter(tmp_path):
     file = tmp_path / 'rig.yaml'
-    file.write_text(yaml.safe_dump({'/mavros': {'ros__parameters': {'fcu_url': 'udp://'}}}))
+    theirs = {'/mavros': {'ros__parameters': {'fcu_url': 'udp://'}}}
+    file.write_text(yaml.safe_dump(theirs | {'/**': {'ros__parameters': {'marker_size': 0.3}}}))
     assert read_settings(file, {}).warnings == ()
+    file.write_text(yaml.safe_dump(theirs))
+    assert read_settings(file, {}).warnings == (f'{file}: nothing in it is for our nodes: it is for /mavros',)
 
 
 def test_a_map_of_another_dictionary_is_warned_of(tmp_path):

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _command(commands, 'check', 'what is doubtful about a map; exit status 1 if anything is', _check)
     for name, fixed in (('fix', True), ('unfix', False)):
         action = _command(commands, name, f'declare markers {"fixed: they never move" if fixed else "free"}', _fix)
-        action.add_argument('ids', type=int, nargs='+', metavar='ID')
+        action.add_argument('ids', type=int, nargs='+', metavar='ID', help='markers of the map')
         action.set_defaults(fixed=fixed)
     _add_editing(commands)
     _command(commands, 'history', 'earlier versions of a map', _history)
@@ -68,7 +68,7 @@ def _command(
 
 def _add_editing(commands: Commands) -> None:
     move = _command(commands, 'move', 'put a marker somewhere else', _move)
-    move.add_argument('id', type=int, metavar='ID')
+    move.add_argument('id', type=int, metavar='ID', help='marker of the map')
     move.add_argument(
         '--position', type=float, nargs=3, required=True, metavar=('X', 'Y', 'Z'), help='of its centre [m]'
     )
@@ -76,12 +76,12 @@ def _add_editing(commands: Commands) -> None:
     move.add_argument('--sigma', type=float, default=0.005, metavar='M', help='how well that is known')
     move.add_argument('--sigma-deg', type=float, default=1.0, metavar='DEG', help='and its orientation')
     rename = _command(commands, 'rename', 'give a marker another ID', _rename)
-    rename.add_argument('old', type=int, metavar='OLD')
-    rename.add_argument('new', type=int, metavar='NEW')
+    rename.add_argument('old', type=int, metavar='OLD', help='ID that it has')
+    rename.add_argument('new', type=int, metavar='NEW', help='ID that no other marker has')
     delete = _command(commands, 'delete', 'take markers out', _delete)
-    delete.add_argument('ids', type=int, nargs='+', metavar='ID')
+    delete.add_argument('ids', type=int, nargs='+', metavar='ID', help='markers of the map')
     merge = _command(commands, 'merge', 'take over the markers of another map, by the ones in common', _merge)
-    merge.add_argument('other', type=Path, metavar='OTHER')
+    merge.add_argument('other', type=Path, metavar='OTHER', help='map file with markers in common')
     merge.add_argument('--out', type=Path, metavar='FILE', help='default: MAP itself')
     anchor = _command(commands, 'anchor', 'move the whole map onto surveyed markers', _anchor)
     anchor.add_argument(

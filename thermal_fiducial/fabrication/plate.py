@@ -20,6 +20,8 @@ from thermal_fiducial.fabrication.shape import contour, Rectangle, trace
 MOUNTS = ('ears', 'frame', 'none')
 
 # Acrylic left around a mounting hole [mm]: the thickness of usual sheets, the least that a bolt may clamp.
+#: Nobody cuts a smaller one; most likely its size is in metres.
+_SMALLEST_MM = 5.0
 _WALL_MM = 3.0
 # Width of a tab and length of its neck in sides of the marker: room for the engraving, and warm background between
 # tab and edge that the camera resolves. Together they stay below the 12 % of a side that OpenCV smooths away when it
@@ -71,6 +73,8 @@ class PlateOptions:
             or min(self.kerf, self.corner_radius, self.stand_off) < 0
         ):
             raise InputError('lengths of a marker plate must be positive')
+        if self.size < _SMALLEST_MM:
+            raise InputError(f'a marker of {self.size:g} mm: sizes are in millimetres, {_SMALLEST_MM:g} and more')
         if self.mount == 'frame' and self.frame_width < self.hole_diameter + _WALL_MM:
             raise InputError(f'a frame of {self.frame_width:g} mm has no room for holes of {self.hole_diameter:g} mm')
 

@@ -49,7 +49,8 @@ def write(drawing: Drawing, path: str | os.PathLike[str], paper: str | None = No
         else:
             {'svg': write_svg, 'dxf': write_dxf, 'png': write_png}[kind](drawing, path)
     except OSError as error:
-        raise InputError(f'{path}: {error.strerror or error}') from None
+        place = path.parent if path.parent.is_file() else path
+        raise InputError(f'{place}: {error.strerror or error}') from None
 
 
 def write_svg(drawing: Drawing, path: Path) -> None:

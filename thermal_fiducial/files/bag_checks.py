@@ -9,8 +9,10 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import require_regular
 from thermal_fiducial.files.schema import load_yaml
 
+#: Of files that are a bag by themselves.
+SINGLE_FILES = ('.mcap', '.db3', '.bag')
 #: Of the files of bags; what else lies in their folder is not opened.
-_SUFFIXES = ('.mcap', '.db3', '.bag', '.zstd')
+_SUFFIXES = (*SINGLE_FILES, '.zstd')
 _ROS1_BEGIN = b'#ROSBAG V2.0\n'
 _LARGEST_NUMBER = 2**63
 

@@ -20,7 +20,7 @@ from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestor
 from rosbags.typesys.store import Typestore
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bag_checks import check_announced, check_file, check_metadata
+from thermal_fiducial.files.bag_checks import check_announced, check_file, check_metadata, SINGLE_FILES
 from thermal_fiducial.files.decompression import bound_decompression
 
 IMAGE_TOPIC = 'thermal/image_raw'
@@ -151,8 +151,10 @@ class BagReader:
     def __enter__(self) -> Self:
         if not self.path.exists():
             raise InputError(f'{self.path}: no such bag')
+        if not self.path.is_dir() and self.path.suffix not in SINGLE_FILES:
+            raise InputError(f'{self.path}: no bag: neither a folder nor a file {", ".join(SINGLE_FILES)}')
         if self.path.is_dir() and not (self.path / 'metadata.yaml').exists():
-            raise InputError(f'{self.path}: no bag, the folder has no metadata.yaml')
+            raise InputError(f'{self.path}: no bag, the folder has no metadata.yaml (ros2 bag reindex makes one)')
         if self.path.is_dir():
             check_metadata(self.path / 'metadata.yaml')
         for file in sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]:

@@ -12,6 +12,7 @@ A dictionary file is YAML::
 """
 
 from collections.abc import Iterable
+import difflib
 import os
 from pathlib import Path
 from typing import Any
@@ -50,7 +51,13 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> cv2.aruco.Dictionar
     try:
         text = read_text(path)
     except InputError:
-        raise InputError(f'dictionary {name!r}: neither a dictionary of OpenCV nor a readable file') from None
+        known = [
+            *(word for word in dir(cv2.aruco) if word.startswith('DICT_')),
+            *(p.stem for p in PACKAGED.glob('*.yaml')),
+        ]
+        close = difflib.get_close_matches(name.upper(), known, 1)
+        hint = f'; did you mean {close[0]}?' if close else ''
+        raise InputError(f'dictionary {name!r}: neither a dictionary of OpenCV nor a readable file{hint}') from None
     try:
         return _from_document(parse_yaml(str(path), text))
     except InputError as error:

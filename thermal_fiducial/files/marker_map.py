@@ -40,6 +40,13 @@ def load_map(
     return MarkerMap(markers, document.frame_id, document.dictionary, document.revision)
 
 
+def other_frame(of: str, published: str) -> str:
+    """In words, whether a map is in another frame than that of the published poses; empty: it is not."""
+    return (
+        '' if of == published else f'the map is in frame {of!r}, but poses are published in {published!r} (map_frame)'
+    )
+
+
 def save_map(path: str | Path, marker_map: MarkerMap) -> None:
     """Write ``marker_map`` atomically: a temporary file in the same folder, synced, then renamed.
 

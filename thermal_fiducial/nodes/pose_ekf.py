@@ -49,8 +49,9 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
 
     def _on_imu(self, message: bytes) -> None:
         self._frames.note_imu_frame(message_bytes.frame_id(message))
-        odometry = self.filter.add_imu(message_bytes.imu_sample(message))
-        self._status.after_imu()
+        sample = message_bytes.imu_sample(message)
+        odometry = self.filter.add_imu(sample)
+        self._status.after_imu(sample.stamp_ns)
         if odometry is not None:
             lost, jumps = self.filter.lost, self._status.jumps
             self._outputs.send(odometry, self.filter.smooth, lost=lost, jumps=jumps)

@@ -48,6 +48,8 @@ class RunFiles:
         self.counts: Counter[str] = Counter()
         self.frames_with_markers = 0
         self.warnings: Counter[str] = Counter()
+        #: node to what it said last and was not well then
+        self.complaints: dict[str, str] = {}
         self._last_figures: dict[str, dict[str, str]] = {}
         self._fused = _opened(folder / 'fused.tum')
         self._fiducial = _opened(folder / 'fiducial.tum')
@@ -106,7 +108,9 @@ class RunFiles:
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             self._last_figures[status.name] = {value.key: value.value for value in status.values}
+            self.complaints.pop(status.name, None)
             if status.level != DiagnosticStatus.OK:
+                self.complaints[status.name] = status.message
                 self.warnings[f'{status.name}: {status.message}'] += 1
 
 

@@ -12,7 +12,7 @@ from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import SECOND_NS
-from thermal_fiducial.errors import InputError
+from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.replay.lockstep import replay_lockstep
@@ -86,6 +86,9 @@ def replay(options: Options, progress: Callable[[float], None], warn: Callable[[
                 warn,
             )
         _report_refusals(files, entry, warn)
+        if not files.counts['pose']:
+            reasons = '; '.join(f'{node}: {files.complaints[node]}' for node in entry.nodes if node in files.complaints)
+            warn(f'no pose went out. {reasons}')
         marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)
         summary = _summary(options, settings, bag, files) | {'markers_in_map': len(marker_map.markers)} | timing
     (options.run / 'summary.json').write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
@@ -143,15 +146,16 @@ def _report_refusals(files: RunFiles, entry: Entry, warn: Callable[[str], None])
     InputError
         Not one of the images (or what stands for them), of the calibrations or of the IMU messages could be used.
     """
-    needed = {entry.nodes[0]: [entry.topic], 'pose_ekf': [IMU_TOPIC]}
+    needed = {'aruco_detector': ['thermal/image'], entry.nodes[0]: [entry.topic], 'pose_ekf': [IMU_TOPIC]}
     for node in entry.nodes:
         figures = files.figures.get(node, {})
         refused, reason = int(figures.get('refused messages', 0)), figures.get('last refusal', '')
-        for topic in needed.get(node, []):
-            if refused and refused >= int(figures[f'received /{topic}']):
-                raise InputError(f'not one message on {topic} could be used: {reason}')
         if figures.get('calibrations') == '0':
             raise InputError(f'not one message on {CAMERA_INFO_TOPIC} holds a usable calibration')
+        # An error of the node itself says nothing of the input.
+        for topic in [] if reason.startswith(INTERNAL_ERROR) else needed.get(node, []):
+            if refused and refused >= int(figures[f'received /{topic}']):
+                raise InputError(f'not one message on {topic} could be used: {reason}')
         if refused:
             warn(f'{node}: {refused} messages refused, the last one: {reason}')
 

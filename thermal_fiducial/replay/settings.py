@@ -23,7 +23,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns
-from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.marker_map import load_map, other_frame
 from thermal_fiducial.files.plain_yaml import load_plain
 
 
@@ -63,7 +63,10 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any]) -> Settings
         check_names(values)
         configs[node] = from_mapping(kind, values)
     settings = Settings(**configs)
-    return replace(settings, warnings=tuple(_check_files(settings)))
+    warnings = _check_files(settings)
+    if document and not any(_values_for(node, document) for node in NODES):
+        warnings.append(f'{params}: nothing in it is for our nodes: it is for {", ".join(document)}')
+    return replace(settings, warnings=tuple(warnings))
 
 
 def load_config(path: str | Path | None = None, **overrides: Any) -> PipelineConfig:
@@ -99,7 +102,8 @@ def _check_files(settings: Settings) -> list[str]:
             raise InputError(f'{mapper.map_file}: marker {foreign[0]} is not in {settings.aruco_detector.dictionary}')
         folder = Path(mapper.map_file).parent
         other = other_patterns(marker_map.markers, marker_map.dictionary, settings.aruco_detector.dictionary, folder)
-        return [f'{mapper.map_file}: {other}'] if other else []
+        frame = other_frame(marker_map.frame_id, mapper.map_frame)
+        return [f'{mapper.map_file}: {doubt}' for doubt in (other, frame) if doubt]
     return []
 
 

@@ -4,8 +4,13 @@ import re
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_text, PoseUpdate
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.ros.console import Console
 from thermal_fiducial.ros.node import ERROR, OK, WARN
+
+_WAITING = 'waiting for markers'
+#: No pose is on its way for so long, nor is it so far ahead [s].
+_APART_S = 2.5
 
 
 class FilterStatus:
@@ -19,11 +24,15 @@ class FilterStatus:
         #: the status without numbers and what was said of it, whether it was lost then, and ever not
         self._words, self._headline, self._was_lost, self._initialised = '', '', True, False
         self._last_refusal = ''
+        #: of the latest IMU sample and camera pose; None before there is one
+        self._imu_ns: int | None = None
+        self._pose_ns: int | None = None
         #: stamps of the poses whose innovations were published
         self._published: set[int] = set()
 
-    def after_imu(self) -> None:
+    def after_imu(self, stamp_ns: int) -> None:
         """Count a start or a reset."""
+        self._imu_ns = stamp_ns
         resets = None if self._filter.state is None else self._filter.resets
         if resets == self._resets:
             return
@@ -34,24 +43,36 @@ class FilterStatus:
 
     def after_pose(self, update: PoseUpdate) -> None:
         """Remember why a pose was refused, until one is not."""
+        self._pose_ns = update.stamp_ns
         self._last_refusal = '' if update.accepted or update.pending else update.reason
 
     def state(self) -> tuple[bytes, str]:
         """Level, and in words what the filter does and why it refused the last pose."""
-        status, lost = self._filter.status, self._filter.lost
-        if self._last_refusal and (not lost or status == 'waiting for markers'):
+        status, lost = self._status(), self._filter.lost
+        if self._last_refusal and (not lost or status == _WAITING):
             return ERROR if lost else WARN, f'{status}; pose {self._last_refusal}'
         return ERROR if lost else OK if status == 'tracking' else WARN, status
 
     def headline(self) -> str:
         """What the filter does, without numbers, and what has changed if it has a pose again."""
-        words, lost = re.split(r'[:\d]', self._filter.status)[0].removesuffix(' for '), self._filter.lost
+        words, lost = re.split(r'[:\d]', self._status())[0].removesuffix(' for '), self._filter.lost
         if words != self._words:
             again = 'recovered' if self._initialised else 'initialised'
             self._headline = f'{again}: {words}' if self._was_lost and not lost else words
             self._words, self._was_lost = words, lost
             self._initialised |= not lost
         return self._headline
+
+    def _status(self) -> str:
+        """That of the filter; poses that no IMU sample is near are no lack of markers."""
+        status = self._filter.status
+        if status != _WAITING or self._imu_ns is None or self._pose_ns is None:
+            return status
+        apart = (self._pose_ns - self._imu_ns) / SECOND_NS
+        if abs(apart) < _APART_S:
+            return status
+        side = 'ahead of' if apart > 0.0 else 'behind'
+        return f'camera and IMU have two clocks: poses are {abs(apart):.4g} s {side} the IMU'
 
     def figures(self) -> dict[str, object]:
         """The filter in numbers."""

@@ -14,6 +14,7 @@ from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import other_patterns
 from thermal_fiducial.files.map_keeper import MapKeeper
+from thermal_fiducial.files.marker_map import other_frame
 from thermal_fiducial.ros.map_refinement import MapRefinement
 from thermal_fiducial.ros.node import StageNode
 
@@ -61,6 +62,8 @@ class MapServices:
     def _read(self) -> MarkerMap:
         loaded = self._keeper.load()
         self._node.get_logger().info(f'map of {len(loaded.markers)} markers from {self._keeper.path}')
+        if doubt := other_frame(loaded.frame_id, self._node.config.map_frame):
+            self._node.get_logger().warning(doubt)
         wanted = self._node.config.dictionary
         folder = self._keeper.path.parent
         self.other_dictionary = other_patterns(loaded.markers, loaded.dictionary, wanted, folder)
