@@ -105,6 +105,7 @@ def test_files_that_are_none(tmp_path, load):
         tmp_path / 'sparse',
         Path('a\0b'),
         tmp_path / ('x' * 300),
+        Path('/' + 5000 * '['),
     ):
         refused(load, path)
 

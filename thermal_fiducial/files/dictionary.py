@@ -57,7 +57,9 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> cv2.aruco.Dictionar
         ]
         close = difflib.get_close_matches(name.upper(), known, 1)
         hint = f'; did you mean {close[0]}?' if close else ''
-        raise InputError(f'dictionary {name!r}: neither a dictionary of OpenCV nor a readable file{hint}') from None
+        raise InputError(
+            f'dictionary {name[:200]!r}: neither a dictionary of OpenCV nor a readable file{hint}'
+        ) from None
     try:
         return _from_document(parse_yaml(str(path), text))
     except InputError as error:

@@ -15,6 +15,8 @@ TEXT_LIMIT_BYTES = 6_000_000
 LINE_LIMIT_BYTES = 10_000
 #: Blank lines in a row: where there are more, nobody meant to write a table.
 _BLANK_LINES = 100_000
+#: Characters of a path in an error.
+_LONGEST_NAME = 400
 
 
 def read_bytes(path: str | Path, limit: int) -> bytes:
@@ -42,6 +44,7 @@ def _opened(path: str | Path, limit: int) -> Iterator[BinaryIO]:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:
         name = str(path) if str(path).isprintable() else repr(str(path))
+        name = name if len(name) <= _LONGEST_NAME else f'{name[:_LONGEST_NAME]}...'
         raise InputError(f'{name}: cannot read it: {getattr(error, "strerror", None) or error}') from None
     try:
         found = os.fstat(descriptor)
