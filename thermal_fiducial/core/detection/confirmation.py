@@ -132,7 +132,7 @@ def with_corners_by_pattern(
     contrast, doubt = reading.contrast[good], np.zeros(len(which))
     noise = np.full(len(which), frame.noise)
     observed = RefinedCorners(corners, covariances, contrast, noise, doubt)
-    at_stamp = replace(observed, corners_px=corners - shift)
+    at_stamp = observed._replace(corners_px=corners - shift)
     px = refined.places.at.px.copy()
     px[which] = at_stamp.corners_px
     return (

@@ -5,7 +5,7 @@ levels of black and white is then not that of the step between them: all that is
 marker's sides go out where the inner edges of its border go in, so that the width of the border says by how much.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -60,7 +60,7 @@ def local_corners(image: Float32Array, refined: RefinedCorners, cells: int) -> R
         found = cv2.cornerSubPix(image, points, (window, window), (-1, -1), _STOP).reshape(4, 2).astype(np.float64)
         near = np.abs(found - start).max(axis=1) < max(1.0, _LOST_CELLS * cell)
         corners[index, near] = found[near]
-    return replace(refined, corners_px=corners, covariances=refined.covariances + OF_LOCAL_PX**2 * np.eye(2))
+    return refined._replace(corners_px=corners, covariances=refined.covariances + OF_LOCAL_PX**2 * np.eye(2))
 
 
 class DisplayedSides:
@@ -86,7 +86,7 @@ class DisplayedSides:
         corners = refined.corners.corners_px - displacement[:, None, None] * outward
         unknown = _CORNERS * variance[:, None, None, None] * outward[..., :, None] * outward[..., None, :]
         unknown = unknown + OF_BENT_BLUR_PX**2 * np.eye(2)
-        return replace(refined.corners, corners_px=corners, covariances=refined.corners.covariances + unknown)
+        return refined.corners._replace(corners_px=corners, covariances=refined.corners.covariances + unknown)
 
     def _across_border(self, frame: Frame, ids: IntArray, refined: RefinedMarkers, blur_px: float) -> Segments:
         """Displacements of the inner edges of the borders, inward, where white lies behind them."""
@@ -185,6 +185,5 @@ class CornerEstimator:
 
 def _none(twist: Twist | None) -> MarkerEstimates:
     """No markers."""
-    x, square = np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2))
-    corners = RefinedCorners(x, square, np.zeros(0), np.zeros(0), np.zeros(0))
-    return MarkerEstimates(np.zeros(0, dtype=np.int64), corners, ImagePoints(x, x, square, square), x, twist)
+    found = FoundMarkers.none()
+    return MarkerEstimates(found.ids, RefinedCorners.none(), found.places.at, found.places.at.x, twist)

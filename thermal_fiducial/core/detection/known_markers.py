@@ -36,8 +36,7 @@ def pairs(ids: IntArray, others: IntArray) -> tuple[IntArray, IntArray]:
     return first, second
 
 
-@dataclass(frozen=True, slots=True)
-class ExpectedMarkers:
+class ExpectedMarkers(NamedTuple):
     """Where N markers should be.
 
     Parameters
@@ -64,12 +63,7 @@ class ExpectedMarkers:
 
     def joined(self, others: 'ExpectedMarkers') -> 'ExpectedMarkers':
         """Those of ``others`` as well."""
-        return ExpectedMarkers(
-            np.concatenate([self.ids, others.ids]),
-            np.concatenate([self.x, others.x]),
-            np.concatenate([self.depth, others.depth]),
-            np.concatenate([self.cnr, others.cnr]),
-        )
+        return ExpectedMarkers(*(np.concatenate(pair) for pair in zip(self, others, strict=True)))
 
     def places(self, camera: Camera) -> Places:
         """Their places in the image of a camera."""

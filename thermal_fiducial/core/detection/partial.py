@@ -112,11 +112,9 @@ class PartialMarkerSearch:
             if corners is not None:
                 seen.append((marker.id, corners))
         if not seen:
-            nothing = np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), np.zeros(0), np.zeros(0), np.zeros(0)
-            return np.zeros(0, dtype=np.int64), RefinedCorners(*nothing)
-        parts = [(c.corners_px, c.covariances, c.contrast, c.noise, c.doubt) for _, c in seen]
-        ids = np.array([marker_id for marker_id, _ in seen])
-        return ids, RefinedCorners(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+            return np.zeros(0, dtype=np.int64), RefinedCorners.none()
+        parts = zip(*(found for _, found in seen), strict=True)
+        return np.array([marker_id for marker_id, _ in seen]), RefinedCorners(*map(np.concatenate, parts))
 
     def _one(
         self, frame: Frame, marker: _Marker, allowed: BoolArray, config: ArucoDetectorConfig

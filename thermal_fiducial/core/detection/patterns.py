@@ -4,7 +4,6 @@ All cells count, the black border as well as the bits, each the mean of several 
 from noise at contrasts where no single bit could be thresholded: what is compared are correlations.
 """
 
-from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
@@ -62,8 +61,7 @@ def correctable_bits(bits: Gray) -> int:
     return max((int(distance.min()) - 1) // 2, 0)
 
 
-@dataclass(frozen=True, slots=True)
-class Reading:
+class Reading(NamedTuple):
     """What Q quadrilaterals look most like."""
 
     #: (Q,) most similar ID

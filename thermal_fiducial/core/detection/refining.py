@@ -151,14 +151,14 @@ class Refiner:
             twist = track.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
         if twist is None:
             unsure = doubted + self._never_seen(frame, places, seen, unknown_twist())
-            return RefinedMarkers(view, seen, replace(seen, covariances=unsure), replace(places, at=at), None)
+            return RefinedMarkers(view, seen, seen._replace(covariances=unsure), replace(places, at=at), None)
         lag_blur = places.lag_blur(twist, frame.lag)
         rolling = rolling_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
         corners = seen.corners_px - lag_blur + view.removed - rolling
         unknown = places.unknown(twist, frame.lag) + wrong_lag(lag_blur)
         if frame.twist is None:
             unknown = unknown + self._never_seen(frame, places, seen, twist)
-        refined = replace(seen, corners_px=corners, covariances=doubted + unknown)
+        refined = seen._replace(corners_px=corners, covariances=doubted + unknown)
         return RefinedMarkers(view, seen, refined, replace(places, at=at.at_pixels(corners)), twist)
 
     def _never_seen(self, frame: Frame, places: Places, seen: RefinedCorners, twist: Twist) -> FloatArray:

@@ -1,6 +1,5 @@
 """Blind search for markers in a frame."""
 
-from dataclasses import fields
 from enum import auto, Flag
 from typing import NamedTuple
 
@@ -103,7 +102,7 @@ class BlindSearch:
         pull = SearchScales.FAINT in scales
         reading, quads = self._read(frame, half, (fine, faint), allowed, seen.ids if pull else None)
         good = accepted(reading, frame.noise, self._decoder.correctable, config) & _large(quads, min_side_px)
-        good &= _whole(quads, frame.image)
+        good &= frame.camera.contains(quads, CUT_OFF_PX).all(axis=1)
         if not good.any():
             return Outlines.none()
         good &= ~inside_out(reading, quads, good, distinct(reading, frame.noise, config))
@@ -203,8 +202,7 @@ def _rough(reading: Reading, quads: FloatArray, seen: IntArray) -> IntArray:
 
 
 def _joined(first: Reading, second: Reading) -> Reading:
-    names = [item.name for item in fields(Reading)]
-    return Reading(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))
+    return Reading(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))
 
 
 def distinct(reading: Reading, noise: float, config: ArucoDetectorConfig) -> BoolArray:
@@ -239,13 +237,6 @@ def inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: B
     result = np.zeros(len(good), dtype=bool)
     result[mine] = (together & opposite & (similarity[others] > similarity[mine, None])).any(axis=1)
     return result
-
-
-def _whole(quads: FloatArray, image: Float32Array) -> BoolArray:
-    """Which quadrilaterals (Q, 4, 2) lie in the image, clear of its edges."""
-    height, width = image.shape
-    last = width - 1 - CUT_OFF_PX, height - 1 - CUT_OFF_PX
-    return np.asarray(((quads >= CUT_OFF_PX) & (quads <= last)).all(axis=(1, 2)))
 
 
 def _once(reading: Reading, quads: FloatArray, good: BoolArray, drop_duplicates: bool) -> IntArray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder
-from thermal_fiducial.core.imaging.stops import FramePeriod, FreezeDetector, Settling, ShutterDetector
+from thermal_fiducial.core.imaging.stops import FreezeDetector, Pauses, ShutterDetector
 from thermal_fiducial.core.measurements import LATEST_NS
 from thermal_fiducial.core.types import Counts, Gray, IntArray
 from thermal_fiducial.errors import InputError
@@ -54,10 +54,9 @@ class FrameCleaner:
         self._shape = shape
         self._stamps: set[int] = set()
         self._newest_ns = 0
-        self._period = FramePeriod()
+        self._pauses = Pauses()
         self._freeze = FreezeDetector()
         self._shutter = ShutterDetector()
-        self._settling = Settling()
         self._finder = BadPixelFinder(shape)
         self._found: IntArray = np.zeros((0, 2), np.int64)
         self._filler = BadPixelFiller(self._known_bad, shape) if shape != (0, 0) else None
@@ -113,12 +112,8 @@ class FrameCleaner:
         elif self._shutter.closed(stamp_ns, image):
             reason = SHUTTER
         else:
-            self._period.add(stamp_ns)
-            return SETTLING if self._settling.withholds(stamp_ns) else ''
-        # A few repeated frames are a driver that runs faster than the camera. After a longer stop the first new
-        # frame may still hold old counts: in the bolometers, which lag, and in the driver's buffers.
-        if self._period.stopped(stamp_ns):
-            self._settling.begin(stamp_ns, self.config.settle_frames)
+            return SETTLING if self._pauses.add_new(stamp_ns) else ''
+        self._pauses.add_old(stamp_ns, self.config.settle_frames)
         return reason
 
     def _replace_bad_pixels(self, image: Counts) -> None:

@@ -13,38 +13,52 @@ from thermal_fiducial.core.imaging.bad_pixels import pixel_noise
 from thermal_fiducial.core.types import Counts
 
 
-class FramePeriod:
-    """How often the camera shows something new: a driver may send each frame several times.
+class Pauses:
+    """How often the camera shows something new, and which new frames after a longer pause may still hold old counts.
 
-    The period is the median of the last intervals between new frames, so that neither a shutter event nor the
-    beat of two clocks (a frame now and then stands for two ticks of the driver) changes it.
+    A driver may send each frame several times. The period is the median of the last intervals between new frames, so
+    that neither a shutter event nor the beat of two clocks (a frame now and then stands for two ticks of the driver)
+    changes it. Frames are counted by their stamps: late ones from before the pause have nothing to settle.
     """
 
     #: Of a Tau 2 at full rate: until a second frame has come.
     ASSUMED_NS = 33_333_333
     INTERVALS = 9
-    #: Periods without anything new that are a stop. A frame that was lost makes two of one, an FFC of 0.35 s
+    #: Periods without anything new that are a pause. A frame that was lost makes two of one, an FFC of 0.35 s
     #: is 2.6 of the slowest cameras (7.5 Hz).
-    STOPPED = 2.5
+    LONG = 2.5
 
     def __init__(self) -> None:
         self._newest_ns: int | None = None
         self._intervals_ns: deque[int] = deque(maxlen=self.INTERVALS)
+        self._left = 0
+        self._paused_ns = self._settled_ns = 0
 
-    def add(self, stamp_ns: int) -> None:
-        """Take in the stamp of a frame that shows something new; late ones say nothing of the rate."""
+    def add_new(self, stamp_ns: int) -> bool:
+        """Take in a frame that shows something new; whether it may still hold old counts all the same."""
+        # Late ones say nothing of the rate.
         if self._newest_ns is not None and stamp_ns > self._newest_ns:
             self._intervals_ns.append(stamp_ns - self._newest_ns)
         self._newest_ns = stamp_ns if self._newest_ns is None else max(stamp_ns, self._newest_ns)
+        if stamp_ns < self._paused_ns:
+            return False
+        if self._left == 0:
+            return stamp_ns < self._settled_ns
+        self._left -= 1
+        self._settled_ns = max(stamp_ns, self._settled_ns)
+        return True
 
-    def stopped(self, stamp_ns: int) -> bool:
-        """Whether nothing new has come for longer than a camera of this rate leaves between two frames."""
-        return self._newest_ns is not None and stamp_ns - self._newest_ns > self.STOPPED * self._period_ns()
+    def add_old(self, stamp_ns: int, settling: int) -> None:
+        """Take in a frame that shows nothing new; after a longer pause withhold the next ``settling`` that do.
 
-    def _period_ns(self) -> int:
-        if not self._intervals_ns:
-            return self.ASSUMED_NS
-        return sorted(self._intervals_ns)[(len(self._intervals_ns) - 1) // 2]
+        A few repeated frames are a driver that runs faster than the camera. After a longer pause the first new frame
+        may still hold old counts: in the bolometers, which lag, and in the driver's buffers.
+        """
+        period = (
+            sorted(self._intervals_ns)[(len(self._intervals_ns) - 1) // 2] if self._intervals_ns else self.ASSUMED_NS
+        )
+        if self._newest_ns is not None and stamp_ns - self._newest_ns > self.LONG * period:
+            self._paused_ns, self._left = max(stamp_ns, self._paused_ns), settling
 
 
 class FreezeDetector:
@@ -77,28 +91,6 @@ def _repeated_rows(sample: Counts, earlier: Counts) -> float:
         return 0.0
     clipped = sample.max(axis=1) == sample.min(axis=1)
     return float(np.mean(same if clipped.all() else same[~clipped]))
-
-
-class Settling:
-    """Counts frames after a stop, by their stamps: late ones from before it have nothing to settle."""
-
-    def __init__(self) -> None:
-        self._left = 0
-        self._stopped_ns = self._settled_ns = 0
-
-    def begin(self, stamp_ns: int, frames: int) -> None:
-        """Withhold ``frames`` after the one of ``stamp_ns``, which showed nothing new."""
-        self._stopped_ns, self._left = max(stamp_ns, self._stopped_ns), frames
-
-    def withholds(self, stamp_ns: int) -> bool:
-        """Whether a new frame may still hold old counts."""
-        if stamp_ns < self._stopped_ns:
-            return False
-        if self._left == 0:
-            return stamp_ns < self._settled_ns
-        self._left -= 1
-        self._settled_ns = max(stamp_ns, self._settled_ns)
-        return True
 
 
 class ShutterDetector:

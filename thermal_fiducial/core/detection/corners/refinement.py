@@ -4,8 +4,8 @@ Columns of whole pixels across the sides are compared with the model of a blurre
 adjustment of the four corners to all segments of the marker follows, until the corners no longer move.
 """
 
-from dataclasses import dataclass
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,7 @@ _SETTLED_PX, _STILL_PX = 0.3, 0.1
 _PRIOR_PX = 3.0
 
 
-@dataclass(frozen=True, slots=True)
-class RefinedCorners:
+class RefinedCorners(NamedTuple):
     """Corners of N markers.
 
     Parameters
@@ -41,20 +40,22 @@ class RefinedCorners:
     noise: FloatArray
     doubt: FloatArray
 
+    @staticmethod
+    def none() -> 'RefinedCorners':
+        """No corners."""
+        no = np.zeros(0)
+        return RefinedCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no)
+
     def only(self, keep: BoolArray | IntArray) -> 'RefinedCorners':
         """Those of the markers ``keep``."""
-        return RefinedCorners(*(values[keep] for values in self._arrays))
+        return RefinedCorners(*(values[keep] for values in self))
 
     def with_others(self, which: IntArray, others: 'RefinedCorners') -> 'RefinedCorners':
         """The same with ``others`` for those of the markers ``which``."""
-        arrays = [values.copy() for values in self._arrays]
-        for values, new in zip(arrays, others._arrays, strict=True):
+        arrays = [values.copy() for values in self]
+        for values, new in zip(arrays, others, strict=True):
             values[which] = new
         return RefinedCorners(*arrays)
-
-    @property
-    def _arrays(self) -> tuple[FloatArray, ...]:
-        return self.corners_px, self.covariances, self.contrast, self.noise, self.doubt
 
 
 def refine_corners(

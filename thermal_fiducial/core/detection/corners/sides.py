@@ -112,7 +112,8 @@ def columns_across(
     turn = span[:, 0] * opposite[:, 1] - span[:, 1] * opposite[:, 0]
     inward = np.sign(turn * np.where(steep, -span[:, 1], span[:, 0]))
     pitch = inward / np.sqrt(1.0 + slope * slope)
-    normal = _normals(pitch[columns // 2], slope[columns // 2], steep)
+    by_way, leaning = pitch[columns // 2], -(slope * pitch)[columns // 2]
+    normal = np.stack([np.where(steep, by_way, leaning), np.where(steep, leaning, by_way)], axis=-1)
     base, offsets = np.rint(centre), np.arange(-half, half + 1)[:, None, None, None]
     fresh, inside = _seen(whole, base, steep, nodes, shape, half)
     off, rise = ((base - centre) * pitch).astype(np.float32), pitch.astype(np.float32)
@@ -139,14 +140,6 @@ def _parts(cells: int, columns: int) -> tuple[FloatArray, FloatArray]:
     rate = np.zeros_like(at)
     rate[:, 1:] = powers[1:] * at[:, :-1]
     return share[..., None], np.concatenate([at, rate]) @ np.linalg.inv(np.vander(NODES, increasing=True))
-
-
-def _normals(pitch: FloatArray, slope: FloatArray, steep: BoolArray) -> FloatArray:
-    """Unit normals (m, E, 2) of sides whose part across the way that these run, by rows or columns, is ``pitch``."""
-    leaning = -slope * pitch
-    normal = np.empty((*pitch.shape, 2))
-    normal[..., 0], normal[..., 1] = np.where(steep, pitch, leaning), np.where(steep, leaning, pitch)
-    return normal
 
 
 def _seen(
