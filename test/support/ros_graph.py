@@ -77,7 +77,7 @@ class Graph:
         (source,) = [source for source in node.inputs if source.topic == f'/{topic}']
         return source
 
-    def spin_until(self, condition, seconds=10.0):
+    def spin_until(self, condition, seconds=60.0):
         deadline = time.monotonic() + seconds
         while not condition():
             self.executor.spin_once(timeout_sec=0.05)

@@ -1,6 +1,7 @@
 """Work for a process of its own: it must be found by name over there."""
 
 import os
+from pathlib import Path
 import time
 
 
@@ -10,5 +11,17 @@ def work(task):
         raise ValueError('no answer')
     if task == 'die':
         os._exit(3)
-    time.sleep(task)
+    if isinstance(task, Path):
+        _wait_for(task)
+    else:
+        time.sleep(task)
     return os.getpid(), task
+
+
+def _wait_for(path):
+    """Until a file is there: what ends work when a test says so, however busy the machine is."""
+    until = time.monotonic() + 60.0
+    while not path.exists():
+        if time.monotonic() > until:
+            raise ValueError('waited in vain')
+        time.sleep(0.005)

@@ -51,7 +51,7 @@ def captured(source, done, **options):
     """Frames and states until ``done`` holds for them."""
     frames, states = [], []
     capture = Capture(source, frames.append, states.append, retry=0.01, **options)
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + 60.0
     while not done(frames, states) and time.monotonic() < deadline:
         time.sleep(0.002)
     capture.close()

@@ -59,7 +59,8 @@ def test_a_slow_rate_does_not_hold_the_reader(folder):
     shown(source, 1)
     before = time.monotonic()
     assert source.read() == []
-    assert time.monotonic() - before < 1.0
+    # Half of what it would take to wait for the next one.
+    assert time.monotonic() - before < 5.0
 
 
 def test_pictures_that_cannot_be_used_are_counted(folder):
