@@ -56,39 +56,7 @@ ODOMETRY_AT_WORST = np.repeat([0.3, 0.2], 3)
 INCONSISTENT_PX = 0.3
 
 
-def corner_correlations(corners: FloatArray, width: int, errors: SystematicErrors) -> FloatArray:
-    """Correlations (n, n) of the systematic errors of n corners, of either axis alone.
-
-    Parameters
-    ----------
-    corners : (n, 2) [px]
-    width : of the image [px]
-    """
-    u, v = corners[:, 0], corners[:, 1]
-    squared = (u[:, None] - u) ** 2 + (v[:, None] - v) ** 2
-    return np.asarray(np.exp(squared * (-0.5 / (errors.corner_length * width) ** 2)))
-
-
-def corners_of_pose(
-    gains: FloatArray, J: FloatArray, correlations: FloatArray, errors: SystematicErrors
-) -> tuple[FloatArray, float]:
-    """What the systematic errors of n corners make of a pose that is fitted to them.
-
-    Parameters
-    ----------
-    gains : (n, 6, 2) what a pixel of each corner moves the pose by
-    J : (n, 2, 6) derivatives of the corners with respect to the pose
-    correlations : (n, n) of the errors
-
-    Returns
-    -------
-    Covariance (6, 6) of the pose, and the share of the errors' variance that the pose leaves in the residuals.
-    """
-    n = len(gains)
-    mixed = (correlations @ gains.reshape(n, 12)).reshape(n, 6, 2)
-    covariance = errors.corner_px**2 * np.tensordot(gains, mixed, axes=([0, 2], [0, 2]))
-    Q = np.linalg.qr(J.reshape(2 * n, 6))[0].reshape(n, 12)
-    return covariance, 1.0 - float(np.sum(Q * (correlations @ Q))) / (2.0 * n)
+# Poses from the corners of a frame.
 
 
 def noise_of_pose(gains: FloatArray, covariances: FloatArray, chi2: float) -> FloatArray:
@@ -115,16 +83,43 @@ def noise_factor(chi2: float, freedom: int) -> float:
     return max(1.0, chi2 / max(freedom, 1))
 
 
-def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
-    """Covariance (m, m) of what moves by ``moved`` (m,) for each unit of one error: scale, clock, or another pose.
+def corner_correlations(corners: FloatArray, width: int, errors: SystematicErrors) -> FloatArray:
+    """Correlations (n, n) of the systematic errors of n corners, of either axis alone.
 
     Parameters
     ----------
-    std : of the error: ``marker_size_std`` of poses that move as all markers grow to twice their size [share], how far
-        a clock may be off of poses by their velocity [s]; of a pose that may as well be another one, 1 of what is
-        between them
+    corners : (n, 2) [px]
+    width : of the image [px]
     """
-    return np.asarray(std**2 * np.outer(moved, moved))
+    u, v = corners[:, 0], corners[:, 1]
+    squared = (u[:, None] - u) ** 2 + (v[:, None] - v) ** 2
+    return np.asarray(np.exp(squared * (-0.5 / (errors.corner_length * width) ** 2)))
+
+
+def corners_of_pose(gains: FloatArray, correlations: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Covariance (m, m) that the systematic errors of n corners make of a pose.
+
+    Parameters
+    ----------
+    gains : (n, m, 2) what a pixel of each corner moves the pose by
+    correlations : (n, n) of the errors
+    """
+    n, m, _ = gains.shape
+    mixed = (correlations @ gains.reshape(n, 2 * m)).reshape(n, m, 2)
+    return np.asarray(errors.corner_px**2 * np.tensordot(gains, mixed, axes=([0, 2], [0, 2])))
+
+
+def visible_share(J: FloatArray, correlations: FloatArray) -> float:
+    """Share of the variance of the corners' systematic errors that a pose fitted to them leaves in the residuals.
+
+    Parameters
+    ----------
+    J : (n, 2, 6) derivatives of n corners with respect to the pose
+    correlations : (n, n) of the errors
+    """
+    n = len(J)
+    Q = np.linalg.qr(J.reshape(2 * n, 6))[0].reshape(n, 12)
+    return 1.0 - float(np.sum(Q * (correlations @ Q))) / (2.0 * n)
 
 
 def map_of_pose(
@@ -151,10 +146,97 @@ def map_of_pose(
     return np.asarray(common[-1] + correlated_sum(gains, positive(covariances - common[:-1])))
 
 
-def positive(covariances: FloatArray) -> FloatArray:
-    """The nearest covariances (..., 6, 6): negative variances become none."""
-    values, vectors = np.linalg.eigh(0.5 * (covariances + np.swapaxes(covariances, -1, -2)))
-    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2))
+def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
+    """Covariance (m, m) of what moves by ``moved`` (m,) for each unit of one error: scale, clock, or another pose.
+
+    Parameters
+    ----------
+    std : of the error: ``marker_size_std`` of poses that move as all markers grow to twice their size [share], how far
+        a clock may be off of poses by their velocity [s]; of a pose that may as well be another one, 1 of what is
+        between them
+    """
+    return np.asarray(std**2 * np.outer(moved, moved))
+
+
+# The map, from a joint adjustment.
+
+
+def shape_of_corners(precisions: FloatArray, views: IntArray, errors: SystematicErrors) -> FloatArray:
+    """Standard deviations (M,) [px] of what corners of M markers are off by in all of their views alike.
+
+    Parameters
+    ----------
+    precisions : (M,) sum over the views of a marker of its corners' inverse variance [1/px^2]
+    views : (M,) how many they are
+    """
+    return np.asarray(errors.marker_shape * np.sqrt(views / precisions))
+
+
+def scale_of_map(positions: FloatArray, held: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Covariances (M, 6, 6) of markers at ``positions`` (M, 3), known by their distance from the nearest of ``held``.
+
+    Parameters
+    ----------
+    held : (H, 3) positions that are given, at least one: they carry the scale
+    """
+    arms = positions[:, None] - held
+    nearest = np.argmin(np.sum(arms**2, axis=-1), axis=1)
+    arm = arms[np.arange(len(positions)), nearest]
+    covariances = np.zeros((len(positions), 6, 6))
+    covariances[:, :3, :3] = errors.marker_size_std**2 * arm[:, :, None] * arm[:, None, :]
+    return covariances
+
+
+def divided_prior(covariance: FloatArray, count: int) -> FloatArray:
+    """Covariance (6, 6) of one of ``count`` markers that are known from before, without how their errors hang together.
+
+    Each so many times as large, they are an upper bound of the joint covariance whatever that is.
+    """
+    return count * covariance
+
+
+# Odometry.
+
+
+def alike_odometry(covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of one of many poses by the odometry whose errors are the same for seconds."""
+    return CORRELATED_ODOMETRY * covariance
+
+
+def bounded_odometry(covariance: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of odometry that has agreed with the markers so far: no worse than at its worst."""
+    scale = float(np.min(ODOMETRY_AT_WORST**2 / np.maximum(np.diag(covariance), 1e-12)))
+    return np.asarray(min(1.0, scale) * covariance)
+
+
+# Weights of markers, and decisions between hypotheses; no published covariance has these in it.
+
+
+def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Weights (N,) of markers whose places in the map are uncertain by ``pixels`` (N,) [px] in the view at hand.
+
+    They depend on each marker alone and change as slowly as the view does. Weighing with the covariance relative to the
+    best marker in view, poses over a carpet of 81 markers jittered twice as much as with the map taken for exact.
+
+    Parameters
+    ----------
+    noise : (N,) standard deviation of the corners [px]
+    """
+    own = noise**2 + errors.decision_px**2
+    return np.asarray(own / (own + pixels**2))
+
+
+def decision_weights(noise: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Weights (N,) of markers with corner noise (N,) [px] that make it what decisions rest on: noise and bias."""
+    return np.asarray(noise**2 / (noise**2 + errors.decision_px**2))
+
+
+def with_corner_errors(covariances: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Corner covariances (..., 2, 2) [px^2] to decide between hypotheses with: noise, and what corners are off by."""
+    return np.asarray(covariances + errors.decision_px**2 * np.eye(2))
+
+
+# What the others are made of.
 
 
 def correlated_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:
@@ -181,70 +263,7 @@ def correlated_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:
     return np.asarray(np.sum(terms[used] / weights[:, None, None], axis=0))
 
 
-def scale_of_map(positions: FloatArray, held: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Covariances (M, 6, 6) of markers at ``positions`` (M, 3), known by their distance from the nearest of ``held``.
-
-    Parameters
-    ----------
-    held : (H, 3) positions that are given, at least one: they carry the scale
-    """
-    arms = positions[:, None] - held
-    nearest = np.argmin(np.sum(arms**2, axis=-1), axis=1)
-    arm = arms[np.arange(len(positions)), nearest]
-    covariances = np.zeros((len(positions), 6, 6))
-    covariances[:, :3, :3] = errors.marker_size_std**2 * arm[:, :, None] * arm[:, None, :]
-    return covariances
-
-
-def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Weights (N,) of markers whose places in the map are uncertain by ``pixels`` (N,) [px] in the view at hand.
-
-    They depend on each marker alone and change as slowly as the view does. Weighing with the covariance relative to the
-    best marker in view, poses over a carpet of 81 markers jittered twice as much as with the map taken for exact.
-
-    Parameters
-    ----------
-    noise : (N,) standard deviation of the corners [px]
-    """
-    own = noise**2 + errors.decision_px**2
-    return np.asarray(own / (own + pixels**2))
-
-
-def shape_of_corners(precisions: FloatArray, views: IntArray, errors: SystematicErrors) -> FloatArray:
-    """Standard deviations (M,) [px] of what corners of M markers are off by in all of their views alike.
-
-    Parameters
-    ----------
-    precisions : (M,) sum over the views of a marker of its corners' inverse variance [1/px^2]
-    views : (M,) how many they are
-    """
-    return np.asarray(errors.marker_shape * np.sqrt(views / precisions))
-
-
-def divided_prior(covariance: FloatArray, count: int) -> FloatArray:
-    """Covariance (6, 6) of one of ``count`` markers that are known from before, without how their errors hang together.
-
-    Each so many times as large, they are an upper bound of the joint covariance whatever that is.
-    """
-    return count * covariance
-
-
-def decision_weights(noise: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Weights (N,) of markers with corner noise (N,) [px] that make it what decisions rest on: noise and bias."""
-    return np.asarray(noise**2 / (noise**2 + errors.decision_px**2))
-
-
-def alike_odometry(covariance: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of one of many poses by the odometry whose errors are the same for seconds."""
-    return CORRELATED_ODOMETRY * covariance
-
-
-def bounded_odometry(covariance: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of odometry that has agreed with the markers so far: no worse than at its worst."""
-    scale = float(np.min(ODOMETRY_AT_WORST**2 / np.maximum(np.diag(covariance), 1e-12)))
-    return np.asarray(min(1.0, scale) * covariance)
-
-
-def with_corner_errors(covariances: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Corner covariances (..., 2, 2) [px^2] to decide between hypotheses with: noise, and what corners are off by."""
-    return np.asarray(covariances + errors.decision_px**2 * np.eye(2))
+def positive(covariances: FloatArray) -> FloatArray:
+    """The nearest covariances (..., 6, 6): negative variances become none."""
+    values, vectors = np.linalg.eigh(0.5 * (covariances + np.swapaxes(covariances, -1, -2)))
+    return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2))

@@ -150,7 +150,7 @@ class _Frame:
         by_corner = np.swapaxes(gains.reshape(6, 4 * n, 2), 0, 1)
         white = noise_of_pose(by_corner, sight.covariances.reshape(-1, 2, 2), chi2)
         correlations = corner_correlations(sight.corners.reshape(-1, 2), self.camera.width, model)
-        of_corners, visible = corners_of_pose(by_corner, seen.J_camera.reshape(-1, 2, 6), correlations, model)
+        of_corners = corners_of_pose(by_corner, correlations, model)
         arms = sight.points - sight.T_map_marker[:, None, :3, 3]
         grown = gains @ np.einsum('nckj,ncj->nck', seen.J_marker[..., :3], arms).ravel()
         of_scale = of_single_error(grown, model.marker_size_std)
@@ -162,7 +162,7 @@ class _Frame:
         ids, rms_px = tuple(marker.id for marker in sight.markers), float(np.sqrt(np.mean(seen.errors_px**2)))
         T = retract(T_map_camera, step)
         pose = CameraPose(self.stamp_ns, T, white + systematic, systematic, ids, rms_px)
-        return Location(pose, sight, seen, weights, map_gains, visible, np.zeros((6, 6)))
+        return Location(pose, sight, seen, weights, map_gains, correlations, np.zeros((6, 6)))
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
         """Another pose (4, 4) that the corners do not refute; None when there is none."""

@@ -114,8 +114,8 @@ class Location:
     weights: FloatArray
     #: (N, 6, 6) what a displacement of each moves the pose by
     map_gains: FloatArray
-    #: share of the variance of the corners' systematic errors that the residuals show: the pose takes up the rest
-    visible: float
+    #: (4 N, 4 N) of the systematic errors of the corners
+    correlations: FloatArray
     #: (6, 6) the part of the covariance by which another pose may be the true one as well
     spread: FloatArray
 

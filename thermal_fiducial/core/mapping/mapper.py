@@ -153,7 +153,7 @@ class MarkerMapper:
 
     def _update_errors(self, frame: LocatedFrame, location: Location) -> tuple[dict[int, float], bool]:
         """Re-projection error [px] by ID of each known marker, and whether any standing changed by them."""
-        self._bias.add(frame.stamp_ns, np.array(location.pose.marker_ids), location.seen.residuals, location.visible)
+        self._bias.add(location)
         known, (errors, explained) = frame.known.markers, frame.known_errors(location)
         changed = self._trust.update(self.map.markers, known, errors, explained)
         if not self.frozen:

@@ -10,9 +10,9 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import INCONSISTENT_PX, SystematicErrors
+from thermal_fiducial.core.error_model import INCONSISTENT_PX, SystematicErrors, visible_share
+from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.types import FloatArray, IntArray
 
 #: Why a marker is in quarantine that came so with the map.
 FROM_FILE = 'in quarantine since before the map was loaded'
@@ -157,22 +157,20 @@ class CornerBias:
         self.px = SystematicErrors().corner_px
         self._weight = BIAS_PRIOR
         self._sum = BIAS_PRIOR * self.px**2
-        self._last: tuple[int, IntArray, FloatArray] | None = None
+        self._last: Location | None = None
 
-    def add(self, stamp_ns: int, ids: IntArray, residuals: FloatArray, visible: float) -> None:
-        """Take in residuals (N, 4, 2) [px] of one frame, of which ``visible`` is what a pose leaves of the error."""
-        last, self._last = self._last, (stamp_ns, ids, residuals)
-        if last is None or not 0 < stamp_ns - last[0] < _SUCCESSIVE_NS or len(ids) < FEWEST_MARKERS:
+    def add(self, location: Location) -> None:
+        """Take in what the pose of a frame leaves of its corners."""
+        last, self._last = self._last, location
+        if last is None or not 0 < location.pose.stamp_ns - last.pose.stamp_ns < _SUCCESSIVE_NS:
             return
-        before, residuals_before = last[1], last[2]
-        if not np.array_equal(ids, before):
-            _, now, then = np.intersect1d(ids, before, return_indices=True)
-            residuals, residuals_before = residuals[now], residuals_before[then]
-        if len(residuals) < FEWEST_MARKERS:
+        _, now, then = np.intersect1d(location.pose.marker_ids, last.pose.marker_ids, return_indices=True)
+        if len(now) < FEWEST_MARKERS:
             return
         # Moved markers last as well: none counts for more than what makes it inconsistent.
-        products = np.mean(residuals * residuals_before, axis=(1, 2))
+        products = np.mean(location.seen.residuals[now] * last.seen.residuals[then], axis=(1, 2))
         product = float(np.mean(np.clip(products, -(INCONSISTENT_PX**2), INCONSISTENT_PX**2)))
+        visible = visible_share(location.seen.J_camera.reshape(-1, 2, 6), location.correlations)
         self._weight = BIAS_MEMORY * self._weight + visible
         self._sum = BIAS_MEMORY * self._sum + product
         self.px = math.sqrt(max(self._sum / self._weight, 0.0))
