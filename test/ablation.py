@@ -178,7 +178,7 @@ _READOUT = tuple(f'frame:{name}' for name in ('delays', 'stretch', 'displacement
 _SCALES = _place('search:SearchScales')
 _ALL_IN_THE_SEARCH = {'finding:_next_scales': lambda *_, **__: _SCALES.ALL}
 _DISPLAYED = 'corner_estimates:DisplayedSides', 'corner_estimates:_outward'
-_BORDER_WIDTH = {'corner_estimates:DisplayedSides.corrected': lambda _, __, ___, refined, ____: refined.corners}
+_BORDER_WIDTH = {'corner_estimates:DisplayedSides.corrected': lambda _, __, refined, ___: refined.corners}
 
 MECHANISMS = {
     'corners of squares': Mechanism(

@@ -76,9 +76,9 @@ def test_what_a_display_displaces_the_border_tells(frames, bent):
 
 
 def test_without_markers_a_display_displaces_nothing():
-    untouched = SimpleNamespace(corners='untouched')
+    untouched = SimpleNamespace(ids=np.zeros(0, dtype=np.int64), corners='untouched')
     bits = marker_bits(load_dictionary('DICT_4X4_50'))
-    assert DisplayedSides(bits).corrected(None, np.zeros(0, dtype=np.int64), untouched, 0.66) == 'untouched'
+    assert DisplayedSides(bits).corrected(None, untouched, 0.66) == 'untouched'
 
 
 def test_raw_counts_are_claimed_better_than_a_display(frames):

@@ -5,7 +5,7 @@ levels of black and white is then not that of the step between them: all that is
 marker's sides go out where the inner edges of its border go in, so that the width of the border says by how much.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -27,10 +27,9 @@ from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.refining import RefinedMarkers, Refiner, sides_px
 from thermal_fiducial.core.detection.tracking import MotionTrack
-from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
 
 # Half the window round a corner that is looked at by itself: in cells, and at most in pixels.
 _WINDOW_IN_CELLS, _LARGEST_WINDOW = 0.3, 5
@@ -70,11 +69,11 @@ class DisplayedSides:
         self._behind, self._white = edges_behind_border(bits)
         self._bits = bits.shape[1]
 
-    def corrected(self, frame: Frame, ids: IntArray, refined: RefinedMarkers, blur_px: float) -> RefinedCorners:
-        """Corners of N markers ``ids`` at the stamp, with what stays unknown of the displacement."""
-        if len(ids) == 0:
+    def corrected(self, frame: Frame, refined: RefinedMarkers, blur_px: float) -> RefinedCorners:
+        """Corners of N markers at the stamp, with what stays unknown of the displacement."""
+        if len(refined.ids) == 0:
             return refined.corners
-        segments = self._across_border(frame, ids, refined, blur_px)
+        segments = self._across_border(frame, refined, blur_px)
         known = segments.variance < HOPELESS
         weight = np.where(known, 1.0 / (OF_BORDERS_TOGETHER * (segments.variance + OF_BORDER_PX**2)), 0.0)
         # Where sides are out by one, the inner edges are in by one, of a border that is drawn too large with them.
@@ -88,7 +87,7 @@ class DisplayedSides:
         unknown = unknown + OF_BENT_BLUR_PX**2 * np.eye(2)
         return refined.corners._replace(corners_px=corners, covariances=refined.corners.covariances + unknown)
 
-    def _across_border(self, frame: Frame, ids: IntArray, refined: RefinedMarkers, blur_px: float) -> Segments:
+    def _across_border(self, frame: Frame, refined: RefinedMarkers, blur_px: float) -> Segments:
         """Displacements of the inner edges of the borders, inward, where white lies behind them."""
         seen = ImagePoints.at(refined.observed.corners_px, frame.camera)
         inset = 1.0 / (self._bits + 2.0)
@@ -96,8 +95,8 @@ class DisplayedSides:
         inner = np.moveaxis(se3.in_quadrilaterals(seen.x, a, b), 0, -1)
         sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _HALF)
         blur = blurs(sides.normal[self._bits // 2], blur_px, refined.view.spread)
-        value, slope, weight = model(sides, self._behind[ids], blur)
-        weight *= self._white[ids].reshape(-1, self._bits).T
+        value, slope, weight = model(sides, self._behind[refined.ids], blur)
+        weight *= self._white[refined.ids].reshape(-1, self._bits).T
         counts = sides.counts(refined.view.image, refined.view.to_tails)
         return measure(counts, (value, slope, weight), REACHED * blur[0])
 
@@ -109,21 +108,6 @@ def _outward(corners: FloatArray) -> FloatArray:
     normal = np.stack([side[..., 1], -side[..., 0]], axis=-1)
     before = np.roll(normal, 1, axis=1)
     return np.asarray((normal + before) / (1.0 + np.sum(normal * before, axis=-1, keepdims=True)))
-
-
-@dataclass(frozen=True, slots=True)
-class MarkerEstimates:
-    """N markers of a frame at its stamp."""
-
-    #: (N,)
-    ids: IntArray
-    #: as they are published
-    corners: RefinedCorners
-    at: ImagePoints
-    #: (N, 4, 2) normalised, as the next frame's motion is measured from
-    x: FloatArray
-    #: corrected by the corners
-    twist: Twist | None
 
 
 class CornerEstimator:
@@ -145,24 +129,21 @@ class CornerEstimator:
         found: FoundMarkers,
         track: MotionTrack,
         config: ArucoDetectorConfig,
-    ) -> MarkerEstimates:
+    ) -> RefinedMarkers:
         """Those of the markers ``found`` that their refined corners confirm."""
         if len(found.ids) == 0:
-            return _none(frame.twist)
+            return RefinedMarkers.none(frame)
         refined = self._refiner.refine(frame, found, track, config)
         keep = self._confirmed(frame, found, refined, config)
         if frame.displayed and not keep.all():
             refined, small = with_corners_by_pattern(frame, found, refined, ~keep, self._decoder, config)
             keep = keep | small
-        ids, refined = found.ids[keep], refined.only(keep)
+        refined = refined.only(keep)
         if config.refinement == 'subpix':
-            corners = local_corners(frame.image, refined.corners, self._decoder.cells)
-        elif frame.displayed:
-            corners = self._displayed.corrected(frame, ids, refined, config.blur_px)
-        else:
-            return MarkerEstimates(ids, refined.corners, refined.places.at, refined.places.at.x, refined.twist)
-        at = ImagePoints.at(corners.corners_px, frame.camera)
-        return MarkerEstimates(ids, corners, at, refined.places.at.x, refined.twist)
+            return replace(refined, corners=local_corners(frame.image, refined.corners, self._decoder.cells))
+        if frame.displayed:
+            return replace(refined, corners=self._displayed.corrected(frame, refined, config.blur_px))
+        return refined
 
     def _confirmed(
         self, frame: Frame, found: FoundMarkers, refined: RefinedMarkers, config: ArucoDetectorConfig
@@ -181,9 +162,3 @@ class CornerEstimator:
             observed, there = observed.only(others), there[others]
             keep[others] = confirmed(image, found, there, observed, self._decoder, config, standing_picture=standing)
         return np.asarray(keep & frame.camera.contains(refined.observed.corners_px, BORDER_PX).all(axis=1))
-
-
-def _none(twist: Twist | None) -> MarkerEstimates:
-    """No markers."""
-    found = FoundMarkers.none()
-    return MarkerEstimates(found.ids, RefinedCorners.none(), found.places.at, found.places.at.x, twist)

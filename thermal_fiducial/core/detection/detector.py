@@ -7,13 +7,14 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
-from thermal_fiducial.core.detection.corner_estimates import CornerEstimator, MarkerEstimates
+from thermal_fiducial.core.detection.corner_estimates import CornerEstimator
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.finding import Findings, FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import among, depths, ExpectedMarkers, KnownMarkers
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
+from thermal_fiducial.core.detection.refining import RefinedMarkers
 from thermal_fiducial.core.detection.tracking import FramePrediction, MotionTrack, Predictor
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -102,13 +103,14 @@ class MarkerDetector:
             if prediction.T_camera_map is not None and len(known.ids) and config.guided:
                 expected = known.expected(prediction.T_camera_map, camera, config.min_side_px)
             findings = self._finder.find(frame, history, known, expected, config)
-            estimates = self._estimator.estimate(frame, findings.found, history.track, config)
-            poses = self._poses(estimates.ids, estimates.corners, estimates.at, prediction.T_camera_map)
-            corners = estimates.corners
-            rows = marker_rows(estimates.ids, corners.corners_px, corners.covariances, poses, corners.contrast)
+            refined = self._estimator.estimate(frame, findings.found, history.track, config)
+            ids, corners = refined.ids, refined.corners
+            at = refined.places.at.at_pixels(corners.corners_px)
+            poses = self._poses(ids, corners, at, prediction.T_camera_map)
+            rows = marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)
             if expected is not None:
                 rows = self._with_partial(rows, frame, prediction)
-        self._history = self._after(frame, findings, estimates, poses, saw_partial=len(rows) > len(estimates.ids))
+        self._history = self._after(frame, findings, refined, poses, saw_partial=len(rows) > len(ids))
         return rows
 
     def _poses(
@@ -135,17 +137,17 @@ class MarkerDetector:
         return np.asarray(rows[np.argsort(rows['id'], kind='stable')])
 
     def _after(
-        self, frame: Frame, findings: Findings, estimates: MarkerEstimates, poses: PlanarPoses, *, saw_partial: bool
+        self, frame: Frame, findings: Findings, refined: RefinedMarkers, poses: PlanarPoses, *, saw_partial: bool
     ) -> FrameHistory:
         """What the next frame starts from."""
-        ids, history = estimates.ids, self._history
+        ids, history, contrast = refined.ids, self._history, refined.corners.contrast
         # Motion that came from what turned out to be no markers is none.
-        twist = estimates.twist if len(ids) else frame.twist
+        twist = refined.twist if len(ids) else frame.twist
         depth = depths(poses.T_camera_marker[:, 0], self._known.sizes(ids))
-        markers = ExpectedMarkers(ids, estimates.x, depth, estimates.corners.contrast / frame.noise)
+        markers = ExpectedMarkers(ids, refined.places.at.x, depth, contrast / frame.noise)
         return FrameHistory(
             history.track.after(frame.stamp_ns, twist, markers),
-            history.polarity.after(estimates.corners.contrast),
+            history.polarity.after(contrast),
             saw_partial,
             findings.since_blind,
             findings.scales,

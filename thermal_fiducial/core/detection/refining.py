@@ -72,22 +72,31 @@ class DeblurredView:
 class RefinedMarkers:
     """Refined corners of N markers."""
 
+    #: (N,)
+    ids: IntArray
     #: as the view shows them
     view: DeblurredView
     observed: RefinedCorners
     #: at the stamp, with what is unknown of the motion
     corners: RefinedCorners
+    #: by these, or by what the thermal frame would have shown, from which the next frame's motion is measured
     places: Places
+    #: corrected by the corners
     twist: Twist | None
+
+    @staticmethod
+    def none(frame: Frame) -> 'RefinedMarkers':
+        """No markers."""
+        found, corners = FoundMarkers.none(), RefinedCorners.none()
+        view = _view(frame, found.places, None, 0.0)
+        return RefinedMarkers(found.ids, view, corners, corners, found.places, frame.twist)
 
     def only(self, keep: BoolArray) -> 'RefinedMarkers':
         """That of the markers ``keep`` (N,)."""
         if keep.all():
             return self
-        view, places = self.view.only(keep), self.places.only(keep)
-        return replace(
-            self, view=view, observed=self.observed.only(keep), corners=self.corners.only(keep), places=places
-        )
+        observed, corners, places = self.observed.only(keep), self.corners.only(keep), self.places.only(keep)
+        return RefinedMarkers(self.ids[keep], self.view.only(keep), observed, corners, places, self.twist)
 
 
 class Refiner:
@@ -151,7 +160,8 @@ class Refiner:
             twist = track.correct(frame.stamp_ns, frame.twist, found.ids, at.x, places.depth, deviation)
         if twist is None:
             unsure = doubted + self._never_seen(frame, places, seen, unknown_twist())
-            return RefinedMarkers(view, seen, seen._replace(covariances=unsure), replace(places, at=at), None)
+            corners_there = seen._replace(covariances=unsure)
+            return RefinedMarkers(found.ids, view, seen, corners_there, replace(places, at=at), None)
         lag_blur = places.lag_blur(twist, frame.lag)
         rolling = rolling_displacement(places, twist, frame, (seen.corners_px + view.removed)[..., 1])
         corners = seen.corners_px - lag_blur + view.removed - rolling
@@ -159,7 +169,7 @@ class Refiner:
         if frame.twist is None:
             unknown = unknown + self._never_seen(frame, places, seen, twist)
         refined = seen._replace(corners_px=corners, covariances=doubted + unknown)
-        return RefinedMarkers(view, seen, refined, replace(places, at=at.at_pixels(corners)), twist)
+        return RefinedMarkers(found.ids, view, seen, refined, replace(places, at=at.at_pixels(corners)), twist)
 
     def _never_seen(self, frame: Frame, places: Places, seen: RefinedCorners, twist: Twist) -> FloatArray:
         """Covariances (N, 4, 2, 2) [px^2] by a motion that the frames before show nothing of."""
