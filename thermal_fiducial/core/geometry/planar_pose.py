@@ -13,7 +13,7 @@ import numpy as np
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints, inverse_2x2
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners, whitening
-from thermal_fiducial.core.geometry.rigid_fit import covariances, evaluate, Images, minimise
+from thermal_fiducial.core.geometry.rigid_fit import costs, covariances, evaluate, Images, minimise
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 __all__ = [
@@ -130,7 +130,7 @@ def choose_branches(
         sizes = np.array([entry[1] for entry in in_map if entry is not None])
         squares = corners_in_map(T_map_marker, sizes)
         images = Images.of(corners.only(known), whitening(corner_covs[known])).joined()
-        T_camera_map = starts[np.argmin(evaluate(starts, squares.reshape(1, -1, 3), images, INLIER)[0])]
+        T_camera_map = starts[np.argmin(costs(starts, squares.reshape(1, -1, 3), images, INLIER))]
     if T_camera_map is None:
         return poses
     # The larger the trace of R_1^T R_2, the smaller the angle between two rotations.
@@ -183,7 +183,7 @@ class CameraFit:
     def costs(self, T_map_camera: FloatArray, weights: FloatArray | None = None) -> FloatArray:
         """Robust chi squares (B,) at camera poses (B, 4, 4), inf where a marker would be behind the camera."""
         starts = se3.inverse(T_map_camera) @ self._T_map_middle
-        return evaluate(starts, self._points, self._images(weights), INLIER)[0]
+        return costs(starts, self._points, self._images(weights), INLIER)
 
     def _images(self, weights: FloatArray | None) -> Images:
         W = self._whitening if weights is None else self._whitening * np.sqrt(weights)[:, None, None, None]

@@ -120,11 +120,20 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
     return T, np.where(possible, cost, np.inf), information
 
 
+def costs(T: FloatArray, points: FloatArray, images: Images, inlier: float) -> FloatArray:
+    """The robust squared errors (B,) of :func:`evaluate` alone."""
+    p = se3.apply(T, points)
+    z = p[..., 2:]
+    residual = (images.whitening @ (p[..., :2] / np.maximum(z, _NEAR))[..., None])[..., 0] - images.target
+    squared, _ = _robust(np.sum(residual * residual, axis=-1), inlier)
+    return np.where((z > _NEAR).all(axis=(1, 2)), squared.sum(axis=-1), np.inf)
+
+
 def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> Evaluation:
     """Robust squared error at poses (B, 4, 4) of bodies in the camera, inf where a point is behind it, and derivatives.
 
-    ``points`` are (B or 1, K, 3) [m] in their bodies.
-    Of a whitened error d, the cost is d^2 up to ``inlier`` and ``inlier^2 (1 + 2 log(d / inlier))`` beyond.
+    ``points`` are (B or 1, K, 3) [m] in their bodies. Of a whitened error d, the cost is d^2 up to ``inlier`` and
+    ``inlier^2 (1 + 2 log(d / inlier))`` beyond.
     """
     rotated = points @ np.swapaxes(T[:, :3, :3], -1, -2)
     p = rotated + T[:, None, :3, 3]
@@ -140,16 +149,19 @@ def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = 
     J = np.empty((*p.shape[:2], 2, 6))
     J[..., :3] = d_p
     np.matmul(d_p, (rotated @ _MINUS_SKEW).reshape(*p.shape, 3), out=J[..., 3:])
-    squared = np.sum(residual * residual, axis=(-1, -2))
     J = J.reshape(len(T), 2 * p.shape[1], 6)
-    weighted = J
-    if inlier < np.inf:
-        excess = np.maximum(squared / inlier**2, 1.0)
-        squared = np.where(excess > 1.0, inlier**2 * (1.0 + np.log(excess)), squared)
-        weighted = J / np.repeat(excess, 2, axis=-1)[..., None]
-    weighted = np.swapaxes(weighted, -1, -2)
+    squared, excess = _robust(np.sum(residual * residual, axis=(-1, -2)), inlier)
+    weighted = np.swapaxes(J if excess is None else J / np.repeat(excess, 2, axis=-1)[..., None], -1, -2)
     gradient = (weighted @ residual.reshape(len(T), 2 * p.shape[1], 1))[..., 0]
     return np.where(seen, squared.sum(axis=-1), np.inf), gradient, weighted @ J
+
+
+def _robust(squared: FloatArray, inlier: float) -> tuple[FloatArray, FloatArray | None]:
+    """Costs of squared errors, and by how much their influence falls; None: of none."""
+    if inlier == np.inf:
+        return squared, None
+    excess = np.maximum(squared / inlier**2, 1.0)
+    return np.where(excess > 1.0, inlier**2 * (1.0 + np.log(excess)), squared), excess
 
 
 def covariances(information: FloatArray) -> FloatArray:
