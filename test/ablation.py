@@ -221,7 +221,7 @@ MECHANISMS = {
     ),
     'search near predictions': Mechanism(
         'fast, 0.5 K, guided',
-        ('finding:near_prediction', 'finding:_shifted', 'finding:_confirmed'),
+        ('finding:near_prediction', 'finding:_shifted'),
         {'finding:near_prediction': _nothing_found},
     ),
     'branches by the map': Mechanism('slow, 0.1 K, guided', (), {'detector:choose_branches': lambda poses, *_: poses}),

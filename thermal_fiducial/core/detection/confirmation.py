@@ -81,7 +81,7 @@ def confirmed(
     side = np.linalg.norm(refined.corners_px[:, 2] - refined.corners_px[:, 0], axis=-1) / np.sqrt(2.0)
     deviation = np.sort(np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1)), axis=1)[:, 2]
     softness = deviation * np.minimum(contrast, _NOISY) * np.sqrt(np.minimum(side, _SEEN_PX))
-    known = (similarity >= config.guided_min_correlation) & (similarity - reading.runner_up >= config.guided_min_margin)
+    known = reading.clear(config.guided_min_correlation, config.guided_min_margin)
     near = np.abs(refined.corners_px - there).max(axis=(1, 2)) < 0.7 * side / decoder.cells
     return np.asarray(same & ((found.expected & known & near) | (alike & (softness <= _SHARP))))
 

@@ -21,7 +21,7 @@ from thermal_fiducial.core.detection.known_markers import (
     pairs,
 )
 from thermal_fiducial.core.detection.lag import lag_tail_maps, markers_deblurred, REMAINING
-from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS, Reading
+from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
 from thermal_fiducial.core.detection.refining import BLUR_THAT_MATTERS_PX, CLEAR_CNR
 from thermal_fiducial.core.detection.search import BlindSearch, SearchScales
 from thermal_fiducial.core.detection.tracking import MotionTrack
@@ -233,7 +233,8 @@ def near_prediction(
     left = np.where(blurred[:, None, None], REMAINING * shift, shift)
     shown = _shifted(scene, ids, corners + left, decoder)
     reading = decoder.read(scene, shown)
-    good = _confirmed(reading, ids, frame.noise, config)
+    limits = config.guided_min_correlation, config.guided_min_margin, config.guided_min_contrast * frame.noise
+    good = (reading.ids == ids) & (reading.turns == 0) & reading.clear(*limits)
     at = ImagePoints.at((shown - left - rolling)[good], frame.camera)
     places, no = Places.of(at, expected.depth[good]), np.zeros(len(at.px), dtype=bool)
     return FoundMarkers(ids[good], places, reading.contrast[good] / frame.noise, ~no, no)
@@ -246,14 +247,3 @@ def _shifted(image: Float32Array, ids: IntArray, corners: FloatArray, decoder: D
     tried = (corners[:, None] + step[:, :, None]).reshape(-1, 4, 2)
     similarity = np.abs(decoder.match(image, tried, np.repeat(ids, len(NEAR_CELLS)))).reshape(len(ids), -1)
     return np.asarray(corners + most_similar(similarity, step)[:, None])
-
-
-def _confirmed(reading: Reading, ids: IntArray, noise: float, config: ArucoDetectorConfig) -> BoolArray:
-    similarity = np.abs(reading.correlation)
-    return np.asarray(
-        (reading.ids == ids)
-        & (reading.turns == 0)
-        & (similarity >= config.guided_min_correlation)
-        & (similarity - reading.runner_up >= config.guided_min_margin)
-        & (np.abs(reading.contrast) >= config.guided_min_contrast * noise)
-    )

@@ -82,6 +82,12 @@ class Reading(NamedTuple):
     #: is unlike any marker
     surround: FloatArray
 
+    def clear(self, correlation: float, margin: float, contrast: float = 0.0) -> BoolArray:
+        """Which (Q,) look so much like their marker, and by such a margin more than like any other."""
+        similarity = np.abs(self.correlation)
+        distinct = (similarity >= correlation) & (similarity - self.runner_up >= margin)
+        return np.asarray(distinct & (np.abs(self.contrast) >= contrast))
+
 
 class PatternMatch(NamedTuple):
     """Which patterns Q quadrilaterals look most like."""

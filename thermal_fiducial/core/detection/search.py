@@ -207,12 +207,7 @@ def _joined(first: Reading, second: Reading) -> Reading:
 
 def distinct(reading: Reading, noise: float, config: ArucoDetectorConfig) -> BoolArray:
     """Which readings look like one marker of the dictionary, whatever the bits and sides are like."""
-    similarity = np.abs(reading.correlation)
-    return np.asarray(
-        (similarity >= config.min_correlation)
-        & (similarity - reading.runner_up >= config.min_margin)
-        & (np.abs(reading.contrast) >= config.min_contrast * noise)
-    )
+    return reading.clear(config.min_correlation, config.min_margin, config.min_contrast * noise)
 
 
 def accepted(reading: Reading, noise: float, correctable: int, config: ArucoDetectorConfig) -> BoolArray:

@@ -47,7 +47,7 @@ class FrameCleaner:
     def __init__(self, config: Tau2CameraConfig, bad_pixels: IntArray | None = None) -> None:
         self.config = config
         self._known_bad: IntArray = np.reshape([] if bad_pixels is None else bad_pixels, (-1, 2)).astype(np.int64)
-        self._telemetry = _TelemetryRows()
+        self._telemetry_on_top = 0
         self._restart((0, 0))
 
     def _restart(self, shape: tuple[int, int]) -> None:
@@ -97,7 +97,7 @@ class FrameCleaner:
         """A copy of the image rows as counts."""
         if counts.ndim != 2 or counts.dtype not in (np.uint8, np.uint16):
             raise InputError(f'frame of {counts.dtype} with shape {counts.shape} is not an 8 or 16 bit image')
-        image = self._telemetry.cut(counts)
+        image = self._without_telemetry(counts)
         if min(image.shape) < 16:
             raise InputError(f'frame of {image.shape[1]}x{image.shape[0]} pixels is too small')
         # Some drivers shift counts up: in no living picture the lowest bits are zero in all pixels.
@@ -116,6 +116,16 @@ class FrameCleaner:
         self._pauses.add_old(stamp_ns, self.config.settle_frames)
         return reason
 
+    def _without_telemetry(self, frame: Counts | Gray) -> Counts | Gray:
+        """Without the rows that carry no image, from the side where the picture breaks off."""
+        height = frame.shape[0]
+        extra = next((height - h for h in STANDARD_HEIGHTS if 0 < height - h <= MAX_TELEMETRY_ROWS), 0)
+        if not extra:
+            return frame
+        top, bottom = _break_between(frame, extra), _break_between(frame, height - extra)
+        self._telemetry_on_top = int(np.clip(self._telemetry_on_top + (1 if top > 2 * bottom else -1), -10, 10))
+        return frame[extra:] if self._telemetry_on_top > 0 else frame[: height - extra]
+
     def _replace_bad_pixels(self, image: Counts) -> None:
         assert self._filler is not None
         if self.config.find_bad_pixels:
@@ -124,22 +134,6 @@ class FrameCleaner:
                 self._found = found
                 self._filler = BadPixelFiller(np.concatenate([self._known_bad, found]), self._shape)
         self._filler.fill(image)
-
-
-class _TelemetryRows:
-    """Cuts the rows that carry no image, from the side where the picture breaks off."""
-
-    def __init__(self) -> None:
-        self._top_votes = 0
-
-    def cut(self, frame: Counts | Gray) -> Counts | Gray:
-        height = frame.shape[0]
-        extra = next((height - h for h in STANDARD_HEIGHTS if 0 < height - h <= MAX_TELEMETRY_ROWS), 0)
-        if not extra:
-            return frame
-        top, bottom = _break_between(frame, extra), _break_between(frame, height - extra)
-        self._top_votes = int(np.clip(self._top_votes + (1 if top > 2 * bottom else -1), -10, 10))
-        return frame[extra:] if self._top_votes > 0 else frame[: height - extra]
 
 
 def _break_between(frame: Counts | Gray, row: int) -> float:

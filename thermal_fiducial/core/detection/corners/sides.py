@@ -219,7 +219,10 @@ def model(
     """
     cells = behind.shape[2]
     cell = sides.across / cells
-    own = _seen_along(sides, blur[1])
+    # How much of its side a column sees, blurred along it: less than 1 near its ends.
+    t = sides.t.astype(np.float32)
+    z = np.stack([t, 1.0 - t]) * (sides.along / blur[1]).astype(np.float32)
+    own = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0)
     fall = -own
     value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32))
     value *= fall
@@ -245,15 +248,6 @@ def blurred_step(distance: Float32Array, sharpness: Float32Array) -> tuple[Float
     bent *= 0.5
     bent += 0.5
     return bent, np.asarray(slope, dtype=np.float32)
-
-
-def _seen_along(sides: Sides, blur_along: FloatArray) -> Float32Array:
-    """How much of its side a column (C, m, E) sees, blurred along it: less than 1 near its ends."""
-    length = (sides.along / blur_along).astype(np.float32)
-    t = sides.t.astype(np.float32)
-    z = np.stack([t, 1.0 - t]) * length
-    ends = np.tanh(z * (z * z * _CUBIC + _LINEAR))
-    return np.asarray(0.5 * (ends[0] + ends[1]))
 
 
 def _add_neighbours(
