@@ -1,10 +1,15 @@
 """The entry point: usage, unusable input, missing extras."""
 
 import argparse
+import os
+import subprocess
+import sys
 
 import pytest
+from support.small_bag import map_of
 
 from thermal_fiducial.cli.main import COMMANDS, main
+from thermal_fiducial.files.marker_map import save_map
 
 
 @pytest.mark.parametrize('command', COMMANDS)
@@ -91,3 +96,26 @@ def test_help_fits_a_terminal_of_80_columns(command, monkeypatch):
     for parser in parsers_of(command, monkeypatch):
         wide = [line for line in parser.format_help().splitlines() if len(line) > 80]
         assert not wide, f'{parser.prog}: {wide}'
+
+
+@pytest.mark.parametrize(
+    ('output', 'encoding', 'expected'),
+    [
+        ('/dev/full', 'utf-8', (1, 'thermal-fiducial map: output: No space left on device\n')),
+        ('out', 'ascii', (0, '')),
+    ],
+)
+def test_output_that_takes_nothing_or_not_every_letter(tmp_path, output, encoding, expected):
+    """A full disk behind the output, and a terminal that has no letters but English ones."""
+    path = tmp_path / 'größe.yaml'
+    save_map(path, map_of((0, 1)))
+    with (tmp_path / output).open('wb') as out:
+        done = subprocess.run(
+            [sys.executable, '-m', 'thermal_fiducial', 'map', 'check', str(path)],
+            stdout=out,
+            stderr=subprocess.PIPE,
+            env={**os.environ, 'PYTHONIOENCODING': encoding},
+            text=True,
+            check=False,
+        )
+    assert (done.returncode, done.stderr) == expected

@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         remaps=parse_remaps(args.remap),
     )
     batch = Batch(tuple(args.bags), args.out, options, args.max_frames)
-    batch.runs()
+    batch.check()
     with workers(min(args.workers, len(args.bags)), args.scheduler) as client, progress_bar('batch') as progress:
         summary = run_batch(batch, client, progress, lambda line: print(f'warning: {line}', file=sys.stderr))
     print(

@@ -2,7 +2,9 @@
 
 import argparse
 from collections.abc import Sequence
+import errno
 from importlib import import_module
+from io import TextIOWrapper
 import os
 import sys
 from typing import Any
@@ -28,6 +30,9 @@ COMMANDS = {
     'watch': 'whether the pose may be flown on, live in a terminal',
     'check-bridge': 'verify what a flight controller would receive',
 }
+
+#: Of files and output: nobody can do anything about it here.
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 #: Commands whose module cannot have their name.
 MODULES = {'import': 'import_recording'}
@@ -71,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Exit status: 0 done, 1 something failed on the way, 2 wrong usage or unusable input, 130 interrupted.
     """
     argv = sys.argv[1:] if argv is None else list(argv)
+    _print_any_name()
     command = argv[0] if argv else ''
     parser = _Parser(
         prog=PROGRAM, description='Thermal-inertial localization from acrylic markers, for drones in smoke and fog.'
@@ -83,7 +89,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             module = import_module(f'thermal_fiducial.cli.{MODULES.get(command, command.replace("-", "_"))}')
             module.add_arguments(choices[command])
         args = parser.parse_args(argv)
-        return int(module.run(args))
+        status = int(module.run(args))
+        sys.stdout.flush()
+        return status
     except InputError as error:
         print(f'{PROGRAM} {command}: {error}', file=sys.stderr)
         return 2
@@ -99,5 +107,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f'{PROGRAM} {command}: interrupted', file=sys.stderr)
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _let_go_of_output()
         return 0
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        _let_go_of_output()
+        print(f'{PROGRAM} {command}: {error.filename or "output"}: {error.strerror}', file=sys.stderr)
+        return 1
+
+
+def _print_any_name() -> None:
+    """A terminal that has no letter for a name shows another one in its place."""
+    if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == 'strict':
+        sys.stdout.reconfigure(errors='replace')
+
+
+def _let_go_of_output() -> None:
+    """What is still to be written would fail again when the process ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -72,6 +72,12 @@ class Batch:
             for bag, name in zip(self.bags, names, strict=True)
         ]
 
+    def check(self) -> None:
+        """Raise InputError for what no replay could begin with, before workers are started for it."""
+        self.runs()
+        mode = {} if self.options.mode is None else {'mode': self.options.mode}
+        read_settings(self.options.params, mode | {'map_file': str(self.options.map_file)})
+
 
 @contextmanager
 def workers(count: int, scheduler: str = '') -> Iterator[Any]:
