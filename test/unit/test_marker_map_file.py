@@ -131,6 +131,9 @@ import itertools, sys
 from thermal_fiducial.files.marker_map import load_map, save_map
 path = sys.argv[1]
 old = load_map(path)
+old.revision += 1
+save_map(path, old)
+# From here on it is at work, however long a busy machine took to start it.
 print('ready', flush=True)
 for old.revision in itertools.count(old.revision + 1):
     save_map(path, old)
