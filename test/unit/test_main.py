@@ -2,8 +2,11 @@
 
 import argparse
 import os
+from pathlib import Path
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
 from support.small_bag import map_of
@@ -119,3 +122,27 @@ def test_output_that_takes_nothing_or_not_every_letter(tmp_path, output, encodin
             check=False,
         )
     assert (done.returncode, done.stderr) == expected
+
+
+@pytest.mark.nightly
+def test_an_interrupt_of_simulate_is_one_line_and_leaves_nothing(tmp_path):
+    """While its workers still import what they need."""
+    process = subprocess.Popen(
+        [sys.executable, '-m', 'thermal_fiducial', 'simulate', str(tmp_path / 'bag'), '--seconds', '20'],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    while process.poll() is None and not children(process.pid):
+        time.sleep(0.05)
+    time.sleep(0.3)
+    os.killpg(process.pid, signal.SIGINT)
+    error = process.communicate(timeout=60)[1]
+    assert (process.returncode, error.splitlines()[-1]) == (130, 'thermal-fiducial simulate: interrupted')
+    assert 'Traceback' not in error
+    assert not (tmp_path / 'bag').exists()
+
+
+def children(pid):
+    """Of a process's main thread."""
+    return Path(f'/proc/{pid}/task/{pid}/children').read_text().split()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 import heapq
 import multiprocessing
@@ -10,6 +11,7 @@ from pathlib import Path
 import shutil
 import signal
 import tempfile
+import threading
 from typing import Any
 
 import cv2
@@ -188,8 +190,23 @@ def _frames(flight: FlightPlan, workers: int) -> Iterator[SimFrame]:
     os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')  # a worker is to use one core
     context = multiprocessing.get_context('spawn')  # a fork of a process that runs ROS deadlocks
     with ProcessPoolExecutor(min(workers, len(starts)), context, _start_worker, (flight,)) as pool:
-        for chunk in pool.map(_render_chunk, starts, stops):
+        with _interrupts_ignored():
+            # Which the processes that it starts inherit: an interrupt meets them before their own first line.
+            chunks = pool.map(_render_chunk, starts, stops)
+        for chunk in chunks:
             yield from chunk
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 # --- what a replay needs beside the bag ---------------------------------------------------------------
