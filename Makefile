@@ -10,7 +10,7 @@
 # make latency   latency, losses and CPU of the nodes in real time, on the machine as it is and beside two busy loops
 # make tables    put measured tables and parameters into the documents
 # make structure print how large and how deep the package is, beside what it aims at
-# make ablation what each mechanism of detector and mapper buys: figures with and without it
+# make ablation  what each mechanism of detector, mapper and filter buys: figures with and without it
 # make docs      build the documentation as a web site in build/site; a link that leads nowhere fails it
 PYTHON ?= $(firstword $(foreach version,3.12 3.11,$(if $(shell python$(version) -c 'import venv, ensurepip' 2>/dev/null && echo yes),python$(version))) python3)
 VENV ?= .venv
@@ -104,6 +104,7 @@ structure: $(READY)
 ablation: $(READY)
 	$(BIN)/python test/ablation.py
 	$(BIN)/python test/mapper_ablation.py
+	$(BIN)/python test/filter_ablation.py
 
 docs: $(DOCS)
 	@echo '== Documentation: build/site/index.html'

@@ -117,7 +117,7 @@ def at_camera_stamp(estimate, motion):
 def test_a_corrected_velocity_says_nothing_of_the_clock(estimate, motion):
     """A pose is of the state at the camera's stamp: what is not correlated with the offset there, stays so."""
     updater, std = PoseUpdater(FULL), 0.02
-    unknown = replace(estimate, covariance=np.zeros((SIZE, SIZE)), clock_open=True)
+    unknown = replace(estimate, covariance=np.zeros((SIZE, SIZE)))
     unknown.covariance[CORE, CORE] = np.diag(np.repeat((1e-2, 0.3, 1e-2), 3) ** 2)
     unknown.covariance[VELOCITY, POSITION] = unknown.covariance[POSITION, VELOCITY] = 1.5e-3 * np.eye(3)
     slid = np.zeros(SIZE)
@@ -138,7 +138,7 @@ def test_noise_of_the_motion_is_no_information(estimate, motion):
     updater, std = PoseUpdater(FULL), 0.02
     P = 1e-12 * np.eye(SIZE)
     P[TIME_OFFSET, TIME_OFFSET] = std**2
-    prior = replace(estimate, covariance=P, clock_open=True, state=replace(estimate.state, velocity=np.zeros(3)))
+    prior = replace(estimate, covariance=P, state=replace(estimate.state, velocity=np.zeros(3)))
     pose = BodyPose(0, prior.state.T_map_body, 1e-4 * np.eye(6))
     noisy = motion_of(prior.state, 0.1 * RATE, rate_variance=0.01 * float(RATE @ RATE) / 3.0)
     feigned = updater.correct(pose, updater.innovation(prior, pose, noisy), noisy)
@@ -182,7 +182,7 @@ def test_what_poses_are_worth_is_learned(estimate, still):
     """White errors of a third of what the covariance claims, about a state that is known."""
     rng, updater = np.random.default_rng(8), PoseUpdater(config(stamp_jitter=0.0, estimate_time_offset=False))
     R = np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)
-    now = replace(known(estimate, 1e-14), clock_open=False, pose_noise=PoseNoise.of(1.0, 0.01))
+    now = replace(known(estimate, 1e-14), pose_noise=PoseNoise.of(1.0, 0.01))
     for stamp in range(2000):
         noise = np.linalg.cholesky(R) @ rng.normal(size=6) / 3.0
         T = now.state.T_map_body @ transform(so3_exp(noise[:3]), noise[3:])
@@ -221,7 +221,7 @@ def test_the_jitter_of_the_stamps_is_learned(estimate, motion):
         late = rng.normal(0.0, 3e-3)
         R_late = estimate.state.R_map_body @ so3_exp(late * RATE)
         pose = BodyPose(stamp, transform(R_late, estimate.state.position + late * velocity), R)
-        now = replace(known(estimate, 1e-14), clock_open=False, pose_noise=noise)
+        now = replace(known(estimate, 1e-14), pose_noise=noise)
         noise = updater.correct(pose, updater.innovation(now, pose, motion), motion).pose_noise
     # the memory of 300 poses of one number: 6 % of the deviation; three of that
     assert np.sqrt(noise.jitter) == pytest.approx(3e-3, rel=0.18)

@@ -178,7 +178,7 @@ class PoseEkf:
         main = self._history.main
         if main is None:
             return None
-        covariance, with_bias = self._hypotheses.core_covariance(main, self._contradicting(main), imu)
+        covariance, with_bias = self._hypotheses.core_covariance(main, self._contradicting(main))
         rate_variance = float(self._history.imu.last_densities[0]) ** 2 / self._history.imu.last_step_seconds
         return odometry(main.prediction, covariance, with_bias, imu, rate_variance)
 
@@ -219,9 +219,9 @@ class PoseEkf:
         return self._config.camera_time_offset + main.prediction.state.time_offset - steps
 
     def _time_offset_std(self, main: Hypothesis) -> float:
-        """Of the estimate; before it is begun, and where there is none, what the parameter says [s]."""
-        origin = main.prediction.origin
-        return origin.std(TIME_OFFSET) if origin.clock_open else self._config.time_offset_std
+        """Of the estimate; where there is none, what the parameter says [s]."""
+        config = self._config
+        return main.prediction.origin.std(TIME_OFFSET) if config.estimate_time_offset else config.time_offset_std
 
     @property
     def resets(self) -> int:

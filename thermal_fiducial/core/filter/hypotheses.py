@@ -17,12 +17,10 @@ from thermal_fiducial.core.filter.state import (
     GYROSCOPE_BIAS,
     NavigationState,
     POSE,
-    POSITION,
     SIZE,
     TIME_OFFSET,
-    VELOCITY,
 )
-from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_innovation, PoseUpdater, slide
+from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_innovation, PoseUpdater
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
@@ -81,10 +79,9 @@ class Hypotheses:
     def explains(self, hypothesis: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> bool:
         """Whether a pose at a hypothesis's instant is right by it, but for a clock offset that is not known."""
         estimate = self.estimate(hypothesis)
-        if estimate.clock_open:
-            estimate = self._updater.with_unknown_clock(estimate)
         measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
-        return self._updater.innovation(estimate, measured, motion).nis <= self._config.gate
+        unclocked = self._updater.with_unknown_clock(estimate)
+        return self._updater.innovation(unclocked, measured, motion).nis <= self._config.gate
 
     def settled(self, belief: Belief) -> Belief:
         """The belief after its hypotheses were weighed against each other."""
@@ -107,15 +104,10 @@ class Hypotheses:
     ) -> Hypothesis | None:
         """A hypothesis by which a pose is right that ``main``, which is at its instant, refuses.
 
-        The camera's clock may have stepped; else the pose is taken as it is, and what was known of the sensors stays.
+        The pose is taken as it is, and what was known of the sensors stays.
         """
         estimate = self.estimate(main)
         measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
-        if estimate.clock_open:
-            innovation = self._updater.innovation(self._updater.with_unknown_clock(estimate), measured, motion)
-            if innovation.nis <= self._config.gate:
-                corrected = self._updater.correct(measured, innovation, motion)
-                return Hypothesis(Prediction.begin(corrected), time_ns, time_ns)
         begun = self._begun(pose, time_ns, window, estimate.state)
         if begun is None:
             return None
@@ -132,28 +124,16 @@ class Hypotheses:
             return None
         return Hypothesis(Prediction.begin(estimate), time_ns, time_ns)
 
-    def core_covariance(
-        self, main: Hypothesis, other: Hypothesis | None, imu: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def core_covariance(self, main: Hypothesis, other: Hypothesis | None) -> tuple[FloatArray, FloatArray]:
         """Covariance (9, 9) of an estimate's core, and (9, 3) of it with the gyroscope's bias, to be published.
 
-        They count what the clock offset may be even before that is estimated, and an ``other`` one at the same instant
-        that contradicts it. ``imu`` (6,): sample there.
+        They count an ``other`` one at the same instant that contradicts it.
         """
         covariance, with_bias = main.prediction.core_covariance
-        if self._config.estimate_time_offset and not main.prediction.origin.clock_open:
-            covariance = covariance + self._clock_covariance(main.prediction.state, covariance, imu)
         if other:
             apart = _difference(main.prediction.state, other.prediction.state)
             covariance = covariance + other.prediction.core_covariance[0] + np.outer(apart, apart)
         return covariance, with_bias
-
-    def _clock_covariance(self, state: NavigationState, covariance: FloatArray, imu: FloatArray) -> FloatArray:
-        """What an unknown offset (9, 9) is worth: the state has followed the clock of the camera."""
-        moved = slide(state, imu)
-        added = np.outer(moved, moved)
-        added[POSITION, POSITION] += covariance[VELOCITY, VELOCITY]
-        return np.asarray(self._config.time_offset_std**2 * added)
 
 
 def _far_covariance(covariance: FloatArray) -> FloatArray:

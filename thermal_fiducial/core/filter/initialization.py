@@ -14,6 +14,7 @@ from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
     ACCELEROMETER_MATRIX,
+    CORE,
     Estimate,
     EXTRINSICS,
     GRAVITY,
@@ -21,11 +22,13 @@ from thermal_fiducial.core.filter.state import (
     GYROSCOPE_MATRIX,
     NavigationState,
     POSE,
+    POSITION,
     SIZE,
     SYSTEMATIC,
+    TIME_OFFSET,
     VELOCITY,
 )
-from thermal_fiducial.core.filter.update import PoseUpdater
+from thermal_fiducial.core.filter.update import PoseUpdater, slide
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 
@@ -103,7 +106,7 @@ def start(
     off = abs(float(np.linalg.norm(force)) - config.gravity)
     if off > (NO_GRAVITY if _quiet(imu) else HARDLY_GRAVITY * config.gravity):
         return None
-    estimate = _unaligned(config, pose, stamp_ns, prior)
+    estimate = _unaligned(config, pose, stamp_ns, prior, imu[-1])
     still = rest(imu, config.gravity)
     if still:
         # A slow flight may be as quiet: the larger the mean rate, the rather it is one, and the less it says.
@@ -113,7 +116,9 @@ def start(
     return estimate
 
 
-def _unaligned(config: PoseEkfConfig, pose: BodyPose, stamp_ns: int, prior: NavigationState) -> Estimate:
+def _unaligned(
+    config: PoseEkfConfig, pose: BodyPose, stamp_ns: int, prior: NavigationState, imu: FloatArray
+) -> Estimate:
     noise = PoseNoise.of(WHITE_STD, config.systematic_pose_std, config.stamp_jitter)
     P = np.diag(_initial_variances(config))
     P[np.ix_(POSE, POSE)] += (noise.white + noise.systematic) * pose.shape
@@ -124,7 +129,23 @@ def _unaligned(config: PoseEkfConfig, pose: BodyPose, stamp_ns: int, prior: Navi
         velocity=np.zeros(3),
         systematic=np.zeros(6),
     )
-    return Estimate(stamp_ns, state, P, clock_open=False, pose_noise=noise)
+    if config.estimate_time_offset:
+        P += _of_unknown_clock(config, state, imu)
+    return Estimate(stamp_ns, state, P, pose_noise=noise)
+
+
+def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatArray) -> FloatArray:
+    """Covariance (48, 48) that an unknown offset s of the camera's clock makes, ``imu`` (6,) being the latest sample.
+
+    The first pose is of the state at the camera's stamp, X(t + s) = X(t) Exp(slide s).
+    """
+    slid = np.zeros(SIZE)
+    slid[CORE] = -slide(state, imu)
+    slid[TIME_OFFSET] = 1.0
+    covariance = np.outer(slid, slid)
+    # Second order: the offset times a velocity that is not known.
+    covariance[POSITION, POSITION] += np.eye(3) * config.initial_velocity_std**2
+    return np.asarray(config.time_offset_std**2 * covariance)
 
 
 def _initial_variances(config: PoseEkfConfig) -> FloatArray:

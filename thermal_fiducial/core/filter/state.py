@@ -115,8 +115,6 @@ class Estimate:
     stamp_ns: int
     state: NavigationState
     covariance: FloatArray
-    #: whether the clock offset is estimated: it is once the velocity is known
-    clock_open: bool
     #: what the innovations have shown of the camera poses' error
     pose_noise: PoseNoise
 

@@ -29,9 +29,6 @@ from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_log
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
-#: Root of the sum of the velocity variances [m/s] from which the clock offset is estimated, and by how much the rate
-#: [rad/s] and the velocity [m/s] may have changed until then.
-_KNOWN_VELOCITY, _UNKNOWN_CHANGE = 0.2, 0.5
 #: Noise of the motion at a pose feigns information about the clock offset: once to twice what its square is worth, the
 #: more the larger the gain is, since differences of the motion from pose to pose count. One pose takes at most half of
 #: what is known.
@@ -133,9 +130,6 @@ class PoseUpdater:
         R += unknown * np.outer(twist, twist)
         if not config.estimate_time_offset:
             return
-        if not prior.clock_open:
-            R[_SIX, _SIX] += (config.time_offset_std * _UNKNOWN_CHANGE) ** 2
-            return
         P = prior.covariance
         velocity, variance = P[VELOCITY, VELOCITY], float(P[TIME_OFFSET, TIME_OFFSET])
         H[:, TIME_OFFSET] = twist
@@ -150,7 +144,7 @@ class PoseUpdater:
         prior = innovation.prior
         error, covariance = self._gained(prior.covariance, innovation.value, innovation.H, innovation.R)
         state, before = prior.state.plus(error), innovation.slide
-        if prior.clock_open and self.config.estimate_time_offset:
+        if self.config.estimate_time_offset:
             now = slide(state, motion.imu)
             state = state.plus(_of_core((before - now) * error[TIME_OFFSET]))
             covariance = self._in_clock_of_imu(covariance, now - before, now, innovation, motion)
@@ -163,7 +157,7 @@ class PoseUpdater:
         covariance[SYSTEMATIC] *= unit
         covariance[:, SYSTEMATIC] *= unit
         state = replace(state, systematic=unit * state.systematic)
-        return self._with_clock(replace(prior, state=state, covariance=covariance, pose_noise=noise), motion)
+        return replace(prior, state=state, covariance=covariance, pose_noise=noise)
 
     def _in_clock_of_imu(
         self, P: FloatArray, change: FloatArray, moved: FloatArray, innovation: Innovation, motion: MotionAtPose
@@ -197,23 +191,6 @@ class PoseUpdater:
         algebra.x, algebra.P = np.zeros(SIZE), P
         algebra.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R=R)
         return algebra.x, 0.5 * (algebra.P + algebra.P.T)
-
-    def _with_clock(self, estimate: Estimate, motion: MotionAtPose) -> Estimate:
-        """Begin to estimate the clock offset once the velocity is known: before, it would multiply an unknown one.
-
-        Until then the state has followed the camera's clock. It is off by what moves in the meantime, fully correlated
-        with the offset s: X(t + s) = X(t) Exp((rate, acceleration, velocity) s).
-        """
-        if estimate.clock_open or not self.config.estimate_time_offset:
-            return estimate
-        if estimate.std(VELOCITY) > _KNOWN_VELOCITY:
-            return estimate
-        return replace(estimate, covariance=self._slid(estimate, motion), clock_open=True)
-
-    def _slid(self, estimate: Estimate, motion: MotionAtPose) -> FloatArray:
-        slid = _of_core(-slide(estimate.state, motion.imu))
-        slid[TIME_OFFSET] = 1.0
-        return np.asarray(estimate.covariance + self.config.time_offset_std**2 * np.outer(slid, slid))
 
     def with_unknown_clock(self, estimate: Estimate) -> Estimate:
         """The estimate as good as it is, its clock offset as unknown as after a step of the camera's clock."""

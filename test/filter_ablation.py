@@ -1,0 +1,151 @@
+"""Prints what each mechanism of the filter buys, as ``make ablation`` does for detector and mapper.
+
+For each mechanism one row: the lines that exist for it alone, and all figures of its scenes that change by more than a
+tenth without it. A mechanism is switched off by a parameter, or by putting what does nothing in its place. Names of
+mechanisms as arguments: only these. Recordings are taken where ``THERMAL_FIDUCIAL_DATA`` names their folder.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+import sys
+from typing import Any
+
+import numpy as np
+from support.filter_scenes import Figures, SCENES
+from support.taken_out import lines_of, replaced
+
+FILTER = 'thermal_fiducial.core.filter'
+#: Change of a figure that is worth printing.
+NOTABLE = 0.1
+#: Scenes that every mechanism is judged by.
+ACCEPTANCE = ('brisk', 'cam0')
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """A part of the filter that can be taken out.
+
+    Parameters
+    ----------
+    scenes : that it is for, beside those of acceptance
+    parts : modules, or functions and classes of modules as ``module:name``, that exist for it alone
+    off : places (``module:name``, ``module:class.name``), and what is put there
+    changes : parameters that take it out
+    """
+
+    scenes: tuple[str, ...]
+    parts: tuple[str, ...] = ()
+    off: dict[str, Any] = field(default_factory=dict)
+    changes: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def lines(self) -> int:
+        """Of its parts."""
+        return lines_of(FILTER, self.parts)
+
+
+def _first(value: Any) -> Callable[..., Any]:
+    """What returns its first argument behind ``self``."""
+    return lambda self, given, *_: given if value is None else value
+
+
+def _exactly_linear(self: Any, prior: Any, motion: Any, moved: Any, H: Any, R: Any) -> None:
+    """Without the second order of the clock offset."""
+    twist = moved[np.r_[0:3, 6:9]]
+    R += prior.pose_noise.jitter * np.outer(twist, twist)
+    H[:, 35] = twist
+
+
+MECHANISMS = {
+    'systematic error of poses': Mechanism(('lasting errors',), changes={'systematic_pose_std': 0.01}),
+    'its size is learned': Mechanism(('lasting errors',), off={'pose_noise:_PRIOR_VIEWS': 1e12}),
+    'size of white errors is learned': Mechanism(
+        ('lasting errors', 'slow and noisy'), ('pose_noise:PoseNoise._white_step',), {'pose_noise:_PRIOR_POSES': 1e12}
+    ),
+    'jitter of stamps': Mechanism(('jittering',), ('pose_noise:PoseNoise.with_stamps',), changes={'stamp_jitter': 0.0}),
+    'jitter is learned': Mechanism(
+        ('jittering',),
+        ('pose_noise:PoseNoise.with_stamps',),
+        {'pose_noise:PoseNoise.with_stamps': lambda self, *_: self},
+    ),
+    'scale of the gyroscope': Mechanism(('scale errors',), changes={'gyroscope_scale_std': 0.0}),
+    'scale of the accelerometer': Mechanism(('scale errors',), changes={'accelerometer_scale_std': 0.0}),
+    'floor of the vibration': Mechanism(('shaken',), ('imu_noise:NoiseFloor',), changes={'vibration': 0.0}),
+    'noise in motion': Mechanism(
+        ('nonlinear',),
+        ('imu_noise:ImuNoiseMonitor._size_of_motion',),
+        changes={'gyroscope_nonlinearity': 0.0, 'accelerometer_nonlinearity': 0.0},
+    ),
+    'what gaps hide': Mechanism(
+        ('gaps of imu', 'carpet_slow_circle'),
+        ('imu_noise:StructureFunction',),
+        {'imu_noise:StructureFunction.hidden': lambda *_: (0.0, 0.0)},
+    ),
+    'saturation': Mechanism(('saturated',), off={'imu_noise:_SATURATED': (0.0, 0.0)}),
+    'frozen samples': Mechanism(
+        ('frozen',), ('imu_input:ImuInput._is_frozen',), {'imu_input:ImuInput._is_frozen': _first(False)}
+    ),
+    'clock offset': Mechanism(
+        ('slow and noisy', 'unknown clock at start'), changes={'estimate_time_offset': False, 'time_offset_std': 0.0}
+    ),
+    'second order of the clock offset': Mechanism(
+        ('unknown clock at start', 'slow and noisy'), off={'update:PoseUpdater._add_clock': _exactly_linear}
+    ),
+    'covariance in the clock of the IMU': Mechanism(
+        ('slow and noisy', 'unknown clock at start'),
+        ('update:PoseUpdater._in_clock_of_imu',),
+        {'update:PoseUpdater._in_clock_of_imu': _first(None)},
+    ),
+    'errors in variables': Mechanism(('slow and noisy',), off={'update:_FEIGNED': 0.0}),
+    'motion at a pose from 0.1 s': Mechanism(('slow and noisy',), off={'imu_buffer:_MOTION_SECONDS': 0.0}),
+    'steps of the clock of the camera': Mechanism(
+        ('stepping clock',), ('camera_clock',), {'camera_clock:CameraClock.proposed': _first(0)}
+    ),
+    'tilt of the map': Mechanism(('tilted map',), changes={'map_tilt_std': 0.0}),
+    'far poses need evidence': Mechanism(('twin marker', 'wrong poses'), off={'hypotheses:_ENOUGH_POSES': 0}),
+    'contradiction in what is published': Mechanism(
+        ('moved markers', 'stepping clock'),
+        ('ekf:PoseEkf._contradicting',),
+        {'ekf:PoseEkf._contradicting': lambda *_: None},
+    ),
+    'rest at the start': Mechanism(
+        ('slow and noisy',),
+        ('initialization:rest', 'update:PoseUpdater.align', 'update:PoseUpdater.settle'),
+        {'initialization:rest': lambda *_: None},
+    ),
+}
+
+
+@cache
+def base(scene: str) -> Figures:
+    """A scene with all mechanisms."""
+    return SCENES[scene]({})
+
+
+def row(name: str, mechanism: Mechanism) -> str:
+    """A line of the table."""
+    cells = []
+    for scene in (scene for scene in dict.fromkeys((*mechanism.scenes, *ACCEPTANCE)) if scene in SCENES):
+        with replaced(FILTER, mechanism.off):
+            figures = SCENES[scene](mechanism.changes)
+        changes = [
+            f'{what} {base(scene)[what]:.3g} -> {value:.3g}'
+            for what, value in figures.items()
+            if not abs(value - base(scene)[what]) <= NOTABLE * abs(base(scene)[what])
+        ]
+        cells += [f'{scene}: {", ".join(changes)}'] if changes else []
+    return f'| {name} | {mechanism.lines} | {"; ".join(cells) or "nothing"} |'
+
+
+def main() -> None:
+    """Print the table."""
+    chosen = sys.argv[1:] or list(MECHANISMS)
+    print('| mechanism | lines | without it |')
+    print('| --- | --- | --- |')
+    for name in chosen:
+        print(row(name, MECHANISMS[name]), flush=True)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,329 @@
+"""Scenes that show what the parts of the filter are for: flights of camera poses and IMU samples."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache, partial
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from support import real_flights
+from support.corner_runs import fly, published, rms
+from support.flights import errors, Flight, Motion, START_NS, timeline, white_poses
+from support.sim_flights import simulated
+from thermal_fiducial.config import ImuNoise, PoseEkfConfig
+from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.geometry.se3 import so3_exp
+from thermal_fiducial.core.measurements import CameraPose, ImuSample
+
+Figures = dict[str, float]
+#: Parameters of the filter and of its IMU's noise, by their names.
+Changes = dict[str, Any]
+Scene = Callable[[Changes], Figures]
+#: The first seconds are not counted: the filter learns what it flies with.
+SETTLED = 4.0
+
+
+@dataclass(frozen=True)
+class Arrivals:
+    """A flight, and what arrives of it."""
+
+    flight: Flight
+    items: list[Any]
+    config: PoseEkfConfig
+    #: (begin, end) [s] without poses; counts at its end
+    gaps: tuple[tuple[float, float], ...] = ()
+
+
+def altered(config: PoseEkfConfig, changes: Changes) -> PoseEkfConfig:
+    """``config`` with changes, those of the IMU's noise among them."""
+    of_imu = {name: value for name, value in changes.items() if hasattr(config.imu, name)}
+    others = {name: value for name, value in changes.items() if name not in of_imu}
+    return replace(config, imu=replace(config.imu, **of_imu), **others)
+
+
+@cache
+def recorded_poses(name: str) -> Any:
+    """A flight through mapper and filter once: the poses that the filter received are the scene."""
+    if name in real_flights.CARPETS:
+        return fly(real_flights.carpet(name))
+    return fly(real_flights.april_board(name) if name.startswith('cam') else simulated(name))
+
+
+def of_recording(name: str, changes: Changes) -> Figures:
+    """The filter alone on the poses of a mapper, 30 ms late, at all IMU samples."""
+    run = recorded_poses(name)
+    flight, ekf = run.flight, PoseEkf(altered(run.config, changes))
+    arrivals: list[tuple[int, int, Any]] = [(sample.stamp_ns, 0, sample) for sample in flight.samples]
+    late_ns = round((flight.time_offset + run.late) * 1e9)
+    arrivals += [(pose.stamp_ns + late_ns, 1, pose) for pose in run.poses]
+    states = []
+    for _, kind, item in sorted(arrivals, key=lambda entry: entry[:2]):
+        if kind == 1:
+            ekf.add_pose(item)
+        elif (state := ekf.add_imu(item)) is not None:
+            states.append(state)
+    score = published(flight, states).score(flight)
+    return {
+        'mm': score.rms_mm,
+        'peak mm': score.peak_mm,
+        'deg': score.rms_deg,
+        'NEES': score.nees,
+        'refused': ekf.diagnostics()['poses refused'],
+        'resets': float(ekf.resets),
+    }
+
+
+def of_flights(scene: Callable[[int], Arrivals], changes: Changes, seeds: range = range(3)) -> Figures:
+    """Means over flights of several seeds."""
+    each = [_flown(scene(seed), changes) for seed in seeds]
+    return {what: float(np.mean([figures[what] for figures in each])) for what in each[0]}
+
+
+def _flown(arrivals: Arrivals, changes: Changes) -> Figures:
+    flight, ekf = arrivals.flight, PoseEkf(altered(arrivals.config, changes))
+    states, lost = [], []
+    for item in arrivals.items:
+        if isinstance(item, ImuSample):
+            state = ekf.add_imu(item)
+            states += [state] if state else []
+            lost += [ekf.lost] if state else []
+        else:
+            ekf.add_pose(item)
+    position, attitude = errors(flight, states, SETTLED)
+    counted = np.array([state.stamp_ns >= START_NS + round(SETTLED * 1e9) for state in states])
+    covariances = np.array([state.pose_covariance[:3, :3] for state in states])[counted]
+    truth = flight.motion.pose(_seconds(states)[counted])[:, :3, 3]
+    e = truth - np.array([state.T_map_body[:3, 3] for state in states])[counted]
+    squares = np.einsum('ni,nij,nj->n', e, np.linalg.inv(covariances), e)
+    declared = np.array(lost)[counted]
+    estimate = ekf.estimate
+    assert estimate is not None
+    clock = abs(arrivals.config.camera_time_offset + estimate.state.time_offset - flight.offset)
+    figures = {
+        'mm': 1e3 * rms(position),
+        'peak mm': 1e3 * float(position.max()),
+        'deg': float(np.degrees(rms(attitude))),
+        'NEES': float(np.mean(squares) / 3.0),
+        '% beyond 3 sigma, not lost': 100.0 * float(np.mean((squares > chi2.ppf(0.9973, 3)) & ~declared)),
+        'clock ms': 1e3 * clock,
+        'clock, error over claim': clock / max(ekf.diagnostics()['time offset std'], 1e-6),
+        'resets': float(ekf.resets),
+    }
+    return figures | _at_ends(arrivals, states, truth, counted)
+
+
+def _seconds(states: list[Any]) -> np.ndarray:
+    return np.array([(state.stamp_ns - START_NS) * 1e-9 for state in states])
+
+
+def _at_ends(arrivals: Arrivals, states: list[Any], truth: np.ndarray, counted: np.ndarray) -> Figures:
+    if not arrivals.gaps:
+        return {}
+    kept = [state for state, chosen in zip(states, counted, strict=True) if chosen]
+    ends = np.searchsorted(_seconds(kept), [end for _, end in arrivals.gaps]) - 1
+    off = np.array([np.linalg.norm(kept[k].T_map_body[:3, 3] - truth[k]) for k in ends])
+    claimed = np.array([np.sqrt(np.trace(kept[k].pose_covariance[:3, :3])) for k in ends])
+    return {'coasting cm': 100.0 * rms(off), 'coasting, claim over error': rms(claimed) / rms(off)}
+
+
+# --- flights ------------------------------------------------------------------------------------------------
+
+LATE = 0.03
+
+
+def _arrivals(flight: Flight, poses: list[CameraPose], samples: list[ImuSample] | None = None, **rest: Any) -> Arrivals:
+    gaps = rest.pop('gaps', ())
+    config = white_poses(**rest)
+    begin = [START_NS + round(1e9 * (a - flight.offset)) for a, _ in gaps]
+    end = [START_NS + round(1e9 * (b - flight.offset)) for _, b in gaps]
+    kept = [pose for pose in poses if not any(a <= pose.stamp_ns < b for a, b in zip(begin, end, strict=True))]
+    return Arrivals(flight, timeline(samples or flight.samples(), kept, LATE + flight.offset), config, gaps)
+
+
+def brisk(seed: int) -> Arrivals:
+    """A metre a second, clocks 20 ms apart."""
+    flight = Flight(seed=seed, seconds=16.0, offset=0.02)
+    return _arrivals(flight, flight.poses)
+
+
+def slow_and_noisy(seed: int) -> Arrivals:
+    """Slow, with a gyroscope and an accelerometer ten times as noisy, as known."""
+    noise = ImuNoise(gyroscope_noise_density=2e-3, accelerometer_noise_density=2e-2)
+    motion = Motion.random(np.random.default_rng(100 + seed), speed=0.25, turn=0.12)
+    flight = Flight(seed=seed, seconds=16.0, motion=motion, imu_noise=noise)
+    return _arrivals(flight, flight.poses, imu=noise)
+
+
+def coasting(seed: int) -> Arrivals:
+    """Two seconds without poses, in the middle and at the end."""
+    flight = Flight(seed=seed, seconds=16.0)
+    return _arrivals(flight, flight.poses, gaps=((8.0, 10.0), (13.0, 15.0)))
+
+
+def _by_samples(seed: int, change: Callable[[np.ndarray, np.random.Generator], np.ndarray], **rest: Any) -> Arrivals:
+    """A flight whose samples (N, 6) are changed."""
+    flight = Flight(seed=seed, seconds=16.0)
+    imu = change(flight.imu.copy(), np.random.default_rng(seed))
+    samples = [
+        replace(s, angular_velocity=m[:3], linear_acceleration=m[3:])
+        for s, m in zip(flight.samples(), imu, strict=True)
+    ]
+    return _arrivals(flight, flight.poses, samples, gaps=((8.0, 10.0), (13.0, 15.0)), **rest)
+
+
+def scale_errors(seed: int) -> Arrivals:
+    """Half a per cent of scale and cross-axis errors of both triads."""
+
+    def change(imu: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return imu + np.concatenate([part @ rng.normal(0.0, 0.005, (3, 3)) for part in (imu[:, :3], imu[:, 3:])], 1)
+
+    return _by_samples(seed, change)
+
+
+def shaken(seed: int) -> Arrivals:
+    """Vibration that fills the spectrum: ten and twenty times the densities of the data sheet."""
+
+    def change(imu: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return imu + rng.normal(size=imu.shape) * np.repeat((1.7e-3, 4e-2), 3) * np.sqrt(200.0)
+
+    return _by_samples(seed, change)
+
+
+def nonlinear(seed: int) -> Arrivals:
+    """Errors in proportion to the motion: a quadratic one of 0.4 % of the rate, 1 % of the force."""
+
+    def change(imu: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        motion = imu - imu.mean(axis=0)
+        return imu + np.repeat((0.004, 0.01), 3) * motion * np.abs(motion) / np.abs(motion).mean(axis=0)
+
+    return _by_samples(seed, change)
+
+
+def saturated(seed: int) -> Arrivals:
+    """A range of 1 rad/s that turns exceed."""
+    noise = replace(ImuNoise(), gyroscope_range=1.0)
+    return _by_samples(seed, lambda imu, _: np.clip(imu, *np.outer((-1, 1), [1.0] * 3 + [1e3] * 3)), imu=noise)
+
+
+def frozen(seed: int) -> Arrivals:
+    """The same sample for half a second."""
+
+    def change(imu: np.ndarray, _: np.random.Generator) -> np.ndarray:
+        imu[1600:1700] = imu[1600]
+        return imu
+
+    return _by_samples(seed, change)
+
+
+def gaps_of_imu(seed: int) -> Arrivals:
+    """Nine of ten samples are lost in bursts of 60 to 160 ms."""
+    flight, rng = Flight(seed=seed, seconds=16.0), np.random.default_rng(seed)
+    edges = np.cumsum(rng.integers(12, 32, 200))
+    samples = [sample for k, sample in enumerate(flight.samples()) if k < 300 or np.min(np.abs(edges - k)) < 2]
+    return _arrivals(flight, flight.poses, samples)
+
+
+def jittering(seed: int) -> Arrivals:
+    """Stamps of the camera that are late by 2 ms in the mean, exponentially, and by 2 ms early."""
+    flight, rng = Flight(seed=seed, seconds=16.0), np.random.default_rng(seed)
+    return _arrivals(
+        flight, [replace(p, stamp_ns=p.stamp_ns + round(2e6 * (rng.exponential() - 1.0))) for p in flight.poses]
+    )
+
+
+def tilted_map(seed: int) -> Arrivals:
+    """A map 0.5 deg off the vertical."""
+    flight = Flight(seed=seed, seconds=16.0)
+    tilt = np.eye(4)
+    tilt[:3, :3] = so3_exp(np.radians([0.5, 0.0, 0.0]))
+    # The flight is level in the map, gravity isn't: what the IMU feels turns.
+    lift = np.array([0.0, 0.0, 9.80665])
+    R = np.swapaxes(flight.motion.pose(flight.t)[:, :3, :3], -1, -2)
+    imu = flight.imu.copy()
+    imu[:, 3:] += (R @ (tilt[:3, :3] @ lift - lift)[:, None])[..., 0]
+    samples = [replace(s, linear_acceleration=m[3:]) for s, m in zip(flight.samples(), imu, strict=True)]
+    return _arrivals(flight, flight.poses, samples, gaps=((8.0, 10.0), (13.0, 15.0)))
+
+
+def wrong_poses(seed: int) -> Arrivals:
+    """A fifth of all poses are metres off."""
+    flight, rng = Flight(seed=seed, seconds=16.0), np.random.default_rng(seed)
+    wrong = [_shifted(pose, rng.normal(size=3)) if rng.uniform() < 0.2 else pose for pose in flight.poses]
+    return _arrivals(flight, wrong)
+
+
+def twin_marker(seed: int, by: tuple[float, ...] = (0.9, 0.0, 1.2)) -> Arrivals:
+    """For two seconds all poses agree on a place a metre and a half off."""
+    flight = Flight(seed=seed, seconds=16.0)
+    begin, end = START_NS + 9_000_000_000, START_NS + 11_000_000_000
+    return _arrivals(flight, [_shifted(pose, by) if begin < pose.stamp_ns < end else pose for pose in flight.poses])
+
+
+def moved_markers(seed: int) -> Arrivals:
+    """For two seconds all poses agree on a place half a metre off."""
+    return twin_marker(seed, (0.3, 0.0, 0.4))
+
+
+def _shifted(pose: CameraPose, by: Any) -> CameraPose:
+    T = pose.T_map_camera.copy()
+    T[:3, 3] += by
+    return replace(pose, T_map_camera=T)
+
+
+def unknown_clock_at_start(seed: int) -> Arrivals:
+    """At rest before the flight: the offset of 40 ms shows with the first motion."""
+    flight = Flight(seed=seed, seconds=8.0, offset=0.04)
+    return _arrivals(flight, flight.poses)
+
+
+def stepping_clock(seed: int, step_ns: int = 300_000_000) -> Arrivals:
+    """The clock of the camera steps by 0.3 s."""
+    flight = Flight(seed=seed, seconds=16.0)
+    items = []
+    for pose in flight.poses:
+        step = step_ns * (pose.stamp_ns - START_NS > 8e9)
+        items.append((pose.stamp_ns + round(1e9 * LATE), 1, replace(pose, stamp_ns=pose.stamp_ns + step)))
+    samples = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
+    ordered = [item for _, _, item in sorted(samples + items, key=lambda entry: entry[:2])]
+    return Arrivals(flight, ordered, white_poses())
+
+
+def small_step_of_clock(seed: int) -> Arrivals:
+    """It steps by less than a frame's time."""
+    return stepping_clock(seed, 25_000_000)
+
+
+def lasting_errors(seed: int) -> Arrivals:
+    """Errors of poses that last as long as the view: a smooth function of attitude, twice the white ones."""
+    flight, rng = Flight(seed=seed, seconds=16.0), np.random.default_rng(seed)
+    waves, phases = rng.normal(size=(6, 3)) / 0.3, rng.uniform(0.0, 2.0 * np.pi, 6)
+    poses = []
+    for pose in flight.poses:
+        forward = pose.T_map_camera[:3, 2]
+        e = 2.0 * np.linalg.cholesky(pose.covariance) @ (np.sqrt(2.0) * np.sin(waves @ forward + phases))
+        T = pose.T_map_camera.copy()
+        T[:3, 3] += e[:3]
+        T[:3, :3] = so3_exp(e[3:]) @ T[:3, :3]
+        poses.append(replace(pose, T_map_camera=T, covariance=5.0 * pose.covariance))
+    return _arrivals(flight, poses, pose_noise_scale=1.0)
+
+
+def _scenes() -> dict[str, Scene]:
+    flights = (
+        brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, jittering,
+        tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start, stepping_clock,
+        small_step_of_clock, lasting_errors,
+    )  # fmt: skip
+    scenes: dict[str, Scene] = {scene.__name__.replace('_', ' '): partial(of_flights, scene) for scene in flights}
+    data = os.environ.get('THERMAL_FIDUCIAL_DATA')
+    if data and (Path(data) / 'real_flights').is_dir():
+        for name in ('cam0', *real_flights.CARPETS):
+            scenes[name] = partial(of_recording, name)
+    return scenes
+
+
+SCENES = _scenes()
