@@ -14,7 +14,7 @@ from support.messages import frames, imu, pose
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.body_frame import in_frame
+from thermal_fiducial.core.filter.output import in_frame
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform, transform_from_quaternion
 from thermal_fiducial.core.measurements import Odometry as State
 from thermal_fiducial.errors import InputError

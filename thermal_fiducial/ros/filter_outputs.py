@@ -9,7 +9,7 @@ from nav_msgs.msg import Path
 from sensor_msgs.msg import TimeReference
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.body_frame import in_frame
+from thermal_fiducial.core.filter.output import in_frame
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.bridge import FlightControllerBridge

@@ -15,10 +15,9 @@ from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
 from thermal_fiducial.core.filter.initialization import FEWEST_SAMPLES, WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseLog, PoseUpdate
+from thermal_fiducial.core.filter.output import odometry, SmoothOutput
 from thermal_fiducial.core.filter.recovery import Hypothesis
-from thermal_fiducial.core.filter.smoothing import SmoothOutput
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
-from thermal_fiducial.core.filter.state_output import odometry
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS

@@ -1,0 +1,106 @@
+"""What the filter says, as the outside wants it: ROS order and frames, of another frame on the robot, without steps."""
+
+from dataclasses import replace
+import math
+
+import numpy as np
+
+from thermal_fiducial.core.filter.prediction import Prediction
+from thermal_fiducial.core.filter.state import GYROSCOPE_BIAS, POSITION, ROTATION, VELOCITY
+from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, so3_log, transform
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.types import FloatArray
+
+#: (12, 12) position, rotation, velocity and rate of the robot by the core's errors and the gyroscope's bias, for a
+#: robot at rest whose axes are those of the map.
+_AT_REST = np.zeros((12, 12))
+_AT_REST[6:9, VELOCITY] = np.eye(3)
+_AT_REST[9:, 9:] = -np.eye(3)
+#: Places of the rate's variances in such a matrix, row by row.
+_RATE_VARIANCES = slice(9 * 13, None, 13)
+#: A correction beyond this [m] is a new start of the filter: spreading it would only prolong the error.
+LARGEST_STEP = 1.0
+
+
+def odometry(
+    prediction: Prediction, core: FloatArray, with_bias: FloatArray, imu: FloatArray, rate_variance: float
+) -> Odometry:
+    """State at an IMU sample.
+
+    Parameters
+    ----------
+    core : (9, 9) covariance of rotation, velocity and position errors
+    with_bias : (9, 3) of these with the gyroscope's bias
+    imu : (6,) the sample
+    rate_variance : of the white noise of its rate [rad^2/s^2]
+    """
+    state = prediction.state
+    R, velocity_body = state.R_map_body, state.velocity_body
+    joint = np.empty((12, 12))
+    joint[:9, :9], joint[:9, 9:], joint[9:, :9] = core, with_bias, with_bias.T
+    joint[9:, 9:] = prediction.origin.covariance[GYROSCOPE_BIAS, GYROSCOPE_BIAS]
+    # (p, theta) of the map are R times the error of the robot frame; v_body moves with both nu and phi.
+    J = _AT_REST.copy()
+    J[0:3, POSITION] = J[3:6, ROTATION] = R
+    J[6:9, ROTATION] = skew(velocity_body)
+    covariance = J @ joint @ J.T
+    covariance.reshape(-1)[_RATE_VARIANCES] += rate_variance
+    return Odometry(
+        prediction.stamp_ns,
+        state.T_map_body,
+        velocity_body,
+        state.corrected(imu)[:3],
+        covariance[:6, :6],
+        covariance[6:, 6:],
+    )
+
+
+def in_frame(odometry: Odometry, T_body_frame: FloatArray) -> Odometry:
+    """State of the frame at ``T_body_frame`` (4, 4) on the body of ``odometry``, in the same conventions."""
+    T_map_body, R, lever = odometry.T_map_body, T_body_frame[:3, :3], T_body_frame[:3, 3]
+    pose = np.eye(6)
+    pose[:3, 3:] = -skew(T_map_body[:3, :3] @ lever)
+    twist = np.zeros((6, 6))
+    twist[:3, :3] = twist[3:, 3:] = R.T
+    twist[:3, 3:] = -R.T @ skew(lever)
+    velocities = twist @ np.concatenate((odometry.velocity_body, odometry.angular_velocity_body))
+    return replace(
+        odometry,
+        T_map_body=T_map_body @ T_body_frame,
+        velocity_body=velocities[:3],
+        angular_velocity_body=velocities[3:],
+        pose_covariance=pose @ odometry.pose_covariance @ pose.T,
+        twist_covariance=twist @ odometry.twist_covariance @ twist.T,
+    )
+
+
+class SmoothOutput:
+    """A pose without steps for controllers that hate them: late by design, and never the honest output.
+
+    It follows the filter's odometry, moves with its twist, and takes up its corrections with a time constant.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        """``seconds``: time constant [s]."""
+        self._seconds = seconds
+        self._honest: Odometry | None = None
+        self._T = np.eye(4)
+
+    def follow(self, odometry: Odometry) -> Odometry:
+        """Odometry with the smooth pose; its covariance and twist are the filter's."""
+        if self._honest is None:
+            self._T = odometry.T_map_body
+        else:
+            dt = (odometry.stamp_ns - self._honest.stamp_ns) * 1e-9
+            left = inverse(odometry.T_map_body) @ self._T @ _motion(self._honest, odometry, dt)
+            share = math.exp(-dt / self._seconds) if np.linalg.norm(left[:3, 3]) < LARGEST_STEP else 0.0
+            rotation = so3_exp(share * so3_log(left[:3, :3]))
+            self._T = odometry.T_map_body @ transform(rotation, share * left[:3, 3])
+        self._honest = odometry
+        return replace(odometry, T_map_body=self._T)
+
+
+def _motion(before: Odometry, now: Odometry, dt: float) -> FloatArray:
+    """T_before_now (4, 4) by the mean of both twists."""
+    rotation = so3_exp(0.5 * dt * (before.angular_velocity_body + now.angular_velocity_body))
+    return transform(rotation, 0.5 * dt * (before.velocity_body + rotation @ now.velocity_body))
