@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from support.filter_scenes import Figures, SCENES
-from support.taken_out import lines_of, replaced
+from support.taken_out import ablation_row, lines_of
 
 FILTER = 'thermal_fiducial.core.filter'
 #: Change of a figure that is worth printing.
@@ -123,19 +123,15 @@ def base(scene: str) -> Figures:
     return SCENES[scene]({})
 
 
+def figures_of(scene: str, mechanism: Mechanism | None = None) -> Figures:
+    """Of a scene, with all mechanisms or while one is taken out."""
+    return base(scene) if mechanism is None else SCENES[scene](mechanism.changes)
+
+
 def row(name: str, mechanism: Mechanism) -> str:
     """A line of the table."""
-    cells = []
-    for scene in (scene for scene in dict.fromkeys((*mechanism.scenes, *ACCEPTANCE)) if scene in SCENES):
-        with replaced(FILTER, mechanism.off):
-            figures = SCENES[scene](mechanism.changes)
-        changes = [
-            f'{what} {base(scene)[what]:.3g} -> {value:.3g}'
-            for what, value in figures.items()
-            if not abs(value - base(scene)[what]) <= NOTABLE * abs(base(scene)[what])
-        ]
-        cells += [f'{scene}: {", ".join(changes)}'] if changes else []
-    return f'| {name} | {mechanism.lines} | {"; ".join(cells) or "nothing"} |'
+    scenes = (scene for scene in dict.fromkeys((*mechanism.scenes, *ACCEPTANCE)) if scene in SCENES)
+    return ablation_row(name, mechanism, FILTER, scenes, figures_of, NOTABLE)
 
 
 def main() -> None:

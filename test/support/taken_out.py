@@ -1,6 +1,6 @@
 """Parts of the core by their places, how long they are, and the core with something else in their place."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, ExitStack
 from importlib import import_module
 import inspect
@@ -30,3 +30,24 @@ def replaced(package: str, stand_ins: Mapping[str, Any]) -> Iterator[None]:
             owner, _, name = path.rpartition('.') if '.' in path.partition(':')[2] else path.rpartition(':')
             stack.enter_context(mock.patch.object(place(package, owner), name, stand_in))
         yield
+
+
+def ablation_row(
+    name: str, mechanism: Any, package: str, scenes: Iterable[str], figures_of: Callable[..., Any], notable: float
+) -> str:
+    """A line of the table: all figures of ``scenes`` that change by more than ``notable`` without a mechanism.
+
+    ``figures_of(scene)`` are those with it; ``figures_of(scene, mechanism)`` are measured anew, without it.
+    """
+    cells = []
+    for scene in scenes:
+        base = figures_of(scene)
+        with replaced(package, mechanism.off):
+            figures = figures_of(scene, mechanism)
+        changes = [
+            f'{what} {base[what]:.3g} -> {value:.3g}'
+            for what, value in figures.items()
+            if not abs(value - base[what]) <= notable * abs(base[what])
+        ]
+        cells += [f'{scene}: {", ".join(changes)}'] if changes else []
+    return f'| {name} | {mechanism.lines} | {"; ".join(cells) or "nothing"} |'
