@@ -86,13 +86,17 @@ def replay(options: Options, progress: Callable[[float], None], warn: Callable[[
                 warn,
             )
         _report_refusals(files, entry, warn)
-        if not files.counts['pose']:
-            reasons = '; '.join(f'{node}: {files.complaints[node]}' for node in entry.nodes if node in files.complaints)
-            warn(f'no pose went out. {reasons}')
+        _report_silence(files, entry, warn)
         marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)
         summary = _summary(options, settings, bag, files) | {'markers_in_map': len(marker_map.markers)} | timing
     (options.run / 'summary.json').write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
     return summary
+
+
+def _report_silence(files: RunFiles, entry: Entry, warn: Callable[[str], None]) -> None:
+    if not files.counts['pose']:
+        reasons = '; '.join(f'{node}: {files.complaints[node]}' for node in entry.nodes if node in files.complaints)
+        warn(f'no pose went out. {reasons}')
 
 
 def _settings(options: Options) -> Settings:
