@@ -104,7 +104,7 @@ def test_help_fits_a_terminal_of_80_columns(command, monkeypatch):
 @pytest.mark.parametrize(
     ('output', 'encoding', 'expected'),
     [
-        ('/dev/full', 'utf-8', (1, 'thermal-fiducial map: output: No space left on device\n')),
+        ('/dev/full', 'utf-8', (2, 'thermal-fiducial map: output: No space left on device\n')),
         ('out', 'ascii', (0, '')),
     ],
 )

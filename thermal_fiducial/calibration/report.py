@@ -15,7 +15,7 @@ from thermal_fiducial.calibration.intrinsics import Calibration
 from thermal_fiducial.calibration.lens_check import ImageError
 from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
-from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.writing import write_text
 
 #: Cells of the coverage picture, columns and rows.
 GRID = (16, 12)
@@ -85,10 +85,7 @@ def write_report(
         f'{_picture(calibration, views, error)}{_left_out(calibration, views, unusable)}'
         f'<h2>Views</h2>{_view_figures(calibration, views)}</body></html>'
     )
-    try:
-        path.write_text(page, encoding='utf-8')
-    except OSError as problem:
-        raise InputError(f'{path}: {problem.strerror}') from None
+    write_text(path, page)
 
 
 def _overview(calibration: Calibration, error: ImageError) -> str:

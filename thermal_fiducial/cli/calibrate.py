@@ -21,6 +21,7 @@ from thermal_fiducial.core.measurements import corner_covariances, corners_px
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.writing import write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,7 +74,7 @@ def _camera_imu(args: argparse.Namespace) -> int:
         frames = track(clean_frames(bag), 'finding markers', bag.message_count([bag.image_topic]), transient=True)
         seen = sorted(_mapped_corners(frames, marker_map, camera), key=lambda frame: frame.stamp_ns)
     result = calibrate_rolling_camera_imu(seen, camera, imu, start_ns, noise)
-    args.out.write_text(_extrinsics_text(result), encoding='utf-8')
+    write_text(args.out, _extrinsics_text(result))
     print(_extrinsics_text(result))
     return 0
 

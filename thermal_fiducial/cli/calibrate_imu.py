@@ -8,8 +8,8 @@ import numpy as np
 from thermal_fiducial.calibration.allan_deviation import AllanFit, fit_noise, ImuNoiseFit
 from thermal_fiducial.calibration.sources import imu_track
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, parse_remaps
+from thermal_fiducial.files.writing import write_text
 
 #: With less than this [s] at rest a random walk is hardly seen beside the white noise.
 _LONG_S = 600.0
@@ -31,10 +31,7 @@ def calibrate_imu(args: argparse.Namespace) -> int:
         track, _ = imu_track(bag)
     fit = fit_noise(track)
     text = noise_text(fit)
-    try:
-        args.out.write_text(text, encoding='utf-8')
-    except OSError as error:
-        raise InputError(f'{args.out}: {error.strerror}') from None
+    write_text(args.out, text)
     for name, sensor, unit in (('gyroscope', fit.gyroscope, 'rad/s'), ('accelerometer', fit.accelerometer, 'm/s^2')):
         print(_deviations(name, sensor, unit))
     print(text)

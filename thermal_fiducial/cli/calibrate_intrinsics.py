@@ -31,6 +31,7 @@ from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.files.writing import write_text
 
 # A view of a bag must have moved by this much since the last one kept, and by less than that to the next frame [px].
 _NEW_VIEW_PX, _STILL_PX = 12.0, 0.7
@@ -299,7 +300,7 @@ def _save_covariance(out: Path, result: Calibration, error: ImageError) -> None:
         'sigma_covered_px': error.inside_px,
         'sigma_not_covered_px': error.outside_px,
     }
-    path.write_text(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120), encoding='utf-8')
+    write_text(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
 
 
 def _print_result(

@@ -31,8 +31,8 @@ COMMANDS = {
     'check-bridge': 'verify what a flight controller would receive',
 }
 
-#: Of files and output: nobody can do anything about it here.
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+#: What a file system refuses: full, read-only, not allowed, broken. Nobody can do anything about it here.
+_REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
 
 #: Commands whose module cannot have their name.
 MODULES = {'import': 'import_recording'}
@@ -110,11 +110,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         _let_go_of_output()
         return 0
     except OSError as error:
-        if error.errno not in _NO_ROOM:
+        if error.errno not in _REFUSED:
             raise
         _let_go_of_output()
         print(f'{PROGRAM} {command}: {error.filename or "output"}: {error.strerror}', file=sys.stderr)
-        return 1
+        return 2
 
 
 def _print_any_name() -> None:

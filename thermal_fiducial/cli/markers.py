@@ -18,6 +18,7 @@ from thermal_fiducial.fabrication.dictionary_search import distances, negatives,
 from thermal_fiducial.fabrication.plate import marker_drawing
 from thermal_fiducial.fabrication.strength import strength_of
 from thermal_fiducial.files.dictionary import save_dictionary
+from thermal_fiducial.files.writing import write_text
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -132,7 +133,7 @@ def _dictionary(args: argparse.Namespace) -> int:
     count = ('' if args.count is None else f' --count {args.count}') + ' --signed' * args.signed
     command = f'--bits {args.bits} --distance {args.distance} --seed {args.seed} --restarts {args.restarts}{count}'
     text = args.out.read_text(encoding='utf-8')
-    args.out.write_text(f'# thermal-fiducial markers dictionary {args.out.name} {command}\n{text}', encoding='utf-8')
+    write_text(args.out, f'# thermal-fiducial markers dictionary {args.out.name} {command}\n{text}')
     between, own = distances(kept)
     print(f'{args.out}: {len(kept)} of {found} markers, distance {between}, to own rotations {own}')
     return 0

@@ -90,8 +90,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _refuse_other_folder(out: Path) -> None:
     """Only an empty folder, or what an earlier replay has left, is written to."""
-    earlier = (out / 'parameters.yaml').is_file() and (out / 'output').is_dir()
-    if out.exists() and not earlier and (not out.is_dir() or any(out.iterdir())):
+    names = {path.name for path in out.iterdir()} if out.is_dir() else set()
+    # One that failed has left parameters and map.
+    failed = all(name.startswith(('parameters.yaml', 'marker_map.', 'truth.tum', 'map_true.yaml')) for name in names)
+    earlier = 'parameters.yaml' in names and ('output' in names or failed)
+    if out.exists() and not earlier and (not out.is_dir() or names):
         raise InputError(f'{out} exists and is no earlier run: choose another folder with --out')
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+import shutil
 
 import numpy as np
 
@@ -52,4 +53,9 @@ def write_corner_flight(
     """
     late = IMAGE_DELAY_NS / SECOND_NS
     write_recording(out, simulated_recording(flight, noise), noise.claimed_px, late, storage, progress)
-    write_side_files(out, flight)
+    try:
+        write_side_files(out, flight)
+    except BaseException:
+        # Without its parameters and maps a flight cannot be replayed.
+        shutil.rmtree(out, ignore_errors=True)
+        raise

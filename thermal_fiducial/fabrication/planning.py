@@ -25,6 +25,7 @@ from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.plain_yaml import load_plain
 from thermal_fiducial.files.reading import one_line
+from thermal_fiducial.files.writing import write_text
 
 FORMAT = 'thermal_fiducial/marker_measurements'
 #: What the package ships.
@@ -147,13 +148,11 @@ def load_measurements(path: str | os.PathLike[str] = PACKAGED) -> Measurements:
 
 
 def save_measurements(path: str | os.PathLike[str], measurements: Measurements, notes: dict[str, Any]) -> None:
-    """Write ``measurements``, with ``notes`` on how they were made."""
+    """Write ``measurements``, with ``notes`` on how they were made. Raises InputError."""
     document: dict[str, Any] = {'format': FORMAT, **notes}
     for name in _TABLES:
         document[name] = np.round(getattr(measurements, name), 6).tolist()
-    Path(path).write_text(
-        yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120), encoding='utf-8'
-    )
+    write_text(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
 
 
 @dataclass(frozen=True)

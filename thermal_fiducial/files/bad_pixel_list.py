@@ -8,6 +8,7 @@ import numpy as np
 from thermal_fiducial.core.types import IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import read_text
+from thermal_fiducial.files.writing import write_text
 
 _WHOLE = re.compile(r'[0-9]{1,6}')
 
@@ -36,6 +37,6 @@ def _pixel(path: str | Path, number: int, line: str) -> tuple[int, int]:
 
 
 def save_bad_pixels(path: str | Path, pixels: IntArray) -> None:
-    """Write pixels (N, 2) so that :func:`load_bad_pixels` reads them."""
+    """Write pixels (N, 2) so that :func:`load_bad_pixels` reads them. Raises InputError where it cannot be written."""
     lines = ['# column row', *(f'{column} {row}' for column, row in np.asarray(pixels).reshape(-1, 2))]
-    Path(path).write_text('\n'.join(lines) + '\n', encoding='utf-8')
+    write_text(path, '\n'.join(lines) + '\n')

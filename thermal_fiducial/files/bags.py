@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+import shutil
+import sqlite3
 from types import TracebackType
 from typing import Any, Self
 
@@ -22,6 +24,7 @@ from rosbags.typesys.store import Typestore
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_checks import check_announced, check_file, check_metadata, SINGLE_FILES
 from thermal_fiducial.files.decompression import bound_decompression
+from thermal_fiducial.files.writing import into
 
 IMAGE_TOPIC = 'thermal/image_raw'
 COMPRESSED_TOPIC = 'thermal/image_raw/compressed'
@@ -277,7 +280,7 @@ class BagReader:
 
 
 class BagWriter:
-    """A new rosbag2, opened by ``with``; the same messages give the same bytes.
+    """A new rosbag2, opened by ``with``; the same messages give the same bytes. What is left early is removed.
 
     Parameters
     ----------
@@ -301,16 +304,34 @@ class BagWriter:
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> Self:
-        try:
-            self._writer.open()
-        except OSError as error:
-            raise InputError(f'{self._path}: {error.strerror}') from None
+        with self._removed_unless_whole(), self._written():
+            self._writer.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._writer.close()
+        with self._removed_unless_whole(), self._written():
+            self._writer.__exit__(kind, value, traceback)
+            if value is not None:
+                raise value
+
+    @contextmanager
+    def _removed_unless_whole(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            # Half a flight looks like a whole one.
+            shutil.rmtree(self._path, ignore_errors=True)
+            raise
+
+    @contextmanager
+    def _written(self) -> Iterator[None]:
+        try:
+            with into(self._path):
+                yield
+        except sqlite3.Error as error:
+            raise InputError(f'{self._path}: {error}') from None
 
     def add_topic(self, topic: str, msgtype: str) -> None:
         """Record that there is ``topic``, also if it never gets a message.
@@ -323,7 +344,8 @@ class BagWriter:
         if msgtype not in self._typestore.fielddefs:
             raise InputError(f'{topic}: message type {msgtype} is unknown')
         name = topic if topic.startswith('/') else '/' + topic
-        self._connections[topic] = self._writer.add_connection(name, msgtype, typestore=self._typestore)
+        with self._written():
+            self._connections[topic] = self._writer.add_connection(name, msgtype, typestore=self._typestore)
 
     def write(self, topic: str, stamp_ns: int, message: Any, msgtype: str | None = None) -> None:
         """Append a message.
@@ -333,10 +355,16 @@ class BagWriter:
         topic : as :meth:`add_topic` got it; a new one is added
         stamp_ns : bag stamp
         message : one of rosbags' message objects, or its CDR bytes together with ``msgtype``
+
+        Raises
+        ------
+        InputError
+            It cannot be written: the disk is full, say.
         """
         kind = msgtype or message.__msgtype__
         if topic not in self._connections:
             self.add_topic(topic, kind)
         is_raw = isinstance(message, (bytes, bytearray, memoryview))
         cdr = message if is_raw else self._typestore.serialize_cdr(message, kind)
-        self._writer.write(self._connections[topic], stamp_ns, cdr)
+        with self._written():
+            self._writer.write(self._connections[topic], stamp_ns, cdr)

@@ -10,6 +10,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.schema import load_yaml, Value
+from thermal_fiducial.files.writing import write_text
 
 _LARGEST_SIDE = 65_535
 #: Names that other tools use for our models.
@@ -85,10 +86,7 @@ def save_camera(path: str | Path, camera: Camera, name: str = 'tau2') -> None:
         'rectification_matrix': _entry(np.eye(3)),
         'projection_matrix': _entry(projection),
     }
-    try:
-        Path(path).write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None), encoding='utf-8')
-    except OSError as error:
-        raise InputError(f'calibration {path}: {error.strerror}') from None
+    write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None))
 
 
 def _entry(matrix: FloatArray) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from thermal_fiducial.core.detection.patterns import correctable_bits, marker_bi
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import read_text
 from thermal_fiducial.files.schema import parse_yaml, Value
+from thermal_fiducial.files.writing import write_text
 
 FORMAT = 'thermal_fiducial/dictionary'
 #: Folder of the dictionaries that the package ships, loadable by their bare name.
@@ -108,7 +109,7 @@ def _of_map(name: str, folder: Path) -> str:
 
 
 def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: cv2.aruco.Dictionary) -> None:
-    """Write ``dictionary`` as a dictionary file."""
+    """Write ``dictionary`` as a dictionary file. Raises InputError where it cannot be written."""
     document = {
         'format': FORMAT,
         'version': 1,
@@ -117,7 +118,7 @@ def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: cv2.aru
         'max_correction_bits': int(dictionary.maxCorrectionBits),
         'markers': [[''.join(map(str, row)) for row in bits] for bits in marker_bits(dictionary).tolist()],
     }
-    Path(path).write_text(yaml.safe_dump(document, sort_keys=False, width=120), encoding='utf-8')
+    write_text(path, yaml.safe_dump(document, sort_keys=False, width=120))
 
 
 def _from_document(document: Value) -> cv2.aruco.Dictionary:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 import heapq
 from pathlib import Path
-import shutil
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from thermal_fiducial.files.bags import (
 )
 from thermal_fiducial.files.recordings import Corners, Recording
 from thermal_fiducial.files.rig_files import Rig
+from thermal_fiducial.files.writing import write_text
 
 _Event = tuple[int, str, Any]
 
@@ -55,20 +55,14 @@ def write_recording(
         raise InputError('the recording does not say how large its markers are: give --marker-size')
     late_ns = round((late + recording.rig.time_offset) * SECOND_NS)
     parts = [_imu(recording), _frames(recording, sigma_px, late_ns), _truth(recording)]
-    writer = BagWriter(out, storage)
-    try:
-        with writer as bag:
-            for stamp_ns, topic, message in heapq.merge(*parts, key=lambda event: event[0]):
-                bag.write(topic, stamp_ns, message)
-                if topic in (IMAGE_TOPIC, MARKERS_TOPIC, CAMERA_POSE_TOPIC):
-                    progress(1)
-    except BaseException:
-        # Half a flight looks like a whole one.
-        shutil.rmtree(out, ignore_errors=True)
-        raise
     parameters = {'/**': {'ros__parameters': _parameters(recording.rig)}}
-    text = yaml.safe_dump(parameters, sort_keys=False, default_flow_style=None, width=120)
-    (out / 'params.yaml').write_text(text, encoding='utf-8')
+    with BagWriter(out, storage) as bag:
+        for stamp_ns, topic, message in heapq.merge(*parts, key=lambda event: event[0]):
+            bag.write(topic, stamp_ns, message)
+            if topic in (IMAGE_TOPIC, MARKERS_TOPIC, CAMERA_POSE_TOPIC):
+                progress(1)
+        text = yaml.safe_dump(parameters, sort_keys=False, default_flow_style=None, width=120)
+        write_text(out / 'params.yaml', text)
 
 
 def frame_count(recording: Recording) -> int:

@@ -1,8 +1,9 @@
 """The map file of a running mapper: loaded, saved, autosaved, and in no case lost."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
+import tempfile
 from threading import Thread
 import time
 
@@ -11,6 +12,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import map_history
 from thermal_fiducial.files.atomic import locked, write_atomically
 from thermal_fiducial.files.marker_map import dump_map, load_map
+from thermal_fiducial.files.robot_folder import robot_folder
 
 #: A mapper that starts so many autosave periods after the last autosave has crashed and goes on where it was.
 RESTART_PERIODS = 2.0
@@ -36,6 +38,8 @@ class MapKeeper:
         self._fault = ''
         #: whether the map has learned something since it was loaded or saved
         self.unsaved = False
+        #: why the last save did not go to the file; empty: it did
+        self.obstacle = ''
 
     @property
     def path(self) -> Path:
@@ -87,26 +91,40 @@ class MapKeeper:
     def save(self, marker_map: MarkerMap) -> Path:
         """Write the map: to its file, or beside it where that holds something that the map does not follow.
 
+        Where its folder takes nothing (a full disk, one that is read-only) it goes to where the filter keeps its last
+        pose, or else to a new temporary folder.
+
         Returns
         -------
-        Where it was written.
+        Where it was written; :attr:`obstacle` says why not to its file.
 
         Raises
         ------
         InputError
-            Nothing can be written there.
+            Nothing can be written anywhere.
         """
         self.finish()
+        self.obstacle = ''
         try:
             map_history.save_with_history(self.path, marker_map, 'save', self._read)
-        except InputError:
-            beside = self.path.with_name(f'{self.path.stem}.new{self.path.suffix}')
-            map_history.save_with_history(beside, marker_map, 'save')
+        except InputError as error:
+            self.obstacle = str(error)
+            elsewhere = self._save_elsewhere(marker_map)
             self.unsaved = False
-            return beside
+            return elsewhere
         self._read, self.unsaved = map_history.digest(self.path), False
         self._retire_autosave()
         return self.path
+
+    def _save_elsewhere(self, marker_map: MarkerMap) -> Path:
+        name = f'{self.path.stem}.new{self.path.suffix}'
+        folders: tuple[Callable[[], Path], ...] = (lambda: self.path.parent, _own_folder, _new_folder)
+        for folder in folders:
+            with suppress(OSError, InputError):
+                path = folder() / name
+                map_history.save_with_history(path, marker_map, 'save')
+                return path
+        raise InputError(f'the map is not saved: {self.obstacle}')
 
     def undo(self) -> str:
         """Put the latest earlier version of the file back in place; what was undone.
@@ -157,3 +175,13 @@ class MapKeeper:
         """Wait for what is being written."""
         if self._writer is not None:
             self._writer.join()
+
+
+def _own_folder() -> Path:
+    folder = robot_folder()
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _new_folder() -> Path:
+    return Path(tempfile.mkdtemp(prefix='thermal_fiducial_'))

@@ -10,6 +10,7 @@ import numpy as np
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import text_lines
+from thermal_fiducial.files.writing import write_text
 
 # What an integer of 64 bits holds in nanoseconds: the year 2262.
 _LATEST_S = 9_200_000_000
@@ -35,10 +36,7 @@ def save_tum(path: str | Path, stamps_ns: Iterable[int], positions: FloatArray, 
         The file cannot be written.
     """
     lines = [tum_line(*pose) for pose in zip(stamps_ns, positions, quaternions, strict=True)]
-    try:
-        Path(path).write_text(''.join(line + '\n' for line in lines), encoding='ascii')
-    except OSError as error:
-        raise InputError(f'{path}: {error.strerror}') from None
+    write_text(path, ''.join(line + '\n' for line in lines))
 
 
 def load_tum(path: str | Path) -> tuple[IntArray, FloatArray, FloatArray]:

@@ -7,6 +7,7 @@ is lost or reordered, and time does not matter.
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 from rclpy.context import Context
@@ -168,12 +169,13 @@ class _Graph:
             wait.go_on(sum([source.count for source in self._inputs]))
 
     def close(self) -> None:
-        """Have the nodes finish (the map is saved) and destroy them."""
-        for stage in self._stages:
-            stage.close()
-        self._executor.shutdown()
-        for node in self._nodes:
-            node.destroy_node()
+        """Have the nodes finish (the map is saved) and destroy them, all of them also where one cannot finish."""
+        with ExitStack() as ending:
+            for node in reversed(self._nodes):
+                ending.callback(node.destroy_node)
+            ending.callback(self._executor.shutdown)
+            for stage in reversed(self._stages):
+                ending.callback(stage.close)
 
 
 def _check(message: BagMessage) -> None:

@@ -24,11 +24,14 @@ from thermal_fiducial.errors import InputError, RunError
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.files.writing import into, write_text
 from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.replay.session import MAP_FILE, Options, replay
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.ros import clouds, convert
 
+#: Written last; one of an earlier batch goes before the first replay.
+SUMMARY_FILE = 'batch.json'
 #: Of a cluster on this machine: workers that one bag may outlive, as whatever ends more of them is in the bag; and a
 #: worker that the machine starves is not given up, as its end shows in its connection.
 _PATIENT = {
@@ -134,7 +137,9 @@ def run_batch(
     settings = read_settings(batch.options.params, {})
     if batch.options.map_file is None:
         raise InputError('a joint map needs --map with at least one marker of known pose')
-    batch.out.mkdir(parents=True, exist_ok=True)
+    with into(batch.out):
+        batch.out.mkdir(parents=True, exist_ok=True)
+        (batch.out / SUMMARY_FILE).unlink(missing_ok=True)
     _replay_all(runs, client, progress, warn)
     built, frames = _joint_map(batch, runs, settings)
     save_map(batch.out / MAP_FILE, built.map)
@@ -148,7 +153,7 @@ def run_batch(
         'markers': sorted(built.map.markers),
         'unplaced': {str(key): why for key, why in sorted(built.unplaced.items())},
     }
-    (batch.out / 'batch.json').write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
+    write_text(batch.out / SUMMARY_FILE, json.dumps(summary, indent=2) + '\n')
     return summary
 
 
@@ -182,14 +187,15 @@ def _replay_all(
 def replay_whole(options: Options) -> list[str]:
     """A replay whose run folder is there whole or not at all, in the place of an earlier one; its warnings."""
     warnings: list[str] = []
-    options.run.parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(prefix=f'.{options.run.name}-', dir=options.run.parent))
-    try:
-        replay(replace(options, run=folder / options.run.name), lambda share: None, warnings.append)
-        shutil.rmtree(options.run, ignore_errors=True)
-        (folder / options.run.name).rename(options.run)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+    with into(options.run):
+        options.run.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=f'.{options.run.name}-', dir=options.run.parent))
+        try:
+            replay(replace(options, run=folder / options.run.name), lambda share: None, warnings.append)
+            shutil.rmtree(options.run, ignore_errors=True)
+            (folder / options.run.name).rename(options.run)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
     return warnings
 
 

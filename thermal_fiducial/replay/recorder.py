@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from contextlib import ExitStack
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
@@ -18,9 +19,12 @@ from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagWriter
 from thermal_fiducial.files.trajectory_file import tum_line
+from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.replay.topics import Topics, type_name
 from thermal_fiducial.ros import clouds, convert
 from thermal_fiducial.ros.counting import CountingNode
+
+_TABLES = ('fused.tum', 'fiducial.tum', 'detections.csv')
 
 
 class Sink(Protocol):
@@ -33,7 +37,7 @@ class Sink(Protocol):
 
 
 class RunFiles:
-    """The files of a run folder that grow with the messages; a context manager.
+    """The files of a run folder that grow with the messages; a context manager. What is left early is removed.
 
     Parameters
     ----------
@@ -51,12 +55,9 @@ class RunFiles:
         #: node to what it said last and was not well then
         self.complaints: dict[str, str] = {}
         self._last_figures: dict[str, dict[str, str]] = {}
-        self._fused = _opened(folder / 'fused.tum')
-        self._fiducial = _opened(folder / 'fiducial.tum')
-        self._detections = _opened(folder / 'detections.csv')
-        self._detections.write(','.join(['stamp_ns', 'id', *CORNER_FIELDS, 'sigma_px']) + '\n')
         shutil.rmtree(folder / 'output', ignore_errors=True)
         self._bag = BagWriter(folder / 'output')
+        self._ending = ExitStack()
         self._types = {topic: type_name(kind) for topic, (kind, _) in topics.items()}
         self._readers: dict[str, tuple[type, Callable[[Any], None]]] = {
             'pose': (PoseWithCovarianceStamped, self._on_pose),
@@ -66,16 +67,31 @@ class RunFiles:
         }
 
     def __enter__(self) -> Self:
-        self._bag.__enter__()
-        for topic, msgtype in self._types.items():
-            self._bag.add_topic(topic, msgtype)
+        with ExitStack() as ending:
+            ending.push(self._remove_unless_whole)
+            ending.enter_context(self._bag)
+            for topic, msgtype in self._types.items():
+                self._bag.add_topic(topic, msgtype)
+            ending.push(self._sort_late_frames)
+            self._fused, self._fiducial, self._detections = [
+                ending.enter_context((self.folder / name).open('w', encoding='utf-8')) for name in _TABLES
+            ]
+            self._detections.write(','.join(['stamp_ns', 'id', *CORNER_FIELDS, 'sigma_px']) + '\n')
+            self._ending = ending.pop_all()
         return self
 
     def __exit__(self, *exception: Any) -> None:
-        for file in (self._fused, self._fiducial, self._detections):
-            file.close()
-        _sort_by_stamp(self.folder / 'fiducial.tum')
-        self._bag.__exit__(*exception)
+        self._ending.__exit__(*exception)
+
+    def _sort_late_frames(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            _sort_by_stamp(self.folder / 'fiducial.tum')
+
+    def _remove_unless_whole(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Half a run looks like a whole one."""
+        if kind is not None:
+            for name in _TABLES:
+                (self.folder / name).unlink(missing_ok=True)
 
     def add(self, topic: str, time_ns: int, data: bytes) -> None:
         """Take one published message, as CDR bytes, that came at ``time_ns`` of the bag's clock."""
@@ -128,14 +144,10 @@ def extrinsics(config: Any) -> FloatArray:
     return transform_from_quaternion(config.camera_position, config.camera_orientation)
 
 
-def _opened(path: Path) -> TextIO:
-    return path.open('w', encoding='utf-8')
-
-
 def _sort_by_stamp(path: Path) -> None:
     """Put the lines of late frames where they belong: a trajectory's stamps increase."""
     lines = path.read_text(encoding='utf-8').splitlines(keepends=True)
-    path.write_text(''.join(sorted(lines, key=lambda line: Decimal(line.split(maxsplit=1)[0]))), encoding='utf-8')
+    write_text(path, ''.join(sorted(lines, key=lambda line: Decimal(line.split(maxsplit=1)[0]))))
 
 
 def _write_pose(file: TextIO, message: PoseWithCovarianceStamped, pose: Pose) -> None:

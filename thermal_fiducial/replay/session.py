@@ -15,13 +15,14 @@ from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.files.writing import into, write_text
 from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
 from thermal_fiducial.replay.recorder import RunFiles
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED
 
-MAP_FILE = 'marker_map.yaml'
+MAP_FILE, SUMMARY_FILE = 'marker_map.yaml', 'summary.json'
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,8 @@ def replay(options: Options, progress: Callable[[float], None], warn: Callable[[
     Raises
     ------
     InputError
-        An unusable bag, parameter or file; the message says which and why.
+        An unusable bag, parameter or file, or a run folder that cannot be written to; the message says which and why.
+        What was written until then is removed, but for parameters and map.
     """
     settings = _settings(options)
     for line in settings.warnings:
@@ -72,7 +74,7 @@ def replay(options: Options, progress: Callable[[float], None], warn: Callable[[
         arguments = _prepare(options, settings, entry, warn)
         recorded = entry.recorded(calibration_from_file=from_file, images=options.images)
         extrinsics = settings.pose_ekf.camera_position, settings.pose_ekf.camera_orientation
-        with RunFiles(options.run, transform_from_quaternion(*extrinsics), recorded) as files:
+        with into(options.run), RunFiles(options.run, transform_from_quaternion(*extrinsics), recorded) as files:
             duration = max(bag.duration_ns, 1)
             play = partial(replay_processes, rate=options.rate) if options.transport == 'processes' else replay_lockstep
             timing = play(
@@ -89,7 +91,7 @@ def replay(options: Options, progress: Callable[[float], None], warn: Callable[[
         _report_silence(files, entry, warn)
         marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)
         summary = _summary(options, settings, bag, files) | {'markers_in_map': len(marker_map.markers)} | timing
-    (options.run / 'summary.json').write_text(json.dumps(summary, indent=2) + '\n', encoding='utf-8')
+    write_text(options.run / SUMMARY_FILE, json.dumps(summary, indent=2) + '\n')
     return summary
 
 
@@ -113,7 +115,7 @@ def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[
     try:
         options.run.mkdir(parents=True, exist_ok=True)
         settings.write(options.run / 'parameters.yaml')
-        for name in ('latency.csv', 'report.html', 'flight.mp4'):
+        for name in (SUMMARY_FILE, 'latency.csv', 'report.html', 'flight.mp4'):
             (options.run / name).unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f'run folder {options.run}: {error.strerror}') from None
@@ -126,7 +128,8 @@ def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[
             warn('no map (--map): without one marker of known pose there is nothing to find the camera from')
         return arguments
     if Path(given).resolve() != run_map.resolve():
-        shutil.copyfile(given, run_map)
+        with into(run_map):
+            shutil.copyfile(given, run_map)
     return [*arguments, '-p', f'map_file:={json.dumps(str(run_map))}']
 
 

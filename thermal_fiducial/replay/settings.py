@@ -25,6 +25,7 @@ from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns
 from thermal_fiducial.files.marker_map import load_map, other_frame
 from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.files.writing import write_text
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,12 @@ class Settings:
     warnings: tuple[str, ...] = ()
 
     def write(self, path: Path) -> None:
-        """Write all parameters as a ROS parameter file."""
+        """Write all parameters as a ROS parameter file. Raises InputError where it cannot be written."""
         document = {
             f'/{node}': {'ros__parameters': {name: _plain(value) for name, _, value in parameters(getattr(self, node))}}
             for node in NODES
         }
-        path.write_text(yaml.safe_dump(document, sort_keys=False), encoding='utf-8')
+        write_text(path, yaml.safe_dump(document, sort_keys=False))
 
 
 def read_settings(params: Path | None, overrides: Mapping[str, Any]) -> Settings:

@@ -18,8 +18,9 @@ import numpy as np
 
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.report.evaluation import Evaluation
-from thermal_fiducial.report.page import evaluate_run, write_text
+from thermal_fiducial.report.page import evaluate_run
 from thermal_fiducial.report.tables import number, Table
 from thermal_fiducial.report.trajectory import Trajectory
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.atomic import write_atomically
+from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.report.evaluation import evaluate, Evaluation
 from thermal_fiducial.report.run_folder import read_run, SUMMARY
 
@@ -90,17 +90,3 @@ def write_page(evaluation: Evaluation, numbers: dict[str, Any], bag: Path | None
     path = run.path / REPORT
     write_text(path, render(report_page(evaluation, numbers, strip(run, bag), video)))
     return path
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file, whole or not at all, and never into a pipe or a device.
-
-    Raises
-    ------
-    InputError
-        It cannot be written.
-    """
-    try:
-        write_atomically(path, text)
-    except OSError as error:
-        raise InputError(f'{path}: {error.strerror}') from None

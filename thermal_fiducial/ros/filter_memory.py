@@ -1,8 +1,8 @@
 """What outlives a filter that crashes in flight: its last pose and clock offset, in a file, once a second."""
 
+from contextlib import suppress
 import math
 import os
-from pathlib import Path
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
@@ -11,6 +11,7 @@ from thermal_fiducial.core.filter.restart import LastPose, RestartHint
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.files.last_pose import recent_pose, save_last_pose
+from thermal_fiducial.files.robot_folder import robot_folder
 from thermal_fiducial.ros.node import StageNode
 
 #: What a clock offset of before may be wrong by [s]: the filter had it to 3 ms or better.
@@ -30,9 +31,8 @@ class FilterMemory:
         self._hint: RestartHint | None = None
         self._active = node.live and node.config.resume
         name = node.get_fully_qualified_name().strip('/').replace('/', '_')
-        home = os.environ.get('ROS_HOME', '~/.ros')
         domain = os.environ.get('ROS_DOMAIN_ID', '0')
-        self._path = Path(home).expanduser() / 'thermal_fiducial' / f'{name}_{domain}.json'
+        self._path = robot_folder() / f'{name}_{domain}.json'
         node.endings.append(self._close)
         last = recent_pose(self._path) if self._active else None
         if last is not None:
@@ -74,4 +74,6 @@ class FilterMemory:
     def _close(self) -> None:
         """Ended in order: the next start is none in flight."""
         if self._active:
-            self._path.unlink(missing_ok=True)
+            # On a disk that became read-only it stays, and is too old for a hint soon.
+            with suppress(OSError):
+                self._path.unlink(missing_ok=True)

@@ -77,9 +77,10 @@ class MapServices:
         self._keeper.unsaved = True
 
     def save(self) -> str:
-        """Write the map file, or one beside it where that holds something that the map does not follow."""
+        """Write the map file, or another one, and why, where it cannot be replaced."""
         path = self._keeper.save(self.mapper.map)
-        return f'{len(self.mapper.map.markers)} markers saved to {path}'
+        why = f', as {self._keeper.obstacle}' if self._keeper.obstacle else ''
+        return f'{len(self.mapper.map.markers)} markers saved to {path}{why}'
 
     def load(self) -> str:
         """Take over the map file as it is now: what ``thermal-fiducial map`` has made of it."""
@@ -117,16 +118,27 @@ class MapServices:
         return response
 
     def close(self) -> None:
-        """End the refinement; save what was mapped."""
-        self.refinement.close()
+        """End the refinement; save what was mapped.
+
+        Raises
+        ------
+        InputError
+            It cannot be saved anywhere.
+        """
+        try:
+            self.refinement.close()
+        finally:
+            self._save_at_the_end()
+
+    def _save_at_the_end(self) -> None:
         file = self._node.config.map_file
         lost = not self.mapper.frozen and not Path(file).exists()
         if file and (self._keeper.unsaved or lost) and self.mapper.map.markers:
-            logger = self._node.get_logger()
-            try:
-                logger.info(self.save())
-            except InputError as error:
-                logger.error(str(error))
+            line, logger = self.save(), self._node.get_logger()
+            if self._keeper.obstacle:
+                logger.warning(line)
+            else:
+                logger.info(line)
 
 
 def _answer(act: Callable[[], str]) -> Answer:

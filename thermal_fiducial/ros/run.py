@@ -77,9 +77,18 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
 
     Returns
     -------
-    Exit status: 0 stopped, 2 unusable arguments or parameters (one line says which).
+    Exit status: 0 stopped, 2 unusable arguments or parameters, or a map that cannot be saved (one line says which).
     """
     stop = StopSignals(try_shutdown)
+    try:
+        _make_and_spin(make_node, args, stop)
+    except InputError as error:
+        print(f'{Path(sys.argv[0]).name}: {error}', file=sys.stderr)
+        return 2
+    return 0
+
+
+def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None, stop: StopSignals) -> None:
     # What must be saved is saved first, before anything is taken down that may fail or hang.
     with ExitStack() as ending:
         ending.callback(try_shutdown)
@@ -92,16 +101,14 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
             ending.callback(node.close)
             executor.add_node(node)
             _spin(node, executor, stop)
-        except InputError as error:
-            print(f'{Path(sys.argv[0]).name}: {error}', file=sys.stderr)
-            return 2
+        except InputError:
+            raise
         except ExternalShutdownException:
             pass
         except Exception:
             # Asked to stop while the node is being made, rcl refuses the rest of it: not an error of the node.
             if ok() and not stop.asked:
                 raise
-    return 0
 
 
 def _spin(node: StageNode[Any], executor: Any, stop: StopSignals) -> None:

@@ -24,6 +24,7 @@ from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPI
 from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry
 from thermal_fiducial.files.rosbags_types import MAP_FRAME
 from thermal_fiducial.files.trajectory_file import save_tum
+from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.sim import messages
 from thermal_fiducial.sim.imu import ImuRecord
 from thermal_fiducial.sim.scenario import Scenario
@@ -118,7 +119,7 @@ def _write_bag(folder: Path, flight: FlightPlan, storage: str, workers: int, pro
             bag.write(event.topic, event.arrival_ns, event.message)
             if event.topic == IMAGE_TOPIC:
                 progress(1)
-    (folder / 'ground_truth_corners.csv').write_text(''.join(corners), encoding='ascii')
+    write_text(folder / 'ground_truth_corners.csv', ''.join(corners))
 
 
 def _noting_corners(frames: Iterable[SimFrame], lines: list[str]) -> Iterator[SimFrame]:
@@ -218,13 +219,13 @@ def write_side_files(folder: Path, flight: FlightPlan) -> None:
     times, stamps = flight.imu_stamps()
     motion = scenario.trajectory(flight.seconds, flight.seed)(times)
     save_tum(folder / 'ground_truth.tum', stamps.tolist(), motion.position, motion.rotation.as_quat())
-    (folder / 'map_true.yaml').write_text(_marker_map(scenario, scenario.markers), encoding='utf-8')
-    (folder / 'map_one.yaml').write_text(_marker_map(scenario, scenario.markers[:1]), encoding='utf-8')
+    write_text(folder / 'map_true.yaml', _marker_map(scenario, scenario.markers))
+    write_text(folder / 'map_one.yaml', _marker_map(scenario, scenario.markers[:1]))
     _dump(folder / 'params.yaml', {'/**': {'ros__parameters': _parameters(scenario)}})
 
 
 def _dump(path: Path, content: dict[str, Any]) -> None:
-    path.write_text(yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120), encoding='utf-8')
+    write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=120))
 
 
 def _marker_map(scenario: Scenario, markers: tuple[Marker, ...]) -> str:
