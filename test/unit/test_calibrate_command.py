@@ -70,11 +70,20 @@ def test_intrinsics_from_a_bag(tmp_path, capsys):
     assert load_camera(out).K[0, 0] == pytest.approx(lens.focal[0], rel=3e-3)
 
 
-def test_pictures_of_different_sizes(tmp_path, capsys):
+def test_pictures_that_are_none_or_of_another_size_are_named(tmp_path, capsys):
     board = Chessboard(8, 6, 0.05)
     plate = plate_pose(random_view(SMALL, board.points, np.random.default_rng(6)), np.array([0.175, 0.125]))
     counts = render(SMALL, plate, chessboard_levels(8, 6), 0.55, 0.45, 8.0, 1, samples=23)
     cv2.imwrite(str(tmp_path / 'a.png'), counts)
     cv2.imwrite(str(tmp_path / 'b.png'), counts[:200])
+    (tmp_path / 'd.png').write_bytes(b'no picture')
+    cv2.imwrite(str(tmp_path / 'e.png'), counts)
     assert main(['calibrate', 'intrinsics', str(tmp_path), '--out', str(tmp_path / 'c.yaml')]) == 2
-    assert '320x200' in capsys.readouterr().err
+    out, err = capsys.readouterr()
+    assert 'b.png: not used: 320x200 pixels, the views before it have 320x256' in out
+    assert 'd.png: not used: not a readable picture' in out
+    # The rest is looked at, and the line that ends it says what was wrong with which.
+    assert 'e.png: 48 points' in out
+    assert '2 of 4 frames are usable views' in err
+    assert 'b.png: 320x200 pixels' in err
+    assert 'd.png: not a readable picture' in err

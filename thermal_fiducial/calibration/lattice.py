@@ -4,6 +4,7 @@ Everything is local: a grid is continued from its own nearest points, so neither
 contrast that fades, or reverses, over a board stops it.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -56,7 +57,7 @@ class BoardPoints:
 def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | GridRefusal:
     """Most complete sighting of a board among several sets of keypoints, or why there is none."""
     best: BoardPoints | None = None
-    refusal = GridRefusal('no regular grid of points')
+    refusal, weightiest = GridRefusal('no regular grid of points'), 0.0
     larger, larger_pixels, covered = np.zeros((0, 2), np.int64), np.zeros((0, 2)), 0
     for keypoints in views:
         for grid in Grower(keypoints).grids():
@@ -64,7 +65,10 @@ def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | G
             pixels = keypoints.pixels[list(grid.values())]
             placed = board.place(_facing(nodes, pixels))
             if isinstance(placed, GridRefusal):
-                refusal = max(refusal, placed, key=lambda other: other.points)
+                # Among many points that belong to no board a large grid may be chance: its share of them counts too.
+                weight = len(grid) ** 2 / len(keypoints.pixels)
+                if weight > weightiest:
+                    refusal, weightiest = placed, weight
                 if placed.covered > covered:
                     larger, larger_pixels, covered = nodes, pixels, placed.covered
             elif best is None or len(placed.points) > len(best.points):
@@ -129,23 +133,28 @@ class Grower:
     def _grow(self, seed: Seed) -> dict[Node, int]:
         """Grid from a seed: first what is next to it, then over gaps of one point; given up where it is no grid."""
         grid: dict[Node, int] = dict(zip(((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)), seed, strict=True))
+        support: Counter[Node] = Counter()
+        for node in grid:
+            support.update(_supported(node))
         asked: dict[Node, int] = {}
         off: list[float] = []
         growing = True
         while growing and (len(off) < _ENOUGH or np.mean(off) < _ORDERLY):
-            growing = any(self._add(grid, reach, asked, off) for reach in (1, 2))
+            growing = any(self._add(grid, reach, support, asked, off) for reach in (1, 2))
         return grid
 
-    def _add(self, grid: dict[Node, int], reach: int, asked: dict[Node, int], off: list[float]) -> bool:
+    def _add(
+        self, grid: dict[Node, int], reach: int, support: Counter[Node], asked: dict[Node, int], off: list[float]
+    ) -> bool:
         """Add the points ``reach`` steps from the grid, all expected from what it is before; whether there were any.
 
         Parameters
         ----------
+        support : how many points of the grid show where that of each place should be
         asked : support of each place that was looked at before: with the same the answer is the same
         off : how far each point that was added lay from where it was expected [steps]
         """
-        support = {node: _support(grid, node) for node in _beside(grid, reach)}
-        places = [node for node, count in support.items() if asked.get(node) != count]
+        places = [node for node in _beside(grid, reach) if asked.get(node) != support[node]]
         if not places:
             return False
         asked.update((node, support[node]) for node in places)
@@ -156,6 +165,7 @@ class Grower:
             found = self._next(grid, places[row], surfaces.centres[row], surfaces.steps[row])
             if found is not None:
                 grid[places[row]] = found[0]
+                support.update(_supported(places[row]))
                 off.append(found[1])
         return len(grid) > before
 
@@ -191,7 +201,7 @@ def _beside(grid: dict[Node, int], reach: int) -> list[Node]:
     return list({node: None for known in grid for node in _around(known, reach) if node not in grid})
 
 
-def _support(grid: dict[Node, int], node: Node) -> int:
-    """How many points of the grid show where that of a ``node`` should be."""
+def _supported(node: Node) -> list[Node]:
+    """Places that the point at a ``node`` shows the way to."""
     a, b = node
-    return sum((a + i, b + j) in grid for i, j in _STEPS)
+    return [(a + i, b + j) for i, j in _STEPS]

@@ -20,13 +20,12 @@ _QUARTER = np.array([[0, -1], [1, 0]])
 
 @dataclass(frozen=True)
 class GridRefusal:
-    """Why a grid is not the board, in words, and how many points it has: of several the largest says most.
+    """Why a grid is not the board, in words.
 
-    Where it goes on beyond the board, ``covered`` is how many of the board's points it has.
+    Where it has more points than the board, ``covered`` is how many of the board's it has.
     """
 
     reason: str
-    points: int = 0
     covered: int = 0
 
 
@@ -72,16 +71,19 @@ class BoardNodes:
         """
         count = len(self._outline)
         if len(grid) < _LEAST_SHARE * count:
-            return GridRefusal(f'only {len(grid)} points in a regular grid, the board has {len(self.nodes)}', len(grid))
+            return GridRefusal(f'only {len(grid)} points in a regular grid, the board has {len(self.nodes)}')
         overlaps = self._overlaps(grid)
         most, second = _largest_two(overlaps)
         beyond = len(grid) - int(most)
         if most < _LEAST_SHARE * count:
-            return GridRefusal(f'a grid of {len(grid)} points that is not like the board', len(grid))
-        if beyond > _BEYOND * count + 1.0 or (beyond > 0 and most - second < _CLEAR * self._margin):
-            return GridRefusal(goes_on(beyond), len(grid), int(most))
-        if most - second < _CLEAR * self._margin:
-            return GridRefusal(f'{most:.0f} of {count} points found, which may lie in more than one place', len(grid))
+            return GridRefusal(f'a grid of {len(grid)} points that is not like the board')
+        unclear = most - second < _CLEAR * self._margin
+        # A few points more are another board's where all of this one is seen, and clutter where its border is not.
+        if beyond > _BEYOND * count + 1.0 or (unclear and beyond > 0 and most >= (1.0 - _BEYOND) * count):
+            return GridRefusal(goes_on(beyond), int(most))
+        if unclear:
+            reason = f'{most:.0f} of {count} points found, which may lie in more than one place of the board'
+            return GridRefusal(reason, int(most) if beyond else 0)
         best = int(np.argmax([overlap.max() for overlap in overlaps]))
         view, overlap = self._views[best], overlaps[best]
         pattern = view.nodes(self._outline)

@@ -2,9 +2,9 @@
 
 What the board looks like around a point (:mod:`appearance`) is fitted to the counts in a window, on ground that may
 slope. The grid shows how the board is seen there, so perspective and lens bend the pattern as they bend the image.
-Three rounds: each point alone; with the blur and the width that the board has in common; and with the contrast that the
-neighbours lead one to expect. So neither a lamp's spot of heat nor contrast that fades over the board, or reverses in
-a reflection, moves a point, and what covers a point is noticed.
+Three rounds: some of the points, each alone; all, with the blur and the width that the board has in common; and with
+the contrast that the neighbours lead one to expect. So neither a lamp's spot of heat nor contrast that fades over the
+board, or reverses in a reflection, moves a point, and what covers a point is noticed.
 
 Points are fitted many at a time: their windows hold few pixels, and Python takes longer to call numpy than numpy to
 fit one of them.
@@ -23,12 +23,15 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 
 # Blur to start from, in steps of the grid and at least in pixels.
 _BLUR, _LEAST_BLUR = 0.06, 0.8
-# Steps of a fit, tried ones too; it has converged when a step is shorter than this; and damping that leaves no step.
-_MOST_STEPS, _CONVERGED_PX, _DAMPING, _HOPELESS = 40, 1e-3, 1e-3, 1e3
+# Steps of a fit, tried ones too; it has converged when a step is shorter than this, in the last round and before; and
+# damping that leaves no step.
+_MOST_STEPS, _CONVERGED_PX, _NEARLY_PX, _DAMPING, _HOPELESS = 40, 1e-3, 1e-2, 1e-3, 1e3
 # A point is lost when its standard deviation is larger than this [px], when the fit goes further from the start, in
 # steps of the grid, or when its contrast is not, within these shares, what the neighbours lead one to expect.
 _MOST_SIGMA_PX, _MOST_MOVE, _CONTRAST = 0.5, 0.25, (0.6, 1.6)
 _LEAST_POINTS = 6
+# Points, spread over the board, from which its blur and width are found; each has them to a few per cent.
+_SAMPLE = 48
 # What the linear part of a fit determines: ground (level and slope) and contrast.
 _LINEAR = 4
 # Points looked at, and pixels fitted, at a time: enough for long rows, few enough for a processor's cache.
@@ -47,30 +50,30 @@ def refine(
     board : (M, 2) places of all points of the board
     """
     appearance = appearance.at(nodes, board)
-    shared: _Shared | None = None
-    contrast: FloatArray | None = None
-    for last in (False, False, True):
-        fits = _round(image, nodes, pixels, appearance, shared, contrast)
-        found = np.isfinite(fits.contrast)
-        if np.sum(found) < _LEAST_POINTS:
-            return np.full_like(pixels, np.nan)
-        if last:
-            return fits.pixels
-        pixels = _next_starts(nodes, pixels, fits.pixels)
-        if shared is None:
-            log_blur = _plane(nodes[found], fits.log_blur[found], nodes)
-            shared = _Shared(log_blur, np.full(len(nodes), np.median(fits.width[found])))
-        else:
-            contrast = fits.contrast
-    raise AssertionError('the last round returns')
+    every = np.arange(len(nodes))
+    some = np.sort(np.random.default_rng(0).permutation(every)[:_SAMPLE])
+    alone = _round(image, nodes, pixels, appearance, some, None, None)
+    found = np.isfinite(alone.contrast)
+    if np.sum(found) < _LEAST_POINTS:
+        return np.full_like(pixels, np.nan)
+    log_blur = _plane(nodes[found], alone.log_blur[found], nodes)
+    shared = _Shared(log_blur, np.full(len(nodes), np.median(alone.width[found])))
+    pixels = _next_starts(nodes, pixels, alone.pixels, some)
+    alike = _round(image, nodes, pixels, appearance, every, shared, None)
+    if np.sum(np.isfinite(alike.contrast)) < _LEAST_POINTS:
+        return np.full_like(pixels, np.nan)
+    pixels = _next_starts(nodes, pixels, alike.pixels, every)
+    refined = _round(image, nodes, pixels, appearance, every, shared, alike.contrast)
+    enough = np.sum(np.isfinite(refined.contrast)) >= _LEAST_POINTS
+    return refined.pixels if enough else np.full_like(pixels, np.nan)
 
 
-def _next_starts(nodes: FloatArray, starts: FloatArray, refined: FloatArray) -> FloatArray:
-    """Where the next round starts (N, 2): lost points where those around them say, else where they did before."""
-    found = np.isfinite(refined[:, 0])
-    lost = np.flatnonzero(~found)
-    surfaces = local_surfaces(nodes[found], refined[found], nodes[lost])
-    starts = np.where(found[:, None], refined, starts)
+def _next_starts(nodes: FloatArray, starts: FloatArray, refined: FloatArray, fitted: IntArray) -> FloatArray:
+    """Where the next round starts (N, 2): those of the ``fitted`` that were lost where the others say."""
+    starts = np.where(np.isfinite(refined), refined, starts)
+    lost = fitted[np.isnan(refined[fitted, 0])]
+    others = np.setdiff1d(np.arange(len(nodes)), lost)
+    surfaces = local_surfaces(nodes[others], starts[others], nodes[lost])
     starts[lost[surfaces.determined]] = surfaces.centres[surfaces.determined]
     return starts
 
@@ -96,26 +99,27 @@ def _round(
     nodes: FloatArray,
     pixels: FloatArray,
     appearance: Appearance,
+    index: IntArray,
     shared: _Shared | None,
     contrast: FloatArray | None,
 ) -> _Fits:
-    """Fit all points once; with ``contrast``, points without one are lost ones and say nothing of the grid."""
+    """Fit points ``index`` once; with ``contrast``, points without one are lost ones and say nothing of the grid."""
     known = np.ones(len(nodes), dtype=np.bool_) if contrast is None else np.isfinite(contrast)
     ridge = ROUGHLY if shared is None else CLOSELY
     fits = _Fits(np.full_like(pixels, np.nan), *np.full((3, len(nodes)), np.nan))
-    for first in range(0, len(nodes), _POINTS_AT_A_TIME):
-        part = np.arange(first, min(first + _POINTS_AT_A_TIME, len(nodes)))
+    for first in range(0, len(index), _POINTS_AT_A_TIME):
+        part = index[first : first + _POINTS_AT_A_TIME]
         surfaces = local_surfaces(nodes[known], pixels[known], nodes[part], ridge)
         blur = None if shared is None else np.exp(shared.log_blur[part])
         windows = windows_around(image, pixels[part], surfaces, appearance.rows(part), blur)
         if contrast is not None:
             windows = with_expected_contrast(windows, nodes[part], nodes[known], contrast[known])
         for some in _few_pixels(windows):
-            index = part[some.index]
-            common = None if shared is None else _Shared(*(values[index] for values in shared))
+            points = part[some.index]
+            common = None if shared is None else _Shared(*(values[points] for values in shared))
             fitted = _fit(some, common, with_contrast=contrast is not None)
             for values, new in zip(fits, fitted, strict=True):
-                values[index] = new
+                values[points] = new
     return fits
 
 
@@ -149,14 +153,20 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
     state = _State.at(windows, parameters, free)
     damping = np.full(len(parameters), _DAMPING)
     moving = np.arange(len(parameters))
+    enough = _CONVERGED_PX if with_contrast else _NEARLY_PX
     for _ in range(_MOST_STEPS):
-        step = state.rows(moving).step(damping[moving])
-        tried = _State.at(windows.rows(moving), state.parameters[moving] + np.pad(step, ((0, 0), (0, 4 - free))), free)
+        step = np.pad(state.rows(moving).step(damping[moving]), ((0, 0), (0, 4 - free)))
+        short = np.abs(step[:, :2]).max(axis=1) < enough
+        # The last step changes nothing that would have to be looked at.
+        state.parameters[moving[short]] += step[short]
+        moving, step = moving[~short], step[~short]
+        if len(moving) == 0:
+            break
+        tried = _State.at(windows.rows(moving), state.parameters[moving] + step, free)
         better = tried.cost <= state.cost[moving]
         state.put(moving[better], tried.rows(np.flatnonzero(better)))
         damping[moving] *= np.where(better, 0.1, 10.0)
-        converged = better & (np.abs(step[:, :2]).max(axis=1) < _CONVERGED_PX)
-        moving = moving[~converged & (damping[moving] < _HOPELESS)]
+        moving = moving[damping[moving] < _HOPELESS]
         if len(moving) == 0:
             break
     lost = ~_well_determined(windows, state)
