@@ -121,7 +121,9 @@ def test_a_run_that_does_not_fit_leaves_parameters_and_map_and_can_be_flown_agai
     options = Options(tmp_path / 'bag', out, params, map_file)
     arguments = ['replay', tmp_path / 'bag', '--out', out, '--params', params, '--map', map_file, '--no-report']
     command = [str(word) for word in arguments]
-    assert main(command) == 0
+    (out / 'output').mkdir(parents=True)
+    for earlier in ('parameters.yaml', 'summary.json', 'fused.tum'):
+        (out / earlier).touch()
     # The disk fills up behind the first second; fused.tum alone has more than this.
     with full_after(resource.RLIM_INFINITY), pytest.raises(InputError, match=f'{out}.*: File too large'):
         replay(options, lambda _: resource.setrlimit(resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY)), print)
@@ -139,7 +141,7 @@ def test_commands_in_a_folder_that_is_read_only_say_so_in_a_line(tmp_path, capsy
     commands = [
         ['simulate', tmp_path / 'bag', '--scenario', 'april', '--seconds', '1'],
         ['map', 'move', path, '1', '--position', '1', '2', '3'],
-        ['markers', 'draw', '1', '--out', tmp_path / 'markers'],
+        ['markers', 'make', '--ids', '1', '--out', tmp_path / 'markers'],
     ]
     for command in commands:
         with refused(monkeypatch, tmp_path, number):
@@ -194,10 +196,13 @@ def test_a_map_whose_folder_takes_nothing_is_saved_where_something_can_be(tmp_pa
 def test_a_disk_that_is_full_at_the_end_of_a_mapper_costs_no_map(tmp_path, homes, monkeypatch):
     keeper, grown = learned(tmp_path / 'maps')
     with ros_graph() as graph:
-        node = graph.add(MarkerMapperNode, map_file=str(keeper.path), mode='mapping')
+        node = graph.add(MarkerMapperNode, live=True, map_file=str(keeper.path), mode='mapping')
         node.mapper.map.markers |= grown.markers
         # What was loaded is gone: all there is must be saved.
         keeper.path.unlink()
         with refused(monkeypatch, tmp_path / 'maps', errno.ENOSPC):
             node.close()
-    assert load_map(homes[0] / 'thermal_fiducial' / 'hall.new.yaml').markers.keys() == {0, 1}
+        assert load_map(homes[0] / 'thermal_fiducial' / 'hall.new.yaml').markers.keys() == {0, 1}
+        shutil.rmtree(homes[0])
+        with refused(monkeypatch, tmp_path), pytest.raises(InputError, match=r'not saved: .*hall.yaml: '):
+            node.close()

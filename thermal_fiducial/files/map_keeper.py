@@ -26,11 +26,15 @@ class MapKeeper:
     path : the file; None: nothing is kept
     marker_size : side of markers whose entry has none [m]
     size_overrides : marker ID to side [m], before ``marker_size``
+    flown : the map cannot be made again: it is saved in another folder rather than lost
     """
 
-    def __init__(self, path: Path | None, marker_size: float, size_overrides: Mapping[int, float]) -> None:
+    def __init__(
+        self, path: Path | None, marker_size: float, size_overrides: Mapping[int, float], *, flown: bool = True
+    ) -> None:
         self._path = path
         self._sizes = marker_size, size_overrides
+        self._flown = flown
         # Of what the map follows. Nothing that is there follows from what could not be read.
         self._read = 'nothing'
         self._own_autosave = False
@@ -91,8 +95,8 @@ class MapKeeper:
     def save(self, marker_map: MarkerMap) -> Path:
         """Write the map: to its file, or beside it where that holds something that the map does not follow.
 
-        Where its folder takes nothing (a full disk, one that is read-only) it goes to where the filter keeps its last
-        pose, or else to a new temporary folder.
+        Where its folder takes nothing (a full disk, one that is read-only) a map that was flown goes to where the
+        filter keeps its last pose, or else to a new temporary folder.
 
         Returns
         -------
@@ -118,8 +122,8 @@ class MapKeeper:
 
     def _save_elsewhere(self, marker_map: MarkerMap) -> Path:
         name = f'{self.path.stem}.new{self.path.suffix}'
-        folders: tuple[Callable[[], Path], ...] = (lambda: self.path.parent, _own_folder, _new_folder)
-        for folder in folders:
+        others: tuple[Callable[[], Path], ...] = (_own_folder, _new_folder) if self._flown else ()
+        for folder in (lambda: self.path.parent, *others):
             with suppress(OSError, InputError):
                 path = folder() / name
                 map_history.save_with_history(path, marker_map, 'save')

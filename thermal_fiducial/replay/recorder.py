@@ -90,7 +90,7 @@ class RunFiles:
     def _remove_unless_whole(self, kind: type[BaseException] | None, *_: object) -> None:
         """Half a run looks like a whole one."""
         if kind is not None:
-            for name in _TABLES:
+            for name in (*_TABLES, 'latency.csv'):
                 (self.folder / name).unlink(missing_ok=True)
 
     def add(self, topic: str, time_ns: int, data: bytes) -> None:

@@ -35,7 +35,8 @@ class MapServices:
         self._node = node
         self._publish_jump = publish_jump
         file = Path(config.map_file) if config.map_file else None
-        self._keeper = MapKeeper(file, config.marker_size, size_overrides(config.marker_size_overrides))
+        sizes = size_overrides(config.marker_size_overrides)
+        self._keeper = MapKeeper(file, config.marker_size, sizes, flown=node.live)
         #: in words: the map is of another dictionary than the one that is looked for
         self.other_dictionary = ''
         self.mapper = MarkerMapper(config, self._first_map())
