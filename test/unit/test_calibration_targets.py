@@ -115,9 +115,16 @@ def test_command_calibrates_a_folder(tmp_path, capsys):
     assert '08.png: not used: no regular grid' in printed
     page = out.with_suffix('.html').read_text()
     # Every view with its points and residuals under its name, and the one that gave nothing with the reason.
-    assert page.count('<figure>') == 8
-    assert page.count('<circle') == page.count('<path') >= 8 * 24
-    assert all(f'{index:02}.png:' in page for index in range(8))
+    drawn, seen = page[: page.index('class="views"')], page[page.index('class="views"') :]
+    assert seen.count('<figure>') == 8
+    assert seen.count('<circle') == seen.count('<path') >= 8 * 24
+    # Drawings stand side by side, none in another, in the colour of the page's text: dark pages are read too.
+    assert drawn.count('<svg') == drawn.count('<figure') == 5
+    assert 'currentColor' in drawn
+    assert not re.search(r'fill: (black|#000000)', drawn)
+    bars = drawn[drawn.index('rms of each view') :]
+    assert all(f'>{index:02}.png</text>' in bars for index in range(8))
+    assert all(f'{index:02}.png:' in seen for index in range(8))
     assert re.search(r'<td>08.png</td><td>no regular grid', page)
     covariance = yaml.safe_load((tmp_path / 'camera_covariance.yaml').read_text())
     assert 0.3 < covariance['covered_share'] < 1.0
