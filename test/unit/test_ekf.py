@@ -1,6 +1,7 @@
 """The filter as its users meet it: what comes out, when, and in what words."""
 
 from dataclasses import replace
+import re
 
 import numpy as np
 import pytest
@@ -89,6 +90,25 @@ def test_an_imu_that_measures_no_gravity_is_named(motion, factor):
     assert {update.reason for update in updates if not update.pending} == {'refused: contradicts gravity'}
     assert 'contradict gravity' in ekf.status
     assert 'units' in ekf.status
+
+
+def test_a_gyroscope_in_degrees_is_named_where_no_flight_can_begin():
+    flight = Flight(seed=1, seconds=4.0)
+    ekf, said = PoseEkf(white_poses()), set()
+    wrong = [replace(s, angular_velocity=np.degrees(s.angular_velocity)) for s in flight.samples()]
+    for item in timeline(wrong, flight.poses, 0.03):
+        if isinstance(item, ImuSample):
+            assert ekf.add_imu(item) is None
+        else:
+            ekf.add_pose(item)
+        said.add(ekf.status)
+    assert re.match(r'poses contradict the gyroscope: \d+ deg apart after 0\.\d\d s; its units', ekf.status)
+    # Three poses make a flight, the first is no contradiction yet; then nothing else is said than what contradicts.
+    assert {line.split(':')[0] for line in said} == {
+        'waiting for markers',
+        'initialising',
+        'poses contradict the gyroscope',
+    }
 
 
 def test_live_parameters_hold_from_then_on(flight):

@@ -241,13 +241,18 @@ class PoseEkf:
             return 'waiting for IMU'
         main, other = self._history.main, self._history.belief.alternative
         if main is None:
-            return f'initialising: {other.hits} of {self._config.initial_poses} poses' if other else self._why_waiting()
+            return self._why_no_estimate(other)
         if main.position_std > self._config.lost_position_std:
             return f'lost: position known to {main.position_std:.2f} m'
         if main.in_doubt:
             return f'in doubt: {main.refused_in_row} poses in a row contradict the estimate'
         coasting = self._coasting(main)
         return f'coasting for {coasting:.1f} s' if coasting > 0.5 else 'tracking'
+
+    def _why_no_estimate(self, begun: Hypothesis | None) -> str:
+        if contradiction := self._history.belief.contradiction:
+            return contradiction
+        return f'initialising: {begun.hits} of {self._config.initial_poses} poses' if begun else self._why_waiting()
 
     def _why_waiting(self) -> str:
         latest = next(reversed(self._log.latest.values()), None)

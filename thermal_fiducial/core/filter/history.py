@@ -162,8 +162,11 @@ class History:
             belief = belief._replace(main=main)
             refused = None if update.accepted else (at_pose, motion)
         if belief.alternative:
-            alternative, _ = self._hypotheses.weigh(*self._at(belief.alternative, pose), pose)
+            at_pose, motion = self._at(belief.alternative, pose)
+            alternative, verdict = self._hypotheses.weigh(at_pose, motion, pose)
             belief = belief._replace(alternative=alternative)
+            if belief.main is None and not verdict.accepted:
+                belief = belief._replace(contradiction=self._hypotheses.contradiction(at_pose, motion, pose))
         elif refused:
             belief = self._with_alternative(belief, *refused, pose)
         return self._settled(belief, [update])

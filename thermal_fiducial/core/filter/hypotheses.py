@@ -76,6 +76,19 @@ class Hypotheses:
             pose.stamp_ns, False, f'refused: {math.sqrt(innovation.nis):.1f} sigma', innovation.nis
         )
 
+    def contradiction(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> str:
+        """What of the IMU a pose contradicts that a hypothesis at its instant refuses, in words."""
+        estimate = self.estimate(hypothesis)
+        measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
+        innovation = self._updater.innovation(estimate, measured, motion)
+        turn, shift = innovation.value[:3], innovation.value[3:]
+        seconds = (hypothesis.prediction.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
+        if turn @ np.linalg.solve(np.linalg.inv(innovation.S_inverse)[:3, :3], turn) > self._config.gate:
+            apart = f'{math.degrees(np.linalg.norm(turn)):.0f} deg apart after {seconds:.2f} s'
+            return f'poses contradict the gyroscope: {apart}; its units, axes, sign? camera_orientation?'
+        apart = f'{np.linalg.norm(shift):.2f} m apart after {seconds:.2f} s'
+        return f'poses contradict the accelerometer, or each other: {apart}; its units, axes, sign? marker_size?'
+
     def explains(self, hypothesis: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> bool:
         """Whether a pose at a hypothesis's instant is right by it, but for a clock offset that is not known."""
         estimate = self.estimate(hypothesis)

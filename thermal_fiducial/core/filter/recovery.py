@@ -95,6 +95,8 @@ class Belief(NamedTuple):
     drifted: bool = False
     #: why that happened the last time
     reset_reason: str = ''
+    #: before there is an estimate: what of the IMU the poses contradict, in words
+    contradiction: str = ''
 
     @property
     def hypotheses(self) -> list[Hypothesis]:
@@ -147,4 +149,5 @@ class Belief(NamedTuple):
             alternative=None,
             resets=resets,
             reset_reason=reason,
+            contradiction='',
         )
