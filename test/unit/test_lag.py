@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core.detection.corner_errors import unknown_motion, wrong_lag
-from thermal_fiducial.core.detection.lag import (
+from thermal_fiducial.core.detection.frame import (
     lag_tail_maps,
     markers_deblurred,
     REMAINING,

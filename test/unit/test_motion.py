@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
-from thermal_fiducial.core.detection.lag import (
+from thermal_fiducial.core.detection.frame import (
     LAG_TAIL_AGE,
 )
+from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import interaction, plausible, transfer_from_body, transferred, Twist
 from thermal_fiducial.core.geometry import se3

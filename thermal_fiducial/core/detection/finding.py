@@ -10,7 +10,14 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.frame import Frame, Places, rolling_displacement
+from thermal_fiducial.core.detection.frame import (
+    Frame,
+    lag_tail_maps,
+    markers_deblurred,
+    Places,
+    REMAINING,
+    rolling_displacement,
+)
 from thermal_fiducial.core.detection.known_markers import (
     among,
     CUT_OFF_PX,
@@ -20,7 +27,6 @@ from thermal_fiducial.core.detection.known_markers import (
     KnownMarkers,
     pairs,
 )
-from thermal_fiducial.core.detection.lag import lag_tail_maps, markers_deblurred, REMAINING
 from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
 from thermal_fiducial.core.detection.refining import BLUR_THAT_MATTERS_PX, CLEAR_CNR
 from thermal_fiducial.core.detection.search import BlindSearch, SearchScales

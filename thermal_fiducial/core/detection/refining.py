@@ -17,16 +17,14 @@ from thermal_fiducial.core.detection.frame import (
     delays,
     Frame,
     lag_tail,
-    Places,
-    rolling_displacement,
-)
-from thermal_fiducial.core.detection.known_markers import FoundMarkers
-from thermal_fiducial.core.detection.lag import (
     lag_tail_maps,
     markers_deblurred,
+    Places,
     REMAINING,
+    rolling_displacement,
     SPREAD,
 )
+from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, unknown_twist
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray

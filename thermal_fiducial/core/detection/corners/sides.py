@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.lag import without_lag_tails
+from thermal_fiducial.core.detection.frame import without_lag_tails
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
