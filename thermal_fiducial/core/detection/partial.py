@@ -193,8 +193,8 @@ class PartialMarkerSearch:
         config: ArucoDetectorConfig,
     ) -> bool:
         """Whether the cells in view show the marker beyond doubt."""
-        lines = se3.apply(rough.T_camera_marker, on_marker(self._visible.line_places, marker.size))
-        likeness = self._visible.likeness(layer.image, layer.project(lines), marker.id, allowed)
+        places = se3.apply(rough.T_camera_marker, on_marker(self._visible.places, marker.size))
+        likeness = self._visible.likeness(layer.image, layer.project(places), marker.id, allowed)
         correlation, margin = abs(likeness.correlation), _MARGIN * (1.0 - likeness.perfect)
         return bool(
             likeness.cells >= _CELLS

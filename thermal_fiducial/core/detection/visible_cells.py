@@ -12,15 +12,11 @@ import numpy as np
 from thermal_fiducial.core.detection.patterns import CELL_SAMPLES, Decoder, sampled
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 
-# Samples on either side of a line between cells, so far from it [cells].
-_BESIDE = np.array([0.2, 0.35])
 # Samples nearer to the border of the image are not seen [px].
 _BORDER_PX = 1.0
 # Least number of steps that are compared, least sum of their squares in the pattern, and what keeps steps in a single
 # direction from a slope across it.
 _FEWEST, _LEAST_PATTERN, _RIDGE = 12, 2.0, 1e-6
-# Places one cell off.
-_NEXT = [(right, down) for right in (-1, 0, 1) for down in (-1, 0, 1) if (right, down) != (0, 0)]
 
 
 class CellMatch(NamedTuple):
@@ -28,7 +24,7 @@ class CellMatch(NamedTuple):
 
     #: with its pattern, negative where black and white are swapped
     correlation: float
-    #: of the most similar other marker or turn, or of its own pattern one cell off; and how a perfect view would be
+    #: of the most similar other marker or turn, and what it would be in a perfect view
     runner_up: float
     perfect: float
     #: white minus black [counts]
@@ -64,42 +60,33 @@ class VisibleCells:
         self._slope = np.stack([beside, 1.0 - beside], axis=1)
         self._patterns = ringed.reshape(len(grids), -1)
         self._steps = self._between(self._patterns)
-        # Upright, one cell off.
-        moved = np.stack([_moved(ringed[::4], *step).reshape(decoder.count, -1) for step in _NEXT])
-        self._steps_beside = self._between(moved)
         share = ((np.arange(cells)[:, None] - 1.0 + CELL_SAMPLES) / decoder.cells).ravel()
         b, a = np.meshgrid(share, share, indexing='ij')
         order = np.arange(len(share) ** 2).reshape(cells, 3, cells, 3).swapaxes(1, 2).ravel()
         #: (9 C, 2) shares of the sides at which the C cells are sampled, nine times each
         self.places = np.stack([a, b], axis=-1).reshape(-1, 2)[order]
-        #: (12 P, 2) the same of the P lines between neighbours, six times on either side
-        self.line_places = _line_places(cells) / decoder.cells
 
     def match(self, image: Float32Array, px: FloatArray, marker_id: int) -> FloatArray:
         """Correlation (O,) of cells whose samples are at pixels (O, 9 C, 2) with the upright pattern of a marker."""
-        values, visible = _means(image, px, 9)
+        values, visible = _means(image, px)
         seen = visible[:, self._first] & visible[:, self._second]
         return self._correlations(self._between(values), self._steps[4 * marker_id], seen)[0]
 
     def likeness(self, image: Float32Array, px: FloatArray, marker_id: int, allowed: BoolArray) -> CellMatch:
-        """Of what has its lines at pixels (12 P, 2) with a marker, among those ``allowed`` (M,)."""
-        values, inside = _means(image, px[None], 6)
-        values, seen = values.reshape(-1, 2), np.asarray(inside.reshape(-1, 2).all(axis=1))
-        steps = values[:, 1] - values[:, 0]
-        visible = np.zeros(self._patterns.shape[1], dtype=bool)
-        visible[self._first[seen]] = visible[self._second[seen]] = True
+        """Of cells whose samples are at pixels (9 C, 2) with a marker, among those ``allowed`` (M,)."""
+        values, inside = _means(image, px[None])
+        visible, steps = inside[0], self._between(values[0])
+        seen = visible[self._first] & visible[self._second]
         others = np.repeat(allowed, 4)
         others[4 * marker_id] = False
-        own, beside = self._steps[4 * marker_id], self._steps_beside[:, marker_id]
-        alternatives = np.concatenate([self._steps[others], np.nan_to_num(beside)])
-        all_seen = np.broadcast_to(seen, (int(others.sum()), len(seen)))
-        compared = np.concatenate([all_seen, seen & np.isfinite(beside)])
+        own, alternatives = self._steps[4 * marker_id], self._steps[others]
         correlation, contrast = self._correlations(steps, own, seen[None])
+        compared = np.broadcast_to(seen, (len(alternatives), len(seen)))
         differ = (self._patterns[others] != self._patterns[4 * marker_id])[:, visible].sum(axis=1)
         return CellMatch(
             float(correlation[0]),
-            float(np.abs(self._correlations(steps, alternatives, compared)[0]).max()),
-            float(np.abs(self._correlations(own, alternatives, compared)[0]).max()),
+            float(np.abs(self._correlations(steps, alternatives, compared)[0]).max(initial=0.0)),
+            float(np.abs(self._correlations(own, alternatives, compared)[0]).max(initial=0.0)),
             float(contrast[0]),
             int(visible.sum()),
             int(differ.min(initial=len(visible))),
@@ -128,34 +115,13 @@ class VisibleCells:
         return np.where(enough, sp / np.sqrt(np.maximum(ss, 1e-12) * pp), 0.0), sp / pp
 
 
-def _means(image: Float32Array, px: FloatArray, number: int) -> tuple[FloatArray, BoolArray]:
-    """Mean counts (O, K) of so many samples in a row at pixels (O, number K, 2), and which are in view."""
+def _means(image: Float32Array, px: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Mean counts (O, C) of nine samples in a row each at pixels (O, 9 C, 2), and which are in view."""
     height, width = image.shape
     with np.errstate(invalid='ignore'):
         inside: BoolArray = np.asarray((px >= _BORDER_PX) & (px <= (width - 1 - _BORDER_PX, height - 1 - _BORDER_PX)))
         inside = np.asarray(inside.all(axis=-1))
     places = np.where(inside[..., None], px, 0.0).astype(np.float32)
     counts = sampled(image, np.ascontiguousarray(np.moveaxis(places, -1, 0)))
-    shape = (len(px), -1, number)
+    shape = len(px), -1, 9
     return counts.reshape(shape).mean(axis=-1, dtype=np.float64), np.asarray(inside.reshape(shape).all(axis=-1))
-
-
-def _line_places(cells: int) -> FloatArray:
-    """Places (12 P, 2), in cells from the marker's first, beside the lines between ``cells`` squared and their next."""
-    before, line = np.meshgrid(np.arange(cells - 1), np.arange(cells))
-    across = before[..., None, None, None] + np.stack([-_BESIDE, _BESIDE])[:, :, None]
-    along = line[..., None, None, None] + CELL_SAMPLES - 1.0
-    across, along = np.broadcast_arrays(across, along)
-    beside = np.stack([across, along], axis=-1)
-    above = np.swapaxes(beside[..., ::-1], 0, 1)
-    return np.concatenate([beside.reshape(-1, 2), above.reshape(-1, 2)])
-
-
-def _moved(grids: FloatArray, right: int, down: int) -> FloatArray:
-    """Grids (M, m, m) moved by so many cells, NaN where nothing is known."""
-    cells = grids.shape[1]
-    moved = np.full_like(grids, np.nan)
-    moved[:, max(down, 0) : cells + min(down, 0), max(right, 0) : cells + min(right, 0)] = grids[
-        :, max(-down, 0) : cells + min(-down, 0), max(-right, 0) : cells + min(-right, 0)
-    ]
-    return moved
