@@ -85,6 +85,18 @@ def test_what_cannot_be_compared(runs, capsys, arguments, words):
     assert error.count('\n') == 1
 
 
+def test_a_run_without_truth_says_so(runs, tmp_path, capsys):
+    blind = make_run(tmp_path / 'blind', 2.0, 0, (1.0, 1.4), with_output=False)
+    (blind / 'truth.tum').unlink()
+    page = tmp_path / 'comparison.html'
+    assert main(['evaluate', str(runs[0]), str(blind), '--compare', '--out', str(page)]) == 0
+    line = 'No errors of blind: no ground truth at their stamps (--truth names one).'
+    assert line in capsys.readouterr().out.replace('\n', ' ')
+    assert line in page.read_text()
+    # A comparison has no overview to lead to.
+    assert 'Overview' not in page.read_text()
+
+
 def test_runs_called_alike_have_their_folder_s_name_too(tmp_path):
     folders = [make_run(tmp_path / name / 'run', 2.0, 0, (1.0, 1.4), with_output=False) for name in ('day', 'night')]
     assert compare(folders).names == ('day/run', 'night/run')

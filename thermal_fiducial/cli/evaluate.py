@@ -78,6 +78,8 @@ def _compare(args: argparse.Namespace) -> int:
         print(json.dumps(comparison.numbers, indent=2))
     else:
         print_tables(comparison.tables)
+        if comparison.note:
+            print(comparison.note)
     if not args.no_report:
         comparison.write(args.out)
         print(f'comparison: {args.out}')

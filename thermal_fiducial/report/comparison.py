@@ -62,6 +62,14 @@ class Comparison:
         made.append(Table('Of the filter', heads, [row for row in own if any(cell != '–' for cell in row[2:])]))
         return [table for table in made if table.rows]
 
+    @property
+    def note(self) -> str:
+        """Which runs have no errors, and why; empty where all have them."""
+        without = [name for name in self.names if not self.numbers[name]['evo']]
+        if not without:
+            return ''
+        return f'No errors of {", ".join(without)}: no ground truth at their stamps (--truth names one).'
+
     def _rows(self, part: str, unit: str) -> list[tuple[str, ...]]:
         every = [self.numbers[name]['evo'].get(part, {}) for name in self.names]
         if not any(every):
@@ -73,7 +81,7 @@ class Comparison:
         from thermal_fiducial.report.html import Page, render, Section
 
         wide = Section('measures', 'Measures', tables=tuple(self.tables))
-        charts = Section('errors', 'Errors over time', charts=tuple(_charts(self)))
+        charts = Section('errors', 'Errors over time', charts=tuple(_charts(self)), note=self.note)
         lead = f'Fused poses of {len(self.names)} runs, with the conventions of evo.'
         write_text(path, render(Page(' · '.join(self.names), lead, (charts, wide), footer=_FOOTER)))
 
