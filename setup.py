@@ -54,6 +54,7 @@ setup(
         'test': [
             'pytest',
             'svgpathtools',
+            'foxglove-sdk',  # knows what the panels of a layout can be given
             'pypdfium2',
             'hypothesis',
             'pytest-benchmark',
