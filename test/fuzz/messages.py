@@ -26,6 +26,7 @@ from thermal_fiducial.nodes.aruco_detector import ArucoDetector
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
+from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.ros import convert
 
 #: After so many mutated messages a good flight must give good poses ...
@@ -167,8 +168,9 @@ def run(numbers: range, begin: Callable[[str, int], None]) -> list[Finding]:
     """Findings of inputs ``numbers``; ``begin`` is called before each."""
     findings: list[Finding] = []
     context = Context()
-    context.init(args=['--ros-args', '--log-level', 'FATAL'])
-    with tempfile.TemporaryDirectory() as folder:
+    # Another process that does the same would receive what is published here.
+    with own_domain() as domain, tempfile.TemporaryDirectory() as folder:
+        context.init(args=['--ros-args', '--log-level', 'FATAL'], domain_id=domain)
         nodes = Nodes(context, Path(folder))
         nodes.good_flight()
         for number in numbers:
@@ -182,5 +184,5 @@ def run(numbers: range, begin: Callable[[str, int], None]) -> list[Finding]:
             if (number + 1) % AT_ONCE == 0 and (reason := nodes.good_flight()):
                 findings.append(Finding('messages', number, 'poisoned', reason))
         findings += [Finding('messages', numbers[-1], 'lost', loss) for loss in nodes.close()]
-    context.try_shutdown()
+        context.try_shutdown()
     return findings

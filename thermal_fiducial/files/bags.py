@@ -24,6 +24,7 @@ from rosbags.typesys.store import Typestore
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_checks import check_announced, check_file, check_metadata, SINGLE_FILES
 from thermal_fiducial.files.decompression import bound_decompression
+from thermal_fiducial.files.reading import one_line
 from thermal_fiducial.files.writing import into
 
 IMAGE_TOPIC = 'thermal/image_raw'
@@ -73,12 +74,9 @@ class BagMessage:
         try:
             return self._typestore.deserialize_cdr(self.cdr, self.msgtype)
         except Exception as error:  # the library lets through whatever reading garbage raises
-            raise InputError(f'{self.topic} at {self.stamp_ns}: no {self.msgtype}: {one_line(error)}') from None
-
-
-def one_line(error: BaseException) -> str:
-    """The first line of what an exception says, or its name."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0]
+            raise InputError(
+                f'{self.topic} at {self.stamp_ns}: no {self.msgtype}: {one_line(error) or type(error).__name__}'
+            ) from None
 
 
 def resolve_topics(recorded: Iterable[str], remap: Mapping[str, str] | None = None) -> dict[str, str]:
@@ -276,7 +274,9 @@ class BagReader:
         except InputError:
             raise
         except Exception as error:
-            raise InputError(f'{self.path}: the bag cannot be read: {one_line(error)}') from None
+            raise InputError(
+                f'{self.path}: the bag cannot be read: {one_line(error) or type(error).__name__}'
+            ) from None
 
 
 class BagWriter:
