@@ -60,7 +60,7 @@ nightly: $(READY)
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal -m nightly --durations 15 $(PYTEST_ARGS)
 
 coverage: $(READY)
-	@echo '== Tests with the branch coverage of the core'
+	@echo '== Tests, and the branch coverage of the core by its own (test/conftest.py)'
 	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal --cov thermal_fiducial.core --cov-branch \
 		--cov-report term-missing:skip-covered --cov-fail-under 95 $(PYTEST_ARGS)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 import json
+import os
 
 import numpy as np
 from PIL import Image
@@ -30,6 +31,8 @@ def quick():
 )
 def test_a_short_demo(tmp_path, capfd, monkeypatch, scenario, seconds):
     monkeypatch.setattr(demo, 'SCENARIO', scenario)
+    # Processes that render start for longer than so few frames take.
+    monkeypatch.setattr(os, 'sched_getaffinity', lambda pid: {0})
     out, picture = tmp_path / 'demo', tmp_path / 'picture.png'
     out.mkdir()
     for name in (MARK, 'old'):

@@ -58,7 +58,7 @@ def test_covariance_is_what_the_errors_are(name):
 
 @pytest.mark.parametrize(('name', 'model'), [('7.5mm', 'equidistant'), ('13mm', 'plumb_bob')])
 def test_held_out_error_chooses_the_lens_model(name, model):
-    best, fits = choose_model(sightings(LENSES[name], 16, 0.02, 3), 640, 512)
+    best, fits = choose_model(sightings(LENSES[name], 12, 0.02, 3), 640, 512)
     assert best.camera.model == model
     # Noise of 0.02 px a coordinate is 0.028 px in the plane.
     assert fits[model].held_out_px[0] == pytest.approx(0.028, abs=0.003)
@@ -131,7 +131,7 @@ def middle_third(lens, count, sigma, seed):
     return views
 
 
-@pytest.mark.parametrize('name', ['7.5mm', '9mm', '13mm'])
+@pytest.mark.parametrize('name', ['7.5mm', pytest.param('9mm', marks=pytest.mark.nightly), '13mm'])
 def test_views_in_the_middle_do_not_determine_the_corners(name):
     lens = LENSES[name]
     views = middle_third(lens, 6, 0.05, 1)

@@ -19,7 +19,7 @@ _ODOMETRY, _IMU, _POSE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu', 'geomet
 #: What the filter publishes for others than a flight controller.
 _NOT_FOR_IT = ('odometry', 'odometry_smooth')
 #: How long a filter is looked for [s].
-_DISCOVERY = 5.0
+DISCOVERY_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def _find(node: Node, executor: Any, topic: str) -> Topics:
                 found.append(topics)
         return bool(found)
 
-    _spin(executor, _DISCOVERY, look)
+    _spin(executor, DISCOVERY_S, look)
     topics = found[0] if found else Topics('bridge/odometry', 'imu/data', _LANDING)
     return Topics(topic or topics.odometry, topics.imu, _landing_topic(node) or topics.landing)
 
