@@ -122,16 +122,12 @@ class _Views:
     size: tuple[int, int] = (0, 0)
 
     def find(self, frame: RawFrame, camera: Camera) -> Sighting | None:
-        """The board in a frame; None, with the reason noted, where there is none.
-
-        Raises
-        ------
-        InputError
-            A frame of another size than those before.
-        """
+        """The board in a frame; None, with the reason noted, where there is none."""
         height, width = frame.counts.shape
         if self.kept and self.size != (width, height):
-            raise InputError(f'{frame.name}: {width}x{height} pixels, others have {self.size[0]}x{self.size[1]}')
+            reason = f'{width}x{height} pixels, the views before it have {self.size[0]}x{self.size[1]}'
+            self.unusable.append((frame.name, reason))
+            return None
         self.size = (width, height)
         assert self.target is not None
         try:
@@ -241,7 +237,13 @@ def _look_at_pictures(args: argparse.Namespace, views: _Views) -> None:
     for index, path in enumerate(pictures(args.source)):
         if len(views.kept) == args.most_views:
             return
-        frame = RawFrame(path.name, index * 10_000_000_000, read_picture(path))
+        try:
+            counts = read_picture(path)
+        except InputError as reason:
+            views.unusable.append((path.name, str(reason).removeprefix(f'{path}: ')))
+            print(f'{path.name}: not used: {views.unusable[-1][1]}')
+            continue
+        frame = RawFrame(path.name, index * 10_000_000_000, counts)
         sighting = views.find(frame, _guess(frame, args.focal_px))
         if sighting is None:
             print(f'{frame.name}: not used: {views.unusable[-1][1]}')
