@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.scenes import camera_of, detector_of, motion_prior
 
-from thermal_fiducial.core.detection.tracking import MotionTrack, Predictor
+from thermal_fiducial.core.detection.tracking import MotionTrack, predict_frame
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.sim.scenario import named
 from thermal_fiducial.sim.thermal_camera import render_frames
@@ -29,7 +29,7 @@ def states(offset_s=0.0):
 
 
 def predicted(prior):
-    return Predictor(np.eye(4), 0.010).predict(STAMP_NS, prior, MotionTrack.of_rig(np.eye(4), 0.010), 0.2)
+    return predict_frame(STAMP_NS, prior, MotionTrack(np.eye(4), 0.010), 0.2)
 
 
 @pytest.mark.parametrize('offset_s', [0.0, -0.060, 0.035])

@@ -28,6 +28,10 @@ _OUTSIDE = 0.35
 _BLUR = 0.25
 # Share of its own information that each coordinate is held back with.
 _DAMPING = 0.1
+# Keeps what shows nothing of some direction solvable, as a share.
+_RIDGE = 1e-9
+# What makes a slope per pixel of a Sobel filter's sum.
+_SOBEL = 0.125
 # Longest step of a corner [cells].
 _LONGEST = 0.6
 
@@ -76,8 +80,8 @@ def aligned(
     image, origin = _window(image, quads, decoder.cells)
     quads = quads - origin
     picture = cv2.GaussianBlur(image - np.float32(image.mean()), (0, 0), smoothing)
-    slope_u = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=0.125)
-    slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=0.125)
+    slope_u = cv2.Sobel(picture, cv2.CV_32F, 1, 0, scale=_SOBEL)
+    slope_v = cv2.Sobel(picture, cv2.CV_32F, 0, 1, scale=_SOBEL)
     planes: list[Float32Array] = [np.asarray(plane) for plane in (picture, slope_u, slope_v)]
     for _ in range(_STEPS):
         places = seen_between(quads, grid.weights)
@@ -87,7 +91,7 @@ def aligned(
         information = (J @ np.swapaxes(J, -1, -2)).astype(np.float64)
         diagonal = np.einsum('qii->qi', information)
         diagonal[:, :8] *= 1.0 + _DAMPING
-        diagonal += 1e-9 + 1e-9 * diagonal.max(axis=1, keepdims=True)
+        diagonal += _RIDGE * (1.0 + diagonal.max(axis=1, keepdims=True))
         step = -np.linalg.solve(information, J @ np.swapaxes(value, -1, -2))[:, :8, 0]
         longest = _LONGEST / decoder.cells * np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)[:, None] / np.sqrt(2.0)
         quads = quads + np.swapaxes(np.clip(step, -longest, longest).reshape(-1, 2, 4), -1, -2)

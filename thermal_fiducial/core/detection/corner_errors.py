@@ -46,7 +46,7 @@ def wrong_lag(lag_blur_px: FloatArray) -> FloatArray:
     marker shows, and covariances of single corners cannot say; it is a delay, and belongs to the filter's time
     offset. The differences change the marker's shape. So does a response of another form.
     """
-    common = 0.25 * lag_blur_px.sum(axis=1, keepdims=True)
+    common = lag_blur_px.mean(axis=1, keepdims=True)
     change = OF_LAG * (lag_blur_px - common)
     along = common[..., :, None] * common[..., None, :]
     form = 0.5 * OF_LAG_FORM**2 * (along + (common * common).sum(axis=-1)[..., None, None] * np.eye(2))

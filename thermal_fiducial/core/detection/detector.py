@@ -15,7 +15,7 @@ from thermal_fiducial.core.detection.known_markers import among, depths, Expecte
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
 from thermal_fiducial.core.detection.refining import RefinedMarkers
-from thermal_fiducial.core.detection.tracking import FramePrediction, MotionTrack, Predictor
+from thermal_fiducial.core.detection.tracking import FramePrediction, MotionTrack, predict_frame
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses, solve_marker_poses
@@ -72,8 +72,7 @@ class MarkerDetector:
 
     def _mount(self, config: ArucoDetectorConfig) -> None:
         T_body_camera = se3.transform_from_quaternion(config.camera_position, config.camera_orientation)
-        self._predictor = Predictor(T_body_camera, config.bolometer_lag)
-        self._history = FrameHistory(MotionTrack.of_rig(T_body_camera, config.bolometer_lag))
+        self._history = FrameHistory(MotionTrack(T_body_camera, config.bolometer_lag))
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
         """Markers that are known: ID to (T_map_marker, side [m])."""
@@ -96,7 +95,7 @@ class MarkerDetector:
         """
         config, known, history = self.config, self._known, self._history
         with one_thread():
-            prediction = self._predictor.predict(stamp_ns, prior, history.track, config.max_odometry_age)
+            prediction = predict_frame(stamp_ns, prior, history.track, config.max_odometry_age)
             keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
             frame = Frame.of(stamp_ns, counts, camera, prediction.twist, config, keep_columns=keep_columns)
             expected = None
@@ -174,7 +173,7 @@ def marker_rows(
     table[:, _CORNERS] = corners_px.reshape(-1, 8)
     terms = covariances.reshape(-1, 4, 4)[..., [0, 1, 3]]
     table[:, _COVARIANCES] = terms.reshape(-1, 12)
-    rows['sigma_px'] = np.sqrt(0.125 * (terms[..., 0] + terms[..., 2]).sum(axis=1))
+    rows['sigma_px'] = np.sqrt(terms[..., [0, 2]].mean(axis=(1, 2)))
     if contrast is not None:
         rows['contrast_counts'] = contrast
     positions = poses.T_camera_marker[..., :3, 3]

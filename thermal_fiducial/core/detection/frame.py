@@ -120,7 +120,7 @@ class Places:
 
         What the corners of a marker have in common is no error of its shape.
         """
-        by_twist = lag * (self.flow - 0.25 * self.flow.sum(axis=1, keepdims=True))
+        by_twist = lag * (self.flow - self.flow.mean(axis=1, keepdims=True))
         return np.asarray(by_twist @ twist.covariance_ago(lag) @ by_twist.swapaxes(-1, -2))
 
 

@@ -171,7 +171,7 @@ class KnownMarkers:
         rotated = self._corners_and_normals @ T_camera_map[:3, :3].T
         points, normal = rotated[:, :4] + T_camera_map[:3, 3], rotated[:, 4]
         corners = camera.project(points)
-        centre = 0.25 * points.sum(axis=1)
+        centre = points.mean(axis=1)
         facing = (normal * centre).sum(axis=1) < -_MAX_TILT_COSINE * np.sqrt((centre * centre).sum(axis=1))
         span = corners.take(_NEXT, axis=1) - corners
         large = ((span * span).sum(axis=-1) >= min_side_px**2).all(axis=1)

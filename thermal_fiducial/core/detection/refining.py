@@ -148,8 +148,8 @@ class Refiner:
     ) -> RefinedMarkers:
         """The corners without lag and as if all rows were seen at once, by the twist that they themselves correct."""
         at = places.at.moved(seen.corners_px - view.shift - places.at.px, frame.camera)
-        variance = seen.covariances[..., 0, 0] + seen.covariances[..., 1, 1]
-        deviation = np.sqrt(0.125 * variance.sum(axis=1)) / frame.camera.focal_px
+        variances = seen.covariances.diagonal(axis1=-2, axis2=-1)
+        deviation = np.sqrt(variances.mean(axis=(1, 2))) / frame.camera.focal_px
         # Corners that make no square are those of something else.
         doubted = seen.covariances + seen.doubt[:, None, None, None] * _EYE
         # The same displacement in two frames in a row hides from the first twist; once freed, they are not alike.
@@ -180,7 +180,7 @@ class Refiner:
 def _view(frame: Frame, places: Places, twist: Twist | None, hardly_px: float) -> DeblurredView:
     """The frame with the known motion blur of all markers, to be taken out where it matters."""
     lag_blur = np.zeros_like(places.at.px) if twist is None else places.lag_blur(twist, frame.lag)
-    mean, rolling = 0.25 * lag_blur.sum(axis=1), rolling_displacement(places, twist, frame)
+    mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
     if twist is None or (mean * mean).sum(axis=1).max() <= hardly_px**2:
         return DeblurredView(frame.image, None, lag_blur + rolling, np.zeros_like(lag_blur), mean)
     tail = lag_tail(places, twist, frame)
@@ -192,4 +192,4 @@ def _view(frame: Frame, places: Places, twist: Twist | None, hardly_px: float) -
 def sides_px(corners: FloatArray) -> FloatArray:
     """Mean sides (N,) of quadrilaterals (N, 4, 2)."""
     span = corners.take(_NEXT, axis=1) - corners
-    return np.asarray(0.25 * np.sqrt((span * span).sum(axis=-1)).sum(axis=1))
+    return np.asarray(np.sqrt((span * span).sum(axis=-1)).mean(axis=1))

@@ -180,7 +180,7 @@ def _chosen(reading: Reading, quads: FloatArray, places: IntArray, noise: float)
 
 def _grown(quads: FloatArray, factor: float) -> FloatArray:
     """Quadrilaterals (N, 4, 2) larger by a factor about their middles."""
-    middle = 0.25 * quads.sum(axis=1, keepdims=True)
+    middle = quads.mean(axis=1, keepdims=True)
     return np.asarray(middle + factor * (quads - middle))
 
 

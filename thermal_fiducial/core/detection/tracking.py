@@ -29,8 +29,8 @@ from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray, IntArray
 
-# Frames farther apart show nothing of each other [s].
-_STALE_S = 0.15
+# Frames farther apart show nothing of each other [ns].
+_STALE_NS = 150_000_000
 # So many states of the filter show the acceleration too.
 _ENOUGH_STATES = 4
 # Jitter of the camera's stamps [s].
@@ -41,7 +41,7 @@ _DELAY_UNSURE = 0.5
 _COORDINATES = 8
 # The filter's states from so many time constants before a frame to one after it, symmetric about the velocity that
 # blurs it, say how it moved; so many of them at most. Without lag, those of so long a time.
-_LAGS_BEFORE, _STATES, _SHORTEST_LAG_S = 3, 10, 0.005
+_LAGS_BEFORE, _STATES, _SHORTEST_LAG_NS = 3, 10, 5_000_000
 # Standard deviation of the offset between the clocks before the filter has estimated it: that of drivers' stamps, and
 # what the filter itself starts from (``time_offset_std``) [s].
 _UNKNOWN_CLOCK_S = 0.03
@@ -53,23 +53,18 @@ class MotionTrack:
 
     Parameters
     ----------
-    from_body : (6, 6) what makes the camera's twist of the body's
+    T_body_camera : (4, 4)
     lag : time constant of the bolometers [s]
     stamp_ns, twist, markers : of the last frame
     last_seen_ns : stamp of the last frame that showed markers
     """
 
-    from_body: FloatArray
-    lag: float
+    T_body_camera: FloatArray
+    lag: float = 0.0
     stamp_ns: int | None = None
     twist: Twist | None = None
     markers: ExpectedMarkers = field(default_factory=ExpectedMarkers.none)
     last_seen_ns: int | None = None
-
-    @staticmethod
-    def of_rig(T_body_camera: FloatArray, lag: float = 0.0) -> 'MotionTrack':
-        """Before the first frame, of a camera at ``T_body_camera`` (4, 4)."""
-        return MotionTrack(transfer_from_body(T_body_camera), lag)
 
     def predict(
         self,
@@ -88,15 +83,18 @@ class MotionTrack:
         """
         odometry_ns = stamp_ns if odometry_ns is None else odometry_ns
         if len(odometry) >= _ENOUGH_STATES:
-            return line_through(odometry_ns, odometry, self.from_body, clock_std_s)
+            return line_through(odometry_ns, odometry, transfer_from_body(self.T_body_camera), clock_std_s)
         dt, before = self._since(stamp_ns), None
         # Markers show that the twist holds: one that went wrong would hide them from then on.
-        saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_S * 1e9
+        saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_NS
         if self.twist is not None and dt is not None and saw_lately:
             before = carried(self.twist, dt)
-        if len(odometry) == 0 or abs(odometry_ns - odometry[-1].stamp_ns) * 1e-9 >= _STALE_S:
+        if len(odometry) == 0 or abs(odometry_ns - odometry[-1].stamp_ns) >= _STALE_NS:
             return before
-        seen, later = transferred(odometry[-1], self.from_body), (odometry[-1].stamp_ns - odometry_ns) * 1e-9
+        seen, later = (
+            transferred(odometry[-1], transfer_from_body(self.T_body_camera)),
+            (odometry[-1].stamp_ns - odometry_ns) * 1e-9,
+        )
         unsure = (growth(abs(later))[0] + clock_std_s**2) * RANDOM
         information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + unsure))
         return corrected(before or unknown_twist(), information, information @ seen.value, later)
@@ -155,14 +153,14 @@ class MotionTrack:
 
     def after(self, stamp_ns: int, twist: Twist | None, markers: ExpectedMarkers) -> 'MotionTrack':
         """The track with a frame's twist and markers; of a frame that comes late there is nothing to keep."""
-        if self.stamp_ns is not None and 0 < self.stamp_ns - stamp_ns < _STALE_S * 1e9:
+        if self.stamp_ns is not None and 0 < self.stamp_ns - stamp_ns < _STALE_NS:
             return self
         last_seen_ns = stamp_ns if len(markers.ids) else self.last_seen_ns
-        return MotionTrack(self.from_body, self.lag, stamp_ns, twist, markers, last_seen_ns)
+        return MotionTrack(self.T_body_camera, self.lag, stamp_ns, twist, markers, last_seen_ns)
 
     def _since(self, stamp_ns: int) -> float | None:
         """Time since the last frame [s], negative for one that comes late; None when that shows nothing of this one."""
-        if self.stamp_ns is None or not 0 < abs(stamp_ns - self.stamp_ns) < _STALE_S * 1e9:
+        if self.stamp_ns is None or not 0 < abs(stamp_ns - self.stamp_ns) < _STALE_NS:
             return None
         return (stamp_ns - self.stamp_ns) * 1e-9
 
@@ -179,40 +177,29 @@ class FramePrediction:
     position_std_m: float
 
 
-class Predictor:
-    """Predicts a frame from the filter's states and from the last frames' markers.
+def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, max_age_s: float) -> FramePrediction:
+    """What the filter's states and the last frames' markers say of a frame at ``stamp_ns`` in the camera's clock.
 
-    Parameters
-    ----------
-    T_body_camera : (4, 4)
-    lag : time constant of the bolometers [s]
+    Odometry older than ``max_age_s`` says no pose.
     """
-
-    def __init__(self, T_body_camera: FloatArray, lag: float) -> None:
-        self._T_body_camera = T_body_camera
-        self._lag_ns = round(1e9 * max(lag, _SHORTEST_LAG_S))
-
-    def predict(
-        self, stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, max_age_s: float
-    ) -> FramePrediction:
-        """Of a frame at ``stamp_ns`` in the camera's clock; odometry older than ``max_age_s`` says no pose."""
-        if prior is None:
-            return FramePrediction(track.predict(stamp_ns, []), None, math.inf)
-        odometry_ns = prior.in_odometry_clock(stamp_ns)
-        clock_std_s = 0.0 if prior.clock_is_known else _UNKNOWN_CLOCK_S
-        states = prior.between(odometry_ns - _LAGS_BEFORE * self._lag_ns, odometry_ns + self._lag_ns, _STATES)
-        if not states and (other := prior.nearest(odometry_ns)) is not None:
-            states = [other]
-        states = [state for state in states if plausible(state)]
-        twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)
-        nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
-        dt = math.inf if nearest is None else (odometry_ns - nearest.stamp_ns) * 1e-9
-        if nearest is None or twist is None or abs(dt) > max_age_s:
-            return FramePrediction(twist, None, math.inf)
-        # The nearest pose, carried on with the camera's twist.
-        step = dt * twist.ago(0.5 * dt)
-        moved = se3.transform(se3.so3_exp(step[3:]), step[:3])
-        T_map_camera = nearest.T_map_body @ self._T_body_camera @ moved
-        off = clock_std_s * float(np.linalg.norm(nearest.velocity_body))
-        position_std_m = math.sqrt(np.trace(nearest.pose_covariance[:3, :3]) + off**2)
-        return FramePrediction(twist, se3.inverse(T_map_camera), position_std_m)
+    if prior is None:
+        return FramePrediction(track.predict(stamp_ns, []), None, math.inf)
+    lag_ns = max(round(1e9 * track.lag), _SHORTEST_LAG_NS)
+    odometry_ns = prior.in_odometry_clock(stamp_ns)
+    clock_std_s = 0.0 if prior.clock_is_known else _UNKNOWN_CLOCK_S
+    states = prior.between(odometry_ns - _LAGS_BEFORE * lag_ns, odometry_ns + lag_ns, _STATES)
+    if not states and (other := prior.nearest(odometry_ns)) is not None:
+        states = [other]
+    states = [state for state in states if plausible(state)]
+    twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)
+    nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
+    dt = math.inf if nearest is None else (odometry_ns - nearest.stamp_ns) * 1e-9
+    if nearest is None or twist is None or abs(dt) > max_age_s:
+        return FramePrediction(twist, None, math.inf)
+    # The nearest pose, carried on with the camera's twist.
+    step = dt * twist.ago(0.5 * dt)
+    moved = se3.transform(se3.so3_exp(step[3:]), step[:3])
+    T_map_camera = nearest.T_map_body @ track.T_body_camera @ moved
+    off = clock_std_s * float(np.linalg.norm(nearest.velocity_body))
+    position_std_m = math.sqrt(np.trace(nearest.pose_covariance[:3, :3]) + off**2)
+    return FramePrediction(twist, se3.inverse(T_map_camera), position_std_m)

@@ -28,6 +28,8 @@ _NEAR = 1e-6
 _AHEAD = se3.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.0])
 # Variance of a parameter, over what it would be with the others known, from which it counts as unknown.
 _UNKNOWN = 1e13
+# Share of the largest information that keeps the others from being none.
+_SINGULAR = 1e-12
 _MINUS_SKEW = -se3.SKEW
 
 #: At poses (B, 4, 4): cost (B,), gradient (B, 6), information (B, 6, 6).
@@ -179,6 +181,6 @@ def covariances(information: FloatArray) -> FloatArray:
 def _solve(information: FloatArray, damping: FloatArray, gradient: FloatArray) -> FloatArray:
     damped = information.copy()
     diagonal = np.einsum('bii->bi', damped)
-    floor = 1e-12 * np.maximum(diagonal.max(axis=-1, keepdims=True), 1e-12)
+    floor = _SINGULAR * np.maximum(diagonal.max(axis=-1, keepdims=True), _SINGULAR)
     diagonal += damping[:, None] * diagonal + floor
     return np.asarray(np.linalg.solve(damped, gradient[..., None])[..., 0])

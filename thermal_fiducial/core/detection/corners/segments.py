@@ -19,6 +19,10 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
 REACHED = 2.0
 #: Variance of a segment that measures nothing.
 HOPELESS = 1e6
+# Least number of pixels of a segment: two more than its unknowns.
+_FEWEST_PIXELS = 5
+# Variance of a segment's pixels over the marker's typical one beyond which it counts by itself.
+_NOISIER = 2.5
 # Weight of a pixel or segment falls off beyond this many standard deviations.
 _PIXEL_OUTLIER = 4.5
 _SEGMENT_OUTLIER = 2.5
@@ -150,14 +154,14 @@ def _fit(moments: Float32Array, cells: int, sides: int) -> _SegmentFit:
     square = np.maximum(zz - z * z_mean - contrast * p - product * q, 0.0)
     level = z_mean - contrast * x_mean - product * y_mean
     own = square / np.maximum(number - 3.0, 1.0)
-    typical = median_of(own, number > 4.5)
-    noise = np.where(own > 2.5 * typical, own, typical) + 1e-3
+    typical = median_of(own, number >= _FEWEST_PIXELS)
+    noise = np.where(own > _NOISIER * typical, own, typical) + 1e-3
     return _SegmentFit(contrast, product, c, a, level, number, noise)
 
 
 def _judged(fit: _SegmentFit, reach: FloatArray) -> Segments:
     """Which segments measure anything, within their reach (N, S)."""
-    contrast, product, noise, usable = fit.contrast, fit.product, fit.noise, fit.number > 4.5
+    contrast, product, noise, usable = fit.contrast, fit.product, fit.noise, fit.number >= _FEWEST_PIXELS
     typical = median_of(contrast, usable)
     own = noise * fit.contrast_variance
     scale = np.sign(typical) / np.maximum(np.abs(typical), 1e-6)
@@ -197,10 +201,10 @@ def adjust(
     covariance = np.linalg.inv(fit.information) / fit.trust[:, None, None] + OF_SIDES_PX**2 * np.eye(8)
     known = as_squares(at, fit.moved[..., None], covariance)
     # Corners that constrain one another err together. Taken for independent, they would claim so much too much.
-    together = (8.0 / (8.0 - known.constrained))[:, None, None, None]
+    together = (8 / (8 - known.constrained))[:, None, None, None]
     blocks = together * known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
     # A side of an outline that is no square's is that of something else.
-    doubt = known.doubt * (0.25 * sides.along.reshape(-1, 4).sum(axis=1)) ** 2
+    doubt = known.doubt * sides.along.reshape(-1, 4).mean(axis=1) ** 2
     return known.moved.reshape(-1, 4, 2), blocks + OF_ALL_SIDES_PX**2 * np.eye(2), doubt
 
 

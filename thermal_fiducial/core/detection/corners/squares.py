@@ -83,7 +83,7 @@ def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squ
     seen, covariance : (N, 8, 1), (N, 8, 8) how far they are off, as the image shows [px]
     """
     together = np.empty((len(seen), 4, 2))
-    together[:] = 0.25 * seen.reshape(-1, 4, 2).sum(axis=1, keepdims=True)
+    together[:] = seen.reshape(-1, 4, 2).mean(axis=1, keepdims=True)
     nearest = _corrected(at, together.reshape(-1, 8, 1), seen, covariance)
     refuted = np.flatnonzero(nearest.chi2 > _OTHER_TILT)
     if len(refuted):
