@@ -45,7 +45,7 @@ def contents(out):
 
 @pytest.fixture(scope='module')
 def alone(folder):
-    assert batch(folder, 'alone') == 0
+    assert batch(folder, 'alone', '--workers', '1') == 0
     return folder / 'alone'
 
 
@@ -96,7 +96,8 @@ def test_a_bad_bag_is_named_and_the_others_are_replayed_by_a_cluster_that_is_the
 
     (folder / 'broken').mkdir(exist_ok=True)
     bags = ('flight0', 'broken')
-    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50) as cluster:
+    local = {'processes': False, 'protocol': 'tcp://', 'dashboard_address': None, 'silence_logs': 50}
+    with LocalCluster(n_workers=1, threads_per_worker=1, **local) as cluster:
         assert batch(folder, 'cluster', '--scheduler', cluster.scheduler_address, bags=bags) == 2
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith('thermal-fiducial')]
     assert len(lines) == 1

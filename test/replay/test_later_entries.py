@@ -6,7 +6,8 @@ import pytest
 from support import small_bag
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.files.bags import BagReader, BagWriter, CAMERA_INFO_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bag_writer import BagWriter
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMU_TOPIC
 
 pytestmark = pytest.mark.ros
 

@@ -18,7 +18,8 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import marker_corners
 from thermal_fiducial.core.geometry.se3 import apply, inverse, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMAGE_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bag_writer import BagWriter
+from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import save_map
 
 START_NS = 1_700_000_000_000_000_000

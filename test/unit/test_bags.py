@@ -7,7 +7,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, BagWriter, parse_remaps, resolve_topics
+from thermal_fiducial.files.bag_writer import BagWriter
+from thermal_fiducial.files.bags import BagReader, parse_remaps, resolve_topics
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STRING = 'std_msgs/msg/String'

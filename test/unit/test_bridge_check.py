@@ -13,7 +13,7 @@ from support.flights import Motion
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, so3_exp
-from thermal_fiducial.files.bags import BagWriter
+from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.report.bridge_check import check_bridge, Level
 from thermal_fiducial.report.bridge_record import BridgeRecord, BridgeRecorder
 

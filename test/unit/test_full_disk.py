@@ -16,7 +16,8 @@ from support.ros_graph import ros_graph
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagReader, BagWriter, IMU_TOPIC, STORAGES
+from thermal_fiducial.files.bag_writer import BagWriter, STORAGES
+from thermal_fiducial.files.bags import BagReader, IMU_TOPIC
 from thermal_fiducial.files.map_keeper import MapKeeper
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.trajectory_file import save_tum

@@ -8,7 +8,7 @@ from rosbags.typesys import get_typestore, Stores
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.se3 import so3_exp
-from thermal_fiducial.files.bags import BagWriter
+from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.report.bridge_check import Level
 from thermal_fiducial.report.bridge_record import BridgeRecord, LandingRecord
 from thermal_fiducial.report.landing_check import check_landing

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import STORAGES
+from thermal_fiducial.files.bag_writer import STORAGES
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.flight_bags import frame_count, write_recording
 from thermal_fiducial.files.recordings import read_recording

@@ -9,7 +9,7 @@ import textwrap
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.cli.simulate_corners import write_corner_flight
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import STORAGES
+from thermal_fiducial.files.bag_writer import STORAGES
 from thermal_fiducial.sim.recorded import RecordedFlight
 from thermal_fiducial.sim.scenario import LENSES, named, Scenario, SCENARIOS, with_contrast, with_lens
 from thermal_fiducial.sim.sensor import FFC_BEHAVIOURS, Sensor

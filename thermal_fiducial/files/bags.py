@@ -1,4 +1,4 @@
-"""Bags: rosbag2 (mcap and sqlite3) read and written, ROS 1 bags read. No ROS is needed for it.
+"""Bags read: rosbag2 (mcap and sqlite3) and ROS 1 bags. No ROS is needed for it.
 
 Topics carry the names of the package's interface, relative and without the leading slash: a bag recorded with a
 leading slash or in a namespace needs nothing, other names need a remap, as in ROS.
@@ -9,15 +9,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-import shutil
-import sqlite3
 from types import TracebackType
 from typing import Any, Self
 
 from rosbags.interfaces import Connection
 from rosbags.rosbag1 import Reader as Rosbag1Reader
 from rosbags.rosbag2 import Reader as Rosbag2Reader
-from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import get_types_from_idl, get_types_from_msg, get_typestore, Stores
 from rosbags.typesys.store import Typestore
 
@@ -25,7 +22,6 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_checks import check_announced, check_file, check_metadata, SINGLE_FILES
 from thermal_fiducial.files.decompression import bound_decompression
 from thermal_fiducial.files.reading import one_line
-from thermal_fiducial.files.writing import into
 
 IMAGE_TOPIC = 'thermal/image_raw'
 COMPRESSED_TOPIC = 'thermal/image_raw/compressed'
@@ -40,8 +36,6 @@ INTERFACE_TOPICS = (IMAGE_TOPIC, COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, IMU_TOPIC,
 #: The same for what nodes publish; other programs' topics may end alike (``marker_map/markers``), so that these are
 #: left alone where several do.
 _COMMON_NAMES = (MARKERS_TOPIC, CAMERA_POSE_TOPIC)
-
-STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 
 
 @dataclass(frozen=True)
@@ -277,94 +271,3 @@ class BagReader:
             raise InputError(
                 f'{self.path}: the bag cannot be read: {one_line(error) or type(error).__name__}'
             ) from None
-
-
-class BagWriter:
-    """A new rosbag2, opened by ``with``; the same messages give the same bytes. What is left early is removed.
-
-    Parameters
-    ----------
-    path : folder to create
-    storage : a key of :data:`STORAGES`
-
-    Raises
-    ------
-    InputError
-        The folder exists, cannot be made, or the storage is unknown.
-    """
-
-    def __init__(self, path: str | Path, storage: str = 'mcap') -> None:
-        if storage not in STORAGES:
-            raise InputError(f'storage {storage!r} is not one of {", ".join(STORAGES)}')
-        if Path(path).exists():
-            raise InputError(f'{path} exists already')
-        self._path = Path(path)
-        self._typestore = get_typestore(Stores.ROS2_JAZZY)
-        self._writer = Writer(path, version=9, storage_plugin=STORAGES[storage])
-        self._connections: dict[str, Connection] = {}
-
-    def __enter__(self) -> Self:
-        with self._removed_unless_whole(), self._written():
-            self._writer.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        with self._removed_unless_whole(), self._written():
-            self._writer.__exit__(kind, value, traceback)
-            if value is not None:
-                raise value
-
-    @contextmanager
-    def _removed_unless_whole(self) -> Iterator[None]:
-        try:
-            yield
-        except BaseException:
-            # Half a flight looks like a whole one.
-            shutil.rmtree(self._path, ignore_errors=True)
-            raise
-
-    @contextmanager
-    def _written(self) -> Iterator[None]:
-        try:
-            with into(self._path):
-                yield
-        except sqlite3.Error as error:
-            raise InputError(f'{self._path}: {error}') from None
-
-    def add_topic(self, topic: str, msgtype: str) -> None:
-        """Record that there is ``topic``, also if it never gets a message.
-
-        Raises
-        ------
-        InputError
-            A type that ROS 2 Jazzy does not bring.
-        """
-        if msgtype not in self._typestore.fielddefs:
-            raise InputError(f'{topic}: message type {msgtype} is unknown')
-        name = topic if topic.startswith('/') else '/' + topic
-        with self._written():
-            self._connections[topic] = self._writer.add_connection(name, msgtype, typestore=self._typestore)
-
-    def write(self, topic: str, stamp_ns: int, message: Any, msgtype: str | None = None) -> None:
-        """Append a message.
-
-        Parameters
-        ----------
-        topic : as :meth:`add_topic` got it; a new one is added
-        stamp_ns : bag stamp
-        message : one of rosbags' message objects, or its CDR bytes together with ``msgtype``
-
-        Raises
-        ------
-        InputError
-            It cannot be written: the disk is full, say.
-        """
-        kind = msgtype or message.__msgtype__
-        if topic not in self._connections:
-            self.add_topic(topic, kind)
-        is_raw = isinstance(message, (bytes, bytearray, memoryview))
-        cdr = message if is_raw else self._typestore.serialize_cdr(message, kind)
-        with self._written():
-            self._writer.write(self._connections[topic], stamp_ns, cdr)

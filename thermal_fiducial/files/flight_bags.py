@@ -14,8 +14,8 @@ from thermal_fiducial.core.measurements import Markers
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import bag_messages
+from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.bags import (
-    BagWriter,
     CAMERA_INFO_TOPIC,
     CAMERA_POSE_TOPIC,
     IMAGE_TOPIC,

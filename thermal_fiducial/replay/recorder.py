@@ -17,7 +17,7 @@ from sensor_msgs.msg import PointCloud2
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.files.bags import BagWriter
+from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.trajectory_file import tum_line
 from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.replay.topics import Topics, type_name

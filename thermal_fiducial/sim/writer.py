@@ -20,7 +20,8 @@ import yaml
 
 from thermal_fiducial.core.types import IntArray, SECOND_NS
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bags import BagWriter, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, TRUTH_TOPIC
+from thermal_fiducial.files.bag_writer import BagWriter
+from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC, TRUTH_TOPIC
 from thermal_fiducial.files.map_format import dump_document, MapDocument, MarkerEntry
 from thermal_fiducial.files.rosbags_types import MAP_FRAME
 from thermal_fiducial.files.trajectory_file import save_tum
