@@ -29,7 +29,7 @@ def states(offset_s=0.0):
 
 
 def predicted(prior):
-    return predict_frame(STAMP_NS, prior, MotionTrack(np.eye(4), 0.010), 0.2)
+    return predict_frame(STAMP_NS, prior, MotionTrack.of_rig(np.eye(4), 0.010), 0.2)
 
 
 @pytest.mark.parametrize('offset_s', [0.0, -0.060, 0.035])

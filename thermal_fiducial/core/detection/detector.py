@@ -72,7 +72,7 @@ class MarkerDetector:
 
     def _mount(self, config: ArucoDetectorConfig) -> None:
         T_body_camera = se3.transform_from_quaternion(config.camera_position, config.camera_orientation)
-        self._history = FrameHistory(MotionTrack(T_body_camera, config.bolometer_lag))
+        self._history = FrameHistory(MotionTrack.of_rig(T_body_camera, config.bolometer_lag))
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
         """Markers that are known: ID to (T_map_marker, side [m])."""

@@ -53,18 +53,24 @@ class MotionTrack:
 
     Parameters
     ----------
-    T_body_camera : (4, 4)
+    T_body_camera, from_body : (4, 4), (6, 6) where the camera is, and what makes its twist of the body's
     lag : time constant of the bolometers [s]
     stamp_ns, twist, markers : of the last frame
     last_seen_ns : stamp of the last frame that showed markers
     """
 
     T_body_camera: FloatArray
-    lag: float = 0.0
+    from_body: FloatArray
+    lag: float
     stamp_ns: int | None = None
     twist: Twist | None = None
     markers: ExpectedMarkers = field(default_factory=ExpectedMarkers.none)
     last_seen_ns: int | None = None
+
+    @staticmethod
+    def of_rig(T_body_camera: FloatArray, lag: float = 0.0) -> 'MotionTrack':
+        """Before the first frame, of a camera at ``T_body_camera`` (4, 4)."""
+        return MotionTrack(T_body_camera, transfer_from_body(T_body_camera), lag)
 
     def predict(
         self,
@@ -83,7 +89,7 @@ class MotionTrack:
         """
         odometry_ns = stamp_ns if odometry_ns is None else odometry_ns
         if len(odometry) >= _ENOUGH_STATES:
-            return line_through(odometry_ns, odometry, transfer_from_body(self.T_body_camera), clock_std_s)
+            return line_through(odometry_ns, odometry, self.from_body, clock_std_s)
         dt, before = self._since(stamp_ns), None
         # Markers show that the twist holds: one that went wrong would hide them from then on.
         saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_NS
@@ -92,7 +98,7 @@ class MotionTrack:
         if len(odometry) == 0 or abs(odometry_ns - odometry[-1].stamp_ns) >= _STALE_NS:
             return before
         seen, later = (
-            transferred(odometry[-1], transfer_from_body(self.T_body_camera)),
+            transferred(odometry[-1], self.from_body),
             (odometry[-1].stamp_ns - odometry_ns) * 1e-9,
         )
         unsure = (growth(abs(later))[0] + clock_std_s**2) * RANDOM
@@ -156,7 +162,7 @@ class MotionTrack:
         if self.stamp_ns is not None and 0 < self.stamp_ns - stamp_ns < _STALE_NS:
             return self
         last_seen_ns = stamp_ns if len(markers.ids) else self.last_seen_ns
-        return MotionTrack(self.T_body_camera, self.lag, stamp_ns, twist, markers, last_seen_ns)
+        return MotionTrack(self.T_body_camera, self.from_body, self.lag, stamp_ns, twist, markers, last_seen_ns)
 
     def _since(self, stamp_ns: int) -> float | None:
         """Time since the last frame [s], negative for one that comes late; None when that shows nothing of this one."""
