@@ -7,9 +7,9 @@ import pytest
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.frame import Frame, Places
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
-from thermal_fiducial.core.detection.patterns import Decoder, marker_bits, shrunk
+from thermal_fiducial.core.detection.patterns import Decoder, marker_bits, Reading, shrunk
 from thermal_fiducial.core.detection.quads import noise_of
-from thermal_fiducial.core.detection.search import BlindSearch, SearchScales
+from thermal_fiducial.core.detection.search import BlindSearch, inside_out, SearchScales
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.files.dictionary import load_dictionary
 
@@ -96,6 +96,29 @@ def test_bright_markers_far_away_are_found(contrast):
     found = search((7000.0 + contrast * image + rng.normal(0.0, 1.25, image.shape)).astype(np.float32))
     # 10 or 11 of 12 by five seeds; at most 2 when only the outlines themselves are read.
     assert len(set(found.ids.tolist()) & set(shown.tolist())) >= 9
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+def test_edge_of_a_plate_is_no_markerinside_out(sign):
+    """Readings at one place: a marker without much of a surround, the edge of its plate, bits in it, another."""
+    correlation = sign * np.array([0.96, -0.89, -0.88, -0.9])
+    reading = Reading(
+        np.array([19, 10, 17, 4]),
+        np.zeros(4, dtype=np.int64),
+        correlation,
+        np.full(4, 0.6),
+        100.0 * correlation,
+        np.zeros(4, dtype=np.int64),
+        np.zeros(4, dtype=np.int64),
+        np.array([0.5, 1.2, 0.9, 1.0]),
+    )
+    factor = np.array([1.0, 1.5, 0.6, 1.0])[:, None, None]
+    quads = CORNERS.mean(axis=0) + factor * (CORNERS - CORNERS.mean(axis=0))
+    quads[3] += 200.0
+    everything = np.ones(4, dtype=bool)
+    assert inside_out(reading, quads, everything, everything).tolist() == [False, True, True, False]
+    # What cannot be read is no evidence against another.
+    assert not inside_out(reading, quads, everything, ~everything).any()
 
 
 def test_what_is_seen_already_is_not_sought():

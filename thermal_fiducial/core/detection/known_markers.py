@@ -14,8 +14,8 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 #: Nearer to the border of the image than this a marker may be cut off, before its corners are refined [px].
 CUT_OFF_PX = 2.0
-# Middles of two markers are no nearer than this share of the diagonal.
-_TOGETHER = 0.35
+#: Middles of two markers are no nearer than this share of the larger one's diagonal.
+TOGETHER = 0.35
 # A marker turned further from the camera than this shows too little to be expected.
 _MAX_TILT_COSINE = 0.2
 _NEXT = np.array([1, 2, 3, 0])
@@ -112,7 +112,7 @@ class FoundMarkers:
             return self
         apart = np.linalg.norm(others.corners_px.mean(axis=1)[:, None] - self.corners_px.mean(axis=1), axis=-1)
         extent = np.linalg.norm(self.corners_px[:, 2] - self.corners_px[:, 0], axis=-1)
-        new = np.flatnonzero(~among(others.ids, self.ids) & (apart > _TOGETHER * extent).all(axis=1))
+        new = np.flatnonzero(~among(others.ids, self.ids) & (apart > TOGETHER * extent).all(axis=1))
         return FoundMarkers(
             np.concatenate([self.ids, others.ids[new]]),
             self.places.joined(others.places.only(new)),

@@ -8,7 +8,7 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.alignment import aligned
 from thermal_fiducial.core.detection.frame import Frame
-from thermal_fiducial.core.detection.known_markers import among, CUT_OFF_PX, FoundMarkers
+from thermal_fiducial.core.detection.known_markers import among, CUT_OFF_PX, FoundMarkers, TOGETHER
 from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
 from thermal_fiducial.core.detection.quads import (
     dark,
@@ -105,6 +105,7 @@ class BlindSearch:
         good &= frame.camera.contains(quads, CUT_OFF_PX).all(axis=1)
         if not good.any():
             return Outlines.none()
+        good &= ~inside_out(reading, quads, good, distinct(reading, frame.noise, config))
         return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), frame.noise)
 
     def _read(
@@ -204,15 +205,36 @@ def _joined(first: Reading, second: Reading) -> Reading:
     return Reading(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))
 
 
+def distinct(reading: Reading, noise: float, config: ArucoDetectorConfig) -> BoolArray:
+    """Which readings look like one marker of the dictionary, whatever the bits and sides are like."""
+    return reading.clear(config.min_correlation, config.min_margin, config.min_contrast * noise)
+
+
 def accepted(reading: Reading, noise: float, correctable: int, config: ArucoDetectorConfig) -> BoolArray:
     """Which readings are evidence enough for a marker nobody expected."""
     bits = config.max_bit_errors if config.max_bit_errors >= 0 else correctable
     return np.asarray(
-        reading.clear(config.min_correlation, config.min_margin, config.min_contrast * noise)
+        distinct(reading, noise, config)
         & (reading.bit_errors <= bits)
         & (reading.border_errors <= config.max_border_errors)
         & (reading.surround >= config.min_surround)
     )
+
+
+def inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: BoolArray) -> BoolArray:
+    """Which good readings (Q,) are of a plate's border or of bits: at a more similar readable one of other polarity.
+
+    Left in, one would stand for the place until its corners are refined, and the marker itself would be lost with it.
+    """
+    mine, others = np.flatnonzero(good), np.flatnonzero(readable)
+    similarity, centre = np.abs(reading.correlation), quads.mean(axis=1)
+    across = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)
+    apart = np.linalg.norm(centre[mine, None] - centre[others], axis=-1)
+    together = apart < TOGETHER * np.maximum(across[mine, None], across[others])
+    opposite = reading.correlation[mine, None] * reading.correlation[others] < 0.0
+    result = np.zeros(len(good), dtype=bool)
+    result[mine] = (together & opposite & (similarity[others] > similarity[mine, None])).any(axis=1)
+    return result
 
 
 def _once(reading: Reading, quads: FloatArray, good: BoolArray, drop_duplicates: bool) -> IntArray:
