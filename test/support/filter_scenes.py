@@ -227,6 +227,29 @@ def gaps_of_imu(seed: int) -> Arrivals:
     return _arrivals(flight, flight.poses, samples)
 
 
+def starved(seed: int) -> Arrivals:
+    """A computer that is too busy: for up to 0.8 s neither samples nor poses come, then half of those poses, late."""
+    flight, rng = Flight(seed=seed, seconds=20.0), np.random.default_rng(seed)
+    begins_ns = START_NS + round(2e9) + np.cumsum(rng.uniform(0.9e9, 3.0e9, 8)).astype(np.int64)
+    ends_ns = begins_ns + rng.uniform(0.02e9, 0.8e9, 8).astype(np.int64)
+
+    def end_of_stall(stamp_ns: int) -> int:
+        return max(
+            (int(end) for begin, end in zip(begins_ns, ends_ns, strict=True) if begin <= stamp_ns < end), default=0
+        )
+
+    arrivals: list[tuple[int, Any]] = [(s.stamp_ns, s) for s in flight.samples() if not end_of_stall(s.stamp_ns)]
+    for pose in flight.poses:
+        due_ns = pose.stamp_ns + round(LATE * 1e9)
+        held_ns = end_of_stall(due_ns)
+        if not held_ns:
+            arrivals.append((due_ns, pose))
+        elif rng.random() < 0.5:
+            arrivals.append((held_ns + round(rng.exponential(0.1e9)), pose))
+    arrivals.sort(key=lambda arrival: arrival[0])
+    return Arrivals(flight, [item for _, item in arrivals], white_poses())
+
+
 def jittering(seed: int) -> Arrivals:
     """Stamps of the camera that are late by 2 ms in the mean, exponentially, and by 2 ms early."""
     flight, rng = Flight(seed=seed, seconds=16.0), np.random.default_rng(seed)
@@ -314,8 +337,8 @@ def lasting_errors(seed: int) -> Arrivals:
 
 def _scenes() -> dict[str, Scene]:
     flights = (
-        brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, jittering,
-        tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start, stepping_clock,
+        brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, starved,
+        jittering, tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start, stepping_clock,
         small_step_of_clock, lasting_errors,
     )  # fmt: skip
     scenes: dict[str, Scene] = {scene.__name__.replace('_', ' '): partial(of_flights, scene) for scene in flights}

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
+from thermal_fiducial.core.filter.inertial_motion import NOISE, preintegrated
 
 #: Uneven, as real drivers are.
 STAMPS_NS = [0, 5_000_000, 9_000_000, 15_000_000, 20_000_000]
@@ -68,3 +69,25 @@ def test_it_grows_and_forgets():
     np.testing.assert_allclose(buffer.imu[[0, -1]], [line(3399), line(4999)], rtol=1e-12)
     assert buffer.first_after(4000) == 4001
     assert buffer.first_after(9000) == 4999
+
+
+def test_a_gap_is_filled_with_short_steps_of_its_own_noise(buffer):
+    begin_ns, end_ns = STAMPS_NS[-1], STAMPS_NS[-1] + 100_000_000
+    buffer.append(end_ns, line(end_ns), 9.0 * np.ones(6))
+    steps = buffer.steps(begin_ns, end_ns)
+    # four of 25 ms: more than 30 ms would be one of its parts with three
+    np.testing.assert_allclose(steps.seconds, 0.025)
+    np.testing.assert_allclose(steps.densities, 9.0)
+    np.testing.assert_allclose(steps.imu, [line(begin_ns + (2 * k + 1) * 12_500_000) for k in range(4)], rtol=1e-12)
+
+
+def test_one_pose_behind_a_gap_does_not_make_the_velocity_known():
+    # The hidden acceleration may have come early or late in the gap.
+    gap = ImuBuffer()
+    gap.append(0, np.zeros(6), np.ones(6))
+    gap.append(500_000_000, np.zeros(6), np.ones(6))
+    noise = preintegrated(gap.steps(0, 500_000_000), np.zeros(6), np.zeros((2, 3, 3))).error[:, NOISE]
+    velocity, position = noise[5, 5], noise[8, 8]
+    left = 1.0 - noise[5, 8] ** 2 / (velocity * position)
+    # of white noise a quarter of the variance is left, of steps of 29 ms the less by the square of their share
+    assert left == pytest.approx(0.25, abs=0.005)

@@ -105,6 +105,29 @@ def test_a_gap_hides_the_jumps_that_are_seen_behind_gaps_alone():
     assert np.all(behind_gap < 10.0 * true)
 
 
+def test_what_was_linear_in_time_need_not_stay_so_in_a_gap():
+    slopes = np.repeat((0.3, 1.0), 3)
+    claimed, _ = hidden(lambda t: t[:, None] * slopes, np.arange(600) / 200.0, 0.5)
+    # The change over the gap is 0.15 rad/s and 0.5 m/s^2: at least a tenth of it may have come early or late.
+    assert np.all(np.sqrt(claimed / 0.5) > 0.1 * 0.5 * slopes[[0, 3]])
+
+
+@pytest.mark.parametrize('gap', [0.5, 0.8])
+def test_a_long_gap_is_judged_by_lags_as_long(gap):
+    # A period of two seconds: up to half a second it looks like a parabola.
+    claimed, true = hidden(lambda t: np.sin(np.pi * t)[:, None] * np.ones(6), np.arange(1600) / 200.0, gap)
+    # as for the faster motion above
+    assert np.all(claimed > true / 1.5)
+    assert np.all(claimed < 10.0 * true)
+
+
+def test_a_drone_that_is_still_may_turn_in_a_long_gap():
+    claimed, _ = hidden(lambda t: np.zeros((len(t), 6)), np.arange(400) / 200.0, 0.77)
+    # A rendered flight turned by 13 deg in such a gap, of which nothing was to be seen before or after: 0.3 rad/s at
+    # three sigma.
+    assert 3.0 * np.sqrt(claimed[0] / 0.77) > 0.2
+
+
 def test_a_gap_of_a_drone_at_rest_hides_little():
     claimed, _ = hidden(lambda t: np.zeros((len(t), 6)), np.arange(400) / 200.0, 0.033)
     # no more than the noise of the data sheet, which is in it

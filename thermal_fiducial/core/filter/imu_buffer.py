@@ -12,6 +12,9 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 _MOTION_SECONDS = 0.05
 #: Room for so many samples to begin with: five seconds at 200 Hz.
 _CAPACITY = 1000
+#: Longer steps [ns] are divided: over a gap the error of rate and force is noise, not a constant, and after one pose
+#: behind it the velocity is not known.
+_LONGEST_NS = 30_000_000
 
 
 class Steps(NamedTuple):
@@ -60,7 +63,16 @@ class ImuBuffer:
         return (self._stamps_ns[-1] - self._stamps_ns[-2]) / SECOND_NS
 
     def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
-        """Add a sample (6,) and the densities (6,) of the step that ends with it."""
+        """Add a sample (6,) and the densities (6,) of the step that ends with it; between, a gap is filled."""
+        if self._stamps_ns and stamp_ns - self.newest_ns > _LONGEST_NS:
+            begin_ns, begin = self.newest_ns, self._rows[len(self._stamps_ns) - 1, 0].copy()
+            parts = -((begin_ns - stamp_ns) // _LONGEST_NS)
+            for part in range(1, parts):
+                part_ns = (stamp_ns - begin_ns) * part // parts
+                self._add(begin_ns + part_ns, begin + part / parts * (imu - begin), densities)
+        self._add(stamp_ns, imu, densities)
+
+    def _add(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
         place = len(self._stamps_ns)
         if place == len(self._rows):
             self._rows = np.concatenate((self._rows, np.zeros_like(self._rows)))

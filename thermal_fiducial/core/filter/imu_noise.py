@@ -12,10 +12,14 @@ from thermal_fiducial.core.types import FloatArray
 _SLOW = 0.2
 #: Lags [s] at which differences are averaged, over so long [s].
 _SHORTEST_LAG, _MEMORY = 0.02, 2.0
-_OCTAVES = np.arange(6)
+_OCTAVES = np.arange(7)
 _LAGS = _SHORTEST_LAG * 2.0**_OCTAVES
+#: Largest exponents: of measured motion, as what has been linear in time need not stay so in a gap; of the least one.
+_SMOOTHEST = np.repeat((1.5, 2.0), 2)
+#: What the logarithm of nothing is taken of [(rad/s)^2, (m/s^2)^2].
+_TINY = 1e-12
 #: An IMU at rest may begin to move in a gap: mean squares of the differences that are possible at any time.
-_LEAST_MOTION = (2.0 * (_LAGS / 0.2) ** 3 / (1.0 + (_LAGS / 0.2) ** 2))[:, None] * np.array((0.03, 0.15)) ** 2
+_LEAST_MOTION = (2.0 * (_LAGS / 0.2) ** 3 / (1.0 + (_LAGS / 0.2) ** 2))[:, None] * np.array((0.1, 0.3)) ** 2
 #: Errors of nonlinearity, bandwidth and internal lever arms last as long as the motion does that makes them [s].
 _MOTION_TIME = 1.0
 #: A saturated sample may hide a hit [m/s^2], or a spin as fast again as the range [rad/s].
@@ -138,14 +142,15 @@ class StructureFunction:
         place = math.log2(seconds / _SHORTEST_LAG)
         lower = min(max(int(place), 0), len(_LAGS) - 2)
         into = min(max(place - lower, 0.0), 1.0)
-        log_D = np.log2(np.maximum(self._measured[lower : lower + 3], _LEAST_MOTION[lower : lower + 3]))
-        slopes = np.clip(log_D[1:] - log_D[:-1], 0.0, 2.0)
+        log_D = np.log2(np.hstack((self._measured, _LEAST_MOTION))[lower : lower + 3] + _TINY)
+        slopes = np.clip(log_D[1:] - log_D[:-1], 0.0, _SMOOTHEST)
         at_step = 2.0 ** (log_D[1] + slopes[0] * (place - lower - 1))
         # From one step to two of them.
         exponent = slopes[0] + into * (slopes[-1] - slopes[0])
         # The errors of steps in a row share a sample: they add up twice as fast if all is vibration.
         shared = 1.0 + np.maximum(1.0 - exponent, 0.0)
-        rate, force = (at_step * (1.0 / (exponent + 2.0) - 0.25) * shared * seconds).tolist()
+        noise = at_step * (1.0 / (exponent + 2.0) - 0.25) * shared * seconds
+        rate, force = np.maximum(noise[:2], noise[2:]).tolist()
         return rate, force
 
 
