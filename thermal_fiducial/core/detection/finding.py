@@ -10,14 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.frame import (
-    Frame,
-    lag_tail_maps,
-    markers_deblurred,
-    Places,
-    REMAINING,
-    rolling_displacement,
-)
+from thermal_fiducial.core.detection.frame import Frame, Places, rolling_displacement
 from thermal_fiducial.core.detection.known_markers import (
     among,
     CUT_OFF_PX,
@@ -28,7 +21,7 @@ from thermal_fiducial.core.detection.known_markers import (
     pairs,
 )
 from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
-from thermal_fiducial.core.detection.refining import BLUR_THAT_MATTERS_PX, CLEAR_CNR
+from thermal_fiducial.core.detection.refining import CLEAR_CNR
 from thermal_fiducial.core.detection.search import BlindSearch, SearchScales
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist
@@ -230,18 +223,13 @@ def near_prediction(
 ) -> FoundMarkers:
     """Those of the ``expected`` markers that the frame shows near where they are expected."""
     places = expected.places(frame.camera)
-    shift, rolling = places.lag_blur(twist, frame.lag), rolling_displacement(places, twist, frame)
-    ids, corners = expected.ids, places.at.px + rolling
-    blurred = np.abs(shift).max(axis=(1, 2)) > BLUR_THAT_MATTERS_PX
-    scene = frame.image
-    if blurred.any():
-        scene = markers_deblurred(frame.image, corners[blurred], lag_tail_maps(corners[blurred], shift[blurred]))
-    left = np.where(blurred[:, None, None], REMAINING * shift, shift)
-    shown = _shifted(scene, ids, corners + left, decoder)
-    reading = decoder.read(scene, shown)
+    displaced = places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
+    ids = expected.ids
+    shown = _shifted(frame.image, ids, places.at.px + displaced, decoder)
+    reading = decoder.read(frame.image, shown)
     limits = config.guided_min_correlation, config.guided_min_margin, config.guided_min_contrast * frame.noise
     good = (reading.ids == ids) & (reading.turns == 0) & reading.clear(*limits)
-    at = ImagePoints.at((shown - left - rolling)[good], frame.camera)
+    at = ImagePoints.at((shown - displaced)[good], frame.camera)
     places, no = Places.of(at, expected.depth[good]), np.zeros(len(at.px), dtype=bool)
     return FoundMarkers(ids[good], places, reading.contrast[good] / frame.noise, ~no, no)
 

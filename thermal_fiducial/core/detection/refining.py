@@ -29,8 +29,8 @@ from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, unknown_twist
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-#: Blur by lag below which the shape of an edge doesn't change [px].
-BLUR_THAT_MATTERS_PX = 0.4
+# Blur by lag below which the shape of an edge doesn't change [px].
+_BLUR_THAT_MATTERS_PX = 0.4
 #: Contrast over noise below which a marker is faint; a clearer one shows at full and at half the resolution.
 CLEAR_CNR = 20.0
 # Columns of pixels used of a cell, all of a faint marker's; and blur [px] up to which the lag tail stays in the frame,
@@ -131,7 +131,7 @@ class Refiner:
             seen = refine_corners(view.image, start, frame.camera, behind, *blur, columns, view.to_tails)
             refinement = self._at_stamp(frame, found, places, view, seen, twist, track)
             change = np.abs(refinement.corners.corners_px - seen.corners_px + view.shift)
-            if refinement.twist is None or change.max(initial=0.0) < BLUR_THAT_MATTERS_PX:
+            if refinement.twist is None or change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX:
                 break
             twist, places = refinement.twist, refinement.places
         return refinement

@@ -14,10 +14,9 @@ from thermal_fiducial.core.detection.corners.sides import blurs, half_width, mod
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# Passes follow one another until the last step was short enough; for outlines that are no squares a shorter one, as
-# these may become ones.
+# Passes follow one another until the last step was short enough.
 _PASSES = 4
-_SETTLED_PX, _STILL_PX = 0.3, 0.1
+_SETTLED_PX = 0.3
 # Standard deviation of what is known of the corners beforehand [px].
 _PRIOR_PX = 3.0
 
@@ -84,7 +83,7 @@ def refine_corners(
     found, step = _pass(image, corners, camera, behind, blur_px, lag_blur, columns, to_tails)
     which = np.arange(len(step))
     for _ in range(_PASSES - 1):
-        which = which[step > np.where(found.doubt[which] > 0.0, _STILL_PX, _SETTLED_PX)]
+        which = which[step > _SETTLED_PX]
         if len(which) == 0:
             break
         tails = None if to_tails is None else to_tails[which]
