@@ -114,6 +114,33 @@ def test_a_file_that_does_not_fit_stays_as_it_was(tmp_path):
     assert (path.read_bytes(), list(tmp_path.iterdir())) == (before, [path])
 
 
+MAKE = ['markers', 'make', '--ids', '1', '--formats']
+
+
+# As with bags, of reportlab.
+@pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
+@pytest.mark.parametrize(
+    ('command', 'name'),
+    [
+        (['map', 'show', 'hall.yaml', '--plot'], 'map.png'),
+        *(
+            (['markers', 'make', '--ids', '1', '--formats', kind, '--out'], '.')
+            for kind in ('svg', 'dxf', 'pdf', 'png')
+        ),
+    ],
+)
+def test_a_drawing_that_does_not_fit_leaves_no_half(tmp_path, capsys, monkeypatch, command, name):
+    monkeypatch.chdir(tmp_path)
+    save_map(tmp_path / 'hall.yaml', small_bag.map_of((0, 1)))
+    with full_after(500):
+        assert main([*command, str(tmp_path / name)]) == 2
+    assert 'File too large' in one_line(capsys)
+    assert list(tmp_path.iterdir()) == [tmp_path / 'hall.yaml']
+    gc.collect()
+    assert main([*command, str(tmp_path / name)]) == 0
+    assert len(list(tmp_path.iterdir())) == 2
+
+
 @pytest.mark.ros
 def test_a_run_that_does_not_fit_leaves_parameters_and_map_and_can_be_flown_again(tmp_path):
     small_bag.recording(seconds=1.2).write(tmp_path / 'bag')

@@ -13,6 +13,7 @@ from thermal_fiducial.core.geometry.reprojection import corners_in_map
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.writing import new_file
 
 # Axes that point right and up, as seen from above and along y.
 _VIEWS = (('from above', 0, 1), ('from the side, along y', 0, 2))
@@ -32,10 +33,11 @@ def plot_map(marker_map: MarkerMap, path: Path, cloud: FloatArray | None = None)
         The file can't be written.
     """
     figure = draw_map(marker_map, cloud)
-    try:
-        figure.savefig(path, dpi=120)
-    except (OSError, ValueError) as error:
-        raise InputError(f'{path}: cannot write the plot: {error}') from error
+    with new_file(path) as new:
+        try:
+            figure.savefig(new, dpi=120)
+        except ValueError as error:
+            raise InputError(f'{path}: cannot write the plot: {error}') from error
 
 
 def draw_map(marker_map: MarkerMap, cloud: FloatArray | None = None) -> Figure:

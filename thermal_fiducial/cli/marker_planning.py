@@ -23,6 +23,7 @@ from thermal_fiducial.fabrication.planning import (
     save_measurements,
 )
 from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.writing import new_file
 
 # Pitch of a Tau 2's pixels [mm].
 _PITCH_MM = 0.017
@@ -167,10 +168,11 @@ def _draw(
     found.fill_between(distances, [100.0 * view.found for view in views], alpha=0.15)
     found.set(ylabel='found [%]', ylim=(0, 100))
     pose.legend(fontsize='small')
-    try:
-        figure.savefig(args.plot, dpi=130)
-    except (OSError, ValueError) as error:
-        raise InputError(f'{args.plot}: {error}') from None
+    with new_file(args.plot) as new:
+        try:
+            figure.savefig(new, dpi=130)
+        except ValueError as error:
+            raise InputError(f'{args.plot}: {error}') from None
 
 
 def add_measure(parser: argparse.ArgumentParser) -> None:

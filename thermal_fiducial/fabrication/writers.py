@@ -13,6 +13,7 @@ import numpy as np
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.drawing import Circle, Contour, Drawing
 from thermal_fiducial.fabrication.paper import write_pdf
+from thermal_fiducial.files.writing import new_file
 
 #: Layer to its colour: AutoCAD index and SVG.
 LAYERS = {
@@ -44,13 +45,14 @@ def write(drawing: Drawing, path: str | os.PathLike[str], paper: str | None = No
         raise InputError(f'{path}: drawings are written as {", ".join(FORMATS)}')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        if kind == 'pdf':
-            write_pdf(drawing, path, {layer: colour for layer, (_, colour) in LAYERS.items()}, paper)
-        else:
-            {'svg': write_svg, 'dxf': write_dxf, 'png': write_png}[kind](drawing, path)
     except OSError as error:
         place = path.parent if path.parent.is_file() else path
         raise InputError(f'{place}: {error.strerror or error}') from None
+    with new_file(path) as new:
+        if kind == 'pdf':
+            write_pdf(drawing, new, {layer: colour for layer, (_, colour) in LAYERS.items()}, paper)
+        else:
+            {'svg': write_svg, 'dxf': write_dxf, 'png': write_png}[kind](drawing, new)
 
 
 def write_svg(drawing: Drawing, path: Path) -> None:

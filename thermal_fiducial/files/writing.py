@@ -1,7 +1,7 @@
 """Writing of files: whole or not at all, and one line of what cannot be written."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import os
 from pathlib import Path
 
@@ -19,6 +19,27 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """
     with into(path):
         write_atomically(Path(path), text)
+
+
+@contextmanager
+def new_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A file beside ``path`` for a library to write, which takes the place of ``path`` when it is whole.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    place = Path(path)
+    new = place.with_name(f'.{place.stem}.{os.getpid()}{place.suffix}')
+    try:
+        with into(path):
+            yield new
+            new.replace(place)
+    finally:
+        # Where nothing can be written nothing can be removed either.
+        with suppress(OSError):
+            new.unlink()
 
 
 @contextmanager

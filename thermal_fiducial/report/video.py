@@ -69,11 +69,16 @@ def write_video(
         first = next(frames, None)
         if first is None:
             raise InputError(f'{found[0]}: no video: the bag has no usable frame')
-        with (_ffmpeg if encoder == 'ffmpeg' else _pyav)(path, first, rate) as take:
-            take(first)
-            for index, frame in enumerate(frames, 2):
-                take(frame)
-                progress(min(1.0, index / count))
+        try:
+            with (_ffmpeg if encoder == 'ffmpeg' else _pyav)(path, first, rate) as take:
+                take(first)
+                for index, frame in enumerate(frames, 2):
+                    take(frame)
+                    progress(min(1.0, index / count))
+        except BaseException:
+            # Half a video plays no longer than to its middle.
+            path.unlink(missing_ok=True)
+            raise
 
 
 def _rate(reader: BagReader, count: int) -> float:
