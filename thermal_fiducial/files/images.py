@@ -60,7 +60,7 @@ def _decompressed(message: Any) -> Counts | Gray:
     if not data[:4].tobytes().startswith(_LOSSLESS):
         raise InputError(f'compressed image of format {message.format!r}: only PNG keeps the counts')
     try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        pixels = None if _is_cut_png(data) else cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:
         pixels = None
     if pixels is None:
@@ -70,6 +70,22 @@ def _decompressed(message: Any) -> Counts | Gray:
     if pixels.dtype == np.uint8:
         return np.asarray(pixels, dtype=np.uint8)
     return np.asarray(pixels, dtype=np.uint16)
+
+
+def _is_cut_png(data: npt.NDArray[np.uint8]) -> bool:
+    """Whether a PNG promises more than there is, for which its decoder would take gigabytes and a second.
+
+    Chunks follow each other from byte 8 on: length, name, content, check sum (PNG specification, 5.3).
+    """
+    if data[:4].tobytes() != _LOSSLESS[0]:
+        return False
+    begin = 8
+    while begin + 8 <= data.size:
+        length, name = struct.unpack('>I4s', data[begin : begin + 8].tobytes())
+        begin += 12 + length
+        if name == b'IEND':
+            break
+    return begin > data.size
 
 
 def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
@@ -83,7 +99,7 @@ def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
     data = np.frombuffer(read_bytes(path, _LARGEST_FILE_BYTES), np.uint8)
     try:
         with without_libraries_lines():
-            pixels = cv2.imdecode(data, flags) if data.size else None
+            pixels = cv2.imdecode(data, flags) if data.size and not _is_cut_png(data) else None
     except cv2.error as error:
         reason = 'it is too large' if 'PIXELS' in str(error) or 'WIDTH' in str(error) else 'it is broken'
         raise InputError(f'{path}: not a readable picture: {reason}') from None
