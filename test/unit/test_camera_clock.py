@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.flights import config, errors, Flight, START_NS
+from support.flights import config, errors, Flight, START_NS, timeline, white_poses
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.measurements import ImuSample
@@ -121,3 +121,23 @@ def test_one_stamp_of_the_imu_half_a_second_ahead_costs_one_sample():
     # as good as without it: one marker at 2 m
     assert off.max() < 0.05
     assert ekf.resets == 0
+
+
+@pytest.mark.parametrize('seed', [3, 5])
+def test_a_gyroscope_that_was_dead_teaches_no_offset(seed):
+    """What begins at the end of the fault has turned in its past and not in its future: as if the clock were off."""
+    exact = {'rotation_std': (5e-4,) * 3, 'translation_std': (3e-4, 3e-4, 1e-3)}
+    flight, rng = Flight(seed=seed, seconds=8.0, **exact), np.random.default_rng(seed)
+    dead = slice(1000, 1200)
+    samples = flight.samples()
+    samples[dead] = [replace(s, angular_velocity=1e-6 * rng.normal(size=3)) for s in samples[dead]]
+    ekf, deviations = PoseEkf(white_poses()), []
+    for item in timeline(samples, flight.poses, LATE):
+        if not isinstance(item, ImuSample):
+            ekf.add_pose(item)
+        elif ekf.add_imu(item) and not ekf.lost and item.stamp_ns > samples[dead.stop].stamp_ns:
+            numbers = ekf.diagnostics()
+            deviations.append(abs(numbers['time offset'] / numbers['time offset std']))
+    assert len(deviations) > 100
+    # 27 and 15 sigma when each new estimate began with an unknown offset
+    assert max(deviations) < 3.0

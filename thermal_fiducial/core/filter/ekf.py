@@ -10,7 +10,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.camera_clock import CameraClock
 from thermal_fiducial.core.filter.coasting import usable_seconds
 from thermal_fiducial.core.filter.history import History
-from thermal_fiducial.core.filter.hypotheses import Hypotheses, NO_GRAVITY
+from thermal_fiducial.core.filter.hypotheses import Hypotheses, KNOWN_OFFSET_STD, NO_GRAVITY
 from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
 from thermal_fiducial.core.filter.initialization import FEWEST_SAMPLES, WINDOW_SECONDS
@@ -25,8 +25,6 @@ from thermal_fiducial.errors import InputError
 
 #: Why the filter begins anew, or a pose has to wait.
 CLOCK_JUMPED = "the IMU's clock has jumped"
-#: An offset known to this [s] moves a marker by a pixel or two in the fastest flights.
-_KNOWN_OFFSET_STD = 0.003
 
 
 class PoseEkf:
@@ -209,7 +207,7 @@ class PoseEkf:
     def camera_time_offset(self) -> float | None:
         """Estimate of t_imu - t_camera [s]; None while it is not known well enough to rely on."""
         main = self._history.main
-        if main is None or self._time_offset_std(main) > _KNOWN_OFFSET_STD:
+        if main is None or self._time_offset_std(main) > KNOWN_OFFSET_STD:
             return None
         return self._clock_offset(main)
 

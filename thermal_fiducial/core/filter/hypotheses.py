@@ -26,6 +26,9 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: why a pose was refused that no attitude of a robot under gravity explains
 NO_GRAVITY = 'refused: contradicts gravity'
+#: What a clock offset that was estimated may be wrong by when something else went wrong [s]; it moves a marker by a
+#: pixel or two in the fastest flights.
+KNOWN_OFFSET_STD = 0.003
 #: The motion since the origin is folded into the covariance after so long [ns], as the biases walk meanwhile.
 _FOLDED_NS = 100_000_000
 #: A pose that is off even for an estimate that claims so many times too little, and by more than a few of these
@@ -110,7 +113,7 @@ class Hypotheses:
 
         ``window`` (N, 6): the latest samples up to the instant.
         """
-        return self._begun(pose, time_ns, window, blank_state(self._config))
+        return self._begun(pose, time_ns, window, blank_state(self._config), self._config.time_offset_std)
 
     def alternative_to(
         self, main: Hypothesis, pose: CameraPose, time_ns: int, motion: MotionAtPose, window: FloatArray
@@ -121,7 +124,7 @@ class Hypotheses:
         """
         estimate = self.estimate(main)
         measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
-        begun = self._begun(pose, time_ns, window, estimate.state)
+        begun = self._begun(pose, time_ns, window, estimate.state, self._clock_std(main, pose, motion))
         if begun is None:
             return None
         widened = _far_covariance(estimate.covariance)
@@ -129,8 +132,17 @@ class Hypotheses:
         needed = 0 if far.nis <= self._config.gate else min(main.hits, _ENOUGH_POSES)
         return begun._replace(needed=needed)
 
-    def _begun(self, pose: CameraPose, time_ns: int, window: FloatArray, prior: NavigationState) -> Hypothesis | None:
-        config = self._config
+    def _clock_std(self, main: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> float:
+        """What is known of the clock offset [s] where a pose contradicts ``main``: less, if it may have caused that."""
+        unknown = self._config.time_offset_std
+        if self.explains(main, pose, motion):
+            return unknown
+        return min(unknown, math.hypot(main.prediction.origin.std(TIME_OFFSET), KNOWN_OFFSET_STD))
+
+    def _begun(
+        self, pose: CameraPose, time_ns: int, window: FloatArray, prior: NavigationState, clock_std: float
+    ) -> Hypothesis | None:
+        config = replace(self._config, time_offset_std=clock_std)
         measured = body_pose(pose, prior.T_body_camera, config.pose_noise_scale)
         estimate = start(config, self._updater, measured, time_ns, prior, window)
         if estimate is None:
