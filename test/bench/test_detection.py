@@ -89,12 +89,17 @@ def one_thread():
 
 
 @cache
+def stretch(case, begin, end):
+    """Frames in a row, rendered once."""
+    return list(
+        render_frames(case.scene, SECONDS, SEED, quality=Quality(stepwise=case.stepwise), start=begin, stop=end)
+    )
+
+
 def stretches(case, most=10_000):
     """Lists of frames, of at most so many each; a list is made when it is asked for."""
-    quality = Quality(stepwise=case.stepwise)
     for begin, end in STRETCHES:
-        stop = min(end, begin + most)
-        yield list(render_frames(case.scene, SECONDS, SEED, quality=quality, start=begin, stop=stop))
+        yield stretch(case, begin, min(end, begin + most))
 
 
 def our_detector(case, guided):
