@@ -202,6 +202,6 @@ def _beside(grid: dict[Node, int], reach: int) -> list[Node]:
 
 
 def _supported(node: Node) -> list[Node]:
-    """Places that the point at a ``node`` shows the way to."""
+    """Places that the point at a ``node`` leads to."""
     a, b = node
     return [(a + i, b + j) for i, j in _STEPS]

@@ -6,6 +6,7 @@ import os
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.filter.hypotheses import KNOWN_OFFSET_STD
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.restart import LastPose, RestartHint
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
@@ -13,9 +14,6 @@ from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.files.last_pose import recent_pose, save_last_pose
 from thermal_fiducial.files.robot_folder import robot_folder
 from thermal_fiducial.ros.node import StageNode
-
-#: What a clock offset of before may be wrong by [s]: the filter had it to 3 ms or better.
-_OFFSET_STD = 0.003
 
 
 class FilterMemory:
@@ -44,7 +42,7 @@ class FilterMemory:
         place = ' '.join(f'{value:.2f}' for value in last.T_map_body[:3, 3])
         line = f'started again in flight: the last pose before, at {place} m, is a hint to the first poses'
         if (offset := last.camera_time_offset) is not None and config.estimate_time_offset:
-            std = min(config.time_offset_std, _OFFSET_STD)
+            std = min(config.time_offset_std, KNOWN_OFFSET_STD)
             self._node.derive(camera_time_offset=offset, time_offset_std=std)
             line += f'; the clock offset of {1e3 * offset:.1f} ms is kept'
         self._node.get_logger().warning(line)

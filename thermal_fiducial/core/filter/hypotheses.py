@@ -9,6 +9,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import blank_state, start
 from thermal_fiducial.core.filter.innovations import PoseUpdate
+from thermal_fiducial.core.filter.pose_noise import BodyPose
 from thermal_fiducial.core.filter.prediction import Prediction
 from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.filter.state import (
@@ -68,7 +69,7 @@ class Hypotheses:
     def weigh(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> tuple[Hypothesis, PoseUpdate]:
         """A hypothesis after a pose at its instant, and the verdict on the pose."""
         estimate = self.estimate(hypothesis)
-        measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
+        measured = self._measured(pose, estimate.state)
         innovation = self._updater.innovation(estimate, measured, motion)
         if innovation.nis <= self._config.gate and not self._is_stale(hypothesis):
             corrected = self._updater.correct(measured, innovation, motion)
@@ -82,7 +83,7 @@ class Hypotheses:
     def contradiction(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> str:
         """What of the IMU a pose contradicts that a hypothesis at its instant refuses, in words."""
         estimate = self.estimate(hypothesis)
-        measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
+        measured = self._measured(pose, estimate.state)
         innovation = self._updater.innovation(estimate, measured, motion)
         turn, shift = innovation.value[:3], innovation.value[3:]
         seconds = (hypothesis.prediction.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
@@ -95,9 +96,12 @@ class Hypotheses:
     def explains(self, hypothesis: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> bool:
         """Whether a pose at a hypothesis's instant is right by it, but for a clock offset that is not known."""
         estimate = self.estimate(hypothesis)
-        measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
+        measured = self._measured(pose, estimate.state)
         unclocked = self._updater.with_unknown_clock(estimate)
         return self._updater.innovation(unclocked, measured, motion).nis <= self._config.gate
+
+    def _measured(self, pose: CameraPose, state: NavigationState) -> BodyPose:
+        return body_pose(pose, state.T_body_camera, self._config.pose_noise_scale)
 
     def settled(self, belief: Belief) -> Belief:
         """The belief after its hypotheses were weighed against each other."""
@@ -123,7 +127,7 @@ class Hypotheses:
         The pose is taken as it is, and what was known of the sensors stays.
         """
         estimate = self.estimate(main)
-        measured = body_pose(pose, estimate.state.T_body_camera, self._config.pose_noise_scale)
+        measured = self._measured(pose, estimate.state)
         begun = self._begun(pose, time_ns, window, estimate.state, self._clock_std(main, pose, motion))
         if begun is None:
             return None
@@ -143,7 +147,7 @@ class Hypotheses:
         self, pose: CameraPose, time_ns: int, window: FloatArray, prior: NavigationState, clock_std: float
     ) -> Hypothesis | None:
         config = replace(self._config, time_offset_std=clock_std)
-        measured = body_pose(pose, prior.T_body_camera, config.pose_noise_scale)
+        measured = self._measured(pose, prior)
         estimate = start(config, self._updater, measured, time_ns, prior, window)
         if estimate is None:
             return None

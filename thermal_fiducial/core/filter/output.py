@@ -75,7 +75,7 @@ def in_frame(odometry: Odometry, T_body_frame: FloatArray) -> Odometry:
 
 
 class SmoothOutput:
-    """A pose without steps for controllers that hate them: late by design, and never the honest output.
+    """A pose without steps for controllers that hate them: late by design, and never the consistent output.
 
     It follows the filter's odometry, moves with its twist, and takes up its corrections with a time constant.
     """
