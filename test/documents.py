@@ -72,7 +72,7 @@ def interfaces(name: str) -> dict[tuple[str, str], str]:
     found: dict[tuple[str, str], str] = {}
     for values in SWITCHES.get(name, ({},)):
         with running(node_class(name), values) as node:
-            inputs = [('in', item.topic_name, item.msg_type) for item in node.subscriptions]
+            inputs = [('in', item.topic_name, item.msg_type) for item in (*node.subscriptions, *node.lazy)]
             outputs = [('out', item.topic_name, item.msg_type) for item in node.publishers]
             services = [('service', item.srv_name, item.srv_type) for item in node.services]
             for direction, topic, message in inputs + outputs + services:

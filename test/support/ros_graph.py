@@ -81,6 +81,8 @@ class Graph:
         deadline = time.monotonic() + seconds
         while not condition():
             self.executor.spin_once(timeout_sec=0.05)
+            for node in self.nodes:
+                node.take_waiting()
             assert time.monotonic() < deadline, 'waited in vain'
 
     def call(self, kind, name, request):

@@ -166,6 +166,8 @@ class _Graph:
         wait = Wait(lambda: f'messages on {", ".join(missing())}', self._warn)
         while missing():
             self._executor.spin_once(timeout_sec=0.1)
+            for stage in self._stages:
+                stage.take_waiting()
             wait.go_on(sum([source.count for source in self._inputs]))
 
     def close(self) -> None:

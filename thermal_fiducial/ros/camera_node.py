@@ -33,10 +33,10 @@ class CameraStageNode(StageNode[Config]):
 
     def follow_hints(self) -> None:
         """Subscribe to calibration and odometry; after the node's main input."""
-        self.subscribe(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT, raw=True)
-        self.subscribe(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT, raw=True)
+        self.subscribe_lazily(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
+        self.subscribe_lazily(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT)
         RobotFrames(self, lambda: self.configure(self.config))
-        self.subscribe(TimeReference, 'camera_clock', self._on_camera_clock, qos.RESULT)
+        self.subscribe_lazily(TimeReference, 'camera_clock', self._on_camera_clock, qos.RESULT)
 
     def camera(self) -> Camera:
         """The calibration.
@@ -82,14 +82,14 @@ class CameraStageNode(StageNode[Config]):
             self.refuse(str(error))
             return []
 
-    def _on_camera_clock(self, message: TimeReference) -> None:
-        self.odometry.set_clock_offset(convert.clock_offset(message))
+    def _on_camera_clock(self, message: bytes) -> None:
+        self.odometry.set_clock_offset(convert.clock_offset(_read(message, TimeReference, 'camera_clock')))
 
     def _on_camera_info(self, message: bytes) -> None:
         """Most drivers send the same calibration with each frame: only another one is read, and checked."""
         if message[message_bytes.BEHIND_STAMP :] == self._camera_info:
             return
-        camera = convert.camera(_read(message))
+        camera = convert.camera(_read(message, CameraInfo, 'camera_info'))
         self._camera_info = message[message_bytes.BEHIND_STAMP :]
         if self._camera is not None and camera.matches(self._camera):
             return
@@ -99,8 +99,8 @@ class CameraStageNode(StageNode[Config]):
             self.get_logger().warning('camera_info has changed: the new calibration is used from here on')
 
 
-def _read(message: bytes) -> CameraInfo:
+def _read(message: bytes, kind: type, what: str) -> Any:
     try:
-        return deserialize_message(message, CameraInfo)
+        return deserialize_message(message, kind)
     except RuntimeError as error:
-        raise InputError(f'camera_info cannot be read: {error}') from None
+        raise InputError(f'{what} cannot be read: {error}') from None

@@ -3,7 +3,7 @@
 From the counts a lock-step replay knows when everything that was published has been received.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from rclpy.node import Node
@@ -51,6 +51,17 @@ class Input:
         """Remember the subscription that counts here."""
         self._subscription = subscription
 
+    def waiting(self, at_most: int) -> Iterator[Any]:
+        """Take and count messages until none is waiting, or ``at_most`` of them."""
+        subscription = self._subscription
+        for _ in range(at_most):
+            with subscription.handle:
+                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                return
+            self.count += 1
+            yield taken[0]
+
     @property
     def publishers(self) -> int:
         """Number of matched publishers."""
@@ -61,6 +72,8 @@ class CountingNode(Node):
     """A node that knows how much came in and went out on each of its topics."""
 
     def __init__(self, name: str, **kwargs: Any) -> None:
+        #: subscriptions whose messages wait until they are wanted
+        self.lazy: dict[Any, Input] = {}
         super().__init__(name, **kwargs)
         self.inputs: list[Input] = []
         self.outputs: list[Output] = []
@@ -85,34 +98,49 @@ class CountingNode(Node):
         self.inputs.append(source)
         return source
 
-    def subscribe_newest(self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile) -> Input:
+    def subscribe_newest(
+        self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile, *, raw: bool = False
+    ) -> Input:
         """Call ``callback`` with the newest message that has come; what is older by then is left and counted.
 
-        The executor takes a task after the messages that were waiting before it, so the task finds the last of them.
-        Executors that take turns otherwise go through all that ``profile`` keeps.
+        What waits on other topics (:meth:`subscribe_lazily`) is taken first.
         """
-        waiting: list[Any] = []
-
-        def work() -> None:
-            source.count += 1
-            self.guard(callback, waiting.pop())
+        source = Input(self.resolve_topic_name(topic))
 
         def receive(message: Any) -> None:
-            if waiting:
-                source.count += 1
+            self.take_waiting()
+            for newer in source.waiting(profile.depth):
+                message = newer
                 source.left += 1
-                waiting[:] = [message]
-                return
-            waiting.append(message)
-            if self.executor is None:
-                work()
-            else:
-                self.executor.create_task(work)
+            source.count += 1
+            self.guard(callback, message)
 
-        source = Input(self.resolve_topic_name(topic))
-        source.attach(self.create_subscription(kind, topic, receive, profile))
+        source.attach(self.create_subscription(kind, topic, receive, profile, raw=raw))
         self.inputs.append(source)
         return source
+
+    def subscribe_lazily(self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile) -> Input:
+        """Have messages wait, as many as ``profile`` keeps, for :meth:`take_waiting`: their bytes go to ``callback``.
+
+        Nobody is woken for a message that is wanted with the next frame only.
+        """
+        source = Input(self.resolve_topic_name(topic))
+        subscription = self.create_subscription(kind, topic, callback, profile, raw=True)
+        source.attach(subscription)
+        self.inputs.append(source)
+        self.lazy[subscription] = source
+        return source
+
+    @property
+    def subscriptions(self) -> Iterator[Any]:
+        """Those whose messages the executor takes."""
+        return (subscription for subscription in super().subscriptions if subscription not in self.lazy)
+
+    def take_waiting(self) -> None:
+        """Take the messages that wait until they are wanted, in the order of their topics' subscription."""
+        for subscription, source in self.lazy.items():
+            for message in source.waiting(subscription.qos_profile.depth):
+                self.guard(subscription.callback, message)
 
     def guard(self, callback: Callable[[Any], None], message: Any) -> None:
         """Call ``callback``; what a node makes of unusable input is its own matter."""

@@ -169,6 +169,7 @@ class StageNode(CountingNode, Generic[Config]):
 
     def diagnose(self, stamp_ns: int) -> None:
         """Publish the diagnostics of the time since the last call, and what a pilot must know of it."""
+        self.take_waiting()
         self._rates.look(time.monotonic_ns() if self.live else stamp_ns)
         level, reason = self._level()
         self.console.say(self._rates.trouble() or self.headline(), calm=level == OK)
