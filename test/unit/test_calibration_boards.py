@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from support.heated_boards import Heat, picture
 
+from thermal_fiducial.calibration import targets
 from thermal_fiducial.calibration.appearance import Disc
 from thermal_fiducial.calibration.placement import BoardNodes, GridRefusal
 from thermal_fiducial.calibration.targets import BoardNotFound, Chessboard, CircleGrid
@@ -196,6 +197,30 @@ def test_points_are_looked_at_few_times(monkeypatch):
     assert np.sqrt(np.mean(errors(sighting, points, truth) ** 2)) < 0.03
     # 3.8 were measured: a sample alone, then twice all, each from next to where it ends.
     assert sum(looks) < 5 * len(points)
+
+
+def test_what_continues_the_grid_moves_no_point_of_the_board():
+    """Found among finer keypoints, the grid goes on over nine points of clutter: they moved 21 dots by up to 0.1 px."""
+    target = CircleGrid(16, 10, 1.0, 0.8, longer=1)
+    heat, size = Heat(contrast=5.0), {'radius': 0.4, 'width': 384, 'height': 288, 'fill': 0.8}
+    views = [picture(target.points[:, :2], heat, np.random.default_rng(seed), **size)[0] for seed in (115, 100)]
+    alone = target.find(views[0], GUESS)
+    target.find(views[1], GUESS)
+    after_another = target.find(views[0], GUESS)
+    # A rough start elsewhere: measured 0.003 px.
+    assert np.array_equal(after_another.points, alone.points)
+    assert np.abs(after_another.pixels - alone.pixels).max() < 0.01
+
+
+def test_a_board_is_looked_for_first_as_it_was_found_before(monkeypatch):
+    target, looks = CircleGrid(7, 5, 1.0, 0.54, asymmetric=False), []
+    blobs = targets.blobs
+    monkeypatch.setattr(targets, 'blobs', lambda image, first: (looks.append(k.look) or k for k in blobs(image, first)))
+    for seed in (3, 5):
+        counts, _ = picture(target.points[:, :2], Heat(), np.random.default_rng(seed), radius=0.27, fill=SMALL)
+        assert len(target.find(counts, GUESS).points) == 35
+    assert len(looks) > 2
+    assert looks[-1] == looks[-2]
 
 
 def test_the_grid_of_another_scale_shows_that_the_board_goes_on():

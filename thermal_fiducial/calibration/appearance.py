@@ -1,5 +1,6 @@
 """What boards look like around their points, in steps of their grid."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol, Self
 
@@ -52,12 +53,17 @@ class Appearance(Protocol):
     ) -> tuple[FloatArray, FloatArray]:
         """Pattern (P, N) at places (P, N, 2) relative to the points, and its derivatives (free, P, N).
 
+        Where the place alone is free, without what is :meth:`beside` the point.
+
         Parameters
         ----------
         blur : (P, 2) along the axes [steps]
         width : (P,)
         free : derivatives are by the place (2), the logarithm of the blur and the width: the first so many of them
         """
+
+    def beside(self, places: FloatArray, blur: FloatArray, width: FloatArray) -> FloatArray:
+        """What neighbours of the points add to :meth:`shape` (P, N) when they stay where the grid has them."""
 
 
 @dataclass(frozen=True)
@@ -109,6 +115,10 @@ class SquaresMeet:
         if free > 3:
             slopes[3] *= (sign * (np.abs(width) < _MOST_INSET))[:, None]
         return values, np.stack(slopes)
+
+    def beside(self, places: FloatArray, blur: FloatArray, width: FloatArray) -> FloatArray:
+        """See :class:`Appearance`; the squares around are part of the shape."""
+        return np.zeros(places.shape[:2])
 
 
 def _bands(places: FloatArray, inset: FloatArray, blur: FloatArray, free: int) -> FloatArray:
@@ -181,6 +191,20 @@ class Disc:
     ) -> tuple[FloatArray, FloatArray]:
         """See :class:`Appearance`."""
         values, slopes = _disc(places, blur[:, None], width[:, None], free)
+        if free > 2:
+            self._add_neighbours((values, *slopes), places, blur, width)
+        return values, slopes
+
+    def beside(self, places: FloatArray, blur: FloatArray, width: FloatArray) -> FloatArray:
+        """See :class:`Appearance`."""
+        values = np.zeros(places.shape[:2])
+        self._add_neighbours((values,), places, blur, width)
+        return values
+
+    def _add_neighbours(
+        self, totals: Sequence[FloatArray], places: FloatArray, blur: FloatArray, width: FloatArray
+    ) -> None:
+        """Add what the neighbours show to the values, and to as many derivatives as there are."""
         visible = width + _NOTHING_LEFT * blur.max(axis=1)
         # Neighbours are a step away or more: pixels near the middle see nothing of them.
         from_middle = np.hypot(places[..., 0], places[..., 1])
@@ -188,10 +212,9 @@ class Disc:
         away = places[point, pixel][:, None] - self.others[point]
         row, neighbour = np.nonzero(np.hypot(away[..., 0], away[..., 1]) < visible[point][:, None])
         point, pixel = point[row], pixel[row]
-        more, more_slopes = _disc(away[row, neighbour], blur[point], width[point], free)
-        for total, part in zip((values, *slopes), (more, *more_slopes), strict=True):
+        more, more_slopes = _disc(away[row, neighbour], blur[point], width[point], len(totals) - 1)
+        for total, part in zip(totals, (more, *more_slopes), strict=True):
             total += np.bincount(point * total.shape[1] + pixel, part, total.size).reshape(total.shape)
-        return values, slopes
 
 
 def _disc(places: FloatArray, blur: FloatArray, width: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
@@ -212,8 +235,9 @@ def _disc(places: FloatArray, blur: FloatArray, width: FloatArray, free: int) ->
     density = _density(inside)
     by_blur, by_radius = outwards / steps * density, width * steps / radius**3 * density
     slopes = np.empty((free, *x.shape))
-    slopes[0] = x_blur * by_blur - x * by_radius
-    slopes[1] = y_blur * by_blur - y * by_radius
+    if free > 0:
+        slopes[0] = x_blur * by_blur - x * by_radius
+        slopes[1] = y_blur * by_blur - y * by_radius
     if free > 2:
         slopes[2] = -inside * density
     return np.asarray(ndtr(inside)), slopes

@@ -6,7 +6,7 @@ board may be warm on cold or cold on warm.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -43,16 +43,18 @@ class Keypoints:
     hessians : (N, 3) unit vectors of Iuu, Ivv, sqrt(2) Iuv: which way a saddle lies
     response : (N,) determinant of the Hessian, free of scale
     alternate : whether neighbours on a board have opposite Hessians (corners of a chessboard) or like ones (discs)
+    look : number of the blur, and for blobs of the sign, with which they were looked for
     """
 
     pixels: FloatArray
     hessians: FloatArray
     response: FloatArray
     alternate: bool
+    look: int = 0
 
     def rows(self, index: IntArray) -> 'Keypoints':
         """Some of them."""
-        return Keypoints(self.pixels[index], self.hessians[index], self.response[index], self.alternate)
+        return Keypoints(self.pixels[index], self.hessians[index], self.response[index], self.alternate, self.look)
 
 
 def without_speckles(counts: Counts | Gray) -> Float32Array:
@@ -63,17 +65,23 @@ def without_speckles(counts: Counts | Gray) -> Float32Array:
     return np.where(np.abs(image - median) > _SPECKLE * (high - low) + 1.0, median, image)
 
 
-def saddles(image: Float32Array) -> Iterator[Keypoints]:
-    """Saddle points of ``image``, one scale after the other."""
-    for scale in _SCALES:
-        yield _extrema(image, scale, None)
+def saddles(image: Float32Array, first: int = 0) -> Iterator[Keypoints]:
+    """Saddle points of ``image``, one scale after the other; look number ``first`` before the others."""
+    for look in _beginning_with(first, len(_SCALES)):
+        yield replace(_extrema(image, _SCALES[look], None), look=look)
 
 
-def blobs(image: Float32Array) -> Iterator[Keypoints]:
-    """Bright or dark blobs of ``image``, scale by scale; perspective makes discs of a board differ in size."""
-    for scale in _SCALES:
-        for sign in (1.0, -1.0):
-            yield _strongest([_extrema(image, size, sign) for size in (scale, _FINER * scale)], scale)
+def blobs(image: Float32Array, first: int = 0) -> Iterator[Keypoints]:
+    """Bright or dark blobs of ``image``, as :func:`saddles`; perspective makes discs of a board differ in size."""
+    for look in _beginning_with(first, 2 * len(_SCALES)):
+        scale, sign = _SCALES[look // 2], -1.0 if look % 2 else 1.0
+        found = _strongest([_extrema(image, size, sign) for size in (scale, _FINER * scale)], scale)
+        yield replace(found, look=look)
+
+
+def _beginning_with(first: int, count: int) -> list[int]:
+    """Numbers below ``count`` in their order, but for ``first``."""
+    return sorted(range(count), key=lambda number: number != first)
 
 
 def _strongest(found: list[Keypoints], apart: float) -> Keypoints:

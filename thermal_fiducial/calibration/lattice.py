@@ -44,6 +44,7 @@ class BoardPoints:
     pixels : (N, 2) where they are, to a pixel or a tenth of their spacing
     beyond_nodes, beyond_pixels : (B, 2) points that continue the grid where the board has none
     larger_nodes, larger_pixels : (L, 2) a grid that has more of the board's points than these, and goes on beyond it
+    look : of the keypoints
     """
 
     points: IntArray
@@ -52,6 +53,7 @@ class BoardPoints:
     beyond_pixels: FloatArray
     larger_nodes: IntArray = field(default_factory=lambda: np.zeros((0, 2), np.int64))
     larger_pixels: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    look: int = 0
 
 
 def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | GridRefusal:
@@ -59,22 +61,22 @@ def find_board(views: Iterable[Keypoints], board: BoardNodes) -> BoardPoints | G
     best: BoardPoints | None = None
     refusal, weightiest = GridRefusal('no regular grid of points'), 0.0
     larger, larger_pixels, covered = np.zeros((0, 2), np.int64), np.zeros((0, 2)), 0
-    for keypoints in views:
-        for grid in Grower(keypoints).grids():
-            nodes = np.array(list(grid), dtype=np.int64)
-            pixels = keypoints.pixels[list(grid.values())]
-            placed = board.place(_facing(nodes, pixels))
-            if isinstance(placed, GridRefusal):
-                # Among many points that belong to no board a large grid may be chance: its share of them counts too.
-                weight = len(grid) ** 2 / len(keypoints.pixels)
-                if weight > weightiest:
-                    refusal, weightiest = placed, weight
-                if placed.covered > covered:
-                    larger, larger_pixels, covered = nodes, pixels, placed.covered
-            elif best is None or len(placed.points) > len(best.points):
-                best = BoardPoints(placed.points, pixels[placed.rows], placed.beyond_nodes, pixels[placed.beyond])
-        if best is not None and len(best.points) == len(board.nodes):
-            break
+    for keypoints, grid in ((points, grid) for points in views for grid in Grower(points).grids()):
+        nodes = np.array(list(grid), dtype=np.int64)
+        pixels = keypoints.pixels[list(grid.values())]
+        placed = board.place(_facing(nodes, pixels))
+        if isinstance(placed, GridRefusal):
+            # Among many points that belong to no board a large grid may be chance: its share of them counts too.
+            weight = len(grid) ** 2 / len(keypoints.pixels)
+            if weight > weightiest:
+                refusal, weightiest = placed, weight
+            if placed.covered > covered:
+                larger, larger_pixels, covered = nodes, pixels, placed.covered
+        elif best is None or len(placed.points) > len(best.points):
+            beyond = placed.beyond_nodes, pixels[placed.beyond]
+            best = BoardPoints(placed.points, pixels[placed.rows], *beyond, look=keypoints.look)
+            if len(best.points) == len(board.nodes):
+                break
     if best is not None and covered > len(best.points):
         return replace(best, larger_nodes=larger, larger_pixels=larger_pixels)
     return best or refusal
@@ -160,28 +162,32 @@ class Grower:
         asked.update((node, support[node]) for node in places)
         nodes, pixels = np.array(list(grid), dtype=np.float64), self._pixels[list(grid.values())]
         surfaces = local_surfaces(nodes, pixels, np.array(places, dtype=np.float64))
-        before = len(grid)
-        for row in np.flatnonzero(surfaces.determined).tolist():
-            found = self._next(grid, places[row], surfaces.centres[row], surfaces.steps[row])
+        steps, used, before = surfaces.steps, set(grid.values()), len(grid)
+        rows = np.flatnonzero(surfaces.determined)
+        radii = _TOLERANCE * np.linalg.norm(steps[rows], axis=1).max(axis=1, initial=0.0)
+        for row, nearby in zip(rows.tolist(), self._tree.query_ball_point(surfaces.centres[rows], radii), strict=True):
+            free = [index for index in nearby if index not in used]
+            found = self._next(grid, places[row], free, surfaces.centres[row], steps[row]) if free else None
             if found is not None:
                 grid[places[row]] = found[0]
+                used.add(found[0])
                 support.update(_supported(places[row]))
                 off.append(found[1])
         return len(grid) > before
 
     def _next(
-        self, grid: dict[Node, int], node: Node, centre: FloatArray, steps: FloatArray
+        self, grid: dict[Node, int], node: Node, nearby: list[int], centre: FloatArray, steps: FloatArray
     ) -> tuple[int, float] | None:
-        """Keypoint at ``node``, expected at ``centre`` with ``steps`` to the next, and how far it is off [steps]."""
-        radius = _TOLERANCE * float(np.linalg.norm(steps, axis=0).max())
-        nearby = self._tree.query_ball_point(centre, radius)
-        if not nearby:
-            return None
+        """Keypoint of those ``nearby`` that is at ``node``, expected at ``centre``, and how far it is off [steps].
+
+        Parameters
+        ----------
+        steps : (2, 2) to the next places, by columns [px]
+        """
         off = np.linalg.norm(np.linalg.solve(steps, (self._pixels[nearby] - centre).T), axis=0)
-        used = set(grid.values())
         for away, index in sorted(zip(off.tolist(), nearby, strict=True)):
-            if away <= _TOLERANCE and index not in used and self._fits(grid, node, index):
-                return int(index), away
+            if away <= _TOLERANCE and self._fits(grid, node, index):
+                return index, away
         return None
 
     def _fits(self, grid: dict[Node, int], node: Node, index: int) -> bool:

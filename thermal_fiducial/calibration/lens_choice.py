@@ -12,8 +12,9 @@ import numpy as np
 
 from thermal_fiducial.calibration.intrinsics import board_pose, calibrate, calibrate_from, Calibration
 from thermal_fiducial.calibration.lens_check import reaches_corners
-from thermal_fiducial.calibration.lens_fit import LensFit
+from thermal_fiducial.calibration.lens_fit import LensFit, NEARLY
 from thermal_fiducial.calibration.targets import Sighting
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
@@ -139,17 +140,40 @@ def _candidate(sightings: Sequence[Sighting], near: Calibration, free: tuple[int
 
 
 def _held_out_squares(sightings: Sequence[Sighting], fit: Calibration, radius: float) -> FloatArray:
-    """Mean squared error (V,) [px^2] of views whose pose alone was fitted, with intrinsics from the other folds."""
+    """Mean squared error (V,) [px^2] of views whose pose alone was fitted, with intrinsics from the other folds.
+
+    A fold moves a camera by a part of its errors: circles' centroids stay where they are for all views.
+    """
     squares = np.zeros(len(sightings))
+    centroids = LensFit(sightings, fit.camera, radius).centroids(fit.camera, fit.T_camera_board)
     # Few views: all but one at a time.
     folds = _FOLDS if len(sightings) >= 2 * _FOLDS else len(sightings)
     index = np.arange(len(sightings))
     for fold in range(folds):
         inside, outside = index[index % folds != fold].tolist(), index[fold::folds].tolist()
-        training = LensFit([sightings[k] for k in inside], fit.camera, radius, fit.free)
-        trained, _ = training.solve(fit.T_camera_board[inside])
-        held_out = LensFit([sightings[k] for k in outside], trained, radius, poses_only=True)
+        part = _part(sightings, centroids, inside, fit.camera, fit.free)
+        trained, _ = part.solve(fit.T_camera_board[inside])
+        held_out = _part(sightings, centroids, outside, trained, None)
         _, T = held_out.solve(fit.T_camera_board[outside])
         for view, residual in zip(outside, held_out.residuals(trained, T), strict=True):
             squares[view] = float(np.mean(np.sum(residual**2, axis=1)))
     return squares
+
+
+def _part(
+    sightings: Sequence[Sighting],
+    centroids: Sequence[FloatArray],
+    index: Sequence[int],
+    camera: Camera,
+    free: tuple[int, ...] | None,
+) -> LensFit:
+    """Fit of some of the views; without coefficients to estimate (None), of their poses alone."""
+    return LensFit(
+        [sightings[k] for k in index],
+        camera,
+        0.0,
+        free,
+        poses_only=free is None,
+        centroids=[centroids[k] for k in index],
+        converged=NEARLY,
+    )

@@ -21,9 +21,14 @@ _STEP = 1e-6
 _MAX_STEPS = 60
 # A step that lowers the cost by less than this share is the last; damping at which no step lowers it any more.
 _CONVERGED, _HOPELESS = 1e-7, 1e9
+#: Enough for errors of views that are compared, to some per cent, with each other.
+NEARLY = 1e-4
 # Centroids of circles are brought up to date until they change by less than this [px].
 _ROUNDS, _SETTLED_PX = 4, 1e-4
-_CIRCLE = np.stack([np.cos(np.arange(24) * np.pi / 12), np.sin(np.arange(24) * np.pi / 12), np.zeros(24)], axis=1)
+# A polygon whose second moments are those of the circle: perspective displaces the centroid of both alike.
+_ANGLE = np.pi / 6.0
+_TURNS = np.arange(12) * _ANGLE
+_CIRCLE = np.sqrt(3.0 / (2.0 + np.cos(_ANGLE))) * np.stack([np.cos(_TURNS), np.sin(_TURNS), 0.0 * _TURNS], axis=1)
 # Shares of the distance from the centre by which the first radial term, a higher one and the tangential terms may move
 # the image's corner (standard deviations): lenses of 40 to 100 degrees have up to 0.3, 0.07 and 0.005.
 _FIRST, _HIGHER, _TANGENTIAL = 0.3, 0.1, 0.02
@@ -52,6 +57,9 @@ class LensFit:
     radius : of the board's circles [m]; 0 for corners
     free : indices of the coefficients to estimate; None: all
     poses_only : whether the camera is known
+    centroids : of each view, how far (N, 2) its circles' centroids lie from their centres [px], to be held there; None:
+        worked out from the radius
+    converged : share of the cost that the last step may gain
     """
 
     def __init__(
@@ -62,13 +70,20 @@ class LensFit:
         free: Sequence[int] | None = None,
         *,
         poses_only: bool = False,
+        centroids: Sequence[FloatArray] | None = None,
+        converged: float = _CONVERGED,
     ) -> None:
         self._points = np.concatenate([sighting.points for sighting in sightings])
         self._pixels = np.concatenate([sighting.pixels for sighting in sightings])
         self._lengths = [len(sighting.points) for sighting in sightings]
         self._view = np.repeat(np.arange(len(sightings)), self._lengths)
-        self._camera, self._radius = camera, radius
-        self._centroid = np.zeros_like(self._pixels)
+        # Rows of each view's points, of views with fewer some twice: those have no weight.
+        place, ends = np.arange(max(self._lengths)), np.cumsum(self._lengths)[:, None]
+        self._there = place < np.array(self._lengths)[:, None]
+        self._rows = np.minimum(ends - np.array(self._lengths)[:, None] + place, ends - 1)
+        self._camera, self._radius = camera, radius if centroids is None else 0.0
+        self._centroid = np.zeros_like(self._pixels) if centroids is None else np.concatenate(centroids)
+        self._converged = converged
         coefficients = range(MODELS[camera.model]) if free is None else sorted(free)
         shared = [] if poses_only else [*range(MATRIX), *(MATRIX + index for index in coefficients)]
         self._free: IntArray = np.array(shared, dtype=np.int64)
@@ -88,9 +103,9 @@ class LensFit:
     def covariance(self, camera: Camera, T: FloatArray) -> FloatArray:
         """Of fx fy cx cy and all coefficients, those held included, with the noise that the residuals show."""
         free, self._free = self._free, np.arange(len(self._prior))
-        information, _ = self._normal_equations(camera, T, np.inf, 0.0)
-        self._free = free
         error = self.error(camera, T)
+        information, _ = self._normal_equations(camera, T, error, np.inf, 0.0)
+        self._free = free
         variance = float(np.sum(error**2)) / max(1, error.size - len(information))
         count = len(self._prior)
         information[range(count), range(count)] += variance * self._prior
@@ -100,7 +115,12 @@ class LensFit:
 
     def residuals(self, camera: Camera, T: FloatArray) -> list[FloatArray]:
         """Measured minus predicted (N, 2) [px] of each view."""
-        return np.split(-self.error(camera, T), np.cumsum(self._lengths)[:-1])
+        return self._by_view(-self.error(camera, T))
+
+    def centroids(self, camera: Camera, T: FloatArray) -> list[FloatArray]:
+        """How far circles' centroids lie from their centres (N, 2) [px] in each view."""
+        self._update_centroids(camera, T)
+        return self._by_view(self._centroid)
 
     def error(self, camera: Camera, T: FloatArray) -> FloatArray:
         """Predicted minus measured (N, 2) [px]; large where the model cannot show a point."""
@@ -129,56 +149,54 @@ class LensFit:
         return np.nan_to_num(by_shared), np.asarray(np.nan_to_num(by_pose))
 
     def _minimise(self, camera: Camera, T: FloatArray) -> tuple[Camera, FloatArray]:
-        noise = self._noise(camera, T)
-        cost, damping = self._cost(camera, T, noise), 1e-3
+        error = self.error(camera, T)
+        noise = _noise(error)
+        cost, damping = self._cost(camera, error, noise), 1e-3
         for _ in range(_MAX_STEPS):
-            information, gradient = self._normal_equations(camera, T, _HUBER * noise, noise)
+            information, gradient = self._normal_equations(camera, T, error, _HUBER * noise, noise)
             while damping < _HOPELESS:
                 damped = information + damping * np.diag(np.diag(information) + 1e-12)
                 moved = self.moved(camera, T, -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64))
-                lower = self._cost(*moved, noise)
+                after = self.error(*moved)
+                lower = self._cost(moved[0], after, noise)
                 if lower < cost:
                     break
                 damping *= 10.0
             else:
                 break
-            gain, (camera, T), cost, damping = (cost - lower) / cost, moved, lower, 0.1 * damping
-            if gain < _CONVERGED:
+            gain, (camera, T), error, damping = (cost - lower) / cost, moved, after, 0.1 * damping
+            if gain < self._converged:
                 break
-            noise = min(noise, self._noise(camera, T))
-            cost = self._cost(camera, T, noise)
+            noise = min(noise, _noise(error))
+            cost = self._cost(camera, error, noise)
         return camera, T
 
-    def _cost(self, camera: Camera, T: FloatArray, noise: float) -> float:
+    def _cost(self, camera: Camera, error: FloatArray, noise: float) -> float:
         """Huber's: quadratic up to three times the ``noise`` [px], linear beyond; and the prior's."""
-        size, limit = np.abs(self.error(camera, T)), _HUBER * noise
+        size, limit = np.abs(error), _HUBER * noise
         misfit = float(np.sum(np.where(size <= limit, 0.5 * size**2, limit * (size - 0.5 * limit))))
         return misfit + 0.5 * noise**2 * float(self._prior[self._free] @ camera_parameters(camera)[self._free] ** 2)
 
     def _normal_equations(
-        self, camera: Camera, T: FloatArray, limit: float, noise: float
+        self, camera: Camera, T: FloatArray, error: FloatArray, limit: float, noise: float
     ) -> tuple[FloatArray, FloatArray]:
-        error = self.error(camera, T)
-        weight = np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-12))
-        by_shared, by_pose = self.jacobian(camera, T)
-        shared = len(self._free)
-        information = np.zeros((shared + 6 * len(T), shared + 6 * len(T)))
-        gradient = np.zeros(len(information))
-        ends = np.cumsum(self._lengths)
-        for view, (start, end) in enumerate(zip(ends - self._lengths, ends, strict=True)):
-            J = np.concatenate([by_shared[start:end], by_pose[start:end]], axis=2).reshape(-1, shared + 6)
-            w = weight[start:end].reshape(-1)
-            columns = np.concatenate([np.arange(shared), shared + 6 * view + np.arange(6)])
-            information[np.ix_(columns, columns)] += (J * w[:, None]).T @ J
-            gradient[columns] += J.T @ (w * error[start:end].reshape(-1))
+        weight = np.minimum(1.0, limit / np.maximum(np.abs(error), 1e-12))[self._rows] * self._there[..., None]
+        views, shared = len(T), len(self._free)
+        J = np.concatenate(self.jacobian(camera, T), axis=2)[self._rows].reshape(views, -1, shared + 6)
+        weighted = (J * weight.reshape(views, -1, 1)).swapaxes(1, 2)
+        blocks, slopes = weighted @ J, weighted @ error[self._rows].reshape(views, -1, 1)
+        information = np.zeros((shared + 6 * views, shared + 6 * views))
+        information[:shared, :shared] = blocks[:, :shared, :shared].sum(axis=0)
+        information[:shared, shared:] = np.concatenate(blocks[:, :shared, shared:], axis=1)
+        information[shared:, :shared] = information[:shared, shared:].T
+        of_poses = np.zeros((views, 6, views, 6))
+        of_poses[np.arange(views), :, np.arange(views)] = blocks[:, shared:, shared:]
+        information[shared:, shared:] = of_poses.reshape(6 * views, 6 * views)
+        gradient = np.concatenate([slopes[:, :shared, 0].sum(axis=0), slopes[:, shared:, 0].reshape(-1)])
         prior = noise**2 * self._prior[self._free]
         information[range(shared), range(shared)] += prior
         gradient[:shared] += prior * camera_parameters(camera)[self._free]
         return information, gradient
-
-    def _noise(self, camera: Camera, T: FloatArray) -> float:
-        """Standard deviation of a coordinate, from the median; at least a hundredth of a pixel."""
-        return max(1.4826 * float(np.median(np.abs(self.error(camera, T)))), 0.01)
 
     def _update_centroids(self, camera: Camera, T: FloatArray) -> float:
         """How far the circles' centroids lie from their centres now; by how much that changed at most [px]."""
@@ -189,6 +207,15 @@ class LensFit:
         before = self._centroid
         self._centroid = np.nan_to_num(_area_centroid(outline) - centre)
         return float(np.abs(self._centroid - before).max())
+
+    def _by_view(self, rows: FloatArray) -> list[FloatArray]:
+        """Rows (N, 2) of all points as those of each view."""
+        return np.split(rows, np.cumsum(self._lengths)[:-1])
+
+
+def _noise(error: FloatArray) -> float:
+    """Standard deviation of a coordinate, from the median; at least a hundredth of a pixel."""
+    return max(1.4826 * float(np.median(np.abs(error))), 0.01)
 
 
 def camera_parameters(camera: Camera) -> FloatArray:

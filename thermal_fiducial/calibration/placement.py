@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import correlate
 
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
@@ -104,7 +103,7 @@ class BoardNodes:
     def _overlaps(self, grid: IntArray) -> list[FloatArray]:
         """Points that each view of the board has in common with a grid, for each shift."""
         occupied = _occupancy(grid)
-        return [np.rint(correlate(occupied, _occupancy(view.nodes(self._outline)))) for view in self._views]
+        return [_correlation(occupied, _occupancy(view.nodes(self._outline))) for view in self._views]
 
 
 def goes_on(beyond: int) -> str:
@@ -146,6 +145,12 @@ def _occupancy(nodes: IntArray) -> FloatArray:
     occupied: BoolArray = np.zeros(nodes.max(axis=0) + 1, dtype=np.bool_)
     occupied[nodes[:, 0], nodes[:, 1]] = True
     return occupied.astype(np.float64)
+
+
+def _correlation(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Points that two occupancies have in common for each shift of ``b``, from where but their last corners meet."""
+    shape = [m + n - 1 for m, n in zip(a.shape, b.shape, strict=True)]
+    return np.rint(np.fft.irfft2(np.fft.rfft2(a, shape) * np.fft.rfft2(b[::-1, ::-1], shape), shape))
 
 
 def _largest_two(overlaps: list[FloatArray]) -> tuple[float, float]:

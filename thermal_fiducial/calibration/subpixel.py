@@ -35,11 +35,17 @@ _SAMPLE = 48
 # What the linear part of a fit determines: ground (level and slope) and contrast.
 _LINEAR = 4
 # Points looked at, and pixels fitted, at a time: enough for long rows, few enough for a processor's cache.
-_POINTS_AT_A_TIME, _PIXELS_AT_A_TIME = 12, 4000
+_POINTS_AT_A_TIME, _PIXELS_AT_A_TIME = 48, 8000
 
 
 def refine(
-    image: Float32Array, nodes: FloatArray, pixels: FloatArray, board: FloatArray, appearance: Appearance
+    image: Float32Array,
+    nodes: FloatArray,
+    pixels: FloatArray,
+    board: FloatArray,
+    appearance: Appearance,
+    *,
+    grid: BoolArray | None = None,
 ) -> FloatArray:
     """Points (N, 2) of a board, NaN where they are lost.
 
@@ -48,31 +54,35 @@ def refine(
     nodes : (N, 2) place of each in the grid
     pixels : (N, 2) within a few pixels, or a tenth of their distance
     board : (M, 2) places of all points of the board
+    grid : (N,) which of them show how the grid is seen: of the others it is not known whether they belong; None: all
     """
     appearance = appearance.at(nodes, board)
     every = np.arange(len(nodes))
-    some = np.sort(np.random.default_rng(0).permutation(every)[:_SAMPLE])
-    alone = _round(image, nodes, pixels, appearance, some, None, None)
+    grid = np.ones(len(nodes), dtype=np.bool_) if grid is None else grid
+    some = np.sort(np.random.default_rng(0).permutation(np.flatnonzero(grid))[:_SAMPLE])
+    alone = _round(image, nodes, pixels, appearance, some, grid, None, None)
     found = np.isfinite(alone.contrast)
     if np.sum(found) < _LEAST_POINTS:
         return np.full_like(pixels, np.nan)
     log_blur = _plane(nodes[found], alone.log_blur[found], nodes)
     shared = _Shared(log_blur, np.full(len(nodes), np.median(alone.width[found])))
-    pixels = _next_starts(nodes, pixels, alone.pixels, some)
-    alike = _round(image, nodes, pixels, appearance, every, shared, None)
+    pixels = _next_starts(nodes, pixels, alone.pixels, some, grid)
+    alike = _round(image, nodes, pixels, appearance, every, grid, shared, None)
     if np.sum(np.isfinite(alike.contrast)) < _LEAST_POINTS:
         return np.full_like(pixels, np.nan)
-    pixels = _next_starts(nodes, pixels, alike.pixels, every)
-    refined = _round(image, nodes, pixels, appearance, every, shared, alike.contrast)
+    pixels = _next_starts(nodes, pixels, alike.pixels, every, grid)
+    refined = _round(image, nodes, pixels, appearance, every, grid, shared, alike.contrast)
     enough = np.sum(np.isfinite(refined.contrast)) >= _LEAST_POINTS
     return refined.pixels if enough else np.full_like(pixels, np.nan)
 
 
-def _next_starts(nodes: FloatArray, starts: FloatArray, refined: FloatArray, fitted: IntArray) -> FloatArray:
+def _next_starts(
+    nodes: FloatArray, starts: FloatArray, refined: FloatArray, fitted: IntArray, grid: BoolArray
+) -> FloatArray:
     """Where the next round starts (N, 2): those of the ``fitted`` that were lost where the others say."""
     starts = np.where(np.isfinite(refined), refined, starts)
     lost = fitted[np.isnan(refined[fitted, 0])]
-    others = np.setdiff1d(np.arange(len(nodes)), lost)
+    others = np.setdiff1d(np.flatnonzero(grid), lost)
     surfaces = local_surfaces(nodes[others], starts[others], nodes[lost])
     starts[lost[surfaces.determined]] = surfaces.centres[surfaces.determined]
     return starts
@@ -100,11 +110,12 @@ def _round(
     pixels: FloatArray,
     appearance: Appearance,
     index: IntArray,
+    grid: BoolArray,
     shared: _Shared | None,
     contrast: FloatArray | None,
 ) -> _Fits:
-    """Fit points ``index`` once; with ``contrast``, points without one are lost ones and say nothing of the grid."""
-    known = np.ones(len(nodes), dtype=np.bool_) if contrast is None else np.isfinite(contrast)
+    """Fit points ``index`` once; with ``contrast``, points without one are lost and say nothing of the ``grid``."""
+    known = grid if contrast is None else grid & np.isfinite(contrast)
     ridge = ROUGHLY if shared is None else CLOSELY
     fits = _Fits(np.full_like(pixels, np.nan), *np.full((3, len(nodes)), np.nan))
     for first in range(0, len(index), _POINTS_AT_A_TIME):
@@ -150,6 +161,7 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
     else:
         parameters[:, 2], parameters[:, 3] = shared
         free = 2
+        windows = windows.with_neighbours_held(parameters)
     state = _State.at(windows, parameters, free)
     damping = np.full(len(parameters), _DAMPING)
     moving = np.arange(len(parameters))

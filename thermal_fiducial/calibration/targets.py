@@ -65,7 +65,7 @@ class Detector(Protocol):
 
 
 class Chessboard:
-    """A chessboard of warm and cold squares.
+    """A chessboard of warm and cold squares; looked for first as it was found in the frame before.
 
     Parameters
     ----------
@@ -83,15 +83,18 @@ class Chessboard:
         self._board = BoardNodes(nodes)
         # Outer corners of the outermost squares may look like points: one of every other square.
         self._line = min(columns, rows)
+        self._look = 0
 
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
         """See :class:`Target`."""
         image = without_speckles(counts)
-        return _sighting(image, saddles(image), self._board, self.points, SquaresMeet(), self._line)
+        keypoints = saddles(image, self._look)
+        sighting, self._look = _sighting(image, keypoints, self._board, self.points, SquaresMeet(), self._line)
+        return sighting
 
 
 class CircleGrid:
-    """A grid of round holes or spots.
+    """A grid of round holes or spots; looked for first as it was found in the frame before.
 
     Parameters
     ----------
@@ -129,11 +132,14 @@ class CircleGrid:
         self._board = BoardNodes(nodes[there], nodes[~there])
         self._disc = Disc(0.5 * diameter / pitch)
         self.radius = 0.5 * diameter
+        self._look = 0
 
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
         """See :class:`Target`."""
         image = without_speckles(counts)
-        return _sighting(image, blobs(image), self._board, self.points, self._disc, _ANOTHER_GRID)
+        keypoints = blobs(image, self._look)
+        sighting, self._look = _sighting(image, keypoints, self._board, self.points, self._disc, _ANOTHER_GRID)
+        return sighting
 
 
 def _circles(places: IntArray, spacing: float, longer: int, *, asymmetric: bool) -> tuple[IntArray, FloatArray]:
@@ -165,8 +171,8 @@ def _sighting(
     points: FloatArray,
     appearance: Appearance,
     another: int,
-) -> Sighting:
-    """Find a board roughly, then its points to a few hundredths of a pixel.
+) -> tuple[Sighting, int]:
+    """Find a board roughly, then its points to a few hundredths of a pixel; and with which look it was found.
 
     With ``another`` points of its kind beyond it, it is another board.
     """
@@ -174,10 +180,14 @@ def _sighting(
     if isinstance(found, GridRefusal):
         raise BoardNotFound(found.reason)
     # What continues the grid is looked at as closely as the board: clutter is no point of it, another board's is.
-    nodes = np.concatenate([board.nodes[found.points], found.beyond_nodes]).astype(np.float64)
-    every = np.concatenate([board.nodes, found.beyond_nodes]).astype(np.float64)
-    pixels = refine(image, nodes, np.concatenate([found.pixels, found.beyond_pixels]), every, appearance)
-    good, count = np.isfinite(pixels[:, 0]), len(found.points)
+    count, beside = len(found.points), len(found.beyond_nodes)
+    beside = beside if beside >= another else 0
+    nodes = np.concatenate([board.nodes[found.points], found.beyond_nodes[:beside]]).astype(np.float64)
+    starts = np.concatenate([found.pixels, found.beyond_pixels[:beside]])
+    pixels = refine(
+        image, nodes, starts, board.nodes.astype(np.float64), appearance, grid=np.arange(len(nodes)) < count
+    )
+    good = np.isfinite(pixels[:, 0])
     # So is a grid that shows more of the board, among keypoints of another scale, but goes on.
     larger = found.larger_nodes.astype(np.float64)
     of_larger = refine(image, larger, found.larger_pixels, larger, appearance) if len(larger) else found.larger_pixels
@@ -189,7 +199,7 @@ def _sighting(
     placed = board.place(board.nodes[kept]) if len(kept) else GridRefusal('none of its points is sharp enough')
     if isinstance(placed, GridRefusal):
         raise BoardNotFound(placed.reason)
-    return Sighting(points[kept], pixels[:count][good[:count]])
+    return Sighting(points[kept], pixels[:count][good[:count]]), found.look
 
 
 class MarkerBoard:

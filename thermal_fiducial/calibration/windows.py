@@ -35,6 +35,7 @@ class PointWindows:
     inverse : (P, 2, 2) steps of the grid by pixels
     scale : (P, 2) steps along the axes in a pixel
     expected : (P, N) contrast that the neighbours lead one to expect, or 1 everywhere
+    beside : (P, N) what neighbours show where they are held
     """
 
     appearance: Appearance
@@ -47,6 +48,7 @@ class PointWindows:
     inverse: FloatArray
     scale: FloatArray
     expected: FloatArray
+    beside: FloatArray
 
     def rows(self, index: IntArray) -> 'PointWindows':
         """Those of some of the points."""
@@ -63,11 +65,10 @@ class PointWindows:
         places = self.places - (self.inverse @ parameters[:, :2, None]).swapaxes(1, 2)
         log_blur = parameters[:, 2, None]
         low, high = np.log(_BLUR_BOUNDS)
-        blur = np.exp(np.clip(log_blur, low, high)) * self.scale
-        values, slopes = self.appearance.shape(places, blur, parameters[:, 3], free)
+        values, slopes = self.appearance.shape(places, self._blur(parameters), parameters[:, 3], free)
         slopes[2:3] *= (low < log_blur) & (log_blur < high)
         columns = np.empty((*values.shape, 1 + free))
-        columns[..., 0] = values
+        columns[..., 0] = values + self.beside
         for pixel_axis in range(2):
             towards = self.inverse[:, :, pixel_axis, None]
             columns[..., 1 + pixel_axis] = -slopes[0] * towards[:, 0] - slopes[1] * towards[:, 1]
@@ -75,6 +76,14 @@ class PointWindows:
         columns *= (self.weight * self.expected)[..., None]
         columns -= self.ground @ (self.ground.swapaxes(1, 2) @ columns)
         return columns[..., 0], columns[..., 1:]
+
+    def with_neighbours_held(self, parameters: FloatArray) -> 'PointWindows':
+        """For fits of the places alone: the neighbours stay where the grid has them."""
+        return replace(self, beside=self.appearance.beside(self.places, self._blur(parameters), parameters[:, 3]))
+
+    def _blur(self, parameters: FloatArray) -> FloatArray:
+        """Blur (P, 2) along the axes [steps]."""
+        return np.exp(np.clip(parameters[:, 2, None], *np.log(_BLUR_BOUNDS))) * self.scale
 
 
 def windows_around(
@@ -119,6 +128,7 @@ def windows_around(
         inverse=inverse[enough],
         scale=np.linalg.norm(inverse[enough], axis=2),
         expected=np.ones_like(weight),
+        beside=np.zeros_like(weight),
     )
 
 

@@ -3,16 +3,15 @@
 import argparse
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.progress import track
 
-from thermal_fiducial.calibration.camera_imu import calibrate_rolling_camera_imu, CameraImuCalibration
-from thermal_fiducial.calibration.rolling import FrameCorners
 from thermal_fiducial.calibration.sources import clean_frames, imu_track, RawFrame, recorded_camera
 from thermal_fiducial.cli import calibrate_intrinsics
 from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
+from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -22,6 +21,10 @@ from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.writing import write_text
+
+if TYPE_CHECKING:
+    from thermal_fiducial.calibration.camera_imu import CameraImuCalibration
+    from thermal_fiducial.calibration.rolling import FrameCorners
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,6 +64,9 @@ def _add_camera_imu(parser: argparse.ArgumentParser) -> None:
 
 
 def _camera_imu(args: argparse.Namespace) -> int:
+    # Half a second of loading that the other calibrations need not wait for.
+    from thermal_fiducial.calibration.camera_imu import calibrate_rolling_camera_imu
+
     noise = ImuNoise(
         args.gyroscope_noise_density,
         args.accelerometer_noise_density,
@@ -71,7 +77,7 @@ def _camera_imu(args: argparse.Namespace) -> int:
     with BagReader(args.bag, parse_remaps(args.remap)) as bag:
         camera = recorded_camera(bag) if args.calibration is None else load_camera(args.calibration)
         imu, start_ns = imu_track(bag)
-        frames = track(clean_frames(bag), 'finding markers', bag.message_count([bag.image_topic]), transient=True)
+        frames = tracked(clean_frames(bag), 'finding markers', bag.message_count([bag.image_topic]))
         seen = sorted(_mapped_corners(frames, marker_map, camera), key=lambda frame: frame.stamp_ns)
     result = calibrate_rolling_camera_imu(seen, camera, imu, start_ns, noise)
     write_text(args.out, _extrinsics_text(result))
@@ -79,8 +85,10 @@ def _camera_imu(args: argparse.Namespace) -> int:
     return 0
 
 
-def _mapped_corners(frames: Iterable[RawFrame], marker_map: MarkerMap, camera: Camera) -> Iterator[FrameCorners]:
+def _mapped_corners(frames: Iterable[RawFrame], marker_map: MarkerMap, camera: Camera) -> Iterator['FrameCorners']:
     """Markers of the map in each frame that shows any."""
+    from thermal_fiducial.calibration.rolling import FrameCorners
+
     detector = mapped_detector(marker_map)
     for frame in frames:
         rows = detector.detect(frame.stamp_ns, frame.counts, camera)
@@ -93,11 +101,11 @@ def _mapped_corners(frames: Iterable[RawFrame], marker_map: MarkerMap, camera: C
         yield FrameCorners(frame.stamp_ns, corners_px(rows), corner_covariances(rows), T_map_marker, sizes)
 
 
-def _percent(result: CameraImuCalibration, places: tuple[int, ...]) -> str:
+def _percent(result: 'CameraImuCalibration', places: tuple[int, ...]) -> str:
     return ', '.join(f'{100.0 * result.axes[k]:.2f} +- {100.0 * result.axes_sigma[k]:.2f}' for k in places)
 
 
-def _extrinsics_text(result: CameraImuCalibration) -> str:
+def _extrinsics_text(result: 'CameraImuCalibration') -> str:
     """Parameter file of the nodes, with what is known of the errors as comments."""
     q = se3.quaternion_from_rotation(result.T_body_camera[:3, :3])
     p = result.T_body_camera[:3, 3]

@@ -2,14 +2,17 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermal_fiducial.calibration.allan_deviation import AllanFit, fit_noise, ImuNoiseFit
 from thermal_fiducial.calibration.sources import imu_track
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.writing import write_text
+
+if TYPE_CHECKING:
+    from thermal_fiducial.calibration.allan_deviation import AllanFit, ImuNoiseFit
 
 #: With less than this [s] at rest a random walk is hardly seen beside the white noise.
 _LONG_S = 600.0
@@ -27,6 +30,9 @@ def add_imu(parser: argparse.ArgumentParser) -> None:
 
 def calibrate_imu(args: argparse.Namespace) -> int:
     """Read, fit, write, show."""
+    # allantools takes a second to load, which the other calibrations need not wait for.
+    from thermal_fiducial.calibration.allan_deviation import fit_noise
+
     with BagReader(args.bag, parse_remaps(args.remap)) as bag:
         track, _ = imu_track(bag)
     fit = fit_noise(track)
@@ -38,7 +44,7 @@ def calibrate_imu(args: argparse.Namespace) -> int:
     return 0
 
 
-def noise_text(fit: ImuNoiseFit) -> str:
+def noise_text(fit: 'ImuNoiseFit') -> str:
     """Parameter file of the nodes: the rms of the three axes, with each axis as a comment."""
     lines = [
         f'# Allan deviation of {fit.seconds:.0f} s at rest, {fit.rate_hz:.1f} Hz; in brackets x, y, z',
@@ -60,7 +66,7 @@ def noise_text(fit: ImuNoiseFit) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def _deviations(name: str, sensor: AllanFit, unit: str) -> str:
+def _deviations(name: str, sensor: 'AllanFit', unit: str) -> str:
     nearest = [int(np.argmin(np.abs(np.log(sensor.tau / tau)))) for tau in _SHOWN if tau <= 1.5 * sensor.tau[-1]]
     parts = [f'{sensor.tau[k]:.3g} s: {_rms(sensor.deviation[k]):.2e}' for k in nearest]
     return f'{name}, Allan deviation [{unit}]: ' + ', '.join(parts)

@@ -23,6 +23,7 @@ from thermal_fiducial.calibration.sources import (
     read_picture,
 )
 from thermal_fiducial.calibration.targets import BoardNotFound, Chessboard, CircleGrid, MarkerBoard, Sighting, Target
+from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry.camera import Camera
@@ -257,7 +258,8 @@ def _look_at_bag(args: argparse.Namespace, views: _Views) -> None:
         raise InputError(f'{args.source}: no such folder of pictures, bag or CSV file')
     with BagReader(args.source, parse_remaps(args.remap)) as bag:
         pending: tuple[RawFrame, Sighting] | None = None
-        for index, frame in enumerate(clean_frames(bag)):
+        frames = tracked(clean_frames(bag), 'looking for the board', bag.message_count([bag.image_topic]))
+        for index, frame in enumerate(frames):
             if pending is None and index % args.every:
                 continue
             sighting = views.find(frame, _guess(frame, args.focal_px))

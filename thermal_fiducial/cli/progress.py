@@ -1,10 +1,12 @@
 """How far long work has come: a bar on a terminal, a line every few seconds anywhere else."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 import sys
 import time
-from typing import Protocol
+from typing import Protocol, TypeVar
+
+_Item = TypeVar('_Item')
 
 #: Between two lines where there is no terminal [s]: work that is done by then says nothing.
 LINE_EVERY_S = 5.0
@@ -49,6 +51,15 @@ def counted(show: ShowProgress, total: int) -> Callable[[int], None]:
         show(min(1.0, done / total))
 
     return advance
+
+
+def tracked(items: Iterable[_Item], title: str, total: int) -> Iterator[_Item]:
+    """``items``, of which there are ``total``, with the progress of the work on them called ``title``."""
+    with progress_bar(title) as show:
+        advance = counted(show, max(1, total))
+        for item in items:
+            yield item
+            advance(1)
 
 
 def _lines(title: str) -> ShowProgress:
