@@ -1,6 +1,8 @@
 """Replay with one process a node: what comes out, what is measured, how it ends."""
 
+from contextlib import redirect_stderr
 import json
+import re
 
 import numpy as np
 import pytest
@@ -30,7 +32,11 @@ def run(tmp_path_factory):
     # Half speed: the machine that runs the tests may be busy with others.
     arguments = ['replay', bag, '--out', folder / 'run', '--params', params, '--map', map_file, '--no-report']
     for _ in range(3):
-        assert main([str(word) for word in (*arguments, '--transport', 'processes', '--rate', '0.5')]) == 0
+        with (folder / 'printed').open('w') as printed, redirect_stderr(printed):
+            assert main([str(word) for word in (*arguments, '--transport', 'processes', '--rate', '0.5')]) == 0
+        # Where another program could have listened to the nodes.
+        said = r'in DDS domain (\d+) of this computer: listen with ROS_DOMAIN_ID=\1$'
+        assert re.search(said, (folder / 'printed').read_text(), re.MULTILINE)
         # Best effort: what it loses on a machine that others take for a while says nothing of the nodes.
         if lost_samples(load_tum(folder / 'run' / 'fused.tum')[0]) <= FEW:
             break

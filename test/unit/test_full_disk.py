@@ -161,6 +161,25 @@ def test_a_run_that_does_not_fit_leaves_parameters_and_map_and_can_be_flown_agai
     assert json.loads((out / 'summary.json').read_text())['messages_out']['pose'] > 0
 
 
+@pytest.mark.ros
+def test_a_run_that_is_killed_leaves_no_table_that_looks_whole(tmp_path):
+    small_bag.recording(seconds=1.2).write(tmp_path / 'bag')
+    map_file, params = small_bag.side_files(tmp_path, ids=(0, 1, 2, 3))
+    out, seen = tmp_path / 'run', set()
+    for _ in range(2):
+        replay(
+            Options(tmp_path / 'bag', out, params, map_file),
+            lambda _: seen.update(p.name for p in out.iterdir()),
+            print,
+        )
+    tables = {'fused.tum', 'fiducial.tum', 'detections.csv'}
+    # While it lasts, also over an earlier run: what a kill would leave.
+    assert not seen & (tables | {'summary.json'})
+    assert {f'{name}.part' for name in tables} <= seen
+    assert {*tables, 'summary.json'} <= {path.name for path in out.iterdir()}
+    assert not list(out.glob('*.part'))
+
+
 @pytest.mark.parametrize('number', [errno.EROFS, errno.EACCES])
 def test_commands_in_a_folder_that_is_read_only_say_so_in_a_line(tmp_path, capsys, monkeypatch, number):
     path = tmp_path / 'hall.yaml'

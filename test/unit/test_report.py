@@ -179,6 +179,26 @@ def test_unusable_truth_is_refused(tmp_path, small_run, capsys, truth):
     assert error.count('\n') == 1
 
 
+def test_the_truth_in_the_bag_that_was_replayed_is_used_and_named(tmp_path, small_run, capsys):
+    bag = tmp_path / 'bag'
+    bag.mkdir()
+    (small_run / 'truth.tum').rename(bag / 'ground_truth.tum')
+    (small_run / 'summary.json').write_text(json.dumps({'bag': 'bag', 'bag_path': str(bag)}))
+    assert main(['evaluate', str(small_run), '--no-report']) == 0
+    printed = capsys.readouterr().out
+    assert f'ground truth: {bag / "ground_truth.tum"}' in printed
+    assert 'position_rms_mm' in json.loads((small_run / 'summary.json').read_text())['evaluation']['fused']['error']
+    (bag / 'ground_truth.tum').write_text('5.0 0 0 0 0 0 0 1\n6.0 0 0 0 0 0 0 1\n')
+    assert main(['evaluate', str(small_run)]) == 2
+    assert f'{bag / "ground_truth.tum"}: ground truth and run' in capsys.readouterr().err
+
+
+def test_a_replay_that_was_cut_short_is_no_run(small_run, capsys):
+    (small_run / 'fused.tum').rename(small_run / 'fused.tum.part')
+    assert main(['evaluate', str(small_run)]) == 2
+    assert capsys.readouterr().err.strip().endswith(f'{small_run}: its replay was cut short; replay it again')
+
+
 def test_a_bag_without_truth_is_refused_by_the_name_of_the_topic(run_folder, capsys):
     assert main(['evaluate', str(run_folder), '--truth', str(run_folder / 'output')]) == 2
     assert 'ground_truth/odometry' in capsys.readouterr().err

@@ -24,7 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--truth',
         type=Path,
         metavar='BAG-or-TUM',
-        help='ground truth: a TUM file, or a bag with ground_truth/odometry (default: truth.tum in RUN, if any)',
+        help='ground truth: a TUM file, or a bag with ground_truth/odometry (default: truth.tum in RUN, or '
+        'ground_truth.tum in the bag that was replayed, if any)',
     )
     parser.add_argument(
         '--truth-map', type=Path, metavar='FILE', help='the map as it really is (default: map_true.yaml beside it)'
@@ -55,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(numbers, indent=2))
         return 0
     print_tables(tables(evaluation, numbers).values())
+    print(f'ground truth: {evaluation.run.truth_path or "none, so no errors (--truth)"}')
     if page is not None:
         print(f'report: {page}')
     return 0

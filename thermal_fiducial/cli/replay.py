@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     )
     started = time.monotonic()
     with progress_bar(f'replay {args.bag.name}') as progress:
-        summary = replay.replay(options, progress, _warn)
+        summary = replay.replay(options, progress, _warn, _say)
     seconds = time.monotonic() - started
     out = summary['messages_out']
     print(
@@ -117,3 +117,7 @@ def _internal_errors(diagnostics: Mapping[str, Mapping[str, str]]) -> list[str]:
 
 def _warn(line: str) -> None:
     print(f'warning: {line}', file=sys.stderr)
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr)

@@ -68,9 +68,7 @@ class BagMessage:
         try:
             return self._typestore.deserialize_cdr(self.cdr, self.msgtype)
         except Exception as error:  # the library lets through whatever reading garbage raises
-            raise InputError(
-                f'{self.topic} at {self.stamp_ns}: no {self.msgtype}: {one_line(error) or type(error).__name__}'
-            ) from None
+            raise InputError(f'{self.topic} at {self.stamp_ns}: no {self.msgtype}: {one_line(error)}') from None
 
 
 def resolve_topics(recorded: Iterable[str], remap: Mapping[str, str] | None = None) -> dict[str, str]:
@@ -268,6 +266,4 @@ class BagReader:
         except InputError:
             raise
         except Exception as error:
-            raise InputError(
-                f'{self.path}: the bag cannot be read: {one_line(error) or type(error).__name__}'
-            ) from None
+            raise InputError(f'{self.path}: the bag cannot be read: {one_line(error)}') from None

@@ -21,6 +21,11 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         write_atomically(Path(path), text)
 
 
+def unfinished(path: Path) -> Path:
+    """Where a file that grows lies until it is whole."""
+    return path.with_name(f'{path.name}.part')
+
+
 @contextmanager
 def new_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A file beside ``path`` for a library to write, which takes the place of ``path`` when it is whole.

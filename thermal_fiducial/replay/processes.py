@@ -50,8 +50,11 @@ def replay_processes(
     progress: Callable[[int], None],
     warn: Callable[[str], None],
     rate: float,
+    say: Callable[[str], None],
 ) -> dict[str, Any]:
     """Play topics ``played`` of ``bag`` at ``rate`` times real time; otherwise as in lock-step.
+
+    ``say`` gets a line on where the nodes can be listened to.
 
     Returns
     -------
@@ -67,6 +70,7 @@ def replay_processes(
     context = Context()
     with own_domain() as domain:
         initialise(None, context, domain)
+        say(f'the nodes run in DDS domain {domain} of this computer: listen with ROS_DOMAIN_ID={domain}')
         try:
             with NodeProcesses(domain, nodes, ros_arguments) as processes:
                 player = _Player(context, played, files, recorded)

@@ -19,7 +19,7 @@ from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.trajectory_file import tum_line
-from thermal_fiducial.files.writing import write_text
+from thermal_fiducial.files.writing import unfinished, write_text
 from thermal_fiducial.replay.topics import Topics, type_name
 from thermal_fiducial.ros import clouds, convert
 from thermal_fiducial.ros.counting import CountingNode
@@ -39,6 +39,8 @@ class Sink(Protocol):
 class RunFiles:
     """The files of a run folder that grow with the messages; a context manager. What is left early is removed.
 
+    Tables have a name of their own until they are whole: a replay that is killed leaves none that looks whole.
+
     Parameters
     ----------
     folder : the run folder; what an earlier run left there under these names is replaced
@@ -56,6 +58,8 @@ class RunFiles:
         self.complaints: dict[str, str] = {}
         self._last_figures: dict[str, dict[str, str]] = {}
         shutil.rmtree(folder / 'output', ignore_errors=True)
+        for name in _TABLES:
+            (folder / name).unlink(missing_ok=True)
         self._bag = BagWriter(folder / 'output')
         self._ending = ExitStack()
         self._types = {topic: type_name(kind) for topic, (kind, _) in topics.items()}
@@ -68,13 +72,13 @@ class RunFiles:
 
     def __enter__(self) -> Self:
         with ExitStack() as ending:
-            ending.push(self._remove_unless_whole)
+            ending.push(self._put_in_place)
             ending.enter_context(self._bag)
             for topic, msgtype in self._types.items():
                 self._bag.add_topic(topic, msgtype)
             ending.push(self._sort_late_frames)
             self._fused, self._fiducial, self._detections = [
-                ending.enter_context((self.folder / name).open('w', encoding='utf-8')) for name in _TABLES
+                ending.enter_context(unfinished(self.folder / name).open('w', encoding='utf-8')) for name in _TABLES
             ]
             self._detections.write(','.join(['stamp_ns', 'id', *CORNER_FIELDS, 'sigma_px']) + '\n')
             self._ending = ending.pop_all()
@@ -85,13 +89,17 @@ class RunFiles:
 
     def _sort_late_frames(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
-            _sort_by_stamp(self.folder / 'fiducial.tum')
+            _sort_by_stamp(unfinished(self.folder / 'fiducial.tum'))
 
-    def _remove_unless_whole(self, kind: type[BaseException] | None, *_: object) -> None:
+    def _put_in_place(self, kind: type[BaseException] | None, *_: object) -> None:
         """Half a run looks like a whole one."""
+        for path in (self.folder / name for name in _TABLES):
+            if kind is None:
+                unfinished(path).replace(path)
+            else:
+                unfinished(path).unlink(missing_ok=True)
         if kind is not None:
-            for name in (*_TABLES, 'latency.csv'):
-                (self.folder / name).unlink(missing_ok=True)
+            (self.folder / 'latency.csv').unlink(missing_ok=True)
 
     def add(self, topic: str, time_ns: int, data: bytes) -> None:
         """Take one published message, as CDR bytes, that came at ``time_ns`` of the bag's clock."""

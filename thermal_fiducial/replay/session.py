@@ -42,7 +42,12 @@ class Options:
     remaps: Mapping[str, str] = field(default_factory=dict)
 
 
-def replay(options: Options, progress: Callable[[float], None], warn: Callable[[str], None]) -> dict[str, Any]:
+def replay(
+    options: Options,
+    progress: Callable[[float], None],
+    warn: Callable[[str], None],
+    say: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
     """Play a bag through the nodes that its topics are for and write the run folder, all but the report.
 
     Parameters
@@ -50,6 +55,7 @@ def replay(options: Options, progress: Callable[[float], None], warn: Callable[[
     options : what and how
     progress : called with the share done, 0 to 1
     warn : called with a line about what is suspicious but can be used
+    say : called with a line about what a user may want to know
 
     Returns
     -------
@@ -75,24 +81,20 @@ def replay(options: Options, progress: Callable[[float], None], warn: Callable[[
         recorded = entry.recorded(calibration_from_file=from_file, images=options.images)
         extrinsics = settings.pose_ekf.camera_position, settings.pose_ekf.camera_orientation
         with into(options.run), RunFiles(options.run, transform_from_quaternion(*extrinsics), recorded) as files:
-            duration = max(bag.duration_ns, 1)
-            play = partial(replay_processes, rate=options.rate) if options.transport == 'processes' else replay_lockstep
-            timing = play(
-                bag,
-                entry.nodes,
-                tuple(played),
-                files,
-                recorded,
-                arguments,
-                lambda time_ns: progress(min(1.0, time_ns / duration)),
-                warn,
-            )
-        _report_refusals(files, entry, warn)
+            in_real_time = partial(replay_processes, rate=options.rate, say=say)
+            play = in_real_time if options.transport == 'processes' else replay_lockstep
+            done = partial(_show_share, progress, max(bag.duration_ns, 1))
+            timing = play(bag, entry.nodes, tuple(played), files, recorded, arguments, done, warn)
+            _report_refusals(files, entry, warn)
         _report_silence(files, entry, warn)
         marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)
         summary = _summary(options, settings, bag, files) | {'markers_in_map': len(marker_map.markers)} | timing
     write_text(options.run / SUMMARY_FILE, json.dumps(summary, indent=2) + '\n')
     return summary
+
+
+def _show_share(progress: Callable[[float], None], duration_ns: int, time_ns: int) -> None:
+    progress(min(1.0, time_ns / duration_ns))
 
 
 def _report_silence(files: RunFiles, entry: Entry, warn: Callable[[str], None]) -> None:

@@ -15,7 +15,7 @@ from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
-from thermal_fiducial.report.run_folder import Detections, Run
+from thermal_fiducial.report.run_folder import bag_of_run, Detections, Run
 
 #: Pictures of a strip, and how wide each is [px].
 STRIP, STRIP_WIDTH = 12, 480
@@ -50,12 +50,8 @@ def bag_of(run: Run, bag: Path | None = None) -> tuple[Path, Mapping[str, str]] 
     remaps = remaps if isinstance(remaps, dict) else {}
     if bag is not None:
         return bag, remaps
-    known = run.summary.get('bag_path')
-    places = [Path(known)] if isinstance(known, str) else []
-    name = run.summary.get('bag')
-    # A run folder may have been moved, with the bag in it or beside it.
-    places += [run.path / name, run.path.parent / name] if isinstance(name, str) and name else []
-    return next(((place, remaps) for place in places if place.exists()), None)
+    known = bag_of_run(run.path, run.summary)
+    return None if known is None else (known, remaps)
 
 
 def strip(run: Run, bag: Path | None = None) -> list[FramePicture]:

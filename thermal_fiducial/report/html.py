@@ -124,7 +124,7 @@ def _filter(evaluation: Evaluation) -> tuple[Chart, ...]:
 
 def _lead(evaluation: Evaluation) -> str:
     truth = (
-        'compared with ground truth'
+        f'compared with ground truth ({evaluation.run.truth_path})'
         if evaluation.run.truth is not None
         else 'without ground truth: no errors are shown'
     )

@@ -61,7 +61,7 @@ def evaluate_run(
         and evaluation.fused_errors is not None
         and not len(evaluation.fused_errors)
     ):
-        raise InputError(f'{truth}: ground truth and run {run_dir} have no time in common')
+        raise InputError(f'{run.truth_path}: ground truth and run {run_dir} have no time in common')
     numbers = evaluation.numbers()
     text = json.dumps(run.summary | {'evaluation': numbers}, indent=2)
     write_text(Path(run_dir) / SUMMARY, text + '\n')

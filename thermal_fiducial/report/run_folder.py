@@ -16,10 +16,11 @@ from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.plain_yaml import load_plain
 from thermal_fiducial.files.reading import one_line, read_text
+from thermal_fiducial.files.writing import unfinished
 from thermal_fiducial.report.output_bag import read_output, RecordedOutput
 from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
 
-FUSED, FIDUCIAL, TRUTH = 'fused.tum', 'fiducial.tum', 'truth.tum'
+FUSED, FIDUCIAL, TRUTH, TRUTH_OF_BAG = 'fused.tum', 'fiducial.tum', 'truth.tum', 'ground_truth.tum'
 DETECTIONS, LATENCY, PARAMETERS = 'detections.csv', 'latency.csv', 'parameters.yaml'
 MARKER_MAP, TRUE_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'map_true.yaml', 'summary.json', 'output'
 #: Longer words are no numbers; whole ones fit into 64 bits.
@@ -53,6 +54,8 @@ class Run:
     marker_map: MarkerMap | None
     summary: dict[str, Any]
     truth: Trajectory | None
+    #: where the truth was read from
+    truth_path: Path | None = None
     #: the map as it really is; None where nobody knows
     true_map: MarkerMap | None = None
     #: t_imu - t_camera as configured
@@ -65,7 +68,8 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
     Parameters
     ----------
     path : the folder
-    truth : a TUM file or a bag; default: the folder's own ``truth.tum``, where it has one
+    truth : a TUM file or a bag; default: the folder's own ``truth.tum``, or ``ground_truth.tum`` in the bag that was
+        replayed, where there is one
     true_map : a marker map; default: ``map_true.yaml`` in the truth's bag or beside its file, where there is one
 
     Raises
@@ -76,11 +80,12 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
     if not path.is_dir():
         raise InputError(f'{path}: no such run folder')
     missing = [name for name in (FUSED, FIDUCIAL) if not (path / name).exists()]
+    if any(unfinished(path / name).exists() for name in missing):
+        raise InputError(f'{path}: its replay was cut short; replay it again')
     if missing:
         raise InputError(f'{path} is no run folder: it has no {missing[0]}')
-    own_truth = path / TRUTH
-    if truth is None and own_truth.exists():
-        truth = own_truth
+    summary = _summary(path / SUMMARY)
+    truth = _own_truth(path, summary) if truth is None else truth
     if true_map is None and truth is not None:
         beside = (truth if truth.is_dir() else truth.parent) / TRUE_MAP
         true_map = beside if beside.exists() else None
@@ -93,11 +98,28 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
         latencies=_latencies(path / LATENCY),
         output=read_output(path / OUTPUT, offset_ns),
         marker_map=load_map(path / MARKER_MAP) if (path / MARKER_MAP).exists() else None,
-        summary=_summary(path / SUMMARY),
+        summary=summary,
         truth=None if truth is None else read_truth(truth),
+        truth_path=truth,
         true_map=None if true_map is None else load_map(true_map),
         offset_ns=offset_ns,
     )
+
+
+def _own_truth(path: Path, summary: dict[str, Any]) -> Path | None:
+    """The truth that a run folder has, or the bag that it came from."""
+    bag = bag_of_run(path, summary)
+    places = [path / TRUTH, *([] if bag is None else [bag / TRUTH_OF_BAG])]
+    return next((place for place in places if place.exists()), None)
+
+
+def bag_of_run(path: Path, summary: dict[str, Any]) -> Path | None:
+    """The bag that a run was replayed from; None where it cannot be found any more."""
+    known, name = summary.get('bag_path'), summary.get('bag')
+    places = [Path(known)] if isinstance(known, str) else []
+    # A run folder may have been moved, with the bag in it or beside it.
+    places += [path / name, path.parent / name] if isinstance(name, str) and name else []
+    return next((place for place in places if place.exists()), None)
 
 
 def _camera_time_offset_ns(path: Path) -> int:
