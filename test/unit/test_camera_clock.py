@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from support.flights import config, errors, Flight, START_NS, timeline, white_poses
 
+from thermal_fiducial.core.filter.camera_clock import CameraClock
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.core.measurements import CameraPose, ImuSample
 
 AT = 2.5
 LATE = 0.03
@@ -54,6 +55,19 @@ def test_late_poses_are_no_step(late):
     # Beyond ``max_delay`` they are refused, and the filter coasts for two and a half seconds.
     assert off.max() < (0.05 if late < 1.0 else 0.5)
     assert abs(ekf.camera_time_offset or 0.0) < 0.02
+
+
+def test_poses_that_come_while_the_imu_is_silent_say_nothing_of_the_usual_delay():
+    """As on a real flight: a gap of 1.2 s just after the start, poses at 15 Hz all the while, 30 ms late."""
+    clock, late_ns, frame_ns = CameraClock(), 30_000_000, 66_666_667
+    silent = range(5, 23)
+    for k in range(60):
+        pose = CameraPose(k * frame_ns, np.eye(4), np.eye(6))
+        arrival_ns = pose.stamp_ns + late_ns
+        if k == silent.stop:
+            clock.imu_jumped(len(silent) * frame_ns)
+        newest_ns = silent.start * frame_ns if k in silent else arrival_ns
+        assert clock.proposed(pose, newest_ns) == 0
 
 
 def flown_by_a_stepping_imu(step):

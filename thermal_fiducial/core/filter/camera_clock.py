@@ -15,8 +15,8 @@ from thermal_fiducial.core.measurements import CameraPose
 
 #: Smaller steps [ns] are found by the clock offset that is estimated: a frame's time, in which motion is hardly curved.
 _SMALLEST_NS = 35_000_000
-#: Poses in a row that must agree on a step, and those that say what was usual before.
-_POSES, _USUAL = 5, 30
+#: Poses in a row that must agree on a step, those that say what was usual before, and how many of these are enough.
+_POSES, _USUAL, _ENOUGH = 5, 30, 15
 #: They agree to half of the step, and to this [ns].
 _AGREEMENT_NS = 50_000_000
 #: So many poses that arrive unlike those before a jump of the IMU's stamps wait for an explanation.
@@ -29,14 +29,20 @@ class CameraClock:
     def __init__(self) -> None:
         #: by how much the stamps are ahead of what they were when the filter began [ns]
         self.ahead_ns = 0
-        self._usual: deque[int] = deque(maxlen=_USUAL)
+        #: newest sample at the arrival, and how late that makes the pose
+        self._usual: deque[tuple[int, int]] = deque(maxlen=_USUAL)
         self._latest: deque[tuple[int, int]] = deque(maxlen=_POSES)
         self._imu_jump_ns = 0
         self._waited = 0
 
     def imu_jumped(self, jump_ns: int) -> None:
-        """Take note that the stamps of the IMU jumped [ns]: they missed samples, or their clock stepped."""
+        """Take note that the stamps of the IMU jumped [ns]: they missed samples, or their clock stepped.
+
+        Poses that have come since then were timed by a sample of long before.
+        """
         self._imu_jump_ns, self._waited = jump_ns, 0
+        last_ns = max((newest_ns for newest_ns, _ in self._usual), default=0)
+        self._usual = deque((entry for entry in self._usual if entry[0] != last_ns), maxlen=_USUAL)
 
     @property
     def in_question(self) -> bool:
@@ -57,15 +63,16 @@ class CameraClock:
         ``newest_ns``: stamp of the newest IMU sample when ``pose`` arrives.
         """
         late_ns = newest_ns - pose.stamp_ns
-        if len(self._usual) < _USUAL or abs(late_ns - median(self._usual)) < _SMALLEST_NS:
-            self._usual.append(late_ns)
+        usual_ns = median(late for _, late in self._usual) if len(self._usual) >= _ENOUGH else late_ns
+        if abs(late_ns - usual_ns) < _SMALLEST_NS:
+            self._usual.append((newest_ns, late_ns))
             self._latest.clear()
             self._imu_jump_ns = 0
             return 0
         self._waited += 1
         self._latest.append((pose.stamp_ns, late_ns))
         delays = [delay for _, delay in self._latest]
-        step_ns = round(median(self._usual) - median(delays))
+        step_ns = round(usual_ns - median(delays))
         if len(delays) < _POSES or max(delays) - min(delays) > min(abs(step_ns) // 2, _AGREEMENT_NS):
             return 0
         return step_ns
