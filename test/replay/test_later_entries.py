@@ -7,9 +7,12 @@ from support import small_bag
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.files.bag_writer import BagWriter
-from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMU_TOPIC
+from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMU_TOPIC, MAP_ERROR_TOPIC
 
 pytestmark = pytest.mark.ros
+
+#: What a bag that begins there has, beside IMU and calibration.
+TOPICS = {'markers': ['markers'], 'camera_pose': ['camera_pose', MAP_ERROR_TOPIC]}
 
 
 @pytest.fixture(scope='module')
@@ -19,11 +22,11 @@ def folder(tmp_path_factory):
     small_bag.recording(seconds=1.2).write(folder / 'images')
     small_bag.side_files(folder, ids=(0, 1, 2, 3))
     assert replay(folder, 'images') == 0
-    for topic in ('markers', 'camera_pose'):
+    for topic, topics in TOPICS.items():
         with BagWriter(folder / topic) as bag, BagReader(folder / 'images') as images:
             played = [*images.messages([IMU_TOPIC, CAMERA_INFO_TOPIC])]
             with BagReader(folder / 'images_run' / 'output') as output:
-                played += output.messages([topic])
+                played += output.messages(topics)
             for message in sorted(played, key=lambda item: item.stamp_ns):
                 bag.write(f'/drone/{message.topic}', message.stamp_ns, message.cdr, message.msgtype)
     return folder
@@ -49,7 +52,7 @@ def test_the_same_poses_as_from_images(folder, entry, transport):
     run, images = folder / f'{entry}_run', folder / 'images_run'
     summary = json.loads((run / 'summary.json').read_text())
     assert 'tau2_camera' not in summary['diagnostics']
-    assert set(summary['messages_in']) == {IMU_TOPIC, CAMERA_INFO_TOPIC, entry}
+    assert set(summary['messages_in']) == {IMU_TOPIC, CAMERA_INFO_TOPIC, *TOPICS[entry]}
     if transport == 'lockstep':
         for name in ('fused.tum', 'fiducial.tum'):
             assert (run / name).read_bytes() == (images / name).read_bytes()

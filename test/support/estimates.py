@@ -6,9 +6,12 @@ import numpy as np
 
 from support.flights import config
 from thermal_fiducial.core.filter.initialization import blank_state
-from thermal_fiducial.core.filter.pose_noise import PoseNoise
+from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise
 from thermal_fiducial.core.filter.state import Estimate, SIZE
-from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian_inverse, so3_log
+from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian_inverse, so3_log, transform
+
+#: Far from everything: its systematic error is another one.
+ELSEWHERE = BodyPose(0, transform(np.eye(3), [1e3, 0.0, 0.0]), 1e-4 * np.eye(6))
 
 
 def difference(state, other):
@@ -45,4 +48,4 @@ def any_estimate():
         bias=0.01 * rng.normal(size=6),
         scale=0.01 * rng.normal(size=(2, 3, 3)),
     )
-    return Estimate(1_000, state, A @ A.T, pose_noise=PoseNoise.of(1.0, 1.0))
+    return Estimate(1_000, state, A @ A.T, pose_noise=PoseNoise.of(1.0, 1.0, 0.0, ELSEWHERE))

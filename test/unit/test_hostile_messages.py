@@ -87,6 +87,8 @@ HOSTILE_CORRECTIONS = {
 }
 FOR_FILTER = (
     [('camera_pose', message) for message in HOSTILE_POSES.values()]
+    # A map may be exact, or uncertain in one direction alone.
+    + [('camera_pose/map_error', HOSTILE_POSES[key]) for key in HOSTILE_POSES if key not in ('zero', 'singular')]
     + [('imu/data', message) for message in HOSTILE_IMU.values()]
     + [('map_correction', message) for message in HOSTILE_CORRECTIONS.values()]
 )
@@ -114,6 +116,7 @@ def test_the_filter_refuses_each_and_gives_a_good_pose_after_all(graph, running)
         assert refusals(graph, node) == count, topic
     for message in at_rest(60, 120):
         graph.send(streams[type(message)], message)
+    graph.send('camera_pose/map_error', HOSTILE_POSES['zero']())
     assert graph.diagnose(node)[:2] == (OK, 'tracking')
     # As in the same flight without any of it: at rest at the origin, good to the floor of the made-up poses.
     np.testing.assert_allclose(node.filter.state.T_map_body, EYE, atol=0.01)

@@ -210,11 +210,11 @@ def test_the_white_covariance_of_the_pose_is_the_spread_of_its_errors(count):
     nees = []
     for k in range(0, 600, 3):
         T = flight(k / 30)
-        result = m.process(stamp(k), see(T, poses, 0.02, rng), CAMERA)
-        if result.pose is not None:
-            d = difference(T, result.pose.T_map_camera)
-            white = result.pose.covariance - result.pose.systematic_covariance
-            nees.append(d @ np.linalg.solve(white, d))
+        frame = m.locate(stamp(k), see(T, poses, 0.02, rng), CAMERA)
+        m.learn(frame)
+        if frame.pose is not None:
+            d = difference(T, frame.pose.T_map_camera)
+            nees.append(d @ np.linalg.solve(frame.outcome.noise, d))
     assert len(nees) > 100
     # Six degrees of freedom; the mean of 130 or more has one of 0.3. The covariance never shrinks below the declared
     # noise but grows with the residuals, which takes a little off.

@@ -18,6 +18,7 @@ from support.messages import frames, imu, info, pose
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.filter.innovations import innovations_of
+from thermal_fiducial.core.filter.state import POSITION
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
 from thermal_fiducial.errors import InputError
@@ -284,10 +285,16 @@ def test_the_map_is_latched_and_the_camera_found(graph, map_file):
     rows = clouds.cloud_rows(graph.heard['marker_map'][0], MAP_DTYPE)
     assert (rows['id'].tolist(), rows['fixed'].tolist()) == ([0], [1])
     graph.listen(PoseWithCovarianceStamped, 'camera_pose')
+    graph.listen(PoseWithCovarianceStamped, 'camera_pose/map_error')
     graph.send('thermal/camera_info', info())
     graph.send('markers', markers())
-    graph.spin_until(lambda: graph.heard['camera_pose'])
+    graph.spin_until(lambda: graph.heard['camera_pose'] and graph.heard['camera_pose/map_error'])
     found = convert.camera_pose(graph.heard['camera_pose'][0])
+    error = convert.map_error(graph.heard['camera_pose/map_error'][0])
+    np.testing.assert_array_equal(error.T_map_camera, found.T_map_camera)
+    # 0.3 % of 2.4 m by the size of the marker: within a fifth, as the view is oblique.
+    assert np.sqrt(np.trace(error.covariance[:3, :3])) == pytest.approx(0.003 * 2.4, rel=0.2)
+    assert np.all(np.linalg.eigvalsh(found.covariance - error.covariance) > 0.0)
     true = small_bag.true_pose(0.0) @ small_bag.T_BODY_CAMERA
     # One flat picture of a marker at 2.4 m: a decimetre.
     assert np.linalg.norm(found.T_map_camera[:3, 3] - true[:3, 3]) < 0.1
@@ -372,6 +379,29 @@ def test_a_cloud_that_is_no_markers_is_refused(graph, map_file):
 def fly(graph, messages):
     for message in messages:
         graph.send('imu/data' if isinstance(message, Imu) else 'camera_pose', message)
+
+
+def test_the_error_of_the_map_widens_what_is_claimed_and_moves_no_pose(graph):
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
+    error = pose(0)
+    error.pose.covariance = (0.04 * np.eye(6)).ravel()
+    for k in range(60):
+        if k % 6 == 5:
+            seen = pose(k - 4)
+            error.header.stamp = seen.header.stamp
+            seen.pose.covariance = (np.array(seen.pose.covariance) + error.pose.covariance).ravel()
+            graph.send('camera_pose/map_error', error)
+            graph.send('camera_pose', seen)
+        graph.send('imu/data', imu(k))
+    graph.published(node, 'pose')
+    state = node.filter.estimate
+    assert state is not None
+    assert np.sqrt(np.trace(state.covariance[POSITION, POSITION])) < 0.1
+    graph.listen(Odometry, 'odometry')
+    graph.send('imu/data', imu(60))
+    graph.spin_until(lambda: graph.heard['odometry'])
+    claimed = np.array(graph.heard['odometry'][0].pose.covariance).reshape(6, 6)
+    assert np.all(np.diag(claimed)[:3] >= 0.04)
 
 
 def test_one_pose_and_one_odometry_for_each_imu_message(graph):
@@ -585,7 +615,7 @@ def test_names_are_relative(graph):
         topics = {output.topic for output in node.outputs} | {source.topic for source in node.inputs}
     assert topics == {
         '/diagnostics', '/drone/vision/pose', '/drone/odometry', '/drone/path', '/drone/imu/data', '/drone/camera_pose',
-        '/drone/camera_clock', '/drone/map_correction', '/drone/robot_description',
+        '/drone/camera_pose/map_error', '/drone/camera_clock', '/drone/map_correction', '/drone/robot_description',
     }  # fmt: skip
 
 

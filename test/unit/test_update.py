@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.estimates import any_estimate, difference
+from support.estimates import any_estimate, difference, ELSEWHERE
 from support.flights import CAMERA_POSITION, config
 
 from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise
@@ -97,7 +97,7 @@ def test_the_systematic_error_is_part_of_the_measurement(estimate, still):
     updater = PoseUpdater(FULL)
     A = np.random.default_rng(3).normal(size=(6, 6)) * 1e-3
     pose = BodyPose(0, estimate.state.T_map_body, A @ A.T)
-    same_view = replace(known(estimate), pose_noise=replace(PoseNoise.of(1.0, 2.0), last=pose))
+    same_view = replace(known(estimate), pose_noise=PoseNoise.of(1.0, 2.0, 0.0, pose))
     biased = replace(same_view, state=replace(estimate.state, systematic=np.arange(1.0, 7.0)))
     innovation = updater.innovation(biased, pose, still)
     np.testing.assert_allclose(innovation.value, -innovation.H[:, SYSTEMATIC] @ np.arange(1.0, 7.0), atol=1e-12)
@@ -182,7 +182,7 @@ def test_what_poses_are_worth_is_learned(estimate, still):
     """White errors of a third of what the covariance claims, about a state that is known."""
     rng, updater = np.random.default_rng(8), PoseUpdater(config(stamp_jitter=0.0, estimate_time_offset=False))
     R = np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)
-    now = replace(known(estimate, 1e-14), pose_noise=PoseNoise.of(1.0, 0.01))
+    now = replace(known(estimate, 1e-14), pose_noise=PoseNoise.of(1.0, 0.01, 0.0, ELSEWHERE))
     for stamp in range(2000):
         noise = np.linalg.cholesky(R) @ rng.normal(size=6) / 3.0
         T = now.state.T_map_body @ transform(so3_exp(noise[:3]), noise[3:])
@@ -195,11 +195,9 @@ def test_what_poses_are_worth_is_learned(estimate, still):
 
 
 def test_another_view_has_another_systematic_error():
-    noise = PoseNoise.of(1.0, 1.0)
     R = np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)
     here = BodyPose(0, np.eye(4), R)
-    assert noise.alike(here, 0.3) == 0.0
-    seen = replace(noise, last=here)
+    seen = PoseNoise.of(1.0, 1.0, 0.0, here)
     assert seen.alike(here, 0.3) == pytest.approx(1.0)
     turned = BodyPose(1, transform(so3_exp([0.0, 0.3, 0.0]), np.zeros(3)), R)
     assert seen.alike(turned, 0.3) == pytest.approx(np.exp(-1.0))
@@ -211,11 +209,39 @@ def test_another_view_has_another_systematic_error():
     assert seen.alike(other_markers, 0.3) == pytest.approx((5.0 / 13.0) ** 3, rel=0.01)
 
 
+def test_the_map_has_the_same_error_while_its_covariance_is_the_same():
+    turned = so3_exp([0.3, -0.2, 1.9])
+    R = np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)
+    of_map = np.diag(np.repeat((2e-2, 1e-2), 3) ** 2)
+    here = BodyPose(0, transform(turned, np.zeros(3)), R, of_map)
+    assert not np.any(replace(here, map_covariance=np.zeros((6, 6))).map_change(here))
+    # The robot turns, the map's error doesn't.
+    again = replace(here, T_map_body=transform(turned @ so3_exp([0.0, 0.8, 0.0]), np.zeros(3)))
+    # rounding
+    np.testing.assert_allclose(again.map_change(here), 0.0, atol=1e-12)
+    other_markers = replace(here, map_covariance=1e4 * of_map)
+    # Nothing is left of the former error: rotation before position, in the robot frame, as isotropic as in the map.
+    np.testing.assert_allclose(other_markers.map_change(here), np.diag(np.repeat((1.0, 4.0), 3)), rtol=1e-4, atol=1e-6)
+
+
+def test_what_another_error_of_the_map_makes_of_a_pose_is_not_taken_for_motion(estimate, still):
+    """It goes to the systematic error of the poses, which is as uncertain as that."""
+    updater, pose = PoseUpdater(FULL), estimate.state.T_map_body
+    here = BodyPose(0, pose, 1e-6 * np.eye(6))
+    other = replace(here, map_covariance=1e-2 * np.eye(6))
+    seen = replace(known(estimate), pose_noise=PoseNoise.of(1.0, 1.0, 0.0, here))
+    innovation = updater.innovation(seen, other, still)
+    explained = innovation.H[:, SYSTEMATIC] @ innovation.prior.covariance[SYSTEMATIC, SYSTEMATIC]
+    shown = np.diag(explained @ innovation.H[:, SYSTEMATIC].T)
+    # 1e-2 less what the covariances still have in common: Bhattacharyya's coefficient squared of 1e-6 and 1e-2
+    np.testing.assert_allclose(shown, 1e-2, rtol=1e-2)
+
+
 def test_the_jitter_of_the_stamps_is_learned(estimate, motion):
     """Stamps that scatter by 3 ms, about a state that is known and moves."""
     rng, updater = np.random.default_rng(9), PoseUpdater(config(estimate_time_offset=False, time_offset_std=0.0))
     R = np.diag(np.repeat((1e-5, 2e-5), 3) ** 2)
-    noise = PoseNoise.of(1.0, 0.01, stamp_jitter=5e-4)
+    noise = PoseNoise.of(1.0, 0.01, 5e-4, ELSEWHERE)
     velocity = estimate.state.velocity
     for stamp in range(1000):
         late = rng.normal(0.0, 3e-3)

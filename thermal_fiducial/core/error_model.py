@@ -125,7 +125,7 @@ def visible_share(J: FloatArray, correlations: FloatArray) -> float:
 def map_of_pose(
     gains: FloatArray, covariances: FloatArray, positions: FloatArray, camera_position: FloatArray
 ) -> FloatArray:
-    """Covariance (6, 6) of a camera pose by the errors of the map.
+    """Covariance (6, 6) of a camera pose by the errors of the map, its scale aside.
 
     What the markers have in common moves the camera as if it hung on the same rigid map; for the rest any correlations
     are allowed for.
@@ -136,8 +136,6 @@ def map_of_pose(
     covariances, positions : (N, 6, 6), (N, 3) of the markers
     camera_position : (3,)
     """
-    if not np.any(covariances):
-        return np.zeros((6, 6))
     best = int(np.argmin(np.trace(covariances, axis1=1, axis2=2)))
     arms = np.concatenate([positions, camera_position[None]]) - positions[best]
     A = np.tile(np.eye(6), (len(arms), 1, 1))
@@ -172,8 +170,8 @@ def shape_of_corners(precisions: FloatArray, views: IntArray, errors: Systematic
     return np.asarray(errors.marker_shape * np.sqrt(views / precisions))
 
 
-def scale_of_map(positions: FloatArray, held: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Covariances (M, 6, 6) of markers at ``positions`` (M, 3), known by their distance from the nearest of ``held``.
+def arms_of_scale(positions: FloatArray, held: FloatArray) -> FloatArray:
+    """What markers at ``positions`` (M, 3) move by as the scale grows by 1 (M, 3): from the nearest of ``held``.
 
     Parameters
     ----------
@@ -181,9 +179,13 @@ def scale_of_map(positions: FloatArray, held: FloatArray, errors: SystematicErro
     """
     arms = positions[:, None] - held
     nearest = np.argmin(np.sum(arms**2, axis=-1), axis=1)
-    arm = arms[np.arange(len(positions)), nearest]
-    covariances = np.zeros((len(positions), 6, 6))
-    covariances[:, :3, :3] = errors.marker_size_std**2 * arm[:, :, None] * arm[:, None, :]
+    return np.asarray(arms[np.arange(len(positions)), nearest])
+
+
+def scale_of_map(arms: FloatArray, errors: SystematicErrors) -> FloatArray:
+    """Covariances (M, 6, 6) of markers that move by ``arms`` (M, 3) as the scale grows by 1."""
+    covariances = np.zeros((len(arms), 6, 6))
+    covariances[:, :3, :3] = errors.marker_size_std**2 * arms[:, :, None] * arms[:, None, :]
     return covariances
 
 

@@ -112,8 +112,8 @@ class CameraPose:
     T_map_camera: FloatArray
     #: (6, 6), ROS convention, in ``map`` [m, rad]
     covariance: FloatArray
-    #: (6, 6) the part of ``covariance`` that the next frames share: errors of map, scale and lens
-    systematic_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    #: (6, 6) the part of ``covariance`` that stays while the map does: errors of the map and of its scale
+    map_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     #: markers that it rests on
     marker_ids: tuple[int, ...] = field(default=())
     #: re-projection error, rms over their corners [px]
@@ -127,7 +127,7 @@ def in_moved_map(pose: CameraPose, T_new_old: FloatArray) -> CameraPose:
         pose,
         T_map_camera=T_new_old @ pose.T_map_camera,
         covariance=turn @ pose.covariance @ turn.T,
-        systematic_covariance=turn @ pose.systematic_covariance @ turn.T,
+        map_covariance=turn @ pose.map_covariance @ turn.T,
     )
 
 

@@ -29,13 +29,14 @@ CAMERA_INFO_TOPIC = 'thermal/camera_info'
 IMU_TOPIC = 'imu/data'
 MARKERS_TOPIC = 'markers'
 CAMERA_POSE_TOPIC = 'camera_pose'
+MAP_ERROR_TOPIC = 'camera_pose/map_error'
 TRUTH_TOPIC = 'ground_truth/odometry'
 
 #: Names that are looked for in any namespace of the bag.
 INTERFACE_TOPICS = (IMAGE_TOPIC, COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, IMU_TOPIC, TRUTH_TOPIC)
 #: The same for what nodes publish; other programs' topics may end alike (``marker_map/markers``), so that these are
 #: left alone where several do.
-_COMMON_NAMES = (MARKERS_TOPIC, CAMERA_POSE_TOPIC)
+_COMMON_NAMES = (MARKERS_TOPIC, CAMERA_POSE_TOPIC, MAP_ERROR_TOPIC)
 
 
 @dataclass(frozen=True)

@@ -75,6 +75,7 @@ def replay(
         entry = ENTRIES[options.entry] if options.entry else entry_of(bag.topics)
         played = entry.played(calibration_from_file=from_file)
         bag.require(played)
+        also = [topic for topic in entry.also if topic in bag.topics]
         transport = 'compressed' if entry.topic == COMPRESSED_TOPIC else 'raw'
         settings = replace(settings, tau2_camera=replace(settings.tau2_camera, image_transport=transport))
         arguments = _prepare(options, settings, entry, warn)
@@ -84,7 +85,7 @@ def replay(
             in_real_time = partial(replay_processes, rate=options.rate, say=say)
             play = in_real_time if options.transport == 'processes' else replay_lockstep
             done = partial(_show_share, progress, max(bag.duration_ns, 1))
-            timing = play(bag, entry.nodes, tuple(played), files, recorded, arguments, done, warn)
+            timing = play(bag, entry.nodes, (*also, *played), files, recorded, arguments, done, warn)
             _report_refusals(files, entry, warn)
         _report_silence(files, entry, warn)
         marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)

@@ -18,6 +18,7 @@ from thermal_fiducial.files.bags import (
     COMPRESSED_TOPIC,
     IMAGE_TOPIC,
     IMU_TOPIC,
+    MAP_ERROR_TOPIC,
     MARKERS_TOPIC,
 )
 from thermal_fiducial.ros import qos
@@ -41,6 +42,7 @@ PLAYED: Topics = {
     COMPRESSED_TOPIC: (CompressedImage, qos.IMAGE_OUTPUT),
     CAMERA_INFO_TOPIC: (CameraInfo, qos.RESULT),
     MARKERS_TOPIC: (PointCloud2, qos.RESULT),
+    MAP_ERROR_TOPIC: (PoseWithCovarianceStamped, qos.RESULT),
     CAMERA_POSE_TOPIC: (PoseWithCovarianceStamped, qos.RESULT),
     IMU_TOPIC: (Imu, qos.IMU_RATE_RESULT),
 }
@@ -48,6 +50,7 @@ _RESULTS: dict[str, Topics] = {
     'tau2_camera': {},
     'aruco_detector': {MARKERS_TOPIC: (PointCloud2, qos.RESULT), 'marker_poses': (PoseArray, qos.RESULT)},
     'marker_mapper': {
+        MAP_ERROR_TOPIC: (PoseWithCovarianceStamped, qos.RESULT),
         CAMERA_POSE_TOPIC: (PoseWithCovarianceStamped, qos.RESULT),
         'marker_map': (PointCloud2, qos.LATCHED),
         'map_correction': (TransformStamped, qos.RESULT),
@@ -72,11 +75,13 @@ class Entry:
     topic : what its first node reads
     skipped : nodes that the bag stands in for
     needs_calibration : whether some node that runs reads ``thermal/camera_info``
+    also : topics that are played where the bag has them
     """
 
     topic: str
     skipped: int
     needs_calibration: bool = True
+    also: tuple[str, ...] = ()
 
     @property
     def nodes(self) -> tuple[str, ...]:
@@ -104,7 +109,7 @@ ENTRIES = {
     'images': Entry(IMAGE_TOPIC, 0),
     'compressed': Entry(COMPRESSED_TOPIC, 0),
     'markers': Entry(MARKERS_TOPIC, 2),
-    'poses': Entry(CAMERA_POSE_TOPIC, 3, needs_calibration=False),
+    'poses': Entry(CAMERA_POSE_TOPIC, 3, needs_calibration=False, also=(MAP_ERROR_TOPIC,)),
 }
 
 

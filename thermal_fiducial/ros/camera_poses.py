@@ -18,7 +18,9 @@ from thermal_fiducial.ros.camera_node import CameraStageNode
 
 
 class CameraPoses:
-    """Publishes ``camera_pose`` for ``node``, with the camera that its parameter ``second_camera`` names.
+    """Publishes ``camera_pose`` for ``node``, and what of its covariance is the map's error.
+
+    The camera that the parameter ``second_camera`` names takes part.
 
     The second camera is located in the map of ``mapper`` and never changes it: what both cameras see enters the map
     through the first.
@@ -29,6 +31,7 @@ class CameraPoses:
         #: which map the poses are of
         self.late = LatePoses()
         self._output = node.advertise(PoseWithCovarianceStamped, 'camera_pose')
+        self._map_error = node.advertise(PoseWithCovarianceStamped, 'camera_pose/map_error')
         self._camera: Camera | None = None
         self._second: SecondCamera | None = None
         name = node.config.second_camera
@@ -55,6 +58,8 @@ class CameraPoses:
 
     def _publish(self, pose: CameraPose) -> None:
         head, pose = convert.header(pose.stamp_ns, self._node.config.map_frame), self.late.as_of_its_stamp(pose)
+        # First what belongs to the pose: who uses both has it then.
+        self._map_error.send(convert.pose_with_covariance(pose.T_map_camera, pose.map_covariance, head))
         self._output.send(convert.pose_with_covariance(pose.T_map_camera, pose.covariance, head))
 
     def _on_camera_info(self, message: CameraInfo) -> None:

@@ -42,6 +42,8 @@ from thermal_fiducial.files.records import stamp_ns as stamp_ns
 NORM_TOLERANCE = 0.1
 # Clocks farther apart than this are not those of one robot [s].
 _LARGEST_CLOCK_OFFSET = 10.0
+#: What stands for no variance: a share of the largest, and this [m^2, rad^2].
+_NO_SHARE, _NO_VARIANCE = 1e-9, 1e-15
 # --- stamps, headers, poses ---------------------------------------------------------------------------
 
 
@@ -156,6 +158,21 @@ def camera_pose(message: PoseWithCovarianceStamped) -> CameraPose:
     T_map_camera = transform_of(message.pose.pose, 'camera_pose')
     covariance = checked_covariance(np.array(message.pose.covariance).reshape(6, 6), 'camera_pose with a covariance')
     return CameraPose(stamp_ns(message.header.stamp), T_map_camera, covariance)
+
+
+def map_error(message: PoseWithCovarianceStamped) -> CameraPose:
+    """The camera in the map, its covariance by errors of the map alone: in some directions there may be none.
+
+    Raises
+    ------
+    InputError
+        As :func:`camera_pose`.
+    """
+    what = 'camera_pose/map_error'
+    values = np.array(message.pose.covariance).reshape(6, 6)
+    values = values + (_NO_SHARE * max(float(values.diagonal().max()), 0.0) + _NO_VARIANCE) * np.eye(6)
+    covariance = checked_covariance(values, f'{what} with a covariance')
+    return CameraPose(stamp_ns(message.header.stamp), transform_of(message.pose.pose, what), covariance)
 
 
 def vector(v: FloatArray) -> Vector3:

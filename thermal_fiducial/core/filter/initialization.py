@@ -119,9 +119,12 @@ def start(
 def _unaligned(
     config: PoseEkfConfig, pose: BodyPose, stamp_ns: int, prior: NavigationState, imu: FloatArray
 ) -> Estimate:
-    noise = PoseNoise.of(WHITE_STD, config.systematic_pose_std, config.stamp_jitter)
+    noise = PoseNoise.of(WHITE_STD, config.systematic_pose_std, config.stamp_jitter, pose)
     P = np.diag(_initial_variances(config))
     P[np.ix_(POSE, POSE)] += (noise.white + noise.systematic) * pose.shape
+    # The estimate is off by what the pose is.
+    P[POSE, SYSTEMATIC] -= np.linalg.cholesky(noise.systematic * pose.shape)
+    P[SYSTEMATIC, POSE] = P[POSE, SYSTEMATIC].T
     state = replace(
         prior,
         R_map_body=pose.T_map_body[:3, :3],

@@ -45,12 +45,13 @@ def odometry(
     J[6:9, ROTATION] = skew(velocity_body)
     covariance = J @ joint @ J.T
     covariance.reshape(-1)[_RATE_VARIANCES] += rate_variance
+    of_map = prediction.origin.pose_noise.last.map_covariance
     return Odometry(
         prediction.stamp_ns,
         state.T_map_body,
         velocity_body,
         state.corrected(imu)[:3],
-        covariance[:6, :6],
+        covariance[:6, :6] + of_map,
         covariance[6:, 6:],
     )
 

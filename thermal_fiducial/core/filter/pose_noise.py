@@ -9,7 +9,7 @@ Sources: R. Mehra, "Approaches to Adaptive Filtering", IEEE TAC 1972; R. Shumway
 Series Smoothing and Forecasting Using the EM Algorithm", 1982.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
 
@@ -33,16 +33,38 @@ _ROUNDING = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
 
 @dataclass(frozen=True)
 class BodyPose:
-    """A measured pose of the robot; ``covariance`` (6, 6): rotation, then position, in the robot frame [rad, m]."""
+    """A measured pose of the robot."""
 
     stamp_ns: int
     T_map_body: FloatArray
+    #: (6, 6) relative to the map as it is: rotation, then position, in the robot frame [rad, m]
     covariance: FloatArray
+    #: (6, 6) by errors of the map: ROS convention, in ``map`` [m, rad]
+    map_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
     @cached_property
     def shape(self) -> FloatArray:
         """(6, 6) the covariance, never singular."""
         return self.covariance + _ROUNDING
+
+    def map_change(self, last: 'BodyPose') -> FloatArray:
+        """Covariance (6, 6), as ``covariance``, of what changed with the map's error since the ``last`` pose.
+
+        The same markers in the same map have the same error; as far as the two covariances differ it is another one.
+        """
+        if not self.map_covariance.any():
+            return np.zeros((6, 6))
+        turn = np.zeros((6, 6))
+        turn[:3, 3:] = turn[3:, :3] = self.T_map_body[:3, :3].T
+        then, now = (turn @ pose.map_covariance @ turn.T for pose in (last, self))
+        same = math.exp(2.0 * log_overlap(then + self.shape, now + self.shape))
+        return np.asarray((1.0 - same) * now)
+
+
+def log_overlap(A: FloatArray, B: FloatArray) -> float:
+    """Logarithm, at most 0, of Bhattacharyya's coefficient of errors with covariances (m, m)."""
+    determinants = np.linalg.slogdet(np.stack((A, B, 0.5 * (A + B))))[1]
+    return min(float(0.25 * (determinants[0] + determinants[1]) - 0.5 * determinants[2]), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,21 +75,26 @@ class PoseNoise:
     systematic: float
     #: what they were before the first pose
     initial: tuple[float, float]
+    #: the last pose that was compared with the estimate
+    last: BodyPose
     #: variance of the jitter of the camera's stamps [s^2], 0: they are exact; information about its logarithm
     jitter: float = 0.0
     jitter_information: float = 0.0
-    #: the last pose that was compared with the estimate
-    last: BodyPose | None = None
 
     @classmethod
-    def of(cls, white_std: float, systematic_std: float, stamp_jitter: float = 0.0) -> 'PoseNoise':
-        """Standard deviations to begin with, in units of a pose's own; ``stamp_jitter`` [s]."""
+    def of(cls, white_std: float, systematic_std: float, stamp_jitter: float, first: BodyPose) -> 'PoseNoise':
+        """Standard deviations to begin with, in units of a pose's own; ``stamp_jitter`` [s]; the ``first`` pose."""
         variances = white_std**2, systematic_std**2
-        return cls(*variances, variances, jitter=stamp_jitter**2)
+        return cls(*variances, variances, first, jitter=stamp_jitter**2)
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'PoseNoise':
         """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-        last = self.last and replace(self.last, T_map_body=T_new_old @ self.last.T_map_body)
+        turn = np.kron(np.eye(2), T_new_old[:3, :3])
+        last = replace(
+            self.last,
+            T_map_body=T_new_old @ self.last.T_map_body,
+            map_covariance=turn @ self.last.map_covariance @ turn.T,
+        )
         return replace(self, last=last)
 
     def alike(self, pose: BodyPose, angle: float) -> float:
@@ -76,8 +103,6 @@ class PoseNoise:
         It falls with the change of the view, e-fold for ``angle`` [rad], and as far as the two covariances differ
         (Bhattacharyya's coefficient): other markers have other errors.
         """
-        if self.last is None:
-            return 0.0
         A, B = self.last.shape, pose.shape
         # What is uncertain of position for what is uncertain of rotation: the distance to the markers.
         variances = B.diagonal()
@@ -85,9 +110,7 @@ class PoseNoise:
         T_last, T = self.last.T_map_body, pose.T_map_body
         turned = float(rotation_angle(T_last[:3, :3].T @ T[:3, :3]))
         moved = float(np.linalg.norm(T[:3, 3] - T_last[:3, 3])) / distance
-        determinants = np.linalg.slogdet(np.stack((A, B, 0.5 * (A + B))))[1]
-        overlap = 0.25 * (determinants[0] + determinants[1]) - 0.5 * determinants[2]
-        return math.exp(-(turned + moved) / angle + min(float(overlap), 0.0))
+        return math.exp(-(turned + moved) / angle + log_overlap(A, B))
 
     def after(
         self, pose: BodyPose, innovation: FloatArray, S_inverse: FloatArray, second_moment: float, alike: float

@@ -86,7 +86,10 @@ def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> Body
     J = np.zeros((6, 6))
     J[:3, 3:] = J[3:, :3] = R.T
     J[3:, 3:] = -R.T @ skew(lever)
-    return BodyPose(pose.stamp_ns, T_map_body, scale**2 * (J @ pose.covariance @ J.T))
+    relative = scale**2 * (J @ (pose.covariance - pose.map_covariance) @ J.T)
+    to_body = np.eye(6)
+    to_body[:3, 3:] = -skew(lever)
+    return BodyPose(pose.stamp_ns, T_map_body, relative, to_body @ pose.map_covariance @ to_body.T)
 
 
 def pose_innovation(state: NavigationState, T_map_body: FloatArray) -> FloatArray:
@@ -106,9 +109,12 @@ class PoseUpdater:
     def innovation(self, estimate: Estimate, pose: BodyPose, motion: MotionAtPose) -> Innovation:
         """What ``pose`` says beyond ``estimate`` at its instant."""
         alike = estimate.pose_noise.alike(pose, self.config.systematic_angle)
-        prior = _with_new_view(estimate, alike)
         # The systematic error in the axes of the pose's own: those of the triangular root of its covariance.
-        root = np.linalg.cholesky(prior.pose_noise.systematic * pose.shape)
+        root = np.linalg.cholesky(estimate.pose_noise.systematic * pose.shape)
+        prior = _with_new_view(estimate, alike)
+        to_units = np.linalg.inv(root)
+        change = pose.map_change(estimate.pose_noise.last)
+        prior.covariance[SYSTEMATIC, SYSTEMATIC] += to_units @ change @ to_units.T
         H = np.zeros((6, SIZE))
         H[_SIX, POSE] = 1.0
         H[:, EXTRINSICS] = np.eye(6)

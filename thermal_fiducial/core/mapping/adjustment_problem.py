@@ -8,8 +8,9 @@ import numpy as np
 from thermal_fiducial.core.error_model import CHI2_OF_POSE, CHI2_OF_VIEW
 from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
 from thermal_fiducial.core.geometry.se3 import skew
+from thermal_fiducial.core.mapping.map_data import gauge
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations
-from thermal_fiducial.core.mapping.snapshot import CameraRig, gauge, Snapshot
+from thermal_fiducial.core.mapping.snapshot import CameraRig, Snapshot
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 # Chi square of a view that no pose near the present one explains.

@@ -13,7 +13,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import noise_factor, scale_of_map, shape_of_corners, SystematicErrors
+from thermal_fiducial.core.error_model import (
+    arms_of_scale,
+    noise_factor,
+    scale_of_map,
+    shape_of_corners,
+    SystematicErrors,
+)
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
@@ -106,7 +112,7 @@ def _result(
     covariances = system.covariances(widened, np.stack([snapshot.markers[key].covariance for key in problem.ids]))
     positions = now.state.T_map_marker[:, :3, 3]
     covariances += _shape_covariances(problem, system, now, weights, snapshot.errors)
-    covariances += scale_of_map(positions, positions[problem.held], snapshot.errors)
+    covariances += scale_of_map(arms_of_scale(positions, positions[problem.held]), snapshot.errors)
     if not np.all(np.isfinite(covariances)):
         return None
     free = [(i, key) for i, key in enumerate(problem.ids) if not problem.held[i]]

@@ -17,6 +17,8 @@ from thermal_fiducial.core.error_model import (
     noise_factor,
     noise_of_pose,
     of_single_error,
+    positive,
+    scale_of_map,
     SystematicErrors,
 )
 from thermal_fiducial.core.geometry.camera import Camera
@@ -83,9 +85,8 @@ def _either(frame: '_Frame', found: Location, T_other: FloatArray, prior: FloatA
     T = pose.T_map_camera
     if rotation_angle(T[:3, :3].T @ T_other[:3, :3]) < SAME_POSE:
         spread = of_single_error(difference(T_other, T))
-        systematic = pose.systematic_covariance + spread
-        pose = replace(pose, covariance=pose.covariance + spread, systematic_covariance=systematic)
-        return replace(found, pose=pose, spread=spread)
+        pose = replace(pose, covariance=pose.covariance + spread)
+        return replace(found, pose=pose, noise=found.noise + spread)
     other = frame.refined(T_other, frame.sight.reprojected(frame.camera, T_other), found.weights)
     if other is None:
         return found
@@ -153,16 +154,20 @@ class _Frame:
         of_corners = corners_of_pose(by_corner, correlations, model)
         arms = sight.points - sight.T_map_marker[:, None, :3, 3]
         grown = gains @ np.einsum('nckj,ncj->nck', seen.J_marker[..., :3], arms).ravel()
-        of_scale = of_single_error(grown, model.marker_size_std)
         map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ seen.J_marker.reshape(n, 8, 6)
-        of_map = map_of_pose(map_gains, sight.map_covariances, sight.T_map_marker[:, :3, 3], T_map_camera[:3, 3])
-        systematic = of_map + of_corners + of_scale
-        if not np.all(np.isfinite(white + systematic)):
+        # Sides and map grow together.
+        of_scale = np.einsum('nij,nj->i', map_gains[:, :, :3], sight.scale_arms) - grown
+        of_map = of_single_error(of_scale, model.marker_size_std)
+        if np.any(sight.map_covariances):
+            rest = positive(sight.map_covariances - scale_of_map(sight.scale_arms, model))
+            of_map += map_of_pose(map_gains, rest, sight.T_map_marker[:, :3, 3], T_map_camera[:3, 3])
+        covariance = white + of_corners + of_map
+        if not np.all(np.isfinite(covariance)):
             return None
         ids, rms_px = tuple(marker.id for marker in sight.markers), float(np.sqrt(np.mean(seen.errors_px**2)))
         T = retract(T_map_camera, step)
-        pose = CameraPose(self.stamp_ns, T, white + systematic, systematic, ids, rms_px)
-        return Location(pose, sight, seen, weights, map_gains, correlations, np.zeros((6, 6)))
+        pose = CameraPose(self.stamp_ns, T, covariance, of_map, ids, rms_px)
+        return Location(pose, sight, seen, weights, map_gains, correlations, white)
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
         """Another pose (4, 4) that the corners do not refute; None when there is none."""

@@ -1,15 +1,14 @@
 """The known markers of a frame, and what they say of where the camera is: records of the localization."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import correlated_sum, INCONSISTENT_PX, positive
+from thermal_fiducial.core.error_model import arms_of_scale, correlated_sum, INCONSISTENT_PX, positive
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise
-from thermal_fiducial.core.mapping.map_data import MapMarker
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.odometry_prior import PredictedCamera
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, marker_branches, Markers
@@ -35,19 +34,26 @@ class Sight:
     T_map_marker: FloatArray
     sizes: FloatArray
     map_covariances: FloatArray
+    #: (N, 3) what their positions move by as the scale of the map grows by 1 [m]
+    scale_arms: FloatArray
 
     @classmethod
-    def of(cls, rows: Markers, markers: Mapping[int, MapMarker]) -> 'Sight':
-        """Of rows whose IDs are all among ``markers``."""
-        known = [markers[key] for key in rows['id'].tolist()]
+    def of(cls, rows: Markers, marker_map: MarkerMap) -> 'Sight':
+        """Of rows whose IDs are all in the map."""
+        known = [marker_map.markers[key] for key in rows['id'].tolist()]
+        T_map_marker = np.array([marker.T_map_marker for marker in known]).reshape(-1, 4, 4)
+        covariances = np.array([marker.covariance for marker in known]).reshape(-1, 6, 6)
+        given = not np.any(covariances)
+        positions = T_map_marker[:, :3, 3]
         return cls(
             known,
             corners_px(rows),
             corner_covariances(rows),
             marker_branches(rows),
-            np.array([marker.T_map_marker for marker in known]).reshape(-1, 4, 4),
+            T_map_marker,
             np.array([marker.size for marker in known]),
-            np.array([marker.covariance for marker in known]).reshape(-1, 6, 6),
+            covariances,
+            np.zeros_like(positions) if given else arms_of_scale(positions, marker_map.anchors()),
         )
 
     @cached_property
@@ -56,7 +62,10 @@ class Sight:
         chosen = [marker.trusted for marker in self.markers]
         if all(chosen):
             return self
-        arrays = self.corners, self.covariances, self.branches, self.T_map_marker, self.sizes, self.map_covariances
+        arrays = (
+            self.corners, self.covariances, self.branches,
+            self.T_map_marker, self.sizes, self.map_covariances, self.scale_arms,
+        )  # fmt: skip
         return Sight([marker for marker in self.markers if marker.trusted], *(array[chosen] for array in arrays))
 
     @cached_property
@@ -116,8 +125,8 @@ class Location:
     map_gains: FloatArray
     #: (4 N, 4 N) of the systematic errors of the corners
     correlations: FloatArray
-    #: (6, 6) the part of the covariance by which another pose may be the true one as well
-    spread: FloatArray
+    #: (6, 6) the part of the covariance that the next frames don't share: noise of the corners
+    noise: FloatArray
 
     @property
     def reason(self) -> str:
@@ -134,8 +143,7 @@ class Location:
         """
         pose, of_map = self.pose, self.sight.map_covariances
         best = of_map[np.argmin(np.trace(of_map, axis1=1, axis2=2))]
-        relative = pose.covariance - pose.systematic_covariance + self.spread
-        relative = relative + correlated_sum(self.map_gains, positive(of_map - best))
+        relative = self.noise + correlated_sum(self.map_gains, positive(of_map - best))
         return Viewpoint.known(pose.T_map_camera, relative, positive(pose.covariance - relative))
 
 

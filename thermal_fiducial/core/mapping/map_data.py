@@ -7,7 +7,7 @@ import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS, MAP_DTYPE
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +71,14 @@ class MarkerMap:
     def geometry(self) -> dict[int, tuple[FloatArray, float]]:
         """Marker ID to (T_map_marker, size): what a detector needs to look for them."""
         return {marker.id: (marker.T_map_marker, marker.size) for marker in self.markers.values()}
+
+    def anchors(self) -> FloatArray:
+        """Positions (H, 3) of the markers that carry the scale: see :func:`gauge`."""
+        markers = list(self.markers.values())
+        held = [marker for marker in markers if marker.fixed]
+        if not held:
+            held = [marker for marker, chosen in zip(markers, gauge(markers), strict=True) if chosen]
+        return np.array([marker.T_map_marker[:3, 3] for marker in held]).reshape(-1, 3)
 
     def rows(self, in_view: Collection[int] = ()) -> np.ndarray:
         """Rows (N,) of :data:`MAP_DTYPE`, ordered by ID; ``in_view`` are the IDs that the frame at hand shows."""
@@ -156,6 +164,14 @@ class LatePoses:
         if 0 <= self._moved_ns - pose.stamp_ns <= LATEST_NS:
             return in_moved_map(pose, inverse(self._T_new_old))
         return pose
+
+
+def gauge(markers: list[MapMarker]) -> BoolArray:
+    """Which markers are held: fixed ones and those known exactly; failing these, the one known best."""
+    held = np.array([m.fixed or not np.any(m.covariance) for m in markers], dtype=bool)
+    if markers and not np.any(held):
+        held[int(np.argmin([np.trace(m.covariance) for m in markers]))] = True
+    return held
 
 
 def _fill(rows: np.ndarray, names: Collection[str], values: FloatArray) -> None:

@@ -107,7 +107,7 @@ class MarkerMapper:
         markers = usable(markers)
         # Step 2: known and new markers.
         is_known = np.array([key in self.map.markers for key in markers['id'].tolist()], dtype=bool)
-        known = Sight.of(markers[is_known], self.map.markers)
+        known = Sight.of(markers[is_known], self.map)
         offset_std = self.config.time_offset_std
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.

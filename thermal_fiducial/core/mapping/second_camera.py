@@ -73,7 +73,7 @@ def seen_from(pose: CameraPose, T_camera_other: FloatArray) -> CameraPose:
         pose,
         T_map_camera=T_map_other,
         covariance=J @ pose.covariance @ J.T,
-        systematic_covariance=J @ pose.systematic_covariance @ J.T,
+        map_covariance=J @ pose.map_covariance @ J.T,
     )
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import divided_prior, NO_SYSTEMATIC_ERRORS, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.mapping.map_data import gauge, MapMarker
+from thermal_fiducial.core.types import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
@@ -133,11 +133,3 @@ def prior_poses(markers: Mapping[int, MapMarker]) -> dict[int, tuple[FloatArray,
     """
     known = [m for m in markers.values() if not m.fixed and np.any(m.covariance)]
     return {m.id: (m.T_map_marker, divided_prior(m.covariance, len(known))) for m in known}
-
-
-def gauge(markers: list[MapMarker]) -> BoolArray:
-    """Which markers are held: fixed ones and those known exactly; failing these, the one known best."""
-    held = np.array([m.fixed or not np.any(m.covariance) for m in markers], dtype=bool)
-    if markers and not np.any(held):
-        held[int(np.argmin([np.trace(m.covariance) for m in markers]))] = True
-    return held
