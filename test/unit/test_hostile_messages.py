@@ -1,6 +1,7 @@
 """Messages that cannot be: each is refused in words, costs nothing else, and a good stream gives a good pose after."""
 
 from array import array
+from copy import deepcopy
 from dataclasses import replace
 
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
@@ -293,7 +294,7 @@ def cloud(dtype, **values):
         row[axis] = 0.0
     for name, value in values.items():
         row[name] = value
-    return clouds.cloud(row, at(START))
+    return deepcopy(clouds.cloud(row, at(START)))
 
 
 def promising(message):

@@ -62,7 +62,8 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         markers = self.detector.detect(stamp, counts, camera, self.odometry)
         self._seen = len(markers)
         self._markers.send(clouds.cloud(markers, message.header))
-        self._marker_poses.send(clouds.marker_poses(markers, message.header))
+        if self._marker_poses.listeners:
+            self._marker_poses.send(clouds.marker_poses(markers, message.header))
         self._others.send(markers, message.header)
         if self._annotated.listeners:
             self._annotated.send(convert.image(display.annotated(self._gray(counts), markers), message.header))

@@ -104,7 +104,11 @@ class FrameCleaner:
         used = int(np.bitwise_or.reduce(image[:: FreezeDetector.ROW_STEP], axis=None))
         shift = (used & -used).bit_length() - 1
         down = shift if used >> self.config.bits and shift >= _SHIFTED else 0
-        return (image.astype(np.uint16) >> np.uint16(down)) & np.uint16((1 << self.config.bits) - 1)
+        own = image.astype(np.uint16)
+        if down:
+            own >>= np.uint16(down)
+        own &= np.uint16((1 << self.config.bits) - 1)
+        return own
 
     def _stale(self, stamp_ns: int, image: Counts, *, coarse: bool) -> str:
         if self._freeze.repeats(image, coarse=coarse):
