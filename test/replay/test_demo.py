@@ -69,5 +69,8 @@ def test_a_file_in_the_way_is_refused(tmp_path, capsys):
 
 @pytest.mark.parametrize('seconds', ['-3', '0', 'nan', 'inf', '1.5'])
 def test_an_impossible_length_is_refused(tmp_path, capsys, seconds):
-    assert main(['demo', '--out', str(tmp_path / 'demo'), f'--seconds={seconds}']) == 2
+    (tmp_path / MARK).touch()
+    assert main(['demo', '--out', str(tmp_path), f'--seconds={seconds}']) == 2
     assert f'{seconds} ' in capsys.readouterr().err
+    # What an earlier demo left is not thrown away for it.
+    assert (tmp_path / MARK).exists()

@@ -78,10 +78,27 @@ def test_a_replay_says_what_is_missing_before_it_begins(tmp_path, monkeypatch, o
     assert not (tmp_path / 'run').exists()
 
 
-def test_the_demo_without_ros_says_what_is_missing(tmp_path):
-    code = 'from pathlib import Path\nfrom thermal_fiducial.cli.demo import _replay\n_replay(Path(), Path())'
-    result = python(code, ('rclpy', 'sensor_msgs', 'diagnostic_msgs', 'geometry_msgs'))
-    assert 'install the extra "ros"' in result.stderr
+@pytest.mark.parametrize(
+    ('hidden', 'options', 'words'),
+    [
+        (('rclpy', 'sensor_msgs'), (), 'the demo runs the ROS 2 nodes and finds no rclpy: install the extra "ros"'),
+        (('matplotlib',), ('--picture', 'demo.png'), '--picture needs matplotlib: install the extra "tools"'),
+        (('plotly',), (), 'the report needs plotly: install the extra "tools"'),
+    ],
+)
+def test_the_demo_says_what_is_missing_before_it_begins(tmp_path, hidden, options, words):
+    result = python(COMMAND, hidden, 'demo', '--out', str(tmp_path / 'demo'), *options)
+    assert result.returncode == 2
+    assert result.stderr == f'thermal-fiducial demo: {words}\n'
+    assert not (tmp_path / 'demo').exists()
+
+
+def test_drawings_that_cannot_all_be_written_are_not_begun(tmp_path):
+    result = python(COMMAND, ('ezdxf', 'reportlab'), 'markers', 'make', '--ids', '1', '--out', str(tmp_path))
+    assert result.returncode == 2
+    words = 'ezdxf, reportlab missing: install the extra "tools", or leave dxf, pdf out of --formats'
+    assert result.stderr == f'thermal-fiducial markers: {words}\n'
+    assert not list(tmp_path.iterdir())
 
 
 SLOW = ('scipy.stats', 'scipy.ndimage', 'matplotlib', 'rosbags', 'plotly', 'jinja2', 'rich')

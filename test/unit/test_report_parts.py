@@ -22,6 +22,7 @@ from thermal_fiducial.report.output_bag import Arrivals, RecordedOutput
 from thermal_fiducial.report.run_folder import Detections, read_run, Run
 from thermal_fiducial.report.tables import Table
 from thermal_fiducial.report.tags import tags
+from thermal_fiducial.report.time_plots import TimePlots
 from thermal_fiducial.report.trajectory import Trajectory
 from thermal_fiducial.report.verdict import HEADLINES, judge, Weight
 
@@ -37,6 +38,19 @@ def trajectory(rate_hz, seconds=SECONDS):
 def run_of(tmp_path, fused, fiducial, **more):
     empty = {'latencies': {}, 'output': RecordedOutput(), 'marker_map': None, 'summary': {}, 'truth': trajectory(100.0)}
     return Run(tmp_path, fused, fiducial, **({'detections': NOTHING} | empty | more))
+
+
+def test_logarithmic_axes_have_whole_numbers_at_their_ticks():
+    plots = TimePlots(('a', 'b', 'c', 'd'))
+    time = np.arange(3.0)
+    for row, values in enumerate(([0.3, np.nan, 4.0], [0.02, 1.0, 30.0], [2e-3, 1.0, 2e4], [np.nan] * 3), 1):
+        plots.line(row, time, np.array(values), 'fused', 'blue')
+    plots.make_logarithmic()
+    shown = [axis.ticktext for axis in plots.figure.select_yaxes()]
+    assert shown[0] == ('0.1', '0.2', '0.5', '1', '2', '5', '10', '20', '50')
+    assert shown[1] == ('0.01', '0.03', '0.1', '0.3', '1', '3', '10', '30', '100', '300')
+    assert shown[2][:3] == ('0.001', '0.01', '0.1')
+    assert shown[3] is None
 
 
 # --- interruptions -----------------------------------------------------------------------------------
@@ -255,6 +269,7 @@ def test_tables_in_a_terminal_are_parted_and_lose_nothing(columns, capsys, monke
     shown = capsys.readouterr().out
     assert max(map(len, shown.splitlines())) <= columns
     assert (shown.count('Markers, one by one') == 1) == (columns == 200)
+    assert shown.count('Markers, one by one (continued)') == shown.count('Markers, one by one') - 1
     assert shown.count('[mm]') == 12
     for cell in rows[0][1:-1] + rows[1][1:-1]:
         assert cell in shown.split()

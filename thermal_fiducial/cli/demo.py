@@ -6,25 +6,31 @@ from pathlib import Path
 import shutil
 import sys
 import time
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from thermal_fiducial.cli.evaluate import make_video, print_tables
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.packages import is_installed
 from thermal_fiducial.report.page import evaluate_run, Evaluation, require_packages, write_page
 from thermal_fiducial.report.tables import tables
+
+if TYPE_CHECKING:
+    from thermal_fiducial.sim.thermal_camera import FlightPlan
 
 SCENARIO = 'fog'
 BAG = 'flight_through_fog'
 LONGEST_S = 3600.0
 #: Stands in the folder of a demo: only such a folder is ever replaced.
 MARK = '.thermal_fiducial_demo'
+#: What the replay imports of ROS.
+ROS_PACKAGES = ('rclpy', 'sensor_msgs', 'geometry_msgs', 'diagnostic_msgs')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument('--out', type=Path, default=Path('runs/demo'), metavar='RUN', help='folder')
-    parser.add_argument('--seconds', type=float, default=30.0, help='length of the flight [s]')
+    parser.add_argument('--seconds', type=float, default=30.0, help='length of the flight [s], 11 or more')
     parser.add_argument('--seed', type=int, default=0, help='of path and noise')
     parser.add_argument('--picture', type=Path, metavar='PNG', help='also draw frame, map and error into one picture')
     parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
@@ -34,15 +40,14 @@ def run(args: argparse.Namespace) -> int:
     """Simulate, replay, score, report."""
     if not 0.0 < args.seconds <= LONGEST_S:
         raise InputError(f'--seconds {args.seconds:g} is not between 0 and {LONGEST_S:g}')
-    require_packages(tables=True)
-    if args.video:
-        from thermal_fiducial.report.video import require_encoder
+    _check_packages(args)
+    from thermal_fiducial.sim.thermal_camera import plan
 
-        require_encoder()
     started = time.monotonic()
+    flight = plan(SCENARIO, args.seconds, args.seed)
     _make_room(args.out)
     bag = args.out / BAG
-    _simulate(bag, args.seconds, args.seed)
+    _simulate(bag, flight)
     _replay(bag, args.out)
     evaluation, numbers = evaluate_run(args.out, bag)
     if args.video:
@@ -55,6 +60,20 @@ def run(args: argparse.Namespace) -> int:
     _say(evaluation, numbers)
     print(f'\n{time.monotonic() - started:.0f} s from start to end. The report, with all pictures: {page}')
     return 0
+
+
+def _check_packages(args: argparse.Namespace) -> None:
+    """Say what is missing before minutes of work."""
+    require_packages(tables=True)
+    missing = [name for name in ROS_PACKAGES if not is_installed(name)]
+    if missing:
+        raise InputError(f'the demo runs the ROS 2 nodes and finds no {missing[0]}: install the extra "ros"')
+    if args.picture is not None and not is_installed('matplotlib'):
+        raise InputError('--picture needs matplotlib: install the extra "tools"')
+    if args.video:
+        from thermal_fiducial.report.video import require_encoder
+
+        require_encoder()
 
 
 def _make_room(out: Path) -> None:
@@ -70,20 +89,16 @@ def _make_room(out: Path) -> None:
         raise InputError(f'{out}: {error.strerror}') from None
 
 
-def _simulate(bag: Path, seconds: float, seed: int) -> None:
-    from thermal_fiducial.sim.thermal_camera import plan
+def _simulate(bag: Path, flight: 'FlightPlan') -> None:
     from thermal_fiducial.sim.writer import write_flight
 
-    flight = plan(SCENARIO, seconds, seed)
     with _step(f'1/3 simulating {flight.seconds:g} s of flight') as share:
         write_flight(bag, flight, workers=len(os.sched_getaffinity(0)), progress=counted(share, flight.frame_count))
 
 
 def _replay(bag: Path, out: Path) -> None:
-    try:
-        from thermal_fiducial.replay.session import Options, replay
-    except ImportError as error:
-        raise InputError(f'the demo runs the ROS 2 nodes and finds no {error.name}: install the extra "ros"') from None
+    from thermal_fiducial.replay.session import Options, replay
+
     options = Options(bag=bag, run=out, params=bag / 'params.yaml', map_file=bag / 'map_one.yaml')
     with _step('2/3 replaying it through the four nodes') as share:
         replay(options, share, lambda line: print(f'warning: {line}', file=sys.stderr))

@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 import json
 from pathlib import Path
 from typing import Any, Literal
@@ -111,12 +112,13 @@ def _parts(entry: Table) -> Iterator[Table]:
 
     about = [column for column, head in enumerate(entry.heads[:2]) if column == 0 or head == 'unit']
     left = list(range(len(about), len(entry.heads)))
+    continued = replace(entry, title=f'{entry.title} (continued)')
     while left:
         count = len(left)
         while count > 1 and not fits(_for_terminal(entry.of([*about, *left[:count]]))):
             count -= 1
         yield entry.of([*about, *left[:count]])
-        left = left[count:]
+        entry, left = continued, left[count:]
 
 
 def _for_terminal(entry: Table) -> Any:

@@ -127,18 +127,18 @@ def _edit(args: argparse.Namespace, action: str, change: Callable[[MarkerMap], M
 def _show(args: argparse.Namespace) -> int:
     marker_map = _load(args)
     title = f'{args.map}: {marker_map.dictionary}, frame {marker_map.frame_id}, revision {marker_map.revision}'
-    headers = 'ID', 'size m', 'x m', 'y m', 'z m', 'faces', 'sigma mm', 'deg', 'error px', 'seen', 'standing'
-    table = table_of(title, headers, left=['faces', 'standing'])
+    headers = 'ID', 'size m', 'x m', 'y m', 'z m', 'faces', 'sigma mm', 'deg', 'error px', 'seen', 'status'
+    table = table_of(title, headers, left=['faces', 'status'])
     table.columns[headers.index('faces')].no_wrap = True
     for key in sorted(marker_map.markers):
         m = marker_map.markers[key]
         x, y, z = m.T_map_marker[:3, 3]
         sigma = [float(np.sqrt(max(np.trace(block), 0.0))) for block in (m.covariance[:3, :3], m.covariance[3:, 3:])]
-        standing = 'quarantine' if not m.trusted else 'fixed' if m.fixed else ''
+        status = 'quarantine' if not m.trusted else 'fixed' if m.fixed else ''
         table.add_row(
             str(key), f'{m.size:g}', f'{x:.4f}', f'{y:.4f}', f'{z:.4f}', _facing(m.T_map_marker[:3, 2]),
             f'{1e3 * sigma[0]:.2f}', f'{np.rad2deg(sigma[1]):.3f}', f'{m.reprojection_error_px:.3f}',
-            str(m.observations), standing,
+            str(m.observations), status,
         )  # fmt: skip
     show(table)
     if args.plot:

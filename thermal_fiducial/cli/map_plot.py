@@ -17,7 +17,7 @@ from thermal_fiducial.files.writing import new_file
 
 # Axes that point right and up, as seen from above and along y.
 _VIEWS = (('from above', 0, 1), ('from the side, along y', 0, 2))
-_STANDINGS = {'fixed': 'black', 'free': 'tab:blue', 'in quarantine': 'tab:red'}
+_STATUSES = {'fixed': 'black', 'free': 'tab:blue', 'in quarantine': 'tab:red'}
 #: Millimetres would not be seen in a drawing of metres.
 _ENLARGED = 20.0
 #: Along the whole width of a view, of labels of four digits.
@@ -54,7 +54,7 @@ def draw_map(marker_map: MarkerMap, cloud: FloatArray | None = None) -> Figure:
         _space_ticks(axis)
         if title.endswith('along x'):
             axis.invert_xaxis()  # y points to the left of whoever looks along x
-    handles = [Line2D([], [], color=colour, label=standing) for standing, colour in _STANDINGS.items()]
+    handles = [Line2D([], [], color=colour, label=status) for status, colour in _STATUSES.items()]
     title = f'{len(marker_map.markers)} markers, normals, ellipses of three sigma enlarged {_ENLARGED:g} times'
     figure.legend(handles=handles, title=title, loc='outside lower center', ncols=len(handles))
     # Views of equal scale reach their places at the second time; at the first, a title is cut off.
@@ -76,7 +76,7 @@ def _front(marker_map: MarkerMap) -> str:
 
 
 def _draw(axis: Axes, marker: MapMarker, i: int, j: int) -> None:
-    colour = _STANDINGS['in quarantine' if not marker.trusted else 'fixed' if marker.fixed else 'free']
+    colour = _STATUSES['in quarantine' if not marker.trusted else 'fixed' if marker.fixed else 'free']
     outline = corners_in_map(marker.T_map_marker, marker.size)[[0, 1, 2, 3, 0]]
     axis.plot(outline[:, i], outline[:, j], color=colour)
     centre = marker.T_map_marker[:3, 3]

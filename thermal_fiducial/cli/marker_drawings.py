@@ -25,6 +25,7 @@ from thermal_fiducial.fabrication.verification import agree, problems, read_dxf
 from thermal_fiducial.fabrication.writers import FORMATS, write
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import save_map
+from thermal_fiducial.files.packages import is_installed
 
 _OPTION_HELP = {
     'size': 'side of the black square',
@@ -189,6 +190,12 @@ def _write_all(drawings: Sequence[Drawing], args: argparse.Namespace, others: Se
     unknown = set(formats) - set(FORMATS)
     if unknown:
         raise InputError(f'--formats: {", ".join(sorted(unknown))} is not among {", ".join(FORMATS)}')
+    missing = [kind for kind in formats if not is_installed(FORMATS[kind])]
+    if missing:
+        libraries = ', '.join(FORMATS[kind] for kind in missing)
+        raise InputError(
+            f'{libraries} missing: install the extra "tools", or leave {", ".join(missing)} out of --formats'
+        )
     stems = [f'marker-{drawing.name}' if drawing.name.isdigit() else drawing.name for drawing in drawings]
     refuse_to_overwrite([*(args.out / f'{stem}.{kind}' for stem in stems for kind in formats), *others], args.force)
     for stem, drawing in zip(stems, drawings, strict=True):

@@ -17,7 +17,7 @@ from thermal_fiducial.fabrication.cuttability import examine
 from thermal_fiducial.fabrication.dictionary_search import distances, negatives, search
 from thermal_fiducial.fabrication.plate import marker_drawing
 from thermal_fiducial.fabrication.strength import strength_of
-from thermal_fiducial.files.dictionary import save_dictionary
+from thermal_fiducial.files.dictionary import PACKAGED, save_dictionary
 from thermal_fiducial.files.writing import write_text
 
 
@@ -73,8 +73,12 @@ def _check(args: argparse.Namespace) -> int:
     for complaint, times in against.items():
         print(f'{times} of {len(ids)} markers: {complaint}')
     between, own = distances(bits[ids])
-    for a, b, apart in negatives(bits[ids], between):
-        print(f'marker {ids[a]} and the negative of {ids[b]} differ in {apart} bits')
+    pairs = negatives(bits[ids], between)
+    for a, b, apart in pairs:
+        print(f'marker {ids[a]} and the negative of {ids[b]} differ in {apart} bit{"" if apart == 1 else "s"}')
+    if pairs:
+        signed = ' and '.join(sorted(path.stem for path in PACKAGED.glob('*_SIGNED.yaml')))
+        print(f'of these the border alone shows whether warm is cold: set polarity, or take {signed}, which have none')
     print(f'{good} of {len(ids)} markers can be cut; distance between markers {between}, to own rotations {own}')
     return 0
 

@@ -23,7 +23,8 @@ LAYERS = {
     'OUTLINE': (1, '#ff0000'),
 }
 
-FORMATS = ('svg', 'dxf', 'pdf', 'png')
+#: Formats, and the library that writes each.
+FORMATS = {'svg': 'svgwrite', 'dxf': 'ezdxf', 'pdf': 'reportlab', 'png': 'matplotlib'}
 
 _MM_PER_INCH = 25.4
 _ACRYLIC, _WARM = '#26465a', '#ffb347'

@@ -103,7 +103,7 @@ def available_chart(evaluation: Evaluation) -> list[Chart]:
     for name, errors, colour in (('markers alone', known.markers, FIDUCIAL), ('fused', known.fused, FUSED)):
         plots.line(1, t, np.maximum(1e3 * errors[:, 0], LEAST_MM), name, colour)
         plots.line(2, t, np.maximum(np.rad2deg(errors[:, 1]), 1e-3), name, colour)
-    plots.figure.update_yaxes(type='log')
+    plots.make_logarithmic()
     plots.shade(evaluation)
     text = (
         'The newest pose that had come counts until the next one comes, as a controller finds it. '
@@ -125,7 +125,7 @@ def innovation_chart(evaluation: Evaluation) -> list[Chart]:
     ):
         if chosen.any():
             plots.dots(1, t[chosen], nis[chosen], name, colour, symbol)
-    plots.figure.update_yaxes(type='log')
+    plots.make_logarithmic()
     low, high = (value / 6.0 for value in CHI2_BAND_6)
     plots.figure.add_hrect(y0=low, y1=high, fillcolor=BAND, line_width=0, layer='below')
     plots.shade(evaluation)

@@ -1,11 +1,11 @@
 """Measures of a run folder, and its page."""
 
-from importlib.util import find_spec
 import json
 from pathlib import Path
 from typing import Any
 
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.packages import is_installed
 from thermal_fiducial.files.writing import write_text
 from thermal_fiducial.report.evaluation import evaluate, Evaluation
 from thermal_fiducial.report.run_folder import read_run, SUMMARY
@@ -13,14 +13,6 @@ from thermal_fiducial.report.run_folder import read_run, SUMMARY
 __all__ = ['Evaluation', 'evaluate_run', 'write_report']
 
 REPORT, VIDEO = 'report.html', 'flight.mp4'
-
-
-def is_installed(package: str) -> bool:
-    """Whether a package could be imported; it is not, as that may take a second."""
-    try:
-        return find_spec(package) is not None
-    except ImportError:
-        return False
 
 
 def require_packages(*, tables: bool = False) -> None:

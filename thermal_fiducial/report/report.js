@@ -57,7 +57,7 @@
     layout.font = { family: 'system-ui, sans-serif', size: 12 };
     // A finger scrolls the page; the buttons above a plot zoom it.
     if (touch.matches && !layout.scene) layout.dragmode = false;
-    if (narrow.matches) layout.margin = { ...layout.margin, l: Math.min(layout.margin.l, 52), r: 6 };
+    if (narrow.matches) layout.margin = { ...layout.margin, r: 6 };
     if (narrow.matches && layout.scene) {
       // From farther away the whole path fits into an upright picture.
       const { eye } = layout.scene.camera;

@@ -25,6 +25,8 @@ CAUSES = {
 MOST_POINTS, MOST_DOTS = 12_000, 3_000
 #: Height of one of the plots that lie over each other [px], and of what stands round them.
 ROW_PX, AROUND_PX = 128, 92
+# Decades of a logarithmic axis, and what is written in each of them.
+_LOG_TICKS = ((2, (1, 2, 5)), (4, (1, 3)), (np.inf, (1,)))
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,18 @@ class TimePlots:
         both = np.concatenate([half[shown], -half[shown][::-1]])
         look = {'fill': 'toself', 'fillcolor': BAND, 'line': {'width': 0}, 'mode': 'lines', 'hoverinfo': 'skip'}
         self.add(row, np.concatenate([x[shown], x[shown][::-1]]), both, name, **look)
+
+    def make_logarithmic(self) -> None:
+        """Vertical axes by powers of ten, a whole number at each tick: of Plotly, one digit stands at most of them."""
+        for number, row in enumerate(self.figure.select_yaxes(), 1):
+            drawn = np.concatenate([trace.y for trace in self.figure.select_traces(row=number, col=1)] or [[]])
+            values = drawn[np.isfinite(drawn)]
+            if not len(values):
+                continue
+            first, last = np.floor(np.log10(values.min())), np.ceil(np.log10(values.max()))
+            between = next(digits for decades, digits in _LOG_TICKS if last - first <= decades)
+            ticks = [digit * 10.0**power for power in range(int(first), int(last) + 1) for digit in between]
+            row.update(type='log', tickvals=ticks, ticktext=[f'{tick:g}' for tick in ticks])
 
     def shade(self, evaluation: Evaluation) -> None:
         """Mark the times without a pose from markers, a colour for each cause."""

@@ -13,8 +13,8 @@ import numpy.typing as npt
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
+from thermal_fiducial.files.packages import is_installed
 from thermal_fiducial.report.frames import annotated, bag_of, views, write
-from thermal_fiducial.report.page import is_installed
 from thermal_fiducial.report.run_folder import Run
 
 #: Frames a second of the video where the bag has fewer than three.
