@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rclpy.parameter import Parameter
@@ -16,7 +17,7 @@ class DirectGraph:
     def __init__(self, context: Any) -> None:
         self._context = context
         self.nodes: dict[str, Any] = {}
-        self._readers: dict[str, list[tuple[str, Any]]] = defaultdict(list)
+        self._readers: dict[str, list[tuple[str, Any, Callable[[Any], None]]]] = defaultdict(list)
         self._heard: dict[str, list[Callable[[Any], None]]] = defaultdict(list)
         self._latched: dict[str, Any] = {}
 
@@ -32,11 +33,14 @@ class DirectGraph:
         )
         name = node.get_name()
         self.nodes[name] = node
-        for subscription in node.subscriptions:
+        callbacks = [(subscription, subscription.callback) for subscription in node.subscriptions]
+        # What would wait until a frame wants it comes at once.
+        callbacks += [(subscription, partial(node.guard, subscription.callback)) for subscription in node.lazy]
+        for subscription, callback in callbacks:
             topic = subscription.topic_name
-            self._readers[topic].append((name, subscription))
+            self._readers[topic].append((name, subscription, callback))
             if topic in self._latched:
-                _deliver(subscription, self._latched[topic])
+                _deliver(subscription, callback, self._latched[topic])
         return node
 
     def _joined(self, kind: type) -> type:
@@ -67,13 +71,13 @@ class DirectGraph:
             self._latched[topic] = message
         for callback in self._heard[topic]:
             callback(message)
-        for _, subscription in self._readers[topic]:
-            _deliver(subscription, message)
+        for _, subscription, callback in self._readers[topic]:
+            _deliver(subscription, callback, message)
 
     def send_encoded(self, topic: str, kind: type, data: bytes) -> None:
         """Hand the bytes of a message to all that subscribe to its topic; nothing else hears of it."""
-        for _, subscription in self._readers[topic]:
-            subscription.callback(data if subscription.raw else deserialize_message(data, kind))
+        for _, subscription, callback in self._readers[topic]:
+            callback(data if subscription.raw else deserialize_message(data, kind))
 
     def close(self) -> None:
         """End all nodes."""
@@ -86,5 +90,5 @@ def _message(sent: Any, kind: type) -> Any:
     return deserialize_message(bytes(sent), kind) if isinstance(sent, (bytes, bytearray)) else sent
 
 
-def _deliver(subscription: Any, message: Any) -> None:
-    subscription.callback(serialize_message(message) if subscription.raw else message)
+def _deliver(subscription: Any, callback: Callable[[Any], None], message: Any) -> None:
+    callback(serialize_message(message) if subscription.raw else message)
