@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from nav_msgs.msg import Odometry as OdometryMessage
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, TimeReference
 
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
@@ -83,13 +82,13 @@ class CameraStageNode(StageNode[Config]):
             return []
 
     def _on_camera_clock(self, message: bytes) -> None:
-        self.odometry.set_clock_offset(convert.clock_offset(_read(message, TimeReference, 'camera_clock')))
+        self.odometry.set_clock_offset(convert.clock_offset(message_bytes.read(message, TimeReference, 'camera_clock')))
 
     def _on_camera_info(self, message: bytes) -> None:
         """Most drivers send the same calibration with each frame: only another one is read, and checked."""
         if message[message_bytes.BEHIND_STAMP :] == self._camera_info:
             return
-        camera = convert.camera(_read(message, CameraInfo, 'camera_info'))
+        camera = convert.camera(message_bytes.read(message, CameraInfo, 'camera_info'))
         self._camera_info = message[message_bytes.BEHIND_STAMP :]
         if self._camera is not None and camera.matches(self._camera):
             return
@@ -97,10 +96,3 @@ class CameraStageNode(StageNode[Config]):
         self._calibrations += 1
         if self._calibrations > 1:
             self.get_logger().warning('camera_info has changed: the new calibration is used from here on')
-
-
-def _read(message: bytes, kind: type, what: str) -> Any:
-    try:
-        return deserialize_message(message, kind)
-    except RuntimeError as error:
-        raise InputError(f'{what} cannot be read: {error}') from None

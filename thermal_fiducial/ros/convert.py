@@ -25,6 +25,7 @@ import numpy.typing as npt
 from sensor_msgs.msg import CameraInfo, Image, TimeReference
 from std_msgs.msg import Header
 
+from thermal_fiducial.core.filter.map_corrections import with_variance_everywhere
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
@@ -42,8 +43,6 @@ from thermal_fiducial.files.records import stamp_ns as stamp_ns
 NORM_TOLERANCE = 0.1
 # Clocks farther apart than this are not those of one robot [s].
 _LARGEST_CLOCK_OFFSET = 10.0
-#: What stands for no variance: a share of the largest, and this [m^2, rad^2].
-_NO_SHARE, _NO_VARIANCE = 1e-9, 1e-15
 # --- stamps, headers, poses ---------------------------------------------------------------------------
 
 
@@ -170,8 +169,7 @@ def map_error(message: PoseWithCovarianceStamped) -> CameraPose:
     """
     what = 'camera_pose/map_error'
     values = np.array(message.pose.covariance).reshape(6, 6)
-    values = values + (_NO_SHARE * max(float(values.diagonal().max()), 0.0) + _NO_VARIANCE) * np.eye(6)
-    covariance = checked_covariance(values, f'{what} with a covariance')
+    covariance = checked_covariance(with_variance_everywhere(values), f'{what} with a covariance')
     return CameraPose(stamp_ns(message.header.stamp), transform_of(message.pose.pose, what), covariance)
 
 

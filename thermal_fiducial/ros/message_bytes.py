@@ -6,8 +6,10 @@ little-endian): four bytes that say so, then the fields one after the other, eac
 
 from collections.abc import Sequence
 import struct
+from typing import Any
 
 import numpy as np
+from rclpy.serialization import deserialize_message
 
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
@@ -29,6 +31,20 @@ _IMU = 4 + 9 + 3 + 9 + 3 + 9
 _LONGEST = 8192
 # Nothing that sees markers is faster [m/s, rad/s].
 _FASTEST = 1000.0
+
+
+def read(message: bytes, kind: type, what: str) -> Any:
+    """The message of a ``kind`` itself, where it comes seldom; it is called ``what``.
+
+    Raises
+    ------
+    InputError
+        Bytes that are none.
+    """
+    try:
+        return deserialize_message(message, kind)
+    except RuntimeError as error:
+        raise InputError(f'{what} cannot be read: {error}') from None
 
 
 def stamp_ns(message: bytes, what: str = 'odometry') -> int:

@@ -3,12 +3,22 @@
 from collections import deque
 from dataclasses import replace
 
+import numpy as np
+
 from thermal_fiducial.core.error_model import positive
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.types import FloatArray
 
 #: Corrections that are remembered.
 _REMEMBERED = 10
+#: What stands for no variance: a share of the largest, and this [m^2, rad^2].
+_NO_SHARE, _NO_VARIANCE = 1e-9, 1e-15
+
+
+def with_variance_everywhere(covariance: FloatArray) -> FloatArray:
+    """A covariance (6, 6) of errors of the map, which may have none in some directions, as one that can be checked."""
+    largest = max(float(covariance.diagonal().max()), 0.0)
+    return np.asarray(covariance + (_NO_SHARE * largest + _NO_VARIANCE) * np.eye(6))
 
 
 class MapCorrections:
