@@ -56,6 +56,7 @@ def test_check_tells_sound_from_doubtful(path, capsys):
     doubts = capsys.readouterr().out
     assert 'no marker is fixed' in doubts
     assert 'taken for exact' in doubts
+    assert doubts.endswith(': 2 doubts\n')
 
 
 def test_edits_make_versions_that_can_be_undone(path, poses, capsys):
@@ -196,8 +197,10 @@ def test_a_few_bad_views_do_not_make_the_error_that_is_printed(path, poses, phot
         lines[index] = ','.join(cells)
     file.write_text('\n'.join([head, *lines]))
     save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
-    assert run('--marker-size', SIZE, 'refine', path, *photographed) == 0
-    printed = re.search(r're-projection error ([\d.]+) px, ([\d.]+) px of marker \d', capsys.readouterr().out)
+    # The size behind the action, elsewhere before it.
+    assert run('refine', path, *photographed, '--marker-size', SIZE) == 0
+    words = r're-projection error, median of the views: ([\d.]+) px, at worst ([\d.]+) px \(marker \d\)'
+    printed = re.search(words, capsys.readouterr().out)
     # Corners of 0.02 px, less what the camera's pose of each frame takes up.
     assert 0.005 < float(printed[1]) <= float(printed[2]) < 0.04
 

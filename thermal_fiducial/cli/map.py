@@ -30,10 +30,7 @@ Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Sub-commands of ``map``."""
-    parser.add_argument('--marker-size', type=_side, metavar='M', help='side of markers whose entry has none [m]')
-    parser.add_argument(
-        '--marker-size-override', action='append', default=[], metavar='ID:M', help='side of one marker [m]'
-    )
+    _add_sizes(parser, None, [])
     commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
     shown = _command(commands, 'show', 'table of the markers, and a plot', _show)
     shown.add_argument('--plot', type=Path, metavar='PNG', help='top and side view with uncertainties')
@@ -50,6 +47,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     map_sources.add_refine(commands.add_parser('refine', help='adjust a map to the detections of a run'))
     map_comparison.add_error(commands.add_parser('error', help='how far a map lies from the true one'))
     map_cloud.add_align(commands.add_parser('align', help='hold a map against a point cloud of the place'))
+    for action in commands.choices.values():
+        # Before the action or behind it.
+        _add_sizes(action, argparse.SUPPRESS, argparse.SUPPRESS)
+
+
+def _add_sizes(parser: argparse.ArgumentParser, size: str | None, overrides: list[str] | str) -> None:
+    text = 'side of markers whose entry has none [m]'
+    parser.add_argument('--marker-size', type=_side, default=size, metavar='M', help=text)
+    text = 'side of one marker [m]'
+    parser.add_argument('--marker-size-override', action='append', default=overrides, metavar='ID:M', help=text)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -100,7 +100,7 @@ def say_doubts(marker_map: MarkerMap, path: Path) -> list[Doubt]:
         found.append(Doubt(f'marker {key}: not in {marker_map.dictionary}', True))
     for doubt in found:
         print(doubt.text)
-    print(f'{path}: {len(found)} doubts' if found else f'{path}: sound')
+    print(f'{path}: {len(found)} doubt{"" if len(found) == 1 else "s"}' if found else f'{path}: sound')
     return found
 
 
@@ -111,7 +111,8 @@ def _print_what_was_used(built: Built, frames: int) -> None:
     if errors:
         worst = max(errors, key=lambda key: errors[key])
         middle = float(np.median(list(errors.values())))
-        print(f're-projection error {middle:.3f} px, {errors[worst]:.3f} px of marker {worst} (medians of their views)')
+        of_worst = f'{errors[worst]:.3f} px (marker {worst})'
+        print(f're-projection error, median of the views: {middle:.3f} px, at worst {of_worst}')
     if built.refinement is not None:
         for key in built.refinement.inconsistent:
             share = 100.0 * built.refinement.outliers[key]
