@@ -126,6 +126,11 @@ def test_command_calibrates_a_folder(tmp_path, capsys):
     assert all(f'>{index:02}.png</text>' in bars for index in range(8))
     assert all(f'{index:02}.png:' in seen for index in range(8))
     assert re.search(r'<td>08.png</td><td>no regular grid', page)
+    # Words begin at the left, and a phone shows a table whole.
+    assert page.index('<table class="words"><tr><th>frame</th><th>reason</th>') > page.index(
+        '.words td,.words th{text-align:left}'
+    )
+    assert '@media (max-width:32em)' in page
     covariance = yaml.safe_load((tmp_path / 'camera_covariance.yaml').read_text())
     assert 0.3 < covariance['covered_share'] < 1.0
     assert covariance['sigma_covered_px'] < covariance['sigma_not_covered_px']

@@ -23,7 +23,8 @@ _STYLE = """
 body{font-family:system-ui,sans-serif;max-width:75em;margin:1em auto;padding:0 1em;line-height:1.4}
 table{border-collapse:collapse;display:block;overflow-x:auto}
 td,th{padding:.2em .8em;text-align:right;border-bottom:1px solid var(--line)}
-td:first-child,th:first-child{text-align:left}
+td:first-child,th:first-child,.words td,.words th{text-align:left}
+@media (max-width:32em){table{font-size:.88em}td,th{padding:.2em .35em}}
 .views,.plots{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(100%,20em),1fr));gap:1em}
 .plots{grid-template-columns:repeat(auto-fit,minmax(min(100%,28em),1fr));margin:1em 0}
 figure{margin:0}figcaption{font-size:.9em;overflow-wrap:anywhere}
@@ -116,12 +117,14 @@ def _drawings(calibration: Calibration, views: Sequence[BoardView], error: Image
 def _left_out(calibration: Calibration, views: Sequence[BoardView], unusable: Sequence[tuple[str, str]]) -> str:
     rows = [(views[index].name, 'fits far worse than the other views') for index in calibration.dropped]
     rows += list(unusable)
-    return '<h2>Not used</h2>' + (_table(('frame', 'reason'), rows) if rows else '<p>Every frame was used.</p>')
+    return '<h2>Not used</h2>' + (
+        _table(('frame', 'reason'), rows, 'words') if rows else '<p>Every frame was used.</p>'
+    )
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], kind: str = 'numbers') -> str:
     cells = ''.join('<tr>' + ''.join(f'<td>{escape(cell)}</td>' for cell in row) + '</tr>' for row in rows)
-    return f'<table><tr>{"".join(f"<th>{escape(cell)}</th>" for cell in head)}</tr>{cells}</table>'
+    return f'<table class="{kind}"><tr>{"".join(f"<th>{escape(cell)}</th>" for cell in head)}</tr>{cells}</table>'
 
 
 # --- each view ----------------------------------------------------------------------------------------

@@ -189,6 +189,6 @@ def _charts(comparison: Comparison) -> list[Any]:
         shown, colour = True, _COLOURS[index % len(_COLOURS)]
         plots.line(1, evaluation.seconds(e.stamps_ns), np.maximum(1e3 * e.position_m, 0.01), name, colour)
         plots.line(2, evaluation.seconds(e.stamps_ns), np.maximum(e.attitude_deg, 1e-4), name, colour)
-    plots.figure.update_yaxes(type='log')
+    plots.make_logarithmic()
     text = 'Fused poses, each at its own stamp, from the beginning of each run.'
     return [Chart('errors', 'Error against ground truth', text, plots.figure, wide=True)] if shown else []
