@@ -251,6 +251,13 @@ def test_unusable_circle_grids(arguments):
         CircleGrid(4, 11, 0.03, 0.024, **arguments)
 
 
+def test_circles_of_another_diameter_are_named_as_such():
+    described = CircleGrid(7, 5, 1.0, 0.2, asymmetric=False)
+    counts, _ = picture(SYMMETRIC.points[:, :2], Heat(), np.random.default_rng(3), radius=0.27, fill=SMALL)
+    with pytest.raises(BoardNotFound, match=r'of 35 points look as described: out of focus, or of other sizes'):
+        described.find(counts, GUESS)
+
+
 def test_reasons_in_words():
     noise = np.random.default_rng(1).normal(7000.0, 3.0, (512, 640)).astype(np.uint16)
     with pytest.raises(BoardNotFound, match='grid'):

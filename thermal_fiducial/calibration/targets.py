@@ -21,6 +21,8 @@ from thermal_fiducial.errors import InputError
 _APART_NS = 10_000_000_000
 # Discs that continue the grid, as sharp and as warm as the board's own, of which one or two may be clutter.
 _ANOTHER_GRID = 3
+# With less of a grid's points like those described it is not said to be incomplete: they are of another kind.
+_ALIKE = 0.5
 
 
 @dataclass(frozen=True)
@@ -195,8 +197,10 @@ def _sighting(
     if beyond >= another:
         raise BoardNotFound(goes_on(beyond))
     kept = found.points[good[:count]]
+    if len(kept) < _ALIKE * count:
+        raise BoardNotFound(f'{len(kept)} of {count} points look as described: out of focus, or of other sizes')
     # What turns out to be no point of the board may have been all that showed where in the grid it lies.
-    placed = board.place(board.nodes[kept]) if len(kept) else GridRefusal('none of its points is sharp enough')
+    placed = board.place(board.nodes[kept])
     if isinstance(placed, GridRefusal):
         raise BoardNotFound(placed.reason)
     return Sighting(points[kept], pixels[:count][good[:count]]), found.look
