@@ -227,5 +227,5 @@ sys.exit(main(['check-bridge', '--seconds', '0.1', '--ros-args', '-r', '__ns:=/d
 """
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 1
-    assert 'bridge/odometry' in done.stderr
+    assert 'Listening to /drone/bridge/odometry and /drone/imu/raw for' in done.stderr
     assert 'fault  messages: 0 messages' in done.stdout

@@ -146,6 +146,14 @@ def test_arguments_that_ros_cannot_read_are_an_input_error(arguments):
     assert arguments[1] in str(caught.value)
 
 
+def test_arguments_that_ros_leaves_are_named():
+    """One letter missing, and the parameters behind it would be nobody's."""
+    command = [sys.executable, '-m', 'thermal_fiducial.nodes.landing_target', '--ros-arg', '-p', 'landing_pad:=[1]']
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith('landing_target.py: argument --ros-arg: ')
+
+
 @pytest.mark.parametrize('ending', ['os.kill(os.getpid(), signal.SIGINT)', 'rclpy.shutdown()'])
 def test_a_node_told_to_stop_while_it_is_made_stops_without_a_word(ending):
     program = f"""

@@ -1,7 +1,7 @@
 """Listens to what a flight controller would get, on the topics that the running filter really has."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 import time
 from typing import Any
 
@@ -56,7 +56,7 @@ def listen(
     node = Node('check_bridge', context=context)
     try:
         executor.add_node(node)
-        topics = _find(node, executor, topic)
+        topics = Topics(*map(node.resolve_topic_name, astuple(_find(node, executor, topic))))
         announce(topics)
         node.create_subscription(
             Odometry, topics.odometry, lambda message: on_odometry(message, time.time_ns()), qos.IMU_INPUT

@@ -11,7 +11,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import ok, try_shutdown
+from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.node import StageNode
@@ -94,6 +94,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
         ending.callback(try_shutdown)
         try:
             initialise(args, signals=SignalHandlerOptions.NO)
+            _refuse_others(args)
             node = make_node()
             ending.callback(node.destroy_node)
             executor = make_executor()
@@ -109,6 +110,13 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             # Asked to stop while the node is being made, rcl refuses the rest of it: not an error of the node.
             if ok() and not stop.asked:
                 raise
+
+
+def _refuse_others(args: Sequence[str] | None) -> None:
+    """What ROS does not read, as a mistyped ``--ros-args`` and all that follows it, would be left out silently."""
+    others = remove_ros_args(sys.argv)[1:] if args is None else remove_ros_args(list(args))
+    if others:
+        raise InputError(f'argument {others[0]}: a node has none but those behind --ros-args')
 
 
 def _spin(node: StageNode[Any], executor: Any, stop: StopSignals) -> None:
