@@ -70,6 +70,24 @@ def test_poses_that_come_while_the_imu_is_silent_say_nothing_of_the_usual_delay(
         assert clock.proposed(pose, newest_ns) == 0
 
 
+def test_the_clock_offset_outlasts_a_gap_of_the_imu():
+    """Of 1.2 s, after which the filter begins anew: its first poses are as good as those before the gap."""
+    offset, gap = 0.025, (4.0, 5.2)
+    flight = Flight(seed=1, seconds=6.0, offset=offset)
+    arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples()]
+    arrivals = [entry for entry in arrivals if not gap[0] < (entry[0] - START_NS) * 1e-9 < gap[1]]
+    arrivals += [(pose.stamp_ns + round(1e9 * (offset + LATE)), 1, pose) for pose in flight.poses]
+    ekf, firsts = PoseEkf(config(time_offset_std=0.03)), []
+    for time_ns, kind, item in sorted(arrivals, key=lambda entry: entry[:2]):
+        if kind:
+            ekf.add_pose(item)
+        elif ekf.add_imu(item) is not None and time_ns - START_NS > gap[1] * 1e9:
+            firsts.append(ekf.diagnostics()['time offset'])
+    assert ekf.reset_reason == "the IMU's clock has jumped"
+    # Known to 1.6 ms before; the three poses of the start move it by less than a third of its standard deviation.
+    assert firsts[0] == pytest.approx(offset, abs=0.005)
+
+
 def flown_by_a_stepping_imu(step):
     """Filter, output with the time at which each sample was taken, and flight: the IMU's clock steps at ``AT``."""
     flight = Flight(seed=3, seconds=5.0)

@@ -50,17 +50,27 @@ class PoseEkf:
         self._imu_refused = 0
         self._input = ImuInput(config.max_imu_gap, config.imu.gyroscope_range, config.imu.accelerometer_range)
         self._camera_clock = CameraClock()
-        self._begin()
+        self._begin(config.camera_time_offset)
 
-    def _begin(self) -> None:
+    def _begin(self, camera_time_offset: float) -> None:
         config = self._config
+        #: what is added to the camera's stamps before an offset is estimated [s]
+        self._first_offset = camera_time_offset
         self._noise = ImuNoiseMonitor(config.imu)
-        self._history = History(self._hypotheses, config.max_delay + WINDOW_SECONDS, config.camera_time_offset)
+        self._history = History(self._hypotheses, config.max_delay + WINDOW_SECONDS, camera_time_offset)
         self._log = PoseLog()
         self._imu_fault = ''
         self._smoother = SmoothOutput(config.smoothing_time) if config.smoothing_time > 0.0 else None
         #: the latest odometry without steps; None unless ``smoothing_time`` asks for it
         self.smooth: Odometry | None = None
+
+    def _begin_after_jump(self) -> None:
+        """Begin anew with the clock offset that was known: mostly samples are missing where the stamps jump."""
+        self._restart_reason = CLOCK_JUMPED
+        main = self._history.main
+        known = main is not None and self._time_offset_std(main) <= KNOWN_OFFSET_STD
+        learned = main.prediction.state.time_offset if main and known else 0.0
+        self._begin(self._first_offset + learned)
 
     # --- input ----------------------------------------------------------------------------------------
 
@@ -74,8 +84,7 @@ class PoseEkf:
         """
         verdict = self._input.judge(sample)
         if verdict is Verdict.RESTART:
-            self._restart_reason = CLOCK_JUMPED
-            self._begin()
+            self._begin_after_jump()
         self._imu_fault = verdict.value
         if verdict not in (Verdict.USE, Verdict.RESTART):
             self._imu_refused += 1
@@ -122,8 +131,7 @@ class PoseEkf:
         if self._camera_clock.is_of_imu(step_ns):
             # All since then was propagated over time that never was.
             self._camera_clock.follow(step_ns)
-            self._restart_reason = CLOCK_JUMPED
-            self._begin()
+            self._begin_after_jump()
             return restamped
         if not self._contradicts(pose) or not self._fits(restamped):
             return pose
@@ -213,7 +221,7 @@ class PoseEkf:
 
     def _clock_offset(self, main: Hypothesis) -> float:
         steps = self._camera_clock.ahead_ns / SECOND_NS
-        return self._config.camera_time_offset + main.prediction.state.time_offset - steps
+        return self._first_offset + main.prediction.state.time_offset - steps
 
     def _time_offset_std(self, main: Hypothesis) -> float:
         """Of the estimate; where there is none, what the parameter says [s]."""

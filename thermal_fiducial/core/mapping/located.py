@@ -53,7 +53,7 @@ class Sight:
             T_map_marker,
             np.array([marker.size for marker in known]),
             covariances,
-            np.zeros_like(positions) if given else arms_of_scale(positions, marker_map.anchors()),
+            np.zeros_like(positions) if given else arms_of_scale(positions, marker_map.anchors),
         )
 
     @cached_property

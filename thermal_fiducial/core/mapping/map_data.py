@@ -55,6 +55,8 @@ class MarkerMap:
     frame_id: str = 'map'
     dictionary: str = 'DICT_4X4_50'
     revision: int = 1
+    #: revision and positions of the markers that are held: looking for them takes a while in a large map
+    _held: tuple[int, FloatArray] | None = field(default=None, init=False, repr=False, compare=False)
 
     def copy(self) -> 'MarkerMap':
         """A map that shares the (immutable) markers but not the table of them."""
@@ -72,13 +74,14 @@ class MarkerMap:
         """Marker ID to (T_map_marker, size): what a detector needs to look for them."""
         return {marker.id: (marker.T_map_marker, marker.size) for marker in self.markers.values()}
 
+    @property
     def anchors(self) -> FloatArray:
         """Positions (H, 3) of the markers that carry the scale: see :func:`gauge`."""
-        markers = list(self.markers.values())
-        held = [marker for marker in markers if marker.fixed]
-        if not held:
-            held = [marker for marker, chosen in zip(markers, gauge(markers), strict=True) if chosen]
-        return np.array([marker.T_map_marker[:3, 3] for marker in held]).reshape(-1, 3)
+        if self._held is None or self._held[0] != self.revision:
+            markers = list(self.markers.values())
+            held = [marker for marker, is_held in zip(markers, gauge(markers), strict=True) if is_held]
+            self._held = self.revision, np.array([marker.T_map_marker[:3, 3] for marker in held]).reshape(-1, 3)
+        return self._held[1]
 
     def rows(self, in_view: Collection[int] = ()) -> np.ndarray:
         """Rows (N,) of :data:`MAP_DTYPE`, ordered by ID; ``in_view`` are the IDs that the frame at hand shows."""
