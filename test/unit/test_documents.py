@@ -31,6 +31,13 @@ def test_each_node_is_on_the_page(node):
     assert all(f'<!-- {table} {node} -->' in page for table in ('topics', 'parameters'))
 
 
+def test_the_page_of_examples_shows_each_script():
+    page = (ROOT / 'doc' / 'examples.md').read_text()
+    for script in (ROOT / 'doc' / 'examples').glob('*.py'):
+        # What the site replaces by the script: a formatter once put it apart.
+        assert f"\n--8<-- 'doc/examples/{script.name}'\n" in page
+
+
 def test_the_readme_is_short():
     assert len(README.read_text().splitlines()) <= 150
 
