@@ -120,11 +120,11 @@ def _stepwise(sightings: Sequence[Sighting], start: Calibration, radius: float) 
     best = current if current.usable else None
     while True:
         steps = [
-            (place, _candidate(sightings, current.fit, (*current.fit.free, *group[count]), radius))
+            (place, _step(sightings, current.fit, (*current.fit.free, *group[count]), radius))
             for place, (group, count) in enumerate(zip(groups, entered, strict=True))
             if count < len(group)
         ]
-        better = [(place, step) for place, step in steps if step.clearly_better_than(current)]
+        better = [(place, step) for place, step in steps if step is not None and step.clearly_better_than(current)]
         if not better:
             return best
         place, current = min(better, key=lambda step: step[1].error)
@@ -135,7 +135,26 @@ def _stepwise(sightings: Sequence[Sighting], start: Calibration, radius: float) 
 
 def _candidate(sightings: Sequence[Sighting], near: Calibration, free: tuple[int, ...], radius: float) -> _Candidate:
     """Fit from a solution ``near`` by."""
-    fit = calibrate_from(sightings, near.camera, near.T_camera_board, radius=radius, free=free, drop=False)
+    return _held_out(sightings, _fit(sightings, near, free, radius), radius)
+
+
+def _step(
+    sightings: Sequence[Sighting], current: Calibration, free: tuple[int, ...], radius: float
+) -> _Candidate | None:
+    """Fit with more coefficients than the ``current`` one; None where they gain next to nothing with fitted views.
+
+    With views that were not fitted they gain less still.
+    """
+    fit = _fit(sightings, current, free, radius)
+    gains = current.rms_px**2 > (1.0 + _NEAR_TIE) * fit.rms_px**2
+    return _held_out(sightings, fit, radius) if gains else None
+
+
+def _fit(sightings: Sequence[Sighting], near: Calibration, free: tuple[int, ...], radius: float) -> Calibration:
+    return calibrate_from(sightings, near.camera, near.T_camera_board, radius=radius, free=free, drop=False)
+
+
+def _held_out(sightings: Sequence[Sighting], fit: Calibration, radius: float) -> _Candidate:
     return _Candidate(fit, _held_out_squares(sightings, fit, radius), reaches_corners(fit.camera))
 
 
