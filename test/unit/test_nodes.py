@@ -402,6 +402,10 @@ def test_the_error_of_the_map_widens_what_is_claimed_and_moves_no_pose(graph):
     graph.spin_until(lambda: graph.heard['odometry'])
     claimed = np.array(graph.heard['odometry'][0].pose.covariance).reshape(6, 6)
     assert np.all(np.diag(claimed)[:3] >= 0.04)
+    # 0.2 m on each axis: by 0.3 m the pose is lost.
+    figures = node.filter.diagnostics()
+    assert figures['position std'] > 0.2 * np.sqrt(3.0)
+    assert figures['usable for'] == 0.0
 
 
 def test_one_pose_and_one_odometry_for_each_imu_message(graph):

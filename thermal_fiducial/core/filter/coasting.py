@@ -48,6 +48,7 @@ def coasting_variance(estimate: Estimate, densities: FloatArray) -> FloatArray:
     for i, left in enumerate(terms):
         for j, right in enumerate(terms):
             coefficients[i + j] += np.einsum('ik,kl,il', left, estimate.covariance, right)
+    coefficients[0] += np.trace(estimate.pose_noise.last.map_covariance[:3, :3])
     # White accelerations on three axes, each sigma^2 t^3 / 3, and the tilt that white rates make of two.
     rate, force = float(densities[0]), float(densities[3])
     coefficients[3] += force**2

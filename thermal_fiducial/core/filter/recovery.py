@@ -64,9 +64,10 @@ class Hypothesis(NamedTuple):
 
     @property
     def position_std(self) -> float:
-        """Root of the sum of the position variances [m]."""
+        """Root of the sum of the position variances, those by the map's error too [m]."""
         core, _ = self.prediction.core_covariance
-        return math.sqrt(float(core[POSITION, POSITION].trace()))
+        of_map = self.prediction.origin.pose_noise.last.map_covariance[:3, :3]
+        return math.sqrt(float(core[POSITION, POSITION].trace() + of_map.trace()))
 
     @property
     def in_doubt(self) -> bool:
