@@ -205,6 +205,12 @@ def test_a_few_bad_views_do_not_make_the_error_that_is_printed(path, poses, phot
     assert 0.005 < float(printed[1]) <= float(printed[2]) < 0.04
 
 
+def test_refine_says_when_nothing_may_move(path, poses, photographed, capsys):
+    save_map(path, MarkerMap({key: MapMarker(key, SIZE, True, poses[key]) for key in range(8)}))
+    assert run('refine', path, *photographed) == 0
+    assert 'all markers are fixed: none was moved (map unfix)' in capsys.readouterr().out
+
+
 def test_refine_ends_with_what_check_says_and_with_2_where_that_spoils_the_map(path, poses, photographed, capsys):
     save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0]), 40: MapMarker(40, SIZE, True, poses[0])}))
     assert run('--marker-size', SIZE, 'refine', path, *photographed) == 2

@@ -106,6 +106,8 @@ def say_doubts(marker_map: MarkerMap, path: Path) -> list[Doubt]:
 
 def _print_what_was_used(built: Built, frames: int) -> None:
     print(f'{built.frames_used} of {frames} frames used')
+    if all(marker.fixed for marker in built.map.markers.values()):
+        print('all markers are fixed: none was moved (map unfix)')
     # Medians of each marker's views: the root mean square of all is that of a few bad ones, twenty times as much.
     errors = {marker.id: marker.reprojection_error_px for marker in built.map.markers.values() if marker.observations}
     if errors:
