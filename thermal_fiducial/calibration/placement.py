@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
@@ -149,8 +150,9 @@ def _occupancy(nodes: IntArray) -> FloatArray:
 
 def _correlation(a: FloatArray, b: FloatArray) -> FloatArray:
     """Points that two occupancies have in common for each shift of ``b``, from where but their last corners meet."""
-    shape = [m + n - 1 for m, n in zip(a.shape, b.shape, strict=True)]
-    return np.rint(np.fft.irfft2(np.fft.rfft2(a, shape) * np.fft.rfft2(b[::-1, ::-1], shape), shape))
+    around = np.pad(a, [(n - 1, n - 1) for n in b.shape]).astype(np.float32)
+    # Of numbers as small as these the products of single precision are whole ones, but for a rounding.
+    return np.rint(cv2.matchTemplate(around, b.astype(np.float32), cv2.TM_CCORR)).astype(np.float64)
 
 
 def _largest_two(overlaps: list[FloatArray]) -> tuple[float, float]:
