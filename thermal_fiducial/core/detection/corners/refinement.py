@@ -14,9 +14,9 @@ from thermal_fiducial.core.detection.corners.sides import blurs, half_width, mod
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# Passes follow one another until the last step was short enough.
+# Passes follow one another until the last step was short enough [px]: at best, at worst, between in deviations of it.
 _PASSES = 4
-_SETTLED_PX = 0.3
+_SETTLED_PX, _UNSURE = (0.3, 1.0), 2.0
 # Standard deviation of what is known of the corners beforehand [px].
 _PRIOR_PX = 3.0
 
@@ -80,15 +80,15 @@ def refine_corners(
     to_tails : (N, 2, 3) maps of pixels to lag tails that are to be taken out; none when left out
     """
     lag_blur = np.zeros((len(corners.px), 2)) if lag_blur_px is None else lag_blur_px
-    found, step = _pass(image, corners, camera, behind, blur_px, lag_blur, columns, to_tails)
-    which = np.arange(len(step))
+    found, moving = _pass(image, corners, camera, behind, blur_px, lag_blur, columns, to_tails)
+    which = np.arange(len(moving))
     for _ in range(_PASSES - 1):
-        which = which[step > _SETTLED_PX]
+        which = which[moving]
         if len(which) == 0:
             break
         tails = None if to_tails is None else to_tails[which]
         start = corners.only(which).moved(found.corners_px[which] - corners.px[which], camera)
-        again, step = _pass(image, start, camera, behind[which], blur_px, lag_blur[which], columns, tails)
+        again, moving = _pass(image, start, camera, behind[which], blur_px, lag_blur[which], columns, tails)
         found = found.with_others(which, again)
     return found
 
@@ -102,8 +102,8 @@ def _pass(
     lag_blur: FloatArray,
     columns: int,
     to_tails: FloatArray | None,
-) -> tuple[RefinedCorners, FloatArray]:
-    """Where one linearised adjustment moves the corners, and the longest step (N,) of each marker."""
+) -> tuple[RefinedCorners, BoolArray]:
+    """Where one linearised adjustment moves the corners, and for which markers (N,) that was not the last."""
     cells = behind.shape[2]
     half = half_width(math.hypot(blur_px, math.sqrt(float((lag_blur * lag_blur).sum(axis=1).max()))))
     sides = sides_of(start.x, camera, image.shape, cells, columns, half)
@@ -113,4 +113,6 @@ def _pass(
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]
     contrast, noise = (segments.contrast * share).sum(axis=1), np.sqrt((segments.noise * share).sum(axis=1))
-    return RefinedCorners(start.px + shift, covariances, contrast, noise, doubt), np.abs(shift).max(axis=(1, 2))
+    deviation = np.sqrt(covariances.diagonal(axis1=2, axis2=3))
+    moving: BoolArray = np.asarray((np.abs(shift) > np.clip(_UNSURE * deviation, *_SETTLED_PX)).any(axis=(1, 2)))
+    return RefinedCorners(start.px + shift, covariances, contrast, noise, doubt), moving
