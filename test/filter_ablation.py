@@ -6,7 +6,7 @@ mechanisms as arguments: only these. Recordings are taken where ``THERMAL_FIDUCI
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 import sys
 from typing import Any
@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from support.filter_scenes import Figures, SCENES
 from support.taken_out import ablation_row, lines_of
+
+from thermal_fiducial.core.filter.update import body_pose
 
 FILTER = 'thermal_fiducial.core.filter'
 #: Change of a figure that is worth printing.
@@ -57,9 +59,20 @@ def _exactly_linear(self: Any, prior: Any, motion: Any, moved: Any, H: Any, R: A
     H[:, 35] = twist
 
 
+def _with_the_map(pose: Any, T_body_camera: Any, scale: float) -> Any:
+    """The map's error as one that changes with the view."""
+    return body_pose(replace(pose, map_covariance=np.zeros((6, 6))), T_body_camera, scale)
+
+
 MECHANISMS = {
     'systematic error of poses': Mechanism(('lasting errors',), changes={'systematic_pose_std': 0.01}),
     'its size is learned': Mechanism(('lasting errors',), off={'pose_noise:_PRIOR_VIEWS': 1e12}),
+    'error of the map apart': Mechanism(('map in the making',), off={'hypotheses:body_pose': _with_the_map}),
+    'change of the error of the map': Mechanism(
+        ('map in the making',),
+        ('pose_noise:BodyPose.map_change',),
+        {'pose_noise:BodyPose.map_change': lambda *_: np.zeros((6, 6))},
+    ),
     'size of white errors is learned': Mechanism(
         ('lasting errors', 'slow and noisy'), ('pose_noise:PoseNoise._white_step',), {'pose_noise:_PRIOR_POSES': 1e12}
     ),

@@ -335,11 +335,24 @@ def lasting_errors(seed: int) -> Arrivals:
     return _arrivals(flight, poses, pose_noise_scale=1.0)
 
 
+def map_in_the_making(seed: int) -> Arrivals:
+    """All poses are off alike by a map that is known to 30 mm, and after half of the flight, refined, to 10 mm."""
+    flight, rng = Flight(seed=seed, seconds=16.0), np.random.default_rng(seed)
+    poses = []
+    for std, half in ((0.03, flight.poses[: len(flight.poses) // 2]), (0.01, flight.poses[len(flight.poses) // 2 :])):
+        off, of_map = std * rng.normal(size=3), np.diag(np.repeat((std, 0.0), 3) ** 2)
+        for pose in half:
+            T = pose.T_map_camera.copy()
+            T[:3, 3] += off
+            poses.append(replace(pose, T_map_camera=T, covariance=pose.covariance + of_map, map_covariance=of_map))
+    return _arrivals(flight, poses, gaps=((13.0, 15.0),))
+
+
 def _scenes() -> dict[str, Scene]:
     flights = (
         brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, starved,
         jittering, tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start, stepping_clock,
-        small_step_of_clock, lasting_errors,
+        small_step_of_clock, lasting_errors, map_in_the_making,
     )  # fmt: skip
     scenes: dict[str, Scene] = {scene.__name__.replace('_', ' '): partial(of_flights, scene) for scene in flights}
     data = os.environ.get('THERMAL_FIDUCIAL_DATA')
