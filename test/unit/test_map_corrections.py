@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.flights import config, Flight, timeline
 
+from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.map_corrections import MapCorrections
-from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.measurements import CameraPose, ImuSample
 
 FRAME_NS = 33_333_333
 ERROR = np.diag([4.0, 1.0, 0.0, 0.0, 0.0, 0.0]) * 1e-4
@@ -55,3 +57,22 @@ def test_no_more_than_the_pose_claims_is_the_maps():
     left = POSE.covariance - of_map(corrections, POSE)
     # rounding of an eigendecomposition
     assert np.linalg.eigvalsh(left)[0] > -1e-15
+
+
+def test_a_poor_map_makes_no_pose_lost_to_wrong_ones():
+    """A map known to half a metre, in which the estimate is good: five poses that are off do not replace it."""
+    flight = Flight(seed=2, seconds=5.0)
+    of_map = np.diag(np.repeat((0.5, 0.0), 3) ** 2)
+    poses = [replace(pose, covariance=pose.covariance + of_map, map_covariance=of_map) for pose in flight.poses]
+    for k in range(90, 95):
+        T = poses[k].T_map_camera.copy()
+        T[0, 3] += 1.0
+        poses[k] = replace(poses[k], T_map_camera=T)
+    ekf = PoseEkf(config())
+    for item in timeline(flight.samples(), poses, 0.03):
+        if isinstance(item, ImuSample):
+            ekf.add_imu(item)
+        else:
+            ekf.add_pose(item)
+    assert ekf.lost
+    assert ekf.resets == 0

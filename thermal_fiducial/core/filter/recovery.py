@@ -65,9 +65,14 @@ class Hypothesis(NamedTuple):
     @property
     def position_std(self) -> float:
         """Root of the sum of the position variances, those by the map's error too [m]."""
-        core, _ = self.prediction.core_covariance
         of_map = self.prediction.origin.pose_noise.last.map_covariance[:3, :3]
-        return math.sqrt(float(core[POSITION, POSITION].trace() + of_map.trace()))
+        return math.hypot(self.position_std_in_map, math.sqrt(float(of_map.trace())))
+
+    @property
+    def position_std_in_map(self) -> float:
+        """The same relative to the map as it is, which is what poses can be compared with [m]."""
+        core, _ = self.prediction.core_covariance
+        return math.sqrt(float(core[POSITION, POSITION].trace()))
 
     @property
     def in_doubt(self) -> bool:
@@ -133,7 +138,7 @@ class Belief(NamedTuple):
         """Why the alternative ``other`` should replace ``main``, in words; empty: it should not."""
         if other.accepted_ns - main.accepted_ns > config.reinitialise_after * SECOND_NS:
             return f'no pose was accepted for {config.reinitialise_after:.0f} s'
-        if main.position_std > config.lost_position_std:
+        if main.position_std_in_map > config.lost_position_std:
             return 'the pose was lost, and markers are seen again'
         lasting = other.accepted_ns - other.started_ns >= config.reset_after * SECOND_NS
         against = main.hits - self.hits_before
