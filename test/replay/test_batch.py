@@ -62,7 +62,7 @@ def test_two_workers_of_which_one_is_killed_write_the_same_bytes(folder, alone):
         """As soon as a bag is being replayed: its run folder has a beginning then."""
         while not killed:
             time.sleep(0.05)
-            if any((folder / 'killed').glob('.flight*/*/fused.tum')):
+            if any((folder / 'killed').glob('.flight*/*/fused.tum*')):
                 worker = _workers_of(os.getpid())[0]
                 os.kill(worker, signal.SIGKILL)
                 killed.append(worker)

@@ -116,4 +116,4 @@ def test_no_number_of_a_map_is_cut_at_80_columns(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv('COLUMNS', '80')
     assert main(['map', 'show', str(path)]) == 0
     shown = capsys.readouterr().out
-    assert all(word in shown.split() for word in ('-4.1433', '0.0309', '-3.6953', '0.127', 'faces', 'standing'))
+    assert all(word in shown.split() for word in ('-4.1433', '0.0309', '-3.6953', '0.127', 'faces', 'status'))
