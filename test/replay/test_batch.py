@@ -96,7 +96,7 @@ def test_a_bad_bag_is_named_and_the_others_are_replayed_by_a_cluster_that_is_the
 
     (folder / 'broken').mkdir(exist_ok=True)
     bags = ('flight0', 'broken')
-    local = {'processes': False, 'protocol': 'tcp://', 'dashboard_address': None, 'silence_logs': 50}
+    local = {'processes': False, 'protocol': 'tcp://', 'dashboard_address': ':0', 'silence_logs': 50}
     with LocalCluster(n_workers=1, threads_per_worker=1, **local) as cluster:
         assert batch(folder, 'cluster', '--scheduler', cluster.scheduler_address, bags=bags) == 2
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith('thermal-fiducial')]

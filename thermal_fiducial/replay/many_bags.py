@@ -104,7 +104,7 @@ def workers(count: int, scheduler: str = '') -> Iterator[Any]:
         return
     with dask.config.set(_PATIENT):
         cluster = LocalCluster(
-            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=logging.CRITICAL
+            n_workers=count, threads_per_worker=1, processes=True, dashboard_address=':0', silence_logs=logging.CRITICAL
         )
         with cluster, Client(cluster) as client:
             yield client
