@@ -67,8 +67,7 @@ class PoseEkf:
     def _begin_after_jump(self) -> None:
         """Begin anew with the clock offset that was known: mostly samples are missing where the stamps jump."""
         self._restart_reason = CLOCK_JUMPED
-        main = self._history.main
-        known = main is not None and self._time_offset_std(main) <= KNOWN_OFFSET_STD
+        main, known = self._history.main, self.camera_time_offset is not None
         learned = main.prediction.state.time_offset if main and known else 0.0
         self._begin(self._first_offset + learned)
 
