@@ -1,23 +1,31 @@
 """Camera models of ROS camera_info: plumb_bob, rational_polynomial and equidistant.
 
-Pixels have their centres at integers, (0, 0) is the centre of the top-left one. Sources: OpenCV's
-``projectPoints`` (plumb_bob, rational_polynomial, without the thin-prism and tilt terms) and
-J. Kannala, S. Brandt, "A generic camera model and calibration method for conventional, wide-angle and
-fish-eye lenses", 2006, as ``cv2.fisheye`` has it (equidistant).
+Pixels have their centres at integers, (0, 0) is the centre of the top-left one. Lenses are those of OpenCV, with its
+derivatives: ``projectPoints`` (plumb_bob, rational_polynomial, without the thin-prism and tilt terms) and ``fisheye``
+(equidistant; J. Kannala, S. Brandt, "A generic camera model and calibration method for conventional, wide-angle and
+fish-eye lenses", 2006).
 """
 
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.geometry.distortion import EquidistantLens, LensModel, PolynomialLens
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 
 #: Number of coefficients that each model takes (shorter lists are filled up with zeros).
 MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
+# Newton's iteration doubles the digits: after a step this small nothing is left, and ten are enough at any lens's
+# border.
+_STEPS, _SHORT = 10, 1e-6
+# Depth from which a point is in front of the camera [m].
+_NEAREST = 1e-9
+# Places of p1 and p2 among the coefficients.
+_TANGENTIAL = slice(2, 4)
+_EYE = np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -78,40 +86,44 @@ class Camera:
         A point that the lens cannot show (behind a perspective camera, or beyond the radius where the
         model folds back) gives NaN.
         """
-        points = np.asarray(points, dtype=np.float64)
-        x, visible = self._normalised(points)
-        uv = self._to_pixels(self._lens.distort(x))
-        return np.where(visible[..., None], uv, np.nan)
+        return self.project_jacobian(points)[0]
 
     def project_jacobian(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Pixels (..., 2) of points (..., 3), and their derivative (..., 2, 3) [px/m]."""
         points = np.asarray(points, dtype=np.float64)
-        x, visible = self._normalised(points)
-        distorted, dd_dx = self._lens.linearise(x)
-        uv = np.where(visible[..., None], self._to_pixels(distorted), np.nan)
-        inverse_z = 1.0 / points[..., 2]
-        dx_dp = np.zeros((*points.shape[:-1], 2, 3))
-        dx_dp[..., 0, 0] = dx_dp[..., 1, 1] = inverse_z
-        dx_dp[..., :, 2] = -x * inverse_z[..., None]
-        return uv, self.K[:2, :2] @ dd_dx @ dx_dp
+        uv, J = self._image(points, self.D)
+        in_front = points[..., 2] > _NEAREST
+        across = points[..., :2] / np.where(in_front, points[..., 2], 1.0)[..., None]
+        visible = in_front & ((across * across).sum(axis=-1) < self._fold_radius**2)
+        return np.where(visible[..., None], uv, np.nan), J
 
     def distort(self, normalised: npt.ArrayLike) -> FloatArray:
         """Pixels (..., 2) of normalised image coordinates x/z, y/z (..., 2)."""
-        return self._to_pixels(self._lens.distort(np.asarray(normalised, dtype=np.float64)))
+        return self.distort_linearised(normalised)[0]
 
     def distort_linearised(self, normalised: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """:meth:`distort`, and its derivative (..., 2, 2) [px]."""
-        x, J = self._lens.linearise(np.asarray(normalised, dtype=np.float64))
-        return self._to_pixels(x), self.K[:2, :2] @ J
+        uv, J = self._image(_on_plane(np.asarray(normalised, dtype=np.float64)), self.D)
+        return uv, J[..., :2]
 
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
         """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`.
 
-        Newton's method on the distortion, which at the border of a fisheye converges where OpenCV's fixed-point
-        iteration does not; in the angle alone where the model is purely radial.
+        Newton's method converges at the border of a lens, where OpenCV's fixed-point iteration does not.
         """
         uv = np.asarray(uv, dtype=np.float64)
-        return self._lens.undistort((uv - self.K[:2, 2]) @ self._inverse_focal.T)
+        x = (uv - self.K[:2, 2]) @ self._inverse_focal.T
+        if self.model == 'equidistant' and x.size:
+            undistorted = cv2.fisheye.undistortPoints(x.reshape(-1, 1, 2), _EYE, self.D)
+            return np.asarray(undistorted, dtype=np.float64).reshape(x.shape)
+        for _ in range(_STEPS):
+            there, J = self._image(_on_plane(x), self.D)
+            with np.errstate(divide='ignore', invalid='ignore'):
+                step = (inverse_2x2(J[..., :2]) @ (uv - there)[..., None])[..., 0]
+            x = x + step
+            if np.abs(step).max(initial=0.0) < _SHORT:
+                break
+        return np.asarray(x)
 
     def rays(self, uv: npt.ArrayLike) -> FloatArray:
         """Unit viewing directions (..., 3) of pixels (..., 2)."""
@@ -125,26 +137,33 @@ class Camera:
         last = self._last_pixel - margin_px
         return np.asarray(((uv >= margin_px) & (uv <= last)).all(axis=-1))
 
-    def _to_pixels(self, x: FloatArray) -> FloatArray:
+    def _image(self, points: FloatArray, D: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels (..., 2) of points (..., 3), wherever these are, and their derivative (..., 2, 3), by a distortion."""
+        if not points.size:
+            return points[..., :2], np.zeros((*points.shape[:-1], 2, 3))
+        listed, still = points.reshape(-1, 1, 3), np.zeros(3)
+        # Its derivative by a translation of the camera is that by the points. OpenCV leaves a skew of K out.
+        if self.model == 'equidistant':
+            x, J = cv2.fisheye.projectPoints(listed, still, still, _EYE, D)
+            J = J[:, 11:14]
+        else:
+            x, J = cv2.projectPoints(listed, still, still, _EYE, D)
+            J = J[:, 3:6]
         # One product of matrices costs less than one for each row of points.
-        return np.asarray((x.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]).reshape(x.shape))
-
-    def _normalised(self, points: FloatArray) -> tuple[FloatArray, BoolArray]:
-        z = points[..., 2]
-        in_front = z > 1e-9
-        x = points[..., :2] / np.where(in_front, z, 1.0)[..., None]
-        return x, np.asarray(in_front & ((x * x).sum(axis=-1) < self._fold_radius**2))
+        uv = x.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]
+        by_point = self.K[:2, :2] @ J.reshape(-1, 2, 3)
+        return uv.reshape(*points.shape[:-1], 2), by_point.reshape(*points.shape[:-1], 2, 3)
 
     @cached_property
     def _fold_radius(self) -> float:
         """Normalised radius up to which the distorted radius grows: beyond it two points share a pixel."""
+        radial = self.D.copy()
+        if self.model != 'equidistant':
+            radial[_TANGENTIAL] = 0.0
         r = np.linspace(0.0, 12.0, 4801)
-        falling = np.flatnonzero(np.diff(self._lens.radius(r)) <= 0.0)
+        across = self._image(_on_plane(np.stack([r, np.zeros_like(r)], axis=-1)), radial)[0]
+        falling = np.flatnonzero(np.diff(across[:, 0]) <= 0.0)
         return float(r[falling[0]]) if len(falling) else np.inf
-
-    @cached_property
-    def _lens(self) -> LensModel:
-        return EquidistantLens(self.D) if self.model == 'equidistant' else PolynomialLens(self.D)
 
     @cached_property
     def _last_pixel(self) -> FloatArray:
@@ -205,3 +224,10 @@ def inverse_2x2(J: FloatArray) -> FloatArray:
     inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 1, 0], inverse[..., 1, 1] = d, -b, -c, a
     inverse /= (a * d - b * c)[..., None, None]
     return inverse
+
+
+def _on_plane(x: FloatArray) -> FloatArray:
+    """Points (..., 3) at depth 1 with normalised coordinates (..., 2)."""
+    points = np.ones((*x.shape[:-1], 3))
+    points[..., :2] = x
+    return points
