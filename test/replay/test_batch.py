@@ -86,6 +86,13 @@ def test_two_bags_of_one_name(folder, capfd):
     assert 'flight0' in capfd.readouterr().err
 
 
+def test_missing_bags_are_named_before_anything_is_begun(folder, capfd):
+    assert batch(folder, 'never', bags=('flight0', 'nope', 'nor_this')) == 2
+    names = ', '.join(str(folder / name) for name in ('nope', 'nor_this'))
+    assert capfd.readouterr().err == f'thermal-fiducial batch: {names}: no such bag\n'
+    assert not (folder / 'never').exists()
+
+
 def test_a_scheduler_that_is_not_there(folder, capfd):
     assert batch(folder, 'nowhere', '--scheduler', 'nonsense://1', bags=('flight0',)) == 2
     assert 'no scheduler at nonsense://1' in capfd.readouterr().err
@@ -101,5 +108,5 @@ def test_a_bad_bag_is_named_and_the_others_are_replayed_by_a_cluster_that_is_the
         assert batch(folder, 'cluster', '--scheduler', cluster.scheduler_address, bags=bags) == 2
     lines = [line for line in capfd.readouterr().err.splitlines() if line.startswith('thermal-fiducial')]
     assert len(lines) == 1
-    assert 'broken' in lines[0]
+    assert lines[0].count('broken') == 1
     assert contents(folder / 'cluster' / 'flight0') == contents(alone / 'flight0')

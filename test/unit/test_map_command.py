@@ -49,6 +49,20 @@ def test_show_lists_and_draws(path, capsys):
     assert path.with_name('plot.png').read_bytes().startswith(b'\x89PNG')
 
 
+def test_sides_of_markers_stand_before_the_action_or_behind_it(tmp_path, capsys):
+    text = 'position: [0, 0, 1], orientation: [0.5, 0.5, 0.5, 0.5]'
+    markers = ''.join(f'- {{id: {key}, fixed: true, {text}}}\n' for key in (2, 3, 4))
+    plain = tmp_path / 'plain.yaml'
+    plain.write_text(f'format: thermal_fiducial/marker_map\nversion: 1\ndictionary: DICT_4X4_50\nmarkers:\n{markers}')
+    option = '--marker-size-override'
+    assert run('--marker-size', 0.3, option, '2:0.21', option, '3:0.1', 'show', plain, option, '3:0.43') == 0
+    shown = [line.split()[:2] for line in capsys.readouterr().out.splitlines()]
+    assert [row for row in shown if len(row) == 2 and row[0] in '234'] == [['2', '0.21'], ['3', '0.43'], ['4', '0.3']]
+    with pytest.raises(SystemExit, match='2'):
+        run('show', plain, option, '3')
+    assert f"argument {option}: '3' is not ID:SIZE" in capsys.readouterr().err
+
+
 def test_check_tells_sound_from_doubtful(path, capsys):
     assert run('check', path) == 0
     assert run('unfix', path, 0) == 0

@@ -93,6 +93,21 @@ def test_the_demo_says_what_is_missing_before_it_begins(tmp_path, hidden, option
     assert not (tmp_path / 'demo').exists()
 
 
+@pytest.mark.parametrize(
+    'command',
+    [
+        ('map', 'show', 'map.yaml'),
+        ('map', 'align', 'map.yaml', '--cloud', 'hall.ply'),
+        ('markers', 'plan'),
+    ],
+)
+def test_plots_that_cannot_be_drawn_are_refused_before_the_work(tmp_path, command):
+    result = python(COMMAND, ('matplotlib',), *command, '--plot', str(tmp_path / 'plot.png'))
+    assert result.returncode == 2
+    assert result.stderr == f'thermal-fiducial {command[0]}: --plot needs matplotlib: install the extra "tools"\n'
+    assert result.stdout == ''
+
+
 def test_drawings_that_cannot_all_be_written_are_not_begun(tmp_path):
     result = python(COMMAND, ('ezdxf', 'reportlab'), 'markers', 'make', '--ids', '1', '--out', str(tmp_path))
     assert result.returncode == 2

@@ -11,7 +11,7 @@ from typing import Any, TYPE_CHECKING
 from thermal_fiducial.cli.evaluate import make_video, print_tables
 from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.packages import is_installed
+from thermal_fiducial.files.packages import is_installed, require_plots
 from thermal_fiducial.report.page import evaluate_run, Evaluation, require_packages, write_page
 from thermal_fiducial.report.tables import tables
 
@@ -68,8 +68,8 @@ def _check_packages(args: argparse.Namespace) -> None:
     missing = [name for name in ROS_PACKAGES if not is_installed(name)]
     if missing:
         raise InputError(f'the demo runs the ROS 2 nodes and finds no {missing[0]}: install the extra "ros"')
-    if args.picture is not None and not is_installed('matplotlib'):
-        raise InputError('--picture needs matplotlib: install the extra "tools"')
+    if args.picture is not None:
+        require_plots('--picture')
     if args.video:
         from thermal_fiducial.report.video import require_encoder
 

@@ -10,6 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from thermal_fiducial.cli import map_cloud, map_comparison, map_sources
+from thermal_fiducial.cli.marker_sizes import add_sizes, join_sizes
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
@@ -23,6 +24,7 @@ from thermal_fiducial.files.csv_rows import csv_rows
 from thermal_fiducial.files.dictionary import not_in_dictionary
 from thermal_fiducial.files.map_format import upgraded
 from thermal_fiducial.files.marker_map import dump_map, load_map
+from thermal_fiducial.files.packages import require_plots
 from thermal_fiducial.map_tools import map_editing
 
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
@@ -30,10 +32,15 @@ Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Sub-commands of ``map``."""
-    _add_sizes(parser, None, [])
+    add_sizes(parser)
     commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
     shown = _command(commands, 'show', 'table of the markers, and a plot', _show)
-    shown.add_argument('--plot', type=Path, metavar='PNG', help='top and side view with uncertainties')
+    shown.add_argument(
+        '--plot',
+        type=Path,
+        metavar='PNG',
+        help='picture of the map from above, from the side and from the front, with uncertainties',
+    )
     _command(commands, 'check', 'what is doubtful about a map; exit status 1 if anything is', _check)
     for name, fixed in (('fix', True), ('unfix', False)):
         action = _command(commands, name, f'declare markers {"fixed: they never move" if fixed else "free"}', _fix)
@@ -48,19 +55,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     map_comparison.add_error(commands.add_parser('error', help='how far a map lies from the true one'))
     map_cloud.add_align(commands.add_parser('align', help='hold a map against a point cloud of the place'))
     for action in commands.choices.values():
-        # Before the action or behind it.
-        _add_sizes(action, argparse.SUPPRESS, argparse.SUPPRESS)
-
-
-def _add_sizes(parser: argparse.ArgumentParser, size: str | None, overrides: list[str] | str) -> None:
-    text = 'side of markers whose entry has none [m]'
-    parser.add_argument('--marker-size', type=_side, default=size, metavar='M', help=text)
-    text = 'side of one marker [m]'
-    parser.add_argument('--marker-size-override', action='append', default=overrides, metavar='ID:M', help=text)
+        add_sizes(action, behind=True)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the chosen action."""
+    join_sizes(args)
+    if getattr(args, 'plot', None) is not None:
+        require_plots()
     return int(args.do(args))
 
 
@@ -99,16 +101,6 @@ def _add_editing(commands: Commands) -> None:
 
 def _load(args: argparse.Namespace, path: Path | None = None) -> MarkerMap:
     return load_map(path or args.map, args.marker_size, size_overrides(tuple(args.marker_size_override)))
-
-
-def _side(text: str) -> float:
-    try:
-        side = float(text)
-    except ValueError:
-        side = 0.0
-    if not 0.0 < side < 100.0:
-        raise argparse.ArgumentTypeError(f'{text!r} is no side in metres')
-    return side
 
 
 def _edit(args: argparse.Namespace, action: str, change: Callable[[MarkerMap], MarkerMap]) -> int:

@@ -22,6 +22,8 @@ _STATUSES = {'fixed': 'black', 'free': 'tab:blue', 'in quarantine': 'tab:red'}
 _ENLARGED = 20.0
 #: Along the whole width of a view, of labels of four digits.
 _MOST_TICKS = 7
+#: After three, nothing moves by a pixel any more in drawings of walls, rooms and halls.
+_LAYOUT_STEPS = 3
 
 
 def plot_map(marker_map: MarkerMap, path: Path, cloud: FloatArray | None = None) -> None:
@@ -51,14 +53,16 @@ def draw_map(marker_map: MarkerMap, cloud: FloatArray | None = None) -> Figure:
             _draw(axis, marker, i, j)
         axis.set(title=title, xlabel=f'{"xyz"[i]} [m]', ylabel=f'{"xyz"[j]} [m]', aspect='equal')
         axis.grid(alpha=0.3)
+        axis.margins(0.12)  # numbers stand at the tips of the normals
         _space_ticks(axis)
         if title.endswith('along x'):
             axis.invert_xaxis()  # y points to the left of whoever looks along x
     handles = [Line2D([], [], color=colour, label=status) for status, colour in _STATUSES.items()]
     title = f'{len(marker_map.markers)} markers, normals, ellipses of three sigma enlarged {_ENLARGED:g} times'
     figure.legend(handles=handles, title=title, loc='outside lower center', ncols=len(handles))
-    # Views of equal scale reach their places at the second time; at the first, a title is cut off.
-    figure.draw_without_rendering()
+    # Views of equal scale come to their places step by step; after the first, a title is cut off.
+    for _ in range(_LAYOUT_STEPS):
+        figure.draw_without_rendering()
     return figure
 
 

@@ -23,6 +23,7 @@ from thermal_fiducial.fabrication.planning import (
     save_measurements,
 )
 from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.packages import require_plots
 from thermal_fiducial.files.writing import new_file
 
 # Pitch of a Tau 2's pixels [mm].
@@ -63,6 +64,8 @@ def add_plan(parser: argparse.ArgumentParser) -> None:
 
 
 def _plan(args: argparse.Namespace) -> int:
+    if args.plot is not None:
+        require_plots()
     distances = _numbers(args.distances)
     mounting = Mounting(1e-3 * args.thickness, 1e-3 * args.stand_off, args.loss)
     share = float(remaining_contrast(mounting, args.after))

@@ -78,6 +78,9 @@ class Batch:
     def check(self) -> None:
         """Raise InputError for what no replay could begin with, before workers are started for it."""
         self.runs()
+        missing = [str(bag) for bag in self.bags if not bag.exists()]
+        if missing:
+            raise InputError(f'{", ".join(missing)}: no such bag')
         mode = {} if self.options.mode is None else {'mode': self.options.mode}
         read_settings(self.options.params, mode | {'map_file': str(self.options.map_file)})
 
@@ -178,10 +181,20 @@ def _replay_all(
             shutil.rmtree(unfinished, ignore_errors=True)
         for line in warnings.get(run.run.name, []):
             warn(f'{run.run.name}: {line}')
-    for name, failure in sorted(failures.items()):
-        if isinstance(failure, InputError):
-            raise InputError(f'{name}: {failure}')
-        raise RunError(f'{name}: {type(failure).__name__}: {str(failure).splitlines()[0] if str(failure) else ""}')
+    errors = [_as_error(run, failures[run.run.name]) for run in runs if run.run.name in failures]
+    for error in errors[1:]:
+        warn(str(error))
+    if errors:
+        raise errors[0]
+
+
+def _as_error(run: Options, failure: BaseException) -> Exception:
+    """What became of a bag, as one line that names it once."""
+    if isinstance(failure, InputError):
+        words = str(failure)
+        return failure if words.startswith(str(run.bag)) else InputError(f'{run.run.name}: {words}')
+    reason = str(failure).splitlines()[0] if str(failure) else ''
+    return RunError(f'{run.run.name}: {type(failure).__name__}: {reason}')
 
 
 def replay_whole(options: Options) -> list[str]:

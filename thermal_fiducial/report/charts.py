@@ -131,7 +131,8 @@ def innovation_chart(evaluation: Evaluation) -> list[Chart]:
     plots.shade(evaluation)
     text = (
         'How far each camera pose lay from what the filter expected, squared, in its standard deviations. '
-        '1 on average where the covariances are right, less where they allow for more; the band holds 95 %.'
+        '1 on average where the covariances are right, less where they allow for more; the band holds 95 %. '
+        f'Less than {LEAST_NIS:g} is drawn as that.'
     )
     return [Chart('innovations', 'Innovations', text, plots.figure)]
 

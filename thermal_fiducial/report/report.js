@@ -60,8 +60,8 @@
     if (narrow.matches) layout.margin = { ...layout.margin, r: 6 };
     if (narrow.matches && layout.scene) {
       // From farther away the whole path fits into an upright picture.
-      const { eye } = layout.scene.camera;
-      layout.scene.camera = { eye: { x: 1.5 * eye.x, y: 1.5 * eye.y, z: 1.5 * eye.z } };
+      const { eye, center } = layout.scene.camera;
+      layout.scene.camera = { eye: { x: 1.7 * eye.x, y: 1.7 * eye.y, z: 1.7 * eye.z }, center };
       layout.legend = { orientation: 'h', x: 0, y: 0, yanchor: 'top' };
       layout.margin.b = 110;
       layout.height = 540;

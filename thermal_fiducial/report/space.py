@@ -23,6 +23,8 @@ _LARGEST_FACTOR = 500.0
 #: Larger ones, before the filter has settled, would hide everything else [m].
 _LARGEST_M = 0.4
 _SIGMAS = 3.0
+#: Far and low enough that the titles of all axes are in the picture.
+_CAMERA = {'eye': {'x': -1.6, 'y': -1.26, 'z': 0.95}, 'center': {'x': 0.0, 'y': 0.0, 'z': -0.15}}
 _COLOURS = {'fixed': '#e2a400', 'seen': FIDUCIAL, 'not seen': GOOD, 'quarantined': TRUTH}
 
 
@@ -42,7 +44,7 @@ def scene_chart(evaluation: Evaluation) -> list[Chart]:
         height=620,
         margin={'l': 0, 'r': 0, 't': 0, 'b': 0},
         legend={'x': 0.0, 'y': 1.0},
-        scene={**axes, 'aspectmode': 'data', 'camera': {'eye': {'x': -1.4, 'y': -1.1, 'z': 0.9}}},
+        scene={**axes, 'aspectmode': 'data', 'camera': _CAMERA},
     )
     text = (
         f'Drag to turn, scroll to zoom. Ellipsoids: {_SIGMAS:.0f} sigma of markers and of the pose, '

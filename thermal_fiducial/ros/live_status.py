@@ -215,6 +215,7 @@ class LiveStatus:
         sigma_m, sigma_deg = self._sigma if self._sigma and self._odometry.silent(now) < WINDOW_S else (None, None)
         figures: Mapping[str, str] = self._nodes[_FILTER].figures if _FILTER in self._nodes else {}
         offset, offset_std = _milliseconds(figures, 'time offset'), _milliseconds(figures, 'time offset std')
+        known = offset is not None and offset_std is not None
         return (
             LiveFigure('markers in view', f'{len(in_view)}' + (f' ({listed})' if listed else '')),
             LiveFigure('poses', self._odometry.rate(now), 'Hz'),
@@ -223,7 +224,7 @@ class LiveStatus:
             LiveFigure('camera latency', self._camera_pose.latency, 'ms'),
             LiveFigure('sigma', '' if sigma_m is None else f'{1e3 * sigma_m:.1f}', 'mm'),
             LiveFigure('sigma of attitude', '' if sigma_deg is None else f'{sigma_deg:.2f}', 'deg'),
-            LiveFigure('clock offset', f'{offset:.1f} +- {offset_std:.1f}' if offset and offset_std else '', 'ms'),
+            LiveFigure('clock offset', f'{offset:.1f} +- {offset_std:.1f}' if known else '', 'ms'),
             LiveFigure('usable without markers', _rounded(figures, 'usable for'), 's'),
         )
 
