@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 import os
+import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
@@ -171,3 +172,61 @@ sys.exit(run(Stopped))
 """
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout + done.stderr) == (0, '')
+
+
+ENDED = """
+import os, re, signal, sys, time
+from dataclasses import dataclass
+from diagnostic_msgs.msg import DiagnosticArray
+from thermal_fiducial.ros import run, stopping
+from thermal_fiducial.ros.node import StageNode
+
+@dataclass(frozen=True)
+class Nothing:
+    pass
+
+class Stage(StageNode[Nothing]):
+    def __init__(self):
+        super().__init__('stage', Nothing)
+        self.output = self.advertise(DiagnosticArray, 'results')
+        self.create_timer(0.01, lambda: self.guard(self.work, None))
+
+    def work(self, _):
+        os.kill(os.getpid(), signal.SIGINT)
+        %s
+
+    def close(self):
+        print('saved', flush=True)
+
+    def destroy_node(self):
+        %s
+        super().destroy_node()
+
+class Late:
+    def __del__(self, os=os, signal=signal):
+        %s
+
+sys.modules['late'] = Late()
+stopping.LEAVING_S = %s
+sys.exit(run.run(Stage))
+"""
+PUBLISHES = """
+        while self.context.ok():
+            time.sleep(0.01)
+        self.output.send(DiagnosticArray())"""
+HOLDS_THE_INTERPRETER = "re.match('(a+)+$', 64 * 'a' + 'b')"
+
+
+@pytest.mark.parametrize(
+    ('at_work', 'while_destroyed', 'while_python_ends', 'patience_s', 'status'),
+    [
+        (PUBLISHES, 'pass', 'pass', 60, 0),
+        ('pass', 'pass', 'os.kill(os.getpid(), signal.SIGTERM)', 60, 0),
+        ('pass', HOLDS_THE_INTERPRETER, 'pass', 0.1, -signal.SIGALRM),
+    ],
+)
+def test_a_node_ends_without_a_word(at_work, while_destroyed, while_python_ends, patience_s, status):
+    """Stopped in a callback that publishes, again while the interpreter ends, and with a library that never returns."""
+    program = ENDED % (at_work, while_destroyed, while_python_ends, patience_s)
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (status, 'saved\n', '')

@@ -121,7 +121,9 @@ class StageNode(CountingNode, Generic[Config]):
         except InputError as error:
             self.refuse(str(error))
         except Exception as error:
-            self.refuse(self._unforeseen(error))
+            # Asked to stop in the middle of it, rcl lets it publish nothing: not an error of the node.
+            if self.context.ok():
+                self.refuse(self._unforeseen(error))
 
     def serve(self, kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
         """A service; what ``answer`` cannot do is said in the response, which has ``success`` and ``message``."""

@@ -16,7 +16,7 @@ from rclpy.utilities import ok, remove_ros_args, try_shutdown
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.node import StageNode
 from thermal_fiducial.ros.promptness import keep_for_good, take_priority
-from thermal_fiducial.ros.stopping import StopSignals
+from thermal_fiducial.ros.stopping import limit_the_end, StopSignals
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
 #: Fast DDS 2 (Jazzy) reads the first, Fast DDS 3 the second.
@@ -85,6 +85,8 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     except InputError as error:
         print(f'{Path(sys.argv[0]).name}: {error}', file=sys.stderr)
         return 2
+    finally:
+        stop.ignore()
     return 0
 
 
@@ -99,6 +101,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             ending.callback(node.destroy_node)
             executor = make_executor()
             ending.callback(executor.shutdown)
+            ending.callback(limit_the_end)
             ending.callback(node.close)
             executor.add_node(node)
             _spin(node, executor, stop)
@@ -110,6 +113,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             # Asked to stop while the node is being made, rcl refuses the rest of it: not an error of the node.
             if ok() and not stop.asked:
                 raise
+            limit_the_end()
 
 
 def _refuse_others(args: Sequence[str] | None) -> None:

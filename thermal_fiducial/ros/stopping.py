@@ -8,6 +8,9 @@ from types import FrameType
 
 #: A terminal that is closed ends a node like the others do, with all that it has to save.
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: A node that has saved what it must may take so long to leave the graph [s]; usual are 0.2 s, and 2.5 s on a machine
+#: with six times as much to do as it can. ``ros2 launch`` loses its patience after 5 s.
+LEAVING_S = 5.0
 
 
 class StopSignals:
@@ -43,3 +46,18 @@ class StopSignals:
             if number[0] in STOPS:
                 self.asked = True
                 self._wake()
+
+    def ignore(self) -> None:
+        """Let no further signal end the process: the interpreter, while it ends, would take it for the default one."""
+        for number in STOPS:
+            signal.signal(number, signal.SIG_IGN)
+
+
+def limit_the_end() -> None:
+    """End the process by SIGALRM if it is still there after :data:`LEAVING_S`; when nothing is left to be saved.
+
+    Fast DDS 2 waits for a callback of the discovery to end, in a loop that holds nearly all the time the lock which the
+    callback needs: minutes on a busy machine, with Python's interpreter locked. So no thread of Python could end it.
+    """
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.setitimer(signal.ITIMER_REAL, LEAVING_S)
