@@ -90,7 +90,7 @@ MECHANISMS = {
         {'bundle_adjustment:_shape_covariances': lambda problem, *_: np.zeros((len(problem.ids), 6, 6))},
     ),
     'priors': Mechanism(
-        ('second flight', 'chain'), ('snapshot:prior_poses',), {'keyframes:prior_poses': lambda *_: {}}
+        ('second flight', 'chain'), ('keyframes:prior_poses',), {'keyframes:prior_poses': lambda *_: {}}
     ),
     'quarantine': Mechanism(
         ('moved markers', 'two sheets'),

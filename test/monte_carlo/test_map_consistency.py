@@ -7,8 +7,8 @@ from support.walls import CAMERA, flight, see, SIZE, wall
 
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
+from thermal_fiducial.core.mapping.keyframes import Keyframe, snapshot_of
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.mapping.snapshot import CameraRig, Keyframe, Snapshot
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
 
 
@@ -23,14 +23,12 @@ def one_map(seed):
         rows = see(T, poses, sigma, rng)
         ids = rows['id'].astype(np.int64)
         start = retract(T, 0.01 * rng.normal(size=6))
-        frames.append(
-            Keyframe(k, start, ids, corners_px(rows), corner_covariances(rows), np.zeros(len(ids), dtype=np.int64))
-        )
+        frames.append(Keyframe(k, start, CAMERA, ids, corners_px(rows), corner_covariances(rows)))
     markers = {
         i: MapMarker(i, SIZE, i == 0, T if i == 0 else retract(T, 0.01 * rng.normal(size=6)), (i > 0) * np.eye(6))
         for i, T in poses.items()
     }
-    refinement = refine(Snapshot(markers, tuple(frames), CameraRig.single(CAMERA)))
+    refinement = refine(snapshot_of(markers, frames, {}))
     nees = []
     for i in range(1, 8):
         d = difference(poses[i], refinement.markers[i].T_map_marker)

@@ -3,6 +3,7 @@
 from collections import defaultdict
 import csv
 from dataclasses import dataclass, field, replace
+import sys
 
 import numpy as np
 import yaml
@@ -12,11 +13,10 @@ from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
-from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, transform, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform, transform_from_quaternion
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
-from thermal_fiducial.core.mapping.snapshot import CameraRig, Keyframe, Snapshot
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.map_tools.map_building import decide
 
@@ -32,10 +32,12 @@ _SPEED_SIGMA, _TURN_SIGMA = 0.02, 0.01
 class Recording:
     """One recorded set: corners by stamp and camera, and the solution of the reference."""
 
-    rig: CameraRig
+    #: the first camera on the rig
+    camera: Camera
+    T_rig_camera: np.ndarray
     sizes: defaultdict[int, float]
-    #: stamp -> list of (marker, camera, corners (4, 2))
-    views: dict[int, list[tuple[int, int, np.ndarray]]]
+    #: stamp -> list of (marker, corners (4, 2)) that it saw
+    views: dict[int, list[tuple[int, np.ndarray]]]
     fixed: list[int]
     #: reference: T_map_rig by stamp, T_map_marker by ID
     T_map_rig: dict[int, np.ndarray]
@@ -72,13 +74,13 @@ def load(folder):
     static = next(body for body in bodies if body.get('is_static'))
     sizes = defaultdict(lambda: static['default_tag_size'], {tag['id']: tag['size'] for tag in static['tags']})
     ignored = {key for body in bodies for key in body.get('ignore_tags') or []}
-    index = {entry['tagtopic']: i for i, entry in enumerate(cameras.values())}
+    name, first = next(iter(cameras.items()))
     views = defaultdict(list)
     for row in _rows(folder / 'detections.csv'):
         # Recorded (-,-) (+,-) (+,+) (-,+) of the tag's frame; ours begin at (-,+) and run clockwise.
         corners = np.array([[float(row[f'u{i}']), float(row[f'v{i}'])] for i in (3, 2, 1, 0)])
-        if int(row['id']) not in ignored:
-            views[_stamp(row['stamp'])].append((int(row['id']), index[row['topic']], corners))
+        if int(row['id']) not in ignored and row['topic'] == first['tagtopic']:
+            views[_stamp(row['stamp'])].append((int(row['id']), corners))
     transforms, rig_poses = {}, {}
     for row in _rows(folder / 'reference_tf.csv'):
         if row['parent'] == 'map' and 'rig' in row['child']:
@@ -88,7 +90,8 @@ def load(folder):
     body = next(child for parent, child in transforms if parent == 'map')
     rig = next(parent for parent, child in transforms if child == 'cam0')
     recording = Recording(
-        CameraRig(tuple(_camera(c) for c in cameras.values()), np.stack([transforms[rig, name] for name in cameras])),
+        _camera(first),
+        transforms[rig, name],
         sizes,
         dict(sorted(views.items())),
         [tag['id'] for tag in static['tags']],
@@ -113,7 +116,7 @@ class _Filter:
     def __init__(self, recording):
         self._stamps = np.array([stamp for stamp, _ in recording.odometry], dtype=np.int64)
         self._poses = [T for _, T in recording.odometry]
-        self._T_camera_odometry = inverse(recording.rig.T_rig_camera[0]) @ recording.T_rig_odometry
+        self._T_camera_odometry = inverse(recording.T_rig_camera) @ recording.T_rig_odometry
         self._anchor = None
 
     def _at(self, stamp):
@@ -157,22 +160,19 @@ def solve(recording, passes=1):
         refinement_period=1.0,
     )
     mapper = MarkerMapper(config, MarkerMap(start))
-    camera = recording.rig.cameras[0]
-    T_camera_rig = inverse(recording.rig.T_rig_camera[0])
+    camera = recording.camera
     for _ in range(passes):
         stand_in = _Filter(recording)
         for stamp, seen in recording.views.items():
-            rows = _frame(recording, [view for view in seen if view[1] == 0])
+            rows = _frame(recording, seen)
             result = mapper.process(stamp, rows, camera, motion_prior(*stand_in.odometry(stamp)))
             if result.pose is not None:
                 stand_in.add(result.pose)
             if mapper.refinement_due(stamp):
                 mapper.refine()
         mapper.refine()
-    snapshot = mapper.snapshot()
-    frames = [_keyframe(frame, T_camera_rig, recording.views[frame.stamp_ns]) for frame in snapshot.keyframes]
-    whole = Snapshot(snapshot.markers, tuple(frames), recording.rig)
-    # Markers seen too briefly by one camera alone: all frames of all cameras decide between their two poses.
+    whole = mapper.snapshot(sys.maxsize)
+    # Markers seen too briefly: all frames together decide between their two poses.
     for candidate in mapper.candidates.values():
         settled = decide(whole, candidate.id, candidate.size, candidate.solutions(camera)[:2])
         if settled is not None:
@@ -182,42 +182,23 @@ def solve(recording, passes=1):
 
 
 def _frame(recording, seen):
-    ids = np.array([key for key, _, _ in seen], dtype=np.int64)
+    ids = np.array([key for key, _ in seen], dtype=np.int64)
     sizes = np.array([recording.sizes[key] for key in ids.tolist()])
-    corners = np.array([corners for _, _, corners in seen]).reshape(-1, 4, 2)
+    corners = np.array([corners for _, corners in seen]).reshape(-1, 4, 2)
     covariances = np.broadcast_to(SIGMA_PX**2 * np.eye(2), (len(ids), 4, 2, 2))
-    return rows_from_corners(ids, corners, covariances, sizes, recording.rig.cameras[0])
-
-
-def _keyframe(frame, T_camera_rig, seen):
-    """A keyframe of the first camera as one of the whole rig."""
-    T_odometry = frame.T_odometry @ T_camera_rig
-    of_camera = np.eye(6)
-    of_camera[:3, 3:] = -skew(frame.T_odometry[:3, 3] - T_odometry[:3, 3])
-    return Keyframe(
-        frame.stamp_ns,
-        frame.T_map_rig @ T_camera_rig,
-        np.array([key for key, _, _ in seen]),
-        np.array([corners for _, _, corners in seen]),
-        np.broadcast_to(SIGMA_PX**2 * np.eye(2), (len(seen), 4, 2, 2)),
-        np.array([camera for _, camera, _ in seen]),
-        T_odometry,
-        of_camera.T @ frame.information @ of_camera,
-    )
+    return rows_from_corners(ids, corners, covariances, sizes, recording.camera)
 
 
 def compare(recording, markers, refinement):
     """Rms re-projection error [px] of our solution and of the reference over the same views, and their number."""
     ours, theirs = [], []
-    for stamp, T_map_rig in refinement.keyframes.items():
-        for key, camera, corners in recording.views[stamp]:
+    for stamp, T_map_camera in refinement.keyframes.items():
+        for key, corners in recording.views[stamp]:
             if key in markers and key in recording.T_map_marker and stamp in recording.T_map_rig:
-                size = recording.sizes[key]
-                for errors, T_rig, T_marker in (
-                    (ours, T_map_rig, markers[key].T_map_marker),
-                    (theirs, recording.T_map_rig[stamp], recording.T_map_marker[key]),
+                for errors, T_camera, T_marker in (
+                    (ours, T_map_camera, markers[key].T_map_marker),
+                    (theirs, recording.T_map_rig[stamp] @ recording.T_rig_camera, recording.T_map_marker[key]),
                 ):
-                    T_map_camera = T_rig @ recording.rig.T_rig_camera[camera]
-                    uv = reproject(recording.rig.cameras[camera], T_map_camera, corners_in_map(T_marker, size))
+                    uv = reproject(recording.camera, T_camera, corners_in_map(T_marker, recording.sizes[key]))
                     errors.append(np.sum((uv - corners) ** 2, axis=-1))
     return np.sqrt(np.mean(ours)), np.sqrt(np.mean(theirs)), len(ours)

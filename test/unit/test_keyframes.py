@@ -1,17 +1,14 @@
 """The store of keyframes: bounded, spread out, moved as one."""
 
 import numpy as np
-from support.walls import flight
+from support.walls import CAMERA, flight
 
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
-from thermal_fiducial.core.mapping.keyframes import KeyframeStore
-from thermal_fiducial.core.mapping.snapshot import Keyframe
+from thermal_fiducial.core.mapping.keyframes import Keyframe, KeyframeStore
 
 
 def frame(stamp, T):
-    return Keyframe(
-        stamp, T, np.array([1, 2]), np.zeros((2, 4, 2)), np.zeros((2, 4, 2, 2)), np.zeros(2, dtype=np.int64)
-    )
+    return Keyframe(stamp, T, CAMERA, np.array([1, 2]), np.zeros((2, 4, 2)), np.zeros((2, 4, 2, 2)))
 
 
 def test_the_budget_is_kept_however_long_the_flight():
@@ -46,10 +43,10 @@ def test_frames_that_were_not_adjusted_move_with_the_nearest():
         store.add(frame(k, transform(np.eye(3), [k, 0.0, 0.0])))
     early, late = transform(np.eye(3), [0.0, 0.1, 0.0]), transform(so3_exp([0.0, 0.0, 0.1]), [0.5, 0.0, 0.0])
     moves = {0: early, 1: early, 2: early, 3: late, 4: late, 5: late}
-    moved = store.move({k: moves[k] @ store.frames[k].T_map_rig for k in (1, 4)})
+    moved = store.move({k: moves[k] @ store.frames[k].T_map_camera for k in (1, 4)})
     for k, T in moves.items():
         np.testing.assert_allclose(moved.at(k), T, atol=1e-12)
-        np.testing.assert_allclose(store.frames[k].T_map_rig, T @ transform(np.eye(3), [k, 0.0, 0.0]), atol=1e-12)
+        np.testing.assert_allclose(store.frames[k].T_map_camera, T @ transform(np.eye(3), [k, 0.0, 0.0]), atol=1e-12)
     np.testing.assert_allclose(moved.at(1000), late, atol=1e-12)
     np.testing.assert_array_equal(store.move({99: early}).at(3), np.eye(4))
 
@@ -63,6 +60,6 @@ def test_rotations_stay_rotations_however_often_the_map_moves():
     for _ in range(300):
         stamps = rng.choice(6, 4, replace=False).tolist()
         steps = {k: transform(so3_exp(0.01 * rng.normal(size=3)), 0.01 * rng.normal(size=3)) for k in stamps}
-        moved = store.move({k: step @ store.frames[k].T_map_rig for k, step in steps.items()})
-        R = np.stack([f.T_map_rig[:3, :3] for f in store.frames.values()] + [moved.at(3)[:3, :3]])
+        moved = store.move({k: step @ store.frames[k].T_map_camera for k, step in steps.items()})
+        R = np.stack([f.T_map_camera[:3, :3] for f in store.frames.values()] + [moved.at(3)[:3, :3]])
         np.testing.assert_allclose(np.swapaxes(R, -1, -2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-12)

@@ -10,11 +10,11 @@ from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, reproject
 from thermal_fiducial.core.geometry.se3 import rotation_angle
+from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import DECISIVE, SAME_FIT
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
-from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 

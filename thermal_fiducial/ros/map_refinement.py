@@ -1,8 +1,8 @@
 """The joint refinement of a mapper, beside the frames: in a process of its own as soon as the map may change."""
 
+from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
-from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.worker import Background, Foreground
 

@@ -20,10 +20,9 @@ from thermal_fiducial.core.error_model import (
     shape_of_corners,
     SystematicErrors,
 )
-from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem
+from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Snapshot
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
-from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
 MAX_ITERATIONS = 25
@@ -48,7 +47,7 @@ class AdjustedMap:
 
     #: adjusted markers by ID; those that were held are not among them
     markers: dict[int, MapMarker]
-    #: stamp of each keyframe to its adjusted T_map_rig
+    #: stamp of each keyframe to its adjusted T_map_camera
     keyframes: dict[int, FloatArray]
     #: rms re-projection error [px] before and after
     rms_before_px: float
@@ -124,7 +123,7 @@ def _result(
             key: replace(snapshot.markers[key], T_map_marker=now.state.T_map_marker[i], covariance=covariances[i])
             for i, key in free
         },
-        dict(zip(problem.stamps, now.state.T_map_rig, strict=True)),
+        dict(zip(problem.stamps, now.state.T_map_camera, strict=True)),
         float(np.sqrt(np.sum(before.squared_px) / (4 * n))),
         float(np.sqrt(np.sum(now.squared_px) / (4 * n))),
         now.cost(scale) / widened,
@@ -153,7 +152,7 @@ def _shape_covariances(
     for _ in range(_SAMPLES // _AT_ONCE):
         samples = std[:, None, None, None] * rng.standard_normal((len(problem.ids), 4, 2, _AT_ONCE))
         off = weights[:, None, None] * (problem.W @ samples[problem.marker]).reshape(-1, 8, _AT_ONCE)
-        of_frames = problem.over_frames(np.swapaxes(now.J_rig, -1, -2) @ off)
+        of_frames = problem.over_frames(np.swapaxes(now.J_camera, -1, -2) @ off)
         of_markers = problem.over_markers(np.swapaxes(now.J_marker, -1, -2) @ off)
         _, steps = system.solve(of_frames, of_markers)
         covariances += steps @ np.swapaxes(steps, -1, -2) / _SAMPLES

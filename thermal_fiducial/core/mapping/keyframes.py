@@ -1,18 +1,18 @@
 """Frames kept for the joint refinement, few enough for hours, and when that is due."""
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import alike_odometry, SystematicErrors
+from thermal_fiducial.core.error_model import alike_odometry, divided_prior, NO_SYSTEMATIC_ERRORS, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import inverse
-from thermal_fiducial.core.mapping.map_data import MarkerMap
+from thermal_fiducial.core.mapping.adjustment_problem import Priors, Snapshot
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.odometry_prior import growth, PredictedCamera
-from thermal_fiducial.core.mapping.snapshot import CameraRig, Keyframe, prior_poses, Snapshot
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 
@@ -28,6 +28,60 @@ VIEWS = 10_000
 # Time between two refinements for each view of the last [s]: a view takes a third of it on a slow core. With three
 # times as much, poses from markers just placed along a chain were too vague to publish: 19 of 633 over a carpet.
 _PERIOD_A_VIEW = 3e-4
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """What one frame showed, all markers of it, known or not."""
+
+    stamp_ns: int
+    T_map_camera: FloatArray
+    camera: Camera
+    #: (k,)
+    ids: IntArray
+    #: (k, 4, 2) [px]
+    corners: FloatArray
+    #: (k, 4, 2, 2) [px^2]
+    covariances: FloatArray
+    #: (4, 4) where the odometry has the camera, and (6, 6) how well it knows: information, zero without any
+    T_odometry: FloatArray = field(default_factory=lambda: np.eye(4))
+    information: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+
+
+def snapshot_of(
+    markers: Mapping[int, MapMarker],
+    frames: Sequence[Keyframe],
+    known: Mapping[int, tuple[FloatArray, FloatArray]],
+    map_revision: int = 0,
+    errors: SystematicErrors = NO_SYSTEMATIC_ERRORS,
+) -> Snapshot:
+    """At least one keyframe, and ``markers`` of the map to adjust, as a refinement works on them."""
+    cameras = {id(frame.camera): frame.camera for frame in frames}
+    places = {key: place for place, key in enumerate(cameras)}
+    return Snapshot(
+        markers,
+        np.array([frame.stamp_ns for frame in frames], dtype=np.int64),
+        np.stack([frame.T_map_camera for frame in frames]),
+        tuple(cameras.values()),
+        np.array([places[id(frame.camera)] for frame in frames]),
+        Priors(np.stack([frame.T_odometry for frame in frames]), np.stack([frame.information for frame in frames])),
+        np.repeat(np.arange(len(frames)), [len(frame.ids) for frame in frames]),
+        np.concatenate([frame.ids for frame in frames]),
+        np.concatenate([frame.corners for frame in frames]),
+        np.concatenate([frame.covariances for frame in frames]),
+        known,
+        map_revision,
+        errors,
+    )
+
+
+def prior_poses(markers: Mapping[int, MapMarker]) -> dict[int, tuple[FloatArray, FloatArray]]:
+    """Pose and covariance (6, 6) of markers that are known from before the keyframes, as a refinement may use them.
+
+    Only each marker's own covariance is kept in a map, not how the errors of two hang together.
+    """
+    known = [m for m in markers.values() if not m.fixed and np.any(m.covariance)]
+    return {m.id: (m.T_map_marker, divided_prior(m.covariance, len(known))) for m in known}
 
 
 @dataclass(frozen=True)
@@ -74,10 +128,10 @@ class KeyframeStore:
         stamps = sorted(adjusted.keys() & self.frames.keys())
         if not stamps:
             return Displacement(np.zeros(1, dtype=np.int64), np.eye(4)[None])
-        T = np.stack([adjusted[stamp] @ inverse(self.frames[stamp].T_map_rig) for stamp in stamps])
+        T = np.stack([adjusted[stamp] @ inverse(self.frames[stamp].T_map_camera) for stamp in stamps])
         displacement = Displacement(np.array(stamps, dtype=np.int64), _rigid(T))
         self.frames = {
-            stamp: replace(frame, T_map_rig=adjusted.get(stamp, displacement.at(stamp) @ frame.T_map_rig))
+            stamp: replace(frame, T_map_camera=adjusted.get(stamp, displacement.at(stamp) @ frame.T_map_camera))
             for stamp, frame in self.frames.items()
         }
         return displacement
@@ -108,7 +162,7 @@ class KeyframeStore:
 
     def _cells(self, coarseness: float) -> dict[tuple[int, ...], list[int]]:
         """Stamps of the keyframes by cell of camera position and viewing direction."""
-        T = np.stack([frame.T_map_rig for frame in self.frames.values()])
+        T = np.stack([frame.T_map_camera for frame in self.frames.values()])
         scaled = np.concatenate([T[:, :3, 3] / _CELL_M, T[:, :3, 2] / _CELL_DIRECTION], axis=-1) / coarseness
         cells: dict[tuple[int, ...], list[int]] = defaultdict(list)
         for stamp, key in zip(self.frames, np.floor(scaled).astype(int).tolist(), strict=True):
@@ -143,7 +197,7 @@ class FrameMemory:
 
     def __init__(self, budget: int, marker_map: MarkerMap) -> None:
         self._keyframes = KeyframeStore(budget)
-        self._cameras: list[Camera] = []
+        self._camera: Camera | None = None
         #: when the map last learned from known markers [ns]; None: not yet
         self._last_ns: int | None = None
         #: the odometry when the first marker was seen of those that nothing else joins to the map
@@ -198,42 +252,20 @@ class FrameMemory:
         self._refined_frames, self._refined_markers = len(self._keyframes.frames), len(marker_map.markers)
         self._refined_views = sum(len(frame.ids) for frame in frames)
         self._added_then = self._keyframes.added
-        return Snapshot(
-            {key: marker for key, marker in marker_map.markers.items() if marker.trusted},
-            frames,
-            CameraRig(tuple(self._cameras), np.broadcast_to(np.eye(4), (len(self._cameras), 4, 4))),
-            self._priors,
-            marker_map.revision,
-            errors,
-        )
+        trusted = {key: marker for key, marker in marker_map.markers.items() if marker.trusted}
+        return snapshot_of(trusted, frames, self._priors, marker_map.revision, errors)
 
     def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
         """Go along with a refinement, poses (4, 4) by stamp: how the map has moved at each time."""
         return self._keyframes.move(adjusted)
 
     def _keyframe(self, rows: Markers, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> Keyframe:
-        frame = Keyframe(
-            pose.stamp_ns,
-            pose.T_map_camera,
-            rows['id'].astype(np.int64),
-            corners_px(rows),
-            corner_covariances(rows),
-            np.full(len(rows), self._index(camera)),
-        )
+        if self._camera is None or not camera.matches(self._camera):
+            self._camera = camera
+        ids = rows['id'].astype(np.int64)
+        covariances = corner_covariances(rows)
+        frame = Keyframe(pose.stamp_ns, pose.T_map_camera, self._camera, ids, corners_px(rows), covariances)
         if predicted is None:
             return frame
         information = np.asarray(np.linalg.inv(alike_odometry(predicted.pose.covariance)), dtype=np.float64)
         return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)
-
-    def _index(self, camera: Camera) -> int:
-        """Index of ``camera`` among those of the keyframes: a calibration may change, or frames of several come.
-
-        One that no keyframe needs any more makes room for the next: there are no more than keyframes.
-        """
-        for index, known in enumerate(self._cameras):
-            if camera is known or camera.matches(known):
-                return index
-        used = {int(index) for frame in self._keyframes.frames.values() for index in frame.cameras[:1]}
-        free = next((index for index in range(len(self._cameras)) if index not in used), len(self._cameras))
-        self._cameras[free:] = [camera, *self._cameras[free + 1 :]]
-        return free

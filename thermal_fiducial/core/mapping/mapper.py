@@ -16,6 +16,7 @@ from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, entry, NewMarkers
 from thermal_fiducial.core.mapping.keyframes import FrameMemory, VIEWS
@@ -25,7 +26,6 @@ from thermal_fiducial.core.mapping.map_alignment import jump
 from thermal_fiducial.core.mapping.map_data import MapJump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.odometry_prior import contradicts, predicted_camera
-from thermal_fiducial.core.mapping.snapshot import Snapshot
 from thermal_fiducial.core.mapping.trust import CornerBias, Trust
 from thermal_fiducial.core.measurements import CameraPose, Markers, usable
 from thermal_fiducial.core.motion_prior import MotionPrior

@@ -20,7 +20,7 @@ class Blocks:
     """Gauss-Newton terms of n views of M markers in F keyframes."""
 
     #: (F, 6, 6) and (M, 6, 6) J' J of each keyframe and marker, over its views and what else is known of it
-    rig: FloatArray
+    frame: FloatArray
     marker: FloatArray
     #: (n, 6, 6) J' J of each view's keyframe with its marker
     cross: FloatArray
@@ -46,7 +46,7 @@ class NormalEquations:
 
         markers = len(self._held)
         try:
-            root = np.linalg.inv(np.linalg.cholesky(_damped(blocks.rig, damping)))
+            root = np.linalg.inv(np.linalg.cholesky(_damped(blocks.frame, damping)))
         except np.linalg.LinAlgError:
             return None
         shape = (6 * self._frames, 6 * markers)
