@@ -18,6 +18,7 @@ from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.trajectory_file import load_tum, tum_line
 from thermal_fiducial.replay import lockstep, waiting
+from thermal_fiducial.replay.recorder import RunFiles
 from thermal_fiducial.ros import convert
 
 pytestmark = pytest.mark.ros
@@ -137,6 +138,17 @@ def test_frames_that_swap_places_on_the_way_lose_nothing(folder, short, tmp_path
 def test_two_replays_give_the_same_bytes(short, folder):
     assert replay(folder / 'short', folder / 'again', folder) == 0
     assert_same_files(short[1], folder / 'again')
+
+
+def test_a_folder_into_which_another_replay_writes_is_left_alone(folder, tmp_path, capfd):
+    out = tmp_path / 'run'
+    out.mkdir()
+    (out / 'parameters.yaml').touch()
+    with RunFiles(out, np.eye(4), {}):
+        before = sorted(path.name for path in out.iterdir())
+        assert replay(folder / 'bag', out, folder) == 2
+        assert capfd.readouterr().err == f'thermal-fiducial replay: {out}: another replay is writing there\n'
+        assert sorted(path.name for path in out.iterdir()) == before
 
 
 def test_the_executor_does_not_matter(short, folder, monkeypatch):

@@ -17,7 +17,8 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import IMAGE_TOPIC
 from thermal_fiducial.files.images import stamp_to_ns
 from thermal_fiducial.report import video
-from thermal_fiducial.report.frames import bag_of, strip
+from thermal_fiducial.report.frames import bag_of, strip, ThermalView, write
+from thermal_fiducial.report.interruptions import Cause, Interruption
 from thermal_fiducial.report.page import write_report
 from thermal_fiducial.report.run_folder import read_run
 
@@ -132,6 +133,33 @@ def test_a_video_of_all_frames(flight, encoder, monkeypatch):
     # The caption: white on black.
     assert (frames[0][450:].min(axis=2) > 200).any()
     assert shares[-1] == 1.0
+
+
+def test_letters_can_be_read_on_white():
+    on_black, on_white = np.zeros((40, 200, 3), np.uint8), np.full((40, 200, 3), 255, np.uint8)
+    for picture in (on_black, on_white):
+        write(picture, '12.00 s', (8, 28))
+    letters = (on_black[..., 0] > 64).astype(np.uint8)
+    edge = (cv2.dilate(letters, np.ones((3, 3))) > 0) & (letters == 0)
+    # Black, but where letters fade out into it: with the outline that OpenCV 5 makes it is 248, the ground.
+    assert on_white[edge].mean() < 60
+
+
+def test_the_video_calls_the_shutter_by_its_name(flight, monkeypatch):
+    """Its first frames look frozen to the camera node, which knows only later why."""
+    run = read_run(flight / 'run')
+    stamps = np.unique(run.detections.stamps_ns)
+    closed = Interruption(int(stamps[3]), int(stamps[7]), Cause.SHUTTER, fused_poses=4, step_mm=0.0)
+    pixels = np.zeros((512, 640, 3), np.uint8)
+    seen = [ThermalView(int(stamp), None if 3 < k < 7 or k == 9 else pixels, 'frozen' if 3 < k < 7 or k == 9 else '')
+            for k, stamp in enumerate(stamps)]  # fmt: skip
+    lines = []
+    monkeypatch.setattr(video, 'views', lambda reader: iter(seen))
+    monkeypatch.setattr(video, 'interruptions', lambda run, errors: [closed])
+    monkeypatch.setattr(video, 'write', lambda picture, text, place: lines.append(text))
+    video.write_video(run, flight / 'shutter.mp4')
+    reasons = [line.partition(' s ')[2].strip() for line in lines[::2]]
+    assert reasons == [''] * 4 + ['shutter (FFC)'] * 3 + [''] * 2 + ['frozen'] + [''] * (len(stamps) - 10)
 
 
 def test_without_an_encoder_it_says_what_to_install(monkeypatch):

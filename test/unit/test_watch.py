@@ -72,6 +72,14 @@ def test_what_the_nodes_say_decides(said, advice, words):
     assert words in snapshot.headline
 
 
+def test_figures_of_a_silent_filter_are_not_shown():
+    def shown(at):
+        return {reading.name: reading.value for reading in flying().snapshot(at).readings}
+
+    assert [shown(4.0)[name] for name in ('clock offset', 'usable without markers')] == ['18.2 +- 0.4', '9.8']
+    assert [shown(8.0)[name] for name in ('clock offset', 'usable without markers', 'sigma')] == ['', '', '']
+
+
 def test_silence_is_no_pose():
     assert LiveStatus().snapshot(1.0).headline == 'The pose must not be flown on: nothing is heard of pose_ekf'
     snapshot = flying().snapshot(5.0)

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+import fcntl
 import os
 from pathlib import Path
+from typing import TextIO
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.atomic import write_atomically
@@ -24,6 +26,25 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 def unfinished(path: Path) -> Path:
     """Where a file that grows lies until it is whole."""
     return path.with_name(f'{path.name}.part')
+
+
+def claim(file: TextIO) -> None:
+    """Let others see, by :func:`is_claimed`, that this process writes an open file, until it is closed."""
+    # Where the file system has no locks.
+    with suppress(OSError):
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def is_claimed(path: Path) -> bool:
+    """Whether somebody is writing a file that he has claimed; what a killed process has left is nobody's."""
+    try:
+        with path.open('rb') as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
 
 
 @contextmanager

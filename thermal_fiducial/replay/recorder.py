@@ -17,9 +17,10 @@ from sensor_msgs.msg import PointCloud2
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.trajectory_file import tum_line
-from thermal_fiducial.files.writing import unfinished, write_text
+from thermal_fiducial.files.writing import claim, is_claimed, unfinished, write_text
 from thermal_fiducial.replay.topics import Topics, type_name
 from thermal_fiducial.ros import clouds, convert
 from thermal_fiducial.ros.counting import CountingNode
@@ -34,6 +35,12 @@ class Sink(Protocol):
 
     def add(self, topic: str, time_ns: int, data: bytes) -> None:
         """Take one message, as CDR bytes, that came at ``time_ns`` of the bag's clock."""
+
+
+def refuse_folder_in_use(folder: Path) -> None:
+    """Raise InputError if a replay is writing into a run folder: two would mix their lines."""
+    if is_claimed(unfinished(folder / _TABLES[0])):
+        raise InputError(f'{folder}: another replay is writing there')
 
 
 class RunFiles:
@@ -80,6 +87,7 @@ class RunFiles:
             self._fused, self._fiducial, self._detections = [
                 ending.enter_context(unfinished(self.folder / name).open('w', encoding='utf-8')) for name in _TABLES
             ]
+            claim(self._fused)
             self._detections.write(','.join(['stamp_ns', 'id', *CORNER_FIELDS, 'sigma_px']) + '\n')
             self._ending = ending.pop_all()
         return self

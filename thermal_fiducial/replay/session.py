@@ -18,7 +18,7 @@ from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.writing import into, write_text
 from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
-from thermal_fiducial.replay.recorder import RunFiles
+from thermal_fiducial.replay.recorder import refuse_folder_in_use, RunFiles
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED
 
@@ -115,6 +115,7 @@ def _settings(options: Options) -> Settings:
 
 def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[[str], None]) -> list[str]:
     """Make the run folder, with parameters and a map of its own: the nodes never write to the user's."""
+    refuse_folder_in_use(options.run)
     try:
         options.run.mkdir(parents=True, exist_ok=True)
         settings.write(options.run / 'parameters.yaml')

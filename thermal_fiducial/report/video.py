@@ -1,4 +1,4 @@
-"""A video of a run: thermal frames with their markers, time, state and height, by ffmpeg or PyAV."""
+"""A video of a run: thermal frames with their markers, time, state and place, by ffmpeg or PyAV."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +15,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.packages import is_installed
 from thermal_fiducial.report.frames import annotated, bag_of, views, write
+from thermal_fiducial.report.interruptions import Cause, interruptions
 from thermal_fiducial.report.run_folder import Run
 
 #: Frames a second of the video where the bag has fewer than three.
@@ -90,6 +91,7 @@ def _captioned(run: Run, reader: BagReader) -> Iterator[Frame]:
     """The frames with markers and captions; a withheld one stays as it was, with the reason on it."""
     last: Frame | None = None
     start_ns: int | None = None
+    closed = [(entry.start_ns, entry.end_ns) for entry in interruptions(run, None) if entry.is_shutter]
     for view in views(reader):
         start_ns = view.stamp_ns if start_ns is None else start_ns
         if view.pixels is not None:
@@ -97,7 +99,10 @@ def _captioned(run: Run, reader: BagReader) -> Iterator[Frame]:
         if last is None:
             continue
         picture = annotated(last, run.detections, view.stamp_ns) if view.pixels is not None else last.copy()
-        lines = [f'{(view.stamp_ns - start_ns) / SECOND_NS:6.2f} s  {view.reason}', _place(run, view.stamp_ns)]
+        # The first frames behind a closed shutter only look frozen.
+        in_shutter = any(start < view.stamp_ns + run.offset_ns < end for start, end in closed)
+        reason = Cause.SHUTTER.value if view.reason and in_shutter else view.reason
+        lines = [f'{(view.stamp_ns - start_ns) / SECOND_NS:6.2f} s  {reason}', _place(run, view.stamp_ns)]
         for row, line in enumerate(lines):
             write(picture, line, (8, picture.shape[0] - 10 - _LINE_PX * (len(lines) - 1 - row)))
         # H.264 with halved colours wants even sizes.

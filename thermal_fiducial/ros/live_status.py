@@ -213,7 +213,8 @@ class LiveStatus:
         in_view = self._markers if self._frames.silent(now) < WINDOW_S else ()
         listed = ' '.join(str(marker) for marker in in_view)
         sigma_m, sigma_deg = self._sigma if self._sigma and self._odometry.silent(now) < WINDOW_S else (None, None)
-        figures: Mapping[str, str] = self._nodes[_FILTER].figures if _FILTER in self._nodes else {}
+        said = self._nodes.get(_FILTER)
+        figures: Mapping[str, str] = said.figures if said is not None and now - said.time <= MUTE_S else {}
         offset, offset_std = _milliseconds(figures, 'time offset'), _milliseconds(figures, 'time offset std')
         known = offset is not None and offset_std is not None
         return (
