@@ -133,3 +133,58 @@ def test_an_imu_message_that_is_cut_short_is_refused():
             message_bytes.imu_sample(whole[:length])
     with pytest.raises(InputError, match='frame_id'):
         message_bytes.frame_id(whole[:14])
+
+
+@pytest.mark.parametrize('length', range(9))
+def test_a_camera_pose_is_what_it_says(length):
+    """Written as the mapper does, read as the filter does."""
+    said, frame = state(), 'm' * length
+    written = message_bytes.PoseBytes(frame)
+    written.fill(said.stamp_ns, said.T_map_body)
+    head = convert.header(said.stamp_ns, frame)
+    for covariance in (said.pose_covariance, said.twist_covariance):
+        message = convert.pose_with_covariance(said.T_map_body, covariance, head)
+        assert deserialize_message(written.of(covariance), PoseWithCovarianceStamped) == message
+        read, meant = message_bytes.camera_pose(serialize_message(message)), convert.camera_pose(message)
+        assert read.stamp_ns == meant.stamp_ns
+        np.testing.assert_array_equal(read.T_map_camera, meant.T_map_camera)
+        np.testing.assert_array_equal(read.covariance, meant.covariance)
+
+
+def test_errors_of_the_map_may_have_no_variance_in_some_directions():
+    """The pose itself may not."""
+    written = message_bytes.PoseBytes('map')
+    written.fill(1, np.eye(4))
+    message = written.of(np.diag([1e-4, 1e-4, 0.0, 1e-6, 0.0, 0.0]))
+    np.testing.assert_allclose(message_bytes.map_error(message).covariance.diagonal()[:2], 1e-4, rtol=1e-6)
+    with pytest.raises(InputError, match='variance of 0'):
+        message_bytes.camera_pose(message)
+
+
+@pytest.mark.parametrize('frame', ['', 'a', 'ab', 'abc', 'abcd'])
+def test_a_clock_reference_is_what_it_says(frame):
+    message = convert.clock_reference(1_700_000_000_999_999_000, 0.0123456)
+    message.header.frame_id = frame
+    whole = serialize_message(message)
+    assert message_bytes.clock_offset(whole) == pytest.approx(0.0123456, abs=1e-9)
+    # Behind both stamps comes the name of the source, which nobody reads.
+    end = whole.index(b'camera') - 4
+    for length in range(end):
+        with pytest.raises(InputError):
+            message_bytes.clock_offset(whole[:length])
+
+
+def test_clocks_that_are_far_apart_are_refused():
+    with pytest.raises(InputError, match='11 s off'):
+        message_bytes.clock_offset(serialize_message(convert.clock_reference(1_700_000_000_000_000_000, 11.0)))
+
+
+@pytest.mark.parametrize('read', [message_bytes.camera_pose, message_bytes.map_error])
+def test_a_pose_that_is_cut_short_is_refused(read):
+    written = message_bytes.PoseBytes('map')
+    written.fill(1, np.eye(4))
+    whole = written.of(np.eye(6))
+    read(whole)
+    for length in range(0, len(whole), 7):
+        with pytest.raises(InputError):
+            read(whole[:length])

@@ -31,7 +31,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._status = FilterStatus(self.filter, self.console)
         self._corrections = MapCorrections(self.config.max_delay)
         self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT, raw=True)
-        self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
+        self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT, raw=True)
         self.subscribe_lazily(PoseWithCovarianceStamped, 'camera_pose/map_error', self._on_map_error, qos.RESULT)
         self.subscribe(TransformStamped, 'map_correction', self._on_map_correction, qos.RESULT)
         self._frames = RobotFrames(self, self._mount)
@@ -57,16 +57,15 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
             lost, jumps = self.filter.lost, self._status.jumps
             self._outputs.send(odometry, self.filter.smooth, lost=lost, jumps=jumps)
 
-    def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
+    def _on_camera_pose(self, message: bytes) -> None:
         self.take_waiting()
-        pose = self._corrections.in_present_map(convert.camera_pose(message))
+        pose = self._corrections.in_present_map(message_bytes.camera_pose(message))
         update = self._memory.refusal(self.filter, pose) or self.filter.add_pose(pose)
         self._status.after_pose(update)
         self._outputs.send_clock(update.stamp_ns, self.filter.camera_time_offset)
 
     def _on_map_error(self, message: bytes) -> None:
-        error = message_bytes.read(message, PoseWithCovarianceStamped, 'camera_pose/map_error')
-        self._corrections.note_error(convert.map_error(error))
+        self._corrections.note_error(message_bytes.map_error(message))
 
     def _on_map_correction(self, message: TransformStamped) -> None:
         stamp_ns, T_new_old = convert.correction_of(message)

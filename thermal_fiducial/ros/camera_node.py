@@ -82,7 +82,7 @@ class CameraStageNode(StageNode[Config]):
             return []
 
     def _on_camera_clock(self, message: bytes) -> None:
-        self.odometry.set_clock_offset(convert.clock_offset(message_bytes.read(message, TimeReference, 'camera_clock')))
+        self.odometry.set_clock_offset(message_bytes.clock_offset(message))
 
     def _on_camera_info(self, message: bytes) -> None:
         """Most drivers send the same calibration with each frame: only another one is read, and checked."""

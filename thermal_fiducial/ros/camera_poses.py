@@ -15,6 +15,7 @@ from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros import clouds, convert, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
+from thermal_fiducial.ros.message_bytes import PoseBytes
 
 
 class CameraPoses:
@@ -32,6 +33,7 @@ class CameraPoses:
         self.late = LatePoses()
         self._output = node.advertise(PoseWithCovarianceStamped, 'camera_pose')
         self._map_error = node.advertise(PoseWithCovarianceStamped, 'camera_pose/map_error')
+        self._bytes = PoseBytes(node.config.map_frame)
         self._camera: Camera | None = None
         self._second: SecondCamera | None = None
         name = node.config.second_camera
@@ -57,10 +59,11 @@ class CameraPoses:
             self._publish(pose if self._second is None else self._second.with_second(pose, self._node.odometry))
 
     def _publish(self, pose: CameraPose) -> None:
-        head, pose = convert.header(pose.stamp_ns, self._node.config.map_frame), self.late.as_of_its_stamp(pose)
+        pose = self.late.as_of_its_stamp(pose)
+        self._bytes.fill(pose.stamp_ns, pose.T_map_camera)
         # First what belongs to the pose: who uses both has it then.
-        self._map_error.send(convert.pose_with_covariance(pose.T_map_camera, pose.map_covariance, head))
-        self._output.send(convert.pose_with_covariance(pose.T_map_camera, pose.covariance, head))
+        self._map_error.send(self._bytes.of(pose.map_covariance))
+        self._output.send(self._bytes.of(pose.covariance))
 
     def _on_camera_info(self, message: CameraInfo) -> None:
         self._camera = convert.camera(message)

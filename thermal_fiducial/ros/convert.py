@@ -25,7 +25,6 @@ import numpy.typing as npt
 from sensor_msgs.msg import CameraInfo, Image, TimeReference
 from std_msgs.msg import Header
 
-from thermal_fiducial.core.filter.map_corrections import with_variance_everywhere
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
@@ -52,7 +51,7 @@ def clock_reference(camera_stamp_ns: int, offset: float) -> TimeReference:
     return TimeReference(header=header(imu_stamp_ns, ''), time_ref=header(camera_stamp_ns, '').stamp, source='camera')
 
 
-def clock_offset(message: TimeReference) -> float:
+def checked_clock_offset(imu_stamp_ns: int, camera_stamp_ns: int) -> float:
     """What :func:`clock_reference` says [s].
 
     Raises
@@ -60,7 +59,7 @@ def clock_offset(message: TimeReference) -> float:
     InputError
         Clocks that are farther apart than any the filter follows.
     """
-    offset = (stamp_ns(message.header.stamp) - stamp_ns(message.time_ref)) / SECOND_NS
+    offset = (imu_stamp_ns - camera_stamp_ns) / SECOND_NS
     if abs(offset) > _LARGEST_CLOCK_OFFSET:
         raise InputError(f'camera_clock that is {offset:.6g} s off')
     return offset
@@ -157,20 +156,6 @@ def camera_pose(message: PoseWithCovarianceStamped) -> CameraPose:
     T_map_camera = transform_of(message.pose.pose, 'camera_pose')
     covariance = checked_covariance(np.array(message.pose.covariance).reshape(6, 6), 'camera_pose with a covariance')
     return CameraPose(stamp_ns(message.header.stamp), T_map_camera, covariance)
-
-
-def map_error(message: PoseWithCovarianceStamped) -> CameraPose:
-    """The camera in the map, its covariance by errors of the map alone: in some directions there may be none.
-
-    Raises
-    ------
-    InputError
-        As :func:`camera_pose`.
-    """
-    what = 'camera_pose/map_error'
-    values = np.array(message.pose.covariance).reshape(6, 6)
-    covariance = checked_covariance(with_variance_everywhere(values), f'{what} with a covariance')
-    return CameraPose(stamp_ns(message.header.stamp), transform_of(message.pose.pose, what), covariance)
 
 
 def vector(v: FloatArray) -> Vector3:

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 from rclpy.serialization import deserialize_message
 
+from thermal_fiducial.core.filter.map_corrections import with_variance_everywhere
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
-from thermal_fiducial.core.measurements import ImuSample, Odometry
+from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import records
@@ -97,6 +98,53 @@ def imu_sample(message: bytes) -> ImuSample:
     )
 
 
+def camera_pose(message: bytes) -> CameraPose:
+    """The camera in the map.
+
+    Raises
+    ------
+    InputError
+        As :func:`thermal_fiducial.ros.convert.camera_pose`, or an encoding that is not known.
+    """
+    what = 'camera_pose'
+    stamp, numbers = stamp_ns(message, what), _numbers(message, 1, _POSE, what).astype(np.float64)
+    T_map_camera = convert.transform_of_values(numbers[:7], what)
+    covariance = checked_covariance(numbers[7:].reshape(6, 6), f'{what} with a covariance')
+    return CameraPose(stamp, T_map_camera, covariance)
+
+
+def map_error(message: bytes) -> CameraPose:
+    """The camera in the map, its covariance by errors of the map alone: in some directions there may be none.
+
+    Raises
+    ------
+    InputError
+        As :func:`camera_pose`.
+    """
+    what = 'camera_pose/map_error'
+    stamp, numbers = stamp_ns(message, what), _numbers(message, 1, _POSE, what).astype(np.float64)
+    T_map_camera = convert.transform_of_values(numbers[:7], what)
+    covariance = checked_covariance(with_variance_everywhere(numbers[7:].reshape(6, 6)), f'{what} with a covariance')
+    return CameraPose(stamp, T_map_camera, covariance)
+
+
+def clock_offset(message: bytes) -> float:
+    """What :func:`thermal_fiducial.ros.convert.clock_reference` says [s].
+
+    Raises
+    ------
+    InputError
+        As :func:`thermal_fiducial.ros.convert.checked_clock_offset`, or an encoding that is not known.
+    """
+    what = 'camera_clock'
+    imu_stamp_ns = stamp_ns(message, what)
+    try:
+        camera_stamp = _STAMP.unpack_from(message, _aligned(_behind_names(message, 1), _LENGTH.size))
+    except struct.error:
+        raise InputError(f'{what} of {len(message)} bytes is cut short') from None
+    return convert.checked_clock_offset(imu_stamp_ns, convert.checked_stamp(*camera_stamp))
+
+
 def frame_id(message: bytes) -> str:
     """The frame that the header of a message names.
 
@@ -116,13 +164,18 @@ def frame_id(message: bytes) -> str:
 def _numbers(message: bytes, names: int, count: int, what: str) -> FloatArray:
     """``count`` numbers behind the stamp and so many ``names`` of frames."""
     try:
-        place = BEHIND_STAMP
-        for _ in range(names):
-            place = _aligned(place, _LENGTH.size)
-            place += _LENGTH.size + int(_LENGTH.unpack_from(message, place)[0])
-        return np.frombuffer(message, _NUMBERS, count, _aligned(place, _NUMBERS.itemsize))
+        return np.frombuffer(message, _NUMBERS, count, _aligned(_behind_names(message, names), _NUMBERS.itemsize))
     except (struct.error, ValueError):
         raise InputError(f'{what} of {len(message)} bytes is cut short') from None
+
+
+def _behind_names(message: bytes, names: int) -> int:
+    """Where so many names of frames behind the stamp end; struct.error where the message ends before."""
+    place = BEHIND_STAMP
+    for _ in range(names):
+        place = _aligned(place, _LENGTH.size)
+        place += _LENGTH.size + int(_LENGTH.unpack_from(message, place)[0])
+    return place
 
 
 def _aligned(place: int, size: int) -> int:
@@ -158,6 +211,24 @@ class StateBytes:
     @property
     def pose(self) -> bytes:
         """Its pose."""
+        return bytes(self._pose)
+
+
+class PoseBytes:
+    """A pose with one covariance or another as geometry_msgs/PoseWithCovarianceStamped, in memory of its own."""
+
+    def __init__(self, frame: str) -> None:
+        self._pose, self._numbers = _blank((frame,), _POSE)
+
+    def fill(self, stamp: int, T_frame_body: FloatArray) -> None:
+        """Take over a pose (4, 4)."""
+        self._numbers[0:3] = T_frame_body[:3, 3]
+        self._numbers[3:7] = quaternion_from_rotation(T_frame_body[:3, :3])
+        _STAMP.pack_into(self._pose, _HEADER, *divmod(int(stamp), SECOND_NS))
+
+    def of(self, covariance: FloatArray) -> bytes:
+        """That pose with a covariance (6, 6)."""
+        self._numbers[7:] = covariance.ravel()
         return bytes(self._pose)
 
 
