@@ -1,6 +1,8 @@
-"""Array types shared by the core."""
+"""Array types shared by the core, and records that are made of them."""
 
-from typing import TypeAlias
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -14,3 +16,37 @@ Gray: TypeAlias = npt.NDArray[np.uint8]
 
 #: Nanoseconds of a second: stamps are whole nanoseconds, and seconds only differences of them.
 SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Stacked:
+    """N things: of each field the first axis is theirs, of an array or of another batch; any other belongs to all."""
+
+    def only(self, keep: BoolArray | IntArray) -> Self:
+        """Those at the places ``keep``."""
+        return self._of(_at(field, keep) for field in self._fields())
+
+    def joined(self, others: Self) -> Self:
+        """Those of ``others`` as well."""
+        pairs = zip(self._fields(), others._fields(), strict=True)
+        return self._of(a.joined(b) if isinstance(a, Stacked) else np.concatenate([a, b]) for a, b in pairs)
+
+    def with_others(self, which: IntArray, others: Self) -> Self:
+        """The same with ``others`` at the places ``which``."""
+        order = np.arange(len(self._fields()[0]))
+        order[which] = len(order) + np.arange(len(which))
+        return self.joined(others).only(order)
+
+    def _fields(self) -> list[Any]:
+        names: tuple[str, ...] = self.__slots__
+        return [getattr(self, name) for name in names]
+
+    def _of(self, fields: Iterable[Any]) -> Self:
+        make: Callable[..., Self] = type(self)
+        return make(*fields)
+
+
+def _at(field: Any, keep: BoolArray | IntArray) -> Any:
+    if isinstance(field, Stacked):
+        return field.only(keep)
+    return field[keep] if isinstance(field, np.ndarray) else field

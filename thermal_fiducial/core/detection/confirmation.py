@@ -120,7 +120,7 @@ def with_corners_by_pattern(
     by_pattern = np.zeros(len(lost), dtype=bool)
     if len(small) == 0:
         return refined, by_pattern
-    shift, upright = refined.view.shift[small], np.zeros(len(small), dtype=np.int64)
+    shift, upright = refined.blur.shift[small], np.zeros(len(small), dtype=np.int64)
     corners = aligned(frame.image, found.corners_px[small] + shift, found.ids[small], upright, decoder, noisy=False)
     reading = decoder.read(frame.image, corners)
     good = (reading.ids == found.ids[small]) & (reading.turns == 0) & speaks_for_itself(reading, decoder)
@@ -132,7 +132,7 @@ def with_corners_by_pattern(
     contrast, doubt = reading.contrast[good], np.zeros(len(which))
     noise = np.full(len(which), frame.noise)
     observed = RefinedCorners(corners, covariances, contrast, noise, doubt)
-    at_stamp = observed._replace(corners_px=corners - shift)
+    at_stamp = replace(observed, corners_px=corners - shift)
     px = refined.places.at.px.copy()
     px[which] = at_stamp.corners_px
     return (

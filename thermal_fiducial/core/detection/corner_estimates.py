@@ -22,10 +22,10 @@ from thermal_fiducial.core.detection.corner_errors import (
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind, edges_behind_border, model, sides_of
-from thermal_fiducial.core.detection.frame import Frame
+from thermal_fiducial.core.detection.frame import Frame, markers_deblurred
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.refining import RefinedMarkers, Refiner, sides_px
+from thermal_fiducial.core.detection.refining import refined, RefinedMarkers, sides_px
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
@@ -59,7 +59,7 @@ def local_corners(image: Float32Array, refined: RefinedCorners, cells: int) -> R
         found = cv2.cornerSubPix(image, points, (window, window), (-1, -1), _STOP).reshape(4, 2).astype(np.float64)
         near = np.abs(found - start).max(axis=1) < max(1.0, _LOST_CELLS * cell)
         corners[index, near] = found[near]
-    return refined._replace(corners_px=corners, covariances=refined.covariances + OF_LOCAL_PX**2 * np.eye(2))
+    return replace(refined, corners_px=corners, covariances=refined.covariances + OF_LOCAL_PX**2 * np.eye(2))
 
 
 class DisplayedSides:
@@ -85,7 +85,7 @@ class DisplayedSides:
         corners = refined.corners.corners_px - displacement[:, None, None] * outward
         unknown = _CORNERS * variance[:, None, None, None] * outward[..., :, None] * outward[..., None, :]
         unknown = unknown + OF_BENT_BLUR_PX**2 * np.eye(2)
-        return refined.corners._replace(corners_px=corners, covariances=refined.corners.covariances + unknown)
+        return replace(refined.corners, corners_px=corners, covariances=refined.corners.covariances + unknown)
 
     def _across_border(self, frame: Frame, refined: RefinedMarkers, blur_px: float) -> Segments:
         """Displacements of the inner edges of the borders, inward, where white lies behind them."""
@@ -94,10 +94,10 @@ class DisplayedSides:
         a, b = inset + (1.0 - 2.0 * inset) * np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
         inner = np.moveaxis(se3.in_quadrilaterals(seen.x, a, b), 0, -1)
         sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _HALF)
-        blur = blurs(sides.normal[self._bits // 2], blur_px, refined.view.spread)
+        blur = blurs(sides.normal[self._bits // 2], blur_px, refined.blur.spread)
         value, slope, weight = model(sides, self._behind[refined.ids], blur)
         weight *= self._white[refined.ids].reshape(-1, self._bits).T
-        counts = sides.counts(refined.view.image, refined.view.to_tails)
+        counts = sides.counts(frame.image, refined.blur.to_tails)
         return measure(counts, (value, slope, weight), REACHED * blur[0])
 
 
@@ -120,7 +120,7 @@ class CornerEstimator:
 
     def __init__(self, decoder: Decoder, bits: Gray) -> None:
         self._decoder = decoder
-        self._refiner = Refiner(edges_behind(bits))
+        self._behind = edges_behind(bits)
         self._displayed = DisplayedSides(bits)
 
     def estimate(
@@ -133,32 +133,35 @@ class CornerEstimator:
         """Those of the markers ``found`` that their refined corners confirm."""
         if len(found.ids) == 0:
             return RefinedMarkers.none(frame)
-        refined = self._refiner.refine(frame, found, track, config)
-        keep = self._confirmed(frame, found, refined, config)
+        markers = refined(frame, found, self._behind[found.ids], track, config)
+        keep = self._confirmed(frame, found, markers, config)
         if frame.displayed and not keep.all():
-            refined, small = with_corners_by_pattern(frame, found, refined, ~keep, self._decoder, config)
+            markers, small = with_corners_by_pattern(frame, found, markers, ~keep, self._decoder, config)
             keep = keep | small
-        refined = refined.only(keep)
+        markers = markers if keep.all() else markers.only(keep)
         if config.refinement == 'subpix':
-            return replace(refined, corners=local_corners(frame.image, refined.corners, self._decoder.cells))
+            return replace(markers, corners=local_corners(frame.image, markers.corners, self._decoder.cells))
         if frame.displayed:
-            return replace(refined, corners=self._displayed.corrected(frame, refined, config.blur_px))
-        return refined
+            return replace(markers, corners=self._displayed.corrected(frame, markers, config.blur_px))
+        return markers
 
     def _confirmed(
-        self, frame: Frame, found: FoundMarkers, refined: RefinedMarkers, config: ArucoDetectorConfig
+        self, frame: Frame, found: FoundMarkers, markers: RefinedMarkers, config: ArucoDetectorConfig
     ) -> BoolArray:
         """Which markers look like themselves at their refined corners: how the motion is known does not matter."""
-        view, observed = refined.view, refined.observed
-        there = found.corners_px + view.shift
+        blur, observed, cells = markers.blur, markers.observed, self._decoder.cells
+        there = found.corners_px + blur.shift
         off = np.abs(observed.corners_px - there).max(axis=(1, 2))
-        read = off < _READ_THERE / self._decoder.cells * sides_px(found.corners_px)
+        read = off < _READ_THERE / cells * sides_px(found.corners_px)
         keep = read & found.certain
         others = np.flatnonzero(~keep)
         if len(others):
-            blur = np.sqrt(np.sum(view.spread[others] ** 2, axis=1))
-            standing = frame.displayed & (blur < _STANDING * sides_px(there[others]) / self._decoder.cells)
-            image, found = view.round_markers(there, others), found.only(others)
-            observed, there = observed.only(others), there[others]
-            keep[others] = confirmed(image, found, there, observed, self._decoder, config, standing_picture=standing)
-        return np.asarray(keep & frame.camera.contains(refined.observed.corners_px, BORDER_PX).all(axis=1))
+            there, image = there[others], frame.image
+            if blur.to_tails is not None:
+                image = markers_deblurred(image, there, blur.to_tails[others])
+            standing = np.sqrt(np.sum(blur.spread[others] ** 2, axis=1)) < _STANDING * sides_px(there) / cells
+            keep[others] = confirmed(
+                image, found.only(others), there, observed.only(others), self._decoder, config,
+                standing_picture=frame.displayed & standing,
+            )  # fmt: skip
+        return np.asarray(keep & frame.camera.contains(observed.corners_px, BORDER_PX).all(axis=1))

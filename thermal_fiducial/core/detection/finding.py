@@ -117,7 +117,7 @@ class MarkerFinder:
             return Findings(found, since_blind, history.scales)
         scales = _next_scales(history, complete=complete)
         blind = self._blind(frame, history, found, scales, known, in_map, config)
-        return Findings(found.with_others(blind), 0, scales)
+        return Findings(found.and_elsewhere(blind), 0, scales)
 
     def _guided(
         self,
@@ -143,7 +143,7 @@ class MarkerFinder:
         found = followed(frame, twist, last, places, self._decoder, config)
         new = ~among(expected.ids, found.ids)
         if new.any():
-            found = found.with_others(near_prediction(frame, twist, expected.only(new), self._decoder, config))
+            found = found.and_elsewhere(near_prediction(frame, twist, expected.only(new), self._decoder, config))
         return found, len(expected.ids)
 
     def _blind(

@@ -26,7 +26,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.quads import noise_of, without_columns
 from thermal_fiducial.core.detection.twist import interaction, Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray, Stacked
 
 # Largest number of gray levels of what is meant for a display.
 _LEVELS = 256
@@ -85,7 +85,7 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class Places:
+class Places(Stacked):
     """Where corners (N, 4) of markers are at a frame's stamp, and how the image moves there."""
 
     at: ImagePoints
@@ -98,18 +98,6 @@ class Places:
     def of(at: ImagePoints, depth: FloatArray) -> 'Places':
         """Those of points (N, 4) at ``depth`` (N, 4)."""
         return Places(at, depth, at.J @ interaction(at.x, depth))
-
-    def only(self, keep: BoolArray | IntArray) -> 'Places':
-        """Those of the markers ``keep``."""
-        return Places(self.at.only(keep), self.depth[keep], self.flow[keep])
-
-    def joined(self, others: 'Places') -> 'Places':
-        """Those of ``others`` as well."""
-        one, other = self.at, others.at
-        pairs = (one.px, other.px), (one.x, other.x), (one.J, other.J), (one.inverse, other.inverse)
-        at = ImagePoints(*(np.concatenate(pair) for pair in pairs))
-        depth, flow = np.concatenate([self.depth, others.depth]), np.concatenate([self.flow, others.flow])
-        return Places(at, depth, flow)
 
     def lag_blur(self, twist: Twist, lag: float) -> FloatArray:
         """Mean displacement (N, 4, 2) [px] by a lag [s]."""

@@ -10,7 +10,7 @@ from thermal_fiducial.core.detection.frame import Places
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import marker_corners
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked
 
 #: Nearer to the border of the image than this a marker may be cut off, before its corners are refined [px].
 CUT_OFF_PX = 2.0
@@ -36,7 +36,8 @@ def pairs(ids: IntArray, others: IntArray) -> tuple[IntArray, IntArray]:
     return first, second
 
 
-class ExpectedMarkers(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class ExpectedMarkers(Stacked):
     """Where N markers should be.
 
     Parameters
@@ -57,21 +58,13 @@ class ExpectedMarkers(NamedTuple):
         """No markers."""
         return ExpectedMarkers(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4)), np.zeros(0))
 
-    def only(self, keep: BoolArray | IntArray) -> 'ExpectedMarkers':
-        """Those of the markers ``keep``."""
-        return ExpectedMarkers(self.ids[keep], self.x[keep], self.depth[keep], self.cnr[keep])
-
-    def joined(self, others: 'ExpectedMarkers') -> 'ExpectedMarkers':
-        """Those of ``others`` as well."""
-        return ExpectedMarkers(*(np.concatenate(pair) for pair in zip(self, others, strict=True)))
-
     def places(self, camera: Camera) -> Places:
         """Their places in the image of a camera."""
         return Places.of(ImagePoints.seen_at(self.x, camera), self.depth)
 
 
 @dataclass(frozen=True, slots=True)
-class FoundMarkers:
+class FoundMarkers(Stacked):
     """N markers that a frame shows.
 
     Parameters
@@ -101,25 +94,13 @@ class FoundMarkers:
         places = Places(ImagePoints(x, x, J, J), np.zeros((0, 4)), np.zeros((0, 4, 2, 6)))
         return FoundMarkers(np.zeros(0, dtype=np.int64), places, np.zeros(0), no, no)
 
-    def only(self, keep: BoolArray | IntArray) -> 'FoundMarkers':
-        """Those of the markers ``keep``."""
-        places = self.places.only(keep)
-        return FoundMarkers(self.ids[keep], places, self.cnr[keep], self.expected[keep], self.certain[keep])
-
-    def with_others(self, others: 'FoundMarkers') -> 'FoundMarkers':
+    def and_elsewhere(self, others: 'FoundMarkers') -> 'FoundMarkers':
         """These, and those of ``others`` that are not among them and that lie elsewhere."""
         if len(others.ids) == 0:
             return self
         apart = np.linalg.norm(others.corners_px.mean(axis=1)[:, None] - self.corners_px.mean(axis=1), axis=-1)
         extent = np.linalg.norm(self.corners_px[:, 2] - self.corners_px[:, 0], axis=-1)
-        new = np.flatnonzero(~among(others.ids, self.ids) & (apart > TOGETHER * extent).all(axis=1))
-        return FoundMarkers(
-            np.concatenate([self.ids, others.ids[new]]),
-            self.places.joined(others.places.only(new)),
-            np.concatenate([self.cnr, others.cnr[new]]),
-            np.concatenate([self.expected, others.expected[new]]),
-            np.concatenate([self.certain, others.certain[new]]),
-        )
+        return self.joined(others.only(~among(others.ids, self.ids) & (apart > TOGETHER * extent).all(axis=1)))
 
 
 def depths(T_camera_marker: FloatArray, sizes: FloatArray) -> FloatArray:

@@ -106,15 +106,12 @@ class PartialMarkerSearch:
             )
         )
         largest = sorted((marker for marker in in_view if marker is not None), key=lambda marker: -marker.cell_px)
-        seen = []
+        ids, found = list[int](), RefinedCorners.none()
         for marker in largest[:_MOST]:
             corners = self._one(frame, marker, allowed, config)
             if corners is not None:
-                seen.append((marker.id, corners))
-        if not seen:
-            return np.zeros(0, dtype=np.int64), RefinedCorners.none()
-        parts = zip(*(found for _, found in seen), strict=True)
-        return np.array([marker_id for marker_id, _ in seen]), RefinedCorners(*map(np.concatenate, parts))
+                ids, found = [*ids, marker.id], found.joined(corners)
+        return np.array(ids, dtype=np.int64), found
 
     def _one(
         self, frame: Frame, marker: _Marker, allowed: BoolArray, config: ArucoDetectorConfig

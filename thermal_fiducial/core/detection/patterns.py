@@ -4,6 +4,7 @@ All cells count, the black border as well as the bits, each the mean of several 
 from noise at contrasts where no single bit could be thresholded: what is compared are correlations.
 """
 
+from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Stacked
 
 # How far off a side black and white are compared: in cells, and at most in pixels.
 _OUTSIDE = 0.4
@@ -63,7 +64,8 @@ def correctable_bits(bits: Gray) -> int:
     return max((int(distance.min()) - 1) // 2, 0)
 
 
-class Reading(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Reading(Stacked):
     """What Q quadrilaterals look most like."""
 
     #: (Q,) most similar ID

@@ -125,7 +125,7 @@ class BlindSearch:
         # Blur may leave nothing to be seen of a border between two white ones but the outline of the whole plate.
         fine, faint = (_with_shrunk(quads, decoder.cells) for quads in outlines)
         quads = np.concatenate([fine, faint])
-        reading = _joined(decoder.read(frame.image, fine, allowed), decoder.read(half, halfway(faint), allowed))
+        reading = decoder.read(frame.image, fine, allowed).joined(decoder.read(half, halfway(faint), allowed))
         rough = _NONE if seen is None else _rough(reading, quads, seen)
         if len(rough) == 0:
             return reading, quads
@@ -136,7 +136,7 @@ class BlindSearch:
         else:
             in_half = aligned(half, halfway(quads[rough]), ids, turns, decoder)
             pulled, again = 2.0 * in_half + 0.5, decoder.read(half, in_half, allowed)
-        return _joined(reading, again), np.concatenate([quads, pulled])
+        return reading.joined(again), np.concatenate([quads, pulled])
 
 
 def _fine_mask(frame: Frame, scales: SearchScales) -> Gray:
@@ -199,10 +199,6 @@ def _rough(reading: Reading, quads: FloatArray, seen: IntArray) -> IntArray:
     centre, across = quads.mean(axis=1), np.linalg.norm(quads[clear, 2] - quads[clear, 0], axis=-1)
     distance = np.linalg.norm(centre[places, None] - centre[clear], axis=-1)
     return np.asarray(places[(distance > 0.5 * across).all(axis=1)])
-
-
-def _joined(first: Reading, second: Reading) -> Reading:
-    return Reading(*(np.concatenate(pair) for pair in zip(first, second, strict=True)))
 
 
 def distinct(reading: Reading, noise: float, config: ArucoDetectorConfig) -> BoolArray:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked
 from thermal_fiducial.errors import InputError
 
 #: Number of coefficients that each model takes (shorter lists are filled up with zeros).
@@ -176,7 +176,7 @@ class Camera:
 
 
 @dataclass(frozen=True, slots=True)
-class ImagePoints:
+class ImagePoints(Stacked):
     """Points of an image in both coordinates.
 
     Parameters
@@ -211,10 +211,6 @@ class ImagePoints:
     def at_pixels(self, px: FloatArray) -> 'ImagePoints':
         """Those at pixels (..., 2) that are so near that what is left of the distortion's curvature is nothing."""
         return ImagePoints(px, self.x + (self.inverse @ (px - self.px)[..., None])[..., 0], self.J, self.inverse)
-
-    def only(self, keep: BoolArray | IntArray) -> 'ImagePoints':
-        """Those at the places ``keep`` of the first axis."""
-        return ImagePoints(self.px[keep], self.x[keep], self.J[keep], self.inverse[keep])
 
 
 def inverse_2x2(J: FloatArray) -> FloatArray:

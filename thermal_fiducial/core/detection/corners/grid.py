@@ -24,7 +24,7 @@ from thermal_fiducial.core.detection.corners.sides import blurred_step, blurs, c
 from thermal_fiducial.core.detection.frame import Frame, Places, rolling_displacement
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, Stacked
 
 # Columns of pixels across an edge: every so many pixels, but no fewer and no more than this.
 _EVERY_PX, _FEWEST, _MOST = 3.0, 6, 24
@@ -36,7 +36,8 @@ _PRIOR_PX = 30.0
 _LEAST_DEPTH = 1e-3
 
 
-class GridEdges(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class GridEdges(Stacked):
     """The E edges of a marker, in shares of its sides: a from left to right, b from the top down."""
 
     #: (E, 5, 2) points of each, equally far apart
@@ -45,10 +46,6 @@ class GridEdges(NamedTuple):
     onward: FloatArray
     #: (E,) change of value on the way there, 1 from black to white
     step: FloatArray
-
-    def only(self, keep: BoolArray) -> 'GridEdges':
-        """Those of the edges ``keep`` (E,)."""
-        return GridEdges(self.nodes[keep], self.onward[keep], self.step[keep])
 
 
 def grid_edges(bits: Gray) -> GridEdges:

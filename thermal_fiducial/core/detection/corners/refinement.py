@@ -4,15 +4,15 @@ Columns of whole pixels across the sides are compared with the model of a blurre
 adjustment of the four corners to all segments of the marker follows, until the corners no longer move.
 """
 
+from dataclasses import dataclass
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED
 from thermal_fiducial.core.detection.corners.sides import blurs, half_width, model, sides_of
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Stacked
 
 # Passes follow one another until the last step was short enough [px]: at best, at worst, between in deviations of it.
 _PASSES = 4
@@ -21,7 +21,8 @@ _SETTLED_PX, _UNSURE = (0.3, 1.0), 2.0
 _PRIOR_PX = 3.0
 
 
-class RefinedCorners(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class RefinedCorners(Stacked):
     """Corners of N markers.
 
     Parameters
@@ -44,17 +45,6 @@ class RefinedCorners(NamedTuple):
         """No corners."""
         no = np.zeros(0)
         return RefinedCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no)
-
-    def only(self, keep: BoolArray | IntArray) -> 'RefinedCorners':
-        """Those of the markers ``keep``."""
-        return RefinedCorners(*(values[keep] for values in self))
-
-    def with_others(self, which: IntArray, others: 'RefinedCorners') -> 'RefinedCorners':
-        """The same with ``others`` for those of the markers ``which``."""
-        arrays = [values.copy() for values in self]
-        for values, new in zip(arrays, others, strict=True):
-            values[which] = new
-        return RefinedCorners(*arrays)
 
 
 def refine_corners(
