@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from support.boards import chessboard_levels, circle_levels, plate_pose, random_view, render
+from support.heated_boards import Heat, picture
 import yaml
 
 from thermal_fiducial.calibration.keypoints import without_speckles
@@ -14,6 +15,7 @@ from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.fabrication.boards import asymmetric_circles
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.sim.scenario import LENSES
 
@@ -134,6 +136,19 @@ def test_command_calibrates_a_folder(tmp_path, capsys):
     covariance = yaml.safe_load((tmp_path / 'camera_covariance.yaml').read_text())
     assert 0.3 < covariance['covered_share'] < 1.0
     assert covariance['sigma_covered_px'] < covariance['sigma_not_covered_px']
+
+
+def test_a_board_of_circles_is_calibrated_with_as_it_was_drawn(tmp_path, capsys):
+    assert main(['markers', 'board', 'circles', '--formats', 'svg', '--out', str(tmp_path / 'board')]) == 0
+    said = capsys.readouterr().out.splitlines()[-1].partition(' VIEWS ')[2].split()
+    assert said == ['--target', 'circles', '--grid', '4', '11', '--spacing', '25', '--diameter', '20']
+    views = tmp_path / 'views'
+    views.mkdir()
+    counts, _ = picture(asymmetric_circles(4, 11, 1.0), Heat(), np.random.default_rng(1), radius=0.4, fill=0.8)
+    cv2.imwrite(str(views / '0.png'), counts)
+    for options in (said, said[:2]):
+        assert main(['calibrate', 'intrinsics', str(views), '--out', str(tmp_path / 'no.yaml'), *options]) == 2
+        assert '0.png: 44 points' in capsys.readouterr().out
 
 
 def test_points_that_were_measured_elsewhere(tmp_path, capsys):

@@ -154,10 +154,10 @@ def test_search_refuses_what_cannot_be(bits, distance):
 
 
 @pytest.mark.parametrize(('name', 'bits_apart'), [('STENCIL_4X4_100', 0), ('STENCIL_5X5_100', 1)])
-def test_the_readme_names_the_markers_that_are_like_the_negative_of_another(name, bits_apart):
+def test_the_documents_name_the_markers_that_are_like_the_negative_of_another(name, bits_apart):
     bits = marker_bits(load_dictionary(name))
-    readme = (Path(__file__).resolve().parents[2] / 'README.md').read_text(encoding='utf-8')
-    (listed,) = re.findall(rf'In `{name}`\s+these\b([^.]*)\.', readme)
+    page = (Path(__file__).resolve().parents[2] / 'doc' / 'markers.md').read_text(encoding='utf-8')
+    (listed,) = re.findall(rf'In `{name}`\s+these\b([^.]*)\.', page)
     pairs = [(int(a), int(b), bits_apart) for a, b in re.findall(r'(\d+)\s+and\s+(\d+)', listed)]
     assert pairs == negatives(bits, distances(bits)[0])
 

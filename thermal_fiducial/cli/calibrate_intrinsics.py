@@ -1,32 +1,20 @@
 """``calibrate intrinsics``: camera_info from thermal views of a board, or from points that were measured elsewhere."""
 
 import argparse
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import yaml
 
-from thermal_fiducial.calibration.intrinsics import Calibration, LEAST_VIEWS
+from thermal_fiducial.calibration.intrinsics import Calibration
 from thermal_fiducial.calibration.lens_check import image_error, ImageError
-from thermal_fiducial.calibration.lens_choice import CANDIDATES, choose_model
-from thermal_fiducial.calibration.plots import coverage
+from thermal_fiducial.calibration.lens_choice import CANDIDATES
 from thermal_fiducial.calibration.report import BoardView, write_report
-from thermal_fiducial.calibration.sources import (
-    clean_frames,
-    is_folder_of_pictures,
-    measured_points,
-    pictures,
-    RawFrame,
-    read_picture,
-)
-from thermal_fiducial.calibration.targets import BoardNotFound, Chessboard, CircleGrid, MarkerBoard, Sighting, Target
-from thermal_fiducial.cli.progress import tracked
+from thermal_fiducial.calibration.sources import is_folder_of_pictures, measured_points
+from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Target
+from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pictures
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, parse_remaps
@@ -35,8 +23,6 @@ from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.writing import write_text
 
-# A view of a bag must have moved by this much since the last one kept, and by less than that to the next frame [px].
-_NEW_VIEW_PX, _STILL_PX = 12.0, 0.7
 _SHADES = ' .:+#'
 #: Boards; ``circles`` are OpenCV's asymmetric grid.
 TARGETS = ('chessboard', 'circles', 'symmetric-circles', 'markers')
@@ -80,7 +66,7 @@ def _add_board(group: argparse._ArgumentGroup) -> None:
         '--missing', action='append', default=[], metavar='COLUMN,ROW', help='a circle, from 0,0, that is not there'
     )
     group.add_argument(
-        '--spacing', type=float, default=50.0, metavar='MM', help='square, or between two rows of circles'
+        '--spacing', type=float, metavar='MM', help='square, or between two rows of circles (default: 50; circles 25)'
     )
     group.add_argument('--diameter', type=float, default=20.0, metavar='MM', help='of the circles')
     group.add_argument('--board', type=Path, metavar='MAP', help='marker map of a marker board')
@@ -106,98 +92,27 @@ def _intrinsics(args: argparse.Namespace) -> int:
     return 0
 
 
-@dataclass
-class _Views:
-    """Views of the board as they come in.
-
-    Parameters
-    ----------
-    target : the board; None where its points were measured elsewhere
-    kept, unusable : views, and name and reason of frames that are none
-    size : width and height of the image [px]
-    """
-
-    target: Target | None = None
-    kept: list[BoardView] = field(default_factory=list)
-    unusable: list[tuple[str, str]] = field(default_factory=list)
-    size: tuple[int, int] = (0, 0)
-
-    def find(self, frame: RawFrame, camera: Camera) -> Sighting | None:
-        """The board in a frame; None, with the reason noted, where there is none."""
-        height, width = frame.counts.shape
-        if self.kept and self.size != (width, height):
-            reason = f'{width}x{height} pixels, the views before it have {self.size[0]}x{self.size[1]}'
-            self.unusable.append((frame.name, reason))
-            return None
-        self.size = (width, height)
-        assert self.target is not None
-        try:
-            return self.target.find(frame.counts, camera)
-        except BoardNotFound as reason:
-            self.unusable.append((frame.name, str(reason)))
-            return None
-
-    def keep(self, frame: RawFrame, sighting: Sighting) -> None:
-        """Use a view, and say how much of the image is covered by now."""
-        self.kept.append(BoardView(frame.name, sighting, frame.counts))
-        cells = self.covered()
-        print(f'{frame.name}: {len(sighting.pixels)} points; {np.sum(cells > 0)} of {cells.size} cells covered')
-
-    def covered(self) -> np.ndarray:
-        """Points in each cell of the image."""
-        return coverage(np.concatenate([view.sighting.pixels for view in self.kept]), *self.size)
-
-    def require(self, source: Path) -> None:
-        """Refuse too few views, with the reasons of those that are none.
-
-        Raises
-        ------
-        InputError
-            Fewer than a calibration needs.
-        """
-        if len(self.kept) >= LEAST_VIEWS:
-            return
-        total = len(self.kept) + len(self.unusable)
-        reasons = Counter(reason for _, reason in self.unusable)
-        named = [f'{name}: {reason}' for name, reason in self.unusable] if len(self.unusable) <= 20 else []
-        named = named or [f'{count} frames: {reason}' for reason, count in reasons.most_common(5)]
-        text = f'{source}: {len(self.kept)} of {total} frames are usable views, a calibration needs {LEAST_VIEWS}'
-        raise InputError('; '.join([text, *named]))
-
-    def look_again(self, camera: Camera) -> None:
-        """Find the board once more in all frames, now that the camera is known."""
-        assert self.target is not None
-        for index, view in enumerate(self.kept):
-            if view.counts is None:
-                continue
-            try:
-                self.kept[index] = BoardView(view.name, self.target.find(view.counts, camera), view.counts)
-            except BoardNotFound:
-                continue
-
-    def solve(self, models: Sequence[str], focal_px: float) -> tuple[Calibration, dict[str, Calibration]]:
-        """The best lens, and the best of every model."""
-        radius = 0.0 if self.target is None else self.target.radius
-        sightings = [view.sighting for view in self.kept]
-        return choose_model(sightings, *self.size, models, radius=radius, focal_px=focal_px)
-
-
-def _views(args: argparse.Namespace) -> _Views:
+def _views(args: argparse.Namespace) -> BoardViews:
     if args.source.suffix.lower() == '.csv':
         if args.size is None or min(args.size) < 32:
             raise InputError(f'{args.source}: points without pictures need --size WIDTH HEIGHT')
         named = [BoardView(name, sighting) for name, sighting in measured_points(args.source, *args.size)]
-        return _Views(None, named, size=tuple(args.size))
-    views = _Views(_target(args))
+        return BoardViews(None, named, size=tuple(args.size))
+    views = BoardViews(_target(args))
     if is_folder_of_pictures(args.source):
-        _look_at_pictures(args, views)
-    else:
-        _look_at_bag(args, views)
+        look_at_pictures(args.source, views, args.focal_px, args.most_views)
+        return views
+    if not args.source.exists():
+        raise InputError(f'{args.source}: no such folder of pictures, bag or CSV file')
+    with BagReader(args.source, parse_remaps(args.remap)) as bag:
+        look_at_bag(bag, views, args.focal_px, args.most_views, args.every)
     return views
 
 
 def _target(args: argparse.Namespace) -> Target:
-    spacing, diameter = 1e-3 * args.spacing, 1e-3 * args.diameter
+    # As markers board has it where nothing is said.
+    millimetres = args.spacing or (25.0 if args.target == 'circles' else 50.0)
+    spacing, diameter = 1e-3 * millimetres, 1e-3 * args.diameter
     if args.target == 'chessboard':
         columns, rows = args.grid or (8, 6)
         return Chessboard(columns, rows, spacing)
@@ -228,68 +143,6 @@ def mapped_detector(board: MarkerMap) -> MarkerDetector:
     return detector
 
 
-def _guess(frame: RawFrame, focal_px: float) -> Camera:
-    height, width = frame.counts.shape
-    K = np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
-    return Camera(width, height, K)
-
-
-def _look_at_pictures(args: argparse.Namespace, views: _Views) -> None:
-    for index, path in enumerate(pictures(args.source)):
-        if len(views.kept) == args.most_views:
-            return
-        try:
-            counts = read_picture(path)
-        except InputError as reason:
-            views.unusable.append((path.name, str(reason).removeprefix(f'{path}: ')))
-            print(f'{path.name}: not used: {views.unusable[-1][1]}')
-            continue
-        frame = RawFrame(path.name, index * 10_000_000_000, counts)
-        sighting = views.find(frame, _guess(frame, args.focal_px))
-        if sighting is None:
-            print(f'{frame.name}: not used: {views.unusable[-1][1]}')
-        else:
-            views.keep(frame, sighting)
-
-
-def _look_at_bag(args: argparse.Namespace, views: _Views) -> None:
-    """Every n-th frame where the board stands still and elsewhere than before."""
-    if not args.source.exists():
-        raise InputError(f'{args.source}: no such folder of pictures, bag or CSV file')
-    with BagReader(args.source, parse_remaps(args.remap)) as bag:
-        pending: tuple[RawFrame, Sighting] | None = None
-        frames = tracked(clean_frames(bag), 'looking for the board', bag.message_count([bag.image_topic]))
-        for index, frame in enumerate(frames):
-            if pending is None and index % args.every:
-                continue
-            sighting = views.find(frame, _guess(frame, args.focal_px))
-            if pending is not None and sighting is not None:
-                if _distance(pending[1], sighting) < _STILL_PX:
-                    views.keep(*pending)
-                else:
-                    views.unusable.append((pending[0].name, 'the board moves'))
-            pending = None
-            if sighting is not None and _is_new(sighting, views.kept):
-                pending = (frame, sighting)
-            if len(views.kept) >= args.most_views:
-                return
-
-
-def _is_new(sighting: Sighting, kept: Sequence[BoardView]) -> bool:
-    return all(_distance(sighting, view.sighting) > _NEW_VIEW_PX for view in kept)
-
-
-def _distance(a: Sighting, b: Sighting) -> float:
-    """Mean distance of the points that both show [px]; infinite when they share none."""
-    there = {tuple(point): pixel for point, pixel in zip(a.points.tolist(), a.pixels, strict=True)}
-    both = [
-        (there[tuple(point)], pixel)
-        for point, pixel in zip(b.points.tolist(), b.pixels, strict=True)
-        if tuple(point) in there
-    ]
-    return float(np.mean([np.linalg.norm(p - q) for p, q in both])) if both else np.inf
-
-
 def _save_covariance(out: Path, result: Calibration, error: ImageError) -> None:
     """Next to the calibration, which has no place for it."""
     path = out.with_name(f'{out.stem}_covariance.yaml')
@@ -309,7 +162,7 @@ def _save_covariance(out: Path, result: Calibration, error: ImageError) -> None:
 
 
 def _print_result(
-    out: Path, result: Calibration, fits: dict[str, Calibration], views: _Views, error: ImageError
+    out: Path, result: Calibration, fits: dict[str, Calibration], views: BoardViews, error: ImageError
 ) -> None:
     cells = views.covered()
     shades = np.minimum(np.ceil(4.0 * cells / max(1, int(np.percentile(cells, 90)))), 4).astype(int)

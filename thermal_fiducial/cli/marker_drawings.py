@@ -94,7 +94,9 @@ def _board(args: argparse.Namespace) -> int:
     options = plate_options(args)
     columns, rows = args.grid or ((4, 11) if args.kind == 'circles' else (4, 3))
     if args.kind == 'circles':
-        _write_all([circle_board(columns, rows, args.spacing or 25.0, args.diameter, options)], args)
+        spacing = args.spacing or 25.0
+        _write_all([circle_board(columns, rows, spacing, args.diameter, options)], args)
+        _say_how_to_use(f'circles --grid {columns} {rows} --spacing {spacing:g} --diameter {args.diameter:g}')
         return 0
     bits = marker_bits(load_dictionary(args.dictionary))
     if columns < 1 or rows < 1 or columns * rows > len(bits):
@@ -107,7 +109,12 @@ def _board(args: argparse.Namespace) -> int:
     _write_all([*markers, base], args, [board])
     _say_what_is_weak(markers, args, bits.shape[1] + 2)
     save_map(board, _board_map(centres, options, args.dictionary))
+    _say_how_to_use(f'markers --board {board}')
     return 0
+
+
+def _say_how_to_use(target: str) -> None:
+    print(f'calibrate with it: thermal-fiducial calibrate intrinsics VIEWS --target {target}')
 
 
 def _board_map(centres: FloatArray, options: PlateOptions, dictionary: str) -> MarkerMap:

@@ -1,0 +1,160 @@
+"""Views of a calibration board, from pictures or a bag: those that are kept, and why others are not."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from thermal_fiducial.calibration.intrinsics import Calibration, LEAST_VIEWS
+from thermal_fiducial.calibration.lens_choice import choose_model
+from thermal_fiducial.calibration.plots import coverage
+from thermal_fiducial.calibration.report import BoardView
+from thermal_fiducial.calibration.sources import clean_frames, pictures, RawFrame, read_picture
+from thermal_fiducial.calibration.targets import BoardNotFound, Sighting, Target
+from thermal_fiducial.cli.progress import tracked
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import BagReader
+
+# A view of a bag must have moved by this much since the last one kept, and by less than that to the next frame [px].
+_NEW_VIEW_PX, _STILL_PX = 12.0, 0.7
+
+
+@dataclass
+class BoardViews:
+    """Views of the board as they come in.
+
+    Parameters
+    ----------
+    target : the board; None where its points were measured elsewhere
+    kept, unusable : views, and name and reason of frames that are none
+    size : width and height of the image [px]
+    """
+
+    target: Target | None = None
+    kept: list[BoardView] = field(default_factory=list)
+    unusable: list[tuple[str, str]] = field(default_factory=list)
+    size: tuple[int, int] = (0, 0)
+
+    def find(self, frame: RawFrame, camera: Camera) -> Sighting | None:
+        """The board in a frame; None, with the reason noted, where there is none."""
+        height, width = frame.counts.shape
+        if self.kept and self.size != (width, height):
+            reason = f'{width}x{height} pixels, the views before it have {self.size[0]}x{self.size[1]}'
+            self.unusable.append((frame.name, reason))
+            return None
+        self.size = (width, height)
+        assert self.target is not None
+        try:
+            return self.target.find(frame.counts, camera)
+        except BoardNotFound as reason:
+            self.unusable.append((frame.name, str(reason)))
+            return None
+
+    def keep(self, frame: RawFrame, sighting: Sighting) -> None:
+        """Use a view, and say how much of the image is covered by now."""
+        self.kept.append(BoardView(frame.name, sighting, frame.counts))
+        cells = self.covered()
+        print(f'{frame.name}: {len(sighting.pixels)} points; {np.sum(cells > 0)} of {cells.size} cells covered')
+
+    def covered(self) -> np.ndarray:
+        """Points in each cell of the image."""
+        return coverage(np.concatenate([view.sighting.pixels for view in self.kept]), *self.size)
+
+    def require(self, source: Path) -> None:
+        """Refuse too few views, with the reasons of those that are none.
+
+        Raises
+        ------
+        InputError
+            Fewer than a calibration needs.
+        """
+        if len(self.kept) >= LEAST_VIEWS:
+            return
+        total = len(self.kept) + len(self.unusable)
+        reasons = Counter(reason for _, reason in self.unusable)
+        named = [f'{name}: {reason}' for name, reason in self.unusable] if len(self.unusable) <= 20 else []
+        named = named or [
+            f'{count} frame{"s" if count != 1 else ""}: {reason}' for reason, count in reasons.most_common(5)
+        ]
+        text = f'{source}: {len(self.kept)} of {total} frames are usable views, a calibration needs {LEAST_VIEWS}'
+        raise InputError('; '.join([text, *named]))
+
+    def look_again(self, camera: Camera) -> None:
+        """Find the board once more in all frames, now that the camera is known."""
+        assert self.target is not None
+        for index, view in enumerate(self.kept):
+            if view.counts is None:
+                continue
+            try:
+                self.kept[index] = BoardView(view.name, self.target.find(view.counts, camera), view.counts)
+            except BoardNotFound:
+                continue
+
+    def solve(self, models: Sequence[str], focal_px: float) -> tuple[Calibration, dict[str, Calibration]]:
+        """The best lens, and the best of every model."""
+        radius = 0.0 if self.target is None else self.target.radius
+        sightings = [view.sighting for view in self.kept]
+        return choose_model(sightings, *self.size, models, radius=radius, focal_px=focal_px)
+
+
+def look_at_pictures(source: Path, views: BoardViews, focal_px: float, most: int) -> None:
+    """Each picture of a folder, until there are ``most`` views."""
+    for index, path in enumerate(pictures(source)):
+        if len(views.kept) == most:
+            return
+        try:
+            counts = read_picture(path)
+        except InputError as reason:
+            views.unusable.append((path.name, str(reason).removeprefix(f'{path}: ')))
+            print(f'{path.name}: not used: {views.unusable[-1][1]}')
+            continue
+        frame = RawFrame(path.name, index * 10_000_000_000, counts)
+        sighting = views.find(frame, _guess(frame, focal_px))
+        if sighting is None:
+            print(f'{frame.name}: not used: {views.unusable[-1][1]}')
+        else:
+            views.keep(frame, sighting)
+
+
+def look_at_bag(bag: BagReader, views: BoardViews, focal_px: float, most: int, every: int) -> None:
+    """Every n-th frame of a bag where the board stands still and elsewhere than before."""
+    pending: tuple[RawFrame, Sighting] | None = None
+    frames = tracked(clean_frames(bag), 'looking for the board', bag.message_count([bag.image_topic]))
+    for index, frame in enumerate(frames):
+        if pending is None and index % every:
+            continue
+        sighting = views.find(frame, _guess(frame, focal_px))
+        if pending is not None and sighting is not None:
+            if _distance(pending[1], sighting) < _STILL_PX:
+                views.keep(*pending)
+            else:
+                views.unusable.append((pending[0].name, 'the board moves'))
+        pending = None
+        if sighting is not None and _is_new(sighting, views.kept):
+            pending = (frame, sighting)
+        if len(views.kept) >= most:
+            return
+
+
+def _guess(frame: RawFrame, focal_px: float) -> Camera:
+    height, width = frame.counts.shape
+    K = np.array([[focal_px, 0.0, 0.5 * (width - 1)], [0.0, focal_px, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
+    return Camera(width, height, K)
+
+
+def _is_new(sighting: Sighting, kept: Sequence[BoardView]) -> bool:
+    return all(_distance(sighting, view.sighting) > _NEW_VIEW_PX for view in kept)
+
+
+def _distance(a: Sighting, b: Sighting) -> float:
+    """Mean distance of the points that both show [px]; infinite when they share none."""
+    there = {tuple(point): pixel for point, pixel in zip(a.points.tolist(), a.pixels, strict=True)}
+    both = [
+        (there[tuple(point)], pixel)
+        for point, pixel in zip(b.points.tolist(), b.pixels, strict=True)
+        if tuple(point) in there
+    ]
+    return float(np.mean([np.linalg.norm(p - q) for p, q in both])) if both else np.inf
