@@ -55,23 +55,23 @@ MECHANISMS = {
     ),
     'weights by the map': Mechanism(
         ('uneven map', 'chain'),
-        ('localization:_Frame.map_weights',),
-        {'localization:_Frame.map_weights': lambda self, *_: np.ones(len(self.sight.markers))},
+        ('localization:_JointFit.map_weights',),
+        {'localization:_JointFit.map_weights': lambda self, *_: np.ones(len(self.sight.markers))},
     ),
     'alternative pose': Mechanism(
         ('small markers', 'chain', 'tags test_16'),
-        ('localization:_Frame.alternative',),
-        {'localization:_Frame.alternative': _ignored},
+        ('localization:_JointFit.alternative',),
+        {'localization:_JointFit.alternative': _ignored},
     ),
     'contradiction of odometry': Mechanism(
-        ('chain', 'tags test_22'), ('odometry_prior:contradicts',), {'mapper:contradicts': lambda *_: False}
+        ('chain', 'tags test_22'), ('located:contradicts',), {'mapper:contradicts': lambda *_: False}
     ),
     'odometry of keyframes': Mechanism(
         ('chain', 'tags test_22'), (), {'keyframes:alike_odometry': lambda covariance: 1e12 * covariance}
     ),
     'bridging': Mechanism(
         ('chain', 'tags test_22'),
-        ('keyframes:FrameMemory.bridge', 'keyframes:FrameMemory.bridgeable', 'odometry_prior:growth'),
+        ('keyframes:FrameMemory.bridge', 'keyframes:FrameMemory.bridgeable', 'located:growth'),
         {'keyframes:FrameMemory.bridgeable': lambda *_, **__: False},
     ),
     'two cameras of a candidate': Mechanism(

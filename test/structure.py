@@ -122,10 +122,12 @@ def constants(path: Path) -> int:
 
 
 def repeated_names() -> list[str]:
-    """Names of classes and modules that stand more than once in the package."""
+    """Names of classes and modules that stand more than once in the package, were it with an underscore before them."""
     names: Counter[str] = Counter(path.stem for path in sources(PACKAGE))
     for path in sources(PACKAGE):
-        names.update(node.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ClassDef))
+        names.update(
+            node.name.lstrip('_') for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ClassDef)
+        )
     return sorted(f'{name} x{count}' for name, count in names.items() if count > 1)
 
 

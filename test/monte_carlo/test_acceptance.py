@@ -188,7 +188,7 @@ def first_seconds():
 def test_first_seconds_are_consistent_and_show_the_time_offset():
     square, offsets = first_seconds()
     errors_ms, stds_ms = 1e3 * offsets.T
-    # 1 is honest; the shipped noise is three times that of these poses, so it must be less
+    # 1 is consistent; the shipped noise is three times that of these poses, so it must be less
     assert square < 1.0
     # the 99 % limit of the mean of six squares
     assert rms(errors_ms / stds_ms) < 1.67
@@ -426,7 +426,7 @@ def test_scale_errors_of_the_gyroscope_are_learned(seed):
     learned, nees = fly(ImuNoise(gyroscope_scale_std=0.01))
     # Negative control: an IMU that is taken for linear, too. What motion may add covers some of an unknown scale.
     ignored, nees_ignored = fly(perfect(ImuNoise()))
-    # Measured in four flights: 8 to 12 mm instead of 54 to 81; an honest NEES is 6, and was 32 and more.
+    # Measured in four flights: 8 to 12 mm instead of 54 to 81; a consistent NEES is 6, and was 32 and more.
     assert learned < 0.25 * ignored
     assert nees < 6.0 < 4.0 * 6.0 < nees_ignored
 
@@ -446,14 +446,14 @@ def test_extrinsics_are_refined_on_request():
 def test_smooth_output_has_no_steps_and_arrives():
     data = Flight(seed=SEEDS[0], seconds=5.0, motion=Motion.still())
     ekf = PoseEkf(config(smoothing_time=0.1))
-    honest, smooth = [], []
+    exact, smooth = [], []
     for item in timeline(data.samples(), data.poses, 0.03):
         if hasattr(item, 'T_map_camera'):
             ekf.add_pose(item)
         elif state := ekf.add_imu(item):
-            honest.append(state.T_map_body[:3, 3])
+            exact.append(state.T_map_body[:3, 3])
             smooth.append(ekf.smooth.T_map_body[:3, 3])
-    honest, smooth = np.array(honest)[400:], np.array(smooth)[400:]
-    steps = [np.linalg.norm(np.diff(path, axis=0), axis=1).max() for path in (honest, smooth)]
+    exact, smooth = np.array(exact)[400:], np.array(smooth)[400:]
+    steps = [np.linalg.norm(np.diff(path, axis=0), axis=1).max() for path in (exact, smooth)]
     assert steps[1] < 0.3 * steps[0]
-    assert np.linalg.norm(smooth[-1] - honest[-1]) < 0.01
+    assert np.linalg.norm(smooth[-1] - exact[-1]) < 0.01

@@ -139,10 +139,10 @@ def test_the_smooth_topic_is_another_one_and_feeds_the_bridge():
         fly(graph, range(60))
         fly(graph, range(60, 80), step=0.004)
         graph.spin_until(lambda: len(graph.heard['bridge/odometry']) == graph.published(node, 'odometry'))
-        honest, smooth, bridged = (graph.heard[topic] for topic in ('odometry', 'odometry_smooth', 'bridge/odometry'))
-    assert len(honest) == len(smooth) == len(bridged) > 20
+        exact, smooth, bridged = (graph.heard[topic] for topic in ('odometry', 'odometry_smooth', 'bridge/odometry'))
+    assert len(exact) == len(smooth) == len(bridged) > 20
     assert [message.pose.pose for message in smooth] == [message.pose.pose for message in bridged]
-    steps = [np.abs(np.diff([m.pose.pose.position.x for m in messages])).max() for messages in (honest, smooth)]
+    steps = [np.abs(np.diff([m.pose.pose.position.x for m in messages])).max() for messages in (exact, smooth)]
     # A correction is spread over 100 ms, twenty IMU samples.
     assert 0.0 < steps[1] < 0.5 * steps[0]
 

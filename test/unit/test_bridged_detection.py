@@ -18,13 +18,13 @@ from thermal_fiducial.sim.scenario import LENSES
 
 LENS = LENSES['13mm']
 CAMERA = Camera(LENS.width, LENS.height, LENS.matrix, LENS.model, np.array(LENS.distortion))
-SIZE_MM, RIM_MM = 300.0, 50.0
+SIZE_MM, BORDER_MM = 300.0, 50.0
 CORNERS = 0.5e-3 * SIZE_MM * np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
 
 
 def raster(drawing, origin):
     """Cells of two millimetres, True where the warm surface shows, their lines on the edges of the black square."""
-    border = RIM_MM + 2.0 * np.ceil(0.5 * origin) - origin
+    border = BORDER_MM + 2.0 * np.ceil(0.5 * origin) - origin
     count = round(0.5 * (drawing.width + 2.0 * border))
     x = 2.0 * (np.arange(count) + 0.5) - border
     u, v = np.meshgrid(x, x[::-1])

@@ -264,7 +264,7 @@ def test_reasons_in_words():
         SYMMETRIC.find(noise, GUESS)
 
 
-def test_place_needs_the_rows_at_the_rim():
+def test_place_needs_the_rows_at_the_border():
     row, column = np.divmod(np.arange(48), 8)
     nodes = np.stack([column, row], axis=1)
     board = BoardNodes(nodes)

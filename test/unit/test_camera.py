@@ -92,7 +92,7 @@ def test_points_beyond_the_fold_are_not_seen():
     assert np.isfinite(camera.project(inside)).all()
 
 
-def test_a_wide_fisheye_is_inverted_to_its_rim():
+def test_a_wide_fisheye_is_inverted_to_its_border():
     camera = Camera(640, 512, np.array([[240.0, 0, 320], [0, 240.0, 256], [0, 0, 1]]), 'equidistant', [0.0] * 4)
     uv = np.array([[0.0, 256.0], [639.0, 256.0], [320.0, 0.0], [20.0, 100.0]])
     assert np.allclose(camera.distort(camera.normalise(uv)), uv, atol=1e-8)

@@ -122,7 +122,7 @@ def test_dead_pixels_clutter_and_a_hidden_stretch_cost_little():
 
 
 @pytest.mark.parametrize('width', [13.0, 15.0, 17.0, 19.0])
-def test_the_rim_of_its_plate_does_not_make_a_narrow_marker_narrower(width):
+def test_the_border_of_its_plate_does_not_make_a_narrow_marker_narrower(width):
     camera = CAMERAS['plumb_bob']
     # 40 px high and turned away until it is so narrow; its cells are down to 2.2 px wide, and so is the plate's margin.
     T = marker_pose(3.7, (0.0, np.arccos(width / 40.0), 0.0), u=0.0, v=0.0)
@@ -178,7 +178,7 @@ def test_a_side_that_something_covers_is_no_side_of_a_square(covered_px):
 
 
 @pytest.mark.parametrize('contrast', [12.0, pytest.param(50.0, marks=pytest.mark.nightly)])
-def test_covariance_is_honest(contrast):
+def test_covariance_is_consistent(contrast):
     rng = np.random.default_rng(3)
     squared, count = [], 0
     for model, camera in CAMERAS.items():

@@ -62,7 +62,7 @@ def last_rows(frames, process):
 
 
 @pytest.mark.parametrize('bent', [0.5, 2.0])
-def test_what_a_display_displaces_the_border_tells(frames, bent):
+def test_what_a_display_displaces_the_border_shows(frames, bent):
     rows = last_rows(frames, lambda counts: displayed(counts, bent))
     truth = np.stack([frames[-1].corners_px[marker_id] for marker_id in rows['id'].tolist()])
     error = corners_px(rows) - truth

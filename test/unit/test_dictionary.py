@@ -87,7 +87,7 @@ def test_unknown_name(name):
         ('gone.yaml', 'DICT_4X4_50', "dictionary 'gone.yaml'"),
     ],
 )
-def test_a_map_of_another_dictionary_is_told(of, read_as, words):
+def test_a_map_of_another_dictionary_is_reported(of, read_as, words):
     reported = other_patterns([60, 3] if '250' in of else [3], of, read_as)
     assert words in reported if words else reported == ''
 

@@ -73,7 +73,7 @@ def negative(rows):
 
 
 @pytest.mark.parametrize(('name', 'distance'), [('STENCIL_4X4_80_SIGNED', 4), ('STENCIL_5X5_100_SIGNED', 8)])
-def test_bits_of_signed_markers_tell_warm_from_cold(name, distance):
+def test_bits_of_signed_markers_distinguish_warm_from_cold(name, distance):
     markers = [[''.join(map(str, row)) for row in bits] for bits in marker_bits(load_dictionary(name)).tolist()]
     for rows in markers:
         turns = [negative(rows)]

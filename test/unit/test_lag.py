@@ -20,7 +20,7 @@ def freed(image, maps):
 
 
 @pytest.mark.parametrize('steps', [None, 4, 8])
-def test_sharpened_corners_do_not_depend_on_the_form_of_the_lag(steps):
+def test_deblurred_corners_do_not_depend_on_the_form_of_the_lag(steps):
     """A square seen through lag that is continuous, or integrated in steps of a frame of 1/30 s."""
     tau, frame, velocity = 0.010, 1 / 30, np.array([300.0, -120.0])
     duration = 2e-4 if steps is None else frame / steps
@@ -54,7 +54,7 @@ def test_sharpened_corners_do_not_depend_on_the_form_of_the_lag(steps):
 
 
 @pytest.mark.parametrize('lag_blur', [0.3, 0.7, 2.1])
-def test_sharpened_edges_are_those_of_a_response_that_forgets(lag_blur):
+def test_deblurred_edges_are_those_of_a_response_that_forgets(lag_blur):
     """Across a vertical side the image is the one of a bolometer that remembers no longer than the lag tail's age."""
     ages = np.arange(0.0, 10.0, 0.002)
     weights = np.exp(-ages)

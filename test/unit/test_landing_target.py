@@ -128,7 +128,7 @@ def test_a_pad_of_one_marker_needs_no_map(graph):
 
 
 @pytest.mark.parametrize('parameters', [{'landing_pad': [7, 8]}, {'landing_pad': [7], 'landing_target_frame': 'map'}])
-def test_what_cannot_be_told_without_the_map_is_said(graph, parameters):
+def test_what_cannot_be_known_without_the_map_is_said(graph, parameters):
     node = graph.add(LandingTarget, **parameters, **EXTRINSICS)
     graph.send('marker_map', marker_map([8]), profile=qos.LATCHED)
     graph.send('markers', markers(7, 8))

@@ -63,7 +63,7 @@ def test_sides_of_markers_stand_before_the_action_or_behind_it(tmp_path, capsys)
     assert f"argument {option}: '3' is not ID:SIZE" in capsys.readouterr().err
 
 
-def test_check_tells_sound_from_doubtful(path, capsys):
+def test_check_distinguishes_sound_from_doubtful(path, capsys):
     assert run('check', path) == 0
     assert run('unfix', path, 0) == 0
     assert run('check', path) == 1

@@ -119,7 +119,7 @@ def test_the_schur_complement_answers_like_the_whole_system():
         np.testing.assert_allclose(covariances[m], inverse_H[own, own], rtol=1e-4, atol=1e-15)
 
 
-def test_outliers_do_not_move_the_map_and_are_told():
+def test_outliers_do_not_move_the_map_and_are_named():
     rng = np.random.default_rng(4)
     poses = wall(rng)
     s = snapshot(rng, poses)
@@ -143,14 +143,14 @@ def test_optimistic_corner_covariances_are_found_out():
     poses = wall(rng)
     s = snapshot(rng, poses, sigma=0.1, count=60)
     optimistic = tuple(replace(frame, covariances=frame.covariances / 25.0) for frame in s.keyframes)
-    honest, corrected = refine(s), refine(replace(s, keyframes=optimistic))
-    assert honest is not None
+    promised, corrected = refine(s), refine(replace(s, keyframes=optimistic))
+    assert promised is not None
     assert corrected is not None
     # A variance from a thousand residuals, and the views beyond 99.9 % that it leaves out.
     assert corrected.variance_factor == pytest.approx(25.0, rel=0.1)
-    for key in honest.markers:
+    for key in promised.markers:
         np.testing.assert_allclose(
-            np.diag(corrected.markers[key].covariance), np.diag(honest.markers[key].covariance), rtol=0.2
+            np.diag(corrected.markers[key].covariance), np.diag(promised.markers[key].covariance), rtol=0.2
         )
 
 

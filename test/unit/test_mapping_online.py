@@ -117,7 +117,7 @@ def test_a_marker_that_hangs_twice_is_found_by_the_joint_refinement():
     assert result.quarantined == (5,)
 
 
-def test_another_map_is_taken_over_and_the_jump_told():
+def test_another_map_is_taken_over_and_the_jump_returned():
     rng = np.random.default_rng(9)
     poses = wall(rng)
     m = from_one_marker(poses)

@@ -103,7 +103,7 @@ def test_twist_is_that_of_the_time_that_smears():
     np.testing.assert_allclose([twist.ago(age)[3:] for age in ages], expected, atol=0.02)
 
 
-def test_states_of_the_filter_tell_the_twist_whatever_the_stamps_of_frames_do():
+def test_states_of_the_filter_show_the_twist_whatever_the_stamps_of_frames_do():
     """Jitter of 2 ms is a twentieth of a frame's period: differences alone would be wrong by as much of the turn."""
     stamps = [round(k * 1e9 / 30) for k in range(12)]
     with_prior, alone = (

@@ -462,7 +462,7 @@ def test_a_camera_pose_that_is_none_is_refused(graph):
     assert 'unit quaternion' in graph.diagnose(node)[1]
 
 
-def test_reset_starts_afresh(graph):
+def test_reset_starts_anew(graph):
     node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
     fly(graph, [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
     assert graph.diagnose(node)[1] == 'tracking'
@@ -642,7 +642,7 @@ def test_the_estimate_moves_with_the_map(graph):
     assert graph.diagnose(node)[:2] == (OK, 'tracking')
 
 
-def test_a_late_frame_from_before_a_correction_is_told_in_the_map_of_its_stamp(graph, tmp_path):
+def test_a_late_frame_from_before_a_correction_is_published_in_the_map_of_its_stamp(graph, tmp_path):
     """The filter takes every pose that is stamped before the correction for one of the old map, and moves it."""
     whole = small_bag.side_files(tmp_path, ids=(0, 1, 2, 3))[0]
     graph.listen(PoseWithCovarianceStamped, 'camera_pose')

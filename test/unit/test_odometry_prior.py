@@ -6,7 +6,7 @@ from support.walls import flight, stamp
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.reprojection import difference
-from thermal_fiducial.core.mapping.odometry_prior import predicted_camera
+from thermal_fiducial.core.mapping.located import predicted_camera
 from thermal_fiducial.core.measurements import Odometry
 
 

@@ -70,7 +70,7 @@ def test_corners_outside_the_image_are_found_without_noise(model, view):
 
 
 @pytest.mark.parametrize('view', VIEWS)
-def test_errors_are_those_that_the_covariance_tells(view):
+def test_errors_are_those_that_the_covariance_claims(view):
     """Normalised squared errors of poses, 60 draws of noise: 360 degrees of freedom."""
     camera, T = CAMERAS['plumb_bob'], pose(*VIEWS[view])
     clean, pattern = 7000.0 + 8.0 * drawn('plumb_bob', view), grid_edges(BITS[ID])
@@ -132,7 +132,7 @@ def test_nothing_else_is_taken_for_the_expected_marker(kind):
             assert len(look(image, camera, disturbed(T, rng), 1.5)[0]) == 0
 
 
-def test_what_too_few_cells_tell_is_not_told():
+def test_what_too_few_cells_show_is_not_published():
     """A strip of three cells at one side is that of many markers."""
     camera, T = CAMERAS['equidistant'], pose(200, -0.93, 0.0, (0.0, 0.0, 0.0))
     image = 7000.0 + 200.0 * draw(camera, plate(ID), T, samples=2)

@@ -182,7 +182,7 @@ def correlated_covariances(count, rng, sigma):
     return L @ np.swapaxes(L, -1, -2)
 
 
-def test_marker_covariance_is_honest():
+def test_marker_covariance_is_consistent():
     camera, T = CAMERAS['equidistant'], pose((0.5, -0.4, 0.2), (0.2, 0.1, 1.5))
     rng = np.random.default_rng(11)
     count = 2000
@@ -199,7 +199,7 @@ def test_marker_covariance_is_honest():
     assert np.mean(poses.chi2[:, 0]) == pytest.approx(2.0, abs=0.18)
 
 
-def test_joint_covariance_is_honest():
+def test_joint_covariance_is_consistent():
     camera = CAMERAS['plumb_bob']
     T, squares, corners = scene(camera)
     rng = np.random.default_rng(5)

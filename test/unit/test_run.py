@@ -156,7 +156,7 @@ def test_arguments_that_ros_leaves_are_named():
 
 
 @pytest.mark.parametrize('ending', ['os.kill(os.getpid(), signal.SIGINT)', 'rclpy.shutdown()'])
-def test_a_node_told_to_stop_while_it_is_made_stops_without_a_word(ending):
+def test_a_node_that_is_to_stop_while_it_is_made_stops_without_a_word(ending):
     program = f"""
 import os, signal, sys
 import rclpy

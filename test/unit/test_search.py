@@ -121,7 +121,7 @@ def test_edge_of_a_plate_is_no_markerinside_out(sign):
     assert not inside_out(reading, quads, everything, ~everything).any()
 
 
-def test_what_is_seen_already_is_not_sought():
+def test_what_is_seen_already_is_not_searched_for():
     image = scene(21, 100.0, 2.0)
     image[300:396, 400:496] = scene(8, 100.0, 2.0)[138:234, 188:284]
     frame, one = frame_of(image), np.ones(1, dtype=bool)
@@ -150,7 +150,7 @@ def test_rules():
     assert search(alone, ArucoDetectorConfig(min_contrast=100.0)).ids.tolist() == []
 
 
-def test_a_marker_at_the_rim_may_be_cut_off():
+def test_a_marker_at_the_border_may_be_cut_off():
     """Half a cell beyond the image, or with a corner in its outermost pixels, is too near; clear of them is not."""
     image = scene(21, 100.0, 2.0)
     for left, ids in ((206, []), (199, []), (194, [21])):

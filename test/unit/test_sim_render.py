@@ -210,7 +210,7 @@ def test_stepwise_lag_is_what_its_sum_says():
     np.testing.assert_allclose(before - after, shift, atol=0.01)
 
 
-def test_a_moving_edge_is_smeared_without_steps():
+def test_a_moving_edge_is_blurred_without_steps():
     _, lagged, _ = moving(3.0, 0.010)
     # Along a row the response rises and decays monotonically: no ghost edge at the seams of the sub-frames.
     row = cv2.GaussianBlur(lagged, (0, 0), 0.5)[60]

@@ -65,7 +65,7 @@ def test_the_square_constrains_what_the_image_does_not():
     np.testing.assert_allclose(clear, 0.0, atol=0.1)
 
 
-def test_an_outline_that_is_no_square_is_told():
+def test_an_outline_that_is_no_square_is_reported():
     seen = views(50, marker_corners(0.3) * [1.1, 1.0, 1.0])
     known = as_squares(seen, np.zeros((50, 8, 1)), np.tile(0.01**2 * np.eye(8), (50, 1, 1)))
     assert np.count_nonzero(known.doubt) > 40

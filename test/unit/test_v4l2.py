@@ -330,6 +330,6 @@ def test_the_two_clocks_are_read_together():
     assert abs((first[1] - first[0]) - (second[1] - second[0])) < 1_000_000
 
 
-def test_device_files_are_told_from_pictures():
+def test_device_files_are_distinguished_from_pictures():
     assert is_video_device('/dev/v4l/by-id/usb-FLIR_Boson')
     assert not is_video_device('/home/me/pictures')

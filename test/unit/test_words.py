@@ -12,9 +12,10 @@ REPLACED = {
     'rivals': 'alternative hypotheses', 'astray': 'inconsistent', 'culprit': 'inconsistent', 'stranger': 'unmapped',
     'strangers': 'unmapped', 'smear': 'motion blur', 'smeared': 'blurred', 'sought': 'search scales, estimated',
     'afresh': 'reset', 'clarity': 'contrast-to-noise ratio', 'rim': 'border', 'accused': 'flagged',
-    'outgrown': 'relinearised',
+    'outgrown': 'relinearised', 'sharpened': 'deblurred', 'honest': 'consistent',
 }  # fmt: skip
-WORD = re.compile(rf'\b({"|".join(REPLACED)})\b', re.IGNORECASE)
+#: Within names too, which underscores join.
+WORD = re.compile(rf'(?<![a-z])({"|".join(REPLACED)})(?![a-z])', re.IGNORECASE)
 FILES = [
     path
     for folder in ('thermal_fiducial', 'test', 'doc', 'config', 'launch')

@@ -58,14 +58,14 @@ def failure(worker):
     return str(caught.value)
 
 
-def test_work_that_fails_is_told_and_the_next_is_done(worker):
+def test_work_that_fails_is_reported_and_the_next_is_done(worker):
     worker.start('fail')
     assert 'no answer' in failure(worker)
     worker.start(0.0)
     assert result_of(worker)[1] == 0.0
 
 
-def test_a_process_that_dies_is_told_once_and_never_used_again(worker):
+def test_a_process_that_dies_is_reported_once_and_never_used_again(worker):
     worker.start('die')
     assert 'ended' in failure(worker)
     assert worker.take() is None

@@ -91,7 +91,7 @@ def calibrate_camera_imu(
     InputError
         Too few poses, no IMU samples around them, or motion that the answer cannot be read from.
     """
-    recording = _Recording(imu, start_ns, gravity)
+    recording = _RigRecording(imu, start_ns, gravity)
     poses = [pose for pose, use in zip(poses, recording.covers(poses), strict=True) if use]
     _, first = recording.solved(poses, noise)
     problem, second = recording.solved(poses, imu.noise(noise), first.jitter, first.state)
@@ -118,7 +118,7 @@ def calibrate_rolling_camera_imu(
     InputError
         As there.
     """
-    recording = _Recording(imu, start_ns, gravity)
+    recording = _RigRecording(imu, start_ns, gravity)
     at_once = _solved(frames, camera)
     inside = recording.covers([frame.pose for frame in at_once])
     at_once = [frame for frame, use in zip(at_once, inside, strict=True) if use]
@@ -135,7 +135,7 @@ def calibrate_rolling_camera_imu(
 
 
 def _rolling(
-    recording: '_Recording',
+    recording: '_RigRecording',
     solved: list[SolvedFrame],
     camera: Camera,
     noise: ImuNoise,
@@ -190,7 +190,7 @@ def _row_shifts(frames: Sequence[FrameCorners], camera: Camera, problem: Problem
 
 
 @dataclass(frozen=True)
-class _Recording:
+class _RigRecording:
     """What of a recording doesn't change from round to round."""
 
     imu: ImuTrack

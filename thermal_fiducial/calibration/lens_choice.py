@@ -33,7 +33,7 @@ _GROUPS: dict[str, tuple[tuple[tuple[int, ...], ...], ...]] = {
 
 
 @dataclass(frozen=True)
-class _Candidate:
+class _FittedLens:
     """A fit to all views, and the mean squared error of each when it is held out (V,) [px^2].
 
     One that is not ``usable`` folds back within the image; what enters next may mend that.
@@ -51,7 +51,7 @@ class _Candidate:
     def error(self) -> float:
         return float(np.mean(self.squares))
 
-    def clearly_better_than(self, other: '_Candidate') -> bool:
+    def clearly_better_than(self, other: '_FittedLens') -> bool:
         """Whether the mean is lower by more than the standard error of the differences, and not next to nothing."""
         gain = other.squares - self.squares
         error = float(np.std(gain, ddof=1) / np.sqrt(len(gain)))
@@ -83,7 +83,7 @@ def choose_model(
     # Compared on equal terms: what is an outlier to the model that fits best is one to all.
     reference = min(starts, key=lambda fit: (len(fit.dropped), fit.rms_px))
     used = [sightings[index] for index in reference.views.tolist()]
-    chosen: dict[str, _Candidate] = {}
+    chosen: dict[str, _FittedLens] = {}
     for start in starts:
         candidate = _stepwise(used, start, radius)
         if candidate is not None:
@@ -110,7 +110,7 @@ def _start(
     return calibrate(sightings, width, height, model, radius=radius, focal_px=focal_px, free=free)
 
 
-def _stepwise(sightings: Sequence[Sighting], start: Calibration, radius: float) -> _Candidate | None:
+def _stepwise(sightings: Sequence[Sighting], start: Calibration, radius: float) -> _FittedLens | None:
     """The model with the coefficients that the views determine; None where none of it is usable."""
     camera = replace(start.camera, D=np.zeros_like(start.camera.D))
     poses = np.stack([board_pose(sighting, camera) for sighting in sightings])
@@ -133,14 +133,14 @@ def _stepwise(sightings: Sequence[Sighting], start: Calibration, radius: float) 
             best = current
 
 
-def _candidate(sightings: Sequence[Sighting], near: Calibration, free: tuple[int, ...], radius: float) -> _Candidate:
+def _candidate(sightings: Sequence[Sighting], near: Calibration, free: tuple[int, ...], radius: float) -> _FittedLens:
     """Fit from a solution ``near`` by."""
     return _held_out(sightings, _fit(sightings, near, free, radius), radius)
 
 
 def _step(
     sightings: Sequence[Sighting], current: Calibration, free: tuple[int, ...], radius: float
-) -> _Candidate | None:
+) -> _FittedLens | None:
     """Fit with more coefficients than the ``current`` one; None where they gain next to nothing with fitted views.
 
     With views that were not fitted they gain less still.
@@ -154,8 +154,8 @@ def _fit(sightings: Sequence[Sighting], near: Calibration, free: tuple[int, ...]
     return calibrate_from(sightings, near.camera, near.T_camera_board, radius=radius, free=free, drop=False)
 
 
-def _held_out(sightings: Sequence[Sighting], fit: Calibration, radius: float) -> _Candidate:
-    return _Candidate(fit, _held_out_squares(sightings, fit, radius), reaches_corners(fit.camera))
+def _held_out(sightings: Sequence[Sighting], fit: Calibration, radius: float) -> _FittedLens:
+    return _FittedLens(fit, _held_out_squares(sightings, fit, radius), reaches_corners(fit.camera))
 
 
 def _held_out_squares(sightings: Sequence[Sighting], fit: Calibration, radius: float) -> FloatArray:

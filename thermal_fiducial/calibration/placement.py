@@ -113,7 +113,7 @@ def goes_on(beyond: int) -> str:
 
 
 @dataclass(frozen=True)
-class _View:
+class _PlacedView:
     """A pattern of the board in a grid, and the quarter turns and shears (2, 2) that lead to it."""
 
     ways: list[IntArray]
@@ -128,15 +128,15 @@ class _View:
         return np.asarray((outline @ matrix).min(axis=0))
 
 
-def _views(outline: IntArray) -> list[_View]:
+def _views(outline: IntArray) -> list[_PlacedView]:
     """Different patterns of the board by quarter turns and shears."""
-    views: dict[frozenset[tuple[int, ...]], _View] = {}
+    views: dict[frozenset[tuple[int, ...]], _PlacedView] = {}
     for shear in _SHEARS:
         matrix = shear
         for _ in range(4):
             turned = outline @ matrix
             pattern = frozenset(map(tuple, (turned - turned.min(axis=0)).tolist()))
-            views.setdefault(pattern, _View([])).ways.append(matrix)
+            views.setdefault(pattern, _PlacedView([])).ways.append(matrix)
             matrix = matrix @ _QUARTER
     return list(views.values())
 

@@ -162,7 +162,7 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
         parameters[:, 2], parameters[:, 3] = shared
         free = 2
         windows = windows.with_neighbours_held(parameters)
-    state = _State.at(windows, parameters, free)
+    state = _CornerState.at(windows, parameters, free)
     damping = np.full(len(parameters), _DAMPING)
     moving = np.arange(len(parameters))
     enough = _CONVERGED_PX if with_contrast else _NEARLY_PX
@@ -174,7 +174,7 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
         moving, step = moving[~short], step[~short]
         if len(moving) == 0:
             break
-        tried = _State.at(windows.rows(moving), state.parameters[moving] + step, free)
+        tried = _CornerState.at(windows.rows(moving), state.parameters[moving] + step, free)
         better = tried.cost <= state.cost[moving]
         state.put(moving[better], tried.rows(np.flatnonzero(better)))
         damping[moving] *= np.where(better, 0.1, 10.0)
@@ -189,7 +189,7 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
     return _Fits(values[:, :2], *values[:, 2:].T)
 
 
-def _well_determined(windows: PointWindows, state: '_State') -> BoolArray:
+def _well_determined(windows: PointWindows, state: '_CornerState') -> BoolArray:
     """Which fits (P,) are of small standard deviation, and near to where they started."""
     freedom = np.maximum(1.0, (windows.weight**2).sum(axis=1) - state.free - _LINEAR)
     covariance = np.linalg.pinv(state.normal, hermitian=True)[:, :2, :2]
@@ -199,7 +199,7 @@ def _well_determined(windows: PointWindows, state: '_State') -> BoolArray:
 
 
 @dataclass(frozen=True)
-class _State:
+class _CornerState:
     """Parameters (P, 4) of fits, of which ``free`` are estimated, and what the counts say there.
 
     Parameters
@@ -218,7 +218,7 @@ class _State:
     gradient: FloatArray
 
     @classmethod
-    def at(cls, windows: PointWindows, parameters: FloatArray, free: int) -> '_State':
+    def at(cls, windows: PointWindows, parameters: FloatArray, free: int) -> '_CornerState':
         """State at ``parameters``."""
         shape, slopes = windows.pattern(parameters, free)
         contrast = (shape * windows.counts).sum(axis=1) / ((shape * shape).sum(axis=1) + 1e-12)
@@ -235,11 +235,11 @@ class _State:
         damped[:, diagonal, diagonal] += damping[:, None] * (damped[:, diagonal, diagonal] + 1e-9)
         return np.asarray(np.linalg.solve(damped, self.gradient[..., None])[:, : self.free, 0])
 
-    def rows(self, index: IntArray) -> '_State':
+    def rows(self, index: IntArray) -> '_CornerState':
         """That of some of the points."""
-        return _State(self.free, *(values[index] for values in self._arrays()))
+        return _CornerState(self.free, *(values[index] for values in self._arrays()))
 
-    def put(self, index: IntArray, other: '_State') -> None:
+    def put(self, index: IntArray, other: '_CornerState') -> None:
         """Take over the state of points from ``other``, which has these alone."""
         for values, new in zip(self._arrays(), other._arrays(), strict=True):
             values[index] = new

@@ -46,7 +46,7 @@ def _align(args: argparse.Namespace) -> int:
         alignment = align_to_cloud(marker_map.markers.values(), cloud, initial, args.reach)
     except ImportError as error:
         raise InputError("map align needs the extra 'cloud': pip install '.[cloud]' in the package's folder") from error
-    _tell(alignment)
+    _print_result(alignment)
     if args.out:
         save_alignment(args.out, alignment.T, args.cloud.name, marker_map.frame_id)
         print(f'{args.out} written')
@@ -58,7 +58,7 @@ def _align(args: argparse.Namespace) -> int:
     return 0
 
 
-def _tell(alignment: CloudAlignment) -> None:
+def _print_result(alignment: CloudAlignment) -> None:
     table = Table(title='surface under each marker')
     for name in ('ID', 'distance mm', 'angle deg', 'points'):
         table.add_column(name, justify='right')

@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import apply
-from thermal_fiducial.core.mapping.map_alignment import align, Alignment, rigid
-from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.map_data import align, Alignment, MapMarker, MarkerMap, rigid
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 

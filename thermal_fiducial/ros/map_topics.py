@@ -22,7 +22,7 @@ _XYZ = np.dtype([(axis, '<f4') for axis in 'xyz'])
 
 
 @dataclass(frozen=True)
-class _Drawing:
+class _MapDrawing:
     """What RViz has been shown, and how many it was."""
 
     in_view: frozenset[int]
@@ -35,7 +35,7 @@ class MapTopics:
     def __init__(self, node: StageNode[MarkerMapperConfig]) -> None:
         config = node.config
         self._frame_id = config.map_frame
-        self._drawn: _Drawing | None = None
+        self._drawn: _MapDrawing | None = None
         self._rows = node.advertise(PointCloud2, 'marker_map', qos.LATCHED)
         self._drawing = node.advertise(MarkerArray, 'marker_map/markers', qos.LATCHED)
         self._correction = node.advertise(TransformStamped, 'map_correction')
@@ -55,7 +55,7 @@ class MapTopics:
 
     def draw(self, marker_map: MarkerMap, in_view: frozenset[int], stamp_ns: int) -> None:
         """The markers for RViz: all when they have changed or someone new looks on, else those of another colour."""
-        now = _Drawing(in_view, self._drawing.listeners)
+        now = _MapDrawing(in_view, self._drawing.listeners)
         whole = self._drawn is None or now.listeners > self._drawn.listeners
         recoloured = in_view if self._drawn is None else in_view ^ self._drawn.in_view
         if whole or recoloured:

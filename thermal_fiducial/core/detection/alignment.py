@@ -36,7 +36,7 @@ _SOBEL = 0.125
 _LONGEST = 0.6
 
 
-class _Grid(NamedTuple):
+class _Samples(NamedTuple):
     """The P samples of a marker with m x m cells."""
 
     #: (4, P) of :func:`bilinear`: where they are, and by how much each moves with each corner
@@ -48,12 +48,12 @@ class _Grid(NamedTuple):
 
 
 @cache
-def _grid(cells: int) -> _Grid:
+def _grid(cells: int) -> _Samples:
     share = np.concatenate([[-_OUTSIDE], (np.arange(cells)[:, None] + _SAMPLES).ravel(), [cells + _OUTSIDE]])
     a, b = (axis.ravel() / cells for axis in np.meshgrid(share, share))
     x, y = a - 0.5, b - 0.5
     smooth = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).astype(np.float32)
-    return _Grid(bilinear(a, b).astype(np.float32), smooth, _blur(share, cells))
+    return _Samples(bilinear(a, b).astype(np.float32), smooth, _blur(share, cells))
 
 
 def aligned(

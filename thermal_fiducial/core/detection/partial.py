@@ -53,7 +53,7 @@ _KNOWN_PX, _OUTSIDE = 8.0, 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class _Marker:
+class _PartialMarker:
     """A marker that is looked for."""
 
     id: int
@@ -114,7 +114,7 @@ class PartialMarkerSearch:
         return np.array(ids, dtype=np.int64), found
 
     def _one(
-        self, frame: Frame, marker: _Marker, allowed: BoolArray, config: ArucoDetectorConfig
+        self, frame: Frame, marker: _PartialMarker, allowed: BoolArray, config: ArucoDetectorConfig
     ) -> RefinedCorners | None:
         points = on_marker(self._visible.places, marker.size)
         factor = int(2 ** np.clip(np.floor(np.log2(marker.cell_px / _COARSE_PX)), 0, 3))
@@ -140,7 +140,7 @@ class PartialMarkerSearch:
 
     def _expected(
         self, camera: Camera, marker_id: int, size: float, T_camera_marker: FloatArray, unsure_m: float
-    ) -> _Marker | None:
+    ) -> _PartialMarker | None:
         """A marker as far as it should be in view; None where that is too little."""
         px = camera.project(se3.apply(T_camera_marker, on_marker(self._visible.places, size)))
         inside = camera.contains(px).reshape(-1, 9).all(axis=1)
@@ -155,9 +155,9 @@ class PartialMarkerSearch:
         shares = np.clip(self._visible.places.reshape(-1, 9, 2)[inside].reshape(-1, 2), 0.0, 1.0)
         (left, top), (right_end, bottom) = shares.min(axis=0), shares.max(axis=0)
         window = np.array([[left, top], [right_end, top], [right_end, bottom], [left, bottom]])
-        return _Marker(marker_id, size, T_camera_marker, window, cell_px, unsure_m * self._cells / size)
+        return _PartialMarker(marker_id, size, T_camera_marker, window, cell_px, unsure_m * self._cells / size)
 
-    def _moved(self, marker: _Marker, points: FloatArray, layer: Layer, cell_px: float) -> FloatArray | None:
+    def _moved(self, marker: _PartialMarker, points: FloatArray, layer: Layer, cell_px: float) -> FloatArray | None:
         """The expected pose (4, 4) moved to where the pattern correlates best; None where it does nowhere."""
         px = layer.project(se3.apply(marker.T_camera_marker, points))
 
@@ -183,7 +183,7 @@ class PartialMarkerSearch:
     def _recognised(
         self,
         rough: PoseFit,
-        marker: _Marker,
+        marker: _PartialMarker,
         layer: Layer,
         allowed: BoolArray,
         noise: float,
@@ -215,7 +215,7 @@ def _around(unsure_cells: float) -> FloatArray:
     return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
 
 
-def _corners(frame: Frame, marker: _Marker, fit: PoseFit) -> RefinedCorners | None:
+def _corners(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> RefinedCorners | None:
     """The corners that follow from a marker's pose, with covariances (2, 2) that claim no more than is known of it.
 
     None where they are too uncertain, or too far outside the image.
@@ -235,7 +235,7 @@ def _corners(frame: Frame, marker: _Marker, fit: PoseFit) -> RefinedCorners | No
     return RefinedCorners(corners[None], blocks[None], *scalars)
 
 
-def _pose_covariance(frame: Frame, marker: _Marker, fit: PoseFit) -> FloatArray:
+def _pose_covariance(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> FloatArray:
     """Covariance (6, 6) of a pose by its edges' noise, and by what displaces all of them alike or in some order."""
     T = fit.T_camera_marker
     window = on_marker(marker.window, marker.size)

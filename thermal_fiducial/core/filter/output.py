@@ -84,20 +84,20 @@ class SmoothOutput:
     def __init__(self, seconds: float) -> None:
         """``seconds``: time constant [s]."""
         self._seconds = seconds
-        self._honest: Odometry | None = None
+        self._consistent: Odometry | None = None
         self._T = np.eye(4)
 
     def follow(self, odometry: Odometry) -> Odometry:
         """Odometry with the smooth pose; its covariance and twist are the filter's."""
-        if self._honest is None:
+        if self._consistent is None:
             self._T = odometry.T_map_body
         else:
-            dt = (odometry.stamp_ns - self._honest.stamp_ns) * 1e-9
-            left = inverse(odometry.T_map_body) @ self._T @ _motion(self._honest, odometry, dt)
+            dt = (odometry.stamp_ns - self._consistent.stamp_ns) * 1e-9
+            left = inverse(odometry.T_map_body) @ self._T @ _motion(self._consistent, odometry, dt)
             share = math.exp(-dt / self._seconds) if np.linalg.norm(left[:3, 3]) < LARGEST_STEP else 0.0
             rotation = so3_exp(share * so3_log(left[:3, :3]))
             self._T = odometry.T_map_body @ transform(rotation, share * left[:3, 3])
-        self._honest = odometry
+        self._consistent = odometry
         return replace(odometry, T_map_body=self._T)
 
 

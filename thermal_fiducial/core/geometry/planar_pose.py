@@ -40,7 +40,7 @@ class PlanarPoses:
     information: FloatArray
     #: (N, 2) re-projection error, rms over the four corners (length of the 2-vector) [px]; inf: no pose found
     rms_px: FloatArray
-    #: (N, 2) weighted squared errors: with honest corner covariances, chi-square of two degrees of freedom
+    #: (N, 2) weighted squared errors: with consistent corner covariances, chi-square of two degrees of freedom
     chi2: FloatArray
 
     @property
@@ -52,7 +52,7 @@ class PlanarPoses:
         """Of which markers (N,) the image allows the other branch.
 
         Its squared error is below ``ratio`` times the first one's, or of 2, which is what the errors of corners with
-        honest covariances come to.
+        consistent covariances come to.
         """
         return np.asarray(self.chi2[:, 1] <= ratio * np.maximum(self.chi2[:, 0], 2.0))
 

@@ -10,9 +10,9 @@ from thermal_fiducial.core.error_model import alike_odometry, divided_prior, NO_
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.adjustment_problem import Priors, Snapshot
+from thermal_fiducial.core.mapping.located import growth, PredictedCamera
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
-from thermal_fiducial.core.mapping.odometry_prior import growth, PredictedCamera
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 

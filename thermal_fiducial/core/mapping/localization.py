@@ -64,7 +64,7 @@ def locate(
     hypotheses = _hypotheses(sight, fit, prior)
     if not len(hypotheses):
         return Refusal('no usable pose of any known marker')
-    frame = _Frame(stamp_ns, sight, camera, model, fit)
+    frame = _JointFit(stamp_ns, sight, camera, model, fit)
     # Steps 3 and 4: the pose from all markers jointly, weighted by the map.
     by_map = frame.map_weights(hypotheses[0])
     T = fit.solve(hypotheses[:1], by_map)[0][0]
@@ -79,7 +79,7 @@ def locate(
     return _either(frame, found, T_other, prior)
 
 
-def _either(frame: '_Frame', found: Location, T_other: FloatArray, prior: FloatArray | None) -> Location | Refusal:
+def _either(frame: '_JointFit', found: Location, T_other: FloatArray, prior: FloatArray | None) -> Location | Refusal:
     """One of two poses that the corners allow; without a prior they are refused, unless they are nearly the same."""
     pose = found.pose
     T = pose.T_map_camera
@@ -99,7 +99,7 @@ def _either(frame: '_Frame', found: Location, T_other: FloatArray, prior: FloatA
 
 
 @dataclass(frozen=True)
-class _Frame:
+class _JointFit:
     """The known markers of a frame, with what all fits of the camera to them have in common."""
 
     stamp_ns: int

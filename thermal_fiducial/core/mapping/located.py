@@ -1,21 +1,48 @@
-"""The known markers of a frame, and what they say of where the camera is: records of the localization."""
+"""The known markers of a frame, and what they and the odometry say of where the camera is: records of localization.
+
+A single marker leaves a camera's attitude unknown by degrees, and its position by as much times the distance; inertial
+sensors and gravity know both far better, for seconds. The offset between the clocks of camera and odometry is the
+filter's to estimate; as long as it has not, the motion during what the offset may be wrong by is part of the
+covariance.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import arms_of_scale, correlated_sum, INCONSISTENT_PX, positive
+from thermal_fiducial.core.error_model import (
+    arms_of_scale,
+    bounded_odometry,
+    correlated_sum,
+    INCONSISTENT_PX,
+    of_single_error,
+    positive,
+)
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, linearise
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, linearise
+from thermal_fiducial.core.geometry.se3 import skew, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
-from thermal_fiducial.core.mapping.odometry_prior import PredictedCamera
 from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, marker_branches, Markers
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.motion_prior import MotionPrior
+from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
 
 #: Attitudes known no better than this [rad] are not published: their covariances, of first order, mean nothing.
 VAGUE = 0.2
+#: A state of the filter stands for frames up to this far from it [ns].
+NEAR_NS = 300_000_000
+#: Squared distance (6 degrees of freedom) beyond which markers and odometry contradict each other: ten sigma.
+CONTRADICTION = 100.0
+
+
+@dataclass(frozen=True)
+class PredictedCamera:
+    """Where odometry has the camera at a frame, and how well its velocity is known."""
+
+    pose: CameraPose
+    #: (6, 6) of the body's velocity [m/s, rad/s], in the map
+    velocity_covariance: FloatArray
 
 
 @dataclass(frozen=True)
@@ -190,3 +217,53 @@ class LocatedFrame:
     def pose(self) -> CameraPose | None:
         """The pose to publish; None where there is none, or one too vague."""
         return None if isinstance(self.outcome, Refusal) or self.outcome.reason else self.outcome.pose
+
+
+def predicted_camera(
+    prior: MotionPrior | None, camera_stamp_ns: int, T_body_camera: FloatArray, time_offset_std: float
+) -> PredictedCamera | None:
+    """The camera at the frame ``camera_stamp_ns``; None where odometry has no state near it.
+
+    Parameters
+    ----------
+    prior : the filter's states, and the offset of the two clocks
+    time_offset_std : how far that offset may be wrong while the filter has not estimated it [s]
+    """
+    if prior is None:
+        return None
+    instant_ns = prior.in_odometry_clock(camera_stamp_ns)
+    odometry = prior.nearest(instant_ns)
+    if odometry is None or abs(instant_ns - odometry.stamp_ns) >= NEAR_NS:
+        return None
+    dt = (instant_ns - odometry.stamp_ns) / SECOND_NS
+    step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
+    T_map_body = odometry.T_map_body @ step
+    R, A = T_map_body[:3, :3], np.eye(6)
+    arm = R @ T_body_camera[:3, 3]
+    A[:3, 3:] = -skew(arm)
+    covariance = A @ odometry.pose_covariance @ A.T
+    if not prior.clock_is_known:
+        rate = R @ odometry.angular_velocity_body
+        velocity = np.concatenate([R @ odometry.velocity_body + np.cross(rate, arm), rate])
+        covariance += of_single_error(velocity, time_offset_std)
+    turn = np.kron(np.eye(2), R)
+    return PredictedCamera(
+        CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), turn @ odometry.twist_covariance @ turn.T
+    )
+
+
+def contradicts(T_map_camera: FloatArray, covariance: FloatArray, odometry: CameraPose) -> bool:
+    """Whether a camera pose (4, 4) from markers is where odometry cannot be, even odometry that is in doubt itself."""
+    apart = difference(odometry.T_map_camera, T_map_camera)
+    return bool(apart @ np.linalg.solve(covariance + bounded_odometry(odometry.covariance), apart) > CONTRADICTION)
+
+
+def growth(first: CameraPose, predicted: PredictedCamera) -> FloatArray:
+    """Covariance (6, 6) of the odometry from ``first`` to ``pose``, from either of two bounds, whichever is closer.
+
+    Errors of odometry that grow add up like independent ones at most as the difference of the covariances says; and a
+    displacement is off by no more than the speed is, all the time.
+    """
+    seconds = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS
+    bounds = positive(predicted.pose.covariance - first.covariance), seconds**2 * predicted.velocity_covariance
+    return min(bounds, key=lambda covariance: float(np.trace(covariance)))

@@ -13,7 +13,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import CHI2_OF_POSE
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, skew
-from thermal_fiducial.core.mapping.odometry_prior import predicted_camera
+from thermal_fiducial.core.mapping.located import predicted_camera
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray

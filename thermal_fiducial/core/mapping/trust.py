@@ -1,6 +1,6 @@
 """What frames teach of the markers' errors: running ones, quarantine of who persistently disagrees, the corners' bias.
 
-A marker that was moved, hangs twice, or was put in the map wrongly re-projects badly against a pose that rests on the
+A marker that was moved or duplicated, or was put in the map wrongly re-projects badly against a pose that rests on the
 others. One bad frame is an outlier; most of a second of them is a fact about the marker.
 """
 
