@@ -443,6 +443,26 @@ def test_nan_in_the_imu_is_refused_and_the_next_sample_taken(graph):
     assert graph.diagnose(node)[2]['refused messages'] == '1'
 
 
+def test_a_filter_that_has_no_time_for_its_imu_says_by_how_much_its_pose_is_late(graph):
+    """Nobody spins it for a third of a second."""
+    node = graph.add(PoseEkfNode, live=True)
+    driver = graph.tester.advertise(Imu, 'imu/data')
+    graph.spin_until(lambda: driver.listeners and graph.input(node, 'imu/data').publishers)
+    node.diagnose(0)
+    assert 'no time' not in node.state()[1]
+    for k in range(3):
+        driver.send(imu(k))
+        time.sleep(0.1)
+    node.diagnose(0)
+    level, words = node.state()
+    assert level != OK
+    assert float(words.partition('no time: IMU messages wait for ')[2].removesuffix(' s')) >= 0.3
+    assert 'the pose comes late' in node.headline()
+    graph.spin_until(lambda: graph.input(node, 'imu/data').count == 3)
+    node.diagnose(0)
+    assert 'no time' not in node.state()[1]
+
+
 def test_stamps_that_go_back_are_said_and_survived(graph):
     node = graph.add(PoseEkfNode)
     fly(graph, [imu(10), imu(11), imu(9)])

@@ -14,9 +14,12 @@ from thermal_fiducial.ros import convert, message_bytes, qos
 from thermal_fiducial.ros.filter_memory import FilterMemory
 from thermal_fiducial.ros.filter_outputs import FilterOutputs
 from thermal_fiducial.ros.filter_status import FilterStatus
-from thermal_fiducial.ros.node import StageNode
+from thermal_fiducial.ros.node import StageNode, WARN
 from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.run import run
+
+#: Nobody flies on a pose that is older [s].
+_LATE_S = 0.1
 
 
 class PoseEkfNode(StageNode[PoseEkfConfig]):
@@ -30,7 +33,8 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.filter = PoseEkf(self.config)
         self._status = FilterStatus(self.filter, self.console)
         self._corrections = MapCorrections(self.config.max_delay)
-        self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT, raw=True)
+        self._imu = self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT, raw=True)
+        self._behind = 0.0
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT, raw=True)
         self.subscribe_lazily(PoseWithCovarianceStamped, 'camera_pose/map_error', self._on_map_error, qos.RESULT)
         self.subscribe(TransformStamped, 'map_correction', self._on_map_correction, qos.RESULT)
@@ -81,17 +85,31 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
 
     def diagnose(self, stamp_ns: int) -> None:
         """Publish the diagnostics and, while someone listens, the path."""
+        if self.live:
+            self._look_behind()
         super().diagnose(stamp_ns)
         self._outputs.send_path()
         self._memory.save(self.filter, self._outputs.stamp_ns)
 
+    def _look_behind(self) -> None:
+        """How long the next IMU message has waited, which is by how much the pose is late."""
+        oldest = self._imu.take()
+        self._behind = 0.0
+        if oldest is not None:
+            message, self._behind = oldest
+            self.guard(self._on_imu, message)
+
     def state(self) -> tuple[bytes, str]:
-        """What the filter says of itself, and why it refused the last pose."""
-        return self._status.state()
+        """What the filter says of itself, why it refused the last pose, and by how much it is late."""
+        level, words = self._status.state()
+        if self._behind < _LATE_S:
+            return level, words
+        return max(level, WARN), f'{words}; no time: IMU messages wait for {self._behind:.2g} s'
 
     def headline(self) -> str:
         """What the filter does, without numbers."""
-        return self._status.headline()
+        words = self._status.headline()
+        return words if self._behind < _LATE_S else f'{words}; no time: the pose comes late'
 
     def figures(self) -> dict[str, object]:
         """The filter in numbers."""

@@ -4,11 +4,13 @@ From the counts a lock-step replay knows when everything that was published has 
 """
 
 from collections.abc import Callable, Iterator
+import time
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.ros import qos
 
 
@@ -51,15 +53,23 @@ class Input:
         """Remember the subscription that counts here."""
         self._subscription = subscription
 
+    def take(self) -> tuple[Any, float] | None:
+        """The message that has waited longest, and for how long [s]; it is counted. None where none waits."""
+        subscription = self._subscription
+        with subscription.handle:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        if taken is None:
+            return None
+        self.count += 1
+        message, info = taken
+        return message, (time.time_ns() - info['received_timestamp']) / SECOND_NS
+
     def waiting(self, at_most: int) -> Iterator[Any]:
         """Take and count messages until none is waiting, or ``at_most`` of them."""
-        subscription = self._subscription
         for _ in range(at_most):
-            with subscription.handle:
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            taken = self.take()
             if taken is None:
                 return
-            self.count += 1
             yield taken[0]
 
     @property
