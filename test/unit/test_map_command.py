@@ -6,10 +6,12 @@ import re
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 import numpy as np
 import pytest
+from support import small_bag
 from support.walls import CAMERA, flight, see, SIZE, stamp, wall
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.cli.map_plot import draw_map
+from thermal_fiducial.cli.run_parameters import camera_of_run
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference
 from thermal_fiducial.core.geometry.se3 import apply, inverse, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
@@ -151,14 +153,9 @@ def test_anchor_moves_the_map_onto_a_survey(path, poses):
 
 
 def test_refine_adjusts_a_map_to_the_detections_of_a_run(path, poses):
-    rng = np.random.default_rng(4)
     run_folder = path.with_name('run')
     run_folder.mkdir()
-    lines = []
-    for k in range(0, 300, 10):
-        for row in see(flight(k / 30), poses, 0.02, rng):
-            lines.append(f'{stamp(k)},{row["id"]},{",".join(str(row[n]) for n in CORNER_FIELDS)},{row["sigma_px"]}')
-    (run_folder / 'detections.csv').write_text(f'stamp_ns,id,{",".join(CORNER_FIELDS)},sigma_px\n' + '\n'.join(lines))
+    (run_folder / 'detections.csv').write_text(detections(poses))
     save_camera(path.with_name('camera.yaml'), CAMERA)
     start = MarkerMap({0: MapMarker(0, SIZE, True, poses[0])})
     save_map(path, start)
@@ -171,16 +168,68 @@ def test_refine_adjusts_a_map_to_the_detections_of_a_run(path, poses):
     assert run('refine', path, path, '--calibration', path.with_name('camera.yaml')) == 2
 
 
+def detections(poses, side=SIZE):
+    """A ``detections.csv`` of a flight past the wall."""
+    rng = np.random.default_rng(4)
+    rows = [(stamp(k), row) for k in range(0, 300, 10) for row in see(flight(k / 30), poses, 0.02, rng, side)]
+    lines = [f'{t},{row["id"]},{",".join(str(row[n]) for n in CORNER_FIELDS)},{row["sigma_px"]}' for t, row in rows]
+    return f'stamp_ns,id,{",".join(CORNER_FIELDS)},sigma_px\n' + '\n'.join(lines)
+
+
 @pytest.fixture
 def photographed(path, poses):
     """Detections of a flight past the wall, and the calibration of its camera."""
-    rng = np.random.default_rng(4)
-    rows = [(stamp(k), row) for k in range(0, 300, 10) for row in see(flight(k / 30), poses, 0.02, rng)]
-    lines = [f'{t},{row["id"]},{",".join(str(row[n]) for n in CORNER_FIELDS)},{row["sigma_px"]}' for t, row in rows]
     file = path.with_name('detections.csv')
-    file.write_text(f'stamp_ns,id,{",".join(CORNER_FIELDS)},sigma_px\n' + '\n'.join(lines))
+    file.write_text(detections(poses))
     save_camera(path.with_name('camera.yaml'), CAMERA)
     return [file, '--calibration', path.with_name('camera.yaml')]
+
+
+def test_refine_takes_the_calibration_of_the_run(path, poses, photographed, capsys):
+    folder = path.with_name('run')
+    folder.mkdir()
+    photographed[0].rename(folder / 'detections.csv')
+    save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
+    assert run('--marker-size', SIZE, 'refine', path, folder) == 2
+    assert 'is to be found: name a --calibration' in capsys.readouterr().err
+    # From its bag.
+    recording = small_bag.recording(seconds=0.1)
+    recording.write(folder / 'bag')
+    (folder / 'summary.json').write_text('{"bag": "bag"}')
+    assert camera_of_run(folder).matches(small_bag.CAMERA)
+    # What the nodes were given goes before it.
+    parameters = f'/tau2_camera: {{ros__parameters: {{calibration_file: {path.with_name("camera.yaml")}}}}}'
+    (folder / 'parameters.yaml').write_text(parameters)
+    assert run('--marker-size', SIZE, 'refine', path, folder) == 0
+    assert sorted(load_map(path).markers) == sorted(poses)
+
+
+@pytest.mark.parametrize('said', ['by the run', 'by the map', 'by nobody'])
+def test_refine_never_guesses_the_side_of_a_marker(path, poses, tmp_path, capsys, said):
+    """It took that of the default parameters: markers of 0.4 m came out 0.6 m off, and the map was called sound."""
+    folder, side = tmp_path / 'run', 0.4
+    folder.mkdir()
+    save_camera(folder / 'camera.yaml', CAMERA)
+    (folder / 'detections.csv').write_text(detections(poses, side))
+    markers = {0: MapMarker(0, side, True, poses[0])}
+    if said == 'by the run':
+        (folder / 'parameters.yaml').write_text(
+            '/marker_mapper: {ros__parameters: {marker_size: 0.4, marker_size_overrides: []}}'
+        )
+    if said != 'by the map':
+        markers[99] = MapMarker(99, 0.2, True, transform(np.eye(3), [50.0, 0.0, 0.0]))
+    save_map(path, MarkerMap(markers, dictionary='STENCIL_4X4_100'))
+    status = run('refine', path, folder, '--calibration', folder / 'camera.yaml')
+    if said == 'by nobody':
+        assert status == 2
+        assert 'have no known side: say --marker-size' in capsys.readouterr().err
+        return
+    assert status == 0
+    refined = load_map(path)
+    for i, pose in poses.items():
+        assert refined.markers[i].size == side
+        # As above: tenths of a millimetre.
+        assert np.linalg.norm(difference(refined.markers[i].T_map_marker, pose)[:3]) < 2e-3
 
 
 def test_refine_moves_entries_that_somebody_wrote_by_hand(path, poses, photographed, capsys):

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.run_parameters import camera_of_run, sizes_of_run
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.detection.detector import MarkerDetector, rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
@@ -54,7 +55,7 @@ def add_refine(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('map', type=Path, metavar='MAP', help='the map to adjust; its fixed markers stay')
     parser.add_argument('run_folder', type=Path, metavar='RUN', help='run folder with detections.csv, or such a file')
     parser.add_argument(
-        '--calibration', type=Path, required=True, metavar='FILE', help='camera_info YAML of the camera'
+        '--calibration', type=Path, metavar='FILE', help='camera_info YAML of the camera (default: that of the run)'
     )
     parser.add_argument('--max-frames', type=int, default=1500, metavar='N', help='frames used, evenly chosen')
     parser.add_argument('--out', type=Path, metavar='FILE', help='default: MAP itself')
@@ -64,6 +65,9 @@ def add_refine(parser: argparse.ArgumentParser) -> None:
 def _build(args: argparse.Namespace) -> int:
     camera = load_camera(args.calibration)
     start = _start(args)
+    args.marker_size = args.marker_size or _only_size(start)
+    if args.marker_size is None:
+        raise InputError(f'{args.map}: its markers have several sizes: say --marker-size for new ones')
     frames = _detect(_photos(args.images), camera, args)
     if args.origin is not None and not any(args.origin in rows['id'] for rows in frames):
         raise InputError(f'{args.images}: marker {args.origin}, the origin, is in none of the {len(frames)} photos')
@@ -71,13 +75,23 @@ def _build(args: argparse.Namespace) -> int:
 
 
 def _refine(args: argparse.Namespace) -> int:
-    camera = load_camera(args.calibration)
+    camera = camera_of_run(args.run_folder) if args.calibration is None else load_camera(args.calibration)
+    size, overrides = sizes_of_run(args.run_folder)
+    args.marker_size = args.marker_size or size
+    args.marker_size_override = [*overrides, *args.marker_size_override]
     start = load_map(args.map, args.marker_size, size_overrides(tuple(args.marker_size_override)))
+    args.marker_size = args.marker_size or _only_size(start)
     file = args.run_folder / 'detections.csv' if args.run_folder.is_dir() else args.run_folder
-    frames = _read_detections(file, start, _mapper_config(args, start.dictionary), camera)
+    frames = _read_detections(file, start, args, camera)
     if len(frames) > args.max_frames:
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, args.max_frames).astype(int)]
     return _grow(args, frames, camera, start, args.out or args.map, f'refine from {args.run_folder.name}')
+
+
+def _only_size(marker_map: MarkerMap) -> float | None:
+    """Side of all markers of a map [m]; None where they differ."""
+    sizes = {marker.size for marker in marker_map.markers.values()}
+    return sizes.pop() if len(sizes) == 1 else None
 
 
 def _grow(
@@ -205,19 +219,28 @@ def _photo_detector(args: argparse.Namespace) -> cv2.aruco.ArucoDetector:
     return cv2.aruco.ArucoDetector(load_dictionary(args.dictionary), parameters)
 
 
-def _read_detections(path: Path, start: MarkerMap, config: MarkerMapperConfig, camera: Camera) -> list[Markers]:
-    """Rows of each frame of a ``detections.csv``."""
+def _read_detections(path: Path, start: MarkerMap, args: argparse.Namespace, camera: Camera) -> list[Markers]:
+    """Rows of each frame of a ``detections.csv``.
+
+    Raises
+    ------
+    InputError
+        Also for markers whose side nobody has said: a guess would put them somewhere else.
+    """
     table = _detection_table(path)
     if not len(table):
         raise InputError(f'{path}: no detections')
     stamps, firsts = np.unique(table[:, 0], return_index=True)
-    overrides = size_overrides(config.marker_size_overrides)
-    sizes = {key: marker.size for key, marker in start.markers.items()}
+    sizes = size_overrides(tuple(args.marker_size_override))
+    sizes |= {key: marker.size for key, marker in start.markers.items()}
+    unknown = sorted({int(key) for key in table[:, 1]} - sizes.keys())
+    if unknown and args.marker_size is None:
+        raise InputError(f'{path}: markers {", ".join(map(str, unknown))} have no known side: say --marker-size')
     frames = []
     for first, last in zip(firsts, [*firsts[1:], len(table)], strict=True):
         rows = table[first:last]
         ids = rows[:, 1].astype(np.int64)
-        size = np.array([sizes.get(int(key), overrides.get(int(key), config.marker_size)) for key in ids])
+        size = np.array([sizes.get(int(key), args.marker_size) for key in ids])
         frames.append(rows_from_corners(ids, rows[:, 3:].reshape(-1, 4, 2), _isotropic(rows[:, 2]), size, camera))
     assert len(frames) == len(stamps)
     return frames

@@ -84,7 +84,7 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
         raise InputError(f'{path}: its replay was cut short; replay it again')
     if missing:
         raise InputError(f'{path} is no run folder: it has no {missing[0]}')
-    summary = _summary(path / SUMMARY)
+    summary = read_summary(path / SUMMARY)
     truth = _own_truth(path, summary) if truth is None else truth
     if true_map is None and truth is not None:
         beside = (truth if truth.is_dir() else truth.parent) / TRUE_MAP
@@ -133,7 +133,14 @@ def _camera_time_offset_ns(path: Path) -> int:
         raise InputError(f'{path}: no camera_time_offset of pose_ekf in it') from None
 
 
-def _summary(path: Path) -> dict[str, Any]:
+def read_summary(path: Path) -> dict[str, Any]:
+    """What a replay wrote of itself; nothing where there is no such file.
+
+    Raises
+    ------
+    InputError
+        Another file under its name.
+    """
     if not path.exists():
         return {}
     try:

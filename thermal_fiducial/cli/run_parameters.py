@@ -1,0 +1,56 @@
+"""What a run was made with: its camera and the sides of its markers, where nobody names them."""
+
+from pathlib import Path
+from typing import Any
+
+from thermal_fiducial.calibration.sources import recorded_camera
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.bags import BagReader
+from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.report.run_folder import bag_of_run, read_summary
+
+
+def camera_of_run(run: Path) -> Camera:
+    """The calibration that a run was made with: the file among its parameters, else what its bag recorded.
+
+    Parameters
+    ----------
+    run : a run folder
+
+    Raises
+    ------
+    InputError
+        Neither is to be found; the line says which option names a calibration.
+    """
+    file = _parameter(run, 'tau2_camera', 'calibration_file')
+    if file:
+        return load_camera(str(file))
+    summary = read_summary(run / 'summary.json')
+    bag_path = bag_of_run(run, summary)
+    if bag_path is None:
+        raise InputError(f'{run}: neither a calibration nor the bag of a replay is to be found: name a --calibration')
+    try:
+        with BagReader(bag_path, summary.get('remaps', {})) as bag:
+            return recorded_camera(bag)
+    except InputError as error:
+        raise InputError(f'{error}: name a --calibration') from None
+
+
+def sizes_of_run(run: Path) -> tuple[float | None, tuple[str, ...]]:
+    """Side of the markers [m], and those of single ones as "ID:SIZE"; None and nothing where no replay wrote them."""
+    size, overrides = (_parameter(run, 'marker_mapper', name) for name in ('marker_size', 'marker_size_overrides'))
+    known = isinstance(size, float | int) and isinstance(overrides, list)
+    return (float(size), tuple(map(str, overrides))) if known else (None, ())
+
+
+def _parameter(run: Path, node: str, name: str) -> Any:
+    """A parameter that the nodes of a replay had; None where none is known."""
+    path = run / 'parameters.yaml'
+    if not path.is_file():
+        return None
+    try:
+        return load_plain(path)[f'/{node}']['ros__parameters'][name]
+    except (KeyError, TypeError):
+        return None
