@@ -46,7 +46,7 @@ def _ignored(*_: Any, **__: Any) -> None:
 
 MECHANISMS = {
     'learned bias of corners': Mechanism(
-        ('board', 'moved markers'), ('trust:CornerBias',), {'trust:CornerBias.add': _ignored}
+        ('wrong lens', 'board', 'moved markers'), ('trust:CornerBias',), {'trust:CornerBias.add': _ignored}
     ),
     'weights by running errors': Mechanism(
         ('moved markers', 'board', 'carpet'),
@@ -85,7 +85,7 @@ MECHANISMS = {
         {'bundle_adjustment:two_places': lambda *_: False},
     ),
     'shape of markers': Mechanism(
-        ('wall', 'chain'),
+        ('shaped markers', 'wall', 'chain'),
         ('bundle_adjustment:_shape_covariances',),
         {'bundle_adjustment:_shape_covariances': lambda problem, *_: np.zeros((len(problem.ids), 6, 6))},
     ),

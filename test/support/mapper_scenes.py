@@ -1,6 +1,7 @@
 """Scenes that show what the parts of the mapper are for: flights of corners, simulated and recorded."""
 
 from collections.abc import Callable
+from dataclasses import replace
 import os
 from pathlib import Path
 import time
@@ -22,6 +23,8 @@ from thermal_fiducial.core.measurements import corner_covariances, corners_px, O
 
 AS_BODY = {'camera_orientation': (0.0, 0.0, 0.0, 1.0)}
 SECOND_NS = 1_000_000_000
+#: Distortion that a calibration has missed: 2.9 px in the corners of the image, 0.4 px half-way there.
+WRONG_K1 = 0.012
 
 Figures = dict[str, float]
 
@@ -123,19 +126,39 @@ def _figures_of_maps(maps: list[tuple[MarkerMap, dict[int, np.ndarray]]]) -> Fig
     }
 
 
-def wall() -> Figures:
-    """A slow simulated flight past eight markers of which one is known, corners of 0.1 px, without odometry."""
+def wall(shape_px: float = 0.0) -> Figures:
+    """A slow simulated flight past eight markers of which one is known, corners of 0.1 px, without odometry.
+
+    Corners are off by ``shape_px``, those of a marker by the same in all views.
+    """
     maps, frames_located = [], []
     for seed in range(2):
         rng = np.random.default_rng(seed)
         poses = walls.wall(rng)
+        off = shape_px * np.random.default_rng(seed).normal(size=(len(poses), 4, 2))
         mapper = MarkerMapper(MarkerMapperConfig(), MarkerMap({0: MapMarker(0, walls.SIZE, True, poses[0])}))
-        frames = {
-            walls.stamp(k): walls.see(walls.flight(k / 30 + 5.0 * seed), poses, 0.1, rng) for k in range(0, 600, 5)
-        }
+        frames = {}
+        for k in range(0, 600, 5):
+            seen = walls.see(walls.flight(k / 30 + 5.0 * seed), poses, 0.1, rng)
+            frames[walls.stamp(k)] = walls.rows(seen['id'], corners_px(seen) + off[seen['id']], 0.1)
         frames_located.append(_mapped(mapper, frames, walls.CAMERA)['located %'])
         maps.append((mapper.map, poses))
     return {'located %': float(np.mean(frames_located)), **_figures_of_maps(maps)}
+
+
+def wrong_lens() -> Figures:
+    """The same wall, known, before a lens whose calibration is off by up to 3 px in the corners of the image."""
+    rng = np.random.default_rng(0)
+    poses = walls.wall(rng)
+    lens = replace(walls.CAMERA, D=[WRONG_K1, 0.0, 0.0, 0.0, 0.0])
+    known = MarkerMap({key: MapMarker(key, walls.SIZE, True, T) for key, T in poses.items()})
+    mapper, located = MarkerMapper(MarkerMapperConfig(mode='localization'), known), []
+    for k in range(450):
+        T = walls.flight(k / 30)
+        pose = mapper.process(walls.stamp(k), walls.see(T, poses, 0.1, rng, camera=lens), walls.CAMERA).pose
+        if pose is not None and k > 150:
+            located.append((T, pose.T_map_camera, pose.covariance))
+    return _errors('pose', located)
 
 
 def small_markers() -> Figures:
@@ -305,6 +328,8 @@ def _recorded_tags(name: str) -> Callable[[], Figures]:
 
 SCENES: dict[str, Callable[[], Figures]] = {
     'wall': wall,
+    'shaped markers': lambda: wall(0.07),
+    'wrong lens': wrong_lens,
     'small markers': small_markers,
     'chain': chain,
     'moved markers': moved_marker,
