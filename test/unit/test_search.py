@@ -8,9 +8,9 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.frame import Frame, Places
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder, marker_bits, Reading, shrunk
-from thermal_fiducial.core.detection.quads import noise_of
 from thermal_fiducial.core.detection.search import BlindSearch, inside_out, SearchScales
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.files.dictionary import load_dictionary
 
 BITS = marker_bits(load_dictionary('DICT_4X4_50'))
@@ -35,7 +35,7 @@ CORNERS = np.array([[199.5, 149.5], [271.5, 149.5], [271.5, 221.5], [199.5, 221.
 def frame_of(image):
     height, width = image.shape
     camera = Camera(width, height, [[500.0, 0, width / 2], [0, 500.0, height / 2], [0, 0, 1]])
-    return Frame(0, image, noise_of(image), camera, None, 0.0, 0.0)
+    return Frame(0, image, pixel_noise(image, 0.3), camera, None, 0.0, 0.0)
 
 
 def search(image, config=None, allowed=EVERY):

@@ -16,6 +16,10 @@ Gray: TypeAlias = npt.NDArray[np.uint8]
 
 #: Nanoseconds of a second: stamps are whole nanoseconds, and seconds only differences of them.
 SECOND_NS = 1_000_000_000
+#: What is divided by is kept from zero with it: far below anything that is measured, far above rounding.
+TINY = 1e-9
+#: Standard deviation of normal variables over the median of their absolute values.
+SIGMA_OF_MEDIAN = 1.4826
 
 
 @dataclass(frozen=True, slots=True)

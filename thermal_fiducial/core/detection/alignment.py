@@ -14,7 +14,7 @@ import numpy as np
 
 from thermal_fiducial.core.detection.patterns import Decoder, sampled
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
-from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray
+from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, TINY
 
 _STEPS = 3
 # Smoothing of the image [px], so that its slope shows the way from half a cell away.
@@ -28,8 +28,6 @@ _OUTSIDE = 0.35
 _BLUR = 0.25
 # Share of its own information that each coordinate is held back with.
 _DAMPING = 0.1
-# Keeps what shows nothing of some direction solvable, as a share.
-_RIDGE = 1e-9
 # What makes a slope per pixel of a Sobel filter's sum.
 _SOBEL = 0.125
 # Longest step of a corner [cells].
@@ -91,7 +89,8 @@ def aligned(
         information = (J @ np.swapaxes(J, -1, -2)).astype(np.float64)
         diagonal = np.einsum('qii->qi', information)
         diagonal[:, :8] *= 1.0 + _DAMPING
-        diagonal += _RIDGE * (1.0 + diagonal.max(axis=1, keepdims=True))
+        # What shows nothing of some direction stays solvable.
+        diagonal += TINY * (1.0 + diagonal.max(axis=1, keepdims=True))
         step = -np.linalg.solve(information, J @ np.swapaxes(value, -1, -2))[:, :8, 0]
         longest = _LONGEST / decoder.cells * np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)[:, None] / np.sqrt(2.0)
         quads = quads + np.swapaxes(np.clip(step, -longest, longest).reshape(-1, 2, 4), -1, -2)

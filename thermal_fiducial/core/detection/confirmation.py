@@ -19,7 +19,7 @@ from thermal_fiducial.core.detection.patterns import Decoder, Reading
 from thermal_fiducial.core.detection.quads import halfway, halved
 from thermal_fiducial.core.detection.refining import RefinedMarkers, sides_px
 from thermal_fiducial.core.detection.search import accepted
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, TINY
 
 # Cells at least this wide are read at half the resolution, where a pixel has half the noise and less blur.
 _WIDE_CELL_PX = 8.0
@@ -73,7 +73,7 @@ def confirmed(
         return np.zeros(0, dtype=bool)
     reading = _read(image, refined.corners_px, decoder)
     similarity = np.abs(reading.correlation)
-    contrast = np.abs(refined.contrast) / np.maximum(refined.noise, 1e-6)
+    contrast = np.abs(refined.contrast) / np.maximum(refined.noise, TINY)
     same = reading.ids == found.ids
     asked = np.clip(_FAINT + _PER_CNR * np.abs(found.cnr), _SIMILAR, _SIMILAR_IN_PICTURE)
     distinct = (similarity >= np.where(standing_picture, asked, _SIMILAR)) | (decoder.correctable >= _MANY_BITS)

@@ -6,7 +6,7 @@ all four sides share leaves a square one, a wrong lag displaces them along the m
 
 import numpy as np
 
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, TINY
 
 #: A corner by its four sides, and a corner of a partially visible marker by the edges of its cells [px]: the blur of
 #: the optics is not quite a Gaussian. Rendered frames without noise.
@@ -72,4 +72,4 @@ def unknown_motion(
     variance = 0.5 * np.trace(covariance, axis1=-2, axis2=-1)
     sharp = np.where(unsharpness < BLURRED_OUT, BLUR_THAT_SHOWS * unsharpness, np.inf)
     shown = np.minimum(sharp, READABLE_CELLS * cell_px)[:, None] ** 2
-    return np.asarray(covariance * np.minimum(shown / np.maximum(variance, 1e-12), 1.0)[..., None, None])
+    return np.asarray(covariance * np.minimum(shown / np.maximum(variance, TINY), 1.0)[..., None, None])

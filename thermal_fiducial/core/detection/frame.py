@@ -23,11 +23,16 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.quads import noise_of, without_columns
+from thermal_fiducial.core.detection.quads import without_columns
 from thermal_fiducial.core.detection.twist import interaction, Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray, Stacked
 
+#: Depth of points that are no longer in front of the camera [m].
+LEAST_DEPTH = 1e-3
+# Noise of frames that show none: that of rounding to whole counts [counts].
+_LEAST_NOISE = 0.3
 # Largest number of gray levels of what is meant for a display.
 _LEVELS = 256
 # Interpolation of lag tails where edges are measured: a linear one blurs them more than the image that they are taken
@@ -76,7 +81,7 @@ class Frame:
         keep_columns: bool,
     ) -> 'Frame':
         """A frame without its columns' fixed pattern, unless that is kept or the frame has eight bits."""
-        noise, displayed = noise_of(counts), bool(counts[::64].max() < _LEVELS)
+        noise, displayed = pixel_noise(counts, _LEAST_NOISE), bool(counts[::64].max() < _LEVELS)
         lag, readout = config.bolometer_lag, config.readout_time
         image = counts.astype(np.float32)
         if counts.dtype != np.uint8 and not keep_columns:

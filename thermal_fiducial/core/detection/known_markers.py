@@ -169,7 +169,7 @@ class KnownMarkers:
         corners = camera.project(se3.apply(T_camera_map, self._corners_and_normals[:, :4].reshape(-1, 3))).reshape(
             -1, 4, 2
         )
-        near = np.nan_to_num(corners, nan=-1e9)
+        near = np.nan_to_num(corners, nan=-np.inf)
         low, high = near.min(axis=1), near.max(axis=1)
         inside = camera.contains(corners)
         overlap = inside.any(axis=1) | ((low < (camera.width, camera.height)) & (high > 0.0)).all(axis=1)

@@ -24,7 +24,7 @@ from thermal_fiducial.core.detection.corners.grid import (
 from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import PartialMarkers
-from thermal_fiducial.core.detection.patterns import Decoder, most_similar, NEAR_CELLS
+from thermal_fiducial.core.detection.patterns import CELL_SAMPLES, Decoder, most_similar, NEAR_CELLS
 from thermal_fiducial.core.detection.visible_cells import VisibleCells
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -149,7 +149,7 @@ class PartialMarkerSearch:
         samples = px.reshape(-1, 9, 2)[inside]
         right, down = samples[:, 2] - samples[:, 0], samples[:, 6] - samples[:, 0]
         area = np.abs(right[:, 0] * down[:, 1] - right[:, 1] * down[:, 0])
-        cell_px = float(np.sqrt(np.median(area)) / 0.4)
+        cell_px = float(np.sqrt(np.median(area)) / np.ptp(CELL_SAMPLES))
         if cell_px < _NARROWEST_PX:
             return None
         shares = np.clip(self._visible.places.reshape(-1, 9, 2)[inside].reshape(-1, 2), 0.0, 1.0)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Stacked
+from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
 
 # How far off a side black and white are compared: in cells, and at most in pixels.
 _OUTSIDE = 0.4
@@ -26,15 +26,13 @@ CELL_SAMPLES = np.array([0.3, 0.5, 0.7])
 #: Places (9, 2) round a prediction that are tried [cells], and similarity, as a share of the best, that counts nothing.
 NEAR_CELLS = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]), axis=-1).reshape(-1, 2)
 _UNLIKE = 0.8
-# Spread and contrast [counts] of what shows nothing at all: divided by, it stays nothing.
-_NOTHING = 1e-9
 
 
 def most_similar(similarity: FloatArray, places: FloatArray) -> FloatArray:
     """Where (N, 2), between ``places`` (N, P, 2), a similarity (N, P) is greatest: by its centre of gravity."""
     weight = np.maximum(similarity - _UNLIKE * similarity.max(axis=1, keepdims=True), 0.0)
     mean = np.einsum('np,npk->nk', weight, places)
-    return np.asarray(mean / np.maximum(weight.sum(axis=1, keepdims=True), _NOTHING))
+    return np.asarray(mean / np.maximum(weight.sum(axis=1, keepdims=True), TINY))
 
 
 def marker_bits(dictionary: cv2.aruco.Dictionary) -> Gray:
@@ -128,7 +126,7 @@ class Decoder:
         # A background that rises or bends across the marker is no pattern: it is projected out of both.
         self._detrend = np.eye(x.size) - smooth @ smooth.T
         detrended = flat @ self._detrend
-        patterns = detrended / np.maximum(np.linalg.norm(detrended, axis=1, keepdims=True), _NOTHING)
+        patterns = detrended / np.maximum(np.linalg.norm(detrended, axis=1, keepdims=True), TINY)
         likeness = np.abs(patterns[::4] @ patterns.T).reshape(self.count, -1, 4).max(axis=-1)
         np.fill_diagonal(likeness, 0.0)
         #: (M,) by how much a perfect view of each marker correlates better with itself than with any other
@@ -159,7 +157,7 @@ class Decoder:
         """Most similar patterns of quadrilaterals (Q, 4, 2) among those ``allowed`` (M,), or all."""
         values = self._contrasts(image, quads)
         spread = np.sqrt((values * values).sum(axis=1, keepdims=True))
-        similar = (values / np.maximum(spread, np.float32(_NOTHING))) @ self._patterns.T
+        similar = (values / np.maximum(spread, np.float32(TINY))) @ self._patterns.T
         if allowed is not None and not allowed.all():
             similar[:, np.repeat(~allowed, 4)] = 0.0
         size = np.abs(similar)
@@ -171,7 +169,7 @@ class Decoder:
     def match(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
         """Correlation (Q,) of quadrilaterals (Q, 4, 2) with the upright patterns of ``ids`` (Q,)."""
         values = self._contrasts(image, quads)
-        spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), np.float32(_NOTHING))
+        spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), np.float32(TINY))
         return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread, dtype=np.float64)
 
     def seen(self, ids: IntArray, turns: IntArray) -> FloatArray:
@@ -183,8 +181,8 @@ class Decoder:
     ) -> Reading:
         expected = self._grids.reshape(-1, self.cells**2)[best]
         shape = expected @ self._detrend
-        contrast = np.sum(values * shape, axis=1) / np.maximum(np.sum(shape * shape, axis=1), _NOTHING)
-        safe = np.where(np.abs(contrast) < _NOTHING, _NOTHING, contrast)[:, None]
+        contrast = np.sum(values * shape, axis=1) / np.maximum(np.sum(shape * shape, axis=1), TINY)
+        safe = np.where(np.abs(contrast) < TINY, TINY, contrast)[:, None]
         # What is left of the pattern, back on the scale from 0 for black to 1 for white.
         seen = expected + (values - contrast[:, None] * shape) / safe
         wrong = (seen > 0.5) != (expected > 0.5)

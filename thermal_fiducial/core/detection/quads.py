@@ -10,7 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray
+from thermal_fiducial.core.types import Float32Array, FloatArray, Gray
 
 # The spread is taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
 _LOCAL = 17
@@ -23,25 +23,9 @@ _COLUMNS = 9
 _PICTURE_WINDOW_PX, _PICTURE_STEP, _PICTURE_NOISE = 5, 3.0, 2.0
 # Mean of Gaussian noise clipped at one standard deviation moves by 0.68 of a small offset.
 _CLIPPED = 1.0 / 0.68
-# 1 / (sqrt(2) * 0.6745): standard deviation from the median absolute difference of two pixels.
-_MAD_OF_DIFFERENCE = 1.0484
 # The hull of an outline is simplified to within this share of its length: more than noise bends it, less than a side.
 _STRAIGHT = 0.05
 _CORNERS, _NEXT = 4, np.array([1, 2, 3, 0])
-
-
-def noise_of(counts: Counts | Gray | Float32Array) -> float:
-    """Standard deviation of pixel noise [counts]: median absolute difference of vertical neighbours, sparsely.
-
-    Differences along a column leave the column pattern out.
-    """
-    rows = counts[4::16, ::3]
-    below = counts[5::16, ::3]
-    count = min(len(rows), len(below))
-    difference = cv2.absdiff(np.ascontiguousarray(rows[:count]), np.ascontiguousarray(below[:count])).ravel()
-    middle = difference.size // 2
-    # Whole counts: half a count of quantisation is what a median of 0 can mean.
-    return max(float(np.partition(difference, middle)[middle]) * _MAD_OF_DIFFERENCE, 0.3)
 
 
 def halved(counts: Float32Array) -> Float32Array:

@@ -26,7 +26,7 @@ from thermal_fiducial.core.detection.frame import (
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, unknown_twist
-from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, Stacked
+from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, Stacked, TINY
 
 # Blur by lag below which the shape of an edge doesn't change [px].
 _BLUR_THAT_MATTERS_PX = 0.4
@@ -138,7 +138,7 @@ def _at_stamp(
 def _never_seen(frame: Frame, places: Places, seen: RefinedCorners, twist: Twist, cells: int) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] by a motion that the frames before show nothing of."""
     since = frame.lag - delays(seen.corners_px[..., 1], frame)
-    unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), 1e-6)
+    unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), TINY)
     cell = sides_px(seen.corners_px) / cells
     return unknown_motion(since[..., None, None] * places.flow, twist.covariance_ago(frame.lag), unsharpness, cell)
 

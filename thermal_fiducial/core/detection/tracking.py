@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from thermal_fiducial.core.detection.frame import LEAST_DEPTH
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, pairs
 from thermal_fiducial.core.detection.twist import (
     carried,
@@ -27,7 +28,7 @@ from thermal_fiducial.core.detection.twist import (
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
-from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 
 # Frames farther apart show nothing of each other [ns].
 _STALE_NS = 150_000_000
@@ -99,7 +100,7 @@ class MotionTrack:
             return before
         seen, later = (
             transferred(odometry[-1], self.from_body),
-            (odometry[-1].stamp_ns - odometry_ns) * 1e-9,
+            (odometry[-1].stamp_ns - odometry_ns) / SECOND_NS,
         )
         unsure = (growth(abs(later))[0] + clock_std_s**2) * RANDOM
         information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + unsure))
@@ -113,7 +114,7 @@ class MotionTrack:
         step = (0.5 * dt) * (twist.value + self.twist.value)
         moved = se3.inverse(se3.transform(se3.so3_exp(step[3:]), step[:3]))
         points = self.markers.depth[..., None] * (self.markers.x @ moved[:3, :2].T + moved[:3, 2]) + moved[:3, 3]
-        depth = np.maximum(points[..., 2], 1e-3)
+        depth = np.maximum(points[..., 2], LEAST_DEPTH)
         return ExpectedMarkers(self.markers.ids, points[..., :2] / depth[..., None], depth, self.markers.cnr)
 
     def correct(
@@ -168,7 +169,7 @@ class MotionTrack:
         """Time since the last frame [s], negative for one that comes late; None when that shows nothing of this one."""
         if self.stamp_ns is None or not 0 < abs(stamp_ns - self.stamp_ns) < _STALE_NS:
             return None
-        return (stamp_ns - self.stamp_ns) * 1e-9
+        return (stamp_ns - self.stamp_ns) / SECOND_NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +191,7 @@ def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, 
     """
     if prior is None:
         return FramePrediction(track.predict(stamp_ns, []), None, math.inf)
-    lag_ns = max(round(1e9 * track.lag), _SHORTEST_LAG_NS)
+    lag_ns = max(round(SECOND_NS * track.lag), _SHORTEST_LAG_NS)
     odometry_ns = prior.in_odometry_clock(stamp_ns)
     clock_std_s = 0.0 if prior.clock_is_known else _UNKNOWN_CLOCK_S
     states = prior.between(odometry_ns - _LAGS_BEFORE * lag_ns, odometry_ns + lag_ns, _STATES)
@@ -199,7 +200,7 @@ def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, 
     states = [state for state in states if plausible(state)]
     twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)
     nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
-    dt = math.inf if nearest is None else (odometry_ns - nearest.stamp_ns) * 1e-9
+    dt = math.inf if nearest is None else (odometry_ns - nearest.stamp_ns) / SECOND_NS
     if nearest is None or twist is None or abs(dt) > max_age_s:
         return FramePrediction(twist, None, math.inf)
     # The nearest pose, carried on with the camera's twist.

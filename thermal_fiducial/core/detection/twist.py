@@ -13,7 +13,7 @@ import numpy as np
 
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import Odometry
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 # Twist of which nothing is known: m/s and rad/s of a brisk flight.
 _UNKNOWN = np.full(6, 1.5**2)
@@ -119,7 +119,7 @@ def line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatArr
     """
     parts = [part for state in odometry for part in (state.velocity_body, state.angular_velocity_body)]
     values = np.concatenate(parts).reshape(-1, 6) @ transfer.T
-    t = np.array([(state.stamp_ns - stamp_ns) * 1e-9 for state in odometry])
+    t = np.array([(state.stamp_ns - stamp_ns) / SECOND_NS for state in odometry])
     middle = float(t.sum()) / len(t)
     off = t - middle
     square = float(off @ off)

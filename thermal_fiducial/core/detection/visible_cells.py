@@ -10,13 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.core.detection.patterns import CELL_SAMPLES, Decoder, sampled
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, TINY
 
 # Samples nearer to the border of the image are not seen [px].
 _BORDER_PX = 1.0
-# Least number of steps that are compared, least sum of their squares in the pattern, and what keeps steps in a single
-# direction from a slope across it.
-_FEWEST, _LEAST_PATTERN, _RIDGE = 12, 2.0, 1e-6
+# Least number of steps that are compared, and least sum of their squares in the pattern.
+_FEWEST, _LEAST_PATTERN = 12, 2.0
 
 
 class CellMatch(NamedTuple):
@@ -36,7 +35,7 @@ class CellMatch(NamedTuple):
     @property
     def evidence(self) -> float:
         """Difference of chi square between the marker and the most similar other pattern."""
-        left = max(1.0 - self.correlation**2, 1e-6)
+        left = max(1.0 - self.correlation**2, TINY)
         return self.cells * (self.correlation**2 - self.runner_up**2) / left
 
 
@@ -104,7 +103,7 @@ class VisibleCells:
         An even slope is taken out of both. Where too few steps or too little of a pattern are left, there is none.
         """
         weight = compared.astype(np.float64)
-        number = weight @ self._slope + _RIDGE
+        number = weight @ self._slope + TINY
         steps, patterns = weight * steps, weight * patterns
         rise, own = steps @ self._slope, patterns @ self._slope
         ss = np.sum(steps * steps, axis=1) - np.sum(rise * rise / number, axis=1)
@@ -112,7 +111,7 @@ class VisibleCells:
         pp = np.sum(patterns * patterns, axis=1) - np.sum(own * own / number, axis=1)
         enough = (number.sum(axis=1) >= _FEWEST) & (pp > _LEAST_PATTERN)
         pp = np.maximum(pp, _LEAST_PATTERN)
-        return np.where(enough, sp / np.sqrt(np.maximum(ss, 1e-12) * pp), 0.0), sp / pp
+        return np.where(enough, sp / np.sqrt(np.maximum(ss, TINY) * pp), 0.0), sp / pp
 
 
 def _means(image: Float32Array, px: FloatArray) -> tuple[FloatArray, BoolArray]:

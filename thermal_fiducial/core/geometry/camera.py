@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked
+from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked, TINY
 from thermal_fiducial.errors import InputError
 
 #: Number of coefficients that each model takes (shorter lists are filled up with zeros).
@@ -21,8 +21,6 @@ MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 # Newton's iteration doubles the digits: after a step this small nothing is left, and ten are enough at any lens's
 # border.
 _STEPS, _SHORT = 10, 1e-6
-# Depth from which a point is in front of the camera [m].
-_NEAREST = 1e-9
 # Places of p1 and p2 among the coefficients.
 _TANGENTIAL = slice(2, 4)
 _EYE = np.eye(3)
@@ -92,7 +90,7 @@ class Camera:
         """Pixels (..., 2) of points (..., 3), and their derivative (..., 2, 3) [px/m]."""
         points = np.asarray(points, dtype=np.float64)
         uv, J = self._image(points, self.D)
-        in_front = points[..., 2] > _NEAREST
+        in_front = points[..., 2] > TINY
         across = points[..., :2] / np.where(in_front, points[..., 2], 1.0)[..., None]
         visible = in_front & ((across * across).sum(axis=-1) < self._fold_radius**2)
         return np.where(visible[..., None], uv, np.nan), J

@@ -92,7 +92,7 @@ def planar_poses(corners: ImagePoints, corner_covs: FloatArray, sizes: FloatArra
     chi2 = np.sum((images.whitening @ residuals) ** 2, axis=(-3, -2, -1))
     chi2 = np.where(np.isfinite(cost) & np.isfinite(chi2) & facing, chi2, np.inf).reshape(-1, 2)
     residuals_px = corners.J[:, None] @ residuals.reshape(-1, 2, 4, 2, 1)
-    rms = np.where(np.isfinite(chi2), np.sqrt(0.25 * np.sum(residuals_px**2, axis=(-3, -2, -1))), np.inf)
+    rms = np.where(np.isfinite(chi2), np.sqrt(np.sum(residuals_px**2, axis=(-3, -2, -1)) / 4.0), np.inf)
     poses = PlanarPoses(T.reshape(-1, 2, 4, 4), information.reshape(-1, 2, 6, 6), rms, chi2)
     first = (chi2[:, 1] < chi2[:, 0]).astype(np.intp)
     second = np.where(np.isfinite(chi2).all(axis=1), 1 - first, first)

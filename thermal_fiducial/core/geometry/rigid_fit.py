@@ -20,16 +20,17 @@ _MAX_STEPS = 20
 # that the image refutes anyway a share of the cost is enough, lest it creep along its valley; of one that is worse than
 # an alternative, a share of what it is worse by. One that costs so many times more even after a step is given up.
 _LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-4, 50.0, 1e-2, 10.0
-# Damping at which Levenberg-Marquardt finds no better pose at all.
-_HOPELESS = 1e6
+#: Damping of Levenberg-Marquardt: factors on it after a step that was better, and one that was not; and that at which
+#: no better one is found at all.
+EASED, STIFFENED, MOST_DAMPED = 0.1, 10.0, 1e6
 # Depth [m] from which a point is in front of the camera.
 _NEAR = 1e-6
 # Stands in for a start that does not exist.
 _AHEAD = se3.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.0])
 # Variance of a parameter, over what it would be with the others known, from which it counts as unknown.
 _UNKNOWN = 1e13
-# Share of the largest information that keeps the others from being none.
-_SINGULAR = 1e-12
+#: Share of the largest information that keeps the others from being none.
+SINGULAR = 1e-12
 _MINUS_SKEW = -se3.SKEW
 
 #: At poses (B, 4, 4): cost (B,), gradient (B, 6), information (B, 6, 6).
@@ -102,7 +103,7 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
         gain = np.einsum('bi,bi->b', step, gradient)
         last = gain < np.maximum(_LAST_GAIN, _LAST_SHARE * (cost - np.minimum(best, _REFUTED)))
         if steps > 0:
-            active = active & (damping <= _HOPELESS) & (cost <= _REFUTED + _TIMES_THE_BEST * best)
+            active = active & (damping <= MOST_DAMPED) & (cost <= _REFUTED + _TIMES_THE_BEST * best)
         trial = retract(T, -step)
         done = active & last
         if done.any():
@@ -118,7 +119,7 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
             cost = np.where(better, new[0], cost)
             gradient = np.where(better[:, None], new[1], gradient)
             information = np.where(better[:, None, None], new[2], information)
-        damping *= np.where(better, 0.1, 10.0)
+        damping *= np.where(better, EASED, STIFFENED)
     return T, np.where(possible, cost, np.inf), information
 
 
@@ -181,6 +182,6 @@ def covariances(information: FloatArray) -> FloatArray:
 def _solve(information: FloatArray, damping: FloatArray, gradient: FloatArray) -> FloatArray:
     damped = information.copy()
     diagonal = np.einsum('bii->bi', damped)
-    floor = _SINGULAR * np.maximum(diagonal.max(axis=-1, keepdims=True), _SINGULAR)
+    floor = SINGULAR * np.maximum(diagonal.max(axis=-1, keepdims=True), SINGULAR)
     diagonal += damping[:, None] * diagonal + floor
     return np.asarray(np.linalg.solve(damped, gradient[..., None])[..., 0])

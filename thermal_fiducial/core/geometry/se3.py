@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.types import Float32Array, FloatArray
+from thermal_fiducial.core.types import Float32Array, FloatArray, TINY
 
 #: Numbers in either precision.
 Real = TypeVar('Real', FloatArray, Float32Array)
@@ -22,10 +22,6 @@ Real = TypeVar('Real', FloatArray, Float32Array)
 SMALL_ANGLE = 1e-2
 #: (3, 9): vectors (..., 3) times this are their cross-product matrices, row by row.
 SKEW = np.array(((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0)), float)
-# Below this a half angle is none [rad].
-_NO_ANGLE = 1e-9
-# Half angles that are divided by, and triangles [px^2] or their like, are no smaller.
-_LEAST = 1e-12
 # Of a corner of a quadrilateral, the next and the opposite one.
 _NEXT, _OPPOSITE = np.array([1, 2, 3, 0]), np.array([2, 3, 0, 1])
 
@@ -51,7 +47,7 @@ def so3_exp(phi: npt.ArrayLike) -> FloatArray:
     if phi.ndim == 1:
         return _exp_of_one(phi)
     # sin(h) / h is 1 to the last digit at the smallest half angle that is divided by.
-    half = np.maximum(0.5 * np.sqrt(np.sum(phi * phi, axis=-1)), _LEAST)[..., None, None]
+    half = np.maximum(0.5 * np.sqrt(np.sum(phi * phi, axis=-1)), TINY)[..., None, None]
     s = np.sin(half) / half
     K = skew(phi)
     return np.asarray(np.eye(3) + (s * np.cos(half)) * K + (0.5 * s * s) * (K @ K))
@@ -60,7 +56,7 @@ def so3_exp(phi: npt.ArrayLike) -> FloatArray:
 def _exp_of_one(phi: FloatArray) -> FloatArray:
     """The same for a single vector (3,): many times faster without arrays."""
     x, y, z = phi.tolist()
-    half = max(0.5 * math.sqrt(x * x + y * y + z * z), _LEAST)
+    half = max(0.5 * math.sqrt(x * x + y * y + z * z), TINY)
     s = math.sin(half) / half
     a, b = s * math.cos(half), 0.5 * s * s
     return np.array(
@@ -83,8 +79,8 @@ def so3_log(R: npt.ArrayLike) -> FloatArray:
     w, v = w * flip, v * flip[..., None]
     norm = np.linalg.norm(v, axis=-1)
     angle = 2.0 * np.arctan2(norm, w)
-    safe = np.where(norm < _NO_ANGLE, 1.0, norm)
-    scale = np.where(norm < _NO_ANGLE, 2.0 / np.where(norm < _NO_ANGLE, w, 1.0), angle / safe)
+    safe = np.where(norm < TINY, 1.0, norm)
+    scale = np.where(norm < TINY, 2.0 / np.where(norm < TINY, w, 1.0), angle / safe)
     return np.asarray(scale[..., None] * v)
 
 
@@ -92,7 +88,7 @@ def _log_of_one(R: FloatArray) -> FloatArray:
     """The same for a single matrix (3, 3): many times faster without arrays."""
     x, y, z, w = _quaternion_of_one(R).tolist()
     norm = math.sqrt(x * x + y * y + z * z)
-    scale = 2.0 if norm < _NO_ANGLE else 2.0 * math.atan2(norm, w) / norm
+    scale = 2.0 if norm < TINY else 2.0 * math.atan2(norm, w) / norm
     return np.array((scale * x, scale * y, scale * z))
 
 
@@ -233,5 +229,5 @@ def perspective(c: FloatArray) -> FloatArray:
     to_next = c.take(_NEXT, axis=1) - c
     a, b = to_next.take(_NEXT, axis=1), to_next.take(_OPPOSITE, axis=1)
     triangle = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    triangle[np.abs(triangle) < _LEAST] = _LEAST
+    triangle[np.abs(triangle) < TINY] = TINY
     return np.asarray(triangle)

@@ -8,9 +8,12 @@ the corner of a marker a pixel always has several neighbours of its own kind.
 import cv2
 import numpy as np
 
+from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.core.types import BoolArray, Counts, IntArray
 from thermal_fiducial.errors import InputError
 
+#: Least noise of a pixel: half a count.
+LEAST_NOISE = 0.5
 # How many times the spread of its neighbours a pixel must stand out by. A hot point of the scene, centred on a pixel
 # behind a lens with a point spread of 0.6 px, does so 4 times, but such points are few and carry no marker. The end of
 # a fine line (roofs, masts in real frames) stands out from seven of its neighbours up to 5 times, so where one is
@@ -52,7 +55,7 @@ class BadPixelFinder:
         # The first frames are all looked at: a bad pixel should disturb no more than a moment of the flight.
         if self._frames > self.ENOUGH // self.VOTE + 1 and self._frames % self._interval:
             return None
-        noise = pixel_noise(counts)
+        noise = pixel_noise(counts, LEAST_NOISE)
         surroundings = np.asarray(cv2.medianBlur(counts, 3), np.uint16)
         outlying = _stands_out(counts, surroundings, self._sigmas * noise)
         self._votes -= self._votes > 0
@@ -79,13 +82,6 @@ class BadPixelFinder:
             # A scene that stands still says nothing: what was known of its pixels stays.
             self._stuck = np.where(moved, self._constant, self._stuck & self._constant)
             self._watched = 0
-
-
-def pixel_noise(counts: Counts) -> float:
-    """Standard deviation of the noise between neighbouring pixels [counts], robust, at least half a count."""
-    right = counts[::8, 1::4].astype(np.int32)
-    difference = np.abs(right - counts[::8, 0::4][:, : right.shape[1]])
-    return max(0.5, 1.4826 * float(np.median(difference)) / float(np.sqrt(2.0)))
 
 
 def _stands_out(counts: Counts, surroundings: Counts, margin_counts: float) -> IntArray:

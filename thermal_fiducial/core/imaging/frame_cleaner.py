@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import Tau2CameraConfig
-from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder, pixel_noise
+from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder, LEAST_NOISE
 from thermal_fiducial.core.measurements import LATEST_NS
+from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.core.types import Counts, Gray, IntArray
 from thermal_fiducial.errors import InputError
 
@@ -255,7 +256,7 @@ class ShutterDetector:
         structure = _structure(image)
         before = self._live_structure
         collapsed = before is not None and structure < self.COLLAPSE * before
-        if collapsed and structure < self.FLAT_SIGMAS * pixel_noise(image):
+        if collapsed and structure < self.FLAT_SIGMAS * pixel_noise(image, LEAST_NOISE):
             self._closed_ns = stamp_ns if self._closed_ns is None else self._closed_ns
             if stamp_ns - self._closed_ns < self.LONGEST_NS:
                 return True

@@ -10,7 +10,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
 from thermal_fiducial.core.mapping.map_data import gauge, MapMarker
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
 # Chi square of a view that no pose near the present one explains.
 _BEHIND_CHI2 = 1e8
@@ -238,7 +238,7 @@ def _known(snapshot: Snapshot, ids: IntArray, T_map_marker: FloatArray) -> Prior
 
 
 def _robust_weights(chi2: FloatArray, limit: float) -> FloatArray:
-    return np.asarray(np.minimum(1.0, limit / np.maximum(chi2, 1e-300)))
+    return np.asarray(np.minimum(1.0, limit / np.maximum(chi2, TINY)))
 
 
 def _robust_cost(chi2: FloatArray, limit: float) -> FloatArray:

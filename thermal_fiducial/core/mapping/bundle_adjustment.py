@@ -20,10 +20,11 @@ from thermal_fiducial.core.error_model import (
     shape_of_corners,
     SystematicErrors,
 )
+from thermal_fiducial.core.geometry.rigid_fit import EASED, MOST_DAMPED, STIFFENED
 from thermal_fiducial.core.mapping.adjustment_problem import Linearised, MapProblem, Snapshot
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
 
 MAX_ITERATIONS = 25
 # Decrease of the cost, in chi squares of the actual noise, that ends the iteration: the last step is a third of the
@@ -77,14 +78,14 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
 def _minimise(problem: MapProblem, now: Linearised) -> tuple[Linearised, int]:
     """Levenberg-Marquardt, the corners' variance anew from the residuals of each step; and the number of steps."""
     scale, damping, steps = _scale(now.chi2), 1e-5, 0
-    while steps < MAX_ITERATIONS and damping < 1e6:
+    while steps < MAX_ITERATIONS and damping < MOST_DAMPED:
         steps += 1
         trial = problem.step(now, scale, damping)
         gain = -np.inf if trial is None else now.cost(scale) - trial.cost(scale)
         if trial is None or not gain >= 0.0:
-            damping *= 10.0
+            damping *= STIFFENED
             continue
-        now, scale, damping = trial, _scale(trial.chi2), max(0.1 * damping, 1e-9)
+        now, scale, damping = trial, _scale(trial.chi2), max(EASED * damping, TINY)
         if gain <= _CONVERGED * scale:
             break
     return now, steps

@@ -28,7 +28,7 @@ from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
 from thermal_fiducial.core.mapping.located import Location, Refusal, Reprojected, Sight
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, TINY
 
 #: Difference of chi square that refutes the worse of two poses: odds of e^-10.
 DECISIVE = 20.0
@@ -204,7 +204,7 @@ def marker_weights(errors: FloatArray, running_errors: FloatArray, model: System
     """
     combined = 0.5 * (errors**2 + np.where(running_errors > 0.0, running_errors, errors) ** 2)
     reference = max(float(np.median(combined)), model.decision_px**2)
-    return np.asarray(np.minimum(1.0, reference / np.maximum(combined, 1e-12)))
+    return np.asarray(np.minimum(1.0, reference / np.maximum(combined, TINY)))
 
 
 def _hypotheses(sight: Sight, fit: CameraFit, prior: FloatArray | None) -> FloatArray:

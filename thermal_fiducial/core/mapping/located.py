@@ -119,7 +119,7 @@ class Sight:
         J_camera, J_marker = seen.J_camera.reshape(n, 8, 6), seen.J_marker.reshape(n, 8, 6)
         pose = np.sum(J_camera @ pose_covariance * J_camera, axis=(1, 2))
         marker = np.sum(J_marker @ self.map_covariances * J_marker, axis=(1, 2))
-        return np.asarray(np.sqrt(0.25 * np.nan_to_num(noise + pose + marker) + INCONSISTENT_PX**2))
+        return np.asarray(np.sqrt(np.nan_to_num(noise + pose + marker) / 4.0 + INCONSISTENT_PX**2))
 
 
 @dataclass(frozen=True)

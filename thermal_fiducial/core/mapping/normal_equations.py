@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from thermal_fiducial.core.geometry.rigid_fit import SINGULAR
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 # Columns of the inverse that are computed at a time.
@@ -102,7 +103,7 @@ class ReducedSystem:
 def _damped(H: FloatArray, damping: float) -> FloatArray:
     """Marquardt's damping of (..., 6, 6); a trace of it always, lest an unseen direction makes the block singular."""
     diagonal = np.einsum('...ii->...i', H)
-    floor = 1e-12 * (np.max(diagonal, axis=-1, keepdims=True) + 1e-12)
+    floor = SINGULAR * (np.max(diagonal, axis=-1, keepdims=True) + SINGULAR)
     return np.asarray(H + (damping * diagonal + floor)[..., None] * np.eye(6))
 
 

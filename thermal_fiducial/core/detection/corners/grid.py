@@ -21,10 +21,10 @@ from thermal_fiducial.core.detection.corners.segments import (
     robust_fit,
 )
 from thermal_fiducial.core.detection.corners.sides import blurred_step, blurs, columns_across, half_width, NODES, Sides
-from thermal_fiducial.core.detection.frame import Frame, Places, rolling_displacement
+from thermal_fiducial.core.detection.frame import Frame, LEAST_DEPTH, Places, rolling_displacement
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, Stacked
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, Stacked, TINY
 
 # Columns of pixels across an edge: every so many pixels, but no fewer and no more than this.
 _EVERY_PX, _FEWEST, _MOST = 3.0, 6, 24
@@ -32,8 +32,6 @@ _EVERY_PX, _FEWEST, _MOST = 3.0, 6, 24
 _QUIET = 2.0
 # How far a pose may be off before it is adjusted, as a shift of each edge [px].
 _PRIOR_PX = 30.0
-# Depth of points that are no longer in front of the camera [m].
-_LEAST_DEPTH = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +130,7 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     J = _design(T, size, pattern, sides, modelled[2], layer.camera)
     sharpness = np.where(used, 1.0 / np.sqrt(measured.variance[0] + OF_CELL_EDGE_PX**2), 0.0)
     prior = J[used].T @ J[used] / (used.sum() * _PRIOR_PX**2)
-    prior += 1e-9 * np.diag(np.diag(prior))
+    prior += TINY * np.diag(np.diag(prior))
     fit = robust_fit((J * sharpness[:, None])[None], measured.shift * sharpness, used[None], prior)
     step = fit.moved[0]
     return PoseFit(
@@ -214,5 +212,5 @@ def _coarser(camera: Camera, factor: int) -> Camera:
 
 def places_of_points(points: FloatArray, camera: Camera) -> Places:
     """Places (1, P) of points (P, 3) in the camera."""
-    depth = np.maximum(points[None, :, 2], _LEAST_DEPTH)
+    depth = np.maximum(points[None, :, 2], LEAST_DEPTH)
     return Places.of(ImagePoints.seen_at(points[None, :, :2] / depth[..., None], camera), depth)

@@ -13,7 +13,7 @@ from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, OF_SI
 from thermal_fiducial.core.detection.corners.sides import ENDS, Sides, STARTS
 from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.geometry.camera import ImagePoints
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, SIGMA_OF_MEDIAN, TINY
 
 #: A linearised displacement is good for this many blurs.
 REACHED = 2.0
@@ -26,8 +26,8 @@ _NOISIER = 2.5
 # Weight of a pixel or segment falls off beyond this many standard deviations.
 _PIXEL_OUTLIER = 4.5
 _SEGMENT_OUTLIER = 2.5
-# Standard deviation of normal variables over the median of their absolute values.
-_MAD = 1.4826
+# Keeps columns that hardly differ over a segment apart, in sums of single precision.
+_RIDGE = 1e-6
 # So many segments, beyond the unknowns, make their scatter count as much as the noise of their pixels.
 _SCATTER_COUNTS = 24.0
 # Variance of a standard normal variable of which no more than that is kept.
@@ -145,7 +145,7 @@ def _fit(moments: Float32Array, cells: int, sides: int) -> _SegmentFit:
     number, x, y, z, xx, xy, yy, xz, yz, zz = sums
     x_mean, y_mean, z_mean = sums[1:4] / np.maximum(number, 1.0)
     # Without their means the columns leave two unknowns.
-    ridge = 1e-6 * number + 1e-6
+    ridge = _RIDGE * (number + 1.0)
     a, b, c = xx - x * x_mean + ridge, xy - x * y_mean, yy - y * y_mean + ridge
     p, q = xz - z * x_mean, yz - z * y_mean
     determinant = a * c - b * b
@@ -164,11 +164,11 @@ def _judged(fit: _SegmentFit, reach: FloatArray) -> Segments:
     contrast, product, noise, usable = fit.contrast, fit.product, fit.noise, fit.number >= _FEWEST_PIXELS
     typical = median_of(contrast, usable)
     own = noise * fit.contrast_variance
-    scale = np.sign(typical) / np.maximum(np.abs(typical), 1e-6)
+    scale = np.sign(typical) / np.maximum(np.abs(typical), TINY)
     relative, unsure = contrast * scale, 2.0 * np.sqrt(own) * np.abs(scale)
     usable &= (relative > _LEAST_CONTRAST - unsure) & (relative < _MOST_CONTRAST + unsure)
     # A faint segment hardly shows its contrast, by which its displacement is divided: the others show it better.
-    others = (_CONTRAST_VARIES * typical) ** 2 + 1e-9
+    others = (_CONTRAST_VARIES * typical) ** 2 + TINY
     safe = np.where(usable, (contrast * others + typical * own) / (others + own), 1.0)
     shift = np.where(usable, np.minimum(np.maximum(-product / safe, -reach), reach), 0.0)
     return Segments(shift, np.where(usable, noise * fit.product_variance / (safe * safe), HOPELESS), contrast, noise)
@@ -223,7 +223,7 @@ def robust_fit(A: FloatArray, shift: FloatArray, used: BoolArray, prior: FloatAr
         moved = np.linalg.solve(information, weighted @ shift[..., None])
         left = np.abs(shift - (A @ moved)[..., 0])
         former = robust
-        scale = np.maximum(_MAD * median_of(left, used), 1.0)
+        scale = np.maximum(SIGMA_OF_MEDIAN * median_of(left, used), 1.0)
         robust = 1.0 / np.maximum(left / (_SEGMENT_OUTLIER * scale), 1.0) ** 2
         if np.abs(robust - former).max() < _SETTLED:
             break
