@@ -1,5 +1,6 @@
 """Detections in the messages of other packages, which stand-ins have the fields of."""
 
+import inspect
 import sys
 from types import ModuleType, SimpleNamespace
 
@@ -98,11 +99,23 @@ def test_image_annotations():
     ((outline,), (circle,), (text,)) = (message.points, message.circles, message.texts)
     assert message.timestamp == outline.timestamp == HEAD.stamp
     assert outline.type == 2
-    assert np.allclose([(point.x, point.y) for point in outline.points], CORNERS)
-    assert (circle.position.x, circle.position.y) == tuple(CORNERS[0])
-    assert (text.text, text.position.x, text.position.y) == ('7', 160.0, 141.0)
+    # Foxglove's own library: "the top-left corner of the top-left pixel of the image as the origin".
+    assert np.allclose([(point.x, point.y) for point in outline.points], np.add(CORNERS, 0.5))
+    assert (circle.position.x, circle.position.y) == tuple(np.add(CORNERS[0], 0.5))
+    assert (text.text, text.position.x, text.position.y) == ('7', 160.5, 141.5)
     nothing = image_annotations(FOXGLOVE, rows()[:0], HEAD)
     assert (nothing.points, nothing.circles, nothing.texts) == ([], [], [])
+
+
+def test_annotations_have_the_fields_that_foxglove_knows():
+    library = pytest.importorskip('foxglove.messages')
+    message = image_annotations(FOXGLOVE, rows(), HEAD)
+    parts = {'Points': message.points[0], 'Circle': message.circles[0], 'Text': message.texts[0]}
+    for name, part in parts.items():
+        known = inspect.signature(getattr(library, f'{name}Annotation')).parameters
+        assert vars(part).keys() <= known.keys(), name
+    assert vars(message).keys() <= inspect.signature(library.ImageAnnotations).parameters.keys()
+    assert int(library.PointsAnnotationType.LineLoop) == FOXGLOVE.PointsAnnotation.LINE_LOOP
 
 
 @pytest.mark.ros

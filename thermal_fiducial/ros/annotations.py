@@ -7,6 +7,8 @@ from std_msgs.msg import Header
 from thermal_fiducial.core.measurements import corners_px, Markers
 
 _LINE_PX, _FONT_PX, _CORNER_PX = 2.0, 18.0, 8.0
+#: Of Foxglove's pixels (0, 0) is the corner of the first, of ours its centre.
+_CENTRE_PX = 0.5
 _EDGE, _FIRST_CORNER, _GROUND = (0.13, 0.83, 0.93, 1.0), (1.0, 0.85, 0.0, 1.0), (0.0, 0.0, 0.0, 0.5)
 
 
@@ -20,7 +22,7 @@ def image_annotations(messages: Any, markers: Markers, head: Header) -> Any:
     result = messages.ImageAnnotations()
     if hasattr(result, 'timestamp'):  # since the end of 2025
         result.timestamp = head.stamp
-    for row, corners in zip(markers, corners_px(markers).tolist(), strict=True):
+    for row, corners in zip(markers, (corners_px(markers) + _CENTRE_PX).tolist(), strict=True):
         points = [messages.Point2(x=x, y=y) for x, y in corners]
         outline = messages.PointsAnnotation(timestamp=head.stamp, points=points, thickness=_LINE_PX)
         outline.type, outline.outline_color = messages.PointsAnnotation.LINE_LOOP, _colour(messages, _EDGE)
