@@ -120,7 +120,11 @@ def _expectation(args: argparse.Namespace, measurements: Measurements, distance:
 
 def _view_table(distances: list[float], views: list[Expectation]) -> Table:
     headers = 'at m', 'side px', 'found', 'corner px', 'position mm', 'distance mm', 'rotation deg', 'flips'
-    table = table_of('One view of one marker (median errors; position: of the camera as seen from the marker)', headers)
+    title = (
+        'One view of one marker: median errors, position of the camera as seen from the marker; flips: how often the '
+        'wrong one of its two mirrored poses fits better'
+    )
+    table = table_of(title, headers)
     for distance, view in zip(distances, views, strict=True):
         verdict = f'{100 * view.found:.0f} %{"" if view.detected else ", no"}'
         numbers = ['-'] * 5

@@ -90,7 +90,8 @@ def write_pdf(drawing: Drawing, path: Path, colours: Mapping[str, str], paper: s
     low, high = drawing.page
     # The same drawing gives the same bytes.
     canvas = Canvas(str(path), pagesize=tuple((high - low) * _POINTS_PER_MM), invariant=1)
-    canvas.setTitle(drawing.name)
+    title = f'marker {drawing.name}' if drawing.name.isdigit() else drawing.name
+    canvas.setTitle(title)
     canvas.beginForm('drawing', *(low - 1.0), *(high + 1.0))
     _draw(canvas, drawing, colours)
     canvas.endForm()
@@ -100,7 +101,7 @@ def write_pdf(drawing: Drawing, path: Path, colours: Mapping[str, str], paper: s
         canvas.doForm('drawing')
         canvas.showPage()
     else:
-        _write_tiles(canvas, drawing.name, tiling(drawing, paper))
+        _write_tiles(canvas, title, tiling(drawing, paper))
     canvas.save()
 
 
