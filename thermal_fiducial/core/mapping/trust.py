@@ -13,6 +13,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import INCONSISTENT_PX, SystematicErrors, visible_share
 from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.mapping.map_data import MapMarker
+from thermal_fiducial.core.types import FloatArray
 
 #: Why a marker is in quarantine that came so with the map.
 FROM_FILE = 'in quarantine since before the map was loaded'
@@ -149,7 +150,8 @@ class CornerBias:
     """Systematic error of the corners (lens, detector), from residuals that are still there in the next frame.
 
     White noise of two frames is independent: the mean product of a corner's residuals in successive frames is the
-    variance of what lasts, as far as the pose does not take it up.
+    variance of what lasts, as far as the pose does not take it up. Noise of a marker of which little is in view does
+    last: it counts by what it claims.
     """
 
     def __init__(self) -> None:
@@ -169,8 +171,14 @@ class CornerBias:
             return
         # Moved markers last as well: none counts for more than what makes it inconsistent.
         products = np.mean(location.seen.residuals[now] * last.seen.residuals[then], axis=(1, 2))
-        product = float(np.mean(np.clip(products, -(INCONSISTENT_PX**2), INCONSISTENT_PX**2)))
+        products = np.clip(products, -(INCONSISTENT_PX**2), INCONSISTENT_PX**2)
+        shares = _shares(location.sight.noise_px[now]) * _shares(last.sight.noise_px[then])
         visible = visible_share(location.seen.J_camera.reshape(-1, 2, 6), location.correlations)
-        self._weight = BIAS_MEMORY * self._weight + visible
-        self._sum = BIAS_MEMORY * self._sum + product
+        self._weight = BIAS_MEMORY * self._weight + visible * float(np.mean(shares))
+        self._sum = BIAS_MEMORY * self._sum + float(np.mean(shares * products))
         self.px = math.sqrt(max(self._sum / self._weight, 0.0))
+
+
+def _shares(noise: FloatArray) -> FloatArray:
+    """(N,) in which corners with ``noise`` (N,) [px] count: a marker that is hardly seen says little."""
+    return np.asarray(np.minimum(1.0, np.square(np.median(noise) / noise)))
