@@ -66,7 +66,6 @@ def _with_the_map(pose: Any, T_body_camera: Any, scale: float) -> Any:
 
 MECHANISMS = {
     'systematic error of poses': Mechanism(('lasting errors',), changes={'systematic_pose_std': 0.01}),
-    'its size is learned': Mechanism(('lasting errors',), off={'pose_noise:_PRIOR_VIEWS': 1e12}),
     'error of the map apart': Mechanism(('map in the making',), off={'hypotheses:body_pose': _with_the_map}),
     'change of the error of the map': Mechanism(
         ('map in the making',),
@@ -74,7 +73,9 @@ MECHANISMS = {
         {'pose_noise:BodyPose.map_change': lambda *_: np.zeros((6, 6))},
     ),
     'size of white errors is learned': Mechanism(
-        ('lasting errors', 'slow and noisy'), ('pose_noise:PoseNoise._white_step',), {'pose_noise:_PRIOR_POSES': 1e12}
+        ('noise of poses', 'lasting errors'),
+        ('pose_noise:PoseNoise.weighed',),
+        {'pose_noise:PoseNoise.weighed': lambda self, *_: self},
     ),
     'jitter of stamps': Mechanism(('jittering',), ('pose_noise:PoseNoise.with_stamps',), changes={'stamp_jitter': 0.0}),
     'jitter is learned': Mechanism(

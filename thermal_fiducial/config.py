@@ -598,14 +598,13 @@ class PoseEkfConfig(SelfChecked):
     initial_poses: int = param(3, 'Poses that must agree before the filter starts.', minimum=1, maximum=100)
     pose_noise_scale: float = param(
         1.0,
-        'Factor on the standard deviation of the camera poses to begin with; what they are worth is learned.',
+        'Factor on the standard deviation of the camera poses; where they scatter more, that is learned.',
         minimum=0.1,
         live=True,
     )
     systematic_pose_std: float = param(
         1.0,
-        'Error of camera poses that lasts as long as the view (lens, corners, map), to begin with, in their own '
-        'standard deviations; it is learned.',
+        'Error of camera poses that lasts as long as the view (lens, corners), in their own standard deviations.',
         minimum=0.01,
         maximum=100.0,
     )

@@ -48,4 +48,4 @@ def any_estimate():
         bias=0.01 * rng.normal(size=6),
         scale=0.01 * rng.normal(size=(2, 3, 3)),
     )
-    return Estimate(1_000, state, A @ A.T, pose_noise=PoseNoise.of(1.0, 1.0, 0.0, ELSEWHERE))
+    return Estimate(1_000, state, A @ A.T, pose_noise=PoseNoise(1.0, ELSEWHERE))

@@ -335,6 +335,12 @@ def lasting_errors(seed: int) -> Arrivals:
     return _arrivals(flight, poses, pose_noise_scale=1.0)
 
 
+def noise_of_poses(seed: int) -> Arrivals:
+    """Poses whose white errors are three times what they claim."""
+    flight = Flight(seed=seed, seconds=16.0)
+    return _arrivals(flight, [replace(pose, covariance=pose.covariance / 9.0) for pose in flight.poses])
+
+
 def map_in_the_making(seed: int) -> Arrivals:
     """All poses are off alike by a map that is known to 30 mm, and after half of the flight, refined, to 10 mm."""
     flight, rng = Flight(seed=seed, seconds=16.0), np.random.default_rng(seed)
@@ -352,7 +358,7 @@ def _scenes() -> dict[str, Scene]:
     flights = (
         brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, starved,
         jittering, tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start, stepping_clock,
-        small_step_of_clock, lasting_errors, map_in_the_making,
+        small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making,
     )  # fmt: skip
     scenes: dict[str, Scene] = {scene.__name__.replace('_', ' '): partial(of_flights, scene) for scene in flights}
     data = os.environ.get('THERMAL_FIDUCIAL_DATA')

@@ -7,7 +7,7 @@ import pytest
 from support.estimates import any_estimate, difference, ELSEWHERE
 from support.flights import CAMERA_POSITION, config
 
-from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise
+from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, WHITE
 from thermal_fiducial.core.filter.state import (
     CORE,
     EXTRINSICS,
@@ -94,10 +94,10 @@ def test_time_offset_and_extrinsics_columns(estimate, motion):
 
 def test_the_systematic_error_is_part_of_the_measurement(estimate, still):
     """In its own standard deviations, it moves a pose by the root of the pose's covariance."""
-    updater = PoseUpdater(FULL)
+    updater = PoseUpdater(replace(FULL, systematic_pose_std=2.0))
     A = np.random.default_rng(3).normal(size=(6, 6)) * 1e-3
     pose = BodyPose(0, estimate.state.T_map_body, A @ A.T)
-    same_view = replace(known(estimate), pose_noise=PoseNoise.of(1.0, 2.0, 0.0, pose))
+    same_view = replace(known(estimate), pose_noise=PoseNoise(1.0, pose))
     biased = replace(same_view, state=replace(estimate.state, systematic=np.arange(1.0, 7.0)))
     innovation = updater.innovation(biased, pose, still)
     np.testing.assert_allclose(innovation.value, -innovation.H[:, SYSTEMATIC] @ np.arange(1.0, 7.0), atol=1e-12)
@@ -178,26 +178,44 @@ def test_at_rest_the_force_shows_tilt_bias_and_gravity(estimate, place):
     np.testing.assert_allclose(difference(estimate.state, found.state), error, atol=1e-5)
 
 
-def test_what_poses_are_worth_is_learned(estimate, still):
-    """White errors of a third of what the covariance claims, about a state that is known."""
-    rng, updater = np.random.default_rng(8), PoseUpdater(config(stamp_jitter=0.0, estimate_time_offset=False))
+def weighed(estimate, still, errors):
+    """Variance of the white error that is learned from poses with ``errors`` (N, 6), in standard deviations claimed."""
+    updater = PoseUpdater(config(systematic_pose_std=0.01, stamp_jitter=0.0, estimate_time_offset=False))
     R = np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)
-    now = replace(known(estimate, 1e-14), pose_noise=PoseNoise.of(1.0, 0.01, 0.0, ELSEWHERE))
-    for stamp in range(2000):
-        noise = np.linalg.cholesky(R) @ rng.normal(size=6) / 3.0
-        T = now.state.T_map_body @ transform(so3_exp(noise[:3]), noise[3:])
+    now = replace(known(estimate, 1e-14), pose_noise=PoseNoise.of(0.0, ELSEWHERE))
+    for stamp, error in enumerate(np.sqrt(R.diagonal()) * errors):
+        T = now.state.T_map_body @ transform(so3_exp(error[:3]), error[3:])
         pose = BodyPose(stamp, T, R)
         innovation = updater.innovation(replace(now, covariance=1e-14 * np.eye(SIZE)), pose, still)
-        noise_then = updater.correct(pose, innovation, still).pose_noise
-        now = replace(now, pose_noise=noise_then)
-    # the memory of 50 poses of 6 degrees of freedom: 12 % of the variance, 6 % of the deviation; three of that
-    assert np.sqrt(now.pose_noise.white) == pytest.approx(1.0 / 3.0, rel=0.2)
+        noise = now.pose_noise.weighed(pose, innovation.value, innovation.S_inverse)
+        now = replace(now, pose_noise=replace(noise, last=pose))
+    return now.pose_noise.white
+
+
+def test_what_poses_scatter_is_learned(estimate, still):
+    """White errors of three times what the covariance claims, about a state that is known."""
+    errors = 3.0 * np.random.default_rng(8).normal(size=(600, 6))
+    # the memory of 15 poses of 6 degrees of freedom: a fifth of the variance, a tenth of the deviation; three of that
+    assert np.sqrt(weighed(estimate, still, errors)) == pytest.approx(3.0, rel=0.3)
+
+
+def test_poses_that_scatter_less_than_they_claim_are_worth_what_they_claim(estimate, still):
+    errors = 0.1 * np.random.default_rng(8).normal(size=(100, 6))
+    assert weighed(estimate, still, errors) == WHITE
+
+
+@pytest.mark.parametrize('size', [5.0, 1e4])
+def test_an_error_that_lasts_is_no_white_one(estimate, still, size):
+    """A clock that has stepped, a marker that has moved: after the step the innovations stay the same."""
+    errors = np.zeros((30, 6))
+    errors[10:] = size
+    assert weighed(estimate, still, errors) == WHITE
 
 
 def test_another_view_has_another_systematic_error():
     R = np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)
     here = BodyPose(0, np.eye(4), R)
-    seen = PoseNoise.of(1.0, 1.0, 0.0, here)
+    seen = PoseNoise(1.0, here)
     assert seen.alike(here, 0.3) == pytest.approx(1.0)
     turned = BodyPose(1, transform(so3_exp([0.0, 0.3, 0.0]), np.zeros(3)), R)
     assert seen.alike(turned, 0.3) == pytest.approx(np.exp(-1.0))
@@ -229,7 +247,7 @@ def test_what_another_error_of_the_map_makes_of_a_pose_is_not_taken_for_motion(e
     updater, pose = PoseUpdater(FULL), estimate.state.T_map_body
     here = BodyPose(0, pose, 1e-6 * np.eye(6))
     other = replace(here, map_covariance=1e-2 * np.eye(6))
-    seen = replace(known(estimate), pose_noise=PoseNoise.of(1.0, 1.0, 0.0, here))
+    seen = replace(known(estimate), pose_noise=PoseNoise(1.0, here))
     innovation = updater.innovation(seen, other, still)
     explained = innovation.H[:, SYSTEMATIC] @ innovation.prior.covariance[SYSTEMATIC, SYSTEMATIC]
     shown = np.diag(explained @ innovation.H[:, SYSTEMATIC].T)
@@ -239,9 +257,10 @@ def test_what_another_error_of_the_map_makes_of_a_pose_is_not_taken_for_motion(e
 
 def test_the_jitter_of_the_stamps_is_learned(estimate, motion):
     """Stamps that scatter by 3 ms, about a state that is known and moves."""
-    rng, updater = np.random.default_rng(9), PoseUpdater(config(estimate_time_offset=False, time_offset_std=0.0))
+    white = config(systematic_pose_std=0.01, estimate_time_offset=False, time_offset_std=0.0)
+    rng, updater = np.random.default_rng(9), PoseUpdater(white)
     R = np.diag(np.repeat((1e-5, 2e-5), 3) ** 2)
-    noise = PoseNoise.of(1.0, 0.01, 5e-4, ELSEWHERE)
+    noise = PoseNoise.of(5e-4, ELSEWHERE)
     velocity = estimate.state.velocity
     for stamp in range(1000):
         late = rng.normal(0.0, 3e-3)

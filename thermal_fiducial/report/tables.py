@@ -106,7 +106,6 @@ _UNITS = {
     'time offset': 's',
     'time offset std': 's',
     'white pose error': 'sigma',
-    'systematic pose error': 'sigma',
     'stamp jitter': 's',
     'gyroscope bias': 'rad/s',
     'accelerometer bias': 'm/s^2',

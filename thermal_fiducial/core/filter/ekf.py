@@ -311,7 +311,6 @@ class PoseEkf:
             'time offset': self._clock_offset(main),
             'time offset std': self._time_offset_std(main),
             'white pose error': math.sqrt(noise.white),
-            'systematic pose error': math.sqrt(noise.systematic),
             'stamp jitter': math.sqrt(noise.jitter),
             'gyroscope bias': float(np.linalg.norm(state.bias[:3])),
             'accelerometer bias': float(np.linalg.norm(state.bias[3:])),

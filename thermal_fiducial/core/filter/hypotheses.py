@@ -75,7 +75,8 @@ class Hypotheses:
             corrected = self._updater.correct(measured, innovation, motion)
             accepted = hypothesis.accepting(Prediction.begin(corrected))
             return accepted, PoseUpdate(pose.stamp_ns, True, '', innovation.nis)
-        refusing = hypothesis.refusing(Prediction.begin(estimate))
+        noise = estimate.pose_noise.weighed(measured, innovation.value, innovation.S_inverse)
+        refusing = hypothesis.refusing(Prediction.begin(replace(estimate, pose_noise=noise)))
         return refusing, PoseUpdate(
             pose.stamp_ns, False, f'refused: {math.sqrt(innovation.nis):.1f} sigma', innovation.nis
         )

@@ -32,8 +32,6 @@ from thermal_fiducial.core.filter.update import PoseUpdater, slide
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 
-#: White error of a camera pose in its own standard deviations, to begin with: the rest of what it claims is systematic.
-WHITE_STD = 0.7
 #: Seconds of samples that stillness is judged on, and the fewest of them.
 WINDOW_SECONDS, FEWEST_SAMPLES = 0.5, 20
 #: At rest the samples scatter less than this [rad/s, m/s^2] ...
@@ -119,11 +117,12 @@ def start(
 def _unaligned(
     config: PoseEkfConfig, pose: BodyPose, stamp_ns: int, prior: NavigationState, imu: FloatArray
 ) -> Estimate:
-    noise = PoseNoise.of(WHITE_STD, config.systematic_pose_std, config.stamp_jitter, pose)
+    noise = PoseNoise.of(config.stamp_jitter, pose)
+    systematic = config.systematic_pose_std
     P = np.diag(_initial_variances(config))
-    P[np.ix_(POSE, POSE)] += (noise.white + noise.systematic) * pose.shape
+    P[np.ix_(POSE, POSE)] += (noise.white + systematic**2) * pose.shape
     # The estimate is off by what the pose is.
-    P[POSE, SYSTEMATIC] -= np.linalg.cholesky(noise.systematic * pose.shape)
+    P[POSE, SYSTEMATIC] -= systematic * np.linalg.cholesky(pose.shape)
     P[SYSTEMATIC, POSE] = P[POSE, SYSTEMATIC].T
     state = replace(
         prior,

@@ -1,9 +1,8 @@
-"""What camera poses are worth: their covariance says the shape of the error, innovations its size.
+"""What camera poses are worth: at best what their covariance says; where they scatter more, that is learned.
 
-A part of the error is white; another is systematic: errors of lens, corners and map are the same while the view is,
-and another once the camera has turned to other parts of the image or sees other markers. On a recording of a board of
-36 tags (global shutter, published calibration) the white part has a tenth of the variance that 0.35 px of noise claim,
-the systematic part 4 to 9 times as much.
+A part of the error is white; another is systematic: errors of lens and corners are the same while the view is, and
+another once the camera has turned to other parts of the image or sees other markers. How large that is, the mapper has
+learned from the residuals of the corners, and has put it into the covariance.
 
 Sources: R. Mehra, "Approaches to Adaptive Filtering", IEEE TAC 1972; R. Shumway, D. Stoffer, "An Approach to Time
 Series Smoothing and Forecasting Using the EM Algorithm", 1982.
@@ -15,15 +14,15 @@ import math
 
 import numpy as np
 
+from thermal_fiducial.core.error_model import CHI2_OF_POSE
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.types import FloatArray
 
-#: Poses whose innovations count as much as the parameter, and views that do.
-_PRIOR_POSES, _PRIOR_VIEWS = 50.0, 20.0
-#: The variances are no further than this from the parameters', down and up; no pose changes them by more than e^0.2.
-_LEAST, _LARGEST, _LARGEST_STEP = 0.02, 30.0, 0.2
-#: An innovation counts no more than one of the 95 % limit of chi square with 6 degrees of freedom.
-_LARGEST_NIS = 12.6
+#: Variance of the white error of a pose where it claims enough, in units of its covariance: the rest is systematic.
+WHITE = 0.5
+#: Where it claims too little, what is learned of the last poses, so many; the variance is at most so many times as
+#: large, and no pose changes it by more than e^0.2.
+_WHITE_MEMORY, _LARGEST, _LARGEST_STEP = 10.0, 30.0, 0.3
 #: Stamps: poses that count as much as the parameter, poses over which their jitter may change, its range [s], and the
 #: largest square of an innovation along the motion, normalised.
 _PRIOR_STAMPS, _MEMORY, _STAMP_RANGE, _LARGEST_SQUARE = 10.0, 300.0, (1e-4, 5e-3), 9.0
@@ -69,23 +68,21 @@ def log_overlap(A: FloatArray, B: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True)
 class PoseNoise:
-    """Variances of the white and of the systematic error of a camera pose, in units of its own covariance."""
+    """Variances of the white error of camera poses, in units of their own covariance, and of the jitter of stamps."""
 
     white: float
-    systematic: float
-    #: what they were before the first pose
-    initial: tuple[float, float]
     #: the last pose that was compared with the estimate
     last: BodyPose
     #: variance of the jitter of the camera's stamps [s^2], 0: they are exact; information about its logarithm
     jitter: float = 0.0
     jitter_information: float = 0.0
+    #: (6,) of the last pose that was compared
+    innovation: FloatArray = field(default_factory=lambda: np.zeros(6))
 
     @classmethod
-    def of(cls, white_std: float, systematic_std: float, stamp_jitter: float, first: BodyPose) -> 'PoseNoise':
-        """Standard deviations to begin with, in units of a pose's own; ``stamp_jitter`` [s]; the ``first`` pose."""
-        variances = white_std**2, systematic_std**2
-        return cls(*variances, variances, first, jitter=stamp_jitter**2)
+    def of(cls, stamp_jitter: float, first: BodyPose) -> 'PoseNoise':
+        """To begin with: the jitter of the camera's stamps [s], the ``first`` pose."""
+        return cls(WHITE, first, stamp_jitter**2)
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'PoseNoise':
         """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
@@ -112,38 +109,41 @@ class PoseNoise:
         moved = float(np.linalg.norm(T[:3, 3] - T_last[:3, 3])) / distance
         return math.exp(-(turned + moved) / angle + log_overlap(A, B))
 
-    def after(
-        self, pose: BodyPose, innovation: FloatArray, S_inverse: FloatArray, second_moment: float, alike: float
-    ) -> 'PoseNoise':
-        """What is known after an accepted pose.
+    def weighed(self, pose: BodyPose, innovation: FloatArray, S_inverse: FloatArray) -> 'PoseNoise':
+        """What is known after a pose was weighed: a step of Fisher scoring on the likelihood of its white error.
+
+        White is what changes from pose to pose: a clock that has stepped, or a marker that has moved, is there in all
+        of them. Refused poses count too; if nothing were learned from these, poses that claim too little would stay
+        refused. A change that no white error explains says nothing of it.
 
         Parameters
         ----------
         innovation, S_inverse : (6,) and the inverse (6, 6) of its covariance
-        second_moment : expected square of the systematic error, per coordinate, in its own standard deviations
-        alike : correlation of the systematic error with that of the pose before
         """
-        white = self.white * self._white_step(pose, innovation, S_inverse)
-        # As much is new about the systematic error as has changed of it.
-        news = (1.0 - alike * alike) / _PRIOR_VIEWS * (second_moment - 1.0)
-        systematic = self.systematic * math.exp(min(news, _LARGEST_STEP))
-        return replace(
-            self,
-            white=_within(white, self.initial[0]),
-            systematic=_within(systematic, self.initial[1]),
-            last=pose,
-        )
+        change = self._change(innovation)
+        weighted = S_inverse @ change
+        squared = float(change @ weighted)
+        if squared > _LARGEST * CHI2_OF_POSE:
+            return replace(self, innovation=innovation)
+        share = S_inverse @ (self.white * pose.shape)
+        bounded = CHI2_OF_POSE / max(squared, CHI2_OF_POSE)
+        score = 0.5 * (bounded * self.white * float(weighted @ pose.shape @ weighted) - float(np.trace(share)))
+        information = 0.5 * float(np.sum(share * share.T))
+        step = score / (_WHITE_MEMORY * (0.5 + information))
+        white = self.white * math.exp(min(max(step, -_LARGEST_STEP), _LARGEST_STEP))
+        return replace(self, white=min(max(white, WHITE), _LARGEST * WHITE), innovation=innovation)
 
     def with_stamps(self, twist: FloatArray, innovation: FloatArray, S_inverse: FloatArray) -> 'PoseNoise':
-        """What is known of the stamps' jitter after an innovation: a step of Fisher scoring on its likelihood.
+        """What is known of the stamps' jitter after an accepted pose, from how innovations change along the motion.
 
         ``twist`` (6,): by which a late stamp moves the pose [1/s].
         """
         if not self.jitter:
             return self
+        change = self._change(innovation)
         weighted = S_inverse @ twist
         precision = float(twist @ weighted)
-        square = min(float(innovation @ weighted) ** 2, _LARGEST_SQUARE * precision)
+        square = min(float(change @ weighted) ** 2, _LARGEST_SQUARE * precision)
         share = self.jitter * precision
         information = (1.0 - 1.0 / _MEMORY) * self.jitter_information + 0.5 * share**2
         step = 0.5 * (self.jitter * square - share) / (0.5 * _PRIOR_STAMPS + information)
@@ -151,17 +151,6 @@ class PoseNoise:
         jitter = min(max(self.jitter * math.exp(step), low**2), high**2)
         return replace(self, jitter=jitter, jitter_information=information)
 
-    def _white_step(self, pose: BodyPose, innovation: FloatArray, S_inverse: FloatArray) -> float:
-        """Factor on the white variance: a step of Fisher scoring on the likelihood of an innovation."""
-        weighted = S_inverse @ innovation
-        share = S_inverse @ (self.white * pose.shape)
-        nis = float(innovation @ weighted)
-        bounded = min(_LARGEST_NIS / max(nis, _LARGEST_NIS), 1.0)
-        score = 0.5 * (bounded * self.white * float(weighted @ pose.shape @ weighted) - float(np.trace(share)))
-        information = 0.5 * float(np.sum(share * share.T))
-        step = score / (_PRIOR_POSES * (0.5 + information))
-        return math.exp(min(max(step, -_LARGEST_STEP), _LARGEST_STEP))
-
-
-def _within(value: float, initial: float) -> float:
-    return min(max(value, _LEAST * initial), _LARGEST * initial)
+    def _change(self, innovation: FloatArray) -> FloatArray:
+        """(6,) by which an innovation differs from the last, as large as one where both are white."""
+        return (innovation - self.innovation) / math.sqrt(2.0)

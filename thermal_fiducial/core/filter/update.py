@@ -44,8 +44,6 @@ class Innovation(NamedTuple):
     H: FloatArray
     R: FloatArray
     nis: float
-    #: correlation of the pose's systematic error with that of the pose before
-    alike: float
     #: the estimate that it was compared with, its systematic error as old as the pose's
     prior: Estimate
     #: change (9,) of that estimate's core with time
@@ -110,7 +108,7 @@ class PoseUpdater:
         """What ``pose`` says beyond ``estimate`` at its instant."""
         alike = estimate.pose_noise.alike(pose, self.config.systematic_angle)
         # The systematic error in the axes of the pose's own: those of the triangular root of its covariance.
-        root = np.linalg.cholesky(estimate.pose_noise.systematic * pose.shape)
+        root = self.config.systematic_pose_std * np.linalg.cholesky(pose.shape)
         prior = _with_new_view(estimate, alike)
         to_units = np.linalg.inv(root)
         change = pose.map_change(estimate.pose_noise.last)
@@ -124,7 +122,7 @@ class PoseUpdater:
         self._add_clock(prior, motion, moved, H, R)
         value = pose_innovation(prior.state, pose.T_map_body) - root @ prior.state.systematic
         S_inverse = np.asarray(np.linalg.inv(H @ prior.covariance @ H.T + R))
-        return Innovation(value, S_inverse, H, R, float(value @ S_inverse @ value), alike, prior, moved)
+        return Innovation(value, S_inverse, H, R, float(value @ S_inverse @ value), prior, moved)
 
     def _add_clock(
         self, prior: Estimate, motion: MotionAtPose, moved: FloatArray, H: FloatArray, R: FloatArray
@@ -154,16 +152,9 @@ class PoseUpdater:
             now = slide(state, motion.imu)
             state = state.plus(_of_core((before - now) * error[TIME_OFFSET]))
             covariance = self._in_clock_of_imu(covariance, now - before, now, innovation, motion)
-        variances = covariance.diagonal()[SYSTEMATIC]
-        second_moment = float(state.systematic @ state.systematic + variances.sum()) / 6.0
-        noise = prior.pose_noise.after(pose, innovation.value, innovation.S_inverse, second_moment, innovation.alike)
-        noise = noise.with_stamps(before[POSE], innovation.value, innovation.S_inverse)
-        # The same systematic error in units of its new standard deviation.
-        unit = (prior.pose_noise.systematic / noise.systematic) ** 0.5
-        covariance[SYSTEMATIC] *= unit
-        covariance[:, SYSTEMATIC] *= unit
-        state = replace(state, systematic=unit * state.systematic)
-        return replace(prior, state=state, covariance=covariance, pose_noise=noise)
+        noise = prior.pose_noise.with_stamps(before[POSE], innovation.value, innovation.S_inverse)
+        noise = noise.weighed(pose, innovation.value, innovation.S_inverse)
+        return replace(prior, state=state, covariance=covariance, pose_noise=replace(noise, last=pose))
 
     def _in_clock_of_imu(
         self, P: FloatArray, change: FloatArray, moved: FloatArray, innovation: Innovation, motion: MotionAtPose
