@@ -174,6 +174,20 @@ sys.exit(run(Stopped))
     assert (done.returncode, done.stdout + done.stderr) == (0, '')
 
 
+@pytest.mark.parametrize(
+    ('executable', 'quiet'),
+    [('-m', True), ('/opt/rig/lib/thermal_fiducial/pose_ekf', True), ('thermal-fiducial', False), ('', False)],
+)
+def test_a_node_stopped_while_it_imports_says_nothing_and_commands_are_left_alone(executable, quiet):
+    program = (
+        f'import os, signal, sys\nsys.argv = [{executable!r}]\nimport thermal_fiducial.nodes\n'
+        'os.kill(os.getpid(), signal.SIGINT)'
+    )
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == -signal.SIGINT
+    assert ('KeyboardInterrupt' in done.stderr) is not quiet
+
+
 ENDED = """
 import os, re, signal, sys, time
 from dataclasses import dataclass
