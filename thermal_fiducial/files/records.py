@@ -2,15 +2,17 @@
 
 from collections.abc import Sequence
 import math
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.plausibility import require_usable
 from thermal_fiducial.core.measurements import ImuSample
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
+
+if TYPE_CHECKING:
+    from thermal_fiducial.core.geometry.camera import Camera
 
 # What no IMU measures: seven times the widest gyroscopes' range [rad/s], and four times the widest accelerometers'.
 _FASTEST_TURN, _LARGEST_FORCE = 500.0, 8000.0
@@ -34,7 +36,7 @@ def checked_stamp(seconds: int, nanoseconds: int) -> int:
     return seconds * SECOND_NS + nanoseconds
 
 
-def camera(message: Any) -> Camera:
+def camera(message: Any) -> 'Camera':
     """Intrinsics of a camera_info message.
 
     Parameters
@@ -46,6 +48,9 @@ def camera(message: Any) -> Camera:
     InputError
         No calibration in it, one that no lens has, an unknown model, or a binned or cropped image.
     """
+    # With OpenCV: a filter reads IMU samples alone, and is back in flight sooner without it.
+    from thermal_fiducial.core.geometry.camera import Camera
+
     if max(message.binning_x, message.binning_y) > 1 or message.roi.width or message.roi.height:
         raise InputError('camera_info of a binned or cropped image')
     model = message.distortion_model or 'plumb_bob'

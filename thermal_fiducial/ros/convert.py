@@ -6,7 +6,7 @@ Messages check nothing, so what comes in is checked here and what goes out is co
 
 from array import array
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -25,7 +25,6 @@ import numpy.typing as npt
 from sensor_msgs.msg import CameraInfo, Image, TimeReference
 from std_msgs.msg import Header
 
-from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.measurements import CameraPose
@@ -37,6 +36,9 @@ from thermal_fiducial.files.records import camera as camera
 from thermal_fiducial.files.records import checked_stamp as checked_stamp
 from thermal_fiducial.files.records import imu_sample as imu_sample
 from thermal_fiducial.files.records import stamp_ns as stamp_ns
+
+if TYPE_CHECKING:
+    from thermal_fiducial.core.geometry.camera import Camera
 
 #: By how much the norm of a quaternion may be off.
 NORM_TOLERANCE = 0.1
@@ -122,7 +124,7 @@ def data_bytes(values: npt.NDArray[Any]) -> 'array[int]':
     return data
 
 
-def camera_info(calibration: Camera, head: Header) -> CameraInfo:
+def camera_info(calibration: 'Camera', head: Header) -> CameraInfo:
     """camera_info message of a camera."""
     K = calibration.K
     message = CameraInfo(header=head, width=calibration.width, height=calibration.height)

@@ -3,11 +3,15 @@
 They are far beyond anything real, and near enough that squares and products of what passes stay finite.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
+
+if TYPE_CHECKING:
+    from thermal_fiducial.core.geometry.camera import Camera
 
 #: Farthest coordinate of anything in a map [m]; single precision still resolves a centimetre there.
 LARGEST_COORDINATE = 1e5
@@ -59,7 +63,7 @@ def positive_definite(P: FloatArray) -> BoolArray:
     return np.asarray(np.linalg.eigvalsh(correlations)[..., 0] > _LEAST_INDEPENDENT)
 
 
-def require_usable(camera: Camera) -> Camera:
+def require_usable(camera: 'Camera') -> 'Camera':
     """``camera``, if it can be that of a lens.
 
     Raises
@@ -82,7 +86,7 @@ def require_usable(camera: Camera) -> Camera:
     return camera
 
 
-def _require_invertible(camera: Camera) -> None:
+def _require_invertible(camera: 'Camera') -> None:
     size = np.array([camera.width, camera.height], dtype=np.float64)
     half_way = 0.5 * np.array([[0, 0], [-1, -1], [1, -1], [1, 1], [-1, 1]])
     pixels = 0.5 * size * (1.0 + half_way)
