@@ -185,7 +185,7 @@ MECHANISMS = {
         'slow, 0.5 K, blind', ('corners.squares',), {'corners.segments:as_squares': _as_seen}
     ),
     'other tilt of a square': Mechanism('slow, 0.1 K, blind', (), {'corners.squares:_OTHER_TILT': np.inf}),
-    'passes until settled': Mechanism('fast, 8 K, blind', (), {'corners.refinement:_PASSES': 1}),
+    'passes until settled': Mechanism('fast, 8 K, blind', (), {'refining:_PASSES': 1}),
     'second round': Mechanism('fast, 8 K, blind', (), {'refining:_ROUNDS': 1}),
     'edges behind the sides': Mechanism(
         'fast, 8 K, blind', ('corners.sides:_add_neighbours',), {'corners.sides:_NARROW': 0.0}

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from support.lens_planes import plane_points
 
-from thermal_fiducial.core.detection.corners.refinement import refine_corners
 from thermal_fiducial.core.detection.corners.sides import edges_behind
 from thermal_fiducial.core.detection.patterns import marker_bits
+from thermal_fiducial.core.detection.refining import refine_corners
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_marker_poses

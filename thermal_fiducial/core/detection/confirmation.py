@@ -12,12 +12,11 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.alignment import aligned
 from thermal_fiducial.core.detection.corner_errors import OF_PATTERN_CELLS
-from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
 from thermal_fiducial.core.detection.quads import halfway, halved
-from thermal_fiducial.core.detection.refining import RefinedMarkers, sides_px
+from thermal_fiducial.core.detection.refining import RefinedCorners, RefinedMarkers, sides_px
 from thermal_fiducial.core.detection.search import accepted
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, TINY
 

@@ -19,13 +19,12 @@ from thermal_fiducial.core.detection.corner_errors import (
     OF_BORDERS_TOGETHER,
     OF_LOCAL_PX,
 )
-from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind, edges_behind_border, model, sides_of
 from thermal_fiducial.core.detection.frame import Frame, markers_deblurred
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.refining import refined, RefinedMarkers, sides_px
+from thermal_fiducial.core.detection.refining import refined, RefinedCorners, RefinedMarkers, sides_px
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints

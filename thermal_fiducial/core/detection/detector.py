@@ -8,13 +8,12 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.detection.corner_estimates import CornerEstimator
-from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.finding import Findings, FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import among, depths, ExpectedMarkers, KnownMarkers
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
-from thermal_fiducial.core.detection.refining import RefinedMarkers
+from thermal_fiducial.core.detection.refining import RefinedCorners, RefinedMarkers
 from thermal_fiducial.core.detection.tracking import FramePrediction, MotionTrack, predict_frame
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints

@@ -21,10 +21,10 @@ from thermal_fiducial.core.detection.corners.grid import (
     pose_jacobian,
     PoseFit,
 )
-from thermal_fiducial.core.detection.corners.refinement import RefinedCorners
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import PartialMarkers
 from thermal_fiducial.core.detection.patterns import CELL_SAMPLES, Decoder, most_similar, NEAR_CELLS
+from thermal_fiducial.core.detection.refining import RefinedCorners
 from thermal_fiducial.core.detection.visible_cells import VisibleCells
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera

@@ -4,15 +4,20 @@ The motion blur of each marker follows from the camera's twist. Where it matters
 far as that holds whatever the response is like; the edges are fitted with the blur that remains, and what lag has
 displaced them by is taken out of the corners. These correct the twist: where that changes the blur much, it is done
 once more.
+
+Columns of whole pixels across the sides are compared with the model of a blurred edge, segment by segment, on raw
+counts; a robust adjustment of the four corners to all segments of the marker follows, until they no longer move.
 """
 
 from dataclasses import dataclass, replace
+import math
 
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corner_errors import unknown_motion, wrong_lag
-from thermal_fiducial.core.detection.corners.refinement import refine_corners, RefinedCorners
+from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED
+from thermal_fiducial.core.detection.corners.sides import blurs, half_width, model, sides_of
 from thermal_fiducial.core.detection.frame import (
     delays,
     Frame,
@@ -26,7 +31,8 @@ from thermal_fiducial.core.detection.frame import (
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, unknown_twist
-from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, Stacked, TINY
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked, TINY
 
 # Blur by lag below which the shape of an edge doesn't change [px].
 _BLUR_THAT_MATTERS_PX = 0.4
@@ -37,6 +43,37 @@ CLEAR_CNR = 20.0
 _OF_CLEAR, _OF_FAINT = (6, 0.2), (12, 1.0)
 _ROUNDS = 2
 _NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
+# Passes follow one another until the last step was short enough [px]: at best, at worst, between in deviations of it.
+_PASSES = 4
+_SETTLED_PX, _UNSURE = (0.3, 1.0), 2.0
+# Standard deviation of what is known of the corners beforehand [px].
+_PRIOR_PX = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class RefinedCorners(Stacked):
+    """Corners of N markers.
+
+    Parameters
+    ----------
+    corners_px : (N, 4, 2)
+    covariances : (N, 4, 2, 2) [px^2]
+    contrast : (N,) white minus black [counts]
+    noise : (N,) standard deviation of a pixel about the model [counts]
+    doubt : (N,) variance of corners that make no square, zero where they do [px^2]; not in the covariances
+    """
+
+    corners_px: FloatArray
+    covariances: FloatArray
+    contrast: FloatArray
+    noise: FloatArray
+    doubt: FloatArray
+
+    @staticmethod
+    def none() -> 'RefinedCorners':
+        """No corners."""
+        no = np.zeros(0)
+        return RefinedCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,3 +196,64 @@ def sides_px(corners: FloatArray) -> FloatArray:
     """Mean sides (N,) of quadrilaterals (N, 4, 2)."""
     span = corners.take(_NEXT, axis=1) - corners
     return np.asarray(np.sqrt((span * span).sum(axis=-1)).mean(axis=1))
+
+
+def refine_corners(
+    image: Float32Array,
+    corners: ImagePoints,
+    camera: Camera,
+    behind: Float32Array,
+    blur_px: float,
+    lag_blur_px: FloatArray | None = None,
+    columns: int = 6,
+    to_tails: FloatArray | None = None,
+) -> RefinedCorners:
+    """Corners of N markers, refined.
+
+    Parameters
+    ----------
+    image : (height, width) counts
+    corners : (N, 4) to within two pixels, or a third of a cell
+    behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
+    blur_px : standard deviation of optics and pixel
+    lag_blur_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
+    columns : of pixels, in a segment
+    to_tails : (N, 2, 3) maps of pixels to lag tails that are to be taken out; none when left out
+    """
+    lag_blur = np.zeros((len(corners.px), 2)) if lag_blur_px is None else lag_blur_px
+    found, moving = _pass(image, corners, camera, behind, blur_px, lag_blur, columns, to_tails)
+    which = np.arange(len(moving))
+    for _ in range(_PASSES - 1):
+        which = which[moving]
+        if len(which) == 0:
+            break
+        tails = None if to_tails is None else to_tails[which]
+        start = corners.only(which).moved(found.corners_px[which] - corners.px[which], camera)
+        again, moving = _pass(image, start, camera, behind[which], blur_px, lag_blur[which], columns, tails)
+        found = found.with_others(which, again)
+    return found
+
+
+def _pass(
+    image: Float32Array,
+    start: ImagePoints,
+    camera: Camera,
+    behind: Float32Array,
+    blur_px: float,
+    lag_blur: FloatArray,
+    columns: int,
+    to_tails: FloatArray | None,
+) -> tuple[RefinedCorners, BoolArray]:
+    """Where one linearised adjustment moves the corners, and for which markers (N,) that was not the last."""
+    cells = behind.shape[2]
+    half = half_width(math.hypot(blur_px, math.sqrt(float((lag_blur * lag_blur).sum(axis=1).max()))))
+    sides = sides_of(start.x, camera, image.shape, cells, columns, half)
+    blur = blurs(sides.normal[cells // 2], blur_px, lag_blur)
+    segments = measure(sides.counts(image, to_tails), model(sides, behind, blur), REACHED * blur[0])
+    shift, covariances, doubt = adjust(sides, segments, _PRIOR_PX, start)
+    good = segments.variance < HOPELESS
+    share = good / np.maximum(good.sum(axis=1), 1)[:, None]
+    contrast, noise = (segments.contrast * share).sum(axis=1), np.sqrt((segments.noise * share).sum(axis=1))
+    deviation = np.sqrt(covariances.diagonal(axis1=2, axis2=3))
+    moving: BoolArray = np.asarray((np.abs(shift) > np.clip(_UNSURE * deviation, *_SETTLED_PX)).any(axis=(1, 2)))
+    return RefinedCorners(start.px + shift, covariances, contrast, noise, doubt), moving
