@@ -221,26 +221,28 @@ class Late:
         %s
 
 sys.modules['late'] = Late()
-stopping.LEAVING_S = %s
+stopping.%s
 sys.exit(run.run(Stage))
 """
 PUBLISHES = """
         while self.context.ok():
             time.sleep(0.01)
         self.output.send(DiagnosticArray())"""
+LONG = 'LEAVING_S = 60.0'
 HOLDS_THE_INTERPRETER = "re.match('(a+)+$', 64 * 'a' + 'b')"
 
 
 @pytest.mark.parametrize(
-    ('at_work', 'while_destroyed', 'while_python_ends', 'patience_s', 'status'),
+    ('at_work', 'while_destroyed', 'while_python_ends', 'limit', 'status'),
     [
-        (PUBLISHES, 'pass', 'pass', 60, 0),
-        ('pass', 'pass', 'os.kill(os.getpid(), signal.SIGTERM)', 60, 0),
-        ('pass', HOLDS_THE_INTERPRETER, 'pass', 0.1, -signal.SIGALRM),
+        (PUBLISHES, 'pass', 'pass', LONG, 0),
+        ('pass', 'pass', 'os.kill(os.getpid(), signal.SIGTERM)', LONG, 0),
+        ('pass', HOLDS_THE_INTERPRETER, 'pass', 'LEAVING_CPU_S = 0.1', -signal.SIGPROF),
+        ('pass', 'time.sleep(60)', 'pass', 'LEAVING_S = 0.1', -signal.SIGALRM),
     ],
 )
-def test_a_node_ends_without_a_word(at_work, while_destroyed, while_python_ends, patience_s, status):
+def test_a_node_ends_without_a_word(at_work, while_destroyed, while_python_ends, limit, status):
     """Stopped in a callback that publishes, again while the interpreter ends, and with a library that never returns."""
-    program = ENDED % (at_work, while_destroyed, while_python_ends, patience_s)
+    program = ENDED % (at_work, while_destroyed, while_python_ends, limit)
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (status, 'saved\n', '')

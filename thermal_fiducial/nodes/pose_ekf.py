@@ -14,12 +14,12 @@ from thermal_fiducial.ros import convert, message_bytes, qos
 from thermal_fiducial.ros.filter_memory import FilterMemory
 from thermal_fiducial.ros.filter_outputs import FilterOutputs
 from thermal_fiducial.ros.filter_status import FilterStatus
-from thermal_fiducial.ros.node import StageNode, WARN
+from thermal_fiducial.ros.node import ERROR, StageNode, WARN
 from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.run import run
 
-#: Nobody flies on a pose that is older [s].
-_LATE_S = 0.1
+#: A pose that comes so late is too old to fly well on; autopilots take none that is older (VISO_DELAY_MS) [s].
+_LATE_S, _TOO_LATE_S = 0.1, 0.25
 
 
 class PoseEkfNode(StageNode[PoseEkfConfig]):
@@ -104,7 +104,8 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         level, words = self._status.state()
         if self._behind < _LATE_S:
             return level, words
-        return max(level, WARN), f'{words}; no time: IMU messages wait for {self._behind:.2g} s'
+        late = ERROR if self._behind > _TOO_LATE_S else WARN
+        return max(level, late), f'{words}; no time: IMU messages wait for {self._behind:.2g} s'
 
     def headline(self) -> str:
         """What the filter does, without numbers."""
