@@ -123,11 +123,6 @@ MECHANISMS = {
         ('ekf:PoseEkf._contradicting',),
         {'ekf:PoseEkf._contradicting': lambda *_: None},
     ),
-    'rest at the start': Mechanism(
-        ('slow and noisy',),
-        ('initialization:rest', 'update:PoseUpdater.align', 'update:PoseUpdater.settle'),
-        {'initialization:rest': lambda *_: None},
-    ),
 }
 
 

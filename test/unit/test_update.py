@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.estimates import any_estimate, difference, ELSEWHERE
+from support.estimates import any_estimate, ELSEWHERE
 from support.flights import CAMERA_POSITION, config
 
 from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, WHITE
@@ -162,20 +162,6 @@ def test_an_uncertain_time_offset_costs_what_the_acceleration_makes_of_it(estima
     innovation = updater.innovation(resting, pose, motion)
     expected = 0.75 * std**4 * np.repeat((turning**2, push**2), 3) + np.diag(pose.shape)
     np.testing.assert_allclose(np.diag(innovation.R), expected, rtol=1e-9)
-
-
-@pytest.mark.parametrize('place', [0, 1, 2, 12, 13, 14, 33, 34])
-def test_at_rest_the_force_shows_tilt_bias_and_gravity(estimate, place):
-    """Whichever of them alone is unknown is found from what it makes of the force."""
-    updater = PoseUpdater(FULL)
-    error = np.zeros(SIZE)
-    error[place] = 1e-3
-    truth = estimate.state.plus(error)
-    alone = np.zeros((SIZE, SIZE))
-    alone[place, place] = 1.0
-    found = updater.align(replace(estimate, covariance=alone), truth.bias[3:] - truth.gravity @ truth.R_map_body, 1e-3)
-    # second order of a tilt of 1e-3, under a prior of 1 against a noise of 1e-3
-    np.testing.assert_allclose(difference(estimate.state, found.state), error, atol=1e-5)
 
 
 def weighed(estimate, still, errors):

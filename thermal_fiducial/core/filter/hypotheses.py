@@ -149,7 +149,7 @@ class Hypotheses:
     ) -> Hypothesis | None:
         config = replace(self._config, time_offset_std=clock_std)
         measured = self._measured(pose, prior)
-        estimate = start(config, self._updater, measured, time_ns, prior, window)
+        estimate = start(config, measured, time_ns, prior, window)
         if estimate is None:
             return None
         return Hypothesis(Prediction.begin(estimate), time_ns, time_ns)

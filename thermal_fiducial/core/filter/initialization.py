@@ -1,10 +1,10 @@
-"""The state at a first pose: the pose itself, gravity and gyroscope bias from stillness, the rest wide open.
+"""The state at a first pose: the pose itself, all else wide open.
 
-Nothing else is needed in motion: the pose error is linear in the error coordinates, thus the next two or three
-poses settle velocity and tilt whatever they were.
+Nothing else is needed: the pose error is linear in the error coordinates, thus the next two or three poses settle
+velocity and tilt whatever they were.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 import math
 
 import numpy as np
@@ -28,42 +28,23 @@ from thermal_fiducial.core.filter.state import (
     TIME_OFFSET,
     VELOCITY,
 )
-from thermal_fiducial.core.filter.update import PoseUpdater, slide
+from thermal_fiducial.core.filter.update import slide
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 
 #: Seconds of samples that stillness is judged on, and the fewest of them.
 WINDOW_SECONDS, FEWEST_SAMPLES = 0.5, 20
-#: At rest the samples scatter less than this [rad/s, m/s^2] ...
-STILL_RATE_STD, STILL_FORCE_STD = 0.02, 0.3
-#: ... and their mean is a plausible gyroscope bias [rad/s] and gravity with accelerometer bias [m/s^2].
-STILL_RATE, STILL_FORCE = 0.1, 0.6
+#: At rest the samples scatter less than this, and their mean rate is a plausible gyroscope bias [rad/s, m/s^2].
+STILL_RATE_STD, STILL_FORCE_STD, STILL_RATE = 0.02, 0.3, 0.1
 #: At rest no accelerometer is off gravity by so much [m/s^2], nor by such a share of it over a window of a flight: its
 #: units are others.
 NO_GRAVITY, HARDLY_GRAVITY = 2.0, 0.5
-#: What the mean of such a window is worth: a drone on its legs or in a hand still moves a little [rad/s, m/s^2].
-RATE_STD, FORCE_STD = 0.005, 0.05
 #: A first pose whose vertical is further than this [rad] from the specific force is of the wrong planar branch.
 LARGEST_TILT = math.radians(35.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Rest:
-    """Mean rate (3,) [rad/s] and specific force (3,) [m/s^2] of a robot at rest."""
-
-    rate: FloatArray
-    force: FloatArray
-
-
-def rest(imu: FloatArray, gravity: float) -> Rest | None:
-    """What an IMU window (N, 6) says if the robot stood still in it."""
-    mean = imu.mean(axis=0)
-    level = abs(np.linalg.norm(mean[3:]) - gravity) < STILL_FORCE
-    return Rest(mean[:3], mean[3:]) if level and _quiet(imu) else None
-
-
 def _quiet(imu: FloatArray) -> bool:
-    """Whether samples (N, 6) hardly scatter, about hardly any rate."""
+    """Whether samples (N, 6) are those of a robot at rest: they hardly scatter, about hardly any rate."""
     if len(imu) < FEWEST_SAMPLES:
         return False
     std = imu.std(axis=0)
@@ -87,7 +68,7 @@ def blank_state(config: PoseEkfConfig) -> NavigationState:
 
 
 def start(
-    config: PoseEkfConfig, updater: PoseUpdater, pose: BodyPose, stamp_ns: int, prior: NavigationState, imu: FloatArray
+    config: PoseEkfConfig, pose: BodyPose, stamp_ns: int, prior: NavigationState, imu: FloatArray
 ) -> Estimate | None:
     """Estimate at a first pose, or None where the pose contradicts gravity, or there is none in what the IMU measures.
 
@@ -97,26 +78,8 @@ def start(
     prior : biases, gravity and offsets to begin with
     imu : (N, 6) samples up to the pose's instant, the last one at that instant
     """
-    up = pose.T_map_body[2, :3]
-    force = imu.mean(axis=0)[3:]
-    if up @ force < math.cos(LARGEST_TILT) * np.linalg.norm(force):
+    if _contradicts_gravity(pose, imu, config.gravity):
         return None
-    off = abs(float(np.linalg.norm(force)) - config.gravity)
-    if off > (NO_GRAVITY if _quiet(imu) else HARDLY_GRAVITY * config.gravity):
-        return None
-    estimate = _unaligned(config, pose, stamp_ns, prior, imu[-1])
-    still = rest(imu, config.gravity)
-    if still:
-        # A slow flight may be as quiet: the larger the mean rate, the rather it is one, and the less it says.
-        doubt = max(float(np.linalg.norm(still.rate)) / RATE_STD, 1.0)
-        estimate = updater.align(estimate, still.force, doubt * FORCE_STD)
-        estimate = updater.settle(estimate, still.rate, doubt * RATE_STD)
-    return estimate
-
-
-def _unaligned(
-    config: PoseEkfConfig, pose: BodyPose, stamp_ns: int, prior: NavigationState, imu: FloatArray
-) -> Estimate:
     noise = PoseNoise.of(config.stamp_jitter, pose)
     systematic = config.systematic_pose_std
     P = np.diag(_initial_variances(config))
@@ -132,8 +95,17 @@ def _unaligned(
         systematic=np.zeros(6),
     )
     if config.estimate_time_offset:
-        P += _of_unknown_clock(config, state, imu)
+        P += _of_unknown_clock(config, state, imu[-1])
     return Estimate(stamp_ns, state, P, pose_noise=noise)
+
+
+def _contradicts_gravity(pose: BodyPose, imu: FloatArray, gravity: float) -> bool:
+    """Whether no robot under ``gravity`` [m/s^2] has this attitude, or measures samples (N, 6) like these."""
+    up, force = pose.T_map_body[2, :3], imu.mean(axis=0)[3:]
+    size = float(np.linalg.norm(force))
+    if up @ force < math.cos(LARGEST_TILT) * size:
+        return True
+    return abs(size - gravity) > (NO_GRAVITY if _quiet(imu) else HARDLY_GRAVITY * gravity)
 
 
 def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatArray) -> FloatArray:

@@ -10,12 +10,9 @@ from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
 from thermal_fiducial.core.filter.pose_noise import BodyPose
 from thermal_fiducial.core.filter.rotation_integrals import rotation_integrals
 from thermal_fiducial.core.filter.state import (
-    ACCELEROMETER_BIAS,
     CORE,
     Estimate,
     EXTRINSICS,
-    GRAVITY,
-    GYROSCOPE_BIAS,
     NavigationState,
     POSE,
     POSITION,
@@ -195,28 +192,6 @@ class PoseUpdater:
         covariance[TIME_OFFSET], covariance[:, TIME_OFFSET] = 0.0, 0.0
         covariance[TIME_OFFSET, TIME_OFFSET] = (2.0 * self.config.time_offset_std) ** 2
         return replace(estimate, covariance=covariance)
-
-    def align(self, estimate: Estimate, force: FloatArray, std: float) -> Estimate:
-        """Estimate corrected by the specific force (3,) of a robot at rest, known to ``std`` [m/s^2]."""
-        state = estimate.state
-        expected = -state.gravity @ state.R_map_body
-        H = np.zeros((3, SIZE))
-        H[:, ROTATION] = skew(expected)
-        H[:, ACCELEROMETER_BIAS] = np.eye(3)
-        H[:, GRAVITY] = -state.R_map_body[:2].T
-        return self._at_rest(estimate, force - state.bias[3:] - expected, H, std)
-
-    def settle(self, estimate: Estimate, rate: FloatArray, std: float) -> Estimate:
-        """Estimate corrected by the angular rate (3,) of a robot at rest, known to ``std`` [rad/s]."""
-        H = np.zeros((3, SIZE))
-        H[:, GYROSCOPE_BIAS] = np.eye(3)
-        return self._at_rest(estimate, rate - estimate.state.bias[:3], H, std)
-
-    def _at_rest(self, estimate: Estimate, innovation: FloatArray, H: FloatArray, std: float) -> Estimate:
-        # The algebra is of six rows: three more that measure nothing.
-        H_six, R = np.vstack((H, np.zeros_like(H))), np.eye(6) * std**2
-        error, covariance = self._gained(estimate.covariance, np.append(innovation, np.zeros(3)), H_six, R)
-        return replace(estimate, state=estimate.state.plus(error), covariance=covariance)
 
 
 def _with_new_view(estimate: Estimate, alike: float) -> Estimate:
