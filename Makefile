@@ -24,8 +24,9 @@ export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 # Dozens of processes start in the tests and nodes in a replay: without byte code each would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
-# A notice of the theme about its successor.
+# A notice of the theme about its successor, and ten lines of setuptools about what an editable installation is.
 export NO_MKDOCS_2_WARNING := 1
+QUIET_PIP := PYTHONWARNINGS='ignore:Editable installation'
 
 .PHONY: help demo test lint nightly coverage bench faults soak restart fuzz latency tables structure docs format clean
 
@@ -37,7 +38,7 @@ $(READY): setup.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or 3.12 is needed: make PYTHON=python3.12")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip 'setuptools<80' wheel
-	$(BIN)/python -m pip install --progress-bar on --quiet --editable '.[ros,tools,batch,test,lint,colcon]'
+	$(QUIET_PIP) $(BIN)/python -m pip install --progress-bar on --quiet --editable '.[ros,tools,batch,test,lint,colcon]'
 	@touch $@
 
 demo: $(READY)
@@ -94,7 +95,7 @@ tables: $(READY)
 	$(BIN)/python test/documents.py
 
 $(DOCS): setup.py $(READY)
-	$(BIN)/python -m pip install --quiet --editable '.[docs]'
+	$(QUIET_PIP) $(BIN)/python -m pip install --quiet --editable '.[docs]'
 	@touch $@
 
 structure: $(READY)
