@@ -20,12 +20,11 @@ from thermal_fiducial.core.detection.corner_errors import (
     OF_LOCAL_PX,
 )
 from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
-from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind, edges_behind_border, model, sides_of
+from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind_border, model, sides_of
 from thermal_fiducial.core.detection.frame import Frame, markers_deblurred
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.refining import refined, RefinedCorners, RefinedMarkers, sides_px
-from thermal_fiducial.core.detection.tracking import MotionTrack
+from thermal_fiducial.core.detection.refining import RefinedCorners, RefinedMarkers, sides_px
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
@@ -119,20 +118,14 @@ class CornerEstimator:
 
     def __init__(self, decoder: Decoder, bits: Gray) -> None:
         self._decoder = decoder
-        self._behind = edges_behind(bits)
         self._displayed = DisplayedSides(bits)
 
-    def estimate(
-        self,
-        frame: Frame,
-        found: FoundMarkers,
-        track: MotionTrack,
-        config: ArucoDetectorConfig,
+    def published(
+        self, frame: Frame, found: FoundMarkers, markers: RefinedMarkers, config: ArucoDetectorConfig
     ) -> RefinedMarkers:
-        """Those of the markers ``found`` that their refined corners confirm."""
+        """Those of the markers ``found`` that their refined corners confirm, with these as they are published."""
         if len(found.ids) == 0:
-            return RefinedMarkers.none(frame)
-        markers = refined(frame, found, self._behind[found.ids], track, config)
+            return markers
         keep = self._confirmed(frame, found, markers, config)
         if frame.displayed and not keep.all():
             markers, small = with_corners_by_pattern(frame, found, markers, ~keep, self._decoder, config)

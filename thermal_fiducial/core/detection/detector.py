@@ -8,12 +8,13 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.detection.corner_estimates import CornerEstimator
+from thermal_fiducial.core.detection.corners.sides import edges_behind
 from thermal_fiducial.core.detection.finding import Findings, FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import among, depths, ExpectedMarkers, KnownMarkers
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
-from thermal_fiducial.core.detection.refining import RefinedCorners, RefinedMarkers
+from thermal_fiducial.core.detection.refining import refine, RefinedCorners, RefinedMarkers
 from thermal_fiducial.core.detection.tracking import FramePrediction, MotionTrack, predict_frame
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -58,6 +59,7 @@ class MarkerDetector:
         self._count = decoder.count
         self._sizes = config.marker_size, size_overrides(config.marker_size_overrides)
         self._finder = MarkerFinder(decoder)
+        self._behind = edges_behind(bits)
         self._estimator = CornerEstimator(decoder, bits)
         self._partial = PartialMarkerSearch(decoder, bits)
         self._known = KnownMarkers({}, *self._sizes)
@@ -101,7 +103,9 @@ class MarkerDetector:
             if prediction.T_camera_map is not None and len(known.ids) and config.guided:
                 expected = known.expected(prediction.T_camera_map, camera, config.min_side_px)
             findings = self._finder.find(frame, history, known, expected, config)
-            refined = self._estimator.estimate(frame, findings.found, history.track, config)
+            found = findings.found
+            refined = refine(frame, found, self._behind[found.ids], history.track, config)
+            refined = self._estimator.published(frame, found, refined, config)
             ids, corners = refined.ids, refined.corners
             at = refined.places.at.at_pixels(corners.corners_px)
             poses = self._poses(ids, corners, at, prediction.T_camera_map)

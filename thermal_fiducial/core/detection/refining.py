@@ -114,7 +114,7 @@ class RefinedMarkers(Stacked):
         return RefinedMarkers(found.ids, corners, blur, corners, found.places, frame.twist)
 
 
-def refined(
+def refine(
     frame: Frame, found: FoundMarkers, behind: Float32Array, track: MotionTrack, config: ArucoDetectorConfig
 ) -> RefinedMarkers:
     """Corners of N markers.
@@ -124,6 +124,8 @@ def refined(
     behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
     track : the frames before, which with the corners give the twist
     """
+    if len(found.ids) == 0:
+        return RefinedMarkers.none(frame)
     columns, hardly = _OF_CLEAR if np.abs(found.cnr).min() > CLEAR_CNR else _OF_FAINT
     twist, places = frame.twist, found.places
     for _ in range(_ROUNDS):

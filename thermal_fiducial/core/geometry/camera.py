@@ -97,7 +97,7 @@ class Camera:
 
     def distort(self, normalised: npt.ArrayLike) -> FloatArray:
         """Pixels (..., 2) of normalised image coordinates x/z, y/z (..., 2)."""
-        return self.distort_linearised(normalised)[0]
+        return self._image(_on_plane(np.asarray(normalised, dtype=np.float64)), self.D)[0]
 
     def distort_linearised(self, normalised: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """:meth:`distort`, and its derivative (..., 2, 2) [px]."""

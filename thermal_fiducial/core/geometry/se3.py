@@ -45,51 +45,38 @@ def so3_exp(phi: npt.ArrayLike) -> FloatArray:
     """Rotation matrix (..., 3, 3) of rotation vectors (..., 3) [rad]."""
     phi = np.asarray(phi, dtype=np.float64)
     if phi.ndim == 1:
-        return _exp_of_one(phi)
+        # A single vector is many times faster without arrays.
+        x, y, z = phi.tolist()
+        half = max(0.5 * math.sqrt(x * x + y * y + z * z), TINY)
+        s = math.sin(half) / half
+        a, b = s * math.cos(half), 0.5 * s * s
+        return np.array(
+            [
+                [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+                [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
+                [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
+            ]
+        )
     # sin(h) / h is 1 to the last digit at the smallest half angle that is divided by.
-    half = np.maximum(0.5 * np.sqrt(np.sum(phi * phi, axis=-1)), TINY)[..., None, None]
-    s = np.sin(half) / half
-    K = skew(phi)
-    return np.asarray(np.eye(3) + (s * np.cos(half)) * K + (0.5 * s * s) * (K @ K))
-
-
-def _exp_of_one(phi: FloatArray) -> FloatArray:
-    """The same for a single vector (3,): many times faster without arrays."""
-    x, y, z = phi.tolist()
-    half = max(0.5 * math.sqrt(x * x + y * y + z * z), TINY)
-    s = math.sin(half) / half
-    a, b = s * math.cos(half), 0.5 * s * s
-    return np.array(
-        [
-            [1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
-            [b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x],
-            [b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)],
-        ]
-    )
+    half_angle = np.maximum(0.5 * np.sqrt(np.sum(phi * phi, axis=-1)), TINY)[..., None, None]
+    sines = np.sin(half_angle) / half_angle
+    K = (phi @ SKEW).reshape(*phi.shape, 3)
+    return np.asarray(np.eye(3) + (sines * np.cos(half_angle)) * K + (0.5 * sines * sines) * (K @ K))
 
 
 def so3_log(R: npt.ArrayLike) -> FloatArray:
     """Rotation vector (..., 3) [rad] of rotation matrices (..., 3, 3), its norm at most pi."""
-    R = np.asarray(R, dtype=float)
-    if R.ndim == 2:
-        return _log_of_one(R)
     q = quaternion_from_rotation(R)
+    if q.ndim == 1:
+        # A single matrix is many times faster without arrays.
+        x, y, z, w = q.tolist()
+        length = math.sqrt(x * x + y * y + z * z)
+        factor = 2.0 if length < TINY else 2.0 * math.atan2(length, w) / length
+        return np.array((factor * x, factor * y, factor * z))
     w, v = q[..., 3], q[..., :3]
-    flip = np.where(w < 0.0, -1.0, 1.0)
-    w, v = w * flip, v * flip[..., None]
     norm = np.linalg.norm(v, axis=-1)
-    angle = 2.0 * np.arctan2(norm, w)
-    safe = np.where(norm < TINY, 1.0, norm)
-    scale = np.where(norm < TINY, 2.0 / np.where(norm < TINY, w, 1.0), angle / safe)
+    scale = np.where(norm < TINY, 2.0, 2.0 * np.arctan2(norm, w) / np.maximum(norm, TINY))
     return np.asarray(scale[..., None] * v)
-
-
-def _log_of_one(R: FloatArray) -> FloatArray:
-    """The same for a single matrix (3, 3): many times faster without arrays."""
-    x, y, z, w = _quaternion_of_one(R).tolist()
-    norm = math.sqrt(x * x + y * y + z * z)
-    scale = 2.0 if norm < TINY else 2.0 * math.atan2(norm, w) / norm
-    return np.array((scale * x, scale * y, scale * z))
 
 
 def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
@@ -144,20 +131,16 @@ def quaternion_from_rotation(R: npt.ArrayLike) -> FloatArray:
     """
     R = np.asarray(R, dtype=np.float64)
     if R.ndim == 2:
-        return _quaternion_of_one(R)
+        # A single matrix is many times faster without arrays.
+        listed = _quaternion_products(R.tolist())
+        x, y, z, w = listed[max(range(4), key=lambda k: listed[k][k])]
+        scale = (-1.0 if w < 0.0 else 1.0) / math.sqrt(x * x + y * y + z * z + w * w)
+        return np.array([x * scale, y * scale, z * scale, w * scale])
     flat = R.reshape(*R.shape[:-2], 9)
     products = (flat @ _PRODUCTS_OF_ENTRIES).reshape(*R.shape[:-2], 4, 4) + np.eye(4)
     largest = np.einsum('...ii->...i', products).argmax(axis=-1)
     q = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
     return np.asarray(q * np.copysign(1.0 / np.sqrt(np.sum(q * q, axis=-1)), q[..., 3])[..., None])
-
-
-def _quaternion_of_one(R: FloatArray) -> FloatArray:
-    """The same for a single matrix (3, 3): many times faster without arrays."""
-    products = _quaternion_products(R.tolist())
-    x, y, z, w = products[max(range(4), key=lambda k: products[k][k])]
-    scale = (-1.0 if w < 0.0 else 1.0) / math.sqrt(x * x + y * y + z * z + w * w)
-    return np.array([x * scale, y * scale, z * scale, w * scale])
 
 
 def _quaternion_products(R: list[list[float]]) -> tuple[tuple[float, ...], ...]:
