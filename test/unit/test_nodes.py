@@ -463,6 +463,22 @@ def test_a_filter_that_has_no_time_for_its_imu_says_by_how_much_its_pose_is_late
     assert 'no time' not in node.state()[1]
 
 
+def test_a_queue_of_imu_messages_is_taken_in_at_once_with_one_pose_at_the_newest(graph):
+    node = graph.add(PoseEkfNode, live=True)
+    driver = graph.tester.advertise(Imu, 'imu/data')
+    graph.spin_until(lambda: driver.listeners and graph.input(node, 'imu/data').publishers)
+    for k in range(40):
+        driver.send(imu(k))
+    time.sleep(0.1)
+    node.diagnose(0)
+    graph.spin_until(lambda: graph.input(node, 'imu/data').count == 40)
+    # All but the one that was looked at, whose turn shows how late they are.
+    assert node.figures()['IMU messages without a pose'] == 39
+    driver.send(imu(40))
+    graph.spin_until(lambda: graph.input(node, 'imu/data').count == 41)
+    assert node.figures()['IMU messages without a pose'] == 39
+
+
 def test_stamps_that_go_back_are_said_and_survived(graph):
     node = graph.add(PoseEkfNode)
     fly(graph, [imu(10), imu(11), imu(9)])

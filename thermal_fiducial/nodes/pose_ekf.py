@@ -18,6 +18,8 @@ from thermal_fiducial.ros.node import ERROR, StageNode, WARN
 from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.run import run
 
+#: IMU messages that have waited so long are a queue: they are taken in together, with one pose at the newest [s].
+_QUEUE_S = 0.03
 #: A pose that comes so late is too old to fly well on; autopilots take none that is older (VISO_DELAY_MS) [s].
 _LATE_S, _TOO_LATE_S = 0.1, 0.25
 
@@ -34,7 +36,12 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._status = FilterStatus(self.filter, self.console)
         self._corrections = MapCorrections(self.config.max_delay)
         self._imu = self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT, raw=True)
+        #: for how long [s] the latest IMU message that was looked at has waited; the longest since the diagnostics
+        self._waited = self._longest = 0.0
+        #: and the longest before these
         self._behind = 0.0
+        #: IMU messages without a pose of their own
+        self._without_pose = 0
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT, raw=True)
         self.subscribe_lazily(PoseWithCovarianceStamped, 'camera_pose/map_error', self._on_map_error, qos.RESULT)
         self.subscribe(TransformStamped, 'map_correction', self._on_map_correction, qos.RESULT)
@@ -53,6 +60,8 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.filter.reset('the camera is elsewhere on the robot')
 
     def _on_imu(self, message: bytes) -> None:
+        if self._waited > _QUEUE_S:
+            message = self._newest(message)
         self._frames.note_imu_frame(message_bytes.frame_id(message))
         sample = message_bytes.imu_sample(message)
         odometry = self.filter.add_imu(sample)
@@ -61,8 +70,21 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
             lost, jumps = self.filter.lost, self._status.jumps
             self._outputs.send(odometry, self.filter.smooth, lost=lost, jumps=jumps)
 
+    def _newest(self, message: bytes) -> bytes:
+        """The newest IMU message that waits. Poses at those before it would be old, and make the next ones late."""
+        for later in self._imu.waiting(qos.IMU_INPUT.depth):
+            self.guard(self._keep, message)
+            message = later
+        self._waited = 0.0
+        return message
+
+    def _keep(self, message: bytes) -> None:
+        self._without_pose += self.filter.keep_imu(message_bytes.imu_sample(message))
+
     def _on_camera_pose(self, message: bytes) -> None:
         self.take_waiting()
+        if self.live:
+            self._look_behind()
         pose = self._corrections.in_present_map(message_bytes.camera_pose(message))
         update = self._memory.refusal(self.filter, pose) or self.filter.add_pose(pose)
         self._status.after_pose(update)
@@ -87,6 +109,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         """Publish the diagnostics and, while someone listens, the path."""
         if self.live:
             self._look_behind()
+        self._behind, self._longest = self._longest, 0.0
         super().diagnose(stamp_ns)
         self._outputs.send_path()
         self._memory.save(self.filter, self._outputs.stamp_ns)
@@ -94,9 +117,9 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
     def _look_behind(self) -> None:
         """How long the next IMU message has waited, which is by how much the pose is late."""
         oldest = self._imu.take()
-        self._behind = 0.0
         if oldest is not None:
-            message, self._behind = oldest
+            message, self._waited = oldest
+            self._longest = max(self._longest, self._waited)
             self.guard(self._on_imu, message)
 
     def state(self) -> tuple[bytes, str]:
@@ -114,7 +137,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
 
     def figures(self) -> dict[str, object]:
         """The filter in numbers."""
-        return self._status.figures()
+        return self._status.figures() | {'IMU messages without a pose': self._without_pose}
 
 
 def main() -> int:

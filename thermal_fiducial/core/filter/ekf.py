@@ -81,26 +81,34 @@ class PoseEkf:
         State at the sample's stamp; None before the filter is initialised and for a sample that it can't use
         (``status`` says why).
         """
+        if not self.keep_imu(sample):
+            return None
+        self._take_in()
+        output = self._output(self._history.imu.imu[-1])
+        self.smooth = self._smoother.follow(output) if self._smoother and output else None
+        return output
+
+    def keep_imu(self, sample: ImuSample) -> bool:
+        """Keep an IMU sample without a look at the state there: the next :meth:`add_imu` goes on over all of them.
+
+        Returns
+        -------
+        Whether the sample can be used (``status`` says why not).
+        """
         verdict = self._input.judge(sample)
         if verdict is Verdict.RESTART:
             self._begin_after_jump()
         self._imu_fault = verdict.value
         if verdict not in (Verdict.USE, Verdict.RESTART):
             self._imu_refused += 1
-            return None
+            return False
         if self._input.jump_ns:
             self._camera_clock.imu_jumped(self._input.jump_ns)
-        imu = np.concatenate((sample.angular_velocity, sample.linear_acceleration))
-        buffer = self._history.imu
-        if not buffer:
-            self._history.append(sample.stamp_ns, imu, np.zeros(6))
-            return None
-        seconds = (sample.stamp_ns - buffer.newest_ns) / SECOND_NS
-        self._history.append(sample.stamp_ns, imu, self._noise.densities(imu, seconds))
-        self._take_in()
-        output = self._output(imu)
-        self.smooth = self._smoother.follow(output) if self._smoother and output else None
-        return output
+        imu, buffer = np.concatenate((sample.angular_velocity, sample.linear_acceleration)), self._history.imu
+        seconds = (sample.stamp_ns - buffer.newest_ns) / SECOND_NS if buffer else 0.0
+        densities = self._noise.densities(imu, seconds) if buffer else np.zeros(6)
+        self._history.append(sample.stamp_ns, imu, densities)
+        return True
 
     def add_pose(self, pose: CameraPose) -> PoseUpdate:
         """Correct by a camera pose at its own instant, now or as soon as the IMU samples of that instant are there.
