@@ -179,8 +179,10 @@ sys.exit(run(Stopped))
     [('-m', True), ('/opt/rig/lib/thermal_fiducial/pose_ekf', True), ('thermal-fiducial', False), ('', False)],
 )
 def test_a_node_stopped_while_it_imports_says_nothing_and_commands_are_left_alone(executable, quiet):
+    # Where the tests run in the background of a shell, SIGINT is ignored from the start.
     program = (
-        f'import os, signal, sys\nsys.argv = [{executable!r}]\nimport thermal_fiducial.nodes\n'
+        'import os, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n'
+        f'sys.argv = [{executable!r}]\nimport thermal_fiducial.nodes\n'
         'os.kill(os.getpid(), signal.SIGINT)'
     )
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
