@@ -134,6 +134,7 @@ def test_coasting_beside_its_bound(benchmark, write_table):
     """No filter can be better than the white noise of the IMU, nor than one that knows all densities."""
     benchmark.pedantic(coasted, args=(100,), rounds=1)
     rows = [['no markers for', 'goal', 'error (95 %)', 'inside 3 sigma', 'best possible', 'white noise alone']]
+    shares, covered = [], []
     for words, imu in ('', COASTING_IMU), (', no scale errors', CALIBRATED_IMU):
         flights = [coasted(seed, imu) for seed in range(100, 160)]
         distances, squares = (np.array(values) for values in zip(*flights, strict=True))
@@ -144,7 +145,9 @@ def test_coasting_beside_its_bound(benchmark, write_table):
             centimetres = [f'{100 * value[i]:.1f} cm' for value in (reached, best, noise)]
             share = f'{100 * inside[i]:.0f} %'
             rows.append([f'{gap:.0f} s{words}', GOALS[i], centimetres[0], share, *centimetres[1:]])
-        # the 95th percentile of 60 flights scatters by a tenth
-        assert np.all(reached < 1.25 * best)
-        assert np.all(inside >= 0.95)
+        shares.append(reached / best)
+        covered.append(inside)
     write_table('coasting', rows)
+    # the 95th percentile of 60 flights scatters by a tenth
+    assert np.max(shares) < 1.25
+    assert np.min(covered) >= 0.95
