@@ -268,7 +268,7 @@ def second_flight() -> Figures:
 
 
 def two_sheets() -> Figures:
-    """One of eight markers that are being mapped hangs twice, its two sheets seen in turn; or is moved half-way."""
+    """One of eight markers that are being mapped is there twice, its two sheets seen in turn; or is moved half-way."""
     named, others = 0, []
     for seed in range(4):
         rng = np.random.default_rng(seed)

@@ -107,10 +107,8 @@ def camera_pose(message: bytes) -> CameraPose:
         As :func:`thermal_fiducial.ros.convert.camera_pose`, or an encoding that is not known.
     """
     what = 'camera_pose'
-    stamp, numbers = stamp_ns(message, what), _numbers(message, 1, _POSE, what).astype(np.float64)
-    T_map_camera = convert.transform_of_values(numbers[:7], what)
-    covariance = checked_covariance(numbers[7:].reshape(6, 6), f'{what} with a covariance')
-    return CameraPose(stamp, T_map_camera, covariance)
+    stamp, T_map_camera, covariance = _pose(message, what)
+    return CameraPose(stamp, T_map_camera, checked_covariance(covariance, f'{what} with a covariance'))
 
 
 def map_error(message: bytes) -> CameraPose:
@@ -122,9 +120,8 @@ def map_error(message: bytes) -> CameraPose:
         As :func:`camera_pose`.
     """
     what = 'camera_pose/map_error'
-    stamp, numbers = stamp_ns(message, what), _numbers(message, 1, _POSE, what).astype(np.float64)
-    T_map_camera = convert.transform_of_values(numbers[:7], what)
-    covariance = checked_covariance(with_variance_everywhere(numbers[7:].reshape(6, 6)), f'{what} with a covariance')
+    stamp, T_map_camera, of_map = _pose(message, what)
+    covariance = checked_covariance(with_variance_everywhere(of_map), f'{what} with a covariance')
     return CameraPose(stamp, T_map_camera, covariance)
 
 
@@ -159,6 +156,12 @@ def frame_id(message: bytes) -> str:
         return message[begin : begin + length].rstrip(b'\x00').decode()
     except (struct.error, UnicodeDecodeError):
         raise InputError('message with a frame_id that cannot be read') from None
+
+
+def _pose(message: bytes, what: str) -> tuple[int, FloatArray, FloatArray]:
+    """Stamp [ns], pose (4, 4) and covariance (6, 6), not checked, of a geometry_msgs/PoseWithCovarianceStamped."""
+    stamp, numbers = stamp_ns(message, what), _numbers(message, 1, _POSE, what).astype(np.float64)
+    return stamp, convert.transform_of_values(numbers[:7], what), numbers[7:].reshape(6, 6)
 
 
 def _numbers(message: bytes, names: int, count: int, what: str) -> FloatArray:

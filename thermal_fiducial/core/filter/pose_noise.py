@@ -4,8 +4,7 @@ A part of the error is white; another is systematic: errors of lens and corners 
 another once the camera has turned to other parts of the image or sees other markers. How large that is, the mapper has
 learned from the residuals of the corners, and has put it into the covariance.
 
-Sources: R. Mehra, "Approaches to Adaptive Filtering", IEEE TAC 1972; R. Shumway, D. Stoffer, "An Approach to Time
-Series Smoothing and Forecasting Using the EM Algorithm", 1982.
+Source: R. Mehra, "Approaches to Adaptive Filtering", IEEE TAC 1972.
 """
 
 from dataclasses import dataclass, field, replace
