@@ -16,6 +16,7 @@ import pytest
 from rclpy.context import Context
 from sensor_msgs.msg import Imu
 from support.flights import CAMERA_ORIENTATION, CAMERA_POSITION, Flight, Motion, START_NS, timeline
+from support.messages import pose_with_covariance
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.measurements import ImuSample
@@ -54,7 +55,7 @@ def flight():
 def message(item, start_ns):
     head = convert.header(item.stamp_ns - START_NS + start_ns, 'base_link')
     if not isinstance(item, ImuSample):
-        return convert.pose_with_covariance(item.T_map_camera, item.covariance, head)
+        return pose_with_covariance(item.T_map_camera, item.covariance, head)
     return Imu(
         header=head,
         angular_velocity=convert.vector(item.angular_velocity),

@@ -31,10 +31,18 @@ def imu(k, rate=(0.0, 0.0, 0.0), force=(0.0, 0.0, 9.80665)):
     return message
 
 
+def pose_with_covariance(T, covariance, head):
+    """A camera pose, field by field: what the mapper writes as bytes."""
+    message = PoseWithCovarianceStamped(header=head)
+    message.pose.pose = convert.pose(T)
+    message.pose.covariance[:] = covariance.ravel()
+    return message
+
+
 def pose(k, T=None):
     head = convert.header(START + k * IMU_NS, 'map')
     T_map_camera = small_bag.T_BODY_CAMERA if T is None else T
-    return convert.pose_with_covariance(T_map_camera, np.diag([1e-6] * 3 + [1e-7] * 3), head)
+    return pose_with_covariance(T_map_camera, np.diag([1e-6] * 3 + [1e-7] * 3), head)
 
 
 def odometry(state, frame_id='map', child_frame_id='base_link'):

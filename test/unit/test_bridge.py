@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 from support import small_bag
+from support.messages import pose_with_covariance
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.geometry.se3 import rotation_from_quaternion, so3_exp, transform
@@ -92,7 +93,7 @@ def fly(graph, samples, poses_until=10**9, step=0.0):
             head = convert.header(START + (k - 4) * 5_000_000, 'map')
             T_map_camera = transform(np.eye(3), [step, 0.0, 0.0]) @ small_bag.T_BODY_CAMERA
             covariance = np.diag([1e-6] * 3 + [1e-7] * 3)
-            graph.send('camera_pose', convert.pose_with_covariance(T_map_camera, covariance, head))
+            graph.send('camera_pose', pose_with_covariance(T_map_camera, covariance, head))
 
 
 @pytest.mark.parametrize(('rate', 'expected'), [(30.0, 12), (50.0, 20), (1000.0, 80), (0.0, 0)])

@@ -262,7 +262,9 @@ def test_poses_and_odometry_come_back():
     A, B = rng.normal(size=(2, 6, 6))
     odometry = Odometry(STAMP, random_pose(rng), rng.normal(size=3), rng.normal(size=3), A @ A.T, B @ B.T)
     (taken,) = message_bytes.odometry([serialize_message(messages.odometry(odometry))])
-    pose = convert.camera_pose(sent(convert.pose_with_covariance(odometry.T_map_body, A @ A.T, HEAD)))
+    pose = message_bytes.camera_pose(
+        serialize_message(messages.pose_with_covariance(odometry.T_map_body, A @ A.T, HEAD))
+    )
     # A quaternion in between: the last digits of the rotation may differ.
     np.testing.assert_allclose(taken.T_map_body, odometry.T_map_body, atol=1e-15)
     np.testing.assert_allclose(pose.T_map_camera, odometry.T_map_body, atol=1e-15)
@@ -283,13 +285,13 @@ def test_a_pose_that_is_none_is_refused(pose):
     message = PoseWithCovarianceStamped()
     message.pose.pose = pose
     with pytest.raises(InputError, match='unit quaternion'):
-        convert.camera_pose(message)
+        message_bytes.camera_pose(serialize_message(message))
 
 
 def test_a_covariance_that_is_not_finite_is_refused():
-    message = convert.pose_with_covariance(np.eye(4), np.full((6, 6), np.inf), HEAD)
+    message = messages.pose_with_covariance(np.eye(4), np.full((6, 6), np.inf), HEAD)
     with pytest.raises(InputError, match='covariance'):
-        convert.camera_pose(message)
+        message_bytes.camera_pose(serialize_message(message))
 
 
 def test_an_imu_message():

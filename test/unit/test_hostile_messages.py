@@ -11,7 +11,7 @@ import pytest
 from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2, TimeReference
 from std_srvs.srv import Trigger
 from support import small_bag
-from support.messages import FRAME_NS, frames, imu, IMU_NS, info, odometry, pose, START
+from support.messages import FRAME_NS, frames, imu, IMU_NS, info, odometry, pose, pose_with_covariance, START
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.config import ArucoDetectorConfig
@@ -45,7 +45,7 @@ def at(stamp_ns, frame_id='map'):
 
 
 def camera_pose(T=EYE, covariance=GOOD):
-    return convert.pose_with_covariance(T, covariance, at(START + IMU_NS))
+    return pose_with_covariance(T, covariance, at(START + IMU_NS))
 
 
 def moved(distance):

@@ -3,6 +3,7 @@
 from geometry_msgs.msg import PoseStamped
 import numpy as np
 import pytest
+from support.messages import pose_with_covariance
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, so3_exp, transform
@@ -61,7 +62,7 @@ def markers(*ids, stamp=STAMP):
 
 def camera_pose(stamp=STAMP):
     head = convert.header(stamp, 'map')
-    return convert.pose_with_covariance(T_MAP_BODY @ T_BODY_CAMERA, np.diag([1e-6] * 6), head)
+    return pose_with_covariance(T_MAP_BODY @ T_BODY_CAMERA, np.diag([1e-6] * 6), head)
 
 
 def mavros_ned(message):

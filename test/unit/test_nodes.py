@@ -290,7 +290,7 @@ def test_the_map_is_latched_and_the_camera_found(graph, map_file):
     graph.send('thermal/camera_info', info())
     graph.send('markers', markers())
     graph.spin_until(lambda: graph.heard['camera_pose'] and graph.heard['camera_pose/map_error'])
-    found = convert.camera_pose(graph.heard['camera_pose'][0])
+    found = message_bytes.camera_pose(serialize_message(graph.heard['camera_pose'][0]))
     error = message_bytes.map_error(serialize_message(graph.heard['camera_pose/map_error'][0]))
     np.testing.assert_array_equal(error.T_map_camera, found.T_map_camera)
     # 0.3 % of 2.4 m by the size of the marker: within a fifth, as the view is oblique.
@@ -697,7 +697,7 @@ def test_a_late_frame_from_before_a_correction_is_published_in_the_map_of_its_st
     assert graph.call(Trigger, 'marker_mapper/load', Trigger.Request()).success
     graph.send('markers', late, after)
     graph.spin_until(lambda: len(graph.heard['camera_pose']) == 4)
-    found = [convert.camera_pose(message).T_map_camera for message in graph.heard['camera_pose']]
+    found = [convert.transform_of(message.pose.pose) for message in graph.heard['camera_pose']]
     truth = [small_bag.true_pose(k / 30) @ small_bag.T_BODY_CAMERA for k in (0, 2, 1, 3)]
     truth[3] = T_new_old @ truth[3]
     # The flat pictures are good to a centimetre.

@@ -150,4 +150,4 @@ def test_the_mapper_reads_both_and_goes_on_with_the_second_alone(graph, tmp_path
     for message, k in zip(graph.heard['camera_pose'], (0, 1, 8), strict=True):
         truth = small_bag.true_pose(k / 30) @ T_BODY_FIRST
         # Flat pictures are good to a centimetre or two.
-        np.testing.assert_allclose(convert.camera_pose(message).T_map_camera[:3, 3], truth[:3, 3], atol=0.05)
+        np.testing.assert_allclose(convert.transform_of(message.pose.pose)[:3, 3], truth[:3, 3], atol=0.05)

@@ -22,7 +22,6 @@ from thermal_fiducial.config import (
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.innovations import PoseUpdate
-from thermal_fiducial.core.filter.map_corrections import MapCorrections, with_variance_everywhere
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
@@ -103,7 +102,6 @@ class Pipeline:
         self.detector = MarkerDetector(config.aruco_detector, dictionary)
         self.mapper = MarkerMapper(config.marker_mapper, marker_map)
         self.filter = PoseEkf(config.pose_ekf)
-        self._corrections = MapCorrections(config.pose_ekf.max_delay)
         self._odometry = MotionPrior(config.aruco_detector.camera_time_offset)
         self._share_map()
 
@@ -124,10 +122,7 @@ class Pipeline:
         mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry)
         update = None
         if (pose := mapping.pose) is not None:
-            published = replace(pose, T_map_camera=as_published(pose.T_map_camera), marker_ids=(), rms_px=0.0)
-            of_map = with_variance_everywhere(published.map_covariance)
-            self._corrections.note_error(replace(published, covariance=of_map))
-            update = self.filter.add_pose(self._corrections.in_present_map(published))
+            update = self.filter.add_pose(replace(pose, T_map_camera=as_published(pose.T_map_camera)))
         if (offset := self.filter.camera_time_offset) is not None:
             self._odometry.set_clock_offset(offset)
         if self._refine(stamp_ns) or mapping.map_changed:

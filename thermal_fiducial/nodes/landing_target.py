@@ -11,7 +11,7 @@ from thermal_fiducial.config import LandingTargetConfig
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.measurements import marker_branches, Markers, usable
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.ros import clouds, convert, qos
+from thermal_fiducial.ros import clouds, convert, message_bytes, qos
 from thermal_fiducial.ros.landing_pad import for_mavros, pad_in_map
 from thermal_fiducial.ros.node import OK, StageNode, WARN
 from thermal_fiducial.ros.robot_frames import RobotFrames
@@ -33,7 +33,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         self._in_view = False
         self._target = self.advertise(PoseStamped, 'landing_target')
         self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT)
-        self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT)
+        self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT, raw=True)
         self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
         RobotFrames(self, lambda: None)
 
@@ -67,8 +67,8 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         (T_camera_pad,) = marker_branches(rows)[:, 0]
         self._send_in_body(stamp, self._T_body_camera @ T_camera_pad)
 
-    def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
-        pose = convert.camera_pose(message)
+    def _on_camera_pose(self, message: bytes) -> None:
+        pose = message_bytes.camera_pose(message)
         if self._T_map_pad is None or pose.stamp_ns not in self._frames:
             return
         del self._frames[pose.stamp_ns]

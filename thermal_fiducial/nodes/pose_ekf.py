@@ -9,11 +9,11 @@ from std_srvs.srv import Trigger
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.filter.map_corrections import MapCorrections
 from thermal_fiducial.ros import convert, message_bytes, qos
 from thermal_fiducial.ros.filter_memory import FilterMemory
 from thermal_fiducial.ros.filter_outputs import FilterOutputs
 from thermal_fiducial.ros.filter_status import FilterStatus
+from thermal_fiducial.ros.map_corrections import MapCorrections
 from thermal_fiducial.ros.node import ERROR, StageNode, WARN
 from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.run import run

@@ -8,13 +8,13 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
-from thermal_fiducial.core.mapping.map_data import LatePoses
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.second_camera import SecondCamera
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros import clouds, convert, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
+from thermal_fiducial.ros.map_corrections import LatePoses
 from thermal_fiducial.ros.message_bytes import PoseBytes
 
 

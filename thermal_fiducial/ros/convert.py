@@ -14,7 +14,6 @@ from geometry_msgs.msg import (
     Point,
     Pose,
     PoseStamped,
-    PoseWithCovarianceStamped,
     Quaternion,
     TransformStamped,
     Vector3,
@@ -25,9 +24,8 @@ import numpy.typing as npt
 from sensor_msgs.msg import CameraInfo, Image, TimeReference
 from std_msgs.msg import Header
 
-from thermal_fiducial.core.geometry.plausibility import checked_covariance, LARGEST_COORDINATE
+from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
-from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 
@@ -137,27 +135,6 @@ def camera_info(calibration: 'Camera', head: Header) -> CameraInfo:
 
 
 # --- estimates ----------------------------------------------------------------------------------------
-
-
-def pose_with_covariance(T: FloatArray, covariance: FloatArray, head: Header) -> PoseWithCovarianceStamped:
-    """PoseWithCovarianceStamped of T_a_b (4, 4) and its covariance (6, 6) in the ROS convention."""
-    message = PoseWithCovarianceStamped(header=head)
-    message.pose.pose = pose(T)
-    message.pose.covariance[:] = covariance.ravel()
-    return message
-
-
-def camera_pose(message: PoseWithCovarianceStamped) -> CameraPose:
-    """The camera in the map.
-
-    Raises
-    ------
-    InputError
-        A pose that cannot be, or a covariance that is none.
-    """
-    T_map_camera = transform_of(message.pose.pose, 'camera_pose')
-    covariance = checked_covariance(np.array(message.pose.covariance).reshape(6, 6), 'camera_pose with a covariance')
-    return CameraPose(stamp_ns(message.header.stamp), T_map_camera, covariance)
 
 
 def vector(v: FloatArray) -> Vector3:

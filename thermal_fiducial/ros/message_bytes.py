@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from rclpy.serialization import deserialize_message
 
-from thermal_fiducial.core.filter.map_corrections import with_variance_everywhere
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
@@ -104,11 +103,9 @@ def camera_pose(message: bytes) -> CameraPose:
     Raises
     ------
     InputError
-        As :func:`thermal_fiducial.ros.convert.camera_pose`, or an encoding that is not known.
+        Of another encoding or cut short, a pose that cannot be, or a covariance that is none.
     """
-    what = 'camera_pose'
-    stamp, T_map_camera, covariance = _pose(message, what)
-    return CameraPose(stamp, T_map_camera, checked_covariance(covariance, f'{what} with a covariance'))
+    return _camera_pose(message, 'camera_pose', partial=False)
 
 
 def map_error(message: bytes) -> CameraPose:
@@ -119,10 +116,7 @@ def map_error(message: bytes) -> CameraPose:
     InputError
         As :func:`camera_pose`.
     """
-    what = 'camera_pose/map_error'
-    stamp, T_map_camera, of_map = _pose(message, what)
-    covariance = checked_covariance(with_variance_everywhere(of_map), f'{what} with a covariance')
-    return CameraPose(stamp, T_map_camera, covariance)
+    return _camera_pose(message, 'camera_pose/map_error', partial=True)
 
 
 def clock_offset(message: bytes) -> float:
@@ -158,10 +152,12 @@ def frame_id(message: bytes) -> str:
         raise InputError('message with a frame_id that cannot be read') from None
 
 
-def _pose(message: bytes, what: str) -> tuple[int, FloatArray, FloatArray]:
-    """Stamp [ns], pose (4, 4) and covariance (6, 6), not checked, of a geometry_msgs/PoseWithCovarianceStamped."""
+def _camera_pose(message: bytes, what: str, *, partial: bool) -> CameraPose:
+    """Of a geometry_msgs/PoseWithCovarianceStamped; ``partial``: in some directions there may be no variance."""
     stamp, numbers = stamp_ns(message, what), _numbers(message, 1, _POSE, what).astype(np.float64)
-    return stamp, convert.transform_of_values(numbers[:7], what), numbers[7:].reshape(6, 6)
+    T_map_camera = convert.transform_of_values(numbers[:7], what)
+    covariance = checked_covariance(numbers[7:].reshape(6, 6), f'{what} with a covariance', partial=partial)
+    return CameraPose(stamp, T_map_camera, covariance)
 
 
 def _numbers(message: bytes, names: int, count: int, what: str) -> FloatArray:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
 if TYPE_CHECKING:
@@ -19,6 +19,8 @@ LARGEST_COORDINATE = 1e5
 SMALLEST_VARIANCE, LARGEST_VARIANCE = 1e-20, 1e8
 #: Least share of a variance that the other components may leave unexplained; rounding takes less than a tenth of it.
 _LEAST_INDEPENDENT = 1e-12
+#: What stands for no variance where there may be none: a share of the largest, and this [m^2, rad^2].
+_NO_SHARE, _NO_VARIANCE = 1e-9, 1e-15
 #: Relative difference of entries that should be equal, by rounding of a few operations.
 _ROUNDING = 1e-9
 #: Focal length and distance of the principal point from the image, in longer sides of the image.
@@ -28,39 +30,33 @@ _IMAGE_SIDES = (8, 16384)
 _ROUND_TRIP_PX = 1.0
 
 
-def checked_covariance(values: FloatArray, what: str) -> FloatArray:
+def checked_covariance(values: FloatArray, what: str, *, partial: bool = False) -> FloatArray:
     """``values``, or the symmetric part (..., n, n) of covariances that rounding alone does not make asymmetric.
+
+    ``partial``: of errors that may have no variance in some directions.
 
     Raises
     ------
     InputError
         Not finite, not positive definite, or with a variance beyond the bounds.
     """
-    P = 0.5 * values + 0.5 * np.swapaxes(values, -1, -2)
-    if not np.isfinite(P).all():
+    symmetric = 0.5 * values + 0.5 * np.swapaxes(values, -1, -2)
+    if not np.isfinite(symmetric).all():
         raise InputError(f'{what} that is not finite')
+    P, eye = symmetric, np.eye(values.shape[-1])
+    if partial:
+        largest = max(float(np.diagonal(P, axis1=-2, axis2=-1).max()), 0.0)
+        P = P + (_NO_SHARE * largest + _NO_VARIANCE) * eye
     variances = np.diagonal(P, axis1=-2, axis2=-1)
-    if not ((variances > SMALLEST_VARIANCE).all() and (variances < LARGEST_VARIANCE).all()):
-        raise InputError(f'{what} with a variance of {_most_extreme(variances):.3g}')
-    if not positive_definite(P).all():
-        raise InputError(f'{what} that is not positive definite')
-    return values if (np.abs(P - values) <= _ROUNDING * np.abs(values)).all() else np.asarray(P)
-
-
-def _most_extreme(variances: FloatArray) -> float:
     low, high = float(variances.min()), float(variances.max())
-    return low if low <= SMALLEST_VARIANCE else high
-
-
-def positive_definite(P: FloatArray) -> BoolArray:
-    """(...) which of symmetric matrices (..., n, n) with positive diagonals are, in any units of their components."""
-    scale = 1.0 / np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
-    with np.errstate(over='ignore'):
-        correlations = P * scale[..., :, None] * scale[..., None, :]
-    # What is correlated by more than one is not, and may be infinite by now.
-    possible = np.abs(correlations).max(axis=(-2, -1)) < 2.0
-    correlations = np.where(possible[..., None, None], correlations, 0.0)
-    return np.asarray(np.linalg.eigvalsh(correlations)[..., 0] > _LEAST_INDEPENDENT)
+    if not (low > SMALLEST_VARIANCE and high < LARGEST_VARIANCE):
+        raise InputError(f'{what} with a variance of {low if low <= SMALLEST_VARIANCE else high:.3g}')
+    try:
+        # A smaller diagonal asks, in any units of the components, for the least that each has for itself.
+        np.linalg.cholesky(P - _LEAST_INDEPENDENT * eye * P)
+    except np.linalg.LinAlgError:
+        raise InputError(f'{what} that is not positive definite') from None
+    return values if (np.abs(symmetric - values) <= _ROUNDING * np.abs(values)).all() else symmetric
 
 
 def require_usable(camera: 'Camera') -> 'Camera':

@@ -1,4 +1,4 @@
-"""What the mapper says of the map beside its poses: how it has moved, and how uncertain it is."""
+"""Poses and a map that moves between them, on both sides of ``camera_pose``; and what of them is the map's error."""
 
 from collections import deque
 from dataclasses import replace
@@ -6,23 +6,40 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.core.error_model import positive
-from thermal_fiducial.core.measurements import CameraPose, in_moved_map
+from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
 from thermal_fiducial.core.types import FloatArray
 
 #: Corrections, and errors of the map, that are remembered.
 _REMEMBERED = 10
-#: What stands for no variance: a share of the largest, and this [m^2, rad^2].
-_NO_SHARE, _NO_VARIANCE = 1e-9, 1e-15
 
 
-def with_variance_everywhere(covariance: FloatArray) -> FloatArray:
-    """A covariance (6, 6) of errors of the map, which may have none in some directions, as one that can be checked."""
-    largest = max(float(covariance.diagonal().max()), 0.0)
-    return np.asarray(covariance + (_NO_SHARE * largest + _NO_VARIANCE) * np.eye(6))
+class LatePoses:
+    """Of who publishes poses: those of frames that arrive after the map has moved, in the map of their stamps."""
+
+    def __init__(self) -> None:
+        #: stamp of the newest frame so far
+        self.newest_ns = 0
+        self._moved_ns = 0
+        self._T_new_old: FloatArray = np.eye(4)
+
+    def add(self, stamp_ns: int) -> None:
+        """Take in the stamp of a frame; one of long before is that of a clock that was set back."""
+        self.newest_ns = max(stamp_ns, self.newest_ns) if stamp_ns >= self.newest_ns - LATEST_NS else stamp_ns
+
+    def moved(self, T_new_old: FloatArray) -> None:
+        """The map has moved by (4, 4), after the newest frame."""
+        self._moved_ns, self._T_new_old = self.newest_ns, T_new_old
+
+    def as_of_its_stamp(self, pose: CameraPose) -> CameraPose:
+        """``pose``, found in the map of now, in the map of its stamp."""
+        if 0 <= self._moved_ns - pose.stamp_ns <= LATEST_NS:
+            return in_moved_map(pose, inverse(self._T_new_old))
+        return pose
 
 
 class MapCorrections:
-    """Poses in the map as it is now; ``window`` [s]: what is older is of another clock."""
+    """Of who takes poses: these in the map as it is now; ``window`` [s]: what is older is of another clock."""
 
     def __init__(self, window: float) -> None:
         self._window_ns = window * 1e9
@@ -45,8 +62,10 @@ class MapCorrections:
         error = self._error
         if error is not None and abs(pose.stamp_ns - error.stamp_ns) <= self._window_ns:
             # The map's error changes slowly: that of the frame before will do, as far as this pose claims as much.
-            relative = positive(pose.covariance - error.covariance)
-            pose = replace(pose, map_covariance=pose.covariance - relative)
+            of_map, relative = error.covariance, pose.covariance - error.covariance
+            if np.linalg.eigvalsh(relative)[0] < 0.0:
+                of_map = pose.covariance - positive(relative)
+            pose = replace(pose, map_covariance=of_map)
         for stamp_ns, T_new_old in self._corrections:
             if 0 <= stamp_ns - pose.stamp_ns <= self._window_ns:
                 pose = in_moved_map(pose, T_new_old)
