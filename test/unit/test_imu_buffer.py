@@ -1,10 +1,14 @@
 """What the buffer of IMU samples shows of the time between them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from support.estimates import any_estimate
 
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
-from thermal_fiducial.core.filter.inertial_motion import NOISE, preintegrated
+from thermal_fiducial.core.filter.propagation import propagated
+from thermal_fiducial.core.filter.state import SIZE
 
 #: Uneven, as real drivers are.
 STAMPS_NS = [0, 5_000_000, 9_000_000, 15_000_000, 20_000_000]
@@ -67,8 +71,6 @@ def test_it_grows_and_forgets():
     assert buffer.oldest_ns == 3399
     assert len(buffer) == 5000 - 3399
     np.testing.assert_allclose(buffer.imu[[0, -1]], [line(3399), line(4999)], rtol=1e-12)
-    assert buffer.first_after(4000) == 4001
-    assert buffer.first_after(9000) == 4999
 
 
 def test_a_gap_is_filled_with_short_steps_of_its_own_noise(buffer):
@@ -86,7 +88,8 @@ def test_one_pose_behind_a_gap_does_not_make_the_velocity_known():
     gap = ImuBuffer()
     gap.append(0, np.zeros(6), np.ones(6))
     gap.append(500_000_000, np.zeros(6), np.ones(6))
-    noise = preintegrated(gap.steps(0, 500_000_000), np.zeros(6), np.zeros((2, 3, 3))).error[:, NOISE]
+    known = replace(any_estimate(), stamp_ns=0, covariance=np.zeros((SIZE, SIZE)))
+    noise = propagated(known, gap.steps(0, 500_000_000), 500_000_000, np.zeros(SIZE)).covariance
     velocity, position = noise[5, 5], noise[8, 8]
     left = 1.0 - noise[5, 8] ** 2 / (velocity * position)
     # of white noise a quarter of the variance is left, of steps of 29 ms the less by the square of their share

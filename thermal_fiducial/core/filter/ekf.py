@@ -68,7 +68,7 @@ class PoseEkf:
         """Begin anew with the clock offset that was known: mostly samples are missing where the stamps jump."""
         self._restart_reason = CLOCK_JUMPED
         main, known = self._history.main, self.camera_time_offset is not None
-        learned = main.prediction.state.time_offset if main and known else 0.0
+        learned = main.estimate.state.time_offset if main and known else 0.0
         self._begin(self._first_offset + learned)
 
     # --- input ----------------------------------------------------------------------------------------
@@ -192,7 +192,7 @@ class PoseEkf:
             return None
         covariance, with_bias = self._hypotheses.core_covariance(main, self._contradicting(main))
         rate_variance = float(self._history.imu.last_densities[0]) ** 2 / self._history.imu.last_step_seconds
-        return odometry(main.prediction, covariance, with_bias, imu, rate_variance)
+        return odometry(main.estimate, covariance, with_bias, imu, rate_variance)
 
     def _contradicting(self, main: Hypothesis) -> Hypothesis | None:
         """The alternative, while the latest poses speak for it and against the estimate."""
@@ -210,13 +210,13 @@ class PoseEkf:
     def state(self) -> NavigationState | None:
         """Estimate at the newest IMU sample."""
         main = self._history.main
-        return main.prediction.state if main else None
+        return main.estimate.state if main else None
 
     @property
     def estimate(self) -> Estimate | None:
         """State and whole covariance at the newest IMU sample."""
         main = self._history.main
-        return self._hypotheses.estimate(main) if main else None
+        return main.estimate if main else None
 
     @property
     def camera_time_offset(self) -> float | None:
@@ -228,12 +228,12 @@ class PoseEkf:
 
     def _clock_offset(self, main: Hypothesis) -> float:
         steps = self._camera_clock.ahead_ns / SECOND_NS
-        return self._first_offset + main.prediction.state.time_offset - steps
+        return self._first_offset + main.estimate.state.time_offset - steps
 
     def _time_offset_std(self, main: Hypothesis) -> float:
         """Of the estimate; where there is none, what the parameter says [s]."""
         config = self._config
-        return main.prediction.origin.std(TIME_OFFSET) if config.estimate_time_offset else config.time_offset_std
+        return main.estimate.std(TIME_OFFSET) if config.estimate_time_offset else config.time_offset_std
 
     @property
     def resets(self) -> int:
@@ -292,8 +292,7 @@ class PoseEkf:
         main = self._history.main
         if main is None:
             return 0.0
-        estimate = self._hypotheses.estimate(main)
-        return usable_seconds(estimate, self._history.imu.last_densities, self._config.lost_position_std)
+        return usable_seconds(main.estimate, self._history.imu.last_densities, self._config.lost_position_std)
 
     def diagnostics(self) -> dict[str, float]:
         """How the filter is, in numbers (SI units)."""
@@ -310,7 +309,7 @@ class PoseEkf:
         return numbers if main is None else numbers | self._figures_of(main)
 
     def _figures_of(self, main: Hypothesis) -> dict[str, float]:
-        state, noise = main.prediction.state, main.prediction.origin.pose_noise
+        state, noise = main.estimate.state, main.estimate.pose_noise
         return {
             'seconds since accepted pose': self._coasting(main),
             'resets': float(self.resets),

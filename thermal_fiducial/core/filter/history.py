@@ -18,6 +18,9 @@ from thermal_fiducial.core.filter.update import MotionAtPose
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
+#: Without poses the estimate is kept so often [ns]: a pose that comes late goes back no farther than that.
+_KEPT_EVERY_NS = 100_000_000
+
 
 class History:
     """Samples, poses, and beliefs, kept for so many ``seconds``.
@@ -100,14 +103,14 @@ class History:
 
     def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None) -> int:
         """Instant of a pose in the clock of the IMU by a hypothesis's estimate of the offset."""
-        offset = hypothesis.prediction.origin.state.time_offset if hypothesis else 0.0
+        offset = hypothesis.estimate.state.time_offset if hypothesis else 0.0
         return pose.stamp_ns + self._offset_ns + round(offset * SECOND_NS)
 
     def main_at(self, pose: CameraPose) -> tuple[Hypothesis, MotionAtPose] | None:
         """The estimate and the motion at the instant of a pose that is not to be taken in."""
         for belief in reversed(self._beliefs):
             time_ns = min(self.due_ns(pose, belief.main), self.imu.newest_ns)
-            if belief.main and belief.main.prediction.stamp_ns <= time_ns:
+            if belief.main and belief.main.estimate.stamp_ns <= time_ns:
                 return self._at(belief.main, pose)
         return None
 
@@ -140,17 +143,17 @@ class History:
         return pose if due_ns <= self.imu.newest_ns else None
 
     def _go_on(self) -> None:
-        """Carry the estimate to the newest sample; what is folded on the way is kept."""
+        """Carry the estimate to the newest sample; without poses it is kept now and then, to go on from there."""
         belief = self.belief
         if belief.main is None:
             return
         self._main = self._hypotheses.carried(self._main or belief.main, self.imu, self.imu.newest_ns)
-        if self._main.prediction.origin is not belief.main.prediction.origin:
+        if self._main.estimate.stamp_ns - belief.main.estimate.stamp_ns > _KEPT_EVERY_NS:
             self._beliefs.append(belief._replace(main=self._main, alternative=self.alternative))
 
     def _after(self, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
         """The belief after the next pose, and verdicts on that."""
-        self._unfold(pose)
+        self._go_back_to(pose)
         belief = self.belief._replace(pose_stamp_ns=pose.stamp_ns)
         if not belief.hypotheses:
             return self._begun(belief, pose)
@@ -171,18 +174,18 @@ class History:
             belief = self._with_alternative(belief, *refused, pose)
         return self._settled(belief, [update])
 
-    def _unfold(self, pose: CameraPose) -> None:
-        """Go back before what was folded later than a pose's instant."""
+    def _go_back_to(self, pose: CameraPose) -> None:
+        """Forget estimates without a pose of their own that are later than a pose's instant."""
         while len(self._beliefs) > 1 and self._beliefs[-2].pose_stamp_ns == self.belief.pose_stamp_ns:
-            if all(h.prediction.stamp_ns <= self.due_ns(pose, h) for h in self.belief.hypotheses):
+            if all(h.estimate.stamp_ns <= self.due_ns(pose, h) for h in self.belief.hypotheses):
                 return
             self._forget_belief()
 
     def _at(self, hypothesis: Hypothesis, pose: CameraPose) -> tuple[Hypothesis, MotionAtPose]:
         """A hypothesis at the instant of a pose, where it is if it is beyond that by now, and its motion there."""
-        time_ns = max(self.due_ns(pose, hypothesis), hypothesis.prediction.stamp_ns)
+        time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
         there = self._hypotheses.carried(hypothesis, self.imu, min(time_ns, self.imu.newest_ns))
-        return there, self.imu.motion(there.prediction.stamp_ns, there.accepted_ns)
+        return there, self.imu.motion(there.estimate.stamp_ns, there.accepted_ns)
 
     def _begun(self, belief: Belief, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
         time_ns = max(self.due_ns(pose, None), self.imu.oldest_ns)
@@ -193,7 +196,7 @@ class History:
 
     def _with_alternative(self, belief: Belief, at_pose: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> Belief:
         """With an alternative that begins with a pose that the estimate refuses, if one can."""
-        time_ns = at_pose.prediction.stamp_ns
+        time_ns = at_pose.estimate.stamp_ns
         window = self.imu.window(time_ns, WINDOW_SECONDS)
         begun = self._hypotheses.alternative_to(at_pose, pose, time_ns, motion, window)
         if begun is None:

@@ -10,11 +10,11 @@ from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import blank_state, start
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.pose_noise import BodyPose
-from thermal_fiducial.core.filter.prediction import Prediction
+from thermal_fiducial.core.filter.propagation import propagated
 from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
-    Estimate,
+    CORE,
     GYROSCOPE_BIAS,
     NavigationState,
     POSE,
@@ -30,8 +30,6 @@ NO_GRAVITY = 'refused: contradicts gravity'
 #: What a clock offset that was estimated may be wrong by when something else went wrong [s]; it moves a marker by a
 #: pixel or two in the fastest flights.
 KNOWN_OFFSET_STD = 0.003
-#: The motion since the origin is folded into the covariance after so long [ns], as the biases walk meanwhile.
-_FOLDED_NS = 100_000_000
 #: A pose that is off even for an estimate that claims so many times too little, and by more than a few of these
 #: [rad, m], is a marker's fault, unless as many poses bear it out as have borne out the estimate, or so many. Nearer
 #: ones are believed earlier: coasting on for long would do more harm.
@@ -53,41 +51,33 @@ class Hypotheses:
 
     def carried(self, hypothesis: Hypothesis, imu: ImuBuffer, until_ns: int) -> Hypothesis:
         """A hypothesis as the samples carry it on to an instant that is not later than the newest of them."""
-        prediction = hypothesis.prediction
-        while prediction.stamp_ns < until_ns:
-            folded_ns = imu.first_after(prediction.origin.stamp_ns + _FOLDED_NS)
-            end_ns = min(until_ns, max(folded_ns, imu.first_after(prediction.stamp_ns)))
-            prediction = prediction.after(imu.steps(prediction.stamp_ns, end_ns), end_ns)
-            if end_ns - prediction.origin.stamp_ns > _FOLDED_NS:
-                prediction = Prediction.begin(prediction.estimate(self._walks))
-        return hypothesis._replace(prediction=prediction)
-
-    def estimate(self, hypothesis: Hypothesis) -> Estimate:
-        """State and whole covariance at the hypothesis's instant."""
-        return hypothesis.prediction.estimate(self._walks)
+        estimate = hypothesis.estimate
+        if estimate.stamp_ns >= until_ns:
+            return hypothesis
+        steps = imu.steps(estimate.stamp_ns, until_ns)
+        return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self._walks))
 
     def weigh(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> tuple[Hypothesis, PoseUpdate]:
         """A hypothesis after a pose at its instant, and the verdict on the pose."""
-        estimate = self.estimate(hypothesis)
+        estimate = hypothesis.estimate
         measured = self._measured(pose, estimate.state)
         innovation = self._updater.innovation(estimate, measured, motion)
         if innovation.nis <= self._config.gate and not self._is_stale(hypothesis):
             corrected = self._updater.correct(measured, innovation, motion)
-            accepted = hypothesis.accepting(Prediction.begin(corrected))
-            return accepted, PoseUpdate(pose.stamp_ns, True, '', innovation.nis)
+            return hypothesis.accepting(corrected), PoseUpdate(pose.stamp_ns, True, '', innovation.nis)
         noise = estimate.pose_noise.weighed(measured, innovation.value, innovation.S_inverse)
-        refusing = hypothesis.refusing(Prediction.begin(replace(estimate, pose_noise=noise)))
+        refusing = hypothesis.refusing(replace(estimate, pose_noise=noise))
         return refusing, PoseUpdate(
             pose.stamp_ns, False, f'refused: {math.sqrt(innovation.nis):.1f} sigma', innovation.nis
         )
 
     def contradiction(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> str:
         """What of the IMU a pose contradicts that a hypothesis at its instant refuses, in words."""
-        estimate = self.estimate(hypothesis)
+        estimate = hypothesis.estimate
         measured = self._measured(pose, estimate.state)
         innovation = self._updater.innovation(estimate, measured, motion)
         turn, shift = innovation.value[:3], innovation.value[3:]
-        seconds = (hypothesis.prediction.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
+        seconds = (hypothesis.estimate.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
         if turn @ np.linalg.solve(np.linalg.inv(innovation.S_inverse)[:3, :3], turn) > self._config.gate:
             apart = f'{math.degrees(np.linalg.norm(turn)):.0f} deg apart after {seconds:.2f} s'
             return f'poses contradict the gyroscope: {apart}; its units, axes, sign? camera_orientation?'
@@ -96,7 +86,7 @@ class Hypotheses:
 
     def explains(self, hypothesis: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> bool:
         """Whether a pose at a hypothesis's instant is right by it, but for a clock offset that is not known."""
-        estimate = self.estimate(hypothesis)
+        estimate = hypothesis.estimate
         measured = self._measured(pose, estimate.state)
         unclocked = self._updater.with_unknown_clock(estimate)
         return self._updater.innovation(unclocked, measured, motion).nis <= self._config.gate
@@ -110,7 +100,7 @@ class Hypotheses:
 
     def _is_stale(self, hypothesis: Hypothesis) -> bool:
         """Whether it has gone without poses for too long to be corrected."""
-        coasted_ns = hypothesis.prediction.stamp_ns - hypothesis.accepted_ns
+        coasted_ns = hypothesis.estimate.stamp_ns - hypothesis.accepted_ns
         return coasted_ns > self._config.reinitialise_after * SECOND_NS
 
     def from_nothing(self, pose: CameraPose, time_ns: int, window: FloatArray) -> Hypothesis | None:
@@ -127,7 +117,7 @@ class Hypotheses:
 
         The pose is taken as it is, and what was known of the sensors stays.
         """
-        estimate = self.estimate(main)
+        estimate = main.estimate
         measured = self._measured(pose, estimate.state)
         begun = self._begun(pose, time_ns, window, estimate.state, self._clock_std(main, pose, motion))
         if begun is None:
@@ -142,7 +132,7 @@ class Hypotheses:
         unknown = self._config.time_offset_std
         if self.explains(main, pose, motion):
             return unknown
-        return min(unknown, math.hypot(main.prediction.origin.std(TIME_OFFSET), KNOWN_OFFSET_STD))
+        return min(unknown, math.hypot(main.estimate.std(TIME_OFFSET), KNOWN_OFFSET_STD))
 
     def _begun(
         self, pose: CameraPose, time_ns: int, window: FloatArray, prior: NavigationState, clock_std: float
@@ -152,17 +142,18 @@ class Hypotheses:
         estimate = start(config, measured, time_ns, prior, window)
         if estimate is None:
             return None
-        return Hypothesis(Prediction.begin(estimate), time_ns, time_ns)
+        return Hypothesis(estimate, time_ns, time_ns)
 
     def core_covariance(self, main: Hypothesis, other: Hypothesis | None) -> tuple[FloatArray, FloatArray]:
         """Covariance (9, 9) of an estimate's core, and (9, 3) of it with the gyroscope's bias, to be published.
 
         They count an ``other`` one at the same instant that contradicts it.
         """
-        covariance, with_bias = main.prediction.core_covariance
+        P = main.estimate.covariance
+        covariance, with_bias = P[CORE, CORE], P[CORE, GYROSCOPE_BIAS]
         if other:
-            apart = _difference(main.prediction.state, other.prediction.state)
-            covariance = covariance + other.prediction.core_covariance[0] + np.outer(apart, apart)
+            apart = _difference(main.estimate.state, other.estimate.state)
+            covariance = covariance + other.estimate.covariance[CORE, CORE] + np.outer(apart, apart)
         return covariance, with_bias
 
 

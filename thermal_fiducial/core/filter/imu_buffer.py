@@ -86,10 +86,6 @@ class ImuBuffer:
         self._rows[: len(kept)] = kept
         del self._stamps_ns[:first]
 
-    def first_after(self, stamp_ns: int) -> int:
-        """Stamp [ns] of the first sample later than ``stamp_ns``; of the newest one where there is none."""
-        return self._stamps_ns[min(bisect_right(self._stamps_ns, stamp_ns), len(self._stamps_ns) - 1)]
-
     def steps(self, begin_ns: int, end_ns: int) -> Steps:
         """The steps between two instants that needn't be those of samples (trapezoid rule)."""
         first = bisect_right(self._stamps_ns, begin_ns) - 1

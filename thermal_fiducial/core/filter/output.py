@@ -5,8 +5,7 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.filter.prediction import Prediction
-from thermal_fiducial.core.filter.state import GYROSCOPE_BIAS, POSITION, ROTATION, VELOCITY
+from thermal_fiducial.core.filter.state import Estimate, GYROSCOPE_BIAS, POSITION, ROTATION, VELOCITY
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray
@@ -23,7 +22,7 @@ LARGEST_STEP = 1.0
 
 
 def odometry(
-    prediction: Prediction, core: FloatArray, with_bias: FloatArray, imu: FloatArray, rate_variance: float
+    estimate: Estimate, core: FloatArray, with_bias: FloatArray, imu: FloatArray, rate_variance: float
 ) -> Odometry:
     """State at an IMU sample.
 
@@ -34,20 +33,20 @@ def odometry(
     imu : (6,) the sample
     rate_variance : of the white noise of its rate [rad^2/s^2]
     """
-    state = prediction.state
+    state = estimate.state
     R, velocity_body = state.R_map_body, state.velocity_body
     joint = np.empty((12, 12))
     joint[:9, :9], joint[:9, 9:], joint[9:, :9] = core, with_bias, with_bias.T
-    joint[9:, 9:] = prediction.origin.covariance[GYROSCOPE_BIAS, GYROSCOPE_BIAS]
+    joint[9:, 9:] = estimate.covariance[GYROSCOPE_BIAS, GYROSCOPE_BIAS]
     # (p, theta) of the map are R times the error of the robot frame; v_body moves with both nu and phi.
     J = _AT_REST.copy()
     J[0:3, POSITION] = J[3:6, ROTATION] = R
     J[6:9, ROTATION] = skew(velocity_body)
     covariance = J @ joint @ J.T
     covariance.reshape(-1)[_RATE_VARIANCES] += rate_variance
-    of_map = prediction.origin.pose_noise.last.map_covariance
+    of_map = estimate.pose_noise.last.map_covariance
     return Odometry(
-        prediction.stamp_ns,
+        estimate.stamp_ns,
         state.T_map_body,
         velocity_body,
         state.corrected(imu)[:3],

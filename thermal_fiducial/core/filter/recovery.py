@@ -9,8 +9,7 @@ import math
 from typing import NamedTuple
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.prediction import Prediction
-from thermal_fiducial.core.filter.state import POSITION
+from thermal_fiducial.core.filter.state import Estimate, POSITION
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: An alternative must agree with so many times more poses than the estimate: one whose clock is wrong accepts some when
@@ -24,9 +23,9 @@ NEVER = -(1 << 62)
 
 
 class Hypothesis(NamedTuple):
-    """A prediction and the poses that speak for it, and against it."""
+    """An estimate and the poses that speak for it, and against it."""
 
-    prediction: Prediction
+    estimate: Estimate
     #: instants of its first and of its last accepted pose, clock of the IMU
     started_ns: int
     accepted_ns: int
@@ -38,20 +37,20 @@ class Hypothesis(NamedTuple):
     #: of an alternative: poses that must agree on it
     needed: int = 0
 
-    def accepting(self, prediction: Prediction) -> 'Hypothesis':
+    def accepting(self, estimate: Estimate) -> 'Hypothesis':
         """After a pose that it accepts."""
         return self._replace(
-            prediction=prediction,
-            accepted_ns=prediction.stamp_ns,
+            estimate=estimate,
+            accepted_ns=estimate.stamp_ns,
             hits=self.hits + 1,
             accepted_in_row=self.accepted_in_row + 1,
             refused_in_row=0,
         )
 
-    def refusing(self, prediction: Prediction) -> 'Hypothesis':
+    def refusing(self, estimate: Estimate) -> 'Hypothesis':
         """After a pose that it refuses."""
         return self._replace(
-            prediction=prediction,
+            estimate=estimate,
             misses=self.misses + 1,
             accepted_in_row=0,
             refused_in_row=self.refused_in_row + 1,
@@ -59,20 +58,18 @@ class Hypothesis(NamedTuple):
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'Hypothesis':
         """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-        origin = self.prediction.origin.in_moved_map(T_new_old)
-        return self._replace(prediction=self.prediction.with_origin(origin))
+        return self._replace(estimate=self.estimate.in_moved_map(T_new_old))
 
     @property
     def position_std(self) -> float:
         """Root of the sum of the position variances, those by the map's error too [m]."""
-        of_map = self.prediction.origin.pose_noise.last.map_covariance[:3, :3]
+        of_map = self.estimate.pose_noise.last.map_covariance[:3, :3]
         return math.hypot(self.position_std_in_map, math.sqrt(float(of_map.trace())))
 
     @property
     def position_std_in_map(self) -> float:
         """The same relative to the map as it is, which is what poses can be compared with [m]."""
-        core, _ = self.prediction.core_covariance
-        return math.sqrt(float(core[POSITION, POSITION].trace()))
+        return self.estimate.std(POSITION)
 
     @property
     def in_doubt(self) -> bool:
@@ -112,7 +109,7 @@ class Belief(NamedTuple):
     @property
     def stamp_ns(self) -> int:
         """Instant up to which nothing before it matters any more; that of the pose's stamp without any hypothesis."""
-        return min((h.prediction.stamp_ns for h in self.hypotheses), default=self.pose_stamp_ns)
+        return min((h.estimate.stamp_ns for h in self.hypotheses), default=self.pose_stamp_ns)
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'Belief':
         """The belief in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""

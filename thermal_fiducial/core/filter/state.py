@@ -15,8 +15,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
-from thermal_fiducial.core.filter.rotation_integrals import rotation_integrals
-from thermal_fiducial.core.geometry.se3 import transform
+from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian_inverse, transform
 from thermal_fiducial.core.types import FloatArray
 
 #: Places of the error coordinates: in the robot frame [rad, m/s, m],
@@ -74,18 +73,18 @@ class NavigationState:
         return self.velocity @ self.R_map_body
 
     def corrected(self, imu: FloatArray) -> FloatArray:
-        """(6,) a sample without the errors of the sensors [rad/s, m/s^2]."""
-        return imu - self.bias - (self.scale @ imu.reshape(2, 3, 1)).reshape(6)
+        """Samples (..., 6) without the errors of the sensors [rad/s, m/s^2]."""
+        return imu - self.bias - (self.scale @ imu.reshape(-1, 2, 3, 1)).reshape(imu.shape)
 
     def plus(self, error: FloatArray) -> 'NavigationState':
         """The state moved by ``error`` (48,), X Exp(xi) for the group part."""
-        R, R_left = self.R_map_body @ rotation_integrals(error[ROTATION])[:2]
+        R_left = self.R_map_body @ _left_jacobian(error[ROTATION])
         T_body_camera = self.T_body_camera
         if error[EXTRINSICS].any():
-            rotation, left, _ = rotation_integrals(error[EXTRINSICS][:3])
-            T_body_camera = transform(rotation, left @ error[EXTRINSICS][3:]) @ T_body_camera
+            turn, shift = error[EXTRINSICS][:3], error[EXTRINSICS][3:]
+            T_body_camera = transform(so3_exp(turn), _left_jacobian(turn) @ shift) @ T_body_camera
         return NavigationState(
-            orthonormal(R),
+            orthonormal(self.R_map_body @ so3_exp(error[ROTATION])),
             self.velocity + R_left @ error[VELOCITY],
             self.position + R_left @ error[POSITION],
             self.bias + error[BIAS],
@@ -133,6 +132,11 @@ class Estimate:
     def std(self, place: slice | int) -> float:
         """Root of the sum of the variances of some coordinates."""
         return math.sqrt(float(np.sum(self.covariance.diagonal()[place])))
+
+
+def _left_jacobian(phi: FloatArray) -> FloatArray:
+    """(3, 3) of the exponential at a rotation vector (3,) [rad]."""
+    return np.asarray(np.linalg.inv(so3_left_jacobian_inverse(phi)))
 
 
 def with_horizontal(gravity: FloatArray, horizontal: FloatArray) -> FloatArray:

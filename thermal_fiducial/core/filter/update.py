@@ -8,7 +8,6 @@ import numpy as np
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
 from thermal_fiducial.core.filter.pose_noise import BodyPose
-from thermal_fiducial.core.filter.rotation_integrals import rotation_integrals
 from thermal_fiducial.core.filter.state import (
     CORE,
     Estimate,
@@ -22,7 +21,7 @@ from thermal_fiducial.core.filter.state import (
     TIME_OFFSET,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_log
+from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_left_jacobian_inverse, so3_log
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
@@ -91,7 +90,7 @@ def pose_innovation(state: NavigationState, T_map_body: FloatArray) -> FloatArra
     """Rotation and position (6,) of Log(X^-1 Z) on SE(3): exactly the error of ``state`` if ``T_map_body`` is true."""
     rotation = so3_log(state.R_map_body.T @ T_map_body[:3, :3])
     offset = (T_map_body[:3, 3] - state.position) @ state.R_map_body
-    return np.concatenate((rotation, np.linalg.solve(rotation_integrals(rotation)[1], offset)))
+    return np.concatenate((rotation, so3_left_jacobian_inverse(rotation) @ offset))
 
 
 class PoseUpdater:

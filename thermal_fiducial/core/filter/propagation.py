@@ -1,0 +1,133 @@
+"""From an estimate along the IMU samples: the state and the covariance of its error, step by step.
+
+Over a step, rate and specific force are constant, and so is the generator A of the left-invariant error: d xi/dt = A xi
++ B n, where n is the error of rate and force. The transition exp(A dt) and the input matrix, the integral of exp(A s) B
+from 0 to dt, are exact; rotation and displacement of the step are blocks of them.
+
+Sources: A. Barrau, S. Bonnabel, "The Invariant Extended Kalman Filter as a Stable Observer", IEEE TAC 2017; C. Van
+Loan, "Computing Integrals Involving the Matrix Exponential", IEEE TAC 1978.
+"""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from thermal_fiducial.core.filter.imu_buffer import Steps
+from thermal_fiducial.core.filter.state import (
+    ACCELEROMETER_MATRIX,
+    BIAS,
+    CORE,
+    Estimate,
+    GRAVITY,
+    GYROSCOPE_MATRIX,
+    MOVED_BY,
+    POSITION,
+    ROTATION,
+    VELOCITY,
+)
+from thermal_fiducial.core.geometry.se3 import SKEW
+from thermal_fiducial.core.types import FloatArray
+
+#: Terms of the exponential's series: exact to 1e-12 for steps that turn by 0.3 rad, to 3e-8 for the fastest that an IMU
+#: measures (35 rad/s) over the longest step (30 ms).
+_TERMS = 10
+_IDENTITY = np.eye(9)
+#: Scale and cross-axis errors of both triads.
+_SCALES = slice(GYROSCOPE_MATRIX.start, ACCELEROMETER_MATRIX.stop)
+
+
+def _generators() -> FloatArray:
+    """(7, 81): rate, force and 1 times this are A (9, 9), row by row."""
+    basis = np.zeros((7, 9, 9))
+    crosses = SKEW.reshape(3, 3, 3)
+    for place in (ROTATION, VELOCITY, POSITION):
+        basis[:3, place, place] = -crosses
+    basis[3:6, VELOCITY, ROTATION] = -crosses
+    basis[6, POSITION, VELOCITY] = np.eye(3)
+    return basis.reshape(7, 81)
+
+
+_GENERATORS = _generators()
+
+
+class StepMatrices(NamedTuple):
+    """Of N steps: transition (N, 9, 9) of the core's error, and (N, 9, 6) its change by an error of rate and force."""
+
+    transition: FloatArray
+    by_imu: FloatArray
+
+
+def step_matrices(imu: FloatArray, seconds: FloatArray) -> StepMatrices:
+    """Matrices of steps of constant rate and specific force ``imu`` (N, 6) that last ``seconds`` (N,)."""
+    dt = seconds[:, None]
+    A_dt = np.concatenate((imu * dt, dt), axis=1) @ _GENERATORS
+    A_dt = A_dt.reshape(-1, 9, 9)
+    # Horner's scheme for the mean of the exponential over the step, sum_k (A dt)^k / (k + 1)!
+    mean = _IDENTITY + A_dt / _TERMS
+    for divisor in range(_TERMS - 1, 1, -1):
+        mean = A_dt @ mean
+        mean /= divisor
+        mean += _IDENTITY
+    return StepMatrices(_IDENTITY + A_dt @ mean, mean[..., :6] * dt[..., None])
+
+
+def propagated(estimate: Estimate, steps: Steps, stamp_ns: int, random_walks: FloatArray) -> Estimate:
+    """The estimate after ``steps`` that end at ``stamp_ns``.
+
+    Parameters
+    ----------
+    random_walks : (48,) squared densities of the parameters' random walks
+    """
+    state = estimate.state
+    imu = state.corrected(steps.imu)
+    matrices = step_matrices(imu, steps.seconds)
+    R_map_body, velocity, position = _moved(estimate, matrices, imu, steps.seconds)
+    state = replace(state, R_map_body=R_map_body[-1], velocity=velocity, position=position)
+    transitions = _transitions(matrices, R_map_body, steps)
+    variances = np.square(steps.densities) / steps.seconds[:, None]
+    by_imu = matrices.by_imu
+    noises = (by_imu * variances[:, None]) @ by_imu.swapaxes(-1, -2)
+    P = estimate.covariance.copy()
+    diagonal = np.einsum('ii->i', P)
+    for transition, noise, walked in zip(transitions, noises, np.outer(steps.seconds, random_walks), strict=True):
+        cross = transition @ P[MOVED_BY]
+        P[CORE] = cross
+        P[:, CORE] = cross.T
+        P[CORE, CORE] = cross[:, MOVED_BY] @ transition.T + noise
+        diagonal += walked
+    return replace(estimate, stamp_ns=stamp_ns, state=state, covariance=P)
+
+
+def _moved(
+    estimate: Estimate, matrices: StepMatrices, imu: FloatArray, seconds: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """R_map_body (N, 3, 3) after each step; velocity and position (3,) after the last."""
+    state = estimate.state
+    R, velocity, position = state.R_map_body, state.velocity, state.position
+    turns = matrices.transition[:, ROTATION, ROTATION].swapaxes(-1, -2)
+    # What the force adds to velocity and position, in the robot frame at the end of the step.
+    gained = (matrices.by_imu[:, 3:, 3:] @ imu[:, 3:, None]).reshape(-1, 2, 3)
+    rotations = []
+    for turn, (faster, farther), dt in zip(turns, gained, seconds.tolist(), strict=True):
+        R = R @ turn
+        fall = state.gravity * dt
+        position = position + (velocity + 0.5 * fall) * dt + R @ farther
+        velocity = velocity + fall + R @ faster
+        rotations.append(R)
+    return np.stack(rotations), velocity, position
+
+
+def _transitions(matrices: StepMatrices, R_map_body: FloatArray, steps: Steps) -> FloatArray:
+    """(N, 9, 35) of the core's error by all that moves it; ``R_map_body`` (N, 3, 3) after each step."""
+    dt = steps.seconds[:, None, None]
+    transitions = np.zeros((len(dt), 9, 35))
+    transitions[..., CORE] = matrices.transition
+    transitions[..., BIAS] = -matrices.by_imu
+    # The error that a share of the reading makes is that of a bias as large.
+    shares = matrices.by_imu.reshape(-1, 9, 2, 3, 1) * steps.imu.reshape(-1, 1, 2, 1, 3)
+    transitions[..., _SCALES] = -shares.reshape(-1, 9, 18)
+    fallen = R_map_body[:, :2].swapaxes(-1, -2) * dt
+    transitions[:, VELOCITY, GRAVITY] = fallen
+    transitions[:, POSITION, GRAVITY] = fallen * (0.5 * dt)
+    return transitions
