@@ -35,7 +35,7 @@ def soak(
         play = replay_lockstep
     else:
         meter = Meter(errors, lambda: node_processes(NODES), say)
-        play = partial(replay_processes, rate=1.0)
+        play = partial(replay_processes, rate=1.0, say=say)
     recorded = ENTRIES['images'].recorded(calibration_from_file=False, images=False)
     play(laps, tuple(NODES), TOPICS, errors, recorded, arguments, meter, lines.append)
     saved = sorted(load_map(map_file).markers)

@@ -84,3 +84,11 @@ def test_minutes_in_lock_step_leave_no_trace(tmp_path):
     with Laps(tmp_path, lap(small=True), 181.0) as laps:
         flown, said = soak(laps, tmp_path, print, lockstep=True)
         assert faults(flown, laps.imu_count, said) == []
+
+
+@pytest.mark.nightly
+@pytest.mark.ros
+def test_four_processes_fly_in_real_time(laps, tmp_path):
+    """Five seconds: enough for a map that is saved at the end, too short for a minute."""
+    _, said = soak(laps, tmp_path, print)
+    assert said == []
