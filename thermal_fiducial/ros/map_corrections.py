@@ -8,7 +8,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import positive
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Corrections, and errors of the map, that are remembered.
 _REMEMBERED = 10
@@ -42,7 +42,7 @@ class MapCorrections:
     """Of who takes poses: these in the map as it is now; ``window`` [s]: what is older is of another clock."""
 
     def __init__(self, window: float) -> None:
-        self._window_ns = window * 1e9
+        self._window_ns = window * SECOND_NS
         self._corrections: deque[tuple[int, FloatArray]] = deque(maxlen=_REMEMBERED)
         self._errors: deque[CameraPose] = deque(maxlen=_REMEMBERED)
         #: of the latest pose that had one
