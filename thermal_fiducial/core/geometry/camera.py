@@ -89,20 +89,37 @@ class Camera:
     def project_jacobian(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Pixels (..., 2) of points (..., 3), and their derivative (..., 2, 3) [px/m]."""
         points = np.asarray(points, dtype=np.float64)
-        uv, J = self._image(points, self.D)
         in_front = points[..., 2] > TINY
-        across = points[..., :2] / np.where(in_front, points[..., 2], 1.0)[..., None]
-        visible = in_front & ((across * across).sum(axis=-1) < self._fold_radius**2)
-        return np.where(visible[..., None], uv, np.nan), J
+        depth = np.where(in_front, points[..., 2], 1.0)[..., None]
+        x = points[..., :2] / depth
+        uv, by_x = self.distort_linearised(x)
+        visible = in_front & ((x * x).sum(axis=-1) < self._fold_radius**2)
+        by_depth = -by_x @ x[..., None]
+        by_point = np.concatenate([by_x, by_depth], axis=-1) / depth[..., None]
+        return np.where(visible[..., None], uv, np.nan), by_point
 
     def distort(self, normalised: npt.ArrayLike) -> FloatArray:
         """Pixels (..., 2) of normalised image coordinates x/z, y/z (..., 2)."""
-        return self._image(_on_plane(np.asarray(normalised, dtype=np.float64)), self.D)[0]
+        return self.distort_linearised(normalised)[0]
 
     def distort_linearised(self, normalised: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """:meth:`distort`, and its derivative (..., 2, 2) [px]."""
-        uv, J = self._image(_on_plane(np.asarray(normalised, dtype=np.float64)), self.D)
-        return uv, J[..., :2]
+        x = np.asarray(normalised, dtype=np.float64)
+        if not x.size:
+            return x, np.zeros((*x.shape, 2))
+        still, points = np.zeros(3), np.ones((x.size // 2, 1, 3))
+        points[:, 0, :2] = x.reshape(-1, 2)
+        # At depth 1 its derivative by a translation of the camera is the one wanted. OpenCV leaves a skew of K out.
+        if self.model == 'equidistant':
+            distorted, J = cv2.fisheye.projectPoints(points, still, still, _EYE, self.D)
+            J = J[:, 11:13]
+        else:
+            distorted, J = cv2.projectPoints(points, still, still, _EYE, self.D)
+            J = J[:, 3:5]
+        # One product of matrices costs less than one for each row of points.
+        uv = distorted.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]
+        by_x = self.K[:2, :2] @ J.reshape(-1, 2, 2)
+        return uv.reshape(x.shape), by_x.reshape(*x.shape, 2)
 
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
         """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`.
@@ -115,9 +132,9 @@ class Camera:
             undistorted = cv2.fisheye.undistortPoints(x.reshape(-1, 1, 2), _EYE, self.D)
             return np.asarray(undistorted, dtype=np.float64).reshape(x.shape)
         for _ in range(_STEPS):
-            there, J = self._image(_on_plane(x), self.D)
+            there, J = self.distort_linearised(x)
             with np.errstate(divide='ignore', invalid='ignore'):
-                step = (inverse_2x2(J[..., :2]) @ (uv - there)[..., None])[..., 0]
+                step = (inverse_2x2(J) @ (uv - there)[..., None])[..., 0]
             x = x + step
             if np.abs(step).max(initial=0.0) < _SHORT:
                 break
@@ -135,23 +152,6 @@ class Camera:
         last = self._last_pixel - margin_px
         return np.asarray(((uv >= margin_px) & (uv <= last)).all(axis=-1))
 
-    def _image(self, points: FloatArray, D: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixels (..., 2) of points (..., 3), wherever these are, and their derivative (..., 2, 3), by a distortion."""
-        if not points.size:
-            return points[..., :2], np.zeros((*points.shape[:-1], 2, 3))
-        listed, still = points.reshape(-1, 1, 3), np.zeros(3)
-        # Its derivative by a translation of the camera is that by the points. OpenCV leaves a skew of K out.
-        if self.model == 'equidistant':
-            x, J = cv2.fisheye.projectPoints(listed, still, still, _EYE, D)
-            J = J[:, 11:14]
-        else:
-            x, J = cv2.projectPoints(listed, still, still, _EYE, D)
-            J = J[:, 3:6]
-        # One product of matrices costs less than one for each row of points.
-        uv = x.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]
-        by_point = self.K[:2, :2] @ J.reshape(-1, 2, 3)
-        return uv.reshape(*points.shape[:-1], 2), by_point.reshape(*points.shape[:-1], 2, 3)
-
     @cached_property
     def _fold_radius(self) -> float:
         """Normalised radius up to which the distorted radius grows: beyond it two points share a pixel."""
@@ -159,7 +159,8 @@ class Camera:
         if self.model != 'equidistant':
             radial[_TANGENTIAL] = 0.0
         r = np.linspace(0.0, 12.0, 4801)
-        across = self._image(_on_plane(np.stack([r, np.zeros_like(r)], axis=-1)), radial)[0]
+        lens = Camera(self.width, self.height, self.K, self.model, radial)
+        across = lens.distort(np.stack([r, np.zeros_like(r)], axis=-1))
         falling = np.flatnonzero(np.diff(across[:, 0]) <= 0.0)
         return float(r[falling[0]]) if len(falling) else np.inf
 
@@ -218,10 +219,3 @@ def inverse_2x2(J: FloatArray) -> FloatArray:
     inverse[..., 0, 0], inverse[..., 0, 1], inverse[..., 1, 0], inverse[..., 1, 1] = d, -b, -c, a
     inverse /= (a * d - b * c)[..., None, None]
     return inverse
-
-
-def _on_plane(x: FloatArray) -> FloatArray:
-    """Points (..., 3) at depth 1 with normalised coordinates (..., 2)."""
-    points = np.ones((*x.shape[:-1], 3))
-    points[..., :2] = x
-    return points
