@@ -22,9 +22,9 @@ def test_distances_grow_inward_however_the_square_is_turned_and_tilted(tilt_deg)
         sides = sides_of(x, CAMERA, (512, 640), 6, 6, 4)
         corners = CAMERA.distort(x)[0]
         middles = 0.5 * (corners[[0, 3, 0, 1]] + corners[[1, 2, 3, 2]])
-        inward = np.sum(sides.normal[3] * (corners.mean(axis=0) - middles), axis=1)
+        inward = np.sum(sides.normal[:, 3] * (corners.mean(axis=0) - middles), axis=1)
         # Half the width of the square across each side, to the fraction of a pixel that distortion bends it by.
-        np.testing.assert_allclose(inward, 0.5 * sides.across, atol=0.5)
-        distance = sides.distance[:, 0, 3]
+        np.testing.assert_allclose(inward, 0.5 * sides.across[:, 0], atol=0.5)
+        distance = sides.distance[:, 0, :, 3]
         assert np.all(np.abs(distance).argmin(axis=0) == 4)
         assert np.all(np.diff(distance, axis=0) * np.sign(np.diff(distance[:2], axis=0)) > 0.0)

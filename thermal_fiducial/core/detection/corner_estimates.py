@@ -92,9 +92,9 @@ class DisplayedSides:
         a, b = inset + (1.0 - 2.0 * inset) * np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
         inner = np.moveaxis(se3.in_quadrilaterals(seen.x, a, b), 0, -1)
         sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _HALF)
-        blur = blurs(sides.normal[self._bits // 2], blur_px, refined.blur.spread)
+        blur = blurs(sides.normal[:, self._bits // 2], blur_px, refined.blur.spread)
         value, slope, weight = model(sides, self._behind[refined.ids], blur)
-        weight *= self._white[refined.ids].reshape(-1, self._bits).T
+        weight *= self._white[refined.ids].reshape(-1, self._bits)
         counts = sides.counts(frame.image, refined.blur.to_tails)
         return measure(counts, (value, slope, weight), REACHED * blur[0])
 

@@ -158,7 +158,7 @@ def rolling_displacement(
 
 
 def without_lag_tails(counts: Float32Array, pixel: IntArray, image: Float32Array, to_tails: FloatArray) -> Float32Array:
-    """``counts`` (..., N Q) of pixels of the flat image, as many of each marker, without their lag tails.
+    """``counts`` (M, C, 4 N, m) of pixels of the flat image, as many of each marker, without their lag tails.
 
     Of a few columns of pixels it takes a fourth of the time of the whole windows round the markers.
 
@@ -166,7 +166,7 @@ def without_lag_tails(counts: Float32Array, pixel: IntArray, image: Float32Array
     ----------
     to_tails : (N, 2, 3) affine maps of pixels to where the image shows what these saw one lag tail's age ago
     """
-    by_marker = pixel.reshape(-1, len(to_tails), pixel.shape[-1] // len(to_tails)).astype(np.int32)
+    by_marker = pixel.reshape(pixel.shape[0] * pixel.shape[1], len(to_tails), -1).astype(np.int32)
     v, u = (places.astype(np.float32) for places in np.divmod(by_marker, np.int32(image.shape[1])))
     maps = to_tails.astype(np.float32)[..., None]
     to_u, to_v = (

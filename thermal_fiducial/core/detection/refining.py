@@ -250,7 +250,7 @@ def _pass(
     cells = behind.shape[2]
     half = half_width(math.hypot(blur_px, math.sqrt(float((lag_blur * lag_blur).sum(axis=1).max()))))
     sides = sides_of(start.x, camera, image.shape, cells, columns, half)
-    blur = blurs(sides.normal[cells // 2], blur_px, lag_blur)
+    blur = blurs(sides.normal[:, cells // 2], blur_px, lag_blur)
     segments = measure(sides.counts(image, to_tails), model(sides, behind, blur), REACHED * blur[0])
     shift, covariances, doubt = adjust(sides, segments, _PRIOR_PX, start)
     good = segments.variance < HOPELESS

@@ -121,7 +121,7 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     widest = math.hypot(layer.blur, float(np.linalg.norm(layer.lag_blur)))
     half = half_width(widest)
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, columns, half)
-    blur = blurs(sides.normal[0], layer.blur, layer.lag_blur[None])
+    blur = blurs(sides.normal[:, 0], layer.blur, layer.lag_blur[None])
     modelled = _model(sides, pattern.step, blur)
     measured = measure(sides.counts(layer.image), modelled, REACHED * blur[0], len(nodes))
     used = measured.variance[0] < HOPELESS
@@ -148,9 +148,9 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
 def _model(
     sides: Sides, step: FloatArray, blur: tuple[FloatArray, FloatArray]
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """White's share of every pixel but for a constant, its derivative by distance, and its weight, (M, C, 1, E)."""
+    """White's share of every pixel but for a constant, its derivative by distance, and its weight, (M, C, E, 1)."""
     value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32))
-    sign = step.astype(np.float32)
+    sign = step[:, None].astype(np.float32)
     value *= sign
     slope *= sign
     ends = _QUIET * blur[1] / sides.along
@@ -166,10 +166,10 @@ def _design(
 ) -> FloatArray:
     """Derivative (E, 6) of displacements along the normals by translation and rotation, where columns count."""
     counted: BoolArray = np.asarray(weight.any(axis=0))
-    t = (sides.t * counted).sum(axis=(0, 1)) / np.maximum(counted.sum(axis=(0, 1)), 1)
+    t = (sides.t * counted).sum(axis=(0, 2)) / np.maximum(counted.sum(axis=(0, 2)), 1)
     shares = pattern.nodes[:, 0] + t[:, None] * (pattern.nodes[:, 4] - pattern.nodes[:, 0])
     J = pose_jacobian(T, on_marker(shares, size), camera)
-    return np.asarray(np.einsum('ek,ekj->ej', sides.normal[0], J))
+    return np.asarray(np.einsum('ek,ekj->ej', sides.normal[:, 0], J))
 
 
 def pose_jacobian(T: FloatArray, points: FloatArray, camera: Camera) -> FloatArray:

@@ -37,7 +37,8 @@ _KEPT_VARIANCE = 0.911
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
 # Weights of segments are found in so many rounds, or fewer when they no longer change by more.
 _ROUNDS, _SETTLED = 3, 0.1
-_SIDES = np.arange(4)
+# (4, 1, 4, 1) which corner each side begins at, and ends at.
+_AT_START, _AT_END = (np.eye(4)[corners, None, :, None] for corners in (STARTS, ENDS))
 # Products of the columns of a segment's least squares, and of columns and products together.
 _PRODUCTS = (1, 1), (1, 2), (2, 2), (1, 3), (2, 3), (3, 3)
 _PLANES = 4 + len(_PRODUCTS)
@@ -89,37 +90,36 @@ def measure(
     reach: FloatArray,
     of_each: int = 4,
 ) -> Segments:
-    """Displacement of each segment, S = 4 m to a marker: one of m on each side, the sides of the first parts first.
+    """Displacement of each segment, S = 4 m to a marker: the m of one side after those of the other.
 
     Parameters
     ----------
-    counts : (M, C, m, E) of the pixels across the sides
-    modelled : value, derivative and weight of each pixel (M, C, m, E), of ``sides.model``
-    reach : (E,) longest displacement for which the model can be linearised [px]
+    counts : (M, C, E, m) of the pixels across the sides
+    modelled : value, derivative and weight of each pixel (M, C, E, m), of ``sides.model``
+    reach : (E, 1) longest displacement for which the model can be linearised [px]
     of_each : number of sides of a marker
     """
-    cells = counts.shape[2]
     value, slope, weight = modelled
+    segments = of_each * counts.shape[3]
     X = np.empty((_PLANES, *counts.shape), dtype=np.float32)
     X[0] = weight
     np.multiply(value, weight, out=X[1])
     np.multiply(slope, weight, out=X[2])
     np.subtract(counts, counts[counts.shape[0] // 2, counts.shape[1] // 2], out=X[3])
     X[3] *= weight
-    X = X.reshape(_PLANES, -1, cells * len(reach))
+    X = X.reshape(_PLANES, counts.shape[0] * counts.shape[1], -1)
     moments = _moments(X)
-    fit = _fit(moments, cells, of_each)
-    lines = fit.level, fit.contrast, fit.product, _PIXEL_OUTLIER * np.sqrt(fit.noise)
-    level, contrast, product, limit = (_by_segment(each, cells, of_each) for each in lines)
+    fit = _fit(moments, segments)
+    lines = np.stack([fit.level, fit.contrast, fit.product, _PIXEL_OUTLIER * np.sqrt(fit.noise)])
+    level, contrast, product, limit = lines.astype(np.float32).reshape(4, -1)
     inliers = np.abs(X[3] - level * X[0] - contrast * X[1] - product * X[2]) <= limit
     touched = np.flatnonzero(~inliers.all(axis=0))
     if len(touched):
         part = X[..., touched]
         part[:4] *= inliers[:, touched]
         moments[:, touched] = _moments(part)
-        fit = _fit(moments, cells, of_each)
-    farthest = np.empty((len(reach) // of_each, cells, of_each))
-    farthest[:] = reach.reshape(-1, 1, of_each)
+        fit = _fit(moments, segments)
+    farthest = np.broadcast_to(reach, counts.shape[2:])
     return _judged(fit, farthest.reshape(fit.noise.shape))
 
 
@@ -133,15 +133,9 @@ def _moments(X: Float32Array) -> Float32Array:
     return np.asarray(np.add.reduce(X, axis=1))
 
 
-def _by_segment(values: FloatArray, cells: int, sides: int) -> Float32Array:
-    """Of markers (N, S) as (m E,)."""
-    return np.array(values.reshape(-1, cells, sides).swapaxes(0, 1), dtype=np.float32, order='C').ravel()
-
-
-def _fit(moments: Float32Array, cells: int, sides: int) -> _SegmentFit:
-    """Least squares of the counts on (1, model, derivative), by marker (N, S), with :func:`_moments` (10, m E)."""
-    by_marker = moments.reshape(len(moments), cells, -1, sides).swapaxes(1, 2)
-    sums = np.array(by_marker, dtype=np.float64, order='C').reshape(len(moments), -1, sides * cells)
+def _fit(moments: Float32Array, segments: int) -> _SegmentFit:
+    """Least squares of the counts on (1, model, derivative), by marker (N, S), with :func:`_moments` (10, N S)."""
+    sums = moments.astype(np.float64).reshape(len(moments), -1, segments)
     number, x, y, z, xx, xy, yy, xz, yz, zz = sums
     x_mean, y_mean, z_mean = sums[1:4] / np.maximum(number, 1.0)
     # Without their means the columns leave two unknowns.
@@ -237,10 +231,8 @@ def robust_fit(A: FloatArray, shift: FloatArray, used: BoolArray, prior: FloatAr
 
 def _design(sides: Sides) -> FloatArray:
     """Derivative (N, S, 8) of the segments' displacements along their normals by the corners'."""
-    cells = len(sides.normal)
+    cells = sides.normal.shape[1]
     t = (sides.t * sides.fresh).sum(axis=0) / np.maximum(sides.fresh.sum(axis=0), 1)
     by_end = t[..., None] * sides.normal
-    A = np.zeros((cells, len(by_end[0]) // 4, 4, 4, 2))
-    A[:, :, _SIDES, STARTS] = (sides.normal - by_end).reshape(cells, -1, 4, 2)
-    A[:, :, _SIDES, ENDS] = by_end.reshape(cells, -1, 4, 2)
-    return A.swapaxes(0, 1).reshape(-1, 4 * cells, 8)
+    from_start, from_end = (each.reshape(-1, 4, cells, 1, 2) for each in (sides.normal - by_end, by_end))
+    return np.asarray(from_start * _AT_START + from_end * _AT_END).reshape(-1, 4 * cells, 8)

@@ -41,25 +41,25 @@ _MOSTLY = 0.7
 class Sides:
     """The E = 4 N sides of N markers in m parts each, and C columns of M pixels across every part."""
 
-    #: (C, m, E) share of the side at which a column crosses it
+    #: (C, E, m) share of the side at which a column crosses it
     t: FloatArray
-    #: (C, m, E) which columns lie in the image and repeat no other
+    #: (C, E, m) which columns lie in the image and repeat no other
     fresh: BoolArray
-    #: (M, C, m, E) distance of each pixel from the side, inward [px]
+    #: (M, C, E, m) distance of each pixel from the side, inward [px]
     distance: Float32Array
-    #: (M, C, m, E) place of each pixel in the flat image
+    #: (M, C, E, m) place of each pixel in the flat image
     pixel: IntArray
-    #: (M, C, m, E) whether it lies in the image; None: all do
+    #: (M, C, E, m) whether it lies in the image; None: all do
     inside: BoolArray | None
-    #: (m, E, 2) unit normal inward, in the middle of each part
+    #: (E, m, 2) unit normal inward, in the middle of each part
     normal: FloatArray
-    #: (E,) distance of the opposite side [px]
+    #: (E, 1) distance of the opposite side [px]
     across: FloatArray
-    #: (E,) length [px]
+    #: (E, 1) length [px]
     along: FloatArray
 
     def counts(self, image: Float32Array, to_tails: FloatArray | None = None) -> Float32Array:
-        """Of the pixels (M, C, m, E), without lag tails where maps ``to_tails`` (N, 2, 3) say where these are."""
+        """Of the pixels (M, C, E, m), without lag tails where maps ``to_tails`` (N, 2, 3) say where these are."""
         counts = image.ravel().take(self.pixel, mode='clip')
         return counts if to_tails is None else without_lag_tails(counts, self.pixel, image, to_tails)
 
@@ -97,20 +97,20 @@ def columns_across(
     shape, cells, columns, half : as of :func:`sides_of`
     """
     span = nodes[:, 4] - nodes[:, 0]
-    steep = np.abs(span[:, 1]) > np.abs(span[:, 0])
+    du, dv = span[:, :1], span[:, 1:]
+    steep = np.abs(dv) > np.abs(du)
     share, weights = _parts(cells, columns)
-    by_column = (2, columns, cells, len(nodes))
+    by_column = (2, columns, len(nodes), cells)
     (along, rate), (across, climb) = (
-        (weights @ np.where(upright, nodes[..., 1].T, nodes[..., 0].T)).reshape(by_column)
-        for upright in (steep, ~steep)
+        (np.where(upright, nodes[..., 1], nodes[..., 0]) @ weights).reshape(by_column) for upright in (steep, ~steep)
     )
     # From where the columns should be it is at most half a pixel to a whole one: over that the side is straight.
     whole, slope = np.rint(along), climb / rate
     ahead = whole - along
     centre = across + slope * ahead
     # On which side of the line the opposite one lies: of a steeply tilted square it may lie mostly further along.
-    turn = span[:, 0] * opposite[:, 1] - span[:, 1] * opposite[:, 0]
-    inward = np.sign(turn * np.where(steep, -span[:, 1], span[:, 0]))
+    turn = du * opposite[:, 1:] - dv * opposite[:, :1]
+    inward = np.sign(turn * np.where(steep, -dv, du))
     pitch = inward / np.sqrt(1.0 + slope * slope)
     by_way, leaning = pitch[columns // 2], -(slope * pitch)[columns // 2]
     normal = np.stack([np.where(steep, by_way, leaning), np.where(steep, leaning, by_way)], axis=-1)
@@ -126,34 +126,35 @@ def columns_across(
         pixel + across_stride * offsets,
         inside,
         normal,
-        np.abs((opposite * normal[cells // 2]).sum(axis=-1)),
-        np.sqrt((span * span).sum(axis=-1)),
+        np.abs((opposite * normal[:, cells // 2]).sum(axis=-1, keepdims=True)),
+        np.sqrt((span * span).sum(axis=-1, keepdims=True)),
     )
 
 
 @cache
 def _parts(cells: int, columns: int) -> tuple[FloatArray, FloatArray]:
-    """Shares (C, m, 1) of a side where columns cross it; weights (2 C m, 5) of nodes in the places and derivatives."""
+    """Shares (C, 1, m) of a side where columns cross it; weights (2 C, 5, m) of nodes in the places and derivatives."""
     share = ((np.arange(columns)[:, None] + 0.5) / columns + np.arange(cells)) / cells
     powers = np.arange(len(NODES))
     at = share.reshape(-1, 1) ** powers
     rate = np.zeros_like(at)
     rate[:, 1:] = powers[1:] * at[:, :-1]
-    return share[..., None], np.concatenate([at, rate]) @ np.linalg.inv(np.vander(NODES, increasing=True))
+    weights = np.concatenate([at, rate]) @ np.linalg.inv(np.vander(NODES, increasing=True))
+    return share[:, None], weights.reshape(2 * columns, cells, len(NODES)).swapaxes(1, 2)
 
 
 def _seen(
     whole: FloatArray, base: FloatArray, steep: BoolArray, nodes: FloatArray, shape: tuple[int, ...], half: int
 ) -> tuple[BoolArray, BoolArray | None]:
-    """Which columns (C, m, E) lie in the image, repeating no other, and which of their pixels (M, C, m, E) do."""
+    """Which columns (C, E, m) lie in the image, repeating no other, and which of their pixels (M, C, E, m) do."""
     fresh = np.ones(whole.shape, dtype=bool)
     np.not_equal(whole[1:], whole[:-1], out=fresh[1:])
-    np.not_equal(whole[0, 1:], whole[-1, :-1], out=fresh[0, 1:])
+    np.not_equal(whole[0, :, 1:], whole[-1, :, :-1], out=fresh[0, :, 1:])
     margin = half + _BEYOND_NODES
     last = nodes[..., 0].max() - shape[1], nodes[..., 1].max() - shape[0]
     if nodes.min() >= margin and max(last) <= -1.0 - margin:
         return fresh, None
-    far, end = np.where(steep[:, None], shape[::-1], shape).T - 1.0
+    far, end = np.where(steep, shape[::-1], shape).T[..., None] - 1.0
     fresh &= (whole >= 0.0) & (whole <= end) & (base >= _BOTH_SIDES) & (base <= far - _BOTH_SIDES)
     place = base + np.arange(-half, half + 1)[:, None, None, None]
     return fresh, (place >= 0.0) & (place <= far)
@@ -196,11 +197,11 @@ def half_width(blur: float) -> int:
 
 
 def blurs(normal: FloatArray, optics: float, lag_blur: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Blur (E,) across and along sides with normals (E, 2), of markers with a motion blur (N, 2) [px]."""
+    """Blur (E, 1) across and along sides with normals (E, 2), of markers with a motion blur (N, 2) [px]."""
     u, v = normal[:, 0].reshape(len(lag_blur), -1), normal[:, 1].reshape(len(lag_blur), -1)
     across, along = lag_blur[:, :1] * u + lag_blur[:, 1:] * v, lag_blur[:, 1:] * u - lag_blur[:, :1] * v
     square = optics * optics
-    return np.sqrt(square + across * across).ravel(), np.sqrt(square + along * along).ravel()
+    return np.sqrt(square + across * across).reshape(-1, 1), np.sqrt(square + along * along).reshape(-1, 1)
 
 
 def model(
@@ -211,11 +212,11 @@ def model(
     Parameters
     ----------
     behind : (N, 4, m, 2) of :func:`edges_behind`
-    blur : (E,) across and along the sides
+    blur : (E, 1) across and along the sides
 
     Returns
     -------
-    (M, C, m, E) each
+    (M, C, E, m) each
     """
     cells = behind.shape[2]
     cell = sides.across / cells
@@ -229,7 +230,8 @@ def model(
     slope *= fall
     narrow = cell < _NARROW * blur[0]
     if narrow.any():
-        _add_neighbours(value, slope, sides, np.flatnonzero(narrow), behind.reshape(-1, cells, len(NEIGHBOURS)), blur)
+        which, edges = np.flatnonzero(narrow), behind.reshape(-1, cells, len(NEIGHBOURS))
+        _add_neighbours(value, slope, sides, which, edges, blur)
     reach = np.where(narrow, cell, cell - 2.0 * blur[0])
     quiet = np.minimum(reach, np.maximum(cell - _PLATE_EDGE_SHOWS * blur[0], _LEAST_QUIET_PX))
     weight = (sides.distance >= -quiet.astype(np.float32)) & (sides.distance <= reach.astype(np.float32))
@@ -260,13 +262,13 @@ def _add_neighbours(
 ) -> None:
     """Add to the model of the sides ``which`` what the edges ``behind`` (E, m, 2) contribute, blurred along."""
     cells = behind.shape[1]
-    t = np.moveaxis(sides.t[..., which], -1, 0)[..., None]
-    z = (t * cells - np.arange(cells + 1)) * (sides.along / (cells * blur[1]))[which, None, None, None]
+    t = sides.t[:, which, :, None]
+    z = (t * cells - np.arange(cells + 1)) * (sides.along / (cells * blur[1]))[which, None]
     step = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR))
-    amounts = np.moveaxis((step[..., :-1] - step[..., 1:]).astype(np.float32) @ behind[which, None], 0, -1)
+    amounts = (step[..., :-1] - step[..., 1:]).astype(np.float32) @ behind[which]
     width = (sides.across / cells)[which].astype(np.float32)
     sharpness = (1.0 / blur[0])[which].astype(np.float32)
     for index, number in enumerate(NEIGHBOURS):
-        share, rise = blurred_step(sides.distance[..., which] - number * width, sharpness)
-        value[..., which] += amounts[:, :, index] * share
-        slope[..., which] += amounts[:, :, index] * rise
+        share, rise = blurred_step(sides.distance[:, :, which] - number * width, sharpness)
+        value[:, :, which] += amounts[..., index] * share
+        slope[:, :, which] += amounts[..., index] * rise
