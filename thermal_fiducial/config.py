@@ -414,8 +414,8 @@ class ArucoDetectorConfig(SelfChecked):
     guided: bool = param(True, 'With a map and odometry: look for known markers where they should be.', live=True)
     blind_interval: int = param(
         10,
-        'A blind search follows every so many frames, and sooner without a map or where expected markers are not seen. '
-        'Where all are clear, small markers (at full resolution) and faint ones (at half) are looked for in turn.',
+        'A blind search follows every so many frames, and sooner without a map or where most of its markers are not '
+        'seen. Where all are clear, small markers (at full resolution) and faint ones (at half) take turns.',
         minimum=1,
         maximum=1000,
         live=True,

@@ -33,9 +33,8 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 _FRAMES, _SURE = 30, 6.0
 # Share of the map's expected markers that, when observed, shows that the prediction holds.
 _ENOUGH = 0.5
-# Where not all markers are known, or not all observed that should be, a blind search follows at least every so many
-# frames.
-_INCOMPLETE = 2
+# Where there is no map, or its prediction does not hold, a blind search follows at least every so many frames.
+_UNSURE = 2
 # Correlation with its pattern of a marker that is still where motion has carried it, seen through the lag.
 _STILL_SIMILAR = 0.7
 
@@ -109,10 +108,10 @@ class MarkerFinder:
         if frame.twist is not None and config.guided:
             found, number = self._guided(frame, frame.twist, history, known, in_map, config)
             complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
-            holds = in_map is not None and number > 0 and len(found.ids) >= _ENOUGH * number
-        since_blind, interval = history.since_blind + 1, config.blind_interval
-        if in_map is None or not complete:
-            interval = min(interval, _INCOMPLETE)
+            enough = complete or (number > 0 and len(found.ids) >= _ENOUGH * number)
+            holds = in_map is not None and enough
+        interval = config.blind_interval if holds else min(config.blind_interval, _UNSURE)
+        since_blind = history.since_blind + 1
         if (complete or holds) and since_blind < interval:
             return Findings(found, since_blind, history.scales)
         scales = _next_scales(history, complete=complete)
