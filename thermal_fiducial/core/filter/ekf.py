@@ -23,14 +23,14 @@ from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 
-#: Why the filter begins anew, or a pose has to wait.
+#: Reason of a reset after a jump of the IMU's stamps, and of poses that wait until it is explained.
 CLOCK_JUMPED = "the IMU's clock has jumped"
 
 
 class PoseEkf:
     """Left-invariant error-state Kalman filter with delayed, gated corrections.
 
-    ``status`` says in words how it is; ``diagnostics()`` in numbers; ``decided`` has the latest verdicts on the poses.
+    ``status`` gives its condition in words, ``diagnostics()`` in numbers; ``decided`` has the latest verdicts on poses.
     """
 
     def __init__(self, config: PoseEkfConfig) -> None:
@@ -44,7 +44,7 @@ class PoseEkf:
         self._hypotheses.configure(config)
 
     def reset(self, reason: str = 'it was asked for') -> None:
-        """Forget everything, for a ``reason`` in words."""
+        """Discard the estimate and all samples and poses; the diagnostics give the ``reason``."""
         config, self._restart_reason = self._config, reason
         self._hypotheses = Hypotheses(config)
         self._imu_refused = 0
@@ -54,7 +54,7 @@ class PoseEkf:
 
     def _begin(self, camera_time_offset: float) -> None:
         config = self._config
-        #: what is added to the camera's stamps before an offset is estimated [s]
+        #: prior of the clock offset t_imu - t_camera [s]
         self._first_offset = camera_time_offset
         self._noise = ImuNoiseMonitor(config.imu)
         self._history = History(self._hypotheses, config.max_delay + WINDOW_SECONDS, camera_time_offset)
@@ -65,7 +65,7 @@ class PoseEkf:
         self.smooth: Odometry | None = None
 
     def _begin_after_jump(self) -> None:
-        """Begin anew with the clock offset that was known: mostly samples are missing where the stamps jump."""
+        """Reset, but keep the estimated clock offset: where stamps jump, mostly samples are missing."""
         self._restart_reason = CLOCK_JUMPED
         main, known = self._history.main, self.camera_time_offset is not None
         learned = main.estimate.state.time_offset if main and known else 0.0
@@ -78,8 +78,8 @@ class PoseEkf:
 
         Returns
         -------
-        State at the sample's stamp; None before the filter is initialised and for a sample that it can't use
-        (``status`` says why).
+        State at the sample's stamp; None before the filter is initialised and for a refused sample (``status`` says
+        why).
         """
         if not self.keep_imu(sample):
             return None
@@ -89,11 +89,11 @@ class PoseEkf:
         return output
 
     def keep_imu(self, sample: ImuSample) -> bool:
-        """Keep an IMU sample without a look at the state there: the next :meth:`add_imu` goes on over all of them.
+        """Buffer an IMU sample without propagating to it: the next :meth:`add_imu` propagates over all buffered ones.
 
         Returns
         -------
-        Whether the sample can be used (``status`` says why not).
+        Whether the sample was taken (``status`` says why not).
         """
         verdict = self._input.judge(sample)
         if verdict is Verdict.RESTART:
@@ -111,9 +111,9 @@ class PoseEkf:
         return True
 
     def add_pose(self, pose: CameraPose) -> PoseUpdate:
-        """Correct by a camera pose at its own instant, now or as soon as the IMU samples of that instant are there.
+        """Correct the state at the instant of a camera pose; a pose ahead of the IMU waits for the samples.
 
-        ``pose.stamp_ns`` is the camera's stamp; ``camera_time_offset`` and the estimated rest are applied here.
+        ``pose.stamp_ns`` is in the camera's clock; the clock offset, parameter and estimate, is added here.
         """
         pose = self._in_present_clock(pose)
         if self._history.main is None and self._camera_clock.in_question:
@@ -127,7 +127,7 @@ class PoseEkf:
         return self._log.latest.get(pose.stamp_ns, waiting)
 
     def _in_present_clock(self, pose: CameraPose) -> CameraPose:
-        """``pose`` without the steps of the camera's clock, of which it may show another one."""
+        """``pose`` with all steps of the camera's clock taken out of its stamp, a step that it reveals included."""
         history, pose = self._history, self._camera_clock.stamped(pose)
         if not history.imu:
             return pose
@@ -136,7 +136,7 @@ class PoseEkf:
             return pose
         restamped = replace(pose, stamp_ns=pose.stamp_ns - step_ns)
         if self._camera_clock.is_of_imu(step_ns):
-            # All since then was propagated over time that never was.
+            # Since the step the state was propagated over time that did not pass.
             self._camera_clock.follow(step_ns)
             self._begin_after_jump()
             return restamped
@@ -147,18 +147,18 @@ class PoseEkf:
         return restamped
 
     def _contradicts(self, pose: CameraPose) -> bool:
-        """Whether poses like the one that comes are of no use by their stamps: refused, or out of time."""
+        """Whether poses with this stamp cannot be used: the last one was refused, or the stamp is out of range."""
         main = self._history.main
         ahead = self._history.due_ns(pose, main) > self._history.imu.newest_ns
         return main is not None and (main.accepted_in_row == 0 or ahead or bool(self._unusable(pose)))
 
     def _fits(self, pose: CameraPose) -> bool:
-        """Whether a pose is right up to an unknown clock."""
+        """Whether a pose passes the gate if the clock offset is taken for unknown."""
         found = self._history.main_at(pose)
         return found is not None and self._hypotheses.explains(found[0], pose, found[1])
 
     def move_map(self, T_new_old: FloatArray) -> None:
-        """Follow a correction of the map: estimates and buffered poses move with it, T_new = T_new_old @ T_old."""
+        """Apply a correction of the map to estimates and buffered poses: T_new = T_new_old @ T_old."""
         self._history.move_map(T_new_old)
 
     def _unusable(self, pose: CameraPose) -> str:
@@ -195,7 +195,7 @@ class PoseEkf:
         return odometry(main.estimate, covariance, with_bias, imu, rate_variance)
 
     def _contradicting(self, main: Hypothesis) -> Hypothesis | None:
-        """The alternative, while the latest poses speak for it and against the estimate."""
+        """The alternative hypothesis, while the latest poses support it and contradict the estimate."""
         other = self._history.belief.alternative
         if other is None or not main.in_doubt or other.hits < self._config.initial_poses:
             return None
@@ -203,7 +203,7 @@ class PoseEkf:
 
     @property
     def decided(self) -> Mapping[int, PoseUpdate]:
-        """Stamp of the camera to the latest verdict on its pose, for the latest poses."""
+        """Latest verdict on each of the latest poses, by camera stamp."""
         return self._log.latest
 
     @property
@@ -220,7 +220,7 @@ class PoseEkf:
 
     @property
     def camera_time_offset(self) -> float | None:
-        """Estimate of t_imu - t_camera [s]; None while it is not known well enough to rely on."""
+        """Estimate of t_imu - t_camera [s]; None while its standard deviation is above ``KNOWN_OFFSET_STD``."""
         main = self._history.main
         if main is None or self._time_offset_std(main) > KNOWN_OFFSET_STD:
             return None
@@ -231,23 +231,23 @@ class PoseEkf:
         return self._first_offset + main.estimate.state.time_offset - steps
 
     def _time_offset_std(self, main: Hypothesis) -> float:
-        """Of the estimate; where there is none, what the parameter says [s]."""
+        """Standard deviation of the clock offset [s]: of the estimate, else of the parameter."""
         config = self._config
         return main.estimate.std(TIME_OFFSET) if config.estimate_time_offset else config.time_offset_std
 
     @property
     def resets(self) -> int:
-        """How often another estimate has replaced the present one since it was begun."""
+        """Times that an alternative hypothesis has replaced the estimate."""
         return self._history.belief.resets
 
     @property
     def reset_reason(self) -> str:
-        """Why the estimate was replaced, or given up, the last time."""
+        """Why the estimate was last replaced or discarded."""
         return self._history.belief.reset_reason or self._restart_reason
 
     @property
     def status(self) -> str:
-        """How the filter is, in words."""
+        """Condition of the filter in words."""
         if self._imu_fault:
             return self._imu_fault
         if not self._history.imu:
@@ -280,7 +280,7 @@ class PoseEkf:
 
     @property
     def lost(self) -> bool:
-        """Whether there is no pose to fly on: none as good as ``lost_position_std``, or poses and IMU contradict it."""
+        """Whether not to fly on the pose: worse than ``lost_position_std``, contradicted by poses, or the IMU frozen."""
         main = self._history.main
         if main is None or self._imu_fault == Verdict.FROZEN.value or main.in_doubt:
             return True
@@ -288,14 +288,14 @@ class PoseEkf:
 
     @property
     def usable_for(self) -> float:
-        """Seconds [s] for which the pose stays as good as ``lost_position_std`` asks, if no marker comes any more."""
+        """Seconds [s] until the position is worse than ``lost_position_std`` if no further pose arrives."""
         main = self._history.main
         if main is None:
             return 0.0
         return usable_seconds(main.estimate, self._history.imu.last_densities, self._config.lost_position_std)
 
     def diagnostics(self) -> dict[str, float]:
-        """How the filter is, in numbers (SI units)."""
+        """Condition of the filter in numbers (SI units)."""
         rate, force = self._noise.vibration
         numbers = {
             'poses accepted': float(self._log.accepted),

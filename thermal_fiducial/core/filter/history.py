@@ -1,8 +1,7 @@
-"""What is believed after each pose. Poses come late, and in any order.
+"""Samples, poses and the belief after each pose; late poses are inserted at their stamp, and later ones re-applied.
 
-The belief after a pose is a function of the samples and poses up to it, ordered by time, never of the order in which
-they came, but for the few samples after a pose that show its motion: a pose that comes late goes where it belongs, and
-those after it are taken in again.
+The belief after a pose depends on the samples and poses up to that instant, in the order of their stamps, not of their
+arrival. The exception is :class:`MotionAtPose`, which also averages the few samples after the pose that have arrived.
 """
 
 from bisect import bisect_left, bisect_right, insort
@@ -18,14 +17,17 @@ from thermal_fiducial.core.filter.update import MotionAtPose
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: Without poses the estimate is kept so often [ns]: a pose that comes late goes back no farther than that.
+#: Without poses the propagated estimate is stored at this interval [ns], which bounds what a late pose re-propagates.
 _KEPT_EVERY_NS = 100_000_000
 
 
 class History:
-    """Samples, poses, and beliefs, kept for so many ``seconds``.
+    """Buffers of IMU samples, camera poses and beliefs.
 
-    ``camera_time_offset`` [s]: what is added to the camera's stamps before an offset is estimated.
+    Parameters
+    ----------
+    seconds : how long they are kept [s]
+    camera_time_offset : prior of the clock offset t_imu - t_camera [s]
     """
 
     def __init__(self, hypotheses: Hypotheses, seconds: float, camera_time_offset: float) -> None:
@@ -38,32 +40,32 @@ class History:
 
     @property
     def belief(self) -> Belief:
-        """The latest."""
+        """Belief after the latest pose."""
         return self._beliefs[-1]
 
     @property
     def main(self) -> Hypothesis | None:
-        """The estimate at the newest sample."""
+        """The main hypothesis, the estimate, at the newest sample."""
         return self._main
 
     @property
     def alternative(self) -> Hypothesis | None:
-        """The alternative to it at the newest sample."""
+        """The alternative hypothesis at the newest sample."""
         other = self.belief.alternative
         return other and self._hypotheses.carried(other, self.imu, self.imu.newest_ns)
 
     def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
-        """Add the newest sample (6,), and the densities (6,) of its step."""
+        """Add the newest sample (6,) and the noise densities (6,) of the step that ends with it."""
         self.imu.append(stamp_ns, imu, densities)
-        # In blocks, as the rest moves.
+        # Half of the buffer at a time: each removal moves the rest.
         if stamp_ns - self.imu.oldest_ns > 2 * self._kept_ns:
             self._forget_old()
 
     def _forget_old(self) -> None:
-        """Forget what no pose may reach any more."""
+        """Remove what is older than any pose that may still be inserted."""
         horizon_ns = self.imu.newest_ns - self._kept_ns
         if self.belief.stamp_ns < horizon_ns and self.belief.main is None:
-            # A start that has seen no pose since: where it is by now is all that counts.
+            # Initialising, and no pose for that long: only the hypothesis carried to the present is needed.
             self._beliefs = [self.belief._replace(alternative=self.alternative)]
         while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
             del self._beliefs[0]
@@ -72,19 +74,19 @@ class History:
         self.imu.forget_before(min(horizon_ns, oldest.stamp_ns) if oldest.hypotheses else horizon_ns)
 
     def insert(self, pose: CameraPose) -> None:
-        """Add a pose; it is taken in when its time has come."""
+        """Add a pose; :meth:`take_in` applies it once the samples reach its instant."""
         insort(self._poses, pose, key=_stamp)
         self._go_back_before(pose.stamp_ns)
 
     def discard(self, stamps_ns: Iterable[int]) -> None:
-        """Forget poses by their stamps."""
+        """Remove poses by their stamps."""
         stamps = {pose.stamp_ns for pose in self._poses} & set(stamps_ns)
         self._poses = [pose for pose in self._poses if pose.stamp_ns not in stamps]
         if stamps:
             self._go_back_before(min(stamps))
 
     def _go_back_before(self, stamp_ns: int) -> None:
-        """Forget what was believed after the pose of ``stamp_ns``."""
+        """Remove the beliefs after poses of ``stamp_ns`` and later."""
         while len(self._beliefs) > 1 and self.belief.pose_stamp_ns >= stamp_ns:
             self._forget_belief()
 
@@ -93,21 +95,21 @@ class History:
         self._main = None
 
     def is_forgotten(self, pose: CameraPose) -> bool:
-        """Whether a pose is older than all beliefs."""
+        """Whether a pose is older than the oldest belief, so that it cannot be inserted."""
         return pose.stamp_ns <= self._beliefs[0].pose_stamp_ns
 
     def holds(self, stamp_ns: int) -> bool:
-        """Whether there is a pose of this stamp."""
+        """Whether a pose with this stamp is buffered."""
         place = bisect_left(self._poses, stamp_ns, key=_stamp)
         return place < len(self._poses) and self._poses[place].stamp_ns == stamp_ns
 
     def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None) -> int:
-        """Instant of a pose in the clock of the IMU by a hypothesis's estimate of the offset."""
+        """Instant of a pose in the IMU's clock, with the clock offset that ``hypothesis`` has estimated."""
         offset = hypothesis.estimate.state.time_offset if hypothesis else 0.0
         return pose.stamp_ns + self._offset_ns + round(offset * SECOND_NS)
 
     def main_at(self, pose: CameraPose) -> tuple[Hypothesis, MotionAtPose] | None:
-        """The estimate and the motion at the instant of a pose that is not to be taken in."""
+        """The estimate and the motion at the instant of a pose, which is only compared with them."""
         for belief in reversed(self._beliefs):
             time_ns = min(self.due_ns(pose, belief.main), self.imu.newest_ns)
             if belief.main and belief.main.estimate.stamp_ns <= time_ns:
@@ -115,7 +117,7 @@ class History:
         return None
 
     def move_map(self, T_new_old: FloatArray) -> None:
-        """Move beliefs and poses with the map, T_new = T_new_old @ T_old."""
+        """Apply a correction of the map to beliefs and poses: T_new = T_new_old @ T_old."""
         self._beliefs = [belief.in_moved_map(T_new_old) for belief in self._beliefs]
         self._poses = [in_moved_map(pose, T_new_old) for pose in self._poses]
         self._main = self._main and self._main.in_moved_map(T_new_old)
@@ -123,7 +125,7 @@ class History:
     # --- taking in poses ------------------------------------------------------------------------------
 
     def take_in(self) -> list[PoseUpdate]:
-        """Take in all poses that are due by the newest sample, and go on to it; the verdicts on them."""
+        """Apply all poses up to the newest sample and propagate to it; returns the verdicts on these poses."""
         updates: list[PoseUpdate] = []
         while (pose := self._next_due()) is not None:
             belief, decided = self._after(pose)
@@ -143,7 +145,7 @@ class History:
         return pose if due_ns <= self.imu.newest_ns else None
 
     def _go_on(self) -> None:
-        """Carry the estimate to the newest sample; without poses it is kept now and then, to go on from there."""
+        """Propagate the estimate to the newest sample; without poses it becomes a belief every ``_KEPT_EVERY_NS``."""
         belief = self.belief
         if belief.main is None:
             return
@@ -152,7 +154,7 @@ class History:
             self._beliefs.append(belief._replace(main=self._main, alternative=self.alternative))
 
     def _after(self, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
-        """The belief after the next pose, and verdicts on that."""
+        """The belief after the next pose, and the verdicts on that pose."""
         self._go_back_to(pose)
         belief = self.belief._replace(pose_stamp_ns=pose.stamp_ns)
         if not belief.hypotheses:
@@ -175,14 +177,14 @@ class History:
         return self._settled(belief, [update])
 
     def _go_back_to(self, pose: CameraPose) -> None:
-        """Forget estimates without a pose of their own that are later than a pose's instant."""
+        """Remove beliefs that were only propagated, without a pose, beyond the instant of ``pose``."""
         while len(self._beliefs) > 1 and self._beliefs[-2].pose_stamp_ns == self.belief.pose_stamp_ns:
             if all(h.estimate.stamp_ns <= self.due_ns(pose, h) for h in self.belief.hypotheses):
                 return
             self._forget_belief()
 
     def _at(self, hypothesis: Hypothesis, pose: CameraPose) -> tuple[Hypothesis, MotionAtPose]:
-        """A hypothesis at the instant of a pose, where it is if it is beyond that by now, and its motion there."""
+        """A hypothesis at the instant of a pose, never earlier than where it is now, and the motion there."""
         time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
         there = self._hypotheses.carried(hypothesis, self.imu, min(time_ns, self.imu.newest_ns))
         return there, self.imu.motion(there.estimate.stamp_ns, there.accepted_ns)
@@ -195,7 +197,7 @@ class History:
         return self._settled(belief._replace(alternative=begun), decided) if begun else (belief, decided)
 
     def _with_alternative(self, belief: Belief, at_pose: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> Belief:
-        """With an alternative that begins with a pose that the estimate refuses, if one can."""
+        """``belief`` with an alternative hypothesis begun from a pose that the estimate at ``at_pose`` refuses."""
         time_ns = at_pose.estimate.stamp_ns
         window = self.imu.window(time_ns, WINDOW_SECONDS)
         begun = self._hypotheses.alternative_to(at_pose, pose, time_ns, motion, window)

@@ -1,4 +1,4 @@
-"""How hypotheses begin, go on, and take in poses."""
+"""Hypotheses: how they are initialised, propagated along the IMU samples, and updated by poses that pass the gate."""
 
 from dataclasses import replace
 import math
@@ -25,19 +25,19 @@ from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_in
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: why a pose was refused that no attitude of a robot under gravity explains
+#: reason of refusal of a first pose whose vertical contradicts the measured specific force
 NO_GRAVITY = 'refused: contradicts gravity'
-#: What a clock offset that was estimated may be wrong by when something else went wrong [s]; it moves a marker by a
-#: pixel or two in the fastest flights.
+#: Standard deviation [s] below which the clock offset counts as known, and the least that an alternative hypothesis
+#: begins with: in the fastest flights it moves a marker by a pixel or two.
 KNOWN_OFFSET_STD = 0.003
-#: A pose that is off even for an estimate that claims so many times too little, and by more than a few of these
-#: [rad, m], is a marker's fault, unless as many poses bear it out as have borne out the estimate, or so many. Nearer
-#: ones are believed earlier: coasting on for long would do more harm.
+#: A pose is far if it fails the gate even with the estimate's standard deviations times _FAR_TOO_SURE and _FAR [rad, m]
+#: added: probably a moved or duplicated marker. An alternative hypothesis that begins there needs as many poses as the
+#: estimate has accepted, at most _ENOUGH_POSES. Nearer ones need fewer: coasting for long would do more harm.
 _FAR_TOO_SURE, _FAR, _ENOUGH_POSES = 10.0, np.repeat([0.05, 0.2], 3), 300
 
 
 class Hypotheses:
-    """The rules of one filter: its parameters, inertial steps and pose updates."""
+    """Initialises, propagates and updates hypotheses with the parameters of one filter."""
 
     def __init__(self, config: PoseEkfConfig) -> None:
         self._updater = PoseUpdater(config)
@@ -50,7 +50,7 @@ class Hypotheses:
         self._updater.config = config
 
     def carried(self, hypothesis: Hypothesis, imu: ImuBuffer, until_ns: int) -> Hypothesis:
-        """A hypothesis as the samples carry it on to an instant that is not later than the newest of them."""
+        """A hypothesis propagated along the samples to an instant that is not later than the newest sample."""
         estimate = hypothesis.estimate
         if estimate.stamp_ns >= until_ns:
             return hypothesis
@@ -72,7 +72,7 @@ class Hypotheses:
         )
 
     def contradiction(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> str:
-        """What of the IMU a pose contradicts that a hypothesis at its instant refuses, in words."""
+        """Which sensor of the IMU a refused pose contradicts, in words; ``hypothesis`` is at the pose's instant."""
         estimate = hypothesis.estimate
         measured = self._measured(pose, estimate.state)
         innovation = self._updater.innovation(estimate, measured, motion)
@@ -85,7 +85,7 @@ class Hypotheses:
         return f'poses contradict the accelerometer, or each other: {apart}; its units, axes, sign? marker_size?'
 
     def explains(self, hypothesis: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> bool:
-        """Whether a pose at a hypothesis's instant is right by it, but for a clock offset that is not known."""
+        """Whether a pose at a hypothesis's instant passes the gate once the clock offset is taken for unknown."""
         estimate = hypothesis.estimate
         measured = self._measured(pose, estimate.state)
         unclocked = self._updater.with_unknown_clock(estimate)
@@ -95,27 +95,27 @@ class Hypotheses:
         return body_pose(pose, state.T_body_camera, self._config.pose_noise_scale)
 
     def settled(self, belief: Belief) -> Belief:
-        """The belief after its hypotheses were weighed against each other."""
+        """The belief after the alternative hypothesis was compared with the main one."""
         return belief.settled(self._config)
 
     def _is_stale(self, hypothesis: Hypothesis) -> bool:
-        """Whether it has gone without poses for too long to be corrected."""
+        """Whether it has coasted longer than ``reinitialise_after``, and must not be corrected any more."""
         coasted_ns = hypothesis.estimate.stamp_ns - hypothesis.accepted_ns
         return coasted_ns > self._config.reinitialise_after * SECOND_NS
 
     def from_nothing(self, pose: CameraPose, time_ns: int, window: FloatArray) -> Hypothesis | None:
-        """A hypothesis that begins with a pose; None where no robot under gravity could be there.
+        """A hypothesis initialised from a pose without prior; None where the pose contradicts gravity.
 
-        ``window`` (N, 6): the latest samples up to the instant.
+        ``window`` (N, 6): the latest samples up to the pose's instant ``time_ns``.
         """
         return self._begun(pose, time_ns, window, blank_state(self._config), self._config.time_offset_std)
 
     def alternative_to(
         self, main: Hypothesis, pose: CameraPose, time_ns: int, motion: MotionAtPose, window: FloatArray
     ) -> Hypothesis | None:
-        """A hypothesis by which a pose is right that ``main``, which is at its instant, refuses.
+        """A hypothesis initialised from a pose that ``main``, at the same instant, refuses.
 
-        The pose is taken as it is, and what was known of the sensors stays.
+        Position and attitude are those of the pose; biases, scale errors and extrinsics are those of ``main``.
         """
         estimate = main.estimate
         measured = self._measured(pose, estimate.state)
@@ -128,7 +128,10 @@ class Hypotheses:
         return begun._replace(needed=needed)
 
     def _clock_std(self, main: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> float:
-        """What is known of the clock offset [s] where a pose contradicts ``main``: less, if it may have caused that."""
+        """Initial standard deviation of an alternative's clock offset [s].
+
+        The parameter's where an unknown offset explains why ``main`` refuses the pose, else that of ``main``.
+        """
         unknown = self._config.time_offset_std
         if self.explains(main, pose, motion):
             return unknown
@@ -145,9 +148,9 @@ class Hypotheses:
         return Hypothesis(estimate, time_ns, time_ns)
 
     def core_covariance(self, main: Hypothesis, other: Hypothesis | None) -> tuple[FloatArray, FloatArray]:
-        """Covariance (9, 9) of an estimate's core, and (9, 3) of it with the gyroscope's bias, to be published.
+        """Published covariance (9, 9) of an estimate's core, and cross-covariance (9, 3) with the gyroscope's bias.
 
-        They count an ``other`` one at the same instant that contradicts it.
+        An ``other`` hypothesis at the same instant widens the covariance by its own and by the difference of the two.
         """
         P = main.estimate.covariance
         covariance, with_bias = P[CORE, CORE], P[CORE, GYROSCOPE_BIAS]
@@ -158,14 +161,14 @@ class Hypotheses:
 
 
 def _far_covariance(covariance: FloatArray) -> FloatArray:
-    """The covariance (48, 48) of an estimate that claims too little, and may besides be off by some distance."""
+    """The covariance (48, 48) against which a pose counts as far, see ``_FAR_TOO_SURE`` and ``_FAR``."""
     widened = _FAR_TOO_SURE**2 * covariance
     widened[POSE, POSE] += np.square(_FAR)
     return widened
 
 
 def _difference(state: NavigationState, other: NavigationState) -> FloatArray:
-    """Core error (9,) of ``state`` if ``other`` is true."""
+    """Core error (9,) of ``state`` if ``other`` is the true state."""
     apart = pose_innovation(state, other.T_map_body)
     velocity = (other.velocity - state.velocity) @ state.R_map_body
     return np.concatenate((apart[:3], velocity, apart[3:]))

@@ -1,8 +1,8 @@
-"""What camera poses are worth: at best what their covariance says; where they scatter more, that is learned.
+"""Noise of the camera poses: their covariance, split into white and systematic errors; the white part is adapted.
 
-A part of the error is white; another is systematic: errors of lens and corners are the same while the view is, and
-another once the camera has turned to other parts of the image or sees other markers. How large that is, the mapper has
-learned from the residuals of the corners, and has put it into the covariance.
+The error of a pose is the sum of a white and a systematic error. Errors of lens and corners are systematic: they stay
+the same while the view does, and change as the camera turns or sees other markers. Their size is in the covariance
+already: the mapper learns it from the corners' residuals. White noise beyond the claim is learned from innovations.
 
 Source: R. Mehra, "Approaches to Adaptive Filtering", IEEE TAC 1972.
 """
@@ -17,15 +17,15 @@ from thermal_fiducial.core.error_model import CHI2_OF_POSE
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.types import FloatArray
 
-#: Variance of the white error of a pose where it claims enough, in units of its covariance: the rest is systematic.
+#: Initial and least variance of the white error, as a share of the pose's covariance: the rest is systematic.
 WHITE = 0.5
-#: Where it claims too little, what is learned of the last poses, so many; the variance is at most so many times as
-#: large, and no pose changes it by more than e^0.2.
+#: Adaptation of the white variance where poses claim too little: memory in poses, largest multiple of the initial
+#: value, largest step of its logarithm by one pose.
 _WHITE_MEMORY, _LARGEST, _LARGEST_STEP = 10.0, 30.0, 0.3
-#: Stamps: poses that count as much as the parameter, poses over which their jitter may change, its range [s], and the
-#: largest square of an innovation along the motion, normalised.
+#: Adaptation of the stamps' jitter: weight of the parameter in poses, memory in poses, range of the standard deviation
+#: [s], and the limit of the normalised squared innovation along the motion.
 _PRIOR_STAMPS, _MEMORY, _STAMP_RANGE, _LARGEST_SQUARE = 10.0, 300.0, (1e-4, 5e-3), 9.0
-#: What the covariance of a pose never is below: rounding of float32 corners [rad, m].
+#: Least covariance of a pose: rounding of float32 corners [rad, m].
 _ROUNDING = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
 
 
@@ -35,20 +35,20 @@ class BodyPose:
 
     stamp_ns: int
     T_map_body: FloatArray
-    #: (6, 6) relative to the map as it is: rotation, then position, in the robot frame [rad, m]
+    #: (6, 6) relative to the map, its error left out: rotation, then position, in the robot frame [rad, m]
     covariance: FloatArray
-    #: (6, 6) by errors of the map: ROS convention, in ``map`` [m, rad]
+    #: (6, 6) due to errors of the map: ROS convention, in ``map`` [m, rad]
     map_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
     @cached_property
     def shape(self) -> FloatArray:
-        """(6, 6) the covariance, never singular."""
+        """(6, 6) the covariance plus the least one: never singular."""
         return self.covariance + _ROUNDING
 
     def map_change(self, last: 'BodyPose') -> FloatArray:
-        """Covariance (6, 6), as ``covariance``, of what changed with the map's error since the ``last`` pose.
+        """Covariance (6, 6), conventions of ``covariance``, of the change of the map's error since the ``last`` pose.
 
-        The same markers in the same map have the same error; as far as the two covariances differ it is another one.
+        The same markers in the same map have the same error. The overlap of the two covariances is the correlation.
         """
         if not self.map_covariance.any():
             return np.zeros((6, 6))
@@ -60,27 +60,27 @@ class BodyPose:
 
 
 def log_overlap(A: FloatArray, B: FloatArray) -> float:
-    """Logarithm, at most 0, of Bhattacharyya's coefficient of errors with covariances (m, m)."""
+    """Logarithm, at most 0, of the Bhattacharyya coefficient of two zero-mean Gaussians, covariances (m, m)."""
     determinants = np.linalg.slogdet(np.stack((A, B, 0.5 * (A + B))))[1]
     return min(float(0.25 * (determinants[0] + determinants[1]) - 0.5 * determinants[2]), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class PoseNoise:
-    """Variances of the white error of camera poses, in units of their own covariance, and of the jitter of stamps."""
+    """Adapted variances: white error of camera poses as a multiple of their own covariance, and jitter of stamps."""
 
     white: float
-    #: the last pose that was compared with the estimate
+    #: the last accepted pose
     last: BodyPose
-    #: variance of the jitter of the camera's stamps [s^2], 0: they are exact; information about its logarithm
+    #: variance of the jitter of the camera's stamps [s^2], 0 for exact stamps; information about its logarithm
     jitter: float = 0.0
     jitter_information: float = 0.0
-    #: (6,) of the last pose that was compared
+    #: (6,) of the last pose that was compared with the estimate, accepted or not
     innovation: FloatArray = field(default_factory=lambda: np.zeros(6))
 
     @classmethod
     def of(cls, stamp_jitter: float, first: BodyPose) -> 'PoseNoise':
-        """To begin with: the jitter of the camera's stamps [s], the ``first`` pose."""
+        """Initial values, for the parameter ``stamp_jitter`` [s] and the ``first`` pose."""
         return cls(WHITE, first, stamp_jitter**2)
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'PoseNoise':
@@ -94,13 +94,13 @@ class PoseNoise:
         return replace(self, last=last)
 
     def alike(self, pose: BodyPose, angle: float) -> float:
-        """Correlation of the systematic errors of ``pose`` and of the last one, 0 to 1.
+        """Correlation, 0 to 1, of the systematic errors of ``pose`` and of the last accepted one.
 
-        It falls with the change of the view, e-fold for ``angle`` [rad], and as far as the two covariances differ
-        (Bhattacharyya's coefficient): other markers have other errors.
+        It falls with the change of the view, e-fold for ``angle`` [rad], and with the overlap of the two covariances
+        (Bhattacharyya coefficient), as other markers have other errors.
         """
         A, B = self.last.shape, pose.shape
-        # What is uncertain of position for what is uncertain of rotation: the distance to the markers.
+        # Ratio of position to rotation uncertainty: about the distance to the markers.
         variances = B.diagonal()
         distance = math.sqrt(float(variances[3:].sum() / variances[:3].sum()))
         T_last, T = self.last.T_map_body, pose.T_map_body
@@ -109,11 +109,11 @@ class PoseNoise:
         return math.exp(-(turned + moved) / angle + log_overlap(A, B))
 
     def weighed(self, pose: BodyPose, innovation: FloatArray, S_inverse: FloatArray) -> 'PoseNoise':
-        """What is known after a pose was weighed: a step of Fisher scoring on the likelihood of its white error.
+        """Adapt the white variance: one step of Fisher scoring on the likelihood of the innovations' change.
 
-        White is what changes from pose to pose: a clock that has stepped, or a marker that has moved, is there in all
-        of them. Refused poses count too; if nothing were learned from these, poses that claim too little would stay
-        refused. A change that no white error explains says nothing of it.
+        The change from pose to pose is used since it does not contain what stays, as a step of the clock or a moved
+        marker. Refused poses count too: otherwise poses that claim too little would stay refused. A change too large
+        for any white error is ignored.
 
         Parameters
         ----------
@@ -133,9 +133,9 @@ class PoseNoise:
         return replace(self, white=min(max(white, WHITE), _LARGEST * WHITE), innovation=innovation)
 
     def with_stamps(self, twist: FloatArray, innovation: FloatArray, S_inverse: FloatArray) -> 'PoseNoise':
-        """What is known of the stamps' jitter after an accepted pose, from how innovations change along the motion.
+        """Adapt the stamps' jitter after an accepted pose, from the change of innovations along the motion.
 
-        ``twist`` (6,): by which a late stamp moves the pose [1/s].
+        ``twist`` (6,): derivative of the pose with respect to its stamp [rad/s, m/s].
         """
         if not self.jitter:
             return self
@@ -151,5 +151,5 @@ class PoseNoise:
         return replace(self, jitter=jitter, jitter_information=information)
 
     def _change(self, innovation: FloatArray) -> FloatArray:
-        """(6,) by which an innovation differs from the last, as large as one where both are white."""
+        """(6,) change of the innovation since the last pose, scaled to the variance of one white innovation."""
         return (innovation - self.innovation) / math.sqrt(2.0)

@@ -1,8 +1,8 @@
-"""Which poses count: chi-square against the present estimate, and recovery by evidence instead of lock-out.
+"""The main and the alternative hypothesis, and when the alternative replaces the main one (a reset).
 
-A pose that the estimate refuses begins an alternative hypothesis, a second estimate that the following poses support or
-not. One that many poses agree with, while the estimate accepts few, replaces it. The start of the filter is the same
-thing without an estimate to replace.
+A pose that fails the gate of the estimate begins an alternative hypothesis, a second estimate. It replaces the first
+when many poses pass its gate while the estimate refuses them, so that the gate cannot lock the filter out. The filter
+is initialised in the same way, without an estimate to replace.
 """
 
 import math
@@ -12,33 +12,33 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.state import Estimate, POSITION
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: An alternative must agree with so many times more poses than the estimate: one whose clock is wrong accepts some when
-#: the robot slows down.
+#: Poses that the alternative must accept for each one that the estimate accepts: an estimate with a wrong clock offset
+#: still accepts some when the robot slows down.
 _PREFERRED = 4
-#: So many refused poses in a row, and the estimate is in doubt: a tenth of a second at 30 Hz.
+#: Refused poses in a row from which on the estimate is in doubt: a tenth of a second at 30 Hz.
 REFUSALS_OF_DOUBT = 3
-#: So many accepted ones in a row, and the alternative is forgotten.
+#: Poses that the estimate must accept in a row for the alternative to be dropped.
 _REFUTED = 3
 NEVER = -(1 << 62)
 
 
 class Hypothesis(NamedTuple):
-    """An estimate and the poses that speak for it, and against it."""
+    """An estimate with the numbers of poses that passed and failed its gate."""
 
     estimate: Estimate
-    #: instants of its first and of its last accepted pose, clock of the IMU
+    #: instants of its first and of its last accepted pose, in the IMU's clock
     started_ns: int
     accepted_ns: int
     hits: int = 1
     misses: int = 0
-    #: latest poses that it accepted, refused, in a row
+    #: number of latest poses accepted in a row, or refused in a row
     accepted_in_row: int = 1
     refused_in_row: int = 0
-    #: of an alternative: poses that must agree on it
+    #: of an alternative: poses that it must accept before it may replace the estimate
     needed: int = 0
 
     def accepting(self, estimate: Estimate) -> 'Hypothesis':
-        """After a pose that it accepts."""
+        """The hypothesis after an accepted pose, with the updated ``estimate``."""
         return self._replace(
             estimate=estimate,
             accepted_ns=estimate.stamp_ns,
@@ -48,7 +48,7 @@ class Hypothesis(NamedTuple):
         )
 
     def refusing(self, estimate: Estimate) -> 'Hypothesis':
-        """After a pose that it refuses."""
+        """The hypothesis after a refused pose."""
         return self._replace(
             estimate=estimate,
             misses=self.misses + 1,
@@ -62,53 +62,53 @@ class Hypothesis(NamedTuple):
 
     @property
     def position_std(self) -> float:
-        """Root of the sum of the position variances, those by the map's error too [m]."""
+        """Root of the sum of the position variances, the map's error included [m]."""
         of_map = self.estimate.pose_noise.last.map_covariance[:3, :3]
         return math.hypot(self.position_std_in_map, math.sqrt(float(of_map.trace())))
 
     @property
     def position_std_in_map(self) -> float:
-        """The same relative to the map as it is, which is what poses can be compared with [m]."""
+        """Root of the sum of the position variances relative to the map, its error left out, as poses see it [m]."""
         return self.estimate.std(POSITION)
 
     @property
     def in_doubt(self) -> bool:
-        """Whether the latest poses contradict it."""
+        """Whether the latest poses were refused, ``REFUSALS_OF_DOUBT`` or more in a row."""
         return self.refused_in_row >= REFUSALS_OF_DOUBT
 
     @property
     def failed(self) -> bool:
-        """Whether an alternative fits too few of the poses since it began."""
+        """Whether at least half of the poses since it began were refused."""
         return self.misses >= self.hits
 
 
 class Belief(NamedTuple):
-    """Everything that the filter knows after a pose."""
+    """Everything that the filter knows after a pose; immutable, so that older ones can be returned to."""
 
     main: Hypothesis | None = None
     alternative: Hypothesis | None = None
-    #: stamp of the last camera pose that was taken in
+    #: camera stamp of the last pose that was applied
     pose_stamp_ns: int = NEVER
     #: times that an alternative has replaced an estimate
     resets: int = 0
-    #: hits of the estimate when the alternative began
+    #: ``hits`` of the estimate when the alternative began
     hits_before: int = 0
-    #: whether the first of the poses that the estimate has refused in a row was near it: it has drifted, as by a fault
-    #: of the IMU; a marker that moved, or has a twin, is far off at once
+    #: whether the first of the poses refused in a row was near the estimate: then the estimate has drifted, for example
+    #: by a fault of the IMU; a moved or duplicated marker is far off at once
     drifted: bool = False
-    #: why that happened the last time
+    #: reason of the latest reset, in words
     reset_reason: str = ''
-    #: before there is an estimate: what of the IMU the poses contradict, in words
+    #: while initialising: which sensor of the IMU the poses contradict, in words
     contradiction: str = ''
 
     @property
     def hypotheses(self) -> list[Hypothesis]:
-        """Those that there are."""
+        """Main and alternative, as far as they exist."""
         return [hypothesis for hypothesis in (self.main, self.alternative) if hypothesis]
 
     @property
     def stamp_ns(self) -> int:
-        """Instant up to which nothing before it matters any more; that of the pose's stamp without any hypothesis."""
+        """Earliest instant of its hypotheses, older samples are not needed; without any, the stamp of the pose."""
         return min((h.estimate.stamp_ns for h in self.hypotheses), default=self.pose_stamp_ns)
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'Belief':
@@ -118,7 +118,7 @@ class Belief(NamedTuple):
         return self._replace(main=main, alternative=alternative)
 
     def settled(self, config: PoseEkfConfig) -> 'Belief':
-        """The belief after the alternative was weighed against the estimate: it is forgotten, replaces it, or waits."""
+        """The belief after the alternative was compared with the estimate: dropped, promoted, or kept."""
         main, other = self.main, self.alternative
         if other is None:
             return self
@@ -132,7 +132,7 @@ class Belief(NamedTuple):
         return self._promoted(reason) if reason else self
 
     def _why_reset(self, main: Hypothesis, other: Hypothesis, config: PoseEkfConfig) -> str:
-        """Why the alternative ``other`` should replace ``main``, in words; empty: it should not."""
+        """Why the alternative ``other`` replaces ``main``, in words; empty if it does not."""
         if other.accepted_ns - main.accepted_ns > config.reinitialise_after * SECOND_NS:
             return f'no pose was accepted for {config.reinitialise_after:.0f} s'
         if main.position_std_in_map > config.lost_position_std:
@@ -143,7 +143,7 @@ class Belief(NamedTuple):
         return 'the poses contradict the estimate and agree with each other' if lasting and agreed else ''
 
     def _promoted(self, reason: str) -> 'Belief':
-        """With the alternative as the estimate, for a ``reason`` in words where there was one."""
+        """The belief with the alternative as its estimate; ``reason`` in words, empty at initialisation."""
         assert self.alternative
         resets = self.resets + (self.main is not None)
         fresh = self.alternative._replace(accepted_in_row=1, refused_in_row=0, needed=0)

@@ -25,24 +25,23 @@ from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_left_jacobian_
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
-#: Noise of the motion at a pose feigns information about the clock offset: once to twice what its square is worth, the
-#: more the larger the gain is, since differences of the motion from pose to pose count. One pose takes at most half of
-#: what is known.
+#: The noise of the measured motion at a pose feigns information about the clock offset, 1 to 2 times its squared size
+#: in units of the innovation, growing with the gain. Taking it away at most doubles the offset's variance in one step.
 _FEIGNED, _LEAST_KEPT = 1.5, 0.5
 _SIX = np.arange(6)
 
 
 class Innovation(NamedTuple):
-    """Difference (6,) of a pose and the prediction, inverse of its covariance S, Jacobian H (6, 48), noise R (6, 6)."""
+    """Innovation ``value`` (6,), inverse of its covariance S (6, 6), Jacobian H (6, 48), measurement noise R (6, 6)."""
 
     value: FloatArray
     S_inverse: FloatArray
     H: FloatArray
     R: FloatArray
     nis: float
-    #: the estimate that it was compared with, its systematic error as old as the pose's
+    #: the estimate before the update, its systematic error already propagated to the view of this pose
     prior: Estimate
-    #: change (9,) of that estimate's core with time
+    #: time derivative (9,) of the prior's core error coordinates, as of :func:`slide`
     slide: FloatArray
 
 
@@ -50,10 +49,12 @@ class Innovation(NamedTuple):
 class MotionAtPose:
     """What the IMU shows of the motion at a pose's instant.
 
-    ``imu`` (6,): mean of as many samples before it as after it, so that its noise is as often in the innovations of
-    poses with one sign as with the other, and moves the clock offset to neither side; ``rate_variance`` [rad^2/s^2] of
-    one axis of it; ``velocity_variance`` [m^2/s^2]: what the noise of the accelerometer has added to the velocity since
-    the pose before; ``turning`` [rad/s^2]: size of the angular acceleration.
+    Attributes
+    ----------
+    imu : (6,) mean of equally many samples before and after it: a one-sided mean would bias the clock offset
+    rate_variance : white noise of one axis of the mean rate [rad^2/s^2]
+    velocity_variance : what accelerometer noise has added to the velocity since the last accepted pose [m^2/s^2]
+    turning : magnitude of the angular acceleration [rad/s^2]
     """
 
     imu: FloatArray
@@ -63,7 +64,7 @@ class MotionAtPose:
 
 
 def slide(state: NavigationState, imu: FloatArray) -> FloatArray:
-    """Change (9,) of the core with time: X(t + s) = X(t) Exp(slide s), as a sample ``imu`` (6,) shows it."""
+    """Time derivative (9,) of the core state for an IMU sample ``imu`` (6,): X(t + s) = X(t) Exp(slide s)."""
     moved, velocity = np.empty(9), state.velocity_body
     moved[:6] = state.corrected(imu)
     moved[VELOCITY] += state.gravity @ state.R_map_body - skew(moved[ROTATION]) @ velocity
@@ -72,7 +73,7 @@ def slide(state: NavigationState, imu: FloatArray) -> FloatArray:
 
 
 def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> BodyPose:
-    """Pose of the robot that a camera pose stands for; ``scale`` on its standard deviation."""
+    """Pose of the robot by a camera pose whose standard deviations are multiplied by ``scale``."""
     T_map_body = pose.T_map_camera @ inverse(T_body_camera)
     R = T_map_body[:3, :3]
     lever = T_map_body[:3, 3] - pose.T_map_camera[:3, 3]
@@ -87,23 +88,23 @@ def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> Body
 
 
 def pose_innovation(state: NavigationState, T_map_body: FloatArray) -> FloatArray:
-    """Rotation and position (6,) of Log(X^-1 Z) on SE(3): exactly the error of ``state`` if ``T_map_body`` is true."""
+    """(6,) Log(X^-1 Z) on SE(3), rotation first: the left-invariant error of ``state`` if ``T_map_body`` is true."""
     rotation = so3_log(state.R_map_body.T @ T_map_body[:3, :3])
     offset = (T_map_body[:3, 3] - state.position) @ state.R_map_body
     return np.concatenate((rotation, so3_left_jacobian_inverse(rotation) @ offset))
 
 
 class PoseUpdater:
-    """Compares estimates with poses, and corrects them."""
+    """Innovations of poses, and the corrections by them."""
 
     def __init__(self, config: PoseEkfConfig) -> None:
         self.config = config
         self._algebra = ExtendedKalmanFilter(dim_x=SIZE, dim_z=6)
 
     def innovation(self, estimate: Estimate, pose: BodyPose, motion: MotionAtPose) -> Innovation:
-        """What ``pose`` says beyond ``estimate`` at its instant."""
+        """Innovation of ``pose`` against ``estimate`` at the same instant."""
         alike = estimate.pose_noise.alike(pose, self.config.systematic_angle)
-        # The systematic error in the axes of the pose's own: those of the triangular root of its covariance.
+        # Unit systematic errors map to the pose by the Cholesky factor of its covariance.
         root = self.config.systematic_pose_std * np.linalg.cholesky(pose.shape)
         prior = _with_new_view(estimate, alike)
         to_units = np.linalg.inv(root)
@@ -123,7 +124,7 @@ class PoseUpdater:
     def _add_clock(
         self, prior: Estimate, motion: MotionAtPose, moved: FloatArray, H: FloatArray, R: FloatArray
     ) -> None:
-        """What errors of the camera's clock do to a pose: jitter and, where it isn't estimated, the offset."""
+        """Add errors of the camera's clock to H and R: stamp jitter, and the clock offset, estimated or not."""
         config = self.config
         twist, acceleration = moved[POSE], moved[VELOCITY]
         unknown = prior.pose_noise.jitter + (0.0 if config.estimate_time_offset else config.time_offset_std**2)
@@ -133,7 +134,7 @@ class PoseUpdater:
         P = prior.covariance
         velocity, variance = P[VELOCITY, VELOCITY], float(P[TIME_OFFSET, TIME_OFFSET])
         H[:, TIME_OFFSET] = twist
-        # Second order: offset times what is uncertain of the motion, and half the acceleration times its square.
+        # Second order: offset times the error of rate and velocity, and half the acceleration times the offset squared.
         square = 0.75 * variance**2
         R[_SIX[:3], _SIX[:3]] += variance * motion.rate_variance + square * motion.turning**2
         R[_SIX[3:], _SIX[3:]] += square * float(acceleration @ acceleration)
@@ -155,14 +156,15 @@ class PoseUpdater:
     def _in_clock_of_imu(
         self, P: FloatArray, change: FloatArray, moved: FloatArray, innovation: Innovation, motion: MotionAtPose
     ) -> FloatArray:
-        """The covariance after a pose that has changed by ``change`` (9,) what is known of the motion, now ``moved``.
+        """The covariance after an update that changed the slide by ``change`` (9,) to ``moved`` (9,).
 
-        A pose is of the state at the stamp of the camera, X(t) Exp(slide s). That state's error has nothing to do with
-        how well the slide is known, so the error of X(t) follows the slide; else each correction of the velocity would
-        feign information about the offset s. (G. Huang, A. Mourikis, S. Roumeliotis, "Observability-based Rules for
-        Designing Consistent EKF SLAM Estimators", IJRR 2010, have the like of other unobservable directions.)
+        A pose measures the state at the camera's stamp, X(t) Exp(slide s). The error of that state does not depend on
+        the linearisation point of the slide, so the error of X(t) is shifted with it; otherwise each correction of the
+        velocity would feign information about the offset s. (G. Huang, A. Mourikis, S. Roumeliotis,
+        "Observability-based Rules for Designing Consistent EKF SLAM Estimators", IJRR 2010, keep other unobservable
+        directions in the same way.)
 
-        The square of the slide's noise feigns information too (errors in variables): what it is worth is taken away.
+        Noise of the slide feigns information too (errors in variables): the offset's variance is widened by its worth.
         """
         with_offset = P[TIME_OFFSET]
         variance = float(with_offset[TIME_OFFSET])
@@ -179,14 +181,14 @@ class PoseUpdater:
     def _gained(
         self, P: FloatArray, innovation: FloatArray, H: FloatArray, R: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Error (48,) that an innovation shows, and the covariance after it."""
+        """Kalman update: the corrected error (48,) and the covariance (48, 48)."""
         algebra = self._algebra
         algebra.x, algebra.P = np.zeros(SIZE), P
         algebra.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R=R)
         return algebra.x, 0.5 * (algebra.P + algebra.P.T)
 
     def with_unknown_clock(self, estimate: Estimate) -> Estimate:
-        """The estimate as good as it is, its clock offset as unknown as after a step of the camera's clock."""
+        """The estimate with a clock offset as uncertain as after a step of the camera's clock; all else stays."""
         covariance = estimate.covariance.copy()
         covariance[TIME_OFFSET], covariance[:, TIME_OFFSET] = 0.0, 0.0
         covariance[TIME_OFFSET, TIME_OFFSET] = (2.0 * self.config.time_offset_std) ** 2
@@ -194,7 +196,7 @@ class PoseUpdater:
 
 
 def _with_new_view(estimate: Estimate, alike: float) -> Estimate:
-    """The estimate whose systematic error is that of another view, correlated with the one before by ``alike``."""
+    """The estimate with its systematic error propagated to a new view: first-order Markov, correlation ``alike``."""
     P = estimate.covariance.copy()
     P[SYSTEMATIC] *= alike
     P[:, SYSTEMATIC] *= alike
@@ -204,7 +206,7 @@ def _with_new_view(estimate: Estimate, alike: float) -> Estimate:
 
 
 def _of_core(error: FloatArray) -> FloatArray:
-    """An error (48,) of the core (9,) alone."""
+    """Error coordinates (48,) with the given core (9,), zero elsewhere."""
     whole = np.zeros(SIZE)
     whole[CORE] = error
     return whole
