@@ -1,4 +1,4 @@
-"""Poses and a map that moves between them, on both sides of ``camera_pose``; and what of them is the map's error."""
+"""Corrections of the map while poses are on their way: for the publisher and for the subscriber of ``camera_pose``."""
 
 from collections import deque
 from dataclasses import replace
@@ -10,12 +10,12 @@ from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: Corrections, and errors of the map, that are remembered.
+#: Corrections, and covariances of the map, that are kept.
 _REMEMBERED = 10
 
 
 class LatePoses:
-    """Of who publishes poses: those of frames that arrive after the map has moved, in the map of their stamps."""
+    """For the publisher: poses of frames that are processed after the map has moved, in the map as of their stamps."""
 
     def __init__(self) -> None:
         #: stamp of the newest frame so far
@@ -24,44 +24,47 @@ class LatePoses:
         self._T_new_old: FloatArray = np.eye(4)
 
     def add(self, stamp_ns: int) -> None:
-        """Take in the stamp of a frame; one of long before is that of a clock that was set back."""
+        """Log the stamp of a frame; a much older one is that of a clock that was set back."""
         self.newest_ns = max(stamp_ns, self.newest_ns) if stamp_ns >= self.newest_ns - LATEST_NS else stamp_ns
 
     def moved(self, T_new_old: FloatArray) -> None:
-        """The map has moved by (4, 4), after the newest frame."""
+        """Log that the map moved by ``T_new_old`` (4, 4) after the newest frame."""
         self._moved_ns, self._T_new_old = self.newest_ns, T_new_old
 
     def as_of_its_stamp(self, pose: CameraPose) -> CameraPose:
-        """``pose``, found in the map of now, in the map of its stamp."""
+        """``pose``, which is in the present map, in the map as of its stamp."""
         if 0 <= self._moved_ns - pose.stamp_ns <= LATEST_NS:
             return in_moved_map(pose, inverse(self._T_new_old))
         return pose
 
 
 class MapCorrections:
-    """Of who takes poses: these in the map as it is now; ``window`` [s]: what is older is of another clock."""
+    """For the subscriber: poses in the present map, with the map's covariance.
+
+    ``window`` [s]: differences of stamps beyond it are those of another clock.
+    """
 
     def __init__(self, window: float) -> None:
         self._window_ns = window * SECOND_NS
         self._corrections: deque[tuple[int, FloatArray]] = deque(maxlen=_REMEMBERED)
         self._errors: deque[CameraPose] = deque(maxlen=_REMEMBERED)
-        #: of the latest pose that had one
+        #: map error of the latest pose that had one
         self._error: CameraPose | None = None
 
     def add(self, stamp_ns: int, T_new_old: FloatArray) -> None:
-        """The map has moved by ``T_new_old`` (4, 4) after the frame of ``stamp_ns``."""
+        """Log that the map moved by ``T_new_old`` (4, 4) after the frame of ``stamp_ns``."""
         self._corrections.append((stamp_ns, T_new_old))
 
     def note_error(self, error: CameraPose) -> None:
-        """The map's error has the covariance of ``error`` there."""
+        """Log the covariance of the map's error at a pose: that of ``error``."""
         self._errors.append(error)
 
     def in_present_map(self, pose: CameraPose) -> CameraPose:
-        """``pose``, which was found in the map of its stamp, in the map of now, with what it has of the map's error."""
+        """``pose``, which is in the map as of its stamp, in the present map, with the covariance of the map's error."""
         self._error = next((error for error in self._errors if error.stamp_ns == pose.stamp_ns), self._error)
         error = self._error
         if error is not None and abs(pose.stamp_ns - error.stamp_ns) <= self._window_ns:
-            # The map's error changes slowly: that of the frame before will do, as far as this pose claims as much.
+            # The map's error changes slowly: that of the last frame serves, as far as this covariance contains it.
             of_map, relative = error.covariance, pose.covariance - error.covariance
             if np.linalg.eigvalsh(relative)[0] < 0.0:
                 of_map = pose.covariance - positive(relative)

@@ -1,9 +1,9 @@
-"""Steps of the camera's clock that are too large for the estimated offset: all at once poses arrive later or earlier.
+"""Steps of the camera's clock that are too large for the offset in the state: the delay of poses changes at once.
 
-How late a pose arrives by its stamp says nothing about a clock by itself, as a pipeline may stall. So a step is only
-proposed here, when several poses agree on it; it is one if poses that contradict the estimate fit it then.
+A changed delay alone does not prove a step of the clock, as a pipeline may stall. So a step is only proposed here, once
+several poses agree on it; the filter accepts it if restamped poses pass the gate that they fail as they came.
 
-A step of the IMU's clock shows as one of the camera's: it is known by the IMU's own stamps, which jumped by as much.
+A step of the IMU's clock looks the same, but then the stamps of the IMU have jumped by the same amount.
 """
 
 from collections import deque
@@ -13,32 +13,33 @@ from statistics import median
 
 from thermal_fiducial.core.measurements import CameraPose
 
-#: Smaller steps [ns] are found by the clock offset that is estimated: a frame's time, in which motion is hardly curved.
+#: Smallest step [ns]: one frame period. Smaller ones are left to the estimated clock offset, as motion is nearly
+#: straight over that time.
 _SMALLEST_NS = 35_000_000
-#: Poses in a row that must agree on a step, those that say what was usual before, and how many of these are enough.
+#: Poses in a row that must agree on a step; poses kept for the usual delay, and the fewest for it to be known.
 _POSES, _USUAL, _ENOUGH = 5, 30, 15
-#: They agree to half of the step, and to this [ns].
+#: Largest spread [ns] of the delays of agreeing poses, beside half of the step.
 _AGREEMENT_NS = 50_000_000
-#: So many poses that arrive unlike those before a jump of the IMU's stamps wait for an explanation.
+#: Poses with an unusual delay after a jump of the IMU's stamps that are held back until a cause is found.
 _PATIENCE = 15
 
 
 class CameraClock:
-    """Follows how late poses arrive in the clock of the IMU, and takes steps out of their stamps."""
+    """Monitors the delay of poses in the IMU's clock, and takes the clock's steps out of their stamps."""
 
     def __init__(self) -> None:
-        #: by how much the stamps are ahead of what they were when the filter began [ns]
+        #: sum of the camera clock's steps since the filter began [ns]
         self.ahead_ns = 0
-        #: newest sample at the arrival, and how late that makes the pose
+        #: stamp of the newest sample at arrival, and delay of the pose by that sample [ns]
         self._usual: deque[tuple[int, int]] = deque(maxlen=_USUAL)
         self._latest: deque[tuple[int, int]] = deque(maxlen=_POSES)
         self._imu_jump_ns = 0
         self._waited = 0
 
     def imu_jumped(self, jump_ns: int) -> None:
-        """Take note that the stamps of the IMU jumped [ns]: they missed samples, or their clock stepped.
+        """Take note that the stamps of the IMU jumped by ``jump_ns``: samples are missing, or their clock stepped.
 
-        Poses that have come since then were timed by a sample of long before.
+        Delays that were measured against the last sample before the jump are dropped.
         """
         self._imu_jump_ns, self._waited = jump_ns, 0
         last_ns = max((newest_ns for newest_ns, _ in self._usual), default=0)
@@ -46,19 +47,19 @@ class CameraClock:
 
     @property
     def in_question(self) -> bool:
-        """Whether poses since a jump of the IMU's stamps came unlike those before, and nothing says why."""
+        """Whether poses have an unusual delay since a jump of the IMU's stamps, with no cause found yet."""
         return self._imu_jump_ns != 0 and 0 < self._waited < _PATIENCE
 
     def is_of_imu(self, step_ns: int) -> bool:
-        """Whether what looks like a step of the camera's clock is one of the IMU's."""
+        """Whether an apparent step of the camera's clock is a step of the IMU's."""
         return self._imu_jump_ns != 0 and abs(step_ns + self._imu_jump_ns) < _AGREEMENT_NS
 
     def stamped(self, pose: CameraPose) -> CameraPose:
-        """``pose`` with the stamp that it had without the steps."""
+        """``pose`` with the known steps taken out of its stamp."""
         return replace(pose, stamp_ns=pose.stamp_ns - self.ahead_ns) if self.ahead_ns else pose
 
     def proposed(self, pose: CameraPose, newest_ns: int) -> int:
-        """By how much stamps have jumped ahead [ns] for all that arrival shows, 0: not at all.
+        """Step of the camera's clock [ns] that the delays of the latest poses suggest, 0 for none.
 
         ``newest_ns``: stamp of the newest IMU sample when ``pose`` arrives.
         """
@@ -78,7 +79,7 @@ class CameraClock:
         return step_ns
 
     def follow(self, step_ns: int) -> Iterable[int]:
-        """Take a step of the stamps for true; the stamps of the poses that came with it and were believed."""
+        """Accept a step; returns the stamps of the latest poses, which were applied at wrong instants."""
         self.ahead_ns += step_ns
         wrong = [stamp for stamp, _ in self._latest]
         self._latest.clear()

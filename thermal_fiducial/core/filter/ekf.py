@@ -280,7 +280,7 @@ class PoseEkf:
 
     @property
     def lost(self) -> bool:
-        """Whether not to fly on the pose: worse than ``lost_position_std``, contradicted by poses, or the IMU frozen."""
+        """Whether not to fly on the pose: worse than ``lost_position_std``, contradicted by poses, or IMU frozen."""
         main = self._history.main
         if main is None or self._imu_fault == Verdict.FROZEN.value or main.in_doubt:
             return True

@@ -1,4 +1,4 @@
-"""The latest IMU samples, and what they show of any stretch of time between them."""
+"""Buffer of the latest IMU samples: integration steps, interpolated samples and the motion at a pose's instant."""
 
 from bisect import bisect_left, bisect_right
 from typing import NamedTuple
@@ -8,17 +8,16 @@ import numpy as np
 from thermal_fiducial.core.filter.update import MotionAtPose
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: Samples of so long [s] before and after a pose show its motion, if they have come: the noise of one would not.
+#: The motion at a pose is the mean of the samples this long [s] before and after it, as far as they have arrived.
 _MOTION_SECONDS = 0.05
-#: Room for so many samples to begin with: five seconds at 200 Hz.
+#: Initial capacity [samples]: five seconds at 200 Hz.
 _CAPACITY = 1000
-#: Longer steps [ns] are divided: over a gap the error of rate and force is noise, not a constant, and after one pose
-#: behind it the velocity is not known.
+#: Longest step [ns]; longer ones are divided: over a gap the error of rate and force is noise, not a constant.
 _LONGEST_NS = 30_000_000
 
 
 class Steps(NamedTuple):
-    """N steps in a row: mean samples (N, 6), lengths (N,) [s], densities (N, 6) of the samples' noise over them."""
+    """N consecutive steps: mean sample ``imu`` (N, 6), ``seconds`` (N,), noise ``densities`` (N, 6)."""
 
     imu: FloatArray
     seconds: FloatArray
@@ -30,11 +29,11 @@ class ImuBuffer:
 
     def __init__(self) -> None:
         self._stamps_ns: list[int] = []
-        #: (capacity, 2, 6) the samples, and the densities of the noise of the steps that end with them
+        #: (capacity, 2, 6) samples, and noise densities of the steps that end with them
         self._rows = np.zeros((_CAPACITY, 2, 6))
 
     def __len__(self) -> int:
-        """Samples that are kept."""
+        """Number of samples."""
         return len(self._stamps_ns)
 
     @property
@@ -63,7 +62,7 @@ class ImuBuffer:
         return (self._stamps_ns[-1] - self._stamps_ns[-2]) / SECOND_NS
 
     def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
-        """Add a sample (6,) and the densities (6,) of the step that ends with it; between, a gap is filled."""
+        """Add a sample (6,) and the noise densities (6,) of the step that ends with it; gaps are interpolated."""
         if self._stamps_ns and stamp_ns - self.newest_ns > _LONGEST_NS:
             begin_ns, begin = self.newest_ns, self._rows[len(self._stamps_ns) - 1, 0].copy()
             parts = -((begin_ns - stamp_ns) // _LONGEST_NS)
@@ -80,14 +79,14 @@ class ImuBuffer:
         self._rows[place, 0], self._rows[place, 1] = imu, densities
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Forget samples that lie so far back that none of those from ``stamp_ns`` on needs them."""
+        """Remove samples before ``stamp_ns``, except the last one, which interpolation needs."""
         first = max(bisect_left(self._stamps_ns, stamp_ns) - 1, 0)
         kept = self._rows[first : len(self._stamps_ns)].copy()
         self._rows[: len(kept)] = kept
         del self._stamps_ns[:first]
 
     def steps(self, begin_ns: int, end_ns: int) -> Steps:
-        """The steps between two instants that needn't be those of samples (trapezoid rule)."""
+        """The steps between two arbitrary instants within the samples (trapezoid rule)."""
         first = bisect_right(self._stamps_ns, begin_ns) - 1
         last = bisect_left(self._stamps_ns, end_ns)
         stamps_ns, imu = self._stamps_ns[first : last + 1], self._rows[first : last + 1, 0]
@@ -100,7 +99,7 @@ class ImuBuffer:
         return Steps(0.5 * (imu[:-1] + imu[1:]), seconds, self._rows[first + 1 : last + 1, 1])
 
     def at(self, time_ns: int) -> FloatArray:
-        """(6,) the sample at an instant."""
+        """(6,) sample at an instant, interpolated linearly."""
         index = bisect_left(self._stamps_ns, time_ns)
         after = self._rows[index, 0]
         after_ns = self._stamps_ns[index]
@@ -115,9 +114,9 @@ class ImuBuffer:
         return np.vstack((self._rows[first : bisect_left(self._stamps_ns, until_ns), 0], self.at(until_ns)))
 
     def motion(self, time_ns: int, accepted_ns: int) -> MotionAtPose:
-        """The motion at the instant of a pose, from the samples around it that have come.
+        """The motion at the instant of a pose, from the samples around it that have arrived.
 
-        ``accepted_ns``: instant of the last pose before it that was believed.
+        ``accepted_ns``: instant of the last accepted pose before it.
         """
         stamps_ns, imu = self._stamps_ns, self._rows[:, 0]
         index = max(bisect_left(stamps_ns, time_ns), 1)

@@ -1,19 +1,19 @@
-"""What may enter the filter from the IMU: finite samples in the order of their stamps, on one clock."""
+"""Checks of IMU samples at the filter's input: finite, in range, not frozen, stamps in order and on one clock."""
 
 from enum import Enum
 import math
 
 from thermal_fiducial.core.measurements import ImuSample
 
-#: So many samples in a row must agree on a new clock before it is believed; on the end of a gap.
+#: Samples in a row that must follow each other after a jump: for a stepped clock, and for the end of a gap.
 CLOCK_EVIDENCE, GAP_EVIDENCE = 10, 2
-#: A step is unusual if it is so many times longer than the longest of late, and than this [ns]; that one is forgotten
-#: within so long [ns].
+#: A step between stamps is unusual beyond this multiple of the longest recent one and beyond this length [ns]; time
+#: constant [ns] with which the longest one decays.
 UNUSUAL_FACTOR, UNUSUAL_NS, MEMORY_NS = 3.0, 30_000_000, 2_000_000_000
-#: A sensor saturates at its full scale; a reading so many times as large is a broken message.
+#: A sensor saturates at its full scale; a reading beyond this multiple of it is a corrupt message.
 IMPOSSIBLE_RANGES = 2.0
-#: Noise makes no two samples equal, coarse quantisation of a still sensor a few: equal ones for so long [s], and
-#: so many of them, are one sample that is sent again and again.
+#: Noise keeps samples from being equal, coarse quantisation of a still sensor repeats a few: equal samples for this
+#: long [s], and at least this many, are one sample that is sent again and again.
 FROZEN_SECONDS, FROZEN_SAMPLES = 0.045, 4
 
 
@@ -31,11 +31,11 @@ class Verdict(Enum):
 
 
 class ImuInput:
-    """Judges samples one by one.
+    """Gives a verdict on each sample.
 
-    A stamp out of line is refused, as it may be a single bad one. When the stamps go on from there, it was the end of a
-    gap, or, where it goes back or lasts too long, the clock was set, the bag restarted, or the IMU was away: then
-    everything begins anew.
+    A stamp that does not follow the last one is refused, as a single bad one would be. If further stamps continue from
+    it, it ended a gap; where it went back, or the gap is too long, the clock was set, the bag restarted or the IMU was
+    off, and the filter resets.
     """
 
     def __init__(self, max_gap: float, gyroscope_range: float, accelerometer_range: float) -> None:
@@ -46,14 +46,14 @@ class ImuInput:
         self._stray_ns = self._first_stray_ns = 0
         self._strays = 0
         self._longest_ns = 0.0
-        #: by how much the stamps jumped at the sample that was used last [ns]; 0: they went on as usual
+        #: jump of the stamps at the last sample that was used [ns]; 0 for a usual step
         self.jump_ns = 0
         self._reading: bytes = b''
         self._first_equal_ns = 0
         self._equal = 0
 
     def judge(self, sample: ImuSample) -> Verdict:
-        """Verdict on ``sample``; it is remembered."""
+        """Verdict on ``sample``, which becomes the last sample for the next call if it is used."""
         rates, forces = sample.angular_velocity.tolist(), sample.linear_acceleration.tolist()
         if not all(map(math.isfinite, (*rates, *forces))):
             return Verdict.NOT_FINITE
@@ -72,7 +72,7 @@ class ImuInput:
 
     @property
     def _usual_ns(self) -> float:
-        """Longest step [ns] that is taken without another sample that follows it."""
+        """Longest step [ns] that is accepted at once, without waiting for a sample that follows."""
         return min(max(UNUSUAL_FACTOR * self._longest_ns, UNUSUAL_NS), self._max_gap_ns)
 
     def _follow(self, stamp_ns: int, jump_ns: int = 0) -> None:

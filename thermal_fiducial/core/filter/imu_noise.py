@@ -8,36 +8,37 @@ import numpy as np
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.types import FloatArray
 
-#: Motion of the force is what differs from the mean over so long [s].
+#: Time constant [s] of the mean force; motion is what differs from it.
 _SLOW = 0.2
-#: Lags [s] at which differences are averaged, over so long [s].
+#: Lags [s] of the structure function: the shortest, doubled in octaves; time over which it is averaged [s].
 _SHORTEST_LAG, _MEMORY = 0.02, 2.0
 _OCTAVES = np.arange(7)
 _LAGS = _SHORTEST_LAG * 2.0**_OCTAVES
-#: Largest exponents: of measured motion, as what has been linear in time need not stay so in a gap; of the least one.
+#: Largest exponents of the structure function: of the measured one, as motion need not stay linear in a gap, and of
+#: _LEAST_MOTION.
 _SMOOTHEST = np.repeat((1.5, 2.0), 2)
-#: What the logarithm of nothing is taken of [(rad/s)^2, (m/s^2)^2].
+#: Added before logarithms are taken [(rad/s)^2, (m/s^2)^2].
 _TINY = 1e-12
-#: An IMU at rest may begin to move in a gap: mean squares of the differences that are possible at any time.
+#: Least structure function that is assumed: an IMU at rest may begin to move in a gap.
 _LEAST_MOTION = (2.0 * (_LAGS / 0.2) ** 3 / (1.0 + (_LAGS / 0.2) ** 2))[:, None] * np.array((0.1, 0.3)) ** 2
-#: Errors of nonlinearity, bandwidth and internal lever arms last as long as the motion does that makes them [s].
+#: Correlation time [s] of errors by nonlinearity, bandwidth and internal lever arms: that of the motion.
 _MOTION_TIME = 1.0
-#: A saturated sample may hide a hit [m/s^2], or a spin as fast again as the range [rad/s].
+#: Standard deviation of what a saturated sample may miss: a spin beyond the range [rad/s], a hit [m/s^2].
 _SATURATED = 5.0, 150.0
-#: Longer steps than this [s] interrupt the spectrum; what they hide is more than the spectrum shows.
+#: Steps longer than this [s] interrupt the spectrum; their interpolation error is added.
 _INTERRUPTED = 0.03
-#: The floor of the spectrum is that of the quietest of so many bands between these frequencies [Hz]: above the motion,
-#: below what an IMU's own low-pass filter takes away. The tones of rotors leave at least one of them nearly alone.
+#: Number of bands, and their lowest and highest frequency [Hz]: above the motion, below the IMU's own low-pass filter.
+#: The quietest band is the floor of the spectrum: rotor tones leave at least one band nearly untouched.
 _BANDS, _LOWEST, _HIGHEST = 4, 12.5, 50.0
-#: Length of a window [s], windows that overlap, and windows in the running mean.
+#: Length of a window [s], number of windows that overlap at any time, windows in the running mean.
 _WINDOW, _OVERLAPPING, _MEAN_OF = 0.32, 4, 12
 
 
 class ImuNoiseMonitor:
-    """Noise densities that hold now.
+    """Present noise densities of the IMU.
 
-    Each source adds its variance: the data sheet's noise or the floor of the vibration's spectrum; errors in proportion
-    to the motion; what the samples at the ends of a step don't show of what was between them; saturation.
+    The sum of the variances of: the data sheet's noise, or the floor of the vibration's spectrum if larger; errors in
+    proportion to the motion; interpolation over a step; saturated samples.
     """
 
     def __init__(self, noise: ImuNoise) -> None:
@@ -75,11 +76,11 @@ class ImuNoiseMonitor:
         return np.array((rate, rate, rate, force, force, force))
 
     def _interrupted(self, seconds: float) -> bool:
-        """Whether a step is of those of which the spectrum says nothing."""
+        """Whether the floor of the spectrum does not hold for a step: too long, or nothing measured yet."""
         return seconds > _INTERRUPTED or not any(self._floor.densities)
 
     def _size_of_motion(self, imu: FloatArray, seconds: float) -> tuple[float, float]:
-        """Size of the rate, and of the force beside its slow mean, which is gravity."""
+        """Magnitudes of the rate, and of the force less its slow mean, which is gravity."""
         rate, force = imu[:3], imu[3:]
         if self._mean_force is None:
             self._mean_force = force
@@ -99,13 +100,13 @@ class ImuNoiseMonitor:
 
 
 class StructureFunction:
-    """By how much rate and force differ after so long, and what is hidden between two samples so far apart.
+    """Structure functions of rate and force, and the interpolation error over long steps that follows from them.
 
     D(tau) is the mean square of the difference of samples tau apart (A. Kolmogorov's structure function; S. Panchev,
     "Random Functions and Turbulence", 1971). Where it grows as tau^a, the mean over a step of T seconds differs from
     that of the samples at its ends by a variance of D(T) (1 / (a + 2) - 1 / 4): a quarter of D(T) for vibration, a
-    twelfth for Brownian motion, nothing for motion that is linear in time. Motion is the smoother the shorter one
-    looks: with the exponent between T and 2 T it is an upper bound.
+    twelfth for Brownian motion, zero for motion linear in time. Motion is smoother at shorter times, so the exponent
+    between T and 2 T gives an upper bound.
     """
 
     def __init__(self) -> None:
@@ -115,7 +116,7 @@ class StructureFunction:
         self._measured = np.zeros((len(_LAGS), 2))
 
     def add(self, imu: FloatArray, seconds: float) -> None:
-        """Take a sample (6,) that comes ``seconds`` after the one before."""
+        """Add a sample (6,) that follows the last one after ``seconds``."""
         self._time += seconds
         if self._kept and self._time - self._kept[-1][0] < _SHORTEST_LAG:
             return
@@ -130,7 +131,7 @@ class StructureFunction:
         squares = ((samples - imu) ** 2).reshape(-1, 2, 3).mean(axis=2)
         of_lag = np.rint(np.log2((self._time - times) / _SHORTEST_LAG)) == _OCTAVES[:, None]
         counts = of_lag.sum(axis=1)
-        # The mean of all that came at first, later of the latest.
+        # A plain mean at first, later an exponential one with time constant _MEMORY.
         new = np.minimum(counts, 1) * min(self._time - times[-1], _MEMORY)
         self._weights = np.minimum(self._weights + new, _MEMORY)
         gain = new / np.maximum(self._weights, _SHORTEST_LAG)
@@ -138,7 +139,7 @@ class StructureFunction:
         self._measured = self._measured + gain[:, None] * (mean - self._measured)
 
     def hidden(self, seconds: float) -> tuple[float, float]:
-        """Squared densities of the noise that a step of ``seconds`` between two samples makes."""
+        """Squared noise densities of rate and force for the interpolation error of a step of ``seconds``."""
         place = math.log2(seconds / _SHORTEST_LAG)
         lower = min(max(int(place), 0), len(_LAGS) - 2)
         into = min(max(place - lower, 0.0), 1.0)
@@ -147,7 +148,7 @@ class StructureFunction:
         at_step = 2.0 ** (log_D[1] + slopes[0] * (place - lower - 1))
         # From one step to two of them.
         exponent = slopes[0] + into * (slopes[-1] - slopes[0])
-        # The errors of steps in a row share a sample: they add up twice as fast if all is vibration.
+        # Errors of consecutive steps share a sample: for pure vibration their variances add up twice as fast.
         shared = 1.0 + np.maximum(1.0 - exponent, 0.0)
         noise = at_step * (1.0 / (exponent + 2.0) - 0.25) * shared * seconds
         rate, force = np.maximum(noise[:2], noise[2:]).tolist()
@@ -155,9 +156,9 @@ class StructureFunction:
 
 
 class NoiseFloor:
-    """Density of the white noise above the motion and between tones: that of the quietest band (Welch's method).
+    """Density of the vibration's white noise, without motion and tones: the quietest band of a Welch spectrum.
 
-    Spectra are those of second differences, so that the motion doesn't leak into them.
+    Spectra are taken of second differences, so that the motion does not leak into them.
     """
 
     def __init__(self) -> None:
@@ -166,11 +167,11 @@ class NoiseFloor:
         self._window = self._bands = np.zeros((0, 1))
         self._power = np.zeros((1, 2))
         self._windows = 0
-        #: of gyroscope and accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]; 0 until the first window is full
+        #: gyroscope and accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]; 0 until the first window is full
         self.densities = (0.0, 0.0)
 
     def interrupt(self) -> None:
-        """Begin a new window: the next difference doesn't follow the last one."""
+        """Begin a new window: the next difference does not follow the last one."""
         self._differences.clear()
         self._seconds = 0.0
 

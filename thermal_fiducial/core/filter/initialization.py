@@ -1,7 +1,7 @@
-"""The state at a first pose: the pose itself, all else wide open.
+"""The estimate at a first pose: attitude and position of the pose, wide priors for all else.
 
-Nothing else is needed: the pose error is linear in the error coordinates, thus the next two or three poses settle
-velocity and tilt whatever they were.
+That is enough: the pose error is linear in the error coordinates, so that the next two or three poses determine
+velocity and tilt whatever their true values are.
 """
 
 from dataclasses import replace
@@ -32,19 +32,19 @@ from thermal_fiducial.core.filter.update import slide
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
 
-#: Seconds of samples that stillness is judged on, and the fewest of them.
+#: Window [s] in which rest is detected, and the fewest samples in it.
 WINDOW_SECONDS, FEWEST_SAMPLES = 0.5, 20
-#: At rest the samples scatter less than this, and their mean rate is a plausible gyroscope bias [rad/s, m/s^2].
+#: Limits at rest: standard deviations of the samples [rad/s, m/s^2], and mean rate, a plausible gyroscope bias [rad/s].
 STILL_RATE_STD, STILL_FORCE_STD, STILL_RATE = 0.02, 0.3, 0.1
-#: At rest no accelerometer is off gravity by so much [m/s^2], nor by such a share of it over a window of a flight: its
-#: units are others.
+#: Largest difference of the mean specific force from gravity: at rest [m/s^2], in flight [share of gravity]. Beyond it
+#: the accelerometer's units are wrong.
 NO_GRAVITY, HARDLY_GRAVITY = 2.0, 0.5
-#: A first pose whose vertical is further than this [rad] from the specific force is of the wrong planar branch.
+#: Largest angle [rad] between a first pose's vertical and the specific force: beyond it the planar branch is wrong.
 LARGEST_TILT = math.radians(35.0)
 
 
 def _quiet(imu: FloatArray) -> bool:
-    """Whether samples (N, 6) are those of a robot at rest: they hardly scatter, about hardly any rate."""
+    """Whether samples (N, 6) are those of a robot at rest: small scatter, small mean rate."""
     if len(imu) < FEWEST_SAMPLES:
         return False
     std = imu.std(axis=0)
@@ -53,7 +53,7 @@ def _quiet(imu: FloatArray) -> bool:
 
 
 def blank_state(config: PoseEkfConfig) -> NavigationState:
-    """What is known before the first pose: the parameters."""
+    """The state before the first pose, as the parameters give it."""
     return NavigationState(
         R_map_body=np.eye(3),
         velocity=np.zeros(3),
@@ -70,12 +70,12 @@ def blank_state(config: PoseEkfConfig) -> NavigationState:
 def start(
     config: PoseEkfConfig, pose: BodyPose, stamp_ns: int, prior: NavigationState, imu: FloatArray
 ) -> Estimate | None:
-    """Estimate at a first pose, or None where the pose contradicts gravity, or there is none in what the IMU measures.
+    """Estimate at a first pose; None where pose or specific force contradict gravity.
 
     Parameters
     ----------
-    stamp_ns : instant of the pose in the clock of the IMU
-    prior : biases, gravity and offsets to begin with
+    stamp_ns : instant of the pose in the IMU's clock
+    prior : state that gives biases, scale errors, gravity, clock offset and extrinsics
     imu : (N, 6) samples up to the pose's instant, the last one at that instant
     """
     if _contradicts_gravity(pose, imu, config.gravity):
@@ -84,7 +84,7 @@ def start(
     systematic = config.systematic_pose_std
     P = np.diag(_initial_variances(config))
     P[np.ix_(POSE, POSE)] += (noise.white + systematic**2) * pose.shape
-    # The estimate is off by what the pose is.
+    # The systematic error of the pose is an error of the estimate, with the opposite sign.
     P[POSE, SYSTEMATIC] -= systematic * np.linalg.cholesky(pose.shape)
     P[SYSTEMATIC, POSE] = P[POSE, SYSTEMATIC].T
     state = replace(
@@ -100,7 +100,7 @@ def start(
 
 
 def _contradicts_gravity(pose: BodyPose, imu: FloatArray, gravity: float) -> bool:
-    """Whether no robot under ``gravity`` [m/s^2] has this attitude, or measures samples (N, 6) like these."""
+    """Whether attitude or size of the specific force of samples (N, 6) contradict ``gravity`` [m/s^2]."""
     up, force = pose.T_map_body[2, :3], imu.mean(axis=0)[3:]
     size = float(np.linalg.norm(force))
     if up @ force < math.cos(LARGEST_TILT) * size:
@@ -109,21 +109,21 @@ def _contradicts_gravity(pose: BodyPose, imu: FloatArray, gravity: float) -> boo
 
 
 def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatArray) -> FloatArray:
-    """Covariance (48, 48) that an unknown offset s of the camera's clock makes, ``imu`` (6,) being the latest sample.
+    """Covariance (48, 48) by an unknown clock offset s; ``imu`` (6,) is the latest sample.
 
-    The first pose is of the state at the camera's stamp, X(t + s) = X(t) Exp(slide s).
+    The first pose measures the state at the camera's stamp, X(t + s) = X(t) Exp(slide s).
     """
     slid = np.zeros(SIZE)
     slid[CORE] = -slide(state, imu)
     slid[TIME_OFFSET] = 1.0
     covariance = np.outer(slid, slid)
-    # Second order: the offset times a velocity that is not known.
+    # Second order: clock offset times the unknown velocity.
     covariance[POSITION, POSITION] += np.eye(3) * config.initial_velocity_std**2
     return np.asarray(config.time_offset_std**2 * covariance)
 
 
 def _initial_variances(config: PoseEkfConfig) -> FloatArray:
-    """(48,) of all that the first pose does not say."""
+    """(48,) prior variances of all that the first pose does not measure."""
     stds = np.zeros(SIZE)
     stds[VELOCITY] = config.initial_velocity_std
     stds[GYROSCOPE_BIAS] = config.initial_gyroscope_bias_std

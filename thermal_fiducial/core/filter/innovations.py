@@ -1,4 +1,4 @@
-"""What became of each pose, and how well it fitted what was expected: the filter says it, the report reads it."""
+"""Verdicts on poses with their normalised innovations: logged by the filter, published as text, read by the report."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -10,9 +10,9 @@ import numpy as np
 
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
-#: Name of that line among the filter's figures.
+#: Name of the line of normalised innovations in the filter's diagnostics.
 INNOVATIONS = 'innovations'
-#: Verdicts that are kept, and poses over which the normalised innovation squared is averaged for the diagnostics.
+#: Verdicts kept, and poses over which the diagnostics average the normalised innovation squared (NIS).
 _KEPT, _NIS_POSES = 300, 30
 _REFUSED = '!'
 _ONE = re.compile(rf'(\d+):([\d.e+-]+)({_REFUSED}?)')
@@ -20,13 +20,13 @@ _ONE = re.compile(rf'(\d+):([\d.e+-]+)({_REFUSED}?)')
 
 @dataclass(frozen=True, slots=True)
 class PoseUpdate:
-    """What became of a camera pose."""
+    """Verdict on a camera pose."""
 
     #: stamp of the camera, as it came
     stamp_ns: int
     #: whether it moved the estimate
     accepted: bool
-    #: in words; empty when accepted, but for a pose with which the filter started
+    #: in words; empty when accepted, except for the pose that initialised or reset the filter
     reason: str
     #: squared Mahalanobis distance (6 degrees of freedom), NaN where there was nothing to compare with
     nis: float
@@ -40,7 +40,7 @@ class PoseUpdate:
 
 
 class PoseLog:
-    """The latest verdicts, in the order in which they were spoken, and how many there were."""
+    """The latest verdicts, in the order in which they were given, and the numbers of accepted and refused poses."""
 
     def __init__(self) -> None:
         #: stamp of the camera to the latest verdict on its pose
@@ -48,7 +48,7 @@ class PoseLog:
         self.accepted = self.refused = 0
 
     def add(self, update: PoseUpdate) -> None:
-        """Take note of a verdict; a pose that is weighed again, as another one came late, counts once."""
+        """Log a verdict; a pose that is applied again after a late one counts once."""
         known = self.latest.pop(update.stamp_ns, None)
         if known is None:
             self.accepted += update.accepted
@@ -58,7 +58,7 @@ class PoseLog:
             del self.latest[next(iter(self.latest))]
 
     def mean_nis(self) -> float:
-        """Of the latest accepted poses, per degree of freedom: 1 is consistent, less is cautious; NaN before any."""
+        """Mean NIS per degree of freedom of the latest accepted poses: 1 is consistent, less conservative."""
         latest = islice(reversed(self.latest.values()), _NIS_POSES)
         values = [update.nis / 6.0 for update in latest if update.accepted and not math.isnan(update.nis)]
         return float(np.mean(values or math.nan))
@@ -80,7 +80,7 @@ def innovations_text(updates: Iterable[PoseUpdate]) -> str:
 
 
 def innovations_of(text: str) -> Innovations:
-    """What :func:`innovations_text` wrote; whatever else is in ``text`` doesn't count."""
+    """Parse what :func:`innovations_text` wrote; anything else in ``text`` is skipped."""
     found = [match.groups() for match in _ONE.finditer(text)]
     return Innovations(
         np.array([int(stamp) for stamp, _, _ in found], np.int64),

@@ -1,8 +1,7 @@
-"""filterpy's extended Kalman filter without the rest of filterpy, which is two thirds of a node's start.
+"""filterpy's extended Kalman filter, imported alone: the whole of filterpy takes two thirds of a node's start time.
 
-Importing anything of filterpy imports all of it, and scipy's statistics with it. The one module that is used here needs
-three functions of the others, one of them only for a likelihood that nobody asks for, and the inverse of scipy's linear
-algebra, of which numpy has one too.
+Importing any module of filterpy imports all of them, and scipy.stats. The EKF module needs only two helpers,
+``logpdf`` for a likelihood that is not used here, and ``scipy.linalg.inv``, which numpy replaces.
 """
 
 from importlib import import_module
@@ -17,12 +16,12 @@ _NAME = 'filterpy'
 
 
 def _logpdf(*args: Any, **kwargs: Any) -> Any:
-    """The one of filterpy, for the likelihood."""
+    """The likelihood's ``logpdf`` of filterpy, imported when it is called."""
     return import_module(f'{_NAME}.stats').logpdf(*args, **kwargs)
 
 
 def _load() -> Any:
-    """The class; from the whole of filterpy where it is loaded already, or is not laid out as it was."""
+    """``ExtendedKalmanFilter``; imports all of filterpy if it is loaded already, or if its layout has changed."""
     spec = find_spec(_NAME)
     if _NAME not in sys.modules and spec is not None and spec.submodule_search_locations:
         try:

@@ -1,4 +1,4 @@
-"""What the filter says, as the outside wants it: ROS order and frames, of another frame on the robot, without steps."""
+"""Published odometry: ROS conventions, of another frame on the robot if asked for, without steps if asked for."""
 
 from dataclasses import replace
 import math
@@ -10,12 +10,12 @@ from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, so3_log, 
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray
 
-#: (12, 12) position, rotation, velocity and rate of the robot by the core's errors and the gyroscope's bias, for a
-#: robot at rest whose axes are those of the map.
+#: (12, 12) Jacobian of position, rotation, velocity and rate of the robot by the core's errors and the gyroscope's
+#: bias, without the blocks that depend on attitude and velocity.
 _AT_REST = np.zeros((12, 12))
 _AT_REST[6:9, VELOCITY] = np.eye(3)
 _AT_REST[9:, 9:] = -np.eye(3)
-#: Places of the rate's variances in such a matrix, row by row.
+#: Flat indices of the rate's variances in a (12, 12) matrix.
 _RATE_VARIANCES = slice(9 * 13, None, 13)
 #: A correction beyond this [m] is a new start of the filter: spreading it would only prolong the error.
 LARGEST_STEP = 1.0
@@ -24,21 +24,21 @@ LARGEST_STEP = 1.0
 def odometry(
     estimate: Estimate, core: FloatArray, with_bias: FloatArray, imu: FloatArray, rate_variance: float
 ) -> Odometry:
-    """State at an IMU sample.
+    """Odometry at an IMU sample.
 
     Parameters
     ----------
     core : (9, 9) covariance of rotation, velocity and position errors
-    with_bias : (9, 3) of these with the gyroscope's bias
+    with_bias : (9, 3) cross-covariance of these and the gyroscope's bias
     imu : (6,) the sample
-    rate_variance : of the white noise of its rate [rad^2/s^2]
+    rate_variance : white noise of the sample's rate [rad^2/s^2]
     """
     state = estimate.state
     R, velocity_body = state.R_map_body, state.velocity_body
     joint = np.empty((12, 12))
     joint[:9, :9], joint[:9, 9:], joint[9:, :9] = core, with_bias, with_bias.T
     joint[9:, 9:] = estimate.covariance[GYROSCOPE_BIAS, GYROSCOPE_BIAS]
-    # (p, theta) of the map are R times the error of the robot frame; v_body moves with both nu and phi.
+    # Position and rotation errors turn from the robot frame into the map; that of v_body depends on nu and phi.
     J = _AT_REST.copy()
     J[0:3, POSITION] = J[3:6, ROTATION] = R
     J[6:9, ROTATION] = skew(velocity_body)
@@ -56,7 +56,7 @@ def odometry(
 
 
 def in_frame(odometry: Odometry, T_body_frame: FloatArray) -> Odometry:
-    """State of the frame at ``T_body_frame`` (4, 4) on the body of ``odometry``, in the same conventions."""
+    """Odometry of another frame on the same rigid body, at ``T_body_frame`` (4, 4)."""
     T_map_body, R, lever = odometry.T_map_body, T_body_frame[:3, :3], T_body_frame[:3, 3]
     pose = np.eye(6)
     pose[:3, 3:] = -skew(T_map_body[:3, :3] @ lever)
@@ -75,9 +75,9 @@ def in_frame(odometry: Odometry, T_body_frame: FloatArray) -> Odometry:
 
 
 class SmoothOutput:
-    """A pose without steps for controllers that hate them: late by design, and never the consistent output.
+    """A pose without steps, for controllers that need one: it lags behind, and its covariance is not consistent.
 
-    It follows the filter's odometry, moves with its twist, and takes up its corrections with a time constant.
+    It integrates the filter's twist, and approaches the filter's pose with a time constant.
     """
 
     def __init__(self, seconds: float) -> None:

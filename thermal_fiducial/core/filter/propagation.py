@@ -1,4 +1,4 @@
-"""From an estimate along the IMU samples: the state and the covariance of its error, step by step.
+"""Propagation of state and error covariance along the IMU samples, step by step.
 
 Over a step, rate and specific force are constant, and so is the generator A of the left-invariant error: d xi/dt = A xi
 + B n, where n is the error of rate and force. The transition exp(A dt) and the input matrix, the integral of exp(A s) B
@@ -38,7 +38,7 @@ _SCALES = slice(GYROSCOPE_MATRIX.start, ACCELEROMETER_MATRIX.stop)
 
 
 def _generators() -> FloatArray:
-    """(7, 81): rate, force and 1 times this are A (9, 9), row by row."""
+    """(7, 81) basis of the generator: (rate, force, 1) @ basis is A (9, 9), row by row."""
     basis = np.zeros((7, 9, 9))
     crosses = SKEW.reshape(3, 3, 3)
     for place in (ROTATION, VELOCITY, POSITION):
@@ -52,7 +52,7 @@ _GENERATORS = _generators()
 
 
 class StepMatrices(NamedTuple):
-    """Of N steps: transition (N, 9, 9) of the core's error, and (N, 9, 6) its change by an error of rate and force."""
+    """For N steps: transition (N, 9, 9) of the core's error, and its Jacobian (N, 9, 6) by errors of rate and force."""
 
     transition: FloatArray
     by_imu: FloatArray
@@ -106,7 +106,7 @@ def _moved(
     state = estimate.state
     R, velocity, position = state.R_map_body, state.velocity, state.position
     turns = matrices.transition[:, ROTATION, ROTATION].swapaxes(-1, -2)
-    # What the force adds to velocity and position, in the robot frame at the end of the step.
+    # Increments of velocity and position by the specific force, in the robot frame at the end of the step.
     gained = (matrices.by_imu[:, 3:, 3:] @ imu[:, 3:, None]).reshape(-1, 2, 3)
     rotations = []
     for turn, (faster, farther), dt in zip(turns, gained, seconds.tolist(), strict=True):
@@ -119,12 +119,12 @@ def _moved(
 
 
 def _transitions(matrices: StepMatrices, R_map_body: FloatArray, steps: Steps) -> FloatArray:
-    """(N, 9, 35) of the core's error by all that moves it; ``R_map_body`` (N, 3, 3) after each step."""
+    """(N, 9, 35) Jacobians of the core's error by the coordinates ``MOVED_BY``; ``R_map_body`` after each step."""
     dt = steps.seconds[:, None, None]
     transitions = np.zeros((len(dt), 9, 35))
     transitions[..., CORE] = matrices.transition
     transitions[..., BIAS] = -matrices.by_imu
-    # The error that a share of the reading makes is that of a bias as large.
+    # A scale error acts as a bias of scale times reading.
     shares = matrices.by_imu.reshape(-1, 9, 2, 3, 1) * steps.imu.reshape(-1, 1, 2, 1, 3)
     transitions[..., _SCALES] = -shares.reshape(-1, 9, 18)
     fallen = R_map_body[:, :2].swapaxes(-1, -2) * dt

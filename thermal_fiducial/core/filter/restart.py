@@ -1,4 +1,4 @@
-"""A filter that was started again in flight: its last pose from before is a hint to which poses may be right."""
+"""A filter that restarts in flight: the last pose before serves to reject implausible poses at initialisation."""
 
 from dataclasses import dataclass
 
@@ -8,17 +8,17 @@ from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: Older poses [s] say nothing any more of where the robot is.
+#: Longest time [s] for which the last pose still limits where the robot can be.
 HINT_SECONDS = 10.0
-#: A robot under control may be this far from its last pose [m], and so much farther for each second since [m/s].
+#: Largest distance of the robot from its last pose: a constant [m] and a speed [m/s].
 _NEAR, _SPEED = 0.5, 3.0
-#: As many poses in a row that contradict the hint prove it wrong: a second at 30 Hz.
+#: Poses in a row that contradict the hint until it is dropped: a second at 30 Hz.
 _PROOF = 30
 
 
 @dataclass(frozen=True)
 class LastPose:
-    """What a filter knew last."""
+    """The last pose of a filter before it ended, and its clock offset."""
 
     stamp_ns: int
     #: (4, 4)
@@ -28,11 +28,11 @@ class LastPose:
 
 
 class RestartHint:
-    """Keeps poses of a wrong planar branch, or of a marker of the same ID elsewhere, from starting the filter.
+    """Keeps the wrong branch of a planar pose, or a duplicated marker, from initialising a restarted filter.
 
     Parameters
     ----------
-    last : what was known before
+    last : state before the restart
     T_body_camera : (4, 4)
     """
 
@@ -42,7 +42,7 @@ class RestartHint:
         self._contradictions = 0
 
     def contradiction(self, pose: CameraPose) -> float:
-        """Distance [m] from the last pose of one that cannot be right by it; 0 where it may be."""
+        """Distance [m] of an implausibly far pose from the last one; 0 if the pose is plausible."""
         seconds = (pose.stamp_ns - self._last.stamp_ns) / SECOND_NS
         if not 0.0 <= seconds <= HINT_SECONDS or self._contradictions >= _PROOF:
             return 0.0

@@ -18,11 +18,11 @@ from thermal_fiducial.core.filter.pose_noise import PoseNoise
 from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian_inverse, transform
 from thermal_fiducial.core.types import FloatArray
 
-#: Places of the error coordinates: in the robot frame [rad, m/s, m],
+#: Error coordinates by index. Core, expressed in the robot frame [rad, m/s, m],
 ROTATION, VELOCITY, POSITION = slice(0, 3), slice(3, 6), slice(6, 9)
 #: biases of the IMU [rad/s, m/s^2],
 GYROSCOPE_BIAS, ACCELEROMETER_BIAS, BIAS = slice(9, 12), slice(12, 15), slice(9, 15)
-#: matrices of scale and cross-axis errors of its two triads, row by row [1],
+#: scale and cross-axis error matrices of gyroscope and accelerometer, row by row [1],
 GYROSCOPE_MATRIX, ACCELEROMETER_MATRIX = slice(15, 24), slice(24, 33)
 #: horizontal components of gravity in the map [m/s^2],
 GRAVITY = slice(33, 35)
@@ -30,18 +30,18 @@ GRAVITY = slice(33, 35)
 TIME_OFFSET = 35
 #: T_body_camera, perturbed from the left [rad, m],
 EXTRINSICS = slice(36, 42)
-#: systematic error of the camera poses, in their standard deviations.
+#: systematic error of the camera poses, in units of its standard deviation.
 SYSTEMATIC = slice(42, 48)
 SIZE = 48
-#: Those that an inertial step changes, and those that change it.
+#: Coordinates that an IMU step propagates, and coordinates that they are propagated from.
 CORE, MOVED_BY = slice(0, 9), slice(0, 35)
-#: A pose measures the rotation and the position error.
+#: Coordinates that a pose measures.
 POSE = np.r_[ROTATION, POSITION]
 
 
 @dataclass(frozen=True, slots=True)
 class NavigationState:
-    """Estimate at one instant."""
+    """State estimate at one instant, without its covariance."""
 
     #: (3, 3)
     R_map_body: FloatArray
@@ -59,7 +59,7 @@ class NavigationState:
     time_offset: float
     #: (4, 4)
     T_body_camera: FloatArray
-    #: (6,) systematic error of the camera poses, in standard deviations
+    #: (6,) systematic error of the camera poses, in units of its standard deviation
     systematic: FloatArray
 
     @property
@@ -73,11 +73,11 @@ class NavigationState:
         return self.velocity @ self.R_map_body
 
     def corrected(self, imu: FloatArray) -> FloatArray:
-        """Samples (..., 6) without the errors of the sensors [rad/s, m/s^2]."""
+        """Samples (..., 6) corrected for bias and scale errors [rad/s, m/s^2]."""
         return imu - self.bias - (self.scale @ imu.reshape(-1, 2, 3, 1)).reshape(imu.shape)
 
     def plus(self, error: FloatArray) -> 'NavigationState':
-        """The state moved by ``error`` (48,), X Exp(xi) for the group part."""
+        """The state corrected by ``error`` (48,): X Exp(xi) for the group part, a sum for the rest."""
         R_left = self.R_map_body @ _left_jacobian(error[ROTATION])
         T_body_camera = self.T_body_camera
         if error[EXTRINSICS].any():
@@ -114,11 +114,11 @@ class Estimate:
     stamp_ns: int
     state: NavigationState
     covariance: FloatArray
-    #: what the innovations have shown of the camera poses' error
+    #: noise of the camera poses, as adapted to the innovations
     pose_noise: PoseNoise
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'Estimate':
-        """The estimate in a map whose coordinates are moved: only the horizontal gravity's coordinates turn."""
+        """The estimate in a moved map: of the error coordinates only gravity's are expressed in the map, and turn."""
         turn = np.eye(SIZE)
         turn[GRAVITY, GRAVITY] = T_new_old[:2, :2]
         covariance = turn @ self.covariance @ turn.T
