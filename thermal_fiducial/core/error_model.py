@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.se3 import skew
+from thermal_fiducial.core.geometry.reprojection import lever_arm
 from thermal_fiducial.core.types import FloatArray, IntArray
 
 
@@ -118,8 +118,10 @@ def visible_share(J: FloatArray, correlations: FloatArray) -> float:
     correlations : (n, n) of the errors
     """
     n = len(J)
-    Q = np.linalg.qr(J.reshape(2 * n, 6))[0].reshape(n, 12)
-    return 1.0 - float(np.sum(Q * (correlations @ Q))) / (2.0 * n)
+    mixed = (correlations @ J.reshape(n, 12)).reshape(2 * n, 6)
+    of_coordinates = J.reshape(2 * n, 6)
+    taken_up = np.linalg.solve(of_coordinates.T @ of_coordinates, of_coordinates.T @ mixed)
+    return 1.0 - float(np.trace(taken_up)) / (2.0 * n)
 
 
 def map_of_pose(
@@ -138,8 +140,7 @@ def map_of_pose(
     """
     best = int(np.argmin(np.trace(covariances, axis1=1, axis2=2)))
     arms = np.concatenate([positions, camera_position[None]]) - positions[best]
-    A = np.tile(np.eye(6), (len(arms), 1, 1))
-    A[:, :3, 3:] = -skew(arms)
+    A = lever_arm(arms)
     common = MAP_COMMON * A @ covariances[best] @ np.swapaxes(A, -1, -2)
     return np.asarray(common[-1] + correlated_sum(gains, positive(covariances - common[:-1])))
 

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from thermal_fiducial.core.geometry.reprojection import turned
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked
 
 _F4 = '<f4'
 #: Frames that come later than this after newer ones are those of a clock that was set back [ns].
@@ -74,22 +75,33 @@ def corner_covariances(markers: Markers) -> FloatArray:
     return _numbers(markers, _COVARIANCES).reshape(-1, 4, 2, 2)
 
 
-def usable(markers: Markers) -> Markers:
-    """Rows with finite corners and covariances whose ID is there once: of two alike, nobody knows which is which."""
-    C = corner_covariances(markers)
-    finite = np.isfinite(corners_px(markers)).all(axis=(1, 2))
-    sound = (C[..., 0, 0] > 0.0) & (C[..., 0, 0] * C[..., 1, 1] > C[..., 0, 1] ** 2)
-    ids = markers['id'].tolist()
-    times = Counter(ids)
-    once = np.array([times[key] == 1 for key in ids], dtype=bool)
-    return np.asarray(markers[finite & sound.all(axis=1) & once])
+@dataclass(frozen=True, slots=True)
+class Observations(Stacked):
+    """Markers of a frame in numbers, N of them."""
 
+    #: (N,)
+    ids: IntArray
+    #: (N, 4, 2) [px] and (N, 4, 2, 2) [px^2]
+    corners: FloatArray
+    covariances: FloatArray
+    #: (N, 2, 4, 4) T_camera_marker and its alternative, NaN where there is none
+    branches: FloatArray
 
-def marker_branches(rows: Markers) -> FloatArray:
-    """T_camera_marker (N, 2, 4, 4): the rows' poses and their alternatives, NaN where there is none."""
-    poses = _numbers(rows, _BRANCHES).reshape(-1, 2, 7)
-    with np.errstate(invalid='ignore', divide='ignore'):
-        return transform_from_quaternion(poses[..., :3], poses[..., 3:])
+    @staticmethod
+    def of(markers: Markers) -> 'Observations':
+        """Of rows with sound corners whose ID is there once: of two alike, nobody knows which is which."""
+        corners, covariances, poses = corners_px(markers), corner_covariances(markers), _numbers(markers, _BRANCHES)
+        poses = poses.reshape(-1, 2, 7)
+        with np.errstate(invalid='ignore', divide='ignore'):
+            branches = transform_from_quaternion(poses[..., :3], poses[..., 3:])
+        observations = Observations(markers['id'].astype(np.int64), corners, covariances, branches)
+        uu, uv, vv = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
+        sound = (uu > 0.0) & (uu * vv > uv**2) & np.isfinite(corners).all(axis=2)
+        usable: BoolArray = np.asarray(sound.all(axis=1))
+        times = Counter(observations.ids.tolist())
+        if len(times) < len(markers):
+            usable &= np.array([times[key] == 1 for key in observations.ids.tolist()])
+        return observations if usable.all() else observations.only(usable)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,12 +134,12 @@ class CameraPose:
 
 def in_moved_map(pose: CameraPose, T_new_old: FloatArray) -> CameraPose:
     """``pose`` in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-    turn = np.kron(np.eye(2), T_new_old[:3, :3])
+    R = T_new_old[:3, :3]
     return replace(
         pose,
         T_map_camera=T_new_old @ pose.T_map_camera,
-        covariance=turn @ pose.covariance @ turn.T,
-        map_covariance=turn @ pose.map_covariance @ turn.T,
+        covariance=turned(pose.covariance, R),
+        map_covariance=turned(pose.map_covariance, R),
     )
 
 

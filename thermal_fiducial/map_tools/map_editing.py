@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from thermal_fiducial.core.geometry.reprojection import turned
 from thermal_fiducial.core.geometry.se3 import apply
 from thermal_fiducial.core.mapping.map_data import align, Alignment, MapMarker, MarkerMap, rigid
 from thermal_fiducial.core.types import FloatArray
@@ -68,12 +69,13 @@ def delete(marker_map: MarkerMap, ids: Iterable[int]) -> MarkerMap:
 
 def transformed(marker_map: MarkerMap, T_new_old: FloatArray) -> MarkerMap:
     """The whole map in another frame; covariances turn along."""
-    turn = np.kron(np.eye(2), T_new_old[:3, :3])
     return _changed(
         marker_map,
         {
             key: replace(
-                marker, T_map_marker=T_new_old @ marker.T_map_marker, covariance=turn @ marker.covariance @ turn.T
+                marker,
+                T_map_marker=T_new_old @ marker.T_map_marker,
+                covariance=turned(marker.covariance, T_new_old[:3, :3]),
             )
             for key, marker in marker_map.markers.items()
         },

@@ -5,11 +5,12 @@ import sys
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+import numpy as np
 from sensor_msgs.msg import PointCloud2
 
 from thermal_fiducial.config import LandingTargetConfig
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
-from thermal_fiducial.core.measurements import marker_branches, Markers, usable
+from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros import clouds, convert, message_bytes, qos
 from thermal_fiducial.ros.landing_pad import for_mavros, pad_in_map
@@ -46,9 +47,9 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         self._T_map_pad = pad_in_map({key: pose for key, (pose, _) in poses.items()}, self.config.landing_pad)
 
     def _on_markers(self, message: PointCloud2) -> None:
-        stamp, rows = convert.stamp_ns(message.header.stamp), usable(clouds.markers(message))
-        rows = rows[[int(marker_id) in self.config.landing_pad for marker_id in rows['id']]]
-        self._in_view = len(rows) > 0
+        stamp, seen = convert.stamp_ns(message.header.stamp), Observations.of(clouds.markers(message))
+        seen = seen.only(np.isin(seen.ids, self.config.landing_pad))
+        self._in_view = len(seen.ids) > 0
         if not self._in_view:
             return
         if self._T_map_pad is not None:
@@ -56,16 +57,12 @@ class LandingTarget(StageNode[LandingTargetConfig]):
             if len(self._frames) > _WAITING:
                 self._frames.popitem(last=False)
         elif self._needs_no_map:
-            self._send_detected(stamp, rows)
+            self._send_in_body(stamp, self._T_body_camera @ seen.branches[0, 0])
 
     @property
     def _needs_no_map(self) -> bool:
         """Whether the pad is one marker, wanted in the body: its own detection says where it is."""
         return len(self.config.landing_pad) == 1 and self.config.landing_target_frame == 'body'
-
-    def _send_detected(self, stamp: int, rows: Markers) -> None:
-        (T_camera_pad,) = marker_branches(rows)[:, 0]
-        self._send_in_body(stamp, self._T_body_camera @ T_camera_pad)
 
     def _on_camera_pose(self, message: bytes) -> None:
         pose = message_bytes.camera_pose(message)

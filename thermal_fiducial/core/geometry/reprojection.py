@@ -32,6 +32,21 @@ def difference(T: npt.ArrayLike, T_reference: npt.ArrayLike) -> FloatArray:
     return np.concatenate([T[..., :3, 3] - T_reference[..., :3, 3], rotation], axis=-1)
 
 
+def lever_arm(arm: FloatArray) -> FloatArray:
+    """What moves (..., 6, 6) a point fixed on a body, at ``arm`` (..., 3) from its origin, as ``d`` moves the body."""
+    J = np.zeros((*arm.shape[:-1], 6, 6))
+    J[...] = np.eye(6)
+    J[..., :3, 3:] = -skew(arm)
+    return J
+
+
+def turned(covariance: FloatArray, R: FloatArray) -> FloatArray:
+    """Covariance (6, 6) of a pose or of a twist in axes that ``R`` (3, 3) turns its own to."""
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = R
+    return np.asarray(turn @ covariance @ turn.T)
+
+
 def marker_corners(sizes: npt.ArrayLike) -> FloatArray:
     """Corners (..., 4, 3) [m] of markers of ``sizes`` (...) in their own frames, clockwise from the top-left."""
     return np.asarray(0.5 * np.asarray(sizes, dtype=np.float64)[..., None, None] * _UNIT_CORNERS)

@@ -17,7 +17,7 @@ from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.keyframes import Displacement
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.mapping.marker_views import FittedPoses, MarkerView, MarkerViews, Viewpoint
-from thermal_fiducial.core.measurements import corner_covariances, corners_px, marker_branches, Markers
+from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.types import FloatArray
 
 #: Views closer in direction than this say nothing new of the ambiguity [rad].
@@ -137,21 +137,20 @@ class NewMarkers:
         self.candidates: dict[int, Candidate] = {}
 
     def show(
-        self, stamp_ns: int, rows: Markers, camera: Camera, viewpoint: Viewpoint
+        self, stamp_ns: int, seen: Observations, camera: Camera, viewpoint: Viewpoint
     ) -> tuple[list[MapMarker], dict[int, str]]:
-        """Show a frame's rows to their candidates, but for those of which the detector knows no pose.
+        """Show a frame's markers to their candidates, but for those of which the detector knows no pose.
 
         Returns
         -------
         Those that the views have settled by now, as markers of the map, and what the others wait for, in words by ID.
         """
-        branches, corners, covariances = marker_branches(rows), corners_px(rows), corner_covariances(rows)
         shown = []
-        posed = np.all(np.isfinite(branches[:, 0]), axis=(1, 2))
-        for i, marker_id in zip(np.flatnonzero(posed).tolist(), rows['id'][posed].tolist(), strict=True):
+        posed = np.isfinite(seen.branches[:, 0]).all(axis=(1, 2))
+        for i, marker_id in zip(np.flatnonzero(posed).tolist(), seen.ids[posed].tolist(), strict=True):
             size = self._sizes.get(marker_id, self._size)
             candidate = self.candidates.setdefault(marker_id, Candidate(marker_id, size))
-            candidate.add(MarkerView(stamp_ns, viewpoint, corners[i], covariances[i], branches[i]))
+            candidate.add(MarkerView(stamp_ns, viewpoint, seen.corners[i], seen.covariances[i], seen.branches[i]))
             shown.append(candidate)
         placed = []
         for candidate in sorted(shown, key=lambda c: -c.untried)[:TRIALS]:

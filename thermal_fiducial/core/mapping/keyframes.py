@@ -13,7 +13,7 @@ from thermal_fiducial.core.mapping.adjustment_problem import Priors, Snapshot
 from thermal_fiducial.core.mapping.located import growth, PredictedCamera
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
-from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, Markers
+from thermal_fiducial.core.measurements import CameraPose, Observations
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 
 # Side of a cell of camera positions [m] and of viewing directions [components of a unit vector] to begin with.
@@ -206,24 +206,24 @@ class FrameMemory:
         self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(marker_map.markers)
         self._added_then, self._refined_views = 0, 0
 
-    def keep(self, rows: Markers, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> None:
+    def keep(self, seen: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> None:
         """Keep a frame whose camera is known; of one marker alone a refinement can learn nothing."""
         self._last_ns, self._gap = pose.stamp_ns, None
-        if len(rows) >= 2:
-            self._keyframes.add(self._keyframe(rows, pose, camera, predicted))
+        if len(seen.ids) >= 2:
+            self._keyframes.add(self._keyframe(seen, pose, camera, predicted))
 
-    def bridge(self, rows: Markers, camera: Camera, predicted: PredictedCamera, *, first: bool) -> Viewpoint:
+    def bridge(self, seen: Observations, camera: Camera, predicted: PredictedCamera, *, first: bool) -> Viewpoint:
         """Keep a frame without a known marker; from where its markers are seen.
 
         Nothing but the odometry joins its markers to the map. Once, for the ``first`` of them, that counts in full: its
         error is the same for all that follow, which hang together through the markers themselves.
         """
-        keyframe = self._keyframe(rows, predicted.pose, camera, predicted)
+        keyframe = self._keyframe(seen, predicted.pose, camera, predicted)
         if first:
             information = np.asarray(np.linalg.inv(predicted.pose.covariance), dtype=np.float64)
             self._keyframes.bridges.add(keyframe.stamp_ns)
             self._keyframes.add(replace(keyframe, information=information))
-        elif len(rows) >= 2:
+        elif len(seen.ids) >= 2:
             self._keyframes.add(keyframe)
         if self._gap is None:
             self._gap = predicted.pose
@@ -259,12 +259,12 @@ class FrameMemory:
         """Go along with a refinement, poses (4, 4) by stamp: how the map has moved at each time."""
         return self._keyframes.move(adjusted)
 
-    def _keyframe(self, rows: Markers, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> Keyframe:
+    def _keyframe(
+        self, seen: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None
+    ) -> Keyframe:
         if self._camera is None or not camera.matches(self._camera):
             self._camera = camera
-        ids = rows['id'].astype(np.int64)
-        covariances = corner_covariances(rows)
-        frame = Keyframe(pose.stamp_ns, pose.T_map_camera, self._camera, ids, corners_px(rows), covariances)
+        frame = Keyframe(pose.stamp_ns, pose.T_map_camera, self._camera, seen.ids, seen.corners, seen.covariances)
         if predicted is None:
             return frame
         information = np.asarray(np.linalg.inv(alike_odometry(predicted.pose.covariance)), dtype=np.float64)

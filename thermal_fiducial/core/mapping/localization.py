@@ -5,6 +5,8 @@ filled environments", ISVC 2018.
 """
 
 from dataclasses import dataclass, replace
+import math
+from statistics import median
 
 import numpy as np
 
@@ -60,7 +62,7 @@ def locate(
     -------
     The location, or why there is none.
     """
-    fit = CameraFit(sight.corners, sight.covariances, sight.points, camera)
+    fit = CameraFit(sight.observed.corners, sight.observed.covariances, sight.points, camera)
     hypotheses = _hypotheses(sight, fit, prior)
     if not len(hypotheses):
         return Refusal('no usable pose of any known marker')
@@ -115,11 +117,11 @@ class _JointFit:
         None where the markers do not determine it.
         """
         n, residuals = len(weights), seen.residuals[..., None]
-        information = np.linalg.inv(self.sight.covariances) * weights[:, None, None, None]
-        squared = np.sum(residuals * (information @ residuals), axis=(-2, -1))
+        information = np.linalg.inv(self.sight.observed.covariances) * weights[:, None, None, None]
+        squared = (residuals * (information @ residuals)).sum(axis=(-2, -1))
         robust = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
         J = seen.J_camera.reshape(8 * n, 6)
-        weighted = (information / robust @ seen.J_camera).reshape(8 * n, 6)
+        weighted = (information / robust @ J.reshape(n, 4, 2, 6)).reshape(8 * n, 6)
         try:
             gains = np.linalg.inv(J.T @ weighted) @ weighted.T
         except np.linalg.LinAlgError:
@@ -149,12 +151,12 @@ class _JointFit:
         """
         n, sight, model = len(weights), self.sight, self.model
         by_corner = np.swapaxes(gains.reshape(6, 4 * n, 2), 0, 1)
-        white = noise_of_pose(by_corner, sight.covariances.reshape(-1, 2, 2), chi2)
-        correlations = corner_correlations(sight.corners.reshape(-1, 2), self.camera.width, model)
+        white = noise_of_pose(by_corner, sight.observed.covariances.reshape(-1, 2, 2), chi2)
+        correlations = corner_correlations(sight.observed.corners.reshape(-1, 2), self.camera.width, model)
         of_corners = corners_of_pose(by_corner, correlations, model)
         arms = sight.points - sight.T_map_marker[:, None, :3, 3]
-        grown = gains @ np.einsum('nckj,ncj->nck', seen.J_marker[..., :3], arms).ravel()
-        map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ seen.J_marker.reshape(n, 8, 6)
+        grown = gains @ (seen.J_marker.reshape(n, 4, 2, 6)[..., :3] @ arms[..., None]).ravel()
+        map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ seen.J_marker
         # Sides and map grow together.
         of_scale = np.einsum('nij,nj->i', map_gains[:, :, :3], sight.scale_arms) - grown
         of_map = of_single_error(of_scale, model.marker_size_std)
@@ -164,14 +166,14 @@ class _JointFit:
         covariance = white + of_corners + of_map
         if not np.all(np.isfinite(covariance)):
             return None
-        ids, rms_px = tuple(marker.id for marker in sight.markers), float(np.sqrt(np.mean(seen.errors_px**2)))
+        ids, rms_px = tuple(sight.observed.ids.tolist()), math.sqrt(seen.errors_px @ seen.errors_px / n)
         T = retract(T_map_camera, step)
         pose = CameraPose(self.stamp_ns, T, covariance, of_map, ids, rms_px)
         return Location(pose, sight, seen, weights, map_gains, correlations, white)
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
         """Another pose (4, 4) that the corners do not refute; None when there is none."""
-        width, height = np.ptp(self.sight.corners, axis=(0, 1)) / self.camera.focal_px
+        width, height = np.ptp(self.sight.observed.corners, axis=(0, 1)) / self.camera.focal_px
         if np.hypot(width, height) > WIDE:
             return None
         T = found.pose.T_map_camera
@@ -187,9 +189,9 @@ class _JointFit:
     def map_weights(self, T_map_camera: FloatArray) -> FloatArray:
         """Weights (N,) of the markers by how well the map knows each."""
         sight = self.sight
-        variances = np.diagonal(sight.map_covariances, axis1=-2, axis2=-1)
-        if not np.any(variances):
+        if not sight.map_covariances.any():
             return np.ones(len(sight.markers))
+        variances = np.diagonal(sight.map_covariances, axis1=-2, axis2=-1)
         # A third of the variance is along each axis; a corner is 0.7 sides from the centre.
         apart = variances[:, :3].sum(axis=-1) / 3.0 + sight.sizes**2 * variances[:, 3:].sum(axis=-1) / 9.0
         distances = np.linalg.norm(sight.T_map_marker[:, :3, 3] - T_map_camera[:3, 3], axis=-1)
@@ -203,21 +205,20 @@ def marker_weights(errors: FloatArray, running_errors: FloatArray, model: System
     one as its inverse square, which is what its error's variance deserves.
     """
     combined = 0.5 * (errors**2 + np.where(running_errors > 0.0, running_errors, errors) ** 2)
-    reference = max(float(np.median(combined)), model.decision_px**2)
+    reference = max(median(combined.tolist()), model.decision_px**2)
     return np.asarray(np.minimum(1.0, reference / np.maximum(combined, TINY)))
 
 
 def _hypotheses(sight: Sight, fit: CameraFit, prior: FloatArray | None) -> FloatArray:
     """Camera poses (H, 4, 4) from either branch of each of the largest markers and from the prior, the best first."""
-    largest = np.argsort(-np.sum(np.ptp(sight.corners, axis=1), axis=-1), kind='stable')[:_PROPOSERS]
-    branches = sight.branches[largest].reshape(-1, 4, 4)
-    poses = np.repeat(sight.T_map_marker[largest], 2, axis=0) @ inverse(branches)
-    poses = poses[np.all(np.isfinite(poses), axis=(1, 2))]
+    largest = np.argsort(-np.ptp(sight.observed.corners, axis=1).sum(axis=-1), kind='stable')[:_PROPOSERS]
+    poses = (sight.T_map_marker[largest, None] @ inverse(sight.observed.branches[largest])).reshape(-1, 4, 4)
+    poses = poses[np.isfinite(poses).all(axis=(1, 2))]
     if prior is not None:
         poses = np.concatenate([poses, prior[None]])
     return np.asarray(poses[np.argsort(fit.costs(poses), kind='stable')])
 
 
 def _names(sight: Sight) -> str:
-    ids = [marker.id for marker in sight.markers]
+    ids = sight.observed.ids.tolist()
     return f'marker {ids[0]}' if len(ids) == 1 else 'markers ' + ', '.join(str(i) for i in ids)

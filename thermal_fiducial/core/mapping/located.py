@@ -20,13 +20,13 @@ from thermal_fiducial.core.error_model import (
     positive,
 )
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, linearise
-from thermal_fiducial.core.geometry.se3 import skew, so3_exp, transform
-from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, lever_arm, linearise, turned
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
-from thermal_fiducial.core.measurements import CameraPose, corner_covariances, corners_px, marker_branches, Markers
+from thermal_fiducial.core.measurements import CameraPose, Observations, Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
-from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
+from thermal_fiducial.core.types import FloatArray, ObjectArray, SECOND_NS, Stacked
 
 #: Attitudes known no better than this [rad] are not published: their covariances, of first order, mean nothing.
 VAGUE = 0.2
@@ -38,25 +38,24 @@ CONTRADICTION = 100.0
 
 @dataclass(frozen=True)
 class PredictedCamera:
-    """Where odometry has the camera at a frame, and how well its velocity is known."""
+    """Where odometry has the camera at a frame."""
 
     pose: CameraPose
-    #: (6, 6) of the body's velocity [m/s, rad/s], in the map
-    velocity_covariance: FloatArray
+    #: the state that it is from
+    odometry: Odometry
 
 
-@dataclass(frozen=True)
-class Sight:
+@dataclass(frozen=True, slots=True)
+class Sight(Stacked):
     """The known markers of one frame, N of them."""
 
-    markers: list[MapMarker]
-    #: (N, 4, 2) [px]
-    corners: FloatArray
-    #: (N, 4, 2, 2) [px^2]
-    covariances: FloatArray
-    #: (N, 2, 4, 4) both branches of T_camera_marker, NaN where there is none
-    branches: FloatArray
-
+    observed: Observations
+    #: (N,) standard deviation of a coordinate of the corners of each, rms [px]
+    noise_px: FloatArray
+    #: (N,) of MapMarker
+    markers: ObjectArray
+    #: (N, 4, 3) corners in the map [m]
+    points: FloatArray
     #: (N, 4, 4), (N,) [m] and (N, 6, 6): poses, sides and covariances of the markers in the map
     T_map_marker: FloatArray
     sizes: FloatArray
@@ -64,62 +63,36 @@ class Sight:
     #: (N, 3) what their positions move by as the scale of the map grows by 1 [m]
     scale_arms: FloatArray
 
-    @classmethod
-    def of(cls, rows: Markers, marker_map: MarkerMap) -> 'Sight':
-        """Of rows whose IDs are all in the map."""
-        known = [marker_map.markers[key] for key in rows['id'].tolist()]
+    @staticmethod
+    def of(observed: Observations, marker_map: MarkerMap) -> 'Sight':
+        """Of markers that are all in the map."""
+        known = [marker_map.markers[key] for key in observed.ids.tolist()]
+        sizes = np.array([marker.size for marker in known])
         T_map_marker = np.array([marker.T_map_marker for marker in known]).reshape(-1, 4, 4)
         covariances = np.array([marker.covariance for marker in known]).reshape(-1, 6, 6)
-        given = not np.any(covariances)
         positions = T_map_marker[:, :3, 3]
-        return cls(
-            known,
-            corners_px(rows),
-            corner_covariances(rows),
-            marker_branches(rows),
+        given = not covariances.any()
+        return Sight(
+            observed,
+            np.sqrt(np.einsum('nckk->n', observed.covariances) / 8.0),
+            np.array(known, dtype=np.object_),
+            corners_in_map(T_map_marker, sizes),
             T_map_marker,
-            np.array([marker.size for marker in known]),
+            sizes,
             covariances,
             np.zeros_like(positions) if given else arms_of_scale(positions, marker_map.anchors),
         )
 
-    @cached_property
     def trusted(self) -> 'Sight':
         """Those that are not in quarantine."""
-        chosen = [marker.trusted for marker in self.markers]
-        if all(chosen):
-            return self
-        arrays = (
-            self.corners, self.covariances, self.branches,
-            self.T_map_marker, self.sizes, self.map_covariances, self.scale_arms,
-        )  # fmt: skip
-        return Sight([marker for marker in self.markers if marker.trusted], *(array[chosen] for array in arrays))
-
-    @cached_property
-    def noise_px(self) -> FloatArray:
-        """(N,) standard deviation of a coordinate of the corners of each, rms."""
-        return np.asarray(np.sqrt(0.5 * np.trace(self.covariances, axis1=-2, axis2=-1).mean(axis=-1)))
-
-    @cached_property
-    def points(self) -> FloatArray:
-        """(N, 4, 3) corners in the map [m]."""
-        return corners_in_map(self.T_map_marker, self.sizes)
+        chosen = np.array([marker.trusted for marker in self.markers], dtype=np.bool_)
+        return self if chosen.all() else self.only(chosen)
 
     def reprojected(self, camera: Camera, T_map_camera: FloatArray) -> 'Reprojected':
         """The markers of the map as a camera at (4, 4) should see them."""
-        n = len(self.markers)
-        T = np.broadcast_to(T_map_camera, (n, 4, 4))
+        T = np.broadcast_to(T_map_camera, self.T_map_marker.shape)
         uv, J_camera, J_marker = linearise(camera, T, self.T_map_marker, self.sizes)
-        return Reprojected(self.corners - uv, J_camera.reshape(n, 4, 2, 6), J_marker.reshape(n, 4, 2, 6))
-
-    def expected_errors(self, seen: 'Reprojected', pose_covariance: FloatArray) -> FloatArray:
-        """Rms error (N,) [px] that the noise, the camera's pose and the map's own uncertainty explain."""
-        n = len(self.markers)
-        noise = np.trace(self.covariances, axis1=-2, axis2=-1).sum(axis=-1)
-        J_camera, J_marker = seen.J_camera.reshape(n, 8, 6), seen.J_marker.reshape(n, 8, 6)
-        pose = np.sum(J_camera @ pose_covariance * J_camera, axis=(1, 2))
-        marker = np.sum(J_marker @ self.map_covariances * J_marker, axis=(1, 2))
-        return np.asarray(np.sqrt(np.nan_to_num(noise + pose + marker) / 4.0 + INCONSISTENT_PX**2))
+        return Reprojected(self.observed.corners - uv, J_camera, J_marker)
 
 
 @dataclass(frozen=True)
@@ -128,14 +101,14 @@ class Reprojected:
 
     #: (N, 4, 2) measured minus predicted [px], NaN behind the camera
     residuals: FloatArray
-    #: (N, 4, 2, 6) derivatives of the predictions with respect to the camera's pose and the marker's
+    #: (N, 8, 6) derivatives of the predictions with respect to the camera's pose and the marker's
     J_camera: FloatArray
     J_marker: FloatArray
 
     @cached_property
     def errors_px(self) -> FloatArray:
         """Rms error (N,) [px] of each marker; NaN behind the camera."""
-        return np.asarray(np.sqrt(np.mean(np.sum(self.residuals**2, axis=-1), axis=-1)))
+        return np.asarray(np.sqrt((self.residuals**2).sum(axis=(1, 2)) / 4.0))
 
 
 @dataclass(frozen=True)
@@ -189,19 +162,13 @@ class LocatedFrame:
 
     stamp_ns: int
     camera: Camera
-    #: (N,) of MARKER_DTYPE, and (N,) which of them are in the map
-    rows: Markers
-    is_known: BoolArray
-    #: the known ones
+    #: all N markers, those of them that are in the map, and those that are not
+    observed: Observations
     known: Sight
+    new: Observations
     #: where odometry has the camera
     predicted: PredictedCamera | None
     outcome: Location | Refusal
-
-    @property
-    def new(self) -> Markers:
-        """Rows of the markers that are not in the map."""
-        return self.rows[~self.is_known]
 
     def known_errors(self, location: Location) -> tuple[FloatArray, FloatArray]:
         """Errors (K,) [px], rms, of the K known markers, and what noise, pose and map explain of them (K,).
@@ -209,9 +176,12 @@ class LocatedFrame:
         The error of one behind the camera is the image's width.
         """
         known, pose = self.known, location.pose
-        seen = location.seen if known.trusted is known else known.reprojected(self.camera, pose.T_map_camera)
+        seen = location.seen if location.sight is known else known.reprojected(self.camera, pose.T_map_camera)
         errors = np.where(np.isfinite(seen.errors_px), seen.errors_px, float(self.camera.width))
-        return errors, known.expected_errors(seen, pose.covariance)
+        by_camera = np.einsum('nri,nri->n', seen.J_camera @ pose.covariance, seen.J_camera)
+        by_marker = np.einsum('nri,nri->n', seen.J_marker @ known.map_covariances, seen.J_marker)
+        explained = 2.0 * known.noise_px**2 + np.nan_to_num(by_camera + by_marker) / 4.0 + INCONSISTENT_PX**2
+        return errors, np.sqrt(explained)
 
     @property
     def pose(self) -> CameraPose | None:
@@ -238,18 +208,12 @@ def predicted_camera(
     dt = (instant_ns - odometry.stamp_ns) / SECOND_NS
     step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
     T_map_body = odometry.T_map_body @ step
-    R, A = T_map_body[:3, :3], np.eye(6)
-    arm = R @ T_body_camera[:3, 3]
-    A[:3, 3:] = -skew(arm)
-    covariance = A @ odometry.pose_covariance @ A.T
+    R, J = T_map_body[:3, :3], lever_arm(T_map_body[:3, :3] @ T_body_camera[:3, 3])
+    covariance = J @ odometry.pose_covariance @ J.T
     if not prior.clock_is_known:
-        rate = R @ odometry.angular_velocity_body
-        velocity = np.concatenate([R @ odometry.velocity_body + np.cross(rate, arm), rate])
+        velocity = J @ np.concatenate([R @ odometry.velocity_body, R @ odometry.angular_velocity_body])
         covariance += of_single_error(velocity, time_offset_std)
-    turn = np.kron(np.eye(2), R)
-    return PredictedCamera(
-        CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), turn @ odometry.twist_covariance @ turn.T
-    )
+    return PredictedCamera(CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), odometry)
 
 
 def contradicts(T_map_camera: FloatArray, covariance: FloatArray, odometry: CameraPose) -> bool:
@@ -264,6 +228,7 @@ def growth(first: CameraPose, predicted: PredictedCamera) -> FloatArray:
     Errors of odometry that grow add up like independent ones at most as the difference of the covariances says; and a
     displacement is off by no more than the speed is, all the time.
     """
-    seconds = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS
-    bounds = positive(predicted.pose.covariance - first.covariance), seconds**2 * predicted.velocity_covariance
+    seconds, now = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS, predicted.odometry
+    of_speed = seconds**2 * turned(now.twist_covariance, now.T_map_body[:3, :3])
+    bounds = positive(predicted.pose.covariance - first.covariance), of_speed
     return min(bounds, key=lambda covariance: float(np.trace(covariance)))

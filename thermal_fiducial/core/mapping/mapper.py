@@ -25,7 +25,7 @@ from thermal_fiducial.core.mapping.located import contradicts, LocatedFrame, Loc
 from thermal_fiducial.core.mapping.map_data import jump, MapJump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.trust import CornerBias, Trust
-from thermal_fiducial.core.measurements import CameraPose, Markers, usable
+from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray
 
@@ -102,16 +102,16 @@ class MarkerMapper:
 
     def locate(self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None) -> LocatedFrame:
         """The first half of :meth:`process`, which ends with the pose: whoever waits for that need wait no longer."""
-        markers = usable(markers)
+        observed = Observations.of(markers)
         # Step 2: known and new markers.
-        is_known = np.array([key in self.map.markers for key in markers['id'].tolist()], dtype=bool)
-        known = Sight.of(markers[is_known], self.map)
+        is_known = np.array([key in self.map.markers for key in observed.ids.tolist()], dtype=np.bool_)
+        known, new = Sight.of(observed.only(is_known), self.map), observed.only(~is_known)
         offset_std = self.config.time_offset_std
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
-        sight = known.trusted
+        sight = known.trusted()
         outcome: Location | Refusal = Refusal('no known marker in view')
-        if sight.markers:
+        if len(sight.markers):
             last = self._last
             near = last is not None and 0 < stamp_ns - last.stamp_ns < CONTINUITY_NS
             expected = predicted.pose if predicted is not None else last if near else None
@@ -120,7 +120,7 @@ class MarkerMapper:
             outcome = locate(stamp_ns, sight, running_errors, camera, T_expected, self._errors)
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
-        return LocatedFrame(stamp_ns, camera, markers, is_known, known, predicted, outcome)
+        return LocatedFrame(stamp_ns, camera, observed, known, new, predicted, outcome)
 
     @property
     def _errors(self) -> SystematicErrors:
@@ -136,7 +136,7 @@ class MarkerMapper:
             contradicted = contradicts(pose.T_map_camera, pose.covariance, frame.predicted.pose)
             if contradicted and self._odometry_agreed:
                 # A marker that was moved, or that hangs in two places: what it teaches would spoil the map.
-                return self._result(frame, False, {}, dict.fromkeys(frame.new['id'].tolist(), CONTRADICTED))
+                return self._result(frame, False, {}, dict.fromkeys(frame.new.ids.tolist(), CONTRADICTED))
             self._odometry_agreed |= not contradicted
         self._last = pose
         # Step 7: errors updated.
@@ -144,7 +144,7 @@ class MarkerMapper:
         # Step 8: new markers placed relative to the camera.
         waiting = {}
         if not self.frozen:
-            self._memory.keep(frame.rows, pose, frame.camera, frame.predicted)
+            self._memory.keep(frame.observed, pose, frame.camera, frame.predicted)
             placed, waiting = self._place_new(frame, location.viewpoint)
             changed |= placed
         return self._result(frame, changed, residuals, waiting)
@@ -170,14 +170,14 @@ class MarkerMapper:
     def _without_pose(self, frame: LocatedFrame, refusal: Refusal) -> tuple[bool, Waiting]:
         """What a frame without a pose may still teach of new markers."""
         predicted, longest = frame.predicted, self.config.bridge_duration
-        if self.frozen or not len(frame.new):
+        if self.frozen or not len(frame.new.ids):
             return False, {}
         if refusal.viewpoint is not None:
             return self._place_new(frame, refusal.viewpoint)
         if predicted is None or not self._memory.bridgeable(frame.stamp_ns, longest):
             return False, {}
         # No known marker is in view: the odometry says where the camera is.
-        first = not any(key in self._new.candidates for key in frame.new['id'].tolist())
+        first = not any(key in self._new.candidates for key in frame.new.ids.tolist())
         return self._place_new(frame, self._memory.bridge(frame.new, frame.camera, predicted, first=first))
 
     def refinement_due(self, stamp_ns: int) -> bool:

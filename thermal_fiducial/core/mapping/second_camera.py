@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.core.error_model import CHI2_OF_POSE
-from thermal_fiducial.core.geometry.reprojection import difference, retract
-from thermal_fiducial.core.geometry.se3 import inverse, skew
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
+from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.located import predicted_camera
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.motion_prior import MotionPrior
@@ -67,8 +67,7 @@ class SecondCamera:
 def seen_from(pose: CameraPose, T_camera_other: FloatArray) -> CameraPose:
     """The pose of something fixed at ``T_camera_other`` (4, 4) on the camera."""
     T_map_other = pose.T_map_camera @ T_camera_other
-    J = np.eye(6)
-    J[:3, 3:] = -skew(T_map_other[:3, 3] - pose.T_map_camera[:3, 3])
+    J = lever_arm(T_map_other[:3, 3] - pose.T_map_camera[:3, 3])
     return replace(
         pose,
         T_map_camera=T_map_other,

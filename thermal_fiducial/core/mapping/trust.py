@@ -4,16 +4,17 @@ A marker that was moved or duplicated, or was put in the map wrongly re-projects
 others. One bad frame is an outlier; most of a second of them is a fact about the marker.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 import math
+from statistics import median
 
 import numpy as np
 
 from thermal_fiducial.core.error_model import INCONSISTENT_PX, SystematicErrors, visible_share
 from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, ObjectArray
 
 #: Why a marker is in quarantine that came so with the map.
 FROM_FILE = 'in quarantine since before the map was loaded'
@@ -51,7 +52,7 @@ class Trust:
         return np.sqrt([self._record(marker).mean_square_px for marker in markers])
 
     def update(
-        self, markers: dict[int, MapMarker], known: list[MapMarker], errors_px: np.ndarray, explained_px: np.ndarray
+        self, markers: dict[int, MapMarker], known: ObjectArray, errors_px: np.ndarray, explained_px: np.ndarray
     ) -> bool:
         """Take in a frame, after which those of ``markers`` that persistently disagree are in quarantine.
 
@@ -72,7 +73,7 @@ class Trust:
         if len(known) < 2:
             return False
         ratios = errors_px / explained_px
-        blamed = inconsistent(ratios > DISAGREEMENT, known)
+        blamed = inconsistent(ratios > DISAGREEMENT, known.tolist())
         changed = False
         for marker, record, bad, error, ratio in zip(known, records, blamed, errors_px, ratios, strict=True):
             record.disagreement += MEMORY * (float(bad) - record.disagreement)
@@ -121,7 +122,7 @@ class Trust:
         return record
 
 
-def inconsistent(disagrees: np.ndarray, markers: list[MapMarker]) -> np.ndarray:
+def inconsistent(disagrees: np.ndarray, markers: Sequence[MapMarker]) -> np.ndarray:
     """Which of the disagreeing markers are to blame, (N,) bool.
 
     Among three or more the majority decides, which a robust pose already follows. Of two that disagree a fixed one
@@ -130,7 +131,7 @@ def inconsistent(disagrees: np.ndarray, markers: list[MapMarker]) -> np.ndarray:
     trusted = np.array([marker.trusted for marker in markers], dtype=bool)
     if np.count_nonzero(trusted) != 2 or not np.any(disagrees & trusted):
         return disagrees
-    a, b = np.flatnonzero(trusted)
+    a, b = np.flatnonzero(trusted).tolist()
     blamed = disagrees & ~trusted
     preference = _preference(markers[a], markers[b])
     if preference:
@@ -166,19 +167,21 @@ class CornerBias:
         last, self._last = self._last, location
         if last is None or not 0 < location.pose.stamp_ns - last.pose.stamp_ns < _SUCCESSIVE_NS:
             return
-        _, now, then = np.intersect1d(location.pose.marker_ids, last.pose.marker_ids, return_indices=True)
+        places = {key: place for place, key in enumerate(last.pose.marker_ids)}
+        now = [place for place, key in enumerate(location.pose.marker_ids) if key in places]
+        then = [places[location.pose.marker_ids[place]] for place in now]
         if len(now) < FEWEST_MARKERS:
             return
         # Moved markers last as well: none counts for more than what makes it inconsistent.
-        products = np.mean(location.seen.residuals[now] * last.seen.residuals[then], axis=(1, 2))
+        products = (location.seen.residuals[now] * last.seen.residuals[then]).sum(axis=(1, 2)) / 8.0
         products = np.clip(products, -(INCONSISTENT_PX**2), INCONSISTENT_PX**2)
         shares = _shares(location.sight.noise_px[now]) * _shares(last.sight.noise_px[then])
         visible = visible_share(location.seen.J_camera.reshape(-1, 2, 6), location.correlations)
-        self._weight = BIAS_MEMORY * self._weight + visible * float(np.mean(shares))
-        self._sum = BIAS_MEMORY * self._sum + float(np.mean(shares * products))
+        self._weight = BIAS_MEMORY * self._weight + visible * float(shares.sum()) / len(now)
+        self._sum = BIAS_MEMORY * self._sum + float(shares @ products) / len(now)
         self.px = math.sqrt(max(self._sum / self._weight, 0.0))
 
 
 def _shares(noise: FloatArray) -> FloatArray:
     """(N,) in which corners with ``noise`` (N,) [px] count: a marker that is hardly seen says little."""
-    return np.asarray(np.minimum(1.0, np.square(np.median(noise) / noise)))
+    return np.asarray(np.minimum(1.0, (median(noise.tolist()) / noise) ** 2))
