@@ -14,7 +14,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints, inverse_2x2
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners, whitening
 from thermal_fiducial.core.geometry.rigid_fit import costs, covariances, evaluate, Images, minimise
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
 __all__ = [
     'CameraFit',
@@ -83,16 +83,17 @@ def solve_marker_poses(
 
 def planar_poses(corners: ImagePoints, corner_covs: FloatArray, sizes: FloatArray) -> PlanarPoses:
     """:func:`solve_marker_poses` of corners (N, 4) that are known in both coordinates."""
-    images = Images.of(corners, whitening(corner_covs)).repeated(2)
-    points = np.repeat(marker_corners(sizes), 2, axis=0)
+    twice = np.repeat(np.arange(len(sizes)), 2)
+    seen, points = corners.only(twice), marker_corners(sizes[twice])
+    images = Images.of(seen, whitening(corner_covs)[twice])
     starts = ippe_square(corners.x, sizes).reshape(-1, 4, 4)
     T, cost, information = minimise(starts, lambda T: evaluate(T, points, images), alternatives=2)
-    residuals = images.residuals(T, points)[..., None]
-    facing = np.sum(T[:, :3, 2] * T[:, :3, 3], axis=-1) < 0.0
-    chi2 = np.sum((images.whitening @ residuals) ** 2, axis=(-3, -2, -1))
-    chi2 = np.where(np.isfinite(cost) & np.isfinite(chi2) & facing, chi2, np.inf).reshape(-1, 2)
-    residuals_px = corners.J[:, None] @ residuals.reshape(-1, 2, 4, 2, 1)
-    rms = np.where(np.isfinite(chi2), np.sqrt(np.sum(residuals_px**2, axis=(-3, -2, -1)) / 4.0), np.inf)
+    p = se3.apply(T, points)
+    residuals = (seen.x - p[..., :2] / p[..., 2:])[..., None]
+    chi2, squared_px = (((W @ residuals) ** 2).sum(axis=(1, 2, 3)) for W in (images.whitening, seen.J))
+    facing = (T[:, :3, 2] * T[:, :3, 3]).sum(axis=-1) < 0.0
+    found = np.isfinite(cost) & np.isfinite(chi2) & facing
+    chi2, rms = (np.where(found, value, np.inf).reshape(-1, 2) for value in (chi2, np.sqrt(squared_px / 4.0)))
     poses = PlanarPoses(T.reshape(-1, 2, 4, 4), information.reshape(-1, 2, 6, 6), rms, chi2)
     first = (chi2[:, 1] < chi2[:, 0]).astype(np.intp)
     second = np.where(np.isfinite(chi2).all(axis=1), 1 - first, first)
@@ -224,24 +225,16 @@ def ippe_square(normalised: FloatArray, sizes: FloatArray) -> FloatArray:
 
 
 def _homography_derivative(c: FloatArray, sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivative (N, 2, 2) [1/m] at, and image (N, 2) of, the centre under the homography of a square to ``c``.
-
-    P. Heckbert, "Fundamentals of texture mapping and image warping", 1989.
-    """
-    back, left = c[:, 1] - c[:, 2], c[:, 3] - c[:, 2]
-    excess = c[:, 0] - c[:, 1] - left
-    determinant = cross_in_plane(back, left)
-    g, h = (cross_in_plane(excess, left) / determinant)[:, None], (cross_in_plane(back, excess) / determinant)[:, None]
-    right, down = c[:, 1] - c[:, 0] + g * c[:, 1], c[:, 3] - c[:, 0] + h * c[:, 3]
-    depth = 1.0 + 0.5 * (g + h)
-    v = (c[:, 0] + 0.5 * (right + down)) / depth
-    J = np.stack([right - g * v, h * v - down], axis=-1) / (depth * sizes[:, None])[..., None]
-    return J, np.asarray(v)
-
-
-def cross_in_plane(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products (N,) of vectors (N, 2)."""
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+    """Derivative (N, 2, 2) [1/m] at, and image (N, 2) of, the centre under the homography of a square to ``c``."""
+    weight = se3.perspective(c)[..., None]
+    weight[np.abs(weight) <= TINY] = np.nan
+    corners = np.concatenate([c, np.ones((len(c), 4, 1))], axis=-1) * weight
+    centre, right, up = corners.mean(axis=1), corners[:, 1] - corners[:, 0], corners[:, 0] - corners[:, 3]
+    depth = centre[:, 2:]
+    v = centre[:, :2] / depth
+    along = np.stack([right, up], axis=-1)
+    J = (along[:, :2] - v[..., None] * along[:, 2:]) / (depth * sizes[:, None])[..., None]
+    return J, v
 
 
 def _axis_to(v: FloatArray) -> FloatArray:

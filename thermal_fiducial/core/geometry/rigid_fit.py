@@ -45,31 +45,20 @@ class Images:
     ----------
     whitening : (B, K, 2, 2)
     target : (B, K, 2)
-    normalised : (B, K, 2) the measured points without distortion
     """
 
     whitening: FloatArray
     target: FloatArray
-    normalised: FloatArray
 
     @staticmethod
     def of(points: ImagePoints, whitening: FloatArray) -> 'Images':
         """Of points (B, K) whose noise ``whitening`` (B, K, 2, 2) [1/px] makes unit white."""
         W = whitening @ points.J
-        return Images(W, (W @ points.x[..., None])[..., 0], points.x)
-
-    def repeated(self, times: int) -> 'Images':
-        """Every body so many times in a row."""
-        return Images(*(np.repeat(a, times, axis=0) for a in (self.whitening, self.target, self.normalised)))
+        return Images(W, (W @ points.x[..., None])[..., 0])
 
     def joined(self) -> 'Images':
         """The points of all bodies as those of a single one."""
-        return Images(*(a.reshape(1, -1, *a.shape[2:]) for a in (self.whitening, self.target, self.normalised)))
-
-    def residuals(self, T: FloatArray, points: FloatArray) -> FloatArray:
-        """Measured minus predicted (B, K, 2) in normalised coordinates, NaN behind the camera."""
-        p = se3.apply(T, points)
-        return np.asarray(self.normalised - p[..., :2] / np.where(p[..., 2:] > _NEAR, p[..., 2:], np.nan))
+        return Images(self.whitening.reshape(1, -1, 2, 2), self.target.reshape(1, -1, 2))
 
 
 def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alternatives: int = 1) -> Evaluation:
