@@ -45,7 +45,7 @@ def drawn(model, view):
 def look(image, camera, T_expected, noise, marker_id=ID):
     """What is found of a marker where it is expected."""
     frame = Frame(0, image.astype(np.float32), noise, camera, STILL, 0.010, 0.0)
-    known = KnownMarkers({marker_id: (T_expected, SIZE)})
+    known = KnownMarkers({marker_id: (T_expected, SIZE)}, np.ones(len(BITS)))
     cut = known.partially_visible(np.eye(4), camera, np.zeros(0, dtype=np.int64))
     assert len(cut.ids) == 1
     return SEARCH.look(frame, cut, 0.01, np.ones(len(BITS), dtype=bool), CONFIG)

@@ -75,7 +75,8 @@ def test_expectation_chooses_among_branches_that_the_image_allows(distance, allo
             found,
             ImagePoints.at(corners, camera),
             ISOTROPIC[None],
-            [(np.eye(4), 0.3)],
+            np.array([0.3]),
+            np.eye(4)[None],
             found.T_camera_marker[0, branch],
         )
         assert chosen.rms_px[0, 0] == found.rms_px[0, branch if allowed else 0]
@@ -98,15 +99,17 @@ def test_other_known_markers_choose_the_branch():
     poses = solve_marker_poses(corners, covs, np.full(3, 0.2), camera)
     assert poses.ambiguous().all()
     wrong = poses.swapped(np.array([True, False, True]))
-    known, points = [(T, 0.2) for T in poses_in_map], ImagePoints.at(corners, camera)
+    known, points = np.stack(poses_in_map), ImagePoints.at(corners, camera)
+    sizes = np.full(3, 0.2)
     for predicted in (None, T_camera_map, wrong.T_camera_marker[0, 0] @ se3.inverse(poses_in_map[0])):
-        chosen = choose_branches(wrong, points, covs, known, predicted)
-        np.testing.assert_allclose(chosen.T_camera_marker[:, 0], T_camera_map @ np.stack(poses_in_map), atol=1e-5)
+        chosen = choose_branches(wrong, points, covs, sizes, known, predicted)
+        np.testing.assert_allclose(chosen.T_camera_marker[:, 0], T_camera_map @ known, atol=1e-5)
     # A lone known marker has the prediction alone, one of unknown pose nothing.
-    lone = choose_branches(wrong, points, covs, [known[0], None, None], T_camera_map)
+    first = np.where([[[True]], [[False]], [[False]]], known, np.nan)
+    lone = choose_branches(wrong, points, covs, sizes, first, T_camera_map)
     np.testing.assert_allclose(lone.T_camera_marker[0], poses.T_camera_marker[0])
     np.testing.assert_allclose(lone.T_camera_marker[2], wrong.T_camera_marker[2])
-    assert choose_branches(wrong, points, covs, [known[0], None, None]) is wrong
+    assert choose_branches(wrong, points, covs, sizes, first) is wrong
 
 
 @pytest.mark.parametrize(

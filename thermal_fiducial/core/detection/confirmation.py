@@ -114,13 +114,13 @@ def with_corners_by_pattern(
     config: ArucoDetectorConfig,
 ) -> tuple[RefinedMarkers, BoolArray]:
     """Refined corners with those by the pattern of small ones among the ``lost`` (N,), and which (N,) these are."""
-    cell = sides_px(found.corners_px) / decoder.cells
+    cell = sides_px(found.places.at.px) / decoder.cells
     small = np.flatnonzero(lost & (cell < _WIDEST_CELL_PX))
     by_pattern = np.zeros(len(lost), dtype=bool)
     if len(small) == 0:
         return refined, by_pattern
     shift, upright = refined.blur.shift[small], np.zeros(len(small), dtype=np.int64)
-    corners = aligned(frame.image, found.corners_px[small] + shift, found.ids[small], upright, decoder, noisy=False)
+    corners = aligned(frame.image, found.places.at.px[small] + shift, found.ids[small], upright, decoder, noisy=False)
     reading = decoder.read(frame.image, corners)
     good = (reading.ids == found.ids[small]) & (reading.turns == 0) & speaks_for_itself(reading, decoder)
     good &= accepted(reading, frame.noise, decoder.correctable, config)

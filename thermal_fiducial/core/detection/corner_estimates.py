@@ -142,9 +142,9 @@ class CornerEstimator:
     ) -> BoolArray:
         """Which markers look like themselves at their refined corners: how the motion is known does not matter."""
         blur, observed, cells = markers.blur, markers.observed, self._decoder.cells
-        there = found.corners_px + blur.shift
+        there = found.places.at.px + blur.shift
         off = np.abs(observed.corners_px - there).max(axis=(1, 2))
-        read = off < _READ_THERE / cells * sides_px(found.corners_px)
+        read = off < _READ_THERE / cells * sides_px(found.places.at.px)
         keep = read & found.certain
         others = np.flatnonzero(~keep)
         if len(others):

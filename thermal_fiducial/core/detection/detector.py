@@ -56,13 +56,13 @@ class MarkerDetector:
         self.config = config
         bits = marker_bits(dictionary)
         decoder = Decoder(bits, int(dictionary.maxCorrectionBits))
-        self._count = decoder.count
-        self._sizes = config.marker_size, size_overrides(config.marker_size_overrides)
+        overrides = size_overrides(config.marker_size_overrides)
+        self._sizes = np.array([overrides.get(key, config.marker_size) for key in range(decoder.count)])
         self._finder = MarkerFinder(decoder)
         self._behind = edges_behind(bits)
         self._estimator = CornerEstimator(decoder, bits)
         self._partial = PartialMarkerSearch(decoder, bits)
-        self._known = KnownMarkers({}, *self._sizes)
+        self._known = KnownMarkers({}, self._sizes)
         self._mount(config)
 
     def configure(self, config: ArucoDetectorConfig) -> None:
@@ -77,12 +77,11 @@ class MarkerDetector:
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
         """Markers that are known: ID to (T_map_marker, side [m])."""
-        of_dictionary = {key: entry for key, entry in marker_map.items() if 0 <= key < self._count}
-        self._known = KnownMarkers(of_dictionary, *self._sizes)
+        self._known = KnownMarkers(marker_map, self._sizes)
 
     def size(self, marker_id: int) -> float:
         """Side of a marker [m]: of the map, or of the overrides, or the common one."""
-        return float(self._known.sizes(np.array([marker_id]))[0])
+        return float(self._known.sizes[marker_id])
 
     def detect(self, stamp_ns: int, counts: Counts | Gray, camera: Camera, prior: MotionPrior | None = None) -> Markers:
         """Markers of one frame, sorted by ID; an empty array when there are none.
@@ -119,9 +118,9 @@ class MarkerDetector:
         self, ids: IntArray, corners: RefinedCorners, at: ImagePoints, T_camera_map: FloatArray | None
     ) -> PlanarPoses:
         """Both poses of each marker, the likelier first."""
-        poses = planar_poses(at, corners.covariances, self._known.sizes(ids))
-        T_camera_map = T_camera_map if len(self._known.ids) else None
-        return choose_branches(poses, at, corners.covariances, self._known.entries(ids), T_camera_map)
+        sizes = self._known.sizes[ids]
+        poses = planar_poses(at, corners.covariances, sizes)
+        return choose_branches(poses, at, corners.covariances, sizes, self._known.T_map_marker[ids], T_camera_map)
 
     def _with_partial(self, rows: Markers, frame: Frame, prediction: FramePrediction) -> Markers:
         """The rows of whole markers; where few of them are known, those of known ones partially visible as well."""
@@ -145,7 +144,7 @@ class MarkerDetector:
         ids, history, contrast = refined.ids, self._history, refined.corners.contrast
         # Motion that came from what turned out to be no markers is none.
         twist = refined.twist if len(ids) else frame.twist
-        depth = depths(poses.T_camera_marker[:, 0], self._known.sizes(ids))
+        depth = depths(poses.T_camera_marker[:, 0], self._known.sizes[ids])
         markers = ExpectedMarkers(ids, refined.places.at.x, depth, contrast / frame.noise)
         return FrameHistory(
             history.track.after(frame.stamp_ns, twist, markers),

@@ -162,7 +162,7 @@ class MarkerFinder:
         ids, corners = blind.ids[possible], blind.corners_px[possible]
         if len(ids) == 0:
             return FoundMarkers.none()
-        at, sizes = ImagePoints.at(corners, frame.camera), known.sizes(ids)
+        at, sizes = ImagePoints.at(corners, frame.camera), known.sizes[ids]
         depth = depths(ippe_square(at.x, sizes)[:, 0], sizes)
         if in_map is not None:
             # Alone, one may be tilted wrongly: seen obliquely and approached, it would be blurred across, not along.

@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.core.detection.frame import Places
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked
 
 #: Nearer to the border of the image than this a marker may be cut off, before its corners are refined [px].
@@ -82,11 +82,6 @@ class FoundMarkers(Stacked):
     expected: BoolArray
     certain: BoolArray
 
-    @property
-    def corners_px(self) -> FloatArray:
-        """(N, 4, 2) clockwise from the marker's top-left."""
-        return self.places.at.px
-
     @staticmethod
     def none() -> 'FoundMarkers':
         """No markers."""
@@ -98,8 +93,8 @@ class FoundMarkers(Stacked):
         """These, and those of ``others`` that are not among them and that lie elsewhere."""
         if len(others.ids) == 0:
             return self
-        apart = np.linalg.norm(others.corners_px.mean(axis=1)[:, None] - self.corners_px.mean(axis=1), axis=-1)
-        extent = np.linalg.norm(self.corners_px[:, 2] - self.corners_px[:, 0], axis=-1)
+        apart = np.linalg.norm(others.places.at.px.mean(axis=1)[:, None] - self.places.at.px.mean(axis=1), axis=-1)
+        extent = np.linalg.norm(self.places.at.px[:, 2] - self.places.at.px[:, 0], axis=-1)
         return self.joined(others.only(~among(others.ids, self.ids) & (apart > TOGETHER * extent).all(axis=1)))
 
 
@@ -126,25 +121,18 @@ class KnownMarkers:
     Parameters
     ----------
     markers : ID to (T_map_marker, side [m])
-    common, overrides : sides of the others [m]: of all, and of some by their IDs
+    sizes : (M,) of all markers of the dictionary, by their IDs, if they are not in the map [m]
     """
 
-    def __init__(
-        self,
-        markers: Mapping[int, tuple[FloatArray, float]],
-        common: float = 1.0,
-        overrides: Mapping[int, float] | None = None,
-    ) -> None:
-        self._common, self._overrides = common, overrides or {}
-        #: (M,)
-        self.ids = np.array(sorted(markers), dtype=np.int64)
-        self._entries = dict(markers)
-        entries = [markers[marker_id] for marker_id in self.ids.tolist()]
-        self._T_map_marker = T_map_marker = (
-            np.stack([entry[0] for entry in entries]) if entries else np.zeros((0, 4, 4))
-        )
-        self._sizes = sizes = np.array([entry[1] for entry in entries])
-        corners = se3.apply(T_map_marker, sizes[:, None, None] * marker_corners(1.0))
+    def __init__(self, markers: Mapping[int, tuple[FloatArray, float]], sizes: FloatArray) -> None:
+        #: (K,) those that are known
+        self.ids = np.array(sorted(key for key in markers if 0 <= key < len(sizes)), dtype=np.int64)
+        #: (M,) sides [m] of all, and (M, 4, 4) their poses in the map, NaN where they are not in it
+        self.sizes, self.T_map_marker = sizes.copy(), np.full((len(sizes), 4, 4), np.nan)
+        for marker_id in self.ids.tolist():
+            self.T_map_marker[marker_id], self.sizes[marker_id] = markers[marker_id]
+        T_map_marker = self.T_map_marker[self.ids]
+        corners = corners_in_map(T_map_marker, self.sizes[self.ids])
         self._corners_and_normals = np.concatenate([corners, T_map_marker[:, None, :3, 2]], axis=1)
 
     def expected(self, T_camera_map: FloatArray, camera: Camera, min_side_px: float) -> ExpectedMarkers:
@@ -162,7 +150,7 @@ class KnownMarkers:
 
     def partially_visible(self, T_camera_map: FloatArray, camera: Camera, without: IntArray) -> PartialMarkers:
         """Those that show a face and may be partly in view, but for those of the IDs ``without``."""
-        T = T_camera_map @ self._T_map_marker
+        T = T_camera_map @ self.T_map_marker[self.ids]
         centre, normal = T[:, :3, 3], T[:, :3, 2]
         distance = np.sqrt(np.sum(centre * centre, axis=1))
         facing = np.sum(normal * centre, axis=1) < -_MAX_TILT_COSINE * distance
@@ -175,14 +163,4 @@ class KnownMarkers:
         overlap = inside.any(axis=1) | ((low < (camera.width, camera.height)) & (high > 0.0)).all(axis=1)
         whole = camera.contains(corners, _WHOLE_PX).all(axis=1)
         some = np.flatnonzero(facing & overlap & ~whole & ~among(self.ids, without))
-        return PartialMarkers(self.ids[some], T[some], self._sizes[some])
-
-    def entries(self, ids: IntArray) -> list[tuple[FloatArray, float] | None]:
-        """T_map_marker (4, 4) and side [m] of each of the IDs (N,), None of those that are not among them."""
-        return [self._entries.get(marker_id) for marker_id in ids.tolist()]
-
-    def sizes(self, ids: IntArray) -> FloatArray:
-        """Sides (N,) [m] of markers (N,): of the map, or of the overrides, or the common one."""
-        own = [self._overrides.get(marker_id, self._common) for marker_id in ids.tolist()]
-        in_map = self.entries(ids)
-        return np.array([size if entry is None else entry[1] for size, entry in zip(own, in_map, strict=True)])
+        return PartialMarkers(self.ids[some], T[some], self.sizes[self.ids[some]])

@@ -87,7 +87,7 @@ class BlindSearch:
         scales : at which resolutions
         kinds : of markers looked for among the faintest, 1 for darker than their surroundings, -1 for brighter
         """
-        hidden = _grown(seen.corners_px, 1.0 + 2.0 * _PLATE_CELLS / self._decoder.cells)
+        hidden = _grown(seen.places.at.px, 1.0 + 2.0 * _PLATE_CELLS / self._decoder.cells)
         min_side_px = _PICTURE_SIDE * config.min_side_px if frame.displayed else config.min_side_px
         fine = faint = np.zeros((0, 4, 2))
         half = frame.image

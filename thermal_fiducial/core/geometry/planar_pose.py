@@ -104,7 +104,8 @@ def choose_branches(
     poses: PlanarPoses,
     corners: ImagePoints,
     corner_covs: FloatArray,
-    in_map: list[tuple[FloatArray, float] | None],
+    sizes: FloatArray,
+    T_map_marker: FloatArray,
     T_camera_map: FloatArray | None = None,
 ) -> PlanarPoses:
     """The poses of a frame's markers with the likelier branch first.
@@ -116,20 +117,20 @@ def choose_branches(
     ----------
     poses : of N markers
     corners, corner_covs : (N, 4), (N, 4, 2, 2) [px^2]
-    in_map : N times T_map_marker (4, 4) and side [m], or None for a marker of unknown pose
+    sizes : (N,) sides [m]
+    T_map_marker : (N, 4, 4), NaN of markers that are not in the map
     T_camera_map : (4, 4) predicted
     """
-    known = np.array([k for k, entry in enumerate(in_map) if entry is not None], dtype=np.intp)
+    known = np.flatnonzero(np.isfinite(T_map_marker).all(axis=(1, 2)))
     ambiguous = poses.ambiguous()
     if not ambiguous[known].any():
         return poses
-    T_map_marker = np.stack([entry[0] for entry in in_map if entry is not None])
+    T_map_marker = T_map_marker[known]
     if len(known) > 1:
         starts = (poses.T_camera_marker[known] @ se3.inverse(T_map_marker)[:, None]).reshape(-1, 4, 4)
         if T_camera_map is not None:
             starts = np.concatenate([starts, T_camera_map[None]])
-        sizes = np.array([entry[1] for entry in in_map if entry is not None])
-        squares = corners_in_map(T_map_marker, sizes)
+        squares = corners_in_map(T_map_marker, sizes[known])
         images = Images.of(corners.only(known), whitening(corner_covs[known])).joined()
         T_camera_map = starts[np.argmin(costs(starts, squares.reshape(1, -1, 3), images, INLIER))]
     if T_camera_map is None:

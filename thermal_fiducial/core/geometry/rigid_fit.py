@@ -16,10 +16,11 @@ from thermal_fiducial.core.geometry.reprojection import retract
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
 _MAX_STEPS = 20
-# Costs are chi-squares: a step that lowers one by less is a hundredth of a standard deviation, and the last. Of a pose
-# that the image refutes anyway a share of the cost is enough, lest it creep along its valley; of one that is worse than
-# an alternative, a share of what it is worse by. One that costs so many times more even after a step is given up.
-_LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-4, 50.0, 1e-2, 10.0
+# Costs are chi-squares: a step that lowers one by less is a tenth of a standard deviation, and the last; by how much
+# it misses is of the second order, a hundredth of that. Of a pose that the image refutes anyway a share of the cost
+# is enough, lest it creep along its valley; of one that is worse than an alternative, a share of what it is worse by.
+# One that costs so many times more even after a step is given up.
+_LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-2, 50.0, 1e-2, 10.0
 #: Damping of Levenberg-Marquardt: factors on it after a step that was better, and one that was not; and that at which
 #: no better one is found at all.
 EASED, STIFFENED, MOST_DAMPED = 0.1, 10.0, 1e6
