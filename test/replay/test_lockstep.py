@@ -158,6 +158,35 @@ def test_the_executor_does_not_matter(short, folder, monkeypatch):
     assert_same_files(short[1], folder / 'single')
 
 
+class Timed:
+    """An executor that adds up the timeouts that ran out [s]."""
+
+    def __init__(self, executor):
+        self._executor, self.slept = executor, 0.0
+
+    def __getattr__(self, name):
+        return getattr(self._executor, name)
+
+    def spin_once(self, timeout_sec):
+        begin = time.monotonic()
+        self._executor.spin_once(timeout_sec=timeout_sec)
+        self.slept += timeout_sec * (time.monotonic() - begin >= timeout_sec)
+
+
+def test_inputs_that_do_not_wake_the_executor_cost_no_time(folder, tmp_path, monkeypatch):
+    executors, make = [], lockstep.make_executor
+
+    def timed(context):
+        executors.append(Timed(make(context)))
+        return executors[-1]
+
+    monkeypatch.setattr(lockstep, 'make_executor', timed)
+    small_bag.recording(seconds=0.3).write(tmp_path / 'bag')
+    assert replay(tmp_path / 'bag', tmp_path / 'run', folder) == 0
+    # Measured 0.1 s, connecting included; with timeouts of 0.1 s it was 0.9 s.
+    assert executors[0].slept < 0.5
+
+
 def test_lockstep_equals_the_pipeline(run, folder):
     pipeline = Pipeline(
         PipelineConfig.from_mapping(small_bag.PARAMETERS),

@@ -80,7 +80,8 @@ class Graph:
     def spin_until(self, condition, seconds=60.0):
         deadline = time.monotonic() + seconds
         while not condition():
-            self.executor.spin_once(timeout_sec=0.05)
+            # Short: some inputs are polled by take_waiting, and wake no executor.
+            self.executor.spin_once(timeout_sec=0.002)
             for node in self.nodes:
                 node.take_waiting()
             assert time.monotonic() < deadline, 'waited in vain'

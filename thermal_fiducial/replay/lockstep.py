@@ -34,6 +34,8 @@ _KINDS: dict[str, type[StageNode[Any]]] = {
     'marker_mapper': MarkerMapperNode,
     'pose_ekf': PoseEkfNode,
 }
+#: Longest sleep of the executor [s]: inputs that nodes poll (``take_waiting``) do not wake it.
+_POLL_S = 0.002
 
 
 def replay_lockstep(
@@ -165,7 +167,7 @@ class _Graph:
         """Run callbacks until nothing is ``missing``, however long one of them takes."""
         wait = Wait(lambda: f'messages on {", ".join(missing())}', self._warn)
         while missing():
-            self._executor.spin_once(timeout_sec=0.1)
+            self._executor.spin_once(timeout_sec=_POLL_S)
             for stage in self._stages:
                 stage.take_waiting()
             wait.go_on(sum([source.count for source in self._inputs]))
