@@ -193,6 +193,41 @@ def test_fields_are_looked_up_by_name(order):
     np.testing.assert_array_equal(clouds.markers(other_layout(rows, order)), rows)
 
 
+@pytest.mark.parametrize('order', ['<', '>', 'own'])
+@pytest.mark.parametrize('frame', ['', 'a', 'camera'])
+def test_bytes_of_markers_are_what_their_message_says(order, frame):
+    rows = rows_of(MARKER_DTYPE, 4)
+    message = clouds.cloud(rows, HEAD) if order == 'own' else other_layout(rows, order)
+    message.header = convert.header(STAMP, frame)
+    # What stands between the fields, each at a multiple of its size, is whatever the memory held.
+    whole = bytes(serialize_message(message))
+    assert (clouds.MARKER_CLOUDS.rows(whole) is not None) == (order == 'own')
+    stamp, taken = clouds.stamped_markers(whole)
+    assert stamp == STAMP
+    np.testing.assert_array_equal(taken, rows)
+    assert deserialize_message(clouds.MARKER_CLOUDS.message(rows, message.header), PointCloud2) == clouds.cloud(
+        rows, message.header
+    )
+
+
+@pytest.mark.parametrize('field', ['height', 'width', 'row_step', 'point_step'])
+def test_bytes_of_markers_whose_sizes_do_not_fit_are_refused(field):
+    for size in (0, 1, 3, 2**16, 2**32 - 1):
+        message = clouds.cloud(rows_of(MARKER_DTYPE, 2), HEAD)
+        setattr(message, field, size)
+        if size == getattr(clouds.cloud(rows_of(MARKER_DTYPE, 2), HEAD), field) or (field, size) == ('height', 0):
+            continue
+        with pytest.raises(InputError):
+            clouds.stamped_markers(serialize_message(message))
+
+
+def test_bytes_of_markers_that_are_cut_short_are_refused():
+    whole = bytes(serialize_message(clouds.cloud(rows_of(MARKER_DTYPE, 2), HEAD)))
+    for length in range(0, len(whole) - 4, 3):
+        with pytest.raises(InputError):
+            clouds.stamped_markers(whole[:length])
+
+
 def test_corner_covariances_come_from_sigma_where_there_are_none():
     rows = rows_of(MARKER_DTYPE, 3)
     kept = [name for name in MARKER_DTYPE.names if name not in CORNER_COVARIANCE_FIELDS]

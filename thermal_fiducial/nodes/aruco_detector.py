@@ -61,7 +61,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         camera = self.camera_of(counts)
         markers = self.detector.detect(stamp, counts, camera, self.odometry)
         self._seen = len(markers)
-        self._markers.send(clouds.cloud(markers, message.header))
+        self._markers.send(clouds.MARKER_CLOUDS.message(markers, message.header))
         if self._marker_poses.listeners:
             self._marker_poses.send(clouds.marker_poses(markers, message.header))
         self._others.send(markers, message.header)

@@ -33,7 +33,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         self._frames: OrderedDict[int, None] = OrderedDict()
         self._in_view = False
         self._target = self.advertise(PoseStamped, 'landing_target')
-        self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT)
+        self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT, raw=True)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT, raw=True)
         self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
         RobotFrames(self, lambda: None)
@@ -46,9 +46,10 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         poses = clouds.map_poses(message)
         self._T_map_pad = pad_in_map({key: pose for key, (pose, _) in poses.items()}, self.config.landing_pad)
 
-    def _on_markers(self, message: PointCloud2) -> None:
-        stamp, seen = convert.stamp_ns(message.header.stamp), Observations.of(clouds.markers(message))
-        seen = seen.only(np.isin(seen.ids, self.config.landing_pad))
+    def _on_markers(self, message: bytes) -> None:
+        stamp, markers = clouds.stamped_markers(message)
+        every = Observations.of(markers)
+        seen = every.only(np.isin(every.ids, self.config.landing_pad))
         self._in_view = len(seen.ids) > 0
         if not self._in_view:
             return

@@ -7,7 +7,7 @@ from sensor_msgs.msg import PointCloud2
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.mapping.map_data import MapJump, MapperResult
-from thermal_fiducial.ros import clouds, convert, map_status, qos
+from thermal_fiducial.ros import clouds, map_status, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
 from thermal_fiducial.ros.camera_poses import CameraPoses
 from thermal_fiducial.ros.map_services import MapServices
@@ -26,7 +26,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self.mapper = self._map.mapper
         self._result = MapperResult(0, None, 'no markers yet')
         self._topics = MapTopics(self)
-        self._frames = self.subscribe_newest(PointCloud2, 'markers', self._on_markers, qos.RESULT)
+        self._frames = self.subscribe_newest(PointCloud2, 'markers', self._on_markers, qos.RESULT, raw=True)
         self._poses = CameraPoses(self, self.mapper)
         self.follow_hints()
         self._publish_map()
@@ -38,9 +38,9 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self.mapper.configure(config)
         self._poses.configure()
 
-    def _on_markers(self, message: PointCloud2) -> None:
-        stamp = convert.stamp_ns(message.header.stamp)
-        frame = self.mapper.locate(stamp, clouds.markers(message), self.camera(), self.odometry)
+    def _on_markers(self, message: bytes) -> None:
+        stamp, markers = clouds.stamped_markers(message)
+        frame = self.mapper.locate(stamp, markers, self.camera(), self.odometry)
         self._poses.send(stamp, frame.pose)
         # The pose is on its way by now.
         before, self._result = self._result, self.mapper.learn(frame)

@@ -40,7 +40,7 @@ class CameraPoses:
         self._locator = MarkerMapper(_of_second(node.config), mapper.map)
         if name:
             self.configure()
-            node.subscribe_newest(PointCloud2, f'{name}/markers', self._on_second, qos.RESULT)
+            node.subscribe_newest(PointCloud2, f'{name}/markers', self._on_second, qos.RESULT, raw=True)
             node.subscribe(CameraInfo, f'{name}/thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
 
     def configure(self) -> None:
@@ -68,12 +68,11 @@ class CameraPoses:
     def _on_camera_info(self, message: CameraInfo) -> None:
         self._camera = convert.camera(message)
 
-    def _on_second(self, message: PointCloud2) -> None:
+    def _on_second(self, message: bytes) -> None:
         if self._camera is None:
             raise InputError(f'no camera_info of {self._node.config.second_camera}')
         self._locator.map = self._mapper.map
-        stamp = convert.stamp_ns(message.header.stamp)
-        result = self._locator.process(stamp, clouds.markers(message), self._camera, self._node.odometry)
+        result = self._locator.process(*clouds.stamped_markers(message), self._camera, self._node.odometry)
         if result.pose is not None and self._second is not None:
             alone = self._second.add_second(result.pose)
             if alone is not None:

@@ -47,15 +47,15 @@ def read(message: bytes, kind: type, what: str) -> Any:
         raise InputError(f'{what} cannot be read: {error}') from None
 
 
-def stamp_ns(message: bytes, what: str = 'odometry') -> int:
+def stamp_ns(message: bytes, what: str = 'odometry', longest: int = _LONGEST) -> int:
     """Stamp of the header of a message, which is called ``what``.
 
     Raises
     ------
     InputError
-        Of another encoding, too short or too long, or with a stamp that is none.
+        Of another encoding, too short or longer than ``longest``, or with a stamp that is none.
     """
-    if len(message) > _LONGEST:
+    if len(message) > longest:
         raise InputError(f'{what} of {len(message)} bytes')
     if len(message) < BEHIND_STAMP or message[:2] != _LITTLE_ENDIAN:
         raise InputError(f'{what} of an encoding that is not known')
@@ -175,6 +175,11 @@ def _behind_names(message: bytes, names: int) -> int:
         place = _aligned(place, _LENGTH.size)
         place += _LENGTH.size + int(_LENGTH.unpack_from(message, place)[0])
     return place
+
+
+def behind_header(message: bytes) -> int:
+    """Where the first whole number behind the header of a message stands; struct.error where it ends before."""
+    return _aligned(_behind_names(message, 1), _LENGTH.size)
 
 
 def _aligned(place: int, size: int) -> int:
