@@ -97,9 +97,7 @@ MECHANISMS = {
         {'imu_noise:StructureFunction.hidden': lambda *_: (0.0, 0.0)},
     ),
     'saturation': Mechanism(('saturated',), off={'imu_noise:_SATURATED': (0.0, 0.0)}),
-    'frozen samples': Mechanism(
-        ('frozen',), ('imu_input:ImuInput._is_frozen',), {'imu_input:ImuInput._is_frozen': _first(False)}
-    ),
+    'frozen axes': Mechanism(('frozen',), ('imu_input:Axis',), {'imu_input:Axis.is_frozen': _first(False)}),
     'clock offset': Mechanism(
         ('slow and noisy', 'unknown clock at start'), changes={'estimate_time_offset': False, 'time_offset_std': 0.0}
     ),

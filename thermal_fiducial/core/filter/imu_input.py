@@ -4,6 +4,7 @@ from enum import Enum
 import math
 
 from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.core.types import SECOND_NS
 
 #: Samples in a row that must follow each other after a jump: for a stepped clock, and for the end of a gap.
 CLOCK_EVIDENCE, GAP_EVIDENCE = 10, 2
@@ -12,9 +13,9 @@ CLOCK_EVIDENCE, GAP_EVIDENCE = 10, 2
 UNUSUAL_FACTOR, UNUSUAL_NS, MEMORY_NS = 3.0, 30_000_000, 2_000_000_000
 #: A sensor saturates at its full scale; a reading beyond this multiple of it is a corrupt message.
 IMPOSSIBLE_RANGES = 2.0
-#: Noise keeps samples from being equal, coarse quantisation of a still sensor repeats a few: equal samples for this
-#: long [s], and at least this many, are one sample that is sent again and again.
-FROZEN_SECONDS, FROZEN_SAMPLES = 0.045, 4
+#: An axis is frozen once it has repeated a value for this long [s], in at least this many samples, and in this multiple
+#: of its longest run so far, which is due to quantisation: runs of up to 4 and 30 samples in two recorded IMUs.
+FROZEN_SECONDS, FROZEN_SAMPLES, FROZEN_FACTOR = 0.045, 4, 3
 
 
 class Verdict(Enum):
@@ -23,11 +24,35 @@ class Verdict(Enum):
     USE = ''
     NOT_FINITE = 'IMU sample is not finite'
     IMPOSSIBLE = 'IMU sample far beyond the range of its sensors'
-    FROZEN = 'IMU is frozen: the same sample again and again'
+    FROZEN = 'IMU is frozen: the same value again and again'
     REPEATED = 'IMU stamp repeated'
     BACKWARD = 'IMU stamp went back'
     AHEAD = 'IMU stamp jumped ahead'
     RESTART = 'IMU clock jumped: reset'
+
+
+class Axis:
+    """Runs of equal values of one of the six axes; at ``full_scale`` they may be long."""
+
+    def __init__(self, full_scale: float) -> None:
+        self._full_scale = full_scale
+        self._value = math.nan
+        self._since_ns = self._count = 0
+        self._longest = 1
+
+    def is_frozen(self, stamp_ns: int, value: float) -> bool:
+        """Whether the run that a sample's value continues is too long."""
+        if value != self._value or stamp_ns < self._since_ns:
+            if self._count < self._too_many:
+                self._longest = max(self._longest, self._count)
+            self._value, self._since_ns, self._count = value, stamp_ns, 0
+        self._count += 1
+        lasting = stamp_ns - self._since_ns >= FROZEN_SECONDS * SECOND_NS
+        return lasting and self._count >= self._too_many and abs(value) < self._full_scale
+
+    @property
+    def _too_many(self) -> int:
+        return max(FROZEN_SAMPLES, FROZEN_FACTOR * self._longest)
 
 
 class ImuInput:
@@ -40,26 +65,26 @@ class ImuInput:
 
     def __init__(self, max_gap: float, gyroscope_range: float, accelerometer_range: float) -> None:
         """``max_gap``: longest step [s] that can be bridged; full scale of the sensors [rad/s], [m/s^2]."""
-        self._max_gap_ns = round(max_gap * 1e9)
-        self._limits = IMPOSSIBLE_RANGES * gyroscope_range, IMPOSSIBLE_RANGES * accelerometer_range
+        self._max_gap_ns = round(max_gap * SECOND_NS)
+        ranges = [gyroscope_range] * 3 + [accelerometer_range] * 3
+        self._limits = [IMPOSSIBLE_RANGES * full_scale for full_scale in ranges]
+        self._axes = [Axis(full_scale) for full_scale in ranges]
         self._last_ns: int | None = None
         self._stray_ns = self._first_stray_ns = 0
         self._strays = 0
         self._longest_ns = 0.0
         #: jump of the stamps at the last sample that was used [ns]; 0 for a usual step
         self.jump_ns = 0
-        self._reading: bytes = b''
-        self._first_equal_ns = 0
-        self._equal = 0
 
     def judge(self, sample: ImuSample) -> Verdict:
         """Verdict on ``sample``, which becomes the last sample for the next call if it is used."""
-        rates, forces = sample.angular_velocity.tolist(), sample.linear_acceleration.tolist()
-        if not all(map(math.isfinite, (*rates, *forces))):
+        values = sample.angular_velocity.tolist() + sample.linear_acceleration.tolist()
+        if not all(map(math.isfinite, values)):
             return Verdict.NOT_FINITE
-        if max(map(abs, rates)) > self._limits[0] or max(map(abs, forces)) > self._limits[1]:
+        if any(abs(value) > limit for value, limit in zip(values, self._limits, strict=True)):
             return Verdict.IMPOSSIBLE
-        if self._is_frozen(sample):
+        frozen = [axis.is_frozen(sample.stamp_ns, value) for axis, value in zip(self._axes, values, strict=True)]
+        if any(frozen):
             return Verdict.FROZEN
         if self._last_ns is None:
             self._last_ns = sample.stamp_ns
@@ -81,14 +106,6 @@ class ImuInput:
         if 0 < step_ns <= self._max_gap_ns:
             self._longest_ns = max(self._longest_ns * (1.0 - step_ns / MEMORY_NS), step_ns)
         self._last_ns, self._strays, self.jump_ns = stamp_ns, 0, jump_ns
-
-    def _is_frozen(self, sample: ImuSample) -> bool:
-        reading = sample.angular_velocity.tobytes() + sample.linear_acceleration.tobytes()
-        if reading != self._reading or sample.stamp_ns < self._first_equal_ns:
-            self._reading, self._first_equal_ns, self._equal = reading, sample.stamp_ns, 0
-        self._equal += 1
-        lasting = sample.stamp_ns - self._first_equal_ns >= FROZEN_SECONDS * 1e9
-        return lasting and self._equal >= FROZEN_SAMPLES
 
     def _stray(self, stamp_ns: int) -> Verdict:
         assert self._last_ns is not None

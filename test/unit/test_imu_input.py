@@ -1,0 +1,53 @@
+"""What may enter the filter from the IMU: an axis that repeats itself is a fault, where it has not always done so."""
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
+from thermal_fiducial.core.measurements import ImuSample
+
+STEP_NS = 5_000_000
+rng = np.random.default_rng(4)
+
+
+@pytest.fixture
+def imu():
+    return ImuInput(max_gap=0.5, gyroscope_range=10.0, accelerometer_range=100.0)
+
+
+def verdicts(imu, readings, begin=0):
+    """On samples (N, 6) at 200 Hz."""
+    samples = (ImuSample((begin + k) * STEP_NS, row[:3], row[3:]) for k, row in enumerate(readings))
+    return [imu.judge(sample) for sample in samples]
+
+
+def noise(count):
+    return rng.normal(size=(count, 6))
+
+
+@pytest.mark.parametrize('axis', range(6))
+@pytest.mark.parametrize('value', [0.0, 0.3])
+def test_a_dead_axis_is_found_within_50_ms(imu, axis, value):
+    dead = noise(100)
+    dead[:, axis] = value
+    assert set(verdicts(imu, noise(100))) == {Verdict.USE}
+    found = verdicts(imu, dead, 100)
+    # ten samples last 45 ms
+    assert found == [Verdict.USE] * 9 + [Verdict.FROZEN] * 91
+    # The end of a gap is believed with its second sample.
+    assert verdicts(imu, noise(20), 200) == [Verdict.AHEAD] + [Verdict.USE] * 19
+
+
+def test_coarse_steps_repeat_themselves(imu):
+    """Steps of one and a half times the noise: the same value for up to 70 ms."""
+    coarse = np.round(noise(4000) / 1.5)
+    longest = max(len(run) for run in ''.join('0' if value == 0.0 else ' ' for value in coarse[:, 0]).split())
+    assert longest > 10
+    assert verdicts(imu, coarse).count(Verdict.FROZEN) == 0
+
+
+def test_full_scale_is_not_frozen(imu):
+    """What is cut off there is noise in the filter."""
+    cut = noise(60)
+    cut[:, 2] = -10.0
+    assert set(verdicts(imu, cut)) == {Verdict.USE}
