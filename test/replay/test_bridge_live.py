@@ -27,7 +27,7 @@ from thermal_fiducial.ros.counting import CountingNode
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 #: A busy machine may take a second or two until what leaves the filter reaches the listener.
-STILL, SECONDS = 4.0, 8.0
+STILL, SECONDS = 3.0, 6.5
 #: Amplitude, frequency [rad/s], phase: 1 - cos, which starts at rest.
 REST_THEN = np.array([[(1.0, 0.0, np.pi / 2), (1.0, 1.5, -np.pi / 2)]])
 

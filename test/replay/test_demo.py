@@ -26,7 +26,7 @@ def quick():
 @pytest.mark.ros
 @pytest.mark.parametrize(
     ('scenario', 'seconds'),
-    [(quick(), 6), pytest.param(demo.SCENARIO, 11, marks=pytest.mark.nightly)],
+    [(quick(), 5), pytest.param(demo.SCENARIO, 11, marks=pytest.mark.nightly)],
     ids=['quick', 'whole'],
 )
 def test_a_short_demo(tmp_path, capfd, monkeypatch, scenario, seconds):

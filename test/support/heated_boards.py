@@ -90,7 +90,11 @@ def _squares(x, y, points, gap):
 def _circles(x, y, points, radius):
     warm = np.zeros(x.shape, np.float32)
     for point in points:
-        warm[np.hypot(x - point[0], y - point[1]) < radius] = 1.0
+        # Only the texels around the circle: the whole texture for each point took longer than finding the board.
+        first = ((point - radius - [x[0, 0], y[0, 0]]) * TEXELS).astype(int).clip(0)
+        last = first + round(2.0 * radius * TEXELS) + 2
+        near = slice(first[1], last[1]), slice(first[0], last[0])
+        warm[near][np.hypot(x[near] - point[0], y[near] - point[1]) < radius] = 1.0
     return warm
 
 
