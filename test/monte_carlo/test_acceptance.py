@@ -144,7 +144,7 @@ def test_frames_stamped_at_arrival_are_noticed():
 
 @pytest.mark.parametrize('offset', [-0.04, *(pytest.param(s, marks=pytest.mark.nightly) for s in (-0.01, 0.02, 0.04))])
 def test_time_offset_is_found_within_a_millisecond(offset):
-    data = flight(21, seconds=20.0, offset=offset)
+    data = flight(21, seconds=14.0, offset=offset)
     _, _, ekf, _ = flown(data, config())
     assert ekf.diagnostics()['time offset'] == pytest.approx(offset, abs=0.001)
     assert abs(ekf.diagnostics()['time offset'] - offset) < 4.0 * ekf.diagnostics()['time offset std']
@@ -173,7 +173,7 @@ def first_seconds():
     squares, offsets = [], []
     for seed in range(6):
         motion = Motion.random(np.random.default_rng(seed), turn=1.0)
-        data = Flight(seed, 3.0, motion, offset=0.03 * (-1) ** seed, **GOOD_POSES)
+        data = Flight(seed, 3.0, motion, imu_rate=RATE, offset=0.03 * (-1) ** seed, **GOOD_POSES)
         ekf = PoseEkf(white_poses())
         states, _ = run(ekf, timeline(data.samples(), data.poses, 0.03))
         T_true = data.motion.pose([seconds_of(state) for state in states])
