@@ -6,17 +6,17 @@ import pytest
 
 from thermal_fiducial.core.detection.corner_errors import unknown_motion, wrong_lag
 from thermal_fiducial.core.detection.frame import (
+    counts_of,
     lag_tail_maps,
     markers_deblurred,
     REMAINING,
-    without_lag_tails,
 )
 
 
 def freed(image, maps):
     """The whole image without the lag tails of one marker."""
-    pixel = np.arange(image.size).reshape(1, -1)
-    return without_lag_tails(image.reshape(1, -1), pixel, image, maps).reshape(image.shape)
+    pixel = np.arange(image.size).reshape(1, 1, 1, -1)
+    return counts_of(pixel, image, maps).reshape(image.shape)
 
 
 @pytest.mark.parametrize('steps', [None, 4, 8])
@@ -82,11 +82,11 @@ def test_deblurred_edges_are_those_of_a_response_that_forgets(lag_blur):
 
 def test_each_marker_is_freed_of_its_own_lag_tails():
     rng = np.random.default_rng(4)
-    image, pixel = rng.normal(size=(60, 70)).astype(np.float32), rng.integers(0, 60 * 70, (7, 6))
+    image, pixel = rng.normal(size=(60, 70)).astype(np.float32), rng.integers(0, 60 * 70, (7, 1, 6, 1))
     maps = lag_tail_maps(np.concatenate([SQUARE, SQUARE]), np.array([0.0, 2.5])[:, None, None] * np.ones((2, 4, 2)))
-    columns = without_lag_tails(image.ravel()[pixel], pixel, image, maps)
-    np.testing.assert_allclose(columns[:, :3], image.ravel()[pixel[:, :3]], atol=1e-5)
-    np.testing.assert_allclose(columns[:, 3:], freed(image, maps[1:]).ravel()[pixel[:, 3:]], atol=1e-4)
+    columns = counts_of(pixel, image, maps)
+    np.testing.assert_allclose(columns[:, :, :3], image.ravel()[pixel[:, :, :3]], atol=1e-5)
+    np.testing.assert_allclose(columns[:, :, 3:], freed(image, maps[1:]).ravel()[pixel[:, :, 3:]], atol=1e-4)
 
 
 SQUARE = 60.0 * np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])

@@ -23,7 +23,7 @@ def image():
 
 
 def test_pixels_lie_across_the_sides(image):
-    sides = sides_of(CAMERA.normalise(CORNERS), CAMERA, image.shape, cells=6, columns=6, half=5)
+    sides = sides_of(CAMERA.normalise(CORNERS), CAMERA, image.shape, cells=6, columns=6, blur_px=1.5)
     v, u = np.divmod(sides.pixel, 640)
     # Moved back along the normal by its distance, every pixel of the top side lies between the two upper corners.
     place = np.stack([u, v], axis=-1) - sides.distance[..., None] * sides.normal
@@ -38,7 +38,7 @@ def test_pixels_lie_across_the_sides(image):
 
 def test_columns_beyond_the_image_do_not_count(image):
     corners = CORNERS[:1] - [97.0, 60.0]
-    sides = sides_of(CAMERA.normalise(corners), CAMERA, image.shape, cells=6, columns=6, half=5)
+    sides = sides_of(CAMERA.normalise(corners), CAMERA, image.shape, cells=6, columns=6, blur_px=1.5)
     # The left side is cut off by the border of the image: its lower half lies outside, the top side does not.
     assert sides.inside is not None
     assert sides.fresh[:, 0].any()

@@ -19,7 +19,7 @@ def test_distances_grow_inward_however_the_square_is_turned_and_tilted(tilt_deg)
         T = se3.transform(R @ se3.so3_exp([0.0, 0.0, turn]), [0.2, -0.1, 3.0])
         points = se3.apply(T, marker_corners(0.3))
         x = (points[:, :2] / points[:, 2:])[None]
-        sides = sides_of(x, CAMERA, (512, 640), 6, 6, 4)
+        sides = sides_of(x, CAMERA, (512, 640), 6, 6, 1.0)
         corners = CAMERA.distort(x)[0]
         middles = 0.5 * (corners[[0, 3, 0, 1]] + corners[[1, 2, 3, 2]])
         inward = np.sum(sides.normal[:, 3] * (corners.mean(axis=0) - middles), axis=1)

@@ -21,7 +21,7 @@ from thermal_fiducial.core.detection.corner_errors import (
 )
 from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind_border, model, sides_of
-from thermal_fiducial.core.detection.frame import Frame, markers_deblurred
+from thermal_fiducial.core.detection.frame import counts_of, Frame, markers_deblurred
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.refining import RefinedCorners, RefinedMarkers, sides_px
@@ -36,7 +36,8 @@ _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
 _LOST_CELLS = 0.4
 # Four corners that err together, each with a covariance of its own, claim what they have in common four times too well.
 _CORNERS = 4.0
-_COLUMNS, _HALF = 6, 6
+# Columns of pixels in a segment of a border, and blur that these reach across [px].
+_COLUMNS, _WIDEST_PX = 6, 2.0
 # A marker that was read off its corners by less than this need not be read again [cells].
 _READ_THERE = 0.1
 # Standard deviation of motion blur below which a marker looks as if it stood still [cells].
@@ -91,11 +92,11 @@ class DisplayedSides:
         inset = 1.0 / (self._bits + 2.0)
         a, b = inset + (1.0 - 2.0 * inset) * np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
         inner = np.moveaxis(se3.in_quadrilaterals(seen.x, a, b), 0, -1)
-        sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _HALF)
+        sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _WIDEST_PX)
         blur = blurs(sides.normal[:, self._bits // 2], blur_px, refined.blur.spread)
         value, slope, weight = model(sides, self._behind[refined.ids], blur)
         weight *= self._white[refined.ids].reshape(-1, self._bits)
-        counts = sides.counts(frame.image, refined.blur.to_tails)
+        counts = counts_of(sides.pixel, frame.image, refined.blur.to_tails)
         return measure(counts, (value, slope, weight), REACHED * blur[0])
 
 

@@ -157,15 +157,19 @@ def rolling_displacement(
     return displacement(places, twist, frame, delays(lagging, frame) * stretch(places, twist, frame))
 
 
-def without_lag_tails(counts: Float32Array, pixel: IntArray, image: Float32Array, to_tails: FloatArray) -> Float32Array:
-    """``counts`` (M, C, 4 N, m) of pixels of the flat image, as many of each marker, without their lag tails.
+def counts_of(pixel: IntArray, image: Float32Array, to_tails: FloatArray | None = None) -> Float32Array:
+    """Counts (M, C, 4 N, m) of the pixels at these places of the flat image, as many of each of N markers.
 
-    Of a few columns of pixels it takes a fourth of the time of the whole windows round the markers.
+    Lag tails are taken out of a few columns of pixels in a fourth of the time of the whole windows round the markers.
 
     Parameters
     ----------
-    to_tails : (N, 2, 3) affine maps of pixels to where the image shows what these saw one lag tail's age ago
+    to_tails : (N, 2, 3) affine maps of pixels to where the image shows what these saw one lag tail's age ago, which is
+        taken out; None: nothing is
     """
+    counts = image.ravel().take(pixel, mode='clip')
+    if to_tails is None:
+        return counts
     by_marker = pixel.reshape(pixel.shape[0] * pixel.shape[1], len(to_tails), -1).astype(np.int32)
     v, u = (places.astype(np.float32) for places in np.divmod(by_marker, np.int32(image.shape[1])))
     maps = to_tails.astype(np.float32)[..., None]

@@ -17,8 +17,9 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corner_errors import unknown_motion, wrong_lag
 from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED
-from thermal_fiducial.core.detection.corners.sides import blurs, half_width, model, sides_of
+from thermal_fiducial.core.detection.corners.sides import blurs, model, sides_of
 from thermal_fiducial.core.detection.frame import (
+    counts_of,
     delays,
     Frame,
     lag_tail,
@@ -43,6 +44,8 @@ CLEAR_CNR = 20.0
 _OF_CLEAR, _OF_FAINT = (6, 0.2), (12, 1.0)
 _ROUNDS = 2
 _NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
+# Of the ends of the sides, those that are the corners, clockwise.
+_CORNERS = np.array([0, 1, 3, 2])
 # Passes follow one another until the last step was short enough [px]: at best, at worst, between in deviations of it.
 _PASSES = 4
 _SETTLED_PX, _UNSURE = (0.3, 1.0), 2.0
@@ -130,7 +133,7 @@ def refine(
     twist, places = frame.twist, found.places
     for _ in range(_ROUNDS):
         blur = _motion_blur(frame, places, twist, hardly)
-        start = places.at.moved(blur.shift, frame.camera)
+        start = places.at.at_pixels(places.at.px + blur.shift)
         widths = config.blur_px, blur.spread
         seen = refine_corners(frame.image, start, frame.camera, behind, *widths, columns, blur.to_tails)
         markers = _at_stamp(frame, found.ids, places, blur, seen, twist, track, behind.shape[2])
@@ -152,7 +155,7 @@ def _at_stamp(
     cells: int,
 ) -> RefinedMarkers:
     """The corners without lag and as if all rows were seen at once, by the twist that they themselves correct."""
-    at = places.at.moved(seen.corners_px - blur.shift - places.at.px, frame.camera)
+    at = places.at.at_pixels(seen.corners_px - blur.shift)
     variances = seen.covariances.diagonal(axis1=-2, axis2=-1)
     deviation = np.sqrt(variances.mean(axis=(1, 2))) / frame.camera.focal_px
     # Corners that make no square are those of something else.
@@ -230,7 +233,7 @@ def refine_corners(
         if len(which) == 0:
             break
         tails = None if to_tails is None else to_tails[which]
-        start = corners.only(which).moved(found.corners_px[which] - corners.px[which], camera)
+        start = corners.only(which).at_pixels(found.corners_px[which])
         again, moving = _pass(image, start, camera, behind[which], blur_px, lag_blur[which], columns, tails)
         found = found.with_others(which, again)
     return found
@@ -248,14 +251,15 @@ def _pass(
 ) -> tuple[RefinedCorners, BoolArray]:
     """Where one linearised adjustment moves the corners, and for which markers (N,) that was not the last."""
     cells = behind.shape[2]
-    half = half_width(math.hypot(blur_px, math.sqrt(float((lag_blur * lag_blur).sum(axis=1).max()))))
-    sides = sides_of(start.x, camera, image.shape, cells, columns, half)
+    widest = math.hypot(blur_px, math.sqrt(float((lag_blur * lag_blur).sum(axis=1).max())))
+    sides = sides_of(start.x, camera, image.shape, cells, columns, widest)
     blur = blurs(sides.normal[:, cells // 2], blur_px, lag_blur)
-    segments = measure(sides.counts(image, to_tails), model(sides, behind, blur), REACHED * blur[0])
+    segments = measure(counts_of(sides.pixel, image, to_tails), model(sides, behind, blur), REACHED * blur[0])
     shift, covariances, doubt = adjust(sides, segments, _PRIOR_PX, start)
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]
     contrast, noise = (segments.contrast * share).sum(axis=1), np.sqrt((segments.noise * share).sum(axis=1))
     deviation = np.sqrt(covariances.diagonal(axis1=2, axis2=3))
     moving: BoolArray = np.asarray((np.abs(shift) > np.clip(_UNSURE * deviation, *_SETTLED_PX)).any(axis=(1, 2)))
-    return RefinedCorners(start.px + shift, covariances, contrast, noise, doubt), moving
+    corners = sides.ends.reshape(-1, 8, 2).take(_CORNERS, axis=1) + shift
+    return RefinedCorners(corners, covariances, contrast, noise, doubt), moving

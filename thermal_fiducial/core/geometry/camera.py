@@ -202,11 +202,6 @@ class ImagePoints(Stacked):
         px, J = camera.distort_linearised(x)
         return ImagePoints(px, x, J, inverse_2x2(J))
 
-    def moved(self, shift_px: FloatArray, camera: Camera) -> 'ImagePoints':
-        """Those some pixels (..., 2) away: undistorting them anew would cost more than it is worth."""
-        x = self.x + (self.inverse @ shift_px[..., None])[..., 0]
-        return ImagePoints(camera.distort(x), x, self.J, self.inverse)
-
     def at_pixels(self, px: FloatArray) -> 'ImagePoints':
         """Those at pixels (..., 2) that are so near that what is left of the distortion's curvature is nothing."""
         return ImagePoints(px, self.x + (self.inverse @ (px - self.px)[..., None])[..., 0], self.J, self.inverse)

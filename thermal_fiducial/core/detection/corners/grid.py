@@ -20,8 +20,8 @@ from thermal_fiducial.core.detection.corners.segments import (
     REACHED,
     robust_fit,
 )
-from thermal_fiducial.core.detection.corners.sides import blurred_step, blurs, columns_across, half_width, NODES, Sides
-from thermal_fiducial.core.detection.frame import Frame, LEAST_DEPTH, Places, rolling_displacement
+from thermal_fiducial.core.detection.corners.sides import blurred_step, blurs, columns_across, NODES, Sides
+from thermal_fiducial.core.detection.frame import counts_of, Frame, LEAST_DEPTH, Places, rolling_displacement
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, Stacked, TINY
@@ -119,11 +119,10 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     length = float(np.linalg.norm(nodes[:, 4] - nodes[:, 0], axis=1).max())
     columns = int(np.clip(length / _EVERY_PX, _FEWEST, _MOST))
     widest = math.hypot(layer.blur, float(np.linalg.norm(layer.lag_blur)))
-    half = half_width(widest)
-    sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, columns, half)
+    sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, columns, widest)
     blur = blurs(sides.normal[:, 0], layer.blur, layer.lag_blur[None])
     modelled = _model(sides, pattern.step, blur)
-    measured = measure(sides.counts(layer.image), modelled, REACHED * blur[0], len(nodes))
+    measured = measure(counts_of(sides.pixel, layer.image), modelled, REACHED * blur[0], len(nodes))
     used = measured.variance[0] < HOPELESS
     if used.sum() < 6:
         return None

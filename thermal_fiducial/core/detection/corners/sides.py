@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.detection.frame import without_lag_tails
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
@@ -21,6 +20,8 @@ STARTS, ENDS = np.array([0, 3, 0, 1]), np.array([1, 2, 3, 2])
 _OPPOSITE = np.array([1, 0, 3, 2])
 #: A curved side is a quartic through five of its points, at these shares of it.
 NODES = np.linspace(0.0, 1.0, 5)
+# Half the length of columns: a pixel more than so many blurs, within bounds [px].
+_REACHES, _SHORTEST, _LONGEST = 2.5, 4, 10
 # Pixels of the image that a side must have on both sides, and by how many a curve may pass the nodes it goes through.
 _BOTH_SIDES, _BEYOND_NODES = 3, 3.0
 #: Neighbouring edges that the model knows: so many cells behind the side.
@@ -57,14 +58,11 @@ class Sides:
     across: FloatArray
     #: (E, 1) length [px]
     along: FloatArray
-
-    def counts(self, image: Float32Array, to_tails: FloatArray | None = None) -> Float32Array:
-        """Of the pixels (M, C, E, m), without lag tails where maps ``to_tails`` (N, 2, 3) say where these are."""
-        counts = image.ravel().take(self.pixel, mode='clip')
-        return counts if to_tails is None else without_lag_tails(counts, self.pixel, image, to_tails)
+    #: (E, 2, 2) where they begin and end [px]
+    ends: FloatArray
 
 
-def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, columns: int, half: int) -> Sides:
+def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, columns: int, blur_px: float) -> Sides:
     """Sides of quadrilaterals (N, 4, 2) in normalised coordinates.
 
     Parameters
@@ -72,7 +70,7 @@ def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, 
     shape : height and width of the image
     cells : m equal parts of a side
     columns : C in each of them
-    half : number of pixels of a column on either side; M = 2 half + 1
+    blur_px : the widest: columns have pixels as far as it reaches on either side
     """
     weight = se3.perspective(x)
     start, end = x.take(STARTS, axis=1), x.take(ENDS, axis=1)
@@ -82,11 +80,11 @@ def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, 
     nodes = camera.distort(points).reshape(-1, len(NODES), 2)
     middle = nodes[:, 2]
     opposite = middle.reshape(-1, 4, 2).take(_OPPOSITE, axis=1).reshape(-1, 2) - middle
-    return columns_across(nodes, opposite, shape, cells, columns, half)
+    return columns_across(nodes, opposite, shape, cells, columns, blur_px)
 
 
 def columns_across(
-    nodes: FloatArray, opposite: FloatArray, shape: tuple[int, ...], cells: int, columns: int, half: int
+    nodes: FloatArray, opposite: FloatArray, shape: tuple[int, ...], cells: int, columns: int, blur_px: float
 ) -> Sides:
     """Columns across E sides, or across other edges.
 
@@ -94,7 +92,7 @@ def columns_across(
     ----------
     nodes : (E, 5, 2) pixels of five points on each, from end to end
     opposite : (E, 2) from their middles to the opposite sides, inward [px]
-    shape, cells, columns, half : as of :func:`sides_of`
+    shape, cells, columns, blur_px : as of :func:`sides_of`
     """
     span = nodes[:, 4] - nodes[:, 0]
     du, dv = span[:, :1], span[:, 1:]
@@ -114,6 +112,7 @@ def columns_across(
     pitch = inward / np.sqrt(1.0 + slope * slope)
     by_way, leaning = pitch[columns // 2], -(slope * pitch)[columns // 2]
     normal = np.stack([np.where(steep, by_way, leaning), np.where(steep, leaning, by_way)], axis=-1)
+    half = min(max(math.ceil(_REACHES * blur_px + 1.0), _SHORTEST), _LONGEST)
     base, offsets = np.rint(centre), np.arange(-half, half + 1)[:, None, None, None]
     fresh, inside = _seen(whole, base, steep, nodes, shape, half)
     off, rise = ((base - centre) * pitch).astype(np.float32), pitch.astype(np.float32)
@@ -128,6 +127,7 @@ def columns_across(
         normal,
         np.abs((opposite * normal[:, cells // 2]).sum(axis=-1, keepdims=True)),
         np.sqrt((span * span).sum(axis=-1, keepdims=True)),
+        nodes[:, ::4],
     )
 
 
@@ -189,11 +189,6 @@ def _inward(grid: Float32Array) -> Float32Array:
 
 def _changes(inward: Float32Array) -> Float32Array:
     return np.ascontiguousarray(np.moveaxis(np.diff(inward, axis=2), 2, 3))
-
-
-def half_width(blur: float) -> int:
-    """Pixels of a column on either side of an edge with a ``blur`` [px]."""
-    return min(max(math.ceil(2.5 * blur + 1.0), 4), 10)
 
 
 def blurs(normal: FloatArray, optics: float, lag_blur: FloatArray) -> tuple[FloatArray, FloatArray]:
