@@ -88,7 +88,8 @@ fuzz: $(READY)
 
 latency: $(READY)
 	@echo '== Latency: one process a node, in real time; the idle row needs an idle machine'
-	$(BIN)/python test/latency.py
+	$(BIN)/python test/latency.py $(LATENCY_ARGS)
+	$(BIN)/python test/documents.py
 
 tables: $(READY)
 	THERMAL_FIDUCIAL_TABLES=1 $(BIN)/python -m pytest --quiet -m '' test/real

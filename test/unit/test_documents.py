@@ -18,6 +18,17 @@ LINK = re.compile(r'\]\(([^)#\s]+)')
 PAGES = [README, *sorted((ROOT / 'doc').rglob('*.md'))]
 
 
+def test_the_design_names_files_that_are_there():
+    named = set(re.findall(r'`?([\w/]+\.py)\b', (ROOT / 'doc' / 'design.md').read_text(encoding='utf-8')))
+    assert len(named) > 50
+    files = [
+        f'/{path.relative_to(ROOT)}'
+        for folder in ('thermal_fiducial', 'test')
+        for path in (ROOT / folder).rglob('*.py')
+    ]
+    assert [name for name in sorted(named) if not any(file.endswith(f'/{name}') for file in files)] == []
+
+
 @pytest.mark.ros
 def test_tables_are_up_to_date():
     # They are made anew by: make tables

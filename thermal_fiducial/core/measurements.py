@@ -21,8 +21,7 @@ LATEST_NS = 1_000_000_000
 CORNER_FIELDS = tuple(f'{axis}{corner}' for corner in range(4) for axis in 'uv')
 CORNER_COVARIANCE_FIELDS = tuple(f'c{corner}{term}' for corner in range(4) for term in ('uu', 'uv', 'vv'))
 
-#: A row of the ``markers`` topic: the layout of DESIGN.md section 5 followed by the corner covariances
-#: ``c0uu c0uv c0vv ...`` [px^2].
+#: A row of the ``markers`` topic (meanings: doc/nodes.md). New fields go to the end: readers look them up by name.
 MARKER_DTYPE = np.dtype(
     [('x', _F4), ('y', _F4), ('z', _F4), ('id', '<u4')]
     + [(name, _F4) for name in CORNER_FIELDS]
