@@ -64,7 +64,9 @@ MECHANISMS = {
         {'localization:_JointFit.alternative': _ignored},
     ),
     'contradiction of odometry': Mechanism(
-        ('chain', 'tags test_22'), ('located:contradicts',), {'mapper:contradicts': lambda *_: False}
+        ('chain', 'tags test_22'),
+        ('located:LocatedFrame.contradicts_odometry.func',),
+        {'located:LocatedFrame.contradicts_odometry': False},
     ),
     'odometry of keyframes': Mechanism(
         ('chain', 'tags test_22'), (), {'keyframes:alike_odometry': lambda covariance: 1e12 * covariance}

@@ -126,7 +126,7 @@ def test_all_markers_are_drawn_once_and_then_those_that_change_colour(graph, tmp
     plates = [[m.id for m in message.markers if m.ns == 'plates'] for message in heard]
     assert plates[-1] == [0, 1, 2]
     assert heard[-1].markers[0].action == Marker.DELETEALL
-    monkeypatch.setattr(node.mapper, 'learn', lambda _: MapperResult(1, None, '', residuals_px={1: 0.1}))
+    monkeypatch.setattr(node.mapper, 'learn', lambda _: MapperResult(1, None, '', in_view=frozenset({1})))
     graph.send('thermal/camera_info', info())
     graph.send('markers', clouds.cloud(np.zeros(0, MARKER_DTYPE), convert.header(1, 'camera')))
     graph.diagnose(node)

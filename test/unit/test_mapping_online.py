@@ -42,7 +42,7 @@ def test_a_flight_ends_with_a_map_of_a_millimetre():
     m = from_one_marker(poses)
     versions, resets = [], 0
     for k in range(0, 600, 3):
-        result = m.process(stamp(k), see(flight(k / 30), poses, 0.02, rng), CAMERA)
+        m.process(stamp(k), see(flight(k / 30), poses, 0.02, rng), CAMERA)
         if m.refinement_due(stamp(k)):
             # In the background, the mapper goes on with the next frame before the outcome comes.
             snapshot = m.snapshot()
@@ -51,7 +51,7 @@ def test_a_flight_ends_with_a_map_of_a_millimetre():
             assert m.apply(refine(snapshot))
             resets += 1
             assert (m.resets, m.map.revision) == (resets, revision + 1)
-        versions.append(result.map_revision)
+        versions.append(m.map.revision)
         if k > 300:
             assert rms(position_errors(m, poses)) < 1e-3
             assert rms(rotation_errors(m, poses)) < np.deg2rad(0.05)
@@ -77,7 +77,6 @@ def test_a_refinement_moves_poses_by_no_more_than_they_claimed():
     squares = [d @ np.linalg.solve(x.pose.covariance, d) for d, (x, _) in zip(moved, pairs, strict=True)]
     # Six degrees of freedom: their mean, of frames that share nearly all of it, stays below 99.9 % of one.
     assert np.mean(squares) < 22.5
-    assert after[0].map_resets == before[-1].map_resets + 1
 
 
 def test_a_frozen_map_takes_no_refinement():
@@ -128,10 +127,10 @@ def test_another_map_is_taken_over_and_the_jump_returned():
     rows = see(flight(k / 30), poses, 0.02, rng)
     before = m.process(stamp(k) + 1, rows, CAMERA)
     T_new_old = transform(so3_exp([0.0, 0.0, 0.4]), [3.0, -1.0, 0.2])
-    jump = m.load(transformed(m.map, T_new_old))
-    np.testing.assert_allclose(jump.T_new_old, T_new_old, atol=1e-9)
-    assert (jump.resets, jump.map_revision) == (2, m.map.revision)
-    assert m.map.revision > before.map_revision
+    revision = m.map.revision
+    np.testing.assert_allclose(m.load(transformed(m.map, T_new_old)), T_new_old, atol=1e-9)
+    assert m.resets == 2
+    assert m.map.revision > revision
     # A refinement that was under way knows nothing of the new map.
     assert not m.apply(late)
     after = m.process(stamp(k) + 2, rows, CAMERA)

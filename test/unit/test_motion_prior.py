@@ -20,7 +20,6 @@ def stamps(found):
 
 def test_empty():
     log = MotionPrior()
-    assert log.latest() is None
     assert log.nearest(0) is None
     assert log.between(0, 10**9, 10) == []
 
@@ -28,7 +27,6 @@ def test_empty():
 def test_nearest_and_between_whatever_the_order_of_arrival():
     given = states(20)
     log = motion_prior(*given[:10], *given[15:], *given[10:15])
-    assert log.latest().stamp_ns == 19 * PERIOD_NS
     assert [log.nearest(t).stamp_ns // PERIOD_NS for t in (-(10**9), 12_000_000, 13_000_000, 10**12)] == [0, 2, 3, 19]
     assert stamps(log.between(4 * PERIOD_NS, 8 * PERIOD_NS, 10)) == [k * PERIOD_NS for k in range(4, 9)]
     assert log.between(10**12, 10**13, 10) == []
@@ -78,4 +76,4 @@ def test_stamps_that_do_not_go_on_fill_no_memory():
     for k in range(10_000):
         log.add(k, replace(STATE, stamp_ns=k))
     assert 1000 <= len(log.between(-1, 10**12, 10**6)) <= 2000
-    assert log.latest().stamp_ns == 9_999
+    assert log.nearest(10**12).stamp_ns == 9_999

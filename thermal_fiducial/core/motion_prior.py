@@ -62,16 +62,12 @@ class MotionPrior:
             old = bisect_left(self._stamps_ns, self._stamps_ns[-1] - _KEPT_NS)
             del self._stamps_ns[:old], self._states[:old]
 
-    def latest(self) -> Odometry | None:
-        """The newest state; None when there is none."""
-        return self._one(len(self._states) - 1)
-
     def nearest(self, stamp_ns: int) -> Odometry | None:
         """The state whose stamp, in the clock of the odometry, is nearest."""
         place = bisect_left(self._stamps_ns, stamp_ns)
         around = range(max(place - 1, 0), min(place + 1, len(self._stamps_ns)))
         best = min(around, key=lambda index: abs(self._stamps_ns[index] - stamp_ns), default=None)
-        return self._one(-1 if best is None else best)
+        return None if best is None else next(iter(self._read([self._states[best]])), None)
 
     def between(self, first_ns: int, last_ns: int, at_most: int) -> list[Odometry]:
         """States from the first to the last stamp, of more than ``at_most`` so many, as evenly apart as can be."""
@@ -80,7 +76,3 @@ class MotionPrior:
         kept = min(count, at_most)
         chosen = [first + place * (count - 1) // max(kept - 1, 1) for place in range(kept)]
         return self._read([self._states[place] for place in chosen]) if chosen else []
-
-    def _one(self, place: int) -> Odometry | None:
-        """The state at a place; None below the first."""
-        return next(iter(self._read([self._states[place]])), None) if place >= 0 else None

@@ -119,18 +119,19 @@ class Pipeline:
         if frame.counts is None or self.camera is None:
             return FrameResult(stamp_ns, withheld=frame.reason or 'no camera_info')
         markers = self.detector.detect(stamp_ns, frame.counts, self.camera, self._odometry)
-        mapping = self.mapper.process(stamp_ns, markers, self.camera, self._odometry)
+        mapping = self.mapper.learn(self.mapper.locate(stamp_ns, markers, self.camera, self._odometry))
         update = None
         if (pose := mapping.pose) is not None:
             update = self.filter.add_pose(replace(pose, T_map_camera=as_published(pose.T_map_camera)))
         if (offset := self.filter.camera_time_offset) is not None:
             self._odometry.set_clock_offset(offset)
-        if self._refine(stamp_ns) or mapping.map_changed:
+        refined = self.mapper.refinement_due(stamp_ns) and self._refine()
+        if refined or mapping.map_changed:
             self._share_map()
         return FrameResult(stamp_ns, markers=markers, mapping=mapping, update=update)
 
-    def _refine(self, stamp_ns: int) -> bool:
-        snapshot = self.mapper.snapshot() if self.mapper.refinement_due(stamp_ns) else None
+    def _refine(self) -> bool:
+        snapshot = self.mapper.snapshot()
         refinement = None if snapshot is None else refine(snapshot)
         return refinement is not None and self.mapper.apply(refinement)
 

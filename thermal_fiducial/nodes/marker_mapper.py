@@ -6,7 +6,8 @@ from typing import Any
 from sensor_msgs.msg import PointCloud2
 
 from thermal_fiducial.config import MarkerMapperConfig
-from thermal_fiducial.core.mapping.map_data import MapJump, MapperResult
+from thermal_fiducial.core.mapping.map_data import MapperResult
+from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros import clouds, map_status, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
 from thermal_fiducial.ros.camera_poses import CameraPoses
@@ -51,11 +52,11 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         if self._map.refinement.step(stamp) or self._result.map_changed:
             self._publish_map()
 
-    def _publish_jump(self, jump: MapJump | None) -> None:
+    def _publish_jump(self, T_new_old: FloatArray | None) -> None:
         """Publish a map that was taken over, and how poses move with it, with the stamp of the newest frame before."""
-        if jump is not None:
-            self._poses.late.moved(jump.T_new_old)
-            self._topics.publish_correction(jump.T_new_old, self._poses.late.newest_ns)
+        if T_new_old is not None:
+            self._poses.late.moved(T_new_old)
+            self._topics.publish_correction(T_new_old, self._poses.late.newest_ns)
         self._publish_map()
 
     def _publish_map(self) -> None:

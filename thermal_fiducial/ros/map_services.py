@@ -9,8 +9,9 @@ from rclpy.clock_type import ClockType
 from std_srvs.srv import SetBool, Trigger
 
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
-from thermal_fiducial.core.mapping.map_data import MapJump, MarkerMap
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import other_patterns
 from thermal_fiducial.files.map_keeper import MapKeeper
@@ -30,7 +31,7 @@ class MapServices:
     publish_jump : called with what becomes of the map when a service has replaced it
     """
 
-    def __init__(self, node: StageNode[MarkerMapperConfig], publish_jump: Callable[[MapJump | None], None]) -> None:
+    def __init__(self, node: StageNode[MarkerMapperConfig], publish_jump: Callable[[FloatArray | None], None]) -> None:
         config = node.config
         self._node = node
         self._publish_jump = publish_jump

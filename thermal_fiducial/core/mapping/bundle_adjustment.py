@@ -50,18 +50,14 @@ class AdjustedMap:
     markers: dict[int, MapMarker]
     #: stamp of each keyframe to its adjusted T_map_camera
     keyframes: dict[int, FloatArray]
-    #: rms re-projection error [px] before and after
-    rms_before_px: float
+    #: rms re-projection error [px]
     rms_px: float
     #: robust sum of squared whitened residuals, in units of their actual variance
     cost: float
-    #: ratio of the residuals' variance to what the corner covariances promise
-    variance_factor: float
     #: marker ID to the share of its views that are outliers
     outliers: dict[int, float]
     #: of adjusted markers whose views don't belong to one marker that hangs still, the same
     inconsistent: dict[int, float]
-    iterations: int
     map_revision: int
 
 
@@ -70,16 +66,15 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
     problem = MapProblem.build(snapshot)
     if problem is None:
         return None
-    before = problem.evaluate(problem.start)
-    now, iterations = _minimise(problem, before)
-    return _result(problem, snapshot, before, now, iterations)
+    return _result(problem, snapshot, _minimise(problem, problem.evaluate(problem.start)))
 
 
-def _minimise(problem: MapProblem, now: Linearised) -> tuple[Linearised, int]:
-    """Levenberg-Marquardt, the corners' variance anew from the residuals of each step; and the number of steps."""
-    scale, damping, steps = _scale(now.chi2), 1e-5, 0
-    while steps < MAX_ITERATIONS and damping < MOST_DAMPED:
-        steps += 1
+def _minimise(problem: MapProblem, now: Linearised) -> Linearised:
+    """Levenberg-Marquardt, the corners' variance anew from the residuals of each step."""
+    scale, damping = _scale(now.chi2), 1e-5
+    for _ in range(MAX_ITERATIONS):
+        if damping >= MOST_DAMPED:
+            break
         trial = problem.step(now, scale, damping)
         gain = -np.inf if trial is None else now.cost(scale) - trial.cost(scale)
         if trial is None or not gain >= 0.0:
@@ -88,7 +83,7 @@ def _minimise(problem: MapProblem, now: Linearised) -> tuple[Linearised, int]:
         now, scale, damping = trial, _scale(trial.chi2), max(EASED * damping, TINY)
         if gain <= _CONVERGED * scale:
             break
-    return now, steps
+    return now
 
 
 def _scale(chi2: FloatArray) -> float:
@@ -96,9 +91,7 @@ def _scale(chi2: FloatArray) -> float:
     return max(1.0, float(np.nanmedian(chi2)) / _MEDIAN_CHI2)
 
 
-def _result(
-    problem: MapProblem, snapshot: Snapshot, before: Linearised, now: Linearised, iterations: int
-) -> AdjustedMap | None:
+def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> AdjustedMap | None:
     """The outcome with its covariances; None where these do not exist."""
     scale = _scale(now.chi2)
     n, weights = len(problem.frame), now.weights(scale)
@@ -125,13 +118,10 @@ def _result(
             for i, key in free
         },
         dict(zip(problem.stamps, now.state.T_map_camera, strict=True)),
-        float(np.sqrt(np.sum(before.squared_px) / (4 * n))),
         float(np.sqrt(np.sum(now.squared_px) / (4 * n))),
         now.cost(scale) / widened,
-        chi2 / max(freedom, 1),
         outliers,
         {key: outliers[key] for key, own in views.items() if two_places(*now.of_views(own), ~full[own])},
-        iterations,
         snapshot.map_revision,
     )
 

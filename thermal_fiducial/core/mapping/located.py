@@ -8,6 +8,7 @@ covariance.
 
 from dataclasses import dataclass
 from functools import cached_property
+import math
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, Observations, Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
-from thermal_fiducial.core.types import FloatArray, ObjectArray, SECOND_NS, Stacked
+from thermal_fiducial.core.types import BoolArray, FloatArray, ObjectArray, SECOND_NS, Stacked
 
 #: Attitudes known no better than this [rad] are not published: their covariances, of first order, mean nothing.
 VAGUE = 0.2
@@ -128,12 +129,14 @@ class Location:
     #: (6, 6) the part of the covariance that the next frames don't share: noise of the corners
     noise: FloatArray
 
-    @property
+    @cached_property
     def reason(self) -> str:
         """Why the pose is not published, in words; empty where it is."""
-        std = float(np.sqrt(np.trace(self.pose.covariance[3:, 3:])))
+        std = math.sqrt(self.pose.covariance[3:, 3:].trace())
+        if std <= VAGUE:
+            return ''
         listed = ', '.join(str(key) for key in self.pose.marker_ids)
-        return f'known to {np.rad2deg(std):.0f} degrees only, by marker {listed}' if std > VAGUE else ''
+        return f'known to {math.degrees(std):.0f} degrees only, by marker {listed}'
 
     @property
     def viewpoint(self) -> Viewpoint:
@@ -162,13 +165,28 @@ class LocatedFrame:
 
     stamp_ns: int
     camera: Camera
-    #: all N markers, those of them that are in the map, and those that are not
+    #: all N markers, (N,) which of them are in the map, and these
     observed: Observations
+    is_known: BoolArray
     known: Sight
-    new: Observations
     #: where odometry has the camera
     predicted: PredictedCamera | None
     outcome: Location | Refusal
+
+    @property
+    def new(self) -> Observations:
+        """The markers that are not in the map."""
+        return self.observed.only(~self.is_known)
+
+    @cached_property
+    def contradicts_odometry(self) -> bool:
+        """Whether the camera is where odometry cannot be, even odometry that is in doubt itself."""
+        if self.predicted is None or isinstance(self.outcome, Refusal):
+            return False
+        pose, odometry = self.outcome.pose, self.predicted.pose
+        apart = difference(odometry.T_map_camera, pose.T_map_camera)
+        covariance = pose.covariance + bounded_odometry(odometry.covariance)
+        return bool(apart @ np.linalg.solve(covariance, apart) > CONTRADICTION)
 
     def known_errors(self, location: Location) -> tuple[FloatArray, FloatArray]:
         """Errors (K,) [px], rms, of the K known markers, and what noise, pose and map explain of them (K,).
@@ -214,12 +232,6 @@ def predicted_camera(
         velocity = J @ np.concatenate([R @ odometry.velocity_body, R @ odometry.angular_velocity_body])
         covariance += of_single_error(velocity, time_offset_std)
     return PredictedCamera(CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), odometry)
-
-
-def contradicts(T_map_camera: FloatArray, covariance: FloatArray, odometry: CameraPose) -> bool:
-    """Whether a camera pose (4, 4) from markers is where odometry cannot be, even odometry that is in doubt itself."""
-    apart = difference(odometry.T_map_camera, T_map_camera)
-    return bool(apart @ np.linalg.solve(covariance + bounded_odometry(odometry.covariance), apart) > CONTRADICTION)
 
 
 def growth(first: CameraPose, predicted: PredictedCamera) -> FloatArray:

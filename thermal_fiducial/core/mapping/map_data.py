@@ -119,13 +119,10 @@ class MapperResult:
     reason: str
     #: the map has another geometry, or trusts other markers, than before
     map_changed: bool = False
-    #: rms re-projection error of each known marker in view [px], quarantined ones included
-    residuals_px: dict[int, float] = field(default_factory=dict)
+    #: IDs of the known markers in view
+    in_view: frozenset[int] = frozenset()
     #: markers on trial in view: ID to what each waits for
     candidates: dict[int, str] = field(default_factory=dict)
-    map_revision: int = 0
-    #: how often the map was refined, or another was taken over
-    map_resets: int = 0
     #: all markers in quarantine: ID to why it is there, with numbers
     quarantine_reasons: dict[int, str] = field(default_factory=dict)
     #: the map took something in: a new marker, or what the known ones were seen like
@@ -135,22 +132,6 @@ class MapperResult:
     def quarantined(self) -> tuple[int, ...]:
         """IDs of all markers in quarantine."""
         return tuple(sorted(self.quarantine_reasons))
-
-    @property
-    def in_view(self) -> frozenset[int]:
-        """IDs of the known markers in view."""
-        return frozenset(self.residuals_px)
-
-
-@dataclass(frozen=True)
-class MapJump:
-    """Another map was taken over: poses published before and after don't compare as they are."""
-
-    map_revision: int
-    #: how often maps were taken over or refined
-    resets: int
-    #: (4, 4) moves poses from the old map to the new: T_new = T_new_old @ T_old
-    T_new_old: FloatArray
 
 
 def gauge(markers: list[MapMarker]) -> BoolArray:

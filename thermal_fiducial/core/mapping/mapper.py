@@ -21,15 +21,15 @@ from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, entry, NewMarkers
 from thermal_fiducial.core.mapping.keyframes import FrameMemory, VIEWS
 from thermal_fiducial.core.mapping.localization import locate
-from thermal_fiducial.core.mapping.located import contradicts, LocatedFrame, Location, predicted_camera, Refusal, Sight
-from thermal_fiducial.core.mapping.map_data import jump, MapJump, MapMarker, MapperResult, MarkerMap
+from thermal_fiducial.core.mapping.located import LocatedFrame, Location, predicted_camera, Refusal, Sight
+from thermal_fiducial.core.mapping.map_data import jump, MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.trust import CornerBias, Trust
 from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray
 
-__all__ = ['MapJump', 'MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
+__all__ = ['MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
 
 #: Why nothing is learned from a frame that has a pose.
 CONTRADICTED = 'the known markers in view contradict the odometry'
@@ -60,21 +60,22 @@ class MarkerMapper:
         self.config = config
         self._T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
 
-    def reset(self) -> MapJump | None:
+    def reset(self) -> FloatArray | None:
         """Back to the map that it was started with; see :meth:`load`."""
         return self.load(self._initial)
 
-    def load(self, marker_map: MarkerMap) -> MapJump | None:
+    def load(self, marker_map: MarkerMap) -> FloatArray | None:
         """Go on with another map of the place, of the next revision; what was seen before is forgotten.
 
         Returns
         -------
-        The jump from the old map to the new by the markers that both have; None where they have none.
+        T_new_old (4, 4), by the markers that both have, which moves poses from the old map to the new: they don't
+        compare as they are. None where they have none.
         """
         T_new_old = jump(marker_map.markers, self.map.markers)
         self._begin(replace(marker_map, revision=max(self.map.revision, marker_map.revision) + 1))
         self.resets += 1
-        return None if T_new_old is None else MapJump(self.map.revision, self.resets, T_new_old)
+        return T_new_old
 
     def _begin(self, marker_map: MarkerMap) -> None:
         self._initial, self.map = marker_map.copy(), marker_map.copy()
@@ -105,7 +106,7 @@ class MarkerMapper:
         observed = Observations.of(markers)
         # Step 2: known and new markers.
         is_known = np.array([key in self.map.markers for key in observed.ids.tolist()], dtype=np.bool_)
-        known, new = Sight.of(observed.only(is_known), self.map), observed.only(~is_known)
+        known = Sight.of(observed if is_known.all() else observed.only(is_known), self.map)
         offset_std = self.config.time_offset_std
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
@@ -120,7 +121,7 @@ class MarkerMapper:
             outcome = locate(stamp_ns, sight, running_errors, camera, T_expected, self._errors)
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
-        return LocatedFrame(stamp_ns, camera, observed, known, new, predicted, outcome)
+        return LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome)
 
     @property
     def _errors(self) -> SystematicErrors:
@@ -128,36 +129,37 @@ class MarkerMapper:
 
     def learn(self, frame: LocatedFrame) -> MapperResult:
         """The second half: errors, standings and new markers, from the frame that was located last."""
-        if isinstance(frame.outcome, Refusal):
-            changed, waiting = self._without_pose(frame, frame.outcome)
-            return self._result(frame, changed, {}, waiting)
-        location, pose = frame.outcome, frame.outcome.pose
-        if frame.predicted is not None:
-            contradicted = contradicts(pose.T_map_camera, pose.covariance, frame.predicted.pose)
-            if contradicted and self._odometry_agreed:
-                # A marker that was moved, or that hangs in two places: what it teaches would spoil the map.
-                return self._result(frame, False, {}, dict.fromkeys(frame.new.ids.tolist(), CONTRADICTED))
-            self._odometry_agreed |= not contradicted
-        self._last = pose
-        # Step 7: errors updated.
-        residuals, changed = self._update_errors(frame, location)
-        # Step 8: new markers placed relative to the camera.
-        waiting = {}
-        if not self.frozen:
-            self._memory.keep(frame.observed, pose, frame.camera, frame.predicted)
-            placed, waiting = self._place_new(frame, location.viewpoint)
-            changed |= placed
-        return self._result(frame, changed, residuals, waiting)
+        outcome, waiting = frame.outcome, Waiting()
+        changed = updated = False
+        if isinstance(outcome, Refusal):
+            changed, waiting = self._without_pose(frame, outcome)
+        elif frame.contradicts_odometry and self._odometry_agreed:
+            # A marker that was moved, or that hangs in two places: what it teaches would spoil the map.
+            waiting = dict.fromkeys(frame.new.ids.tolist(), CONTRADICTED)
+        else:
+            self._odometry_agreed |= frame.predicted is not None and not frame.contradicts_odometry
+            self._last, updated = outcome.pose, True
+            # Step 7: errors updated.
+            changed = self._update_errors(frame, outcome)
+            # Step 8: new markers placed relative to the camera.
+            if not self.frozen:
+                self._memory.keep(frame.observed, outcome.pose, frame.camera, frame.predicted)
+                placed, waiting = self._place_new(frame, outcome.viewpoint)
+                changed |= placed
+        return MapperResult(
+            frame.stamp_ns, frame.pose, outcome.reason, changed, frozenset(frame.known.observed.ids.tolist()), waiting,
+            dict(self._trust.quarantined), not self.frozen and (changed or updated),
+        )  # fmt: skip
 
-    def _update_errors(self, frame: LocatedFrame, location: Location) -> tuple[dict[int, float], bool]:
-        """Re-projection error [px] by ID of each known marker, and whether any standing changed by them."""
+    def _update_errors(self, frame: LocatedFrame, location: Location) -> bool:
+        """Take in the re-projection errors of the known markers; whether any standing changed by them."""
         self._bias.add(location)
         known, (errors, explained) = frame.known.markers, frame.known_errors(location)
         changed = self._trust.update(self.map.markers, known, errors, explained)
         if not self.frozen:
             for marker, running in zip(known, self._trust.running_errors(known).tolist(), strict=True):
                 self.map.markers[marker.id] = self.map.markers[marker.id].seen(frame.stamp_ns, running)
-        return {marker.id: error for marker, error in zip(known, errors.tolist(), strict=True)}, changed
+        return changed
 
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, Waiting]:
         """Show new markers to their candidates; whether any entered the map, and what the others wait for."""
@@ -238,12 +240,3 @@ class MarkerMapper:
     def _take_in(self, marker: MapMarker) -> None:
         self._trust.forget([marker.id])
         self.map.markers[marker.id] = marker
-
-    def _result(
-        self, frame: LocatedFrame, changed: bool, residuals: dict[int, float], waiting: Waiting
-    ) -> MapperResult:
-        learned = not self.frozen and bool(changed or residuals)
-        return MapperResult(
-            frame.stamp_ns, frame.pose, frame.outcome.reason, changed, residuals, waiting, self.map.revision,
-            self.resets, dict(self._trust.quarantined), learned,
-        )  # fmt: skip

@@ -160,11 +160,15 @@ class CornerBias:
         self.px = SystematicErrors().corner_px
         self._weight = BIAS_PRIOR
         self._sum = BIAS_PRIOR * self.px**2
-        self._last: Location | None = None
+        #: the frame before, and (N,) in which its markers count
+        self._last: tuple[Location | None, FloatArray] = None, np.zeros(0)
 
     def add(self, location: Location) -> None:
         """Take in what the pose of a frame leaves of its corners."""
-        last, self._last = self._last, location
+        (last, before), noise = self._last, location.sight.noise_px
+        # A marker that is hardly seen, of more noise than most of its frame, says little.
+        shares = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2)
+        self._last = location, shares
         if last is None or not 0 < location.pose.stamp_ns - last.pose.stamp_ns < _SUCCESSIVE_NS:
             return
         places = {key: place for place, key in enumerate(last.pose.marker_ids)}
@@ -175,13 +179,8 @@ class CornerBias:
         # Moved markers last as well: none counts for more than what makes it inconsistent.
         products = (location.seen.residuals[now] * last.seen.residuals[then]).sum(axis=(1, 2)) / 8.0
         products = np.clip(products, -(INCONSISTENT_PX**2), INCONSISTENT_PX**2)
-        shares = _shares(location.sight.noise_px[now]) * _shares(last.sight.noise_px[then])
+        shares = shares[now] * before[then]
         visible = visible_share(location.seen.J_camera.reshape(-1, 2, 6), location.correlations)
         self._weight = BIAS_MEMORY * self._weight + visible * float(shares.sum()) / len(now)
         self._sum = BIAS_MEMORY * self._sum + float(shares @ products) / len(now)
         self.px = math.sqrt(max(self._sum / self._weight, 0.0))
-
-
-def _shares(noise: FloatArray) -> FloatArray:
-    """(N,) in which corners with ``noise`` (N,) [px] count: a marker that is hardly seen says little."""
-    return np.asarray(np.minimum(1.0, (median(noise.tolist()) / noise) ** 2))
