@@ -170,10 +170,6 @@ def _as_seen(_: Any, seen: Any, covariance: Any) -> Any:
     return _place('corners.squares:Squared')(seen, covariance, none, none, none)
 
 
-def _no_covariance(lag_blur_px: Any) -> Any:
-    return np.zeros((len(lag_blur_px), 4, 2, 2))
-
-
 _READOUT = tuple(f'frame:{name}' for name in ('delays', 'stretch', 'displacement', 'rolling_displacement'))
 _SCALES = _place('search:SearchScales')
 _ALL_IN_THE_SEARCH = {'finding:_next_scales': lambda *_, **__: _SCALES.ALL}
@@ -195,7 +191,7 @@ MECHANISMS = {
     'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'refining:_OF_CLEAR': (6, np.inf)}),
     'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(
-        'fast, 8 K, blind', ('corner_errors:wrong_lag',), {'refining:wrong_lag': _no_covariance}
+        'fast, 8 K, blind', (), {'corner_errors:OF_LAG': 0.0, 'corner_errors:OF_LAG_FORM': 0.0}
     ),
     'partially visible markers': Mechanism(
         'landing', ('partial', 'visible_cells', 'corners.grid'), {'detector:_ENOUGH_WHOLE': 0}

@@ -52,7 +52,7 @@ def test_expected_markers_are_those_in_view():
     frame = frames(8.0, 1)[0]
     expected = KnownMarkers(MAP, np.ones(50)).expected(se3.inverse(frame.T_map_camera), CAMERA, 12.0)
     assert set(frame.corners_px) >= set(expected.ids.tolist())
-    for marker_id, corners in zip(expected.ids.tolist(), expected.places(CAMERA).at.px, strict=True):
+    for marker_id, corners in zip(expected.ids.tolist(), CAMERA.distort(expected.x), strict=True):
         np.testing.assert_allclose(corners, frame.corners_px[marker_id], atol=1e-6)
     assert np.all(expected.depth > 1.0)
     assert len(KnownMarkers({}, np.ones(50)).expected(np.eye(4), CAMERA, 12.0).ids) == 0

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.corner_errors import unknown_motion, wrong_lag
+from thermal_fiducial.core.detection.corner_errors import of_motion_blur, unknown_motion
 from thermal_fiducial.core.detection.frame import (
     counts_of,
     lag_tail_maps,
@@ -90,6 +90,11 @@ def test_each_marker_is_freed_of_its_own_lag_tails():
 
 
 SQUARE = 60.0 * np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
+
+
+def wrong_lag(lag_blur_px):
+    """What is wrong with the lag, of a twist that is known."""
+    return of_motion_blur(np.ones((1, 4, 2, 6)), np.eye(6), lag_blur_px)
 
 
 def test_a_wrong_lag_leaves_the_common_shift_out():

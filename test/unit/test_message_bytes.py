@@ -53,6 +53,14 @@ def test_what_is_not_finite_is_refused(name):
         message_bytes.odometry([serialize_message(odometry(state(**{name: broken})))])
 
 
+@pytest.mark.parametrize(('name', 'speed'), [('velocity_body', 19.0), ('angular_velocity_body', 29.0)])
+def test_what_is_faster_than_any_camera_that_sees_markers_is_refused(name, speed):
+    possible, impossible = (state(**{name: np.array([0.0, -factor * speed, 0.0])}) for factor in (1.0, 1.1))
+    assert len(message_bytes.odometry([serialize_message(odometry(possible))])) == 1
+    with pytest.raises(InputError, match='beyond all bounds'):
+        message_bytes.odometry([serialize_message(odometry(impossible))])
+
+
 def test_what_is_no_quaternion_is_refused():
     message = odometry(state())
     message.pose.pose.orientation.w += 0.7

@@ -1,16 +1,13 @@
 """Motion of the camera from frame to frame."""
 
-from dataclasses import replace
-
 import numpy as np
-import pytest
 
 from thermal_fiducial.core.detection.frame import (
     LAG_TAIL_AGE,
 )
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.tracking import MotionTrack
-from thermal_fiducial.core.detection.twist import interaction, plausible, transfer_from_body, transferred, Twist
+from thermal_fiducial.core.detection.twist import interaction, transfer_from_body, transferred, Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import Odometry
@@ -170,13 +167,6 @@ def test_a_late_frame_disturbs_nothing_and_a_clock_set_back_is_followed():
     assert tracker.predict(now + 33_000_000, []) is not None
     tracker = tracker.after(now - 10**9, twist, seen)
     np.testing.assert_array_equal(tracker.expected(now - 10**9 + 33_000_000, twist).x, ahead.x)
-
-
-@pytest.mark.parametrize(('velocity', 'turn'), [(1e3, 0.0), (0.0, 1e3), (np.nan, 0.0)])
-def test_implausible_odometry_is_known(velocity, turn):
-    odometry = Odometry(0, np.eye(4), np.array([velocity, 0, 0]), np.array([0, turn, 0]), np.eye(6), np.eye(6))
-    assert not plausible(odometry)
-    assert plausible(replace(odometry, velocity_body=np.zeros(3), angular_velocity_body=np.zeros(3)))
 
 
 def test_motion_that_shows_no_markers_is_forgotten():

@@ -39,18 +39,26 @@ BLUR_THAT_SHOWS, BLURRED_OUT = 20.0, 0.055
 READABLE_CELLS = 0.4
 
 
-def wrong_lag(lag_blur_px: FloatArray) -> FloatArray:
-    """Covariances (N, 4, 2, 2) [px^2] of what is wrong with an exponential lag of this time constant.
+def of_motion_blur(by_twist: FloatArray, twist_covariance: FloatArray, lag_blur_px: FloatArray) -> FloatArray:
+    """Covariances (N, 4, 2, 2) [px^2] of corners that are freed of their motion blur.
 
-    A wrong time constant displaces the corners along their motion blur (N, 4, 2). What they have in common no
-    marker shows, and covariances of single corners cannot say; it is a delay, and belongs to the filter's time
-    offset. The differences change the marker's shape. So does a response of another form.
+    A wrong twist displaces them, and a wrong time constant along their blur. What they have in common no marker shows,
+    and covariances of single corners cannot say; of the time constant it is a delay, and belongs to the filter's time
+    offset. The differences change the marker's shape. So does a response that is not exponential.
+
+    Parameters
+    ----------
+    by_twist : (N, 4, 2, 6) derivative of the blur by the twist [px]
+    twist_covariance : (6, 6)
+    lag_blur_px : (N, 4, 2)
     """
+    of_shape = by_twist - by_twist.mean(axis=1, keepdims=True)
+    unknown = of_shape @ twist_covariance @ of_shape.swapaxes(-1, -2)
     common = lag_blur_px.mean(axis=1, keepdims=True)
     change = OF_LAG * (lag_blur_px - common)
     along = common[..., :, None] * common[..., None, :]
     form = 0.5 * OF_LAG_FORM**2 * (along + (common * common).sum(axis=-1)[..., None, None] * np.eye(2))
-    return np.asarray(change[..., :, None] * change[..., None, :] + form)
+    return np.asarray(unknown + change[..., :, None] * change[..., None, :] + form)
 
 
 def unknown_motion(

@@ -1,7 +1,6 @@
 """Markers of a frame: predicted, found, refined, confirmed, both poses of each."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -15,7 +14,7 @@ from thermal_fiducial.core.detection.known_markers import among, depths, Expecte
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
 from thermal_fiducial.core.detection.refining import refine, RefinedCorners, RefinedMarkers
-from thermal_fiducial.core.detection.tracking import FramePrediction, MotionTrack, predict_frame
+from thermal_fiducial.core.detection.tracking import MotionTrack, predict_frame
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import choose_branches, planar_poses, PlanarPoses, solve_marker_poses
@@ -30,17 +29,6 @@ _NUMBER = np.dtype('<f4')
 _CLEARER_THAN_COLUMNS = 100.0
 # So many known markers wholly in view give the pose so well that partially visible ones are not worth a look.
 _ENOUGH_WHOLE = 2
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """OpenCV on one thread inside: at this image size threads cost more than they give."""
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(threads)
 
 
 class MarkerDetector:
@@ -94,23 +82,23 @@ class MarkerDetector:
         prior : the filter's latest states and the offset of its clock, where there are any
         """
         config, known, history = self.config, self._known, self._history
-        with one_thread():
-            prediction = predict_frame(stamp_ns, prior, history.track, config.max_odometry_age)
-            keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
-            frame = Frame.of(stamp_ns, counts, camera, prediction.twist, config, keep_columns=keep_columns)
-            expected = None
-            if prediction.T_camera_map is not None and len(known.ids) and config.guided:
-                expected = known.expected(prediction.T_camera_map, camera, config.min_side_px)
-            findings = self._finder.find(frame, history, known, expected, config)
-            found = findings.found
-            refined = refine(frame, found, self._behind[found.ids], history.track, config)
-            refined = self._estimator.published(frame, found, refined, config)
-            ids, corners = refined.ids, refined.corners
-            at = refined.places.at.at_pixels(corners.corners_px)
-            poses = self._poses(ids, corners, at, prediction.T_camera_map)
-            rows = marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)
-            if expected is not None:
-                rows = self._with_partial(rows, frame, prediction)
+        prediction = predict_frame(stamp_ns, prior, history.track, config.max_odometry_age)
+        T_camera_map = prediction.T_camera_map
+        keep_columns = history.track.all_clearer_than(_CLEARER_THAN_COLUMNS)
+        frame = Frame.of(stamp_ns, counts, camera, prediction.twist, config, keep_columns=keep_columns)
+        expected = None
+        if T_camera_map is not None and len(known.ids) and config.guided:
+            expected = known.expected(T_camera_map, camera, config.min_side_px)
+        findings = self._finder.find(frame, history, known, expected, config)
+        found = findings.found
+        refined = refine(frame, found, self._behind[found.ids], history.track, config)
+        refined = self._estimator.published(frame, found, refined, config)
+        ids, corners = refined.ids, refined.corners
+        at = refined.places.at.at_pixels(corners.corners_px)
+        poses = self._poses(ids, corners, at, T_camera_map)
+        rows = marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)
+        if T_camera_map is not None and expected is not None and among(ids, known.ids).sum() < _ENOUGH_WHOLE:
+            rows = self._with_partial(rows, frame, T_camera_map, prediction.position_std_m)
         self._history = self._after(frame, findings, refined, poses, saw_partial=len(rows) > len(ids))
         return rows
 
@@ -122,14 +110,12 @@ class MarkerDetector:
         poses = planar_poses(at, corners.covariances, sizes)
         return choose_branches(poses, at, corners.covariances, sizes, self._known.T_map_marker[ids], T_camera_map)
 
-    def _with_partial(self, rows: Markers, frame: Frame, prediction: FramePrediction) -> Markers:
-        """The rows of whole markers; where few of them are known, those of known ones partially visible as well."""
-        seen, T_camera_map = rows['id'].astype(np.int64), prediction.T_camera_map
-        if T_camera_map is None or among(seen, self._known.ids).sum() >= _ENOUGH_WHOLE:
-            return rows
+    def _with_partial(self, rows: Markers, frame: Frame, T_camera_map: FloatArray, position_std_m: float) -> Markers:
+        """The rows of whole markers, and those of known ones that are partially visible."""
+        seen = rows['id'].astype(np.int64)
         candidates = self._known.partially_visible(T_camera_map, frame.camera, seen)
         allowed = self._finder.allowed(self._known, self.config)
-        ids, corners = self._partial.look(frame, candidates, prediction.position_std_m, allowed, self.config)
+        ids, corners = self._partial.look(frame, candidates, position_std_m, allowed, self.config)
         if len(ids) == 0:
             return rows
         poses = self._poses(ids, corners, ImagePoints.at(corners.corners_px, frame.camera), T_camera_map)

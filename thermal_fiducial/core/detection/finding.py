@@ -104,8 +104,9 @@ class MarkerFinder:
         config: ArucoDetectorConfig,
     ) -> Findings:
         """Markers to a pixel or two, at the frame's stamp; ``in_map``: where those of the map should be, if known."""
-        found, complete, holds = FoundMarkers.none(), False, False
-        if frame.twist is not None and config.guided:
+        if frame.twist is None or not config.guided:
+            found, complete, holds = FoundMarkers.none(), False, False
+        else:
             found, number = self._guided(frame, frame.twist, history, known, in_map, config)
             complete = len(found.ids) >= number and (number > 0 or history.saw_partial)
             enough = complete or (number > 0 and len(found.ids) >= _ENOUGH * number)
@@ -129,7 +130,7 @@ class MarkerFinder:
     ) -> tuple[FoundMarkers, int]:
         """Markers where they should be, the last frame's and others of the map, and how many there should be."""
         last = history.track.expected(frame.stamp_ns, twist)
-        places = last.places(frame.camera)
+        places = Places.of(ImagePoints.seen_at(last.x, frame.camera), last.depth)
         wanted: BoolArray = np.asarray(frame.camera.contains(places.at.px, CUT_OFF_PX).all(axis=1))
         if in_map is None:
             expected = last.only(wanted)
@@ -221,7 +222,7 @@ def near_prediction(
     config: ArucoDetectorConfig,
 ) -> FoundMarkers:
     """Those of the ``expected`` markers that the frame shows near where they are expected."""
-    places = expected.places(frame.camera)
+    places = Places.of(ImagePoints.seen_at(expected.x, frame.camera), expected.depth)
     displaced = places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
     ids = expected.ids
     shown = _shifted(frame.image, ids, places.at.px + displaced, decoder)

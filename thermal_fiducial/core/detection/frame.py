@@ -108,14 +108,6 @@ class Places(Stacked):
         """Mean displacement (N, 4, 2) [px] by a lag [s]."""
         return np.asarray(-lag * (self.flow @ twist.ago(lag)))
 
-    def unknown(self, twist: Twist, lag: float) -> FloatArray:
-        """Covariances (N, 4, 2, 2) [px^2] of the motion blur by what is unknown of the twist.
-
-        What the corners of a marker have in common is no error of its shape.
-        """
-        by_twist = lag * (self.flow - self.flow.mean(axis=1, keepdims=True))
-        return np.asarray(by_twist @ twist.covariance_ago(lag) @ by_twist.swapaxes(-1, -2))
-
 
 def delays(rows: FloatArray, frame: Frame) -> FloatArray:
     """How long after the stamp ``rows`` (...) are seen [s]."""
@@ -126,12 +118,6 @@ def stretch(places: Places, twist: Twist, frame: Frame) -> FloatArray:
     """How much longer (N, 4) ways in the image are for what runs with the read-out, or shorter against it."""
     velocity = places.flow @ twist.value
     return np.asarray(1.0 / (1.0 - frame.readout / (frame.camera.height - 1) * velocity[..., 1]))
-
-
-def lag_tail(places: Places, twist: Twist, frame: Frame) -> FloatArray:
-    """Displacement (N, 4, 2) [px] in so long a time as the lag, as it places the image's lag tail."""
-    still: FloatArray = np.asarray(-frame.lag * (places.flow @ twist.ago(LAG_TAIL_AGE * frame.lag)))
-    return still * stretch(places, twist, frame)[..., None] if frame.readout > 0.0 else still
 
 
 def displacement(places: Places, twist: Twist, frame: Frame, seconds: FloatArray) -> FloatArray:

@@ -58,10 +58,6 @@ class ExpectedMarkers(Stacked):
         """No markers."""
         return ExpectedMarkers(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), np.zeros((0, 4)), np.zeros(0))
 
-    def places(self, camera: Camera) -> Places:
-        """Their places in the image of a camera."""
-        return Places.of(ImagePoints.seen_at(self.x, camera), self.depth)
-
 
 @dataclass(frozen=True, slots=True)
 class FoundMarkers(Stacked):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corner_errors import OF_BENT_SCALE_PX, OF_SIDES_PX, wrong_lag
+from thermal_fiducial.core.detection.corner_errors import OF_BENT_SCALE_PX, of_motion_blur, OF_SIDES_PX
 from thermal_fiducial.core.detection.corners.grid import (
     adjusted,
     grid_edges,
@@ -243,8 +243,8 @@ def _pose_covariance(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> Floa
     blocks = np.broadcast_to((OF_BENT_SCALE_PX if frame.displayed else OF_SIDES_PX) ** 2 * np.eye(2), (4, 2, 2))
     if frame.twist is not None:
         places = places_of_points(se3.apply(T, window), frame.camera)
-        unknown = places.unknown(frame.twist, frame.lag)
-        blocks = blocks + unknown[0] + wrong_lag(places.lag_blur(frame.twist, frame.lag))[0]
+        lag_blur, twist_covariance = places.lag_blur(frame.twist, frame.lag), frame.twist.covariance_ago(frame.lag)
+        blocks = blocks + of_motion_blur(frame.lag * places.flow, twist_covariance, lag_blur)[0]
     gain = np.linalg.pinv(J).reshape(6, 4, 2)
     systematic = np.einsum('ick,ckl,jcl->ij', gain, blocks, gain)
     return np.asarray(np.linalg.inv(fit.information) + systematic)

@@ -15,19 +15,20 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corner_errors import unknown_motion, wrong_lag
+from thermal_fiducial.core.detection.corner_errors import of_motion_blur, unknown_motion
 from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED
 from thermal_fiducial.core.detection.corners.sides import blurs, model, sides_of
 from thermal_fiducial.core.detection.frame import (
     counts_of,
     delays,
     Frame,
-    lag_tail,
+    LAG_TAIL_AGE,
     lag_tail_maps,
     Places,
     REMAINING,
     rolling_displacement,
     SPREAD,
+    stretch,
 )
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.tracking import MotionTrack
@@ -170,7 +171,7 @@ def _at_stamp(
     lag_blur = places.lag_blur(twist, frame.lag)
     rolling = rolling_displacement(places, twist, frame, (seen.corners_px + blur.removed)[..., 1])
     px = seen.corners_px - lag_blur + blur.removed - rolling
-    unknown = places.unknown(twist, frame.lag) + wrong_lag(lag_blur)
+    unknown = of_motion_blur(frame.lag * places.flow, twist.covariance_ago(frame.lag), lag_blur)
     if frame.twist is None:
         unknown = unknown + _never_seen(frame, places, seen, twist, cells)
     corners = replace(seen, corners_px=px, covariances=doubted + unknown)
@@ -191,7 +192,10 @@ def _motion_blur(frame: Frame, places: Places, twist: Twist | None, hardly_px: f
     mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
     if twist is None or (mean * mean).sum(axis=1).max() <= hardly_px**2:
         return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean)
-    tail = lag_tail(places, twist, frame)
+    # So far the velocity has carried the image since its lag tail was seen, as the read-out shows it.
+    tail = -frame.lag * (places.flow @ twist.ago(LAG_TAIL_AGE * frame.lag))
+    if frame.readout > 0.0:
+        tail = tail * stretch(places, twist, frame)[..., None]
     removed = (1.0 - REMAINING) * tail
     shift = lag_blur - removed + rolling
     return MotionBlur(lag_tail_maps(places.at.px + shift, tail), shift, removed, SPREAD * mean)

@@ -18,7 +18,6 @@ from thermal_fiducial.core.detection.twist import (
     growth,
     interaction,
     line_through,
-    plausible,
     RANDOM,
     transfer_from_body,
     transferred,
@@ -197,7 +196,6 @@ def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, 
     states = prior.between(odometry_ns - _LAGS_BEFORE * lag_ns, odometry_ns + lag_ns, _STATES)
     if not states and (other := prior.nearest(odometry_ns)) is not None:
         states = [other]
-    states = [state for state in states if plausible(state)]
     twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)
     nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
     dt = math.inf if nearest is None else (odometry_ns - nearest.stamp_ns) / SECOND_NS

@@ -26,8 +26,6 @@ _UNSURE = np.diag([0.3, 0.3, 0.3, 0.0, 0.0, 0.0]) ** 2
 # Covariance of a twist that is said to be without error [m^2/s^2, rad^2/s^2].
 _LEAST = 1e-6 * np.eye(6)
 _EYE = np.eye(6)
-# No camera that sees markers moves faster: such odometry shows nothing [m/s, rad/s].
-_FASTEST, _FASTEST_TURN = 20.0, 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,13 +150,3 @@ def corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later
     mean, P = change[:, 12], P - change[:, :12]
     # What rounding makes of a covariance would add up over the frames.
     return Twist(twist.value + mean[:6], 0.5 * (P + P.T), twist.acceleration + mean[6:])
-
-
-def plausible(odometry: Odometry) -> bool:
-    """Whether a camera that sees markers may move so: anything else shows nothing."""
-    v, w = odometry.velocity_body, odometry.angular_velocity_body
-    if not (v @ v <= _FASTEST**2 and w @ w <= _FASTEST_TURN**2):
-        return False
-    # A sum of squares is finite when all numbers are.
-    T, P = odometry.T_map_body, odometry.twist_covariance
-    return math.isfinite(np.vdot(T, T) + np.vdot(P, P))

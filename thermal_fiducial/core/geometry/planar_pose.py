@@ -84,13 +84,13 @@ def solve_marker_poses(
 def planar_poses(corners: ImagePoints, corner_covs: FloatArray, sizes: FloatArray) -> PlanarPoses:
     """:func:`solve_marker_poses` of corners (N, 4) that are known in both coordinates."""
     twice = np.repeat(np.arange(len(sizes)), 2)
-    seen, points = corners.only(twice), marker_corners(sizes[twice])
-    images = Images.of(seen, whitening(corner_covs)[twice])
+    once, points = Images.of(corners, whitening(corner_covs)), marker_corners(sizes[twice])
+    images = Images(once.whitening[twice], once.target[twice])
     starts = ippe_square(corners.x, sizes).reshape(-1, 4, 4)
     T, cost, information = minimise(starts, lambda T: evaluate(T, points, images), alternatives=2)
     p = se3.apply(T, points)
-    residuals = (seen.x - p[..., :2] / p[..., 2:])[..., None]
-    chi2, squared_px = (((W @ residuals) ** 2).sum(axis=(1, 2, 3)) for W in (images.whitening, seen.J))
+    residuals = (corners.x[twice] - p[..., :2] / p[..., 2:])[..., None]
+    chi2, squared_px = (((W @ residuals) ** 2).sum(axis=(1, 2, 3)) for W in (images.whitening, corners.J[twice]))
     facing = (T[:, :3, 2] * T[:, :3, 3]).sum(axis=-1) < 0.0
     found = np.isfinite(cost) & np.isfinite(chi2) & facing
     chi2, rms = (np.where(found, value, np.inf).reshape(-1, 2) for value in (chi2, np.sqrt(squared_px / 4.0)))
