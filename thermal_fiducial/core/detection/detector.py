@@ -22,12 +22,12 @@ from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 
-# All fields have four bytes: a row is a row of a table of numbers as well.
+# All fields have four bytes, so that rows can be viewed as a table of numbers.
 _COLUMN = {name: column for column, name in enumerate(MARKER_DTYPE.names or ())}
 _NUMBER = np.dtype('<f4')
-# Contrast over noise beyond which the column pattern of the array displaces no side.
+# Contrast-to-noise ratio beyond which the array's column pattern does not displace sides.
 _CLEARER_THAN_COLUMNS = 100.0
-# So many known markers wholly in view give the pose so well that partially visible ones are not worth a look.
+# Known markers wholly in view from which on partially visible ones would not improve the pose.
 _ENOUGH_WHOLE = 2
 
 
@@ -54,7 +54,7 @@ class MarkerDetector:
         self._mount(config)
 
     def configure(self, config: ArucoDetectorConfig) -> None:
-        """Take over the dynamic parameters of ``config``, and where the camera is on the robot."""
+        """Take over the dynamic parameters of ``config``, and the pose of the camera on the robot."""
         before, self.config = self.config, config
         if (config.camera_position, config.camera_orientation) != (before.camera_position, before.camera_orientation):
             self._mount(config)
@@ -64,11 +64,11 @@ class MarkerDetector:
         self._history = FrameHistory(MotionTrack.of_rig(T_body_camera, config.bolometer_lag))
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:
-        """Markers that are known: ID to (T_map_marker, side [m])."""
+        """Set the known markers: ID to (T_map_marker, side [m])."""
         self._known = KnownMarkers(marker_map, self._sizes)
 
     def size(self, marker_id: int) -> float:
-        """Side of a marker [m]: of the map, or of the overrides, or the common one."""
+        """Side of a marker [m]: from the map, else from the overrides, else the common one."""
         return float(self._known.sizes[marker_id])
 
     def detect(self, stamp_ns: int, counts: Counts | Gray, camera: Camera, prior: MotionPrior | None = None) -> Markers:
@@ -79,7 +79,7 @@ class MarkerDetector:
         stamp_ns : of the frame
         counts : (height, width), clean
         camera : its intrinsics
-        prior : the filter's latest states and the offset of its clock, where there are any
+        prior : the filter's latest odometry and clock offset, if available
         """
         config, known, history = self.config, self._known, self._history
         prediction = predict_frame(stamp_ns, prior, history.track, config.max_odometry_age)
@@ -105,7 +105,7 @@ class MarkerDetector:
     def _poses(
         self, ids: IntArray, corners: RefinedCorners, at: ImagePoints, T_camera_map: FloatArray | None
     ) -> PlanarPoses:
-        """Both poses of each marker, the likelier first."""
+        """Both planar poses of each marker, the likelier first."""
         sizes = self._known.sizes[ids]
         poses = planar_poses(at, corners.covariances, sizes)
         return choose_branches(poses, at, corners.covariances, sizes, self._known.T_map_marker[ids], T_camera_map)
@@ -126,9 +126,9 @@ class MarkerDetector:
     def _after(
         self, frame: Frame, findings: Findings, refined: RefinedMarkers, poses: PlanarPoses, *, saw_partial: bool
     ) -> FrameHistory:
-        """What the next frame starts from."""
+        """The history that the next frame starts from."""
         ids, history, contrast = refined.ids, self._history, refined.corners.contrast
-        # Motion that came from what turned out to be no markers is none.
+        # A twist by corners of which none was confirmed as a marker's is dropped.
         twist = refined.twist if len(ids) else frame.twist
         depth = depths(poses.T_camera_marker[:, 0], self._known.sizes[ids])
         markers = ExpectedMarkers(ids, refined.places.at.x, depth, contrast / frame.noise)

@@ -1,7 +1,7 @@
-"""Markers of a frame: followed, known ones near their predicted places, and blindly when that is due.
+"""Finds the markers of a frame: those of the last frame, known ones near their predictions, and by blind search if due.
 
-A marker that is looked for at its place is accepted by its own evidence alone: its pattern, in its expected place and
-attitude, must correlate with the image clearly, and better than any other marker's or any other turn of its own.
+A marker at its prediction is accepted if its pattern, in the predicted attitude, correlates with the image clearly, and
+better than the pattern of any other marker and than any other rotation of its own.
 """
 
 from dataclasses import dataclass, field
@@ -29,32 +29,32 @@ from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# A frame's markers are remembered for about so many frames, and make sure of the kind when so many more are of it.
+# Polarity: memory in frames, and the surplus of markers of one polarity from which on it is certain.
 _FRAMES, _SURE = 30, 6.0
-# Share of the map's expected markers that, when observed, shows that the prediction holds.
+# Share of the predicted map markers that must be found for the prediction to count as right.
 _ENOUGH = 0.5
-# Where there is no map, or its prediction does not hold, a blind search follows at least every so many frames.
+# Longest interval of blind searches [frames] without a map or with a wrong prediction.
 _UNSURE = 2
-# Correlation with its pattern of a marker that is still where motion has carried it, seen through the lag.
+# Least correlation with its pattern of a followed marker, in an image that lag blurs.
 _STILL_SIMILAR = 0.7
 
 
 @dataclass(frozen=True, slots=True)
 class Polarity:
-    """The kind of the markers that were seen last: how many more were dark than bright, the older the less."""
+    """Polarity of the latest markers: surplus of dark over bright ones, with exponential forgetting."""
 
     balance: float = 0.0
 
     def after(self, contrast: FloatArray) -> 'Polarity':
-        """With the markers (N,) of one more frame, by white minus black."""
+        """The polarity after one more frame with markers of signed ``contrast`` (N,), white minus black."""
         return Polarity(self.balance + float(np.sign(contrast).sum()) - self.balance / _FRAMES)
 
     def kinds(self, rule: str) -> tuple[float, ...]:
-        """Which kinds there may be by the parameter ``polarity``: 1 for markers darker than what is behind, -1."""
+        """Possible polarities by the parameter ``polarity``: 1 for markers darker than their background, -1."""
         return tuple(kind for kind in (1.0, -1.0) if self.possible(np.array([kind]), rule)[0])
 
     def possible(self, contrast: FloatArray, rule: str) -> BoolArray:
-        """Which markers (N,) may be some, by the parameter ``polarity``."""
+        """Which markers (N,) have a possible polarity by the parameter ``polarity``."""
         if rule == 'any' or (rule == 'alike' and abs(self.balance) < _SURE):
             return np.ones(len(contrast), dtype=bool)
         kind = self.balance if rule == 'alike' else 1.0 if rule == 'dark' else -1.0
@@ -63,22 +63,22 @@ class Polarity:
 
 @dataclass(frozen=True, slots=True)
 class FrameHistory:
-    """What the frames so far have shown."""
+    """What a frame needs from the frames before it."""
 
     track: MotionTrack
     polarity: Polarity = field(default_factory=Polarity)
     #: whether the last frame showed markers that are partially visible
     saw_partial: bool = False
-    #: frames since the last blind search, and at which resolutions that was
+    #: frames since the last blind search, and the resolutions that it used
     since_blind: int = 0
     scales: SearchScales = SearchScales.ALL
 
 
 class Findings(NamedTuple):
-    """What is found in a frame."""
+    """Markers found in a frame, and the state of the blind search after it."""
 
     found: FoundMarkers
-    #: of :class:`FrameHistory`
+    #: as in :class:`FrameHistory`
     since_blind: int
     scales: SearchScales
 
@@ -103,7 +103,7 @@ class MarkerFinder:
         in_map: ExpectedMarkers | None,
         config: ArucoDetectorConfig,
     ) -> Findings:
-        """Markers to a pixel or two, at the frame's stamp; ``in_map``: where those of the map should be, if known."""
+        """Markers at the frame's stamp, accurate to a pixel or two; ``in_map``: predictions of the map's markers."""
         if frame.twist is None or not config.guided:
             found, complete, holds = FoundMarkers.none(), False, False
         else:
@@ -128,7 +128,7 @@ class MarkerFinder:
         in_map: ExpectedMarkers | None,
         config: ArucoDetectorConfig,
     ) -> tuple[FoundMarkers, int]:
-        """Markers where they should be, the last frame's and others of the map, and how many there should be."""
+        """Markers found at their predictions, from the last frame and from the map; number of predictions."""
         last = history.track.expected(frame.stamp_ns, twist)
         places = Places.of(ImagePoints.seen_at(last.x, frame.camera), last.depth)
         wanted: BoolArray = np.asarray(frame.camera.contains(places.at.px, CUT_OFF_PX).all(axis=1))
@@ -156,7 +156,7 @@ class MarkerFinder:
         in_map: ExpectedMarkers | None,
         config: ArucoDetectorConfig,
     ) -> FoundMarkers:
-        """Markers wherever they are, but for those that are ``found`` already."""
+        """Markers by blind search, except those already ``found``."""
         kinds, allowed = history.polarity.kinds(config.polarity), self.allowed(known, config)
         blind = self._search.search(frame, allowed, config, found, scales, kinds)
         possible = history.polarity.possible(blind.cnr, config.polarity)
@@ -166,12 +166,12 @@ class MarkerFinder:
         at, sizes = ImagePoints.at(corners, frame.camera), known.sizes[ids]
         depth = depths(ippe_square(at.x, sizes)[:, 0], sizes)
         if in_map is not None:
-            # Alone, one may be tilted wrongly: seen obliquely and approached, it would be blurred across, not along.
+            # A single marker's planar pose may be the wrong one, and with it depth and direction of the motion blur.
             mapped, mine = pairs(in_map.ids, ids)
             depth[mine] = in_map.depth[mapped]
         places = Places.of(at, depth)
         if frame.readout > 0.0:
-            # Where they would be if all rows were seen at once.
+            # Places at the stamp, without the displacement by the rolling shutter.
             rolling = rolling_displacement(places, frame.twist, frame, corners[..., 1])
             places = Places.of(ImagePoints.at(corners - rolling, frame.camera), depth)
         no = np.zeros(len(ids), dtype=bool)
@@ -186,7 +186,7 @@ class MarkerFinder:
 
 
 def _next_scales(history: FrameHistory, *, complete: bool) -> SearchScales:
-    """Both resolutions; where all that is expected is seen, so clearly that either shows it, only one, in turn."""
+    """Both resolutions; one in turn where all predicted markers were found with high contrast."""
     if not (complete and history.track.all_clearer_than(CLEAR_CNR)):
         return SearchScales.ALL
     return SearchScales.FAINT if history.scales == SearchScales.FINE else SearchScales.FINE
@@ -200,7 +200,7 @@ def followed(
     decoder: Decoder,
     config: ArucoDetectorConfig,
 ) -> FoundMarkers:
-    """Those of the ``last`` frame's N markers, at ``places`` by now, that look like themselves there, lag and all."""
+    """Those of the ``last`` frame's N markers whose pattern the image shows at the predicted ``places``."""
     if len(last.ids) == 0:
         return FoundMarkers.none()
     shown = places.at.px + places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
@@ -221,7 +221,7 @@ def near_prediction(
     decoder: Decoder,
     config: ArucoDetectorConfig,
 ) -> FoundMarkers:
-    """Those of the ``expected`` markers that the frame shows near where they are expected."""
+    """Those of the ``expected`` markers that are decoded near their predictions."""
     places = Places.of(ImagePoints.seen_at(expected.x, frame.camera), expected.depth)
     displaced = places.lag_blur(twist, frame.lag) + rolling_displacement(places, twist, frame)
     ids = expected.ids
@@ -235,7 +235,7 @@ def near_prediction(
 
 
 def _shifted(image: Float32Array, ids: IntArray, corners: FloatArray, decoder: Decoder) -> FloatArray:
-    """Corners (N, 4, 2) moved to where their patterns correlate best, between the places by the centre of gravity."""
+    """Corners (N, 4, 2) moved to the best correlation with their patterns on a grid, interpolated by its centroid."""
     cell = np.linalg.norm(corners[:, 2] - corners[:, 0], axis=-1) / (np.sqrt(2.0) * decoder.cells)
     step = cell[:, None, None] * NEAR_CELLS
     tried = (corners[:, None] + step[:, :, None]).reshape(-1, 4, 2)

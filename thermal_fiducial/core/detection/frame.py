@@ -1,19 +1,19 @@
-"""A frame, and how what is seen in it moves: what is known before anything is found.
+"""A frame with its noise, and the model of displacement and blur by rolling shutter and bolometer lag.
 
-The rows of a bolometer array are sampled one after the other. The stamp is that of the middle row; row v is seen d
-later, and what moves is carried on as far by then. Under constant motion that is an affine map of the image: straight
-sides stay straight, and shifts of the corners say it all.
+Rolling shutter: the rows of a bolometer array are sampled one after the other. The stamp is that of the middle row; row
+v is sampled d later, and moving points are displaced by then. Under constant motion that is an affine map of the image:
+straight sides stay straight, and displacements of the corners describe it.
 
-A bolometer answers the scene x with y, ``tau dy/dt + y = x``. While the image moves with velocity w, the pattern y is
-carried along, ``dy/dt = -w . grad y``, so the scene at the very stamp would be ``x = y - tau w . grad y``. Corners must
-not depend so much on the response being exactly exponential (renderers integrate the lag in a few steps, and a
-derivative makes a ghost of every step). Only what is older than a time m is taken out: with ``b = exp(-m / tau)`` that
-leaves ``(y(t) - b y(t - m)) / (1 - b)``, where the older image is the present one, shifted. It is blurred along the
-motion by little, which the model of an edge knows, and late by a known mean delay.
+Lag: a bolometer responds to the scene x with y, ``tau dy/dt + y = x``. While the image moves with velocity w, the
+pattern y moves along, ``dy/dt = -w . grad y``, so the scene at the stamp would be ``x = y - tau w . grad y``. Corners
+must not depend that much on an exactly exponential response (renderers integrate the lag in a few steps, and a
+derivative makes a ghost of every step). Only the response older than a time m, the lag tail, is removed: with
+``b = exp(-m / tau)``, ``(y(t) - b y(t - m)) / (1 - b)``, where the older image is the present one, shifted. A little
+motion blur remains, which the edge model contains, and a known mean delay.
 
-While the velocity w changes by a, every age has one of its own: what was seen s ago lies s w - s^2 a / 2 behind. So the
-mean delay of an exponential, -tau w + tau^2 a, is that of the velocity one time constant ago, and the lag tail
-is as far from the image as the velocity of tau + m / 2 ago has carried it.
+With an acceleration a, the image of s ago lies s w - s^2 a / 2 behind. The mean delay of an exponential,
+-tau w + tau^2 a, is therefore that of the velocity one time constant ago, and the lag tail is displaced by the velocity
+of tau + m / 2 ago.
 """
 
 from dataclasses import dataclass
@@ -29,33 +29,33 @@ from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray, Stacked
 
-#: Depth of points that are no longer in front of the camera [m].
+#: Least depth of points, used for those behind the camera [m].
 LEAST_DEPTH = 1e-3
-# Noise of frames that show none: that of rounding to whole counts [counts].
+# Least noise of a pixel: rounding to whole counts [counts].
 _LEAST_NOISE = 0.3
-# Largest number of gray levels of what is meant for a display.
+# Number of gray levels up to which a frame counts as a picture for a display.
 _LEVELS = 256
 # Interpolation of lag tails where edges are measured: a linear one blurs them more than the image that they are taken
 # from, a cubic one displaces them by up to 0.04 px.
 _EXACT = cv2.INTER_LANCZOS4
-# Pixels round a marker in which its edges and what surrounds it are looked at: 10 across its sides at most, and two
-# that they may be off.
+# Margin around a marker from which the lag tail is removed [px]: windows across the sides of 10, and two for errors of
+# the prediction.
 _MARGIN_PX = 12
-# How much of the past is taken out of the image, in time constants, and its weight.
+# Age m from which on the response counts as lag tail, in time constants, and the weight b of the tail.
 _TAIL = 0.75
 _FORGOTTEN = math.exp(-_TAIL)
-# The present's weight when the lag tail is taken out.
+# Weight of the present image when the lag tail is removed.
 _GAIN = 1.0 / (1.0 - _FORGOTTEN)
-#: What is left of the motion blur: its mean, and its standard deviation about that, as shares of the whole.
+#: Motion blur that remains, as shares of that by the whole lag: its mean displacement, and its standard deviation.
 REMAINING = 1.0 - _TAIL * _FORGOTTEN * _GAIN
 SPREAD = math.sqrt(1.0 - _TAIL**2 * _FORGOTTEN * _GAIN**2)
-#: Age, in time constants, of the velocity that has carried the lag tail as far as it is from the image.
+#: Age, in time constants, of the velocity that gives the displacement of the lag tail.
 LAG_TAIL_AGE = 1.0 + 0.5 * _TAIL
 
 
 @dataclass(frozen=True)
 class Frame:
-    """An image, and what is known of the camera's motion at its stamp."""
+    """An image with its noise, calibration and the predicted twist of the camera."""
 
     stamp_ns: int
     #: (height, width) counts as floating-point numbers
@@ -67,7 +67,7 @@ class Frame:
     #: time constant of the bolometers, and time from the first row's sampling to the last's [s]
     lag: float
     readout: float
-    #: whether it has gone through the camera's processing for a display, which bends the scale of counts
+    #: whether it is a picture for a display, whose gain control is a nonlinear function of the counts
     displayed: bool = False
 
     @staticmethod
@@ -80,7 +80,7 @@ class Frame:
         *,
         keep_columns: bool,
     ) -> 'Frame':
-        """A frame without its columns' fixed pattern, unless that is kept or the frame has eight bits."""
+        """A frame; the fixed pattern of its columns is removed unless ``keep_columns`` or the pixels have 8 bits."""
         noise, displayed = pixel_noise(counts, _LEAST_NOISE), bool(counts[::64].max() < _LEVELS)
         lag, readout = config.bolometer_lag, config.readout_time
         image = counts.astype(np.float32)
@@ -91,39 +91,39 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Places(Stacked):
-    """Where corners (N, 4) of markers are at a frame's stamp, and how the image moves there."""
+    """Image points of the corners (N, 4) of markers at a frame's stamp, with depth and optical flow."""
 
     at: ImagePoints
     #: (N, 4) [m]
     depth: FloatArray
-    #: (N, 4, 2, 6) derivative of the image's velocity by the camera's twist [px/s]
+    #: (N, 4, 2, 6) Jacobian of the image velocity by the camera's twist [px/s]
     flow: FloatArray
 
     @staticmethod
     def of(at: ImagePoints, depth: FloatArray) -> 'Places':
-        """Those of points (N, 4) at ``depth`` (N, 4)."""
+        """Places of image points (N, 4) at ``depth`` (N, 4)."""
         return Places(at, depth, at.J @ interaction(at.x, depth))
 
     def lag_blur(self, twist: Twist, lag: float) -> FloatArray:
-        """Mean displacement (N, 4, 2) [px] by a lag [s]."""
+        """Mean displacement (N, 4, 2) [px] of the corners by a lag [s]."""
         return np.asarray(-lag * (self.flow @ twist.ago(lag)))
 
 
 def delays(rows: FloatArray, frame: Frame) -> FloatArray:
-    """How long after the stamp ``rows`` (...) are seen [s]."""
+    """Time after the stamp [s] at which ``rows`` (...) are sampled."""
     return frame.readout * (rows / (frame.camera.height - 1) - 0.5)
 
 
 def stretch(places: Places, twist: Twist, frame: Frame) -> FloatArray:
-    """How much longer (N, 4) ways in the image are for what runs with the read-out, or shorter against it."""
+    """Factor (N, 4) on displacements by the rolling shutter: above 1 for motion in the direction of the readout."""
     velocity = places.flow @ twist.value
     return np.asarray(1.0 / (1.0 - frame.readout / (frame.camera.height - 1) * velocity[..., 1]))
 
 
 def displacement(places: Places, twist: Twist, frame: Frame, seconds: FloatArray) -> FloatArray:
-    """By how much (N, 4, 2) corners appear farther on [px] when they are seen ``seconds`` (N, 4) after the stamp.
+    """Displacement (N, 4, 2) [px] of corners that are sampled ``seconds`` (N, 4) after the stamp.
 
-    What lag holds back has the velocity of one time constant earlier.
+    A lagging image moves with the velocity of one time constant ago.
     """
     later = seconds[..., None]
     middle = places.at.x + 0.5 * later * (interaction(places.at.x, places.depth) @ twist.value)
@@ -134,7 +134,10 @@ def displacement(places: Places, twist: Twist, frame: Frame, seconds: FloatArray
 def rolling_displacement(
     places: Places, twist: Twist | None, frame: Frame, rows: FloatArray | None = None
 ) -> FloatArray:
-    """The same (N, 4, 2) [px] for the ``rows`` (N, 4) in which corners are seen; None: will be seen, lag included."""
+    """Displacement (N, 4, 2) [px] by the rolling shutter.
+
+    ``rows`` (N, 4): in which the corners were observed; None: predicted, lag included.
+    """
     if frame.readout == 0.0 or twist is None:
         return np.zeros_like(places.at.px)
     if rows is not None:
@@ -144,14 +147,13 @@ def rolling_displacement(
 
 
 def counts_of(pixel: IntArray, image: Float32Array, to_tails: FloatArray | None = None) -> Float32Array:
-    """Counts (M, C, 4 N, m) of the pixels at these places of the flat image, as many of each of N markers.
+    """Counts (M, C, 4 N, m) at the indices ``pixel`` of the flat image, lag tails removed; N markers in equal parts.
 
-    Lag tails are taken out of a few columns of pixels in a fourth of the time of the whole windows round the markers.
+    Only these pixels are corrected, in a fourth of the time of the whole windows around the markers.
 
     Parameters
     ----------
-    to_tails : (N, 2, 3) affine maps of pixels to where the image shows what these saw one lag tail's age ago, which is
-        taken out; None: nothing is
+    to_tails : (N, 2, 3) affine maps from pixels to their lag tails; None: nothing is removed
     """
     counts = image.ravel().take(pixel, mode='clip')
     if to_tails is None:
@@ -167,9 +169,10 @@ def counts_of(pixel: IntArray, image: Float32Array, to_tails: FloatArray | None 
 
 
 def markers_deblurred(image: Float32Array, corners_px: FloatArray, maps: FloatArray) -> Float32Array:
-    """``image`` with the windows round N markers with corners (N, 4, 2) freed of lag tails, by ``maps`` to these.
+    """``image`` with the lag tails removed in windows around N markers with corners (N, 4, 2).
 
-    To read cells a cubic interpolation will do, which takes a fifth of the time of an exact one.
+    ``maps`` (N, 2, 3): as ``to_tails`` of :func:`counts_of`. Cubic interpolation suffices to read cells, in a fifth of
+    the time of an exact one.
     """
     result, flags = image.copy(), cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     height, width = image.shape
@@ -188,9 +191,9 @@ def markers_deblurred(image: Float32Array, corners_px: FloatArray, maps: FloatAr
 
 
 def lag_tail_maps(corners_px: FloatArray, lag_blur_px: FloatArray) -> FloatArray:
-    """Affine maps (N, 2, 3) of the pixels round markers, (N, 4, 2) both, to where their lag tail lies.
+    """Affine maps (N, 2, 3) from pixels around N markers to their lag tails.
 
-    What a pixel saw earlier, the scene now has farther on: by least squares of the motion blur on (u, v, 1).
+    A least-squares fit of the displacements ``lag_blur_px`` (N, 4, 2) of the corners (N, 4, 2) on (u, v, 1).
     """
     A = np.concatenate([corners_px, np.ones((len(corners_px), 4, 1))], axis=-1)
     A_T = A.swapaxes(1, 2)

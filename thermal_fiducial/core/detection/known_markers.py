@@ -1,4 +1,4 @@
-"""Markers of a frame that were found, and those of a map where a camera at a pose should see them."""
+"""Markers found in a frame, and the markers of a map as predicted in the image of a camera."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,16 +12,16 @@ from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked
 
-#: Nearer to the border of the image than this a marker may be cut off, before its corners are refined [px].
+#: Distance from the image's border [px] below which an unrefined marker counts as possibly cut off.
 CUT_OFF_PX = 2.0
-#: Middles of two markers are no nearer than this share of the larger one's diagonal.
+#: Least distance of the centres of two markers, as a share of the larger one's diagonal.
 TOGETHER = 0.35
-# A marker turned further from the camera than this shows too little to be expected.
+# Least cosine between a marker's normal and the line of sight for it to be expected.
 _MAX_TILT_COSINE = 0.2
 _NEXT = np.array([1, 2, 3, 0])
 # Corners of a marker of side 1 in its plane.
 _FACE = marker_corners(1.0)[:, :2]
-# A marker predicted as far inside the image as this is not cut by its border [px].
+# A marker predicted with this margin inside the image counts as wholly visible [px].
 _WHOLE_PX = 10.0
 
 
@@ -38,14 +38,14 @@ def pairs(ids: IntArray, others: IntArray) -> tuple[IntArray, IntArray]:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedMarkers(Stacked):
-    """Where N markers should be.
+    """Predictions of N markers.
 
     Parameters
     ----------
     ids : (N,)
     x : (N, 4, 2) normalised corners
     depth : (N, 4) of the corners [m]
-    cnr : (N,) contrast-to-noise ratio of a pixel when they were last seen, 0 of others
+    cnr : (N,) signed contrast-to-noise ratio of a pixel when last observed; 0 if never
     """
 
     ids: IntArray
@@ -61,15 +61,15 @@ class ExpectedMarkers(Stacked):
 
 @dataclass(frozen=True, slots=True)
 class FoundMarkers(Stacked):
-    """N markers that a frame shows.
+    """N markers found in a frame, not refined yet.
 
     Parameters
     ----------
     ids : (N,)
-    places : to a pixel or two, at the frame's stamp
-    cnr : (N,) contrast-to-noise ratio of a pixel; negative where black is warmer than white
-    expected : (N,) whether it was looked for where it was found
-    certain : (N,) whether its pattern was read in this very place, beyond doubt
+    places : at the frame's stamp, accurate to a pixel or two
+    cnr : (N,) signed contrast-to-noise ratio of a pixel; negative where black is warmer than white
+    expected : (N,) whether it was found near its prediction
+    certain : (N,) whether its pattern was decoded at exactly this place with a clear margin
     """
 
     ids: IntArray
@@ -86,7 +86,7 @@ class FoundMarkers(Stacked):
         return FoundMarkers(np.zeros(0, dtype=np.int64), places, np.zeros(0), no, no)
 
     def and_elsewhere(self, others: 'FoundMarkers') -> 'FoundMarkers':
-        """These, and those of ``others`` that are not among them and that lie elsewhere."""
+        """These markers and those of ``others`` with other IDs that do not overlap them."""
         if len(others.ids) == 0:
             return self
         apart = np.linalg.norm(others.places.at.px.mean(axis=1)[:, None] - self.places.at.px.mean(axis=1), axis=-1)
@@ -101,7 +101,7 @@ def depths(T_camera_marker: FloatArray, sizes: FloatArray) -> FloatArray:
 
 
 class PartialMarkers(NamedTuple):
-    """N markers that show a face and may be in view, but not wholly."""
+    """N markers that face the camera and are partially in view by prediction."""
 
     #: (N,)
     ids: IntArray
@@ -117,13 +117,13 @@ class KnownMarkers:
     Parameters
     ----------
     markers : ID to (T_map_marker, side [m])
-    sizes : (M,) of all markers of the dictionary, by their IDs, if they are not in the map [m]
+    sizes : (M,) sides of all markers of the dictionary by ID, which those of the map replace [m]
     """
 
     def __init__(self, markers: Mapping[int, tuple[FloatArray, float]], sizes: FloatArray) -> None:
-        #: (K,) those that are known
+        #: (K,) IDs of the markers in the map, ascending
         self.ids = np.array(sorted(key for key in markers if 0 <= key < len(sizes)), dtype=np.int64)
-        #: (M,) sides [m] of all, and (M, 4, 4) their poses in the map, NaN where they are not in it
+        #: (M,) sides [m] and (M, 4, 4) poses in the map, NaN if not in it, of all markers of the dictionary by ID
         self.sizes, self.T_map_marker = sizes.copy(), np.full((len(sizes), 4, 4), np.nan)
         for marker_id in self.ids.tolist():
             self.T_map_marker[marker_id], self.sizes[marker_id] = markers[marker_id]
@@ -132,7 +132,7 @@ class KnownMarkers:
         self._corners_and_normals = np.concatenate([corners, T_map_marker[:, None, :3, 2]], axis=1)
 
     def expected(self, T_camera_map: FloatArray, camera: Camera, min_side_px: float) -> ExpectedMarkers:
-        """Those that are wholly in view and show a face."""
+        """Predictions of the markers that are wholly in view, face the camera and are large enough."""
         rotated = self._corners_and_normals @ T_camera_map[:3, :3].T
         points, normal = rotated[:, :4] + T_camera_map[:3, 3], rotated[:, 4]
         corners = camera.project(points)
@@ -145,7 +145,7 @@ class KnownMarkers:
         return ExpectedMarkers(self.ids[seen], points[..., :2] / points[..., 2:], points[..., 2], np.zeros(len(seen)))
 
     def partially_visible(self, T_camera_map: FloatArray, camera: Camera, without: IntArray) -> PartialMarkers:
-        """Those that show a face and may be partly in view, but for those of the IDs ``without``."""
+        """Markers that face the camera and are partially in view, except the IDs ``without``."""
         T = T_camera_map @ self.T_map_marker[self.ids]
         centre, normal = T[:, :3, 3], T[:, :3, 2]
         distance = np.sqrt(np.sum(centre * centre, axis=1))

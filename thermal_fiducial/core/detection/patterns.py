@@ -1,7 +1,7 @@
-"""Patterns of the markers of a dictionary: their bits, and what quadrilaterals of a frame look most like.
+"""Decoding by correlation: the most similar marker pattern of a dictionary for quadrilaterals in a frame.
 
-All cells count, the black border as well as the bits, each the mean of several pixels, so that a pattern stands out
-from noise at contrasts where no single bit could be thresholded: what is compared are correlations.
+A pattern is all cells of a marker, border and bits, each the mean of several pixels. Correlating the whole pattern
+decodes markers at contrasts at which single bits could not be thresholded.
 """
 
 from dataclasses import dataclass
@@ -14,22 +14,22 @@ import numpy as np
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
 from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
 
-# How far off a side black and white are compared: in cells, and at most in pixels.
+# Distance from a side at which black and white are compared: in cells, and at most in pixels.
 _OUTSIDE = 0.4
 _OUTSIDE_PX = 2.5
-# Correlation below which nothing is a marker whatever surrounds it.
+# Correlation below which the surroundings need not be measured.
 _SIMILAR = 0.5
 #: Samples along a cell, in its middle, away from blurred edges.
 CELL_SAMPLES = np.array([0.3, 0.5, 0.7])
 
 
-#: Places (9, 2) round a prediction that are tried [cells], and similarity, as a share of the best, that counts nothing.
+#: Offsets (9, 2) from a prediction that are tried [cells]; similarity, as a share of the best, that has no weight.
 NEAR_CELLS = np.stack(np.meshgrid([-0.5, 0.0, 0.5], [-0.5, 0.0, 0.5]), axis=-1).reshape(-1, 2)
 _UNLIKE = 0.8
 
 
 def most_similar(similarity: FloatArray, places: FloatArray) -> FloatArray:
-    """Where (N, 2), between ``places`` (N, P, 2), a similarity (N, P) is greatest: by its centre of gravity."""
+    """Position (N, 2) of the greatest similarity (N, P) between ``places`` (N, P, 2): a weighted centroid."""
     weight = np.maximum(similarity - _UNLIKE * similarity.max(axis=1, keepdims=True), 0.0)
     mean = np.einsum('np,npk->nk', weight, places)
     return np.asarray(mean / np.maximum(weight.sum(axis=1, keepdims=True), TINY))
@@ -64,13 +64,13 @@ def correctable_bits(bits: Gray) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Reading(Stacked):
-    """What Q quadrilaterals look most like."""
+    """Most similar markers of Q quadrilaterals, with the evidence for them."""
 
     #: (Q,) most similar ID
     ids: IntArray
     #: (Q,) quarter turns that make the first corner the marker's top-left
     turns: IntArray
-    #: (Q,) its correlation, negative where black and white are swapped
+    #: (Q,) correlation with the most similar pattern, negative where black and white are swapped
     correlation: FloatArray
     #: (Q,) correlation of the most similar other ID
     runner_up: FloatArray
@@ -78,27 +78,27 @@ class Reading(Stacked):
     contrast: FloatArray
     #: (Q,) bits on the wrong side of the middle between black and white
     bit_errors: IntArray
-    #: (Q,) the same of border cells
+    #: (Q,) border cells on the wrong side of that middle
     border_errors: IntArray
-    #: (Q,) step from the black border to its white surroundings over the contrast, on the worst side but one; 0 of what
-    #: is unlike any marker
+    #: (Q,) step from the black border to its white surroundings over the contrast, on the second worst side; 0 if the
+    #: correlation is low
     surround: FloatArray
 
     def clear(self, correlation: float, margin: float, contrast: float = 0.0) -> BoolArray:
-        """Which (Q,) look so much like their marker, and by such a margin more than like any other."""
+        """Which (Q,) have at least this correlation, margin over the runner-up, and contrast [counts]."""
         similarity = np.abs(self.correlation)
         distinct = (similarity >= correlation) & (similarity - self.runner_up >= margin)
         return np.asarray(distinct & (np.abs(self.contrast) >= contrast))
 
 
 class PatternMatch(NamedTuple):
-    """Which patterns Q quadrilaterals look most like."""
+    """Most similar patterns of Q quadrilaterals."""
 
     #: (Q, m * m) contrast of the cells, without background
     values: Float32Array
     #: (Q,) four times the most similar ID, and the quarter turns
     best: IntArray
-    #: (Q,) its correlation, and that of the most similar other ID
+    #: (Q,) correlation with the best pattern, and with the most similar other ID
     correlation: FloatArray
     runner_up: FloatArray
 
@@ -123,13 +123,13 @@ class Decoder:
         across = np.linspace(-1.0, 1.0, self.cells)
         x, y = np.tile(across, self.cells), np.repeat(across, self.cells)
         smooth = np.linalg.qr(np.stack([np.ones(x.size), x, y, x * x, x * y, y * y], axis=1))[0]
-        # A background that rises or bends across the marker is no pattern: it is projected out of both.
+        # A quadratic background across the marker is projected out of patterns and images.
         self._detrend = np.eye(x.size) - smooth @ smooth.T
         detrended = flat @ self._detrend
         patterns = detrended / np.maximum(np.linalg.norm(detrended, axis=1, keepdims=True), TINY)
         likeness = np.abs(patterns[::4] @ patterns.T).reshape(self.count, -1, 4).max(axis=-1)
         np.fill_diagonal(likeness, 0.0)
-        #: (M,) by how much a perfect view of each marker correlates better with itself than with any other
+        #: (M,) margin of correlation of a perfect view of each marker over any other
         self.isolation = 1.0 - likeness.max(axis=1)
         self._patterns = patterns.astype(np.float32)
         share = ((np.arange(self.cells)[:, None] + CELL_SAMPLES) / self.cells).ravel()
@@ -183,7 +183,7 @@ class Decoder:
         shape = expected @ self._detrend
         contrast = np.sum(values * shape, axis=1) / np.maximum(np.sum(shape * shape, axis=1), TINY)
         safe = np.where(np.abs(contrast) < TINY, TINY, contrast)[:, None]
-        # What is left of the pattern, back on the scale from 0 for black to 1 for white.
+        # Cells on the scale from 0 for black to 1 for white.
         seen = expected + (values - contrast[:, None] * shape) / safe
         wrong = (seen > 0.5) != (expected > 0.5)
         return Reading(
@@ -198,7 +198,7 @@ class Decoder:
         )
 
     def _steps(self, image: Float32Array, quads: FloatArray) -> FloatArray:
-        """Mean counts just outside the sides (Q, 4) less those just inside."""
+        """Mean counts just outside the sides minus those just inside (Q, 4)."""
         side = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1) / np.sqrt(2.0)
         near = np.minimum(_OUTSIDE / self.cells, _OUTSIDE_PX / np.maximum(side, 1.0))[:, None, None]
         weights = self._along_sides + near.astype(np.float32) * self._away
@@ -213,7 +213,7 @@ class Decoder:
 
 
 def shrunk(quads: FloatArray, cells: int) -> FloatArray:
-    """The markers (Q, 4, 2) in plates (Q, 4, 2) that surround them with a white margin of one cell."""
+    """Outlines (Q, 4, 2) of the markers in white plates (Q, 4, 2) with a margin of one cell."""
     return seen_between(quads, _in_plate(cells)).transpose(1, 2, 0)
 
 

@@ -1,8 +1,7 @@
-"""Where markers may be: quadrilaterals in the outlines of what is darker than its surroundings.
+"""Candidates for markers: quadrilaterals among the outlines of regions darker than their surroundings.
 
-Darker by a share of the local contrast, the same of markers of any contrast. The local spread is the measure, down to a
-floor of the order of the noise, below which ever more is asked for: next to strong structures little shows, of a marker
-of twice the noise all, of a bare wall nearly nothing.
+The threshold is a share of the local standard deviation, so that markers of any contrast are found. Below a floor of
+the order of the noise it rises again: a marker of twice the noise is still segmented, a bare wall hardly at all.
 """
 
 from typing import NamedTuple
@@ -12,18 +11,18 @@ import numpy as np
 
 from thermal_fiducial.core.types import Float32Array, FloatArray, Gray
 
-# The spread is taken on a quarter of the resolution over 17 of its pixels: 68 px, a marker at working distance.
+# Window of the local standard deviation, at a quarter of the resolution: 68 px, a marker at working distance.
 _LOCAL = 17
-# Odd width of the median that takes out specks.
+# Odd width of the median filter that removes specks.
 _SPECKS = 3
 # Half-resolution pixels along a row over which columns are compared.
 _COLUMNS = 9
-# In a picture for a display: odd width of the surroundings, no wider than the white round the smallest markers; and by
-# how much darker a pixel must be [gray levels], and in standard deviations of the noise.
+# In a picture for a display: odd width of the surroundings, no wider than the white around the smallest markers; least
+# difference of a dark pixel from their mean [gray levels] and [standard deviations of the noise].
 _PICTURE_WINDOW_PX, _PICTURE_STEP, _PICTURE_NOISE = 5, 3.0, 2.0
 # Mean of Gaussian noise clipped at one standard deviation moves by 0.68 of a small offset.
 _CLIPPED = 1.0 / 0.68
-# The hull of an outline is simplified to within this share of its length: more than noise bends it, less than a side.
+# Tolerance of polygon approximation as a share of an outline's length: above the effect of noise, below a side.
 _STRAIGHT = 0.05
 _CORNERS, _NEXT = 4, np.array([1, 2, 3, 0])
 
@@ -40,10 +39,10 @@ def halfway(places: FloatArray) -> FloatArray:
 
 
 def without_columns(counts: Float32Array, noise: float) -> Float32Array:
-    """``counts`` without the offsets of its columns.
+    """``counts`` without the fixed-pattern offsets of its columns.
 
-    They show in the typical pixel of each column against its neighbours. What the scene does to a column is bounded by
-    the noise: no pixel counts for more than that.
+    An offset is the mean difference of a column's pixels from neighbouring columns, clipped at the noise so that the
+    scene has little influence.
     """
     deviation = counts - cv2.blur(counts, (_COLUMNS, 1))
     np.clip(deviation, -noise, noise, out=deviation)
@@ -52,16 +51,16 @@ def without_columns(counts: Float32Array, noise: float) -> Float32Array:
 
 
 class Scale(NamedTuple):
-    """How dark places are looked for at one resolution."""
+    """Parameters of the segmentation at one resolution."""
 
     #: standard deviation of the Gaussian before the search [px]
     smoothing_px: float
     #: odd width of the surroundings, and by how much lower the resolution is at which their mean is taken
     window_px: int
     window_shrink: int
-    #: how much darker than the mean of the surroundings, in local standard deviations
+    #: least difference from the mean of the surroundings, in local standard deviations
     depth: float
-    #: spread below which it shows less and less, in standard deviations of the noise of a pixel
+    #: local standard deviation below which the threshold rises again, in standard deviations of the pixel noise
     floor: float
 
 

@@ -1,12 +1,11 @@
-"""Corners refined in frames that motion and the bolometers' lag blur.
+"""Sub-pixel refinement of corners in frames that are blurred by motion and bolometer lag.
 
-The motion blur of each marker follows from the camera's twist. Where it matters it is taken out round the marker, as
-far as that holds whatever the response is like; the edges are fitted with the blur that remains, and what lag has
-displaced them by is taken out of the corners. These correct the twist: where that changes the blur much, it is done
-once more.
+The camera's twist gives the motion blur of each marker. Where it is large, the lag tail is removed around the marker
+(see :mod:`frame`); the edge model contains the blur that remains, and the known displacement by lag is subtracted from
+the corners. The corners then correct the twist; if that changes the blur much, the refinement is repeated.
 
-Columns of whole pixels across the sides are compared with the model of a blurred edge, segment by segment, on raw
-counts; a robust adjustment of the four corners to all segments of the marker follows, until they no longer move.
+Columns of whole pixels across the sides are fitted with the model of a blurred edge, segment by segment, on raw counts.
+A robust adjustment of the four corners to all segments follows; both are repeated until the corners converge.
 """
 
 from dataclasses import dataclass, replace
@@ -36,21 +35,22 @@ from thermal_fiducial.core.detection.twist import Twist, unknown_twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked, TINY
 
-# Blur by lag below which the shape of an edge doesn't change [px].
+# Change of the displacement by lag below which the refinement is not repeated [px].
 _BLUR_THAT_MATTERS_PX = 0.4
-#: Contrast over noise below which a marker is faint; a clearer one shows at full and at half the resolution.
+#: Contrast-to-noise ratio above which a marker is clear: it is found at full and at half resolution.
 CLEAR_CNR = 20.0
-# Columns of pixels used of a cell, all of a faint marker's; and blur [px] up to which the lag tail stays in the frame,
-# where the model takes it for a symmetric one: among faint markers that costs less than the noise of taking it out.
+# Columns of pixels per cell, and blur [px] up to which the lag tail is modelled as symmetric blur instead of removed:
+# for clear markers, and for faint ones, where the noise of removing it would cost more.
 _OF_CLEAR, _OF_FAINT = (6, 0.2), (12, 1.0)
 _ROUNDS = 2
 _NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
-# Of the ends of the sides, those that are the corners, clockwise.
+# Indices of the corners, clockwise, among the ends of the sides.
 _CORNERS = np.array([0, 1, 3, 2])
-# Passes follow one another until the last step was short enough [px]: at best, at worst, between in deviations of it.
+# Largest number of passes. A corner has converged when its last step is below _UNSURE of its standard deviations,
+# clipped to the limits _SETTLED_PX [px].
 _PASSES = 4
 _SETTLED_PX, _UNSURE = (0.3, 1.0), 2.0
-# Standard deviation of what is known of the corners beforehand [px].
+# Standard deviation of the prior of the corners [px].
 _PRIOR_PX = 3.0
 
 
@@ -64,7 +64,7 @@ class RefinedCorners(Stacked):
     covariances : (N, 4, 2, 2) [px^2]
     contrast : (N,) white minus black [counts]
     noise : (N,) standard deviation of a pixel about the model [counts]
-    doubt : (N,) variance of corners that make no square, zero where they do [px^2]; not in the covariances
+    doubt : (N,) additional variance where the outline is inconsistent with a square, else 0; not in covariances [px^2]
     """
 
     corners_px: FloatArray
@@ -82,15 +82,15 @@ class RefinedCorners(Stacked):
 
 @dataclass(frozen=True, slots=True)
 class MotionBlur(Stacked):
-    """How motion displaces and blurs N markers in a frame, of which the lag tail is taken out where it matters."""
+    """Displacement and blur of N markers by motion, after the lag tail is removed where it is large."""
 
-    #: (N, 2, 3) affine maps of pixels to their lag tails, which are to be taken out; None: there is hardly any blur
+    #: (N, 2, 3) affine maps from pixels to their lag tails, which are removed; None: the blur is too small for that
     to_tails: FloatArray | None
-    #: (N, 4, 2) where the corners appear, off their places at the stamp [px]
+    #: (N, 4, 2) displacement of the corners in the image from their places at the stamp [px]
     shift: FloatArray
-    #: (N, 4, 2) how much of the blur's shift is taken out
+    #: (N, 4, 2) part of the displacement that vanishes with the lag tail [px]
     removed: FloatArray
-    #: (N, 2) standard deviation of what is left of the blur, along it
+    #: (N, 2) standard deviation of the remaining motion blur, along the motion [px]
     spread: FloatArray
 
 
@@ -100,14 +100,14 @@ class RefinedMarkers(Stacked):
 
     #: (N,)
     ids: IntArray
-    #: as the frame shows them, blurred so
+    #: as observed in the frame, displaced by ``blur``
     observed: RefinedCorners
     blur: MotionBlur
-    #: at the stamp, with what is unknown of the motion
+    #: at the stamp, with the uncertainty of the motion
     corners: RefinedCorners
-    #: by these, or by what the thermal frame would have shown, from which the next frame's motion is measured
+    #: places of the corners, before later corrections for displays: the next frame's motion is measured from them
     places: Places
-    #: corrected by the corners
+    #: of the camera, corrected by the corners
     twist: Twist | None
 
     @staticmethod
@@ -126,7 +126,7 @@ def refine(
     Parameters
     ----------
     behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
-    track : the frames before, which with the corners give the twist
+    track : motion and markers of the last frame, which with the corners give the twist
     """
     if len(found.ids) == 0:
         return RefinedMarkers.none(frame)
@@ -155,13 +155,14 @@ def _at_stamp(
     track: MotionTrack,
     cells: int,
 ) -> RefinedMarkers:
-    """The corners without lag and as if all rows were seen at once, by the twist that they themselves correct."""
+    """Corners at the stamp, without lag and rolling shutter, by the twist that they correct."""
     at = places.at.at_pixels(seen.corners_px - blur.shift)
     variances = seen.covariances.diagonal(axis1=-2, axis2=-1)
     deviation = np.sqrt(variances.mean(axis=(1, 2))) / frame.camera.focal_px
-    # Corners that make no square are those of something else.
+    # Corners that are inconsistent with a square get a larger covariance.
     doubted = seen.covariances + seen.doubt[:, None, None, None] * _EYE
-    # The same displacement in two frames in a row hides from the first twist; once freed, they are not alike.
+    # Without a predicted twist, the first round measures one between two lagging frames, and the second must not again:
+    # its corners are corrected for lag, those of the last frame are not.
     twist = known
     if frame.twist is not None or known is None:
         twist = track.correct(frame.stamp_ns, frame.twist, ids, at.x, places.depth, deviation)
@@ -179,7 +180,7 @@ def _at_stamp(
 
 
 def _never_seen(frame: Frame, places: Places, seen: RefinedCorners, twist: Twist, cells: int) -> FloatArray:
-    """Covariances (N, 4, 2, 2) [px^2] by a motion that the frames before show nothing of."""
+    """Covariances (N, 4, 2, 2) [px^2] by the motion in a frame without a predicted twist."""
     since = frame.lag - delays(seen.corners_px[..., 1], frame)
     unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), TINY)
     cell = sides_px(seen.corners_px) / cells
@@ -187,7 +188,7 @@ def _never_seen(frame: Frame, places: Places, seen: RefinedCorners, twist: Twist
 
 
 def _motion_blur(frame: Frame, places: Places, twist: Twist | None, hardly_px: float) -> MotionBlur:
-    """The known blur of all markers; its lag tails are to be taken out where it is more than ``hardly_px``."""
+    """Motion blur of all markers; lag tails are removed if the largest displacement by lag exceeds ``hardly_px``."""
     lag_blur = np.zeros_like(places.at.px) if twist is None else places.lag_blur(twist, frame.lag)
     mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
     if twist is None or (mean * mean).sum(axis=1).max() <= hardly_px**2:
@@ -222,12 +223,12 @@ def refine_corners(
     Parameters
     ----------
     image : (height, width) counts
-    corners : (N, 4) to within two pixels, or a third of a cell
+    corners : (N, 4) initial values, accurate to two pixels or a third of a cell
     behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
     blur_px : standard deviation of optics and pixel
     lag_blur_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
     columns : of pixels, in a segment
-    to_tails : (N, 2, 3) maps of pixels to lag tails that are to be taken out; none when left out
+    to_tails : (N, 2, 3) maps from pixels to lag tails, which are removed; nothing is removed when left out
     """
     lag_blur = np.zeros((len(corners.px), 2)) if lag_blur_px is None else lag_blur_px
     found, moving = _pass(image, corners, camera, behind, blur_px, lag_blur, columns, to_tails)
@@ -253,7 +254,7 @@ def _pass(
     columns: int,
     to_tails: FloatArray | None,
 ) -> tuple[RefinedCorners, BoolArray]:
-    """Where one linearised adjustment moves the corners, and for which markers (N,) that was not the last."""
+    """Corners after one linearised adjustment, and which markers (N,) have not converged."""
     cells = behind.shape[2]
     widest = math.hypot(blur_px, math.sqrt(float((lag_blur * lag_blur).sum(axis=1).max())))
     sides = sides_of(start.x, camera, image.shape, cells, columns, widest)

@@ -21,25 +21,25 @@ from thermal_fiducial.core.detection.quads import (
 )
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
-# Full resolution sees small and blurred markers; half resolution, without the pattern of columns, faint ones.
+# Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.
 _FINE = Scale(smoothing_px=1.0, window_px=7, window_shrink=2, depth=0.2, floor=1.5)
 _FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0)
-# Among markers that are seen clearly noise is left alone, and with it what it would show of the faintest.
+# Where all markers have a high contrast, higher floors: less noise is followed, and the faintest markers are missed.
 _FINE_OF_CLEAR = _FINE._replace(floor=4.0)
 _FAINT_OF_CLEAR = _FAINT._replace(floor=4.0)
-# Correlation beyond which an outline needs no alignment, and from which, by such a margin, it is worth one.
+# Correlation from which an outline needs no alignment; least correlation, and its margin, for alignment to be tried.
 _CLEAR = 0.95
 _HINT, _HINT_MARGIN = 0.5, 0.06
-# Width of a plate round its marker [cells], and what motion blur may add.
+# Width of the white plate around a marker, with an allowance for motion blur [cells].
 _PLATE_CELLS = 1.6
-# Shortest side of a marker in a picture for a display, which has little noise, over that in raw counts: of one that is
-# seen obliquely, the other sides are longer.
+# Factor on the shortest side of a marker in a picture for a display, which has little noise: in oblique views the other
+# sides are longer.
 _PICTURE_SIDE = 0.25
 _NONE = np.zeros(0, dtype=np.intp)
 
 
 class SearchScales(Flag):
-    """At which resolutions markers are looked for."""
+    """Resolutions of the blind search."""
 
     FINE = auto()
     FAINT = auto()
@@ -47,7 +47,7 @@ class SearchScales(Flag):
 
 
 class Outlines(NamedTuple):
-    """N markers wherever they are: IDs (N,), corners (N, 4, 2) [px] and contrast-to-noise ratios (N,) of a pixel."""
+    """N markers by blind search: IDs (N,), corners (N, 4, 2) [px], signed contrast-to-noise ratios (N,) of a pixel."""
 
     ids: IntArray
     corners_px: FloatArray
@@ -60,7 +60,7 @@ class Outlines(NamedTuple):
 
 
 class BlindSearch:
-    """Finds the markers of a dictionary wherever they are.
+    """Finds the markers of a dictionary anywhere in a frame.
 
     Parameters
     ----------
@@ -83,9 +83,9 @@ class BlindSearch:
 
         Parameters
         ----------
-        seen : markers that are there: nothing is looked for in them and their plates
-        scales : at which resolutions
-        kinds : of markers looked for among the faintest, 1 for darker than their surroundings, -1 for brighter
+        seen : markers found already: they and their plates are left out of the search
+        scales : resolutions of the search
+        kinds : polarities searched at half resolution, 1 for markers darker than their surroundings, -1 for brighter
         """
         hidden = _grown(seen.places.at.px, 1.0 + 2.0 * _PLATE_CELLS / self._decoder.cells)
         min_side_px = _PICTURE_SIDE * config.min_side_px if frame.displayed else config.min_side_px
@@ -98,7 +98,7 @@ class BlindSearch:
             faint = _faint_quads(half, frame.noise, scales, kinds, config.min_side_px, hidden)
         if len(fine) + len(faint) == 0:
             return Outlines.none()
-        # At full resolution alone those are looked for that show clearly, if not now then in a frame to come.
+        # A search at full resolution alone is for clear markers, which need no alignment.
         pull = SearchScales.FAINT in scales
         reading, quads = self._read(frame, half, (fine, faint), allowed, seen.ids if pull else None)
         good = accepted(reading, frame.noise, self._decoder.correctable, config) & _large(quads, min_side_px)
@@ -118,11 +118,11 @@ class BlindSearch:
     ) -> tuple[Reading, FloatArray]:
         """Readings of fine and faint outlines, and their corners (Q, 4, 2).
 
-        Those that show but not clearly are read once more after they are pulled onto their pattern, unless their IDs
-        are ``seen`` already; None: pull none.
+        Doubtful ones are aligned with their pattern and read again, unless their IDs are ``seen`` already; None: none
+        is aligned.
         """
         decoder = self._decoder
-        # Blur may leave nothing to be seen of a border between two white ones but the outline of the whole plate.
+        # Blur may merge a thin black border with the white on both sides: only the outline of the plate is left then.
         fine, faint = (_with_shrunk(quads, decoder.cells) for quads in outlines)
         quads = np.concatenate([fine, faint])
         reading = decoder.read(frame.image, fine, allowed).joined(decoder.read(half, halfway(faint), allowed))
@@ -140,7 +140,7 @@ class BlindSearch:
 
 
 def _fine_mask(frame: Frame, scales: SearchScales) -> Gray:
-    """What is dark at full resolution."""
+    """Mask of dark pixels at full resolution."""
     if frame.displayed:
         return dark_in_picture(frame.image, frame.noise)
     return dark(frame.image, frame.noise, _FINE if scales == SearchScales.ALL else _FINE_OF_CLEAR)
@@ -162,33 +162,33 @@ def _faint_quads(
 
 
 def _with_shrunk(outlines: FloatArray, cells: int) -> FloatArray:
-    """Quadrilaterals (Q, 4, 2), and what would be a marker in each if it were a plate."""
+    """Outlines (Q, 4, 2), and the outlines of the markers in them if they are plates."""
     return np.concatenate([outlines, shrunk(outlines, cells)]) if len(outlines) else outlines
 
 
 def _large(quads: FloatArray, min_side_px: float) -> BoolArray:
-    """Which quadrilaterals (Q, 4, 2) have no shorter side."""
+    """Which quadrilaterals (Q, 4, 2) have no side shorter than ``min_side_px``."""
     span = quads[:, [1, 2, 3, 0]] - quads
     return np.asarray((np.sum(span * span, axis=-1) >= min_side_px**2).all(axis=1))
 
 
 def _chosen(reading: Reading, quads: FloatArray, places: IntArray, noise: float) -> Outlines:
-    """The markers at ``places`` among the quadrilaterals, their corners from the marker's own first one."""
+    """Markers at indices ``places`` of the quadrilaterals, corners ordered from the marker's first one."""
     turned = (np.arange(4) - reading.turns[places][:, None]) % 4
     corners = np.take_along_axis(quads[places], turned[..., None], axis=1)
     return Outlines(reading.ids[places], corners, reading.contrast[places] / noise)
 
 
 def _grown(quads: FloatArray, factor: float) -> FloatArray:
-    """Quadrilaterals (N, 4, 2) larger by a factor about their middles."""
+    """Quadrilaterals (N, 4, 2) scaled about their centres."""
     middle = quads.mean(axis=1, keepdims=True)
     return np.asarray(middle + factor * (quads - middle))
 
 
 def _rough(reading: Reading, quads: FloatArray, seen: IntArray) -> IntArray:
-    """Places of the best readings of IDs that show, but not clearly, where none does: their outlines may be off.
+    """Indices of the best doubtful reading of each ID, away from clear readings: its outline may be inaccurate.
 
-    IDs that are ``seen`` already need no other place.
+    IDs that are ``seen`` already or that have a clear reading are left out.
     """
     similarity = np.abs(reading.correlation)
     clear = similarity >= _CLEAR
@@ -202,12 +202,12 @@ def _rough(reading: Reading, quads: FloatArray, seen: IntArray) -> IntArray:
 
 
 def distinct(reading: Reading, noise: float, config: ArucoDetectorConfig) -> BoolArray:
-    """Which readings look like one marker of the dictionary, whatever the bits and sides are like."""
+    """Which readings pass the limits of correlation, margin and contrast."""
     return reading.clear(config.min_correlation, config.min_margin, config.min_contrast * noise)
 
 
 def accepted(reading: Reading, noise: float, correctable: int, config: ArucoDetectorConfig) -> BoolArray:
-    """Which readings are evidence enough for a marker nobody expected."""
+    """Which readings suffice for a marker that was not predicted: also few wrong cells, and white surroundings."""
     bits = config.max_bit_errors if config.max_bit_errors >= 0 else correctable
     return np.asarray(
         distinct(reading, noise, config)
@@ -218,9 +218,9 @@ def accepted(reading: Reading, noise: float, correctable: int, config: ArucoDete
 
 
 def inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: BoolArray) -> BoolArray:
-    """Which good readings (Q,) are of a plate's border or of bits: at a more similar readable one of other polarity.
+    """Which good readings (Q,) overlap a more similar ``readable`` one of opposite polarity: a plate, or inner bits.
 
-    Left in, one would stand for the place until its corners are refined, and the marker itself would be lost with it.
+    They must not take the place of the marker itself.
     """
     mine, others = np.flatnonzero(good), np.flatnonzero(readable)
     similarity, centre = np.abs(reading.correlation), quads.mean(axis=1)
@@ -234,7 +234,7 @@ def inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: B
 
 
 def _once(reading: Reading, quads: FloatArray, good: BoolArray, drop_duplicates: bool) -> IntArray:
-    """Place of the best reading of every ID; of an ID at two places neither, when such are to be dropped."""
+    """Index of the best reading of every ID; IDs at two places are left out if ``drop_duplicates``."""
     similarity = np.abs(reading.correlation)
     across = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)
     centre = quads.mean(axis=1)

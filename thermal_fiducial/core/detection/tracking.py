@@ -1,7 +1,7 @@
-"""Motion of the camera from frame to frame, as its markers and the filter's states show it.
+"""Motion of the camera from frame to frame, estimated from its markers and from odometry.
 
-A Kalman filter holds the camera's twist and its change: predicted from the last frame, corrected by the filter's states
-round the frame and by how the markers' corners moved since.
+A Kalman filter of the camera's twist and acceleration: predicted from the last frame, corrected by odometry around the
+frame and by the displacement of the markers' corners since the last frame.
 """
 
 from collections.abc import Sequence
@@ -29,31 +29,31 @@ from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 
-# Frames farther apart show nothing of each other [ns].
+# Longest time between frames whose motion is related [ns].
 _STALE_NS = 150_000_000
-# So many states of the filter show the acceleration too.
+# Fewest odometry states from which the acceleration is fitted, too.
 _ENOUGH_STATES = 4
 # Jitter of the camera's stamps [s].
 _JITTER_S = 0.001
-# How far corners that lag displaces may be off their mean delay, where the form of blurred edges is unknown [lag].
+# Standard deviation of the delay of corners in a lagging image before the twist is known [lag].
 _DELAY_UNSURE = 0.5
 # Of the corners of a marker.
 _COORDINATES = 8
-# The filter's states from so many time constants before a frame to one after it, symmetric about the velocity that
-# blurs it, say how it moved; so many of them at most. Without lag, those of so long a time.
+# Odometry that gives the twist of a frame: from so many time constants before it to one after it, which is symmetric
+# about the velocity that blurs it; largest number of states; time constant that is assumed without lag [ns].
 _LAGS_BEFORE, _STATES, _SHORTEST_LAG_NS = 3, 10, 5_000_000
-# Standard deviation of the offset between the clocks before the filter has estimated it: that of drivers' stamps, and
-# what the filter itself starts from (``time_offset_std``) [s].
+# Standard deviation of the clock offset before the filter has estimated it [s]: the filter's own prior,
+# ``time_offset_std``.
 _UNKNOWN_CLOCK_S = 0.03
 
 
 @dataclass(frozen=True, slots=True)
 class MotionTrack:
-    """The camera's twist over the frames, and the markers that it saw: what one frame leaves to the next.
+    """The camera's twist and markers at the last frame, from which the next frame is predicted.
 
     Parameters
     ----------
-    T_body_camera, from_body : (4, 4), (6, 6) where the camera is, and what makes its twist of the body's
+    T_body_camera, from_body : (4, 4), (6, 6) pose of the camera on the body, map from the body's twist to the camera's
     lag : time constant of the bolometers [s]
     stamp_ns, twist, markers : of the last frame
     last_seen_ns : stamp of the last frame that showed markers
@@ -69,7 +69,7 @@ class MotionTrack:
 
     @staticmethod
     def of_rig(T_body_camera: FloatArray, lag: float = 0.0) -> 'MotionTrack':
-        """Before the first frame, of a camera at ``T_body_camera`` (4, 4)."""
+        """The track before the first frame of a camera at ``T_body_camera`` (4, 4)."""
         return MotionTrack(T_body_camera, transfer_from_body(T_body_camera), lag)
 
     def predict(
@@ -79,19 +79,19 @@ class MotionTrack:
         odometry_ns: int | None = None,
         clock_std_s: float = 0.0,
     ) -> Twist | None:
-        """Twist expected at a frame; None when nothing is known.
+        """Twist predicted for a frame; None without any information.
 
         Parameters
         ----------
-        odometry : states round the time that blurs the frame, or the nearest that there is
-        odometry_ns : the frame's stamp in their clock, if that is not the camera's
+        odometry : states around the time that blurs the frame, or the nearest one
+        odometry_ns : the frame's stamp in the clock of the odometry, if that is another one
         clock_std_s : standard deviation of that stamp [s]
         """
         odometry_ns = stamp_ns if odometry_ns is None else odometry_ns
         if len(odometry) >= _ENOUGH_STATES:
             return line_through(odometry_ns, odometry, self.from_body, clock_std_s)
         dt, before = self._since(stamp_ns), None
-        # Markers show that the twist holds: one that went wrong would hide them from then on.
+        # Without markers the twist is not extrapolated: a wrong one would keep them from being found again.
         saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_NS
         if self.twist is not None and dt is not None and saw_lately:
             before = carried(self.twist, dt)
@@ -106,7 +106,7 @@ class MotionTrack:
         return corrected(before or unknown_twist(), information, information @ seen.value, later)
 
     def expected(self, stamp_ns: int, twist: Twist) -> ExpectedMarkers:
-        """The last frame's markers where the camera's motion since has carried them."""
+        """The last frame's markers, predicted at this frame."""
         dt = self._since(stamp_ns)
         if dt is None or self.twist is None or len(self.markers.ids) == 0:
             return ExpectedMarkers.none()
@@ -125,12 +125,12 @@ class MotionTrack:
         depth: FloatArray,
         noise: FloatArray,
     ) -> Twist | None:
-        """Twist from how the corners moved since the last frame.
+        """Twist corrected by the displacement of corners since the last frame.
 
         Parameters
         ----------
         ids : (N,)
-        x : (N, 4, 2) normalised corners, where they would be without lag if the twist is predicted, and else as seen
+        x : (N, 4, 2) normalised corners: without the displacement by lag if a twist is predicted, else as observed
         depth : (N, 4) [m]
         noise : (N,) standard deviation of a corner in normalised coordinates
         """
@@ -140,13 +140,13 @@ class MotionTrack:
             return predicted
         begin, end = dt + (self.lag if self.twist is None else 0.0), self.lag if predicted is None else 0.0
         seconds, start = begin - end, predicted or unknown_twist()
-        # Stamps that jitter stretch or shrink all velocities of a frame alike.
+        # Jitter of the stamps scales all velocities of a frame by a common factor.
         unsure = 2.0 * _JITTER_S**2 + (0.0 if self.twist is not None else (_DELAY_UNSURE * self.lag) ** 2)
         A = interaction(0.5 * (x[now] + self.markers.x[before]), depth[now]).reshape(-1, 6)
         velocity = (x[now] - self.markers.x[before]).reshape(-1) / seconds
         stretch = A @ (np.zeros(6) if predicted is None else math.sqrt(unsure) / seconds * predicted.value)
         weight = np.repeat((seconds / (1.5 * noise[now])) ** 2, _COORDINATES)
-        # Weighted least squares whose residuals share one more error: by the formula of Sherman and Morrison.
+        # Weighted least squares whose residuals have one common error: the Sherman-Morrison formula.
         weighted, stretched = A.T * weight, weight * stretch
         spread = weighted @ stretch
         share = spread / (1.0 + stretched @ stretch)
@@ -154,18 +154,18 @@ class MotionTrack:
         return corrected(start, information, weighted @ velocity - share * (stretched @ velocity), -0.5 * (begin + end))
 
     def all_clearer_than(self, cnr: float) -> bool:
-        """Whether there were markers, all of more contrast over noise."""
+        """Whether the last frame had markers, all with a contrast-to-noise ratio above ``cnr``."""
         return len(self.markers.ids) > 0 and bool(np.abs(self.markers.cnr).min() > cnr)
 
     def after(self, stamp_ns: int, twist: Twist | None, markers: ExpectedMarkers) -> 'MotionTrack':
-        """The track with a frame's twist and markers; of a frame that comes late there is nothing to keep."""
+        """The track after a frame with its twist and markers; unchanged by a frame that comes late."""
         if self.stamp_ns is not None and 0 < self.stamp_ns - stamp_ns < _STALE_NS:
             return self
         last_seen_ns = stamp_ns if len(markers.ids) else self.last_seen_ns
         return MotionTrack(self.T_body_camera, self.from_body, self.lag, stamp_ns, twist, markers, last_seen_ns)
 
     def _since(self, stamp_ns: int) -> float | None:
-        """Time since the last frame [s], negative for one that comes late; None when that shows nothing of this one."""
+        """Time since the last frame [s], negative for a late frame; None if it is too long for the motion to hold."""
         if self.stamp_ns is None or not 0 < abs(stamp_ns - self.stamp_ns) < _STALE_NS:
             return None
         return (stamp_ns - self.stamp_ns) / SECOND_NS
@@ -173,20 +173,20 @@ class MotionTrack:
 
 @dataclass(frozen=True, slots=True)
 class FramePrediction:
-    """What is known of a frame before it is looked at."""
+    """Motion and pose of the camera at a frame, predicted before its image is used."""
 
-    #: of the camera; None: nothing is known
+    #: of the camera; None: unknown
     twist: Twist | None
-    #: (4, 4); None: no odometry that is fresh enough
+    #: (4, 4); None without recent odometry
     T_camera_map: FloatArray | None
     #: standard deviation of the camera's position in it [m]
     position_std_m: float
 
 
 def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, max_age_s: float) -> FramePrediction:
-    """What the filter's states and the last frames' markers say of a frame at ``stamp_ns`` in the camera's clock.
+    """Prediction of a frame at ``stamp_ns``, in the camera's clock, from odometry and the last frames' markers.
 
-    Odometry older than ``max_age_s`` says no pose.
+    Odometry older than ``max_age_s`` gives no pose.
     """
     if prior is None:
         return FramePrediction(track.predict(stamp_ns, []), None, math.inf)
@@ -201,7 +201,7 @@ def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, 
     dt = math.inf if nearest is None else (odometry_ns - nearest.stamp_ns) / SECOND_NS
     if nearest is None or twist is None or abs(dt) > max_age_s:
         return FramePrediction(twist, None, math.inf)
-    # The nearest pose, carried on with the camera's twist.
+    # The nearest pose, extrapolated with the camera's twist.
     step = dt * twist.ago(0.5 * dt)
     moved = se3.transform(se3.so3_exp(step[3:]), step[:3])
     T_map_camera = nearest.T_map_body @ track.T_body_camera @ moved
