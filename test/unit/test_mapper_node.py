@@ -59,7 +59,7 @@ def test_edits_of_the_file_are_loaded_and_undone_in_flight(graph, map_file):
 
 def test_a_map_that_is_loaded_is_said_on_the_console(graph, map_file, capfd):
     graph.add(MarkerMapperNode, map_file=str(map_file))
-    assert f'map of 1 markers from {map_file}' in capfd.readouterr().err
+    assert f'map of 1 marker from {map_file}' in capfd.readouterr().err
 
 
 def test_a_map_of_another_dictionary_is_used_and_warned_of(graph, map_file):

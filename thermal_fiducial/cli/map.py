@@ -119,7 +119,7 @@ def _edit(args: argparse.Namespace, action: str, change: Callable[[MarkerMap], M
         except map_history.ChangedMeanwhileError:
             # An edit says what to do, not what comes out: on top of what another one has made it is as good.
             continue
-    print(f'{args.map}: {action}; revision {edited.revision}, {len(edited.markers)} markers')
+    print(f'{args.map}: {action}; revision {edited.revision}, {edited.size_in_words}')
     return 0
 
 
@@ -211,7 +211,7 @@ def _merge(args: argparse.Namespace) -> int:
     if args.out:
         merged, _ = map_editing.merge(_load(args), other)
         map_history.save_with_history(args.out, merged, f'merge {args.map.name} and {args.other.name}')
-        print(f'{args.out}: {len(merged.markers)} markers')
+        print(f'{args.out}: {merged.size_in_words}')
         return 0
     return _edit(args, f'merge {args.other.name}', lambda marker_map: map_editing.merge(marker_map, other)[0])
 
@@ -251,7 +251,7 @@ def _history(args: argparse.Namespace) -> int:
         what = entry.problem or f'revision {entry.revision}, {entry.markers} markers, before: {entry.action}'
         print(f'{entry.number:6d}  {what}')
     current = _load(args)
-    print(f'   now  revision {current.revision}, {len(current.markers)} markers')
+    print(f'   now  revision {current.revision}, {current.size_in_words}')
     copy = map_history.autosaved(args.map)
     if copy is not None:
         print(f'autosaved  revision {copy.revision}, {copy.markers} markers: map undo takes it up')

@@ -58,7 +58,7 @@ def draw_map(marker_map: MarkerMap, cloud: FloatArray | None = None) -> Figure:
         if title.endswith('along x'):
             axis.invert_xaxis()  # y points to the left of whoever looks along x
     handles = [Line2D([], [], color=colour, label=status) for status, colour in _STATUSES.items()]
-    title = f'{len(marker_map.markers)} markers, normals, ellipses of three sigma enlarged {_ENLARGED:g} times'
+    title = f'{marker_map.size_in_words}, normals, ellipses of three sigma enlarged {_ENLARGED:g} times'
     figure.legend(handles=handles, title=title, loc='outside lower center', ncols=len(handles))
     # Views of equal scale come to their places step by step; after the first, a title is cut off.
     for _ in range(_LAYOUT_STEPS):

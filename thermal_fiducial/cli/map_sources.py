@@ -103,7 +103,7 @@ def _grow(
         built = build_map(frames, camera, start, config, lambda markers, share: progress(share, f'{markers} markers'))
     _print_what_was_used(built, len(frames))
     save_with_history(out, built.map, action)
-    print(f'{out}: {len(built.map.markers)} markers')
+    print(f'{out}: {built.map.size_in_words}')
     return 2 if any(doubt.spoils for doubt in say_doubts(built.map, out)) else 0
 
 

@@ -79,7 +79,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         """Number of markers in the last frame, and of images that there was no time for since the last word."""
         if left := self._images.left_since():
             return WARN, f'{self._seen} markers; {left} older images left'
-        return OK, f'{self._seen} markers'
+        return OK, '1 marker' if self._seen == 1 else f'{self._seen} markers'
 
 
 def _require_opencv() -> None:

@@ -63,7 +63,7 @@ class MapServices:
 
     def _read(self) -> MarkerMap:
         loaded = self._keeper.load()
-        self._node.get_logger().info(f'map of {len(loaded.markers)} markers from {self._keeper.path}')
+        self._node.get_logger().info(f'map of {loaded.size_in_words} from {self._keeper.path}')
         if doubt := other_frame(loaded.frame_id, self._node.config.map_frame):
             self._node.get_logger().warning(doubt)
         wanted = self._node.config.dictionary
@@ -82,14 +82,14 @@ class MapServices:
         """Write the map file, or another one, and why, where it cannot be replaced."""
         path = self._keeper.save(self.mapper.map)
         why = f', as {self._keeper.obstacle}' if self._keeper.obstacle else ''
-        return f'{len(self.mapper.map.markers)} markers saved to {path}{why}'
+        return f'{self.mapper.map.size_in_words} saved to {path}{why}'
 
     def load(self) -> str:
         """Take over the map file as it is now: what ``thermal-fiducial map`` has made of it."""
         self._refuse_frozen()
         loaded = self._read()
         self._publish_jump(self.mapper.load(loaded))
-        return f'{len(loaded.markers)} markers loaded from {self._keeper.path}'
+        return f'{loaded.size_in_words} loaded from {self._keeper.path}'
 
     def undo(self) -> str:
         """Put the earlier version of the map file back, and take it over."""
@@ -100,7 +100,7 @@ class MapServices:
         """Back to the map that was loaded last."""
         self._refuse_frozen()
         self._publish_jump(self.mapper.reset())
-        left = f'{len(self.mapper.map.markers)} markers left'
+        left = f'{self.mapper.map.size_in_words} left'
         self._node.console.event('map', f'map reset, as it was asked for: {left}')
         return left
 

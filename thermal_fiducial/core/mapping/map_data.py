@@ -66,6 +66,12 @@ class MarkerMap:
     #: revision and positions of the markers that are held: looking for them takes a while in a large map
     _held: tuple[int, FloatArray] | None = field(default=None, init=False, repr=False, compare=False)
 
+    @property
+    def size_in_words(self) -> str:
+        """How many markers it has."""
+        count = len(self.markers)
+        return '1 marker' if count == 1 else f'{count} markers'
+
     def copy(self) -> 'MarkerMap':
         """A map that shares the (immutable) markers but not the table of them."""
         return replace(self, markers=dict(self.markers))
