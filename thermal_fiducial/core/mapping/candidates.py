@@ -1,9 +1,9 @@
-"""New markers on trial: views are collected until they leave only one pose.
+"""Candidates: new markers whose views are collected until only one pose explains them.
 
 A small square seen from one side fits two poses nearly equally well (the planar ambiguity of Schweighofer and Pinz,
-"Robust pose estimation from a planar target", 2006). The wrong one is wrong differently from each direction, so the
-marker's pose is fitted to views from several directions from either start, and enters the map only when one of the
-two fits is refuted.
+"Robust pose estimation from a planar target", 2006). The wrong pose differs between directions, so the marker's pose is
+fitted to views from several directions, starting from either solution. The marker enters the map once one of the two
+fits is ruled out.
 """
 
 from collections.abc import Mapping
@@ -20,21 +20,20 @@ from thermal_fiducial.core.mapping.marker_views import FittedPoses, MarkerView, 
 from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.types import FloatArray
 
-#: Views closer in direction than this say nothing new of the ambiguity [rad].
+#: Least angle between the directions of views that are kept [rad]: closer ones do not resolve the ambiguity.
 MIN_SEPARATION = np.deg2rad(1.0)
 MIN_VIEWS = 3
-#: Views kept of a candidate: the fit's cost stays bounded, however long the trial lasts.
+#: Views kept of a candidate, which bounds the cost of the fit.
 MAX_VIEWS = 16
-#: Difference of the two fits' chi squares that refutes the worse one: odds of e^-12 against a flip.
+#: Difference of the two fits' chi squares that rules the worse one out: odds of e^-12 against a flip.
 DECISIVE = 25.0
-#: Mean chi square of a view (8 residuals) above which the views don't belong to one marker that hangs still.
+#: Mean chi square of a view (8 residuals) above which the views cannot be of one marker at rest.
 INCONSISTENT = 200.0
-#: Fits that end nearer to each other than this are one fit [rad].
+#: Fits that end closer to each other than this count as one [rad].
 SAME_FIT = np.deg2rad(2.0)
 #: Candidates that are judged in one frame: bounds its time when many are new.
 TRIALS = 3
-#: Candidates at most, more than the largest dictionaries have markers in use: what was seen in passing, or is none at
-#: all, is forgotten before it fills the memory, that of the longest ago first.
+#: Largest number of candidates, which bounds memory against false positives: those observed longest ago are dropped.
 MOST = 1000
 
 
@@ -49,7 +48,7 @@ class Placement:
 
 @dataclass
 class Candidate:
-    """A marker on trial."""
+    """A new marker with its views, not in the map yet."""
 
     id: int
     size: float
@@ -61,7 +60,7 @@ class Candidate:
     _directions: list[FloatArray] = field(default_factory=list)
 
     def add(self, view: MarkerView) -> None:
-        """Keep ``view`` if it shows the marker from a new direction, or a frame whose camera is known better by now."""
+        """Keep ``view`` if its direction is new, or in place of a view of the same frame with an older camera pose."""
         # Both branches put the centre at the same place: the direction doesn't depend on the ambiguity.
         arm = view.viewpoint.T_map_camera[0, :3, :3] @ view.branches[0, :3, 3]
         direction = -arm / np.linalg.norm(arm)
@@ -79,7 +78,7 @@ class Candidate:
             self._drop_most_redundant()
 
     def move(self, displacement: Displacement) -> None:
-        """The map moved: each view's camera pose moves with the frames of its time."""
+        """Apply a displacement of the map to the views' camera poses."""
         moves = [displacement.at(view.stamp_ns) for view in self.views]
         self.views = [
             replace(view, viewpoint=replace(view.viewpoint, T_map_camera=T @ view.viewpoint.T_map_camera))
@@ -88,7 +87,7 @@ class Candidate:
         self._directions = [T[:3, :3] @ direction for direction, T in zip(self._directions, moves, strict=True)]
 
     def place(self, camera: Camera) -> Placement:
-        """Pose in the map if the views settle it."""
+        """Pose in the map if the views determine it uniquely."""
         self.untried = 0
         nothing = np.zeros((6, 6))
         if len(self.views) < MIN_VIEWS:
@@ -125,7 +124,7 @@ class Candidate:
 
 
 class NewMarkers:
-    """All markers on trial.
+    """All candidates.
 
     Parameters
     ----------
@@ -139,11 +138,11 @@ class NewMarkers:
     def show(
         self, stamp_ns: int, seen: Observations, camera: Camera, viewpoint: Viewpoint
     ) -> tuple[list[MapMarker], dict[int, str]]:
-        """Show a frame's markers to their candidates, but for those of which the detector knows no pose.
+        """Add a frame's views to the candidates, except markers without a pose.
 
         Returns
         -------
-        Those that the views have settled by now, as markers of the map, and what the others wait for, in words by ID.
+        Markers to enter the map, now determined by their views, and what the others wait for, in words by ID.
         """
         shown = []
         posed = np.isfinite(seen.branches[:, 0]).all(axis=(1, 2))
@@ -166,7 +165,7 @@ class NewMarkers:
         return placed, {c.id: c.reason for c in shown if c.id in self.candidates}
 
     def move(self, displacement: Displacement) -> None:
-        """The map moved: each candidate's views move with the frames of their time."""
+        """Apply a displacement of the map to all candidates."""
         for candidate in self.candidates.values():
             candidate.move(displacement)
 

@@ -1,4 +1,4 @@
-"""Frames kept for the joint refinement, few enough for hours, and when that is due."""
+"""Keyframes of the bundle adjustment: a bounded store, and when the next adjustment is due."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ _PERIOD_A_VIEW = 3e-4
 
 @dataclass(frozen=True)
 class Keyframe:
-    """What one frame showed, all markers of it, known or not."""
+    """All markers of one frame, known or not, and the odometry there."""
 
     stamp_ns: int
     T_map_camera: FloatArray
@@ -43,7 +43,7 @@ class Keyframe:
     corners: FloatArray
     #: (k, 4, 2, 2) [px^2]
     covariances: FloatArray
-    #: (4, 4) where the odometry has the camera, and (6, 6) how well it knows: information, zero without any
+    #: camera pose by odometry (4, 4), and its information (6, 6), zero without odometry
     T_odometry: FloatArray = field(default_factory=lambda: np.eye(4))
     information: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
@@ -76,9 +76,9 @@ def snapshot_of(
 
 
 def prior_poses(markers: Mapping[int, MapMarker]) -> dict[int, tuple[FloatArray, FloatArray]]:
-    """Pose and covariance (6, 6) of markers that are known from before the keyframes, as a refinement may use them.
+    """Prior poses and covariances (6, 6) of markers that the map had before the keyframes.
 
-    Only each marker's own covariance is kept in a map, not how the errors of two hang together.
+    A map contains the covariance of each marker, without correlations between markers.
     """
     known = [m for m in markers.values() if not m.fixed and np.any(m.covariance)]
     return {m.id: (m.T_map_marker, divided_prior(m.covariance, len(known))) for m in known}
@@ -86,7 +86,7 @@ def prior_poses(markers: Mapping[int, MapMarker]) -> dict[int, tuple[FloatArray,
 
 @dataclass(frozen=True)
 class Displacement:
-    """How an adjustment has moved the map, which after a gap or round a loop is not the same everywhere."""
+    """Displacement of the map by an adjustment, which differs over the map after gaps and loop closures."""
 
     #: (n,) of the adjusted keyframes, ascending
     stamps_ns: IntArray
@@ -94,7 +94,7 @@ class Displacement:
     T_new_old: FloatArray
 
     def at(self, stamp_ns: int) -> FloatArray:
-        """T_new_old (4, 4) for poses of the time ``stamp_ns``: that of the nearest keyframe."""
+        """T_new_old (4, 4) for poses at ``stamp_ns``: that of the keyframe nearest in time."""
         after = int(np.searchsorted(self.stamps_ns, stamp_ns))
         near = [i for i in (after - 1, after) if 0 <= i < len(self.stamps_ns)]
         return np.asarray(self.T_new_old[min(near, key=lambda i: abs(int(self.stamps_ns[i]) - stamp_ns))])
@@ -102,11 +102,11 @@ class Displacement:
 
 @dataclass
 class KeyframeStore:
-    """At most ``budget`` keyframes; of many alike (camera near, direction alike) only as many as there is room for."""
+    """At most ``budget`` keyframes, thinned out evenly over camera positions and viewing directions."""
 
     budget: int
     frames: dict[int, Keyframe] = field(default_factory=dict)
-    #: stamps of those that odometry alone joins to the rest: they are never dropped
+    #: stamps of keyframes that only odometry connects with the others: never dropped
     bridges: set[int] = field(default_factory=set)
     #: frames that were ever added
     added: int = 0
@@ -119,12 +119,7 @@ class KeyframeStore:
             self._thin(int(_THINNED * self.budget))
 
     def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
-        """Take over adjusted poses by stamp; frames that were not adjusted move like the nearest in time.
-
-        Returns
-        -------
-        How the map has moved at each time.
-        """
+        """Take over adjusted poses by stamp; other keyframes move with the nearest adjusted one in time."""
         stamps = sorted(adjusted.keys() & self.frames.keys())
         if not stamps:
             return Displacement(np.zeros(1, dtype=np.int64), np.eye(4)[None])
@@ -137,7 +132,7 @@ class KeyframeStore:
         return displacement
 
     def selected(self, views: int) -> tuple[Keyframe, ...]:
-        """Keyframes of at most about so many markers' views, spread like all of them."""
+        """Keyframes with about ``views`` views of markers at most, spread over the map like all of them."""
         total = sum(len(frame.ids) for frame in self.frames.values())
         if total <= views:
             return tuple(self.frames.values())
@@ -171,7 +166,7 @@ class KeyframeStore:
 
 
 def _rigid(T: FloatArray) -> FloatArray:
-    """Transforms (n, 4, 4) freed of what rounding has made of their rotations: else it doubles with every product."""
+    """Transforms (n, 4, 4) with orthonormal rotations: rounding errors would double with every product."""
     U, _, Vt = np.linalg.svd(T[:, :3, :3])
     result = T.copy()
     result[:, :3, :3] = U @ Vt
@@ -187,7 +182,7 @@ def _fair_share(counts: list[int], room: int) -> int:
 
 
 class FrameMemory:
-    """What was seen where.
+    """Keyframes of a flight, gaps between known markers, and the time of the last adjustment.
 
     Parameters
     ----------
@@ -198,25 +193,25 @@ class FrameMemory:
     def __init__(self, budget: int, marker_map: MarkerMap) -> None:
         self._keyframes = KeyframeStore(budget)
         self._camera: Camera | None = None
-        #: when the map last learned from known markers [ns]; None: not yet
+        #: stamp of the last frame with known markers [ns]; None: not yet
         self._last_ns: int | None = None
-        #: the odometry when the first marker was seen of those that nothing else joins to the map
+        #: pose by odometry at the first unmapped marker of the present gap
         self._gap: CameraPose | None = None
         self._priors = prior_poses(marker_map.markers)
         self._refined_ns, self._refined_frames, self._refined_markers = 0, 0, len(marker_map.markers)
         self._added_then, self._refined_views = 0, 0
 
     def keep(self, seen: Observations, pose: CameraPose, camera: Camera, predicted: PredictedCamera | None) -> None:
-        """Keep a frame whose camera is known; of one marker alone a refinement can learn nothing."""
+        """Keep a frame with a known camera pose and at least two markers."""
         self._last_ns, self._gap = pose.stamp_ns, None
         if len(seen.ids) >= 2:
             self._keyframes.add(self._keyframe(seen, pose, camera, predicted))
 
     def bridge(self, seen: Observations, camera: Camera, predicted: PredictedCamera, *, first: bool) -> Viewpoint:
-        """Keep a frame without a known marker; from where its markers are seen.
+        """Keep a frame without a known marker; returns the viewpoint of its markers, by odometry.
 
-        Nothing but the odometry joins its markers to the map. Once, for the ``first`` of them, that counts in full: its
-        error is the same for all that follow, which hang together through the markers themselves.
+        Only odometry connects these markers with the map. Its error at the ``first`` of them is common to all that
+        follow in the gap, since the markers connect the later frames.
         """
         keyframe = self._keyframe(seen, predicted.pose, camera, predicted)
         if first:
@@ -227,7 +222,7 @@ class FrameMemory:
             self._keyframes.add(keyframe)
         if self._gap is None:
             self._gap = predicted.pose
-        # What the odometry had gathered when the gap's first marker came is the same for all its views.
+        # The covariance of the odometry at the gap's first marker is the common error of all views.
         return Viewpoint.known(predicted.pose.T_map_camera, growth(self._gap, predicted), self._gap.covariance)
 
     def bridgeable(self, stamp_ns: int, longest: float) -> bool:
@@ -235,7 +230,7 @@ class FrameMemory:
         return self._last_ns is not None and 0 <= stamp_ns - self._last_ns <= longest * SECOND_NS
 
     def refinement_due(self, stamp_ns: int, period: float, markers: int) -> bool:
-        """Whether a refinement is worth its time, ``period`` [s] after the last or more, for so many markers."""
+        """Whether an adjustment of ``markers`` markers is due, at least ``period`` [s] after the last one."""
         if not self._keyframes.frames or period == 0.0:
             return False
         if stamp_ns - self._refined_ns < max(period, _PERIOD_A_VIEW * self._refined_views) * SECOND_NS:
@@ -244,7 +239,7 @@ class FrameMemory:
         return enough or markers > self._refined_markers
 
     def snapshot(self, marker_map: MarkerMap, errors: SystematicErrors, views: int) -> Snapshot | None:
-        """What a refinement works on, with about so many views of markers at most; None: nothing yet."""
+        """Input of an adjustment, with about ``views`` views of markers at most; None without keyframes."""
         if not self._keyframes.frames:
             return None
         frames = self._keyframes.selected(views)
@@ -256,7 +251,7 @@ class FrameMemory:
         return snapshot_of(trusted, frames, self._priors, marker_map.revision, errors)
 
     def move(self, adjusted: Mapping[int, FloatArray]) -> Displacement:
-        """Go along with a refinement, poses (4, 4) by stamp: how the map has moved at each time."""
+        """Take over adjusted camera poses (4, 4) by stamp; returns the displacement of the map."""
         return self._keyframes.move(adjusted)
 
     def _keyframe(

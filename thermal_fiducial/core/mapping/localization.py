@@ -139,14 +139,14 @@ class _JointFit:
         seen: Reprojected,
         weights: FloatArray,
     ) -> Location | None:
-        """A ``step`` (6,) from a pose (4, 4), with what it is uncertain by; None where that has no bounds.
+        """The pose (4, 4) corrected by ``step`` (6,), with its covariance; None if that is not finite.
 
-        Noise of the corners goes in as white, at least as large as the residuals say; errors of the map's markers with
-        unknown correlations; errors of corners and scale as the error model has them.
+        The covariance is the sum of white corner noise, scaled up to the residuals, of errors of the map's markers with
+        unknown correlations, and of systematic errors of corners and scale by the error model.
 
         Parameters
         ----------
-        gains : (6, 8 N) what a pixel of each coordinate moves the pose by
+        gains : (6, 8 N) derivative of the pose by the corners' coordinates [1/px]
         chi2 : of the residuals
         """
         n, sight, model = len(weights), self.sight, self.model
@@ -157,7 +157,7 @@ class _JointFit:
         arms = sight.points - sight.T_map_marker[:, None, :3, 3]
         grown = gains @ (seen.J_marker.reshape(n, 4, 2, 6)[..., :3] @ arms[..., None]).ravel()
         map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ seen.J_marker
-        # Sides and map grow together.
+        # Sides of the markers and distances in the map have the same scale error.
         of_scale = np.einsum('nij,nj->i', map_gains[:, :, :3], sight.scale_arms) - grown
         of_map = of_single_error(of_scale, model.marker_size_std)
         if np.any(sight.map_covariances):
@@ -172,7 +172,7 @@ class _JointFit:
         return Location(pose, sight, seen, weights, map_gains, correlations, white)
 
     def alternative(self, found: Location, hypotheses: FloatArray) -> FloatArray | None:
-        """Another pose (4, 4) that the corners do not refute; None when there is none."""
+        """The second solution (4, 4) of the planar ambiguity if the corners do not rule it out, else None."""
         width, height = np.ptp(self.sight.observed.corners, axis=(0, 1)) / self.camera.focal_px
         if np.hypot(width, height) > WIDE:
             return None
@@ -187,7 +187,7 @@ class _JointFit:
         return None if refuted or np.max(np.abs(other - T)) < 1e-6 else other
 
     def map_weights(self, T_map_camera: FloatArray) -> FloatArray:
-        """Weights (N,) of the markers by how well the map knows each."""
+        """Weights (N,) of the markers by their covariances in the map."""
         sight = self.sight
         if not sight.map_covariances.any():
             return np.ones(len(sight.markers))
@@ -201,8 +201,8 @@ class _JointFit:
 def marker_weights(errors: FloatArray, running_errors: FloatArray, model: SystematicErrors) -> FloatArray:
     """Step 5 of Algorithm 1: weights (N,) from the present and the running re-projection error of each marker [px].
 
-    A marker whose error is that of its neighbours, or below what corners can be trusted to anyway, weighs 1; a worse
-    one as its inverse square, which is what its error's variance deserves.
+    A marker whose error is at most the median, or at most ``decision_px``, has weight 1; a worse one the ratio of the
+    squares.
     """
     combined = 0.5 * (errors**2 + np.where(running_errors > 0.0, running_errors, errors) ** 2)
     reference = max(median(combined.tolist()), model.decision_px**2)
@@ -210,7 +210,7 @@ def marker_weights(errors: FloatArray, running_errors: FloatArray, model: System
 
 
 def _hypotheses(sight: Sight, fit: CameraFit, prior: FloatArray | None) -> FloatArray:
-    """Camera poses (H, 4, 4) from either branch of each of the largest markers and from the prior, the best first."""
+    """Initial camera poses (H, 4, 4): both planar poses of the largest markers and the prior, by ascending cost."""
     largest = np.argsort(-np.ptp(sight.observed.corners, axis=1).sum(axis=-1), kind='stable')[:_PROPOSERS]
     poses = (sight.T_map_marker[largest, None] @ inverse(sight.observed.branches[largest])).reshape(-1, 4, 4)
     poses = poses[np.isfinite(poses).all(axis=(1, 2))]

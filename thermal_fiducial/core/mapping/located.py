@@ -1,9 +1,8 @@
-"""The known markers of a frame, and what they and the odometry say of where the camera is: records of localization.
+"""Records of localization: the known markers of a frame, the camera pose by odometry, and the located frame.
 
-A single marker leaves a camera's attitude unknown by degrees, and its position by as much times the distance; inertial
-sensors and gravity know both far better, for seconds. The offset between the clocks of camera and odometry is the
-filter's to estimate; as long as it has not, the motion during what the offset may be wrong by is part of the
-covariance.
+A single marker determines a camera's attitude to degrees only, and its position to that angle times the distance;
+inertial odometry is far better for seconds. The filter estimates the clock offset between camera and odometry. Until
+it has, the covariance of the predicted pose contains the motion during the standard deviation of the offset.
 """
 
 from dataclasses import dataclass
@@ -29,20 +28,20 @@ from thermal_fiducial.core.measurements import CameraPose, Observations, Odometr
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import BoolArray, FloatArray, ObjectArray, SECOND_NS, Stacked
 
-#: Attitudes known no better than this [rad] are not published: their covariances, of first order, mean nothing.
+#: Standard deviation of the attitude [rad] beyond which a pose is not published: a first-order covariance fails there.
 VAGUE = 0.2
-#: A state of the filter stands for frames up to this far from it [ns].
+#: Longest time [ns] over which an odometry state is extrapolated to a frame.
 NEAR_NS = 300_000_000
-#: Squared distance (6 degrees of freedom) beyond which markers and odometry contradict each other: ten sigma.
+#: Squared Mahalanobis distance (6 d.o.f.) beyond which markers and odometry contradict each other: ten sigma.
 CONTRADICTION = 100.0
 
 
 @dataclass(frozen=True)
 class PredictedCamera:
-    """Where odometry has the camera at a frame."""
+    """Camera pose at a frame by odometry."""
 
     pose: CameraPose
-    #: the state that it is from
+    #: the odometry state that it is extrapolated from
     odometry: Odometry
 
 
@@ -61,7 +60,7 @@ class Sight(Stacked):
     T_map_marker: FloatArray
     sizes: FloatArray
     map_covariances: FloatArray
-    #: (N, 3) what their positions move by as the scale of the map grows by 1 [m]
+    #: (N, 3) derivative of their positions by the scale of the map [m]
     scale_arms: FloatArray
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""The marker map as data: its markers, how two maps of one place lie to each other, and what the mapper answers."""
+"""Data of the mapper: markers and map, alignment of two maps of one place, result of a frame."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
@@ -37,14 +37,14 @@ class MapMarker:
     #: running rms of the re-projection error of its corners [px]; 0 before the first observation
     reprojection_error_px: float = 0.0
     observations: int = 0
-    #: stamps of the first and the last sight; 0 when never seen
+    #: stamps of the first and the last observation; 0 if never observed
     first_seen_ns: int = 0
     last_seen_ns: int = 0
-    #: False: in quarantine, because it persistently disagrees with the others; no pose rests on it
+    #: False: in quarantine as inconsistent; no pose uses it
     trusted: bool = True
 
     def seen(self, stamp_ns: int, error_px: float) -> 'MapMarker':
-        """The marker after one more sight; written out, as every marker of every frame goes through here."""
+        """The marker after one more observation; without ``replace``, as this runs for every marker of every frame."""
         first = self.first_seen_ns if self.observations else stamp_ns
         return MapMarker(
             self.id, self.size, self.fixed, self.T_map_marker, self.covariance,
@@ -63,7 +63,7 @@ class MarkerMap:
     frame_id: str = 'map'
     dictionary: str = 'DICT_4X4_50'
     revision: int = 1
-    #: revision and positions of the markers that are held: looking for them takes a while in a large map
+    #: revision and anchors, cached: finding them takes long in a large map
     _held: tuple[int, FloatArray] | None = field(default=None, init=False, repr=False, compare=False)
 
     @property
@@ -73,11 +73,11 @@ class MarkerMap:
         return '1 marker' if count == 1 else f'{count} markers'
 
     def copy(self) -> 'MarkerMap':
-        """A map that shares the (immutable) markers but not the table of them."""
+        """A copy that shares the immutable markers."""
         return replace(self, markers=dict(self.markers))
 
     def adjust(self, adjusted: Mapping[int, MapMarker]) -> None:
-        """Take poses and covariances over for those markers that poses may rest on."""
+        """Take over poses and covariances of adjusted markers, except those in quarantine."""
         for marker_id, marker in adjusted.items():
             own = self.markers.get(marker_id)
             if own is not None and own.trusted:
@@ -117,21 +117,21 @@ class MarkerMap:
 
 @dataclass(frozen=True)
 class MapperResult:
-    """What one frame came to."""
+    """Result of one frame."""
 
     stamp_ns: int
     pose: CameraPose | None
-    #: in words: why there is no pose; empty when there is one
+    #: why there is no pose, in words; empty if there is one
     reason: str
-    #: the map has another geometry, or trusts other markers, than before
+    #: whether the geometry of the map or its quarantine changed
     map_changed: bool = False
     #: IDs of the known markers in view
     in_view: frozenset[int] = frozenset()
-    #: markers on trial in view: ID to what each waits for
+    #: candidates in view: ID to what each waits for
     candidates: dict[int, str] = field(default_factory=dict)
-    #: all markers in quarantine: ID to why it is there, with numbers
+    #: all markers in quarantine: ID to the reason, with numbers
     quarantine_reasons: dict[int, str] = field(default_factory=dict)
-    #: the map took something in: a new marker, or what the known ones were seen like
+    #: whether a new marker or statistics of known ones entered the map
     learned: bool = False
 
     @property
@@ -155,7 +155,7 @@ def _fill(rows: np.ndarray, names: Collection[str], values: FloatArray) -> None:
 
 @dataclass(frozen=True)
 class Alignment:
-    """A rigid transform between two maps, from what they have in common."""
+    """A rigid transform between two maps, by their common markers."""
 
     #: (4, 4) takes the moving map into the resting one
     T: FloatArray

@@ -1,10 +1,10 @@
 """The incremental marker map: Algorithm 1 of the paper.
 
 S. Khattak, C. Papachristos, K. Alexis, "Marker based thermal-inertial localization for aerial robots in obscurant
-filled environments", ISVC 2018. For every frame: split the markers into known and new, find the camera from all known
-ones jointly, weight each by its present and running re-projection error, refine, update the errors, and place new
-markers that are seen together with known ones. Beyond the paper: planar ambiguities are settled before anything rests
-on them, covariances carry the map's own uncertainty, and markers that stop agreeing are put in quarantine.
+filled environments", ISVC 2018. For every frame: split the markers into known and new ones, estimate the camera pose
+from all known ones jointly, weight each by its present and running re-projection error, refine, update the errors, and
+place new markers observed together with known ones. Beyond the paper: planar ambiguities are resolved before a marker
+enters the map, covariances contain the map's uncertainty, and inconsistent markers are put in quarantine.
 """
 
 from dataclasses import replace
@@ -31,11 +31,11 @@ from thermal_fiducial.core.types import FloatArray
 
 __all__ = ['MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
 
-#: Why nothing is learned from a frame that has a pose.
+#: Reason for which the map is not updated from a frame with a pose.
 CONTRADICTED = 'the known markers in view contradict the odometry'
-#: A pose of the past decides between alternative poses for this long [ns].
+#: Longest time [ns] for which the last pose resolves the planar ambiguity of the next.
 CONTINUITY_NS = 300_000_000
-#: What new markers in view wait for, in words by ID.
+#: ID of a new marker in view to the reason, in words, for which it is not in the map yet.
 Waiting = dict[int, str]
 
 
@@ -50,27 +50,27 @@ class MarkerMapper:
 
     def __init__(self, config: MarkerMapperConfig, marker_map: MarkerMap) -> None:
         self.configure(config)
-        #: no new markers, no changes of the map, while True; ``config.mode`` only says how it starts
+        #: while True the map does not change; ``config.mode`` gives the initial value
         self.frozen = config.mode == 'localization'
         self.resets = 0
         self._begin(marker_map)
 
     def configure(self, config: MarkerMapperConfig) -> None:
-        """Take over the dynamic parameters of ``config``, and where the camera is on the robot."""
+        """Take over the dynamic parameters of ``config``, and the pose of the camera on the robot."""
         self.config = config
         self._T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
 
     def reset(self) -> FloatArray | None:
-        """Back to the map that it was started with; see :meth:`load`."""
+        """Return to the initial map; see :meth:`load`."""
         return self.load(self._initial)
 
     def load(self, marker_map: MarkerMap) -> FloatArray | None:
-        """Go on with another map of the place, of the next revision; what was seen before is forgotten.
+        """Replace the map by another one of the place, with the next revision; keyframes and statistics are dropped.
 
         Returns
         -------
-        T_new_old (4, 4), by the markers that both have, which moves poses from the old map to the new: they don't
-        compare as they are. None where they have none.
+        T_new_old (4, 4), which moves poses from the old map to the new, by the markers that both have; None if there
+        are none.
         """
         T_new_old = jump(marker_map.markers, self.map.markers)
         self._begin(replace(marker_map, revision=max(self.map.revision, marker_map.revision) + 1))
@@ -84,7 +84,7 @@ class MarkerMapper:
         self._bias = CornerBias()
         #: the last pose that nothing contradicted
         self._last: CameraPose | None = None
-        #: whether odometry has been in this map
+        #: whether odometry has agreed with the markers since the map was loaded
         self._odometry_agreed = False
         self._memory = FrameMemory(self.config.keyframe_budget, self._initial)
 
@@ -97,12 +97,12 @@ class MarkerMapper:
         ----------
         markers : (N,) of MARKER_DTYPE
         camera : its intrinsics
-        prior : the filter's states and clock; settles ambiguities, and bridges gaps between known markers
+        prior : the filter's odometry and clock offset; resolves ambiguities, bridges gaps between known markers
         """
         return self.learn(self.locate(stamp_ns, markers, camera, prior))
 
     def locate(self, stamp_ns: int, markers: Markers, camera: Camera, prior: MotionPrior | None = None) -> LocatedFrame:
-        """The first half of :meth:`process`, which ends with the pose: whoever waits for that need wait no longer."""
+        """First half of :meth:`process`, up to the pose, which can be published before the map is updated."""
         observed = Observations.of(markers)
         # Step 2: known and new markers.
         is_known = np.array([key in self.map.markers for key in observed.ids.tolist()], dtype=np.bool_)
@@ -128,13 +128,13 @@ class MarkerMapper:
         return SystematicErrors(self._bias.px, marker_size_std=self.config.marker_size_std)
 
     def learn(self, frame: LocatedFrame) -> MapperResult:
-        """The second half: errors, standings and new markers, from the frame that was located last."""
+        """Second half of :meth:`process`: updates errors, quarantine and new markers with the frame located last."""
         outcome, waiting = frame.outcome, Waiting()
         changed = updated = False
         if isinstance(outcome, Refusal):
             changed, waiting = self._without_pose(frame, outcome)
         elif frame.contradicts_odometry and self._odometry_agreed:
-            # A marker that was moved, or that hangs in two places: what it teaches would spoil the map.
+            # Probably a moved or duplicated marker: an update would corrupt the map.
             waiting = dict.fromkeys(frame.new.ids.tolist(), CONTRADICTED)
         else:
             self._odometry_agreed |= frame.predicted is not None and not frame.contradicts_odometry
@@ -152,7 +152,7 @@ class MarkerMapper:
         )  # fmt: skip
 
     def _update_errors(self, frame: LocatedFrame, location: Location) -> bool:
-        """Take in the re-projection errors of the known markers; whether any standing changed by them."""
+        """Update the running errors of the known markers; whether one entered or left quarantine."""
         self._bias.add(location)
         known, (errors, explained) = frame.known.markers, frame.known_errors(location)
         changed = self._trust.update(self.map.markers, known, errors, explained)
@@ -162,7 +162,7 @@ class MarkerMapper:
         return changed
 
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, Waiting]:
-        """Show new markers to their candidates; whether any entered the map, and what the others wait for."""
+        """Add views to the candidates of new markers; whether any entered the map, and what the others wait for."""
         placed, waiting = self._new.show(frame.stamp_ns, frame.new, frame.camera, viewpoint)
         for marker in placed:
             self._take_in(marker)
@@ -170,7 +170,7 @@ class MarkerMapper:
         return bool(placed), waiting
 
     def _without_pose(self, frame: LocatedFrame, refusal: Refusal) -> tuple[bool, Waiting]:
-        """What a frame without a pose may still teach of new markers."""
+        """Views of new markers from a frame without a pose: with two possible camera poses, or one by odometry."""
         predicted, longest = frame.predicted, self.config.bridge_duration
         if self.frozen or not len(frame.new.ids):
             return False, {}
@@ -178,29 +178,29 @@ class MarkerMapper:
             return self._place_new(frame, refusal.viewpoint)
         if predicted is None or not self._memory.bridgeable(frame.stamp_ns, longest):
             return False, {}
-        # No known marker is in view: the odometry says where the camera is.
+        # No known marker is in view: the camera pose is that of the odometry.
         first = not any(key in self._new.candidates for key in frame.new.ids.tolist())
         return self._place_new(frame, self._memory.bridge(frame.new, frame.camera, predicted, first=first))
 
     def refinement_due(self, stamp_ns: int) -> bool:
-        """Whether enough has been seen since the last joint refinement for another to be worth its time."""
+        """Whether there are enough new keyframes since the last bundle adjustment for another."""
         if self.frozen:
             return False
         return self._memory.refinement_due(stamp_ns, self.config.refinement_period, len(self.map.markers))
 
     def snapshot(self, views: int = VIEWS) -> Snapshot | None:
-        """What a refinement works on, for ``bundle_adjustment.refine``; None: nothing yet.
+        """Input of ``bundle_adjustment.refine``; None without keyframes.
 
         The snapshot is immutable: the refinement may run elsewhere while frames are processed.
 
         Parameters
         ----------
-        views : about so many views of markers at most, which bounds its time
+        views : approximate largest number of views of markers, which bounds the time
         """
         return self._memory.snapshot(self.map, self._errors, views)
 
     def refine(self) -> AdjustedMap | None:
-        """Refine here and now with all keyframes, and take it over: for tools, and wherever time doesn't press."""
+        """Run a bundle adjustment of all keyframes and apply it: for tools, where time does not matter."""
         snapshot = self.snapshot(views=sys.maxsize)
         refinement = refine(snapshot) if snapshot is not None else None
         if refinement is not None:
@@ -224,12 +224,12 @@ class MarkerMapper:
 
     @property
     def corner_bias_px(self) -> float:
-        """Systematic error of the corners, as learned so far [px]."""
+        """Standard deviation of the corners' systematic error, as learned so far [px]."""
         return self._bias.px
 
     @property
     def candidates(self) -> dict[int, Candidate]:
-        """Markers on trial."""
+        """Candidates: new markers that are not in the map yet, by ID."""
         return dict(self._new.candidates)
 
     def enter(self, stamp_ns: int, candidate: Candidate, T_map_marker: FloatArray, covariance: FloatArray) -> None:

@@ -1,4 +1,4 @@
-"""A marker's pose fitted to its views, each from a camera whose own pose is uncertain or one of two."""
+"""Fit of a marker's pose to its views; the camera pose of a view is uncertain, and may be one of two."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,13 +19,13 @@ _CHOICES = 4
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Where a camera is, or the two places where it may be."""
+    """The pose of a camera, or its two possible poses."""
 
     #: (2, 4, 4) twice the same where there is no doubt
     T_map_camera: FloatArray
-    #: (2, 6, 6) of either, ROS convention: by how much views may differ from each other
+    #: (2, 6, 6) of either, ROS convention: the part that is independent between views
     covariances: FloatArray
-    #: (6, 6) error that all views share (of odometry over a gap): it moves the marker, but no view against another
+    #: (6, 6) error that all views share (of odometry over a gap): it moves the marker, but leaves no residual
     common: FloatArray
 
     @property
@@ -35,7 +35,7 @@ class Viewpoint:
 
     @classmethod
     def known(cls, T_map_camera: FloatArray, covariance: FloatArray, common: FloatArray) -> 'Viewpoint':
-        """A camera pose (4, 4) without doubt, by how much its views may differ (6, 6), and what they share (6, 6)."""
+        """A unique camera pose (4, 4); covariances (6, 6) of its independent and of its common error."""
         return cls(np.stack([T_map_camera] * 2), np.stack([covariance] * 2), common)
 
 
@@ -55,7 +55,7 @@ class MarkerView:
 
 @dataclass(frozen=True)
 class FittedPoses:
-    """Poses of a marker that fits to n views ended in, the best of the S first."""
+    """Results of S fits of a marker's pose to n views, the best first."""
 
     #: (S, 4, 4)
     T: FloatArray
@@ -70,7 +70,7 @@ class FittedPoses:
     common: FloatArray
 
     def covariance(self, noise: float) -> FloatArray:
-        """(6, 6) of the best one: ``noise`` times what the corners promise, and the errors of the cameras' poses."""
+        """(6, 6) of the best fit: the corners' covariance times ``noise``, and the errors of the cameras' poses."""
         white = np.linalg.inv(np.einsum('vri,vrj->ij', self.J_marker, self.J_marker))
         gains = -white @ np.einsum('vri,vrj->vij', self.J_marker, self.J_camera)
         from_cameras = correlated_sum(gains, self.camera_covariances) + correlated_sum(gains, self.common)
@@ -102,7 +102,7 @@ class MarkerViews:
         self._doubtful = any(len(view.viewpoint.poses) > 1 for view in views)
 
     def fit(self, starts: FloatArray) -> FittedPoses:
-        """The marker from all starts (S, 4, 4); of a camera's two poses the one that suits it better counts."""
+        """Fits from all initial poses (S, 4, 4); of two possible camera poses the likelier one is used."""
         T, chosen = starts, self._choose(starts)
         for _ in range(_CHOICES):
             begun = self._weights(T, chosen)
@@ -121,7 +121,7 @@ class MarkerViews:
         )  # fmt: skip
 
     def _choose(self, T: FloatArray) -> IntArray:
-        """Which of its two camera poses suits each view, (S, n), for a marker at T."""
+        """The likelier of the two camera poses of each view, (S, n), for a marker at T."""
         first = np.zeros((len(T), len(self._corners)), dtype=np.int64)
         if not self._doubtful:
             return first

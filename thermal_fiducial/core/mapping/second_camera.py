@@ -1,9 +1,9 @@
-"""A second camera on the robot: its poses, as poses of the first, make those of the first better, or stand in for them.
+"""A second camera on the robot: its poses, as poses of the first camera, are fused with those or replace them.
 
-The filter has one camera. It models what its poses have in common from frame to frame as errors of that camera; poses
-of two in turn would break this. So the two become one pose a frame of the first, by covariance intersection, which is
-consistent whatever their errors have in common (S. Julier, J. Uhlmann, "A non-divergent estimation algorithm in the
-presence of unknown correlations", ACC 1997). Where the first sees no known marker, the second's pose goes out alone.
+The filter has one camera, and models errors that its poses have in common from frame to frame as that camera's. Poses
+of two cameras in turn would violate this. So both are fused to one pose per frame of the first, by covariance
+intersection, which is consistent for any correlation (S. Julier, J. Uhlmann, "A non-divergent estimation algorithm in
+the presence of unknown correlations", ACC 1997). Without a known marker in the first, the second's pose is published.
 """
 
 from dataclasses import replace
@@ -37,11 +37,11 @@ class SecondCamera:
         self._T_second_first = inverse(T_body_second) @ T_body_first
         self._waiting: CameraPose | None = None
         self._first_ns: int | None = None
-        #: frames of the first that the second was taken into, poses of the second that went out alone or contradicted
+        #: number of fused frames, of the second's poses published alone, and of those that contradicted the first
         self.joined = self.alone = self.contradicted = 0
 
     def add_second(self, pose: CameraPose) -> CameraPose | None:
-        """A pose of the second camera; it comes back, as one of the first, where that sees nothing."""
+        """Add a pose of the second camera; returned as a pose of the first while that has none, else None."""
         pose = seen_from(pose, self._T_second_first)
         if self._first_ns is None or pose.stamp_ns - self._first_ns > _ALONE_NS:
             self.alone += 1
@@ -50,7 +50,7 @@ class SecondCamera:
         return None
 
     def with_second(self, pose: CameraPose, prior: MotionPrior) -> CameraPose:
-        """A pose of the first camera with what the latest of the second says, carried on by the motion between."""
+        """A pose of the first camera fused with the latest of the second, extrapolated by odometry."""
         waiting, self._waiting = self._waiting, None
         self._first_ns = pose.stamp_ns
         if waiting is None or abs(pose.stamp_ns - waiting.stamp_ns) > _CARRIED_NS:

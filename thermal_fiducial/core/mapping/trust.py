@@ -1,7 +1,7 @@
-"""What frames teach of the markers' errors: running ones, quarantine of who persistently disagrees, the corners' bias.
+"""Statistics of residuals: running error of each marker, quarantine of inconsistent markers, bias of the corners.
 
-A marker that was moved or duplicated, or was put in the map wrongly re-projects badly against a pose that rests on the
-others. One bad frame is an outlier; most of a second of them is a fact about the marker.
+A marker that was moved or duplicated, or has a wrong pose in the map, has large residuals against a pose from the other
+markers. One such frame is an outlier; most frames of a second are evidence against the marker.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,19 +16,19 @@ from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import FloatArray, ObjectArray
 
-#: Why a marker is in quarantine that came so with the map.
+#: Reason of quarantine of markers that the map file already had there.
 FROM_FILE = 'in quarantine since before the map was loaded'
-#: Weight of a new frame in the running error and in the share of disagreeing frames: a memory of 20 frames.
+#: Weight of a new frame in running error and share of inconsistent frames: a memory of 20 frames.
 MEMORY = 0.05
-#: Share of disagreeing frames that puts a marker in quarantine, and the share below which it comes out again.
+#: Share of inconsistent frames above which a marker is put in quarantine, and below which it is released.
 QUARANTINE, RELEASE = 0.7, 0.1
-#: Ratio of an error to what its covariance explains that counts as disagreement.
+#: Ratio of an error to its standard deviation above which a frame counts as inconsistent.
 DISAGREEMENT = 4.0
-#: Frames that the error to begin with is worth, and the weight that each new frame leaves to those before: 300 frames.
+#: Corner bias: weight of the prior in frames, and forgetting factor per frame, a memory of 300 frames.
 BIAS_PRIOR, BIAS_MEMORY = 30.0, 1.0 - 1.0 / 300.0
-#: A pose takes up nearly all of the error of fewer markers.
+#: Fewest markers for the corner bias: the pose absorbs nearly all of the error of fewer.
 FEWEST_MARKERS = 3
-# Frames farther apart than this see the corners elsewhere in the image [ns].
+# Longest time between frames whose residuals are compared [ns]: later the corners are elsewhere in the image.
 _SUCCESSIVE_NS = 150_000_000
 
 
@@ -40,7 +40,7 @@ class _Record:
 
 
 class Trust:
-    """Running errors and disagreement of every marker seen so far, and the standings of a map's ``markers``."""
+    """Running errors and shares of inconsistent frames of all markers, and the quarantine of a map's ``markers``."""
 
     def __init__(self, markers: Mapping[int, MapMarker]) -> None:
         self._records: dict[int, _Record] = {}
@@ -54,16 +54,17 @@ class Trust:
     def update(
         self, markers: dict[int, MapMarker], known: ObjectArray, errors_px: np.ndarray, explained_px: np.ndarray
     ) -> bool:
-        """Take in a frame, after which those of ``markers`` that persistently disagree are in quarantine.
+        """Update with a frame; persistently inconsistent markers are put in quarantine, consistent ones released.
 
         Parameters
         ----------
-        known : the N of them that the frame shows
-        errors_px, explained_px : (N,) their re-projection errors, rms, and what is to be expected of them
+        markers : of the map; those that enter or leave quarantine are replaced
+        known : the N of them in the frame
+        errors_px, explained_px : (N,) their rms re-projection errors, and the standard deviations of these
 
         Returns
         -------
-        Whether any standing changed.
+        Whether any marker entered or left quarantine.
         """
         records = [self._record(marker) for marker in known]
         for record, error in zip(records, errors_px.tolist(), strict=True):
@@ -88,11 +89,11 @@ class Trust:
         return changed
 
     def flag(self, markers: dict[int, MapMarker], outliers: Mapping[int, float]) -> None:
-        """Quarantine what a joint adjustment contradicts: it is trusted again when it has long agreed.
+        """Put markers in quarantine that a bundle adjustment found inconsistent; frames may release them later.
 
         Parameters
         ----------
-        outliers : ID to the share of its views that contradict the others
+        outliers : ID to the share of its views that are inconsistent
         """
         for marker_id, share in outliers.items():
             if marker_id not in markers or not markers[marker_id].trusted:
@@ -102,31 +103,31 @@ class Trust:
             self._set_standing(markers, marker_id, reason)
 
     def _set_standing(self, markers: dict[int, MapMarker], marker_id: int, reason: str) -> None:
-        """Trust one of ``markers`` again, or put it in quarantine for a reason."""
+        """Put one of ``markers`` in quarantine for a ``reason``, or release it if that is empty."""
         markers[marker_id] = replace(markers[marker_id], trusted=not reason)
         self.quarantined.pop(marker_id, None)
         if reason:
             self.quarantined[marker_id] = reason
 
     def forget(self, ids: Iterable[int]) -> None:
-        """Start anew with ``ids``: their poses have changed."""
+        """Reset the statistics of ``ids``, as their poses have changed."""
         for marker_id in ids:
             self._records.pop(marker_id, None)
 
     def _record(self, marker: MapMarker) -> _Record:
         record = self._records.get(marker.id)
         if record is None:
-            # A marker that comes out of a file in quarantine stays there until it has proved itself.
+            # A marker that the file has in quarantine stays there until frames release it.
             record = _Record(marker.reprojection_error_px**2, marker.observations, 0.0 if marker.trusted else 1.0)
             self._records[marker.id] = record
         return record
 
 
 def inconsistent(disagrees: np.ndarray, markers: Sequence[MapMarker]) -> np.ndarray:
-    """Which of the disagreeing markers are to blame, (N,) bool.
+    """Which of the disagreeing markers count as inconsistent, (N,) bool.
 
-    Among three or more the majority decides, which a robust pose already follows. Of two that disagree a fixed one
-    is believed, then the one seen more often by far; else it is open and neither is blamed.
+    With three or more, all that disagree: a robust pose follows the majority. Of two, not the fixed one, nor the one
+    observed more than four times as often; if neither applies, none.
     """
     trusted = np.array([marker.trusted for marker in markers], dtype=bool)
     if np.count_nonzero(trusted) != 2 or not np.any(disagrees & trusted):
@@ -148,11 +149,11 @@ def _preference(a: MapMarker, b: MapMarker) -> int:
 
 
 class CornerBias:
-    """Systematic error of the corners (lens, detector), from residuals that are still there in the next frame.
+    """Systematic error of the corners (lens, detector), from the correlation of residuals of successive frames.
 
-    White noise of two frames is independent: the mean product of a corner's residuals in successive frames is the
-    variance of what lasts, as far as the pose does not take it up. Noise of a marker of which little is in view does
-    last: it counts by what it claims.
+    White noise of two frames is independent, so the mean product of a corner's residuals in successive frames is the
+    variance of the systematic error, less the part that the pose absorbs. Errors of partially visible markers are
+    correlated for other reasons; markers are weighted by their claimed noise.
     """
 
     def __init__(self) -> None:
@@ -160,13 +161,13 @@ class CornerBias:
         self.px = SystematicErrors().corner_px
         self._weight = BIAS_PRIOR
         self._sum = BIAS_PRIOR * self.px**2
-        #: the frame before, and (N,) in which its markers count
+        #: the last frame, and the weights (N,) of its markers
         self._last: tuple[Location | None, FloatArray] = None, np.zeros(0)
 
     def add(self, location: Location) -> None:
-        """Take in what the pose of a frame leaves of its corners."""
+        """Update with the residuals of a located frame."""
         (last, before), noise = self._last, location.sight.noise_px
-        # A marker that is hardly seen, of more noise than most of its frame, says little.
+        # Markers with more noise than the frame's median have less weight.
         shares = np.minimum(1.0, (median(noise.tolist()) / noise) ** 2)
         self._last = location, shares
         if last is None or not 0 < location.pose.stamp_ns - last.pose.stamp_ns < _SUCCESSIVE_NS:
@@ -176,7 +177,7 @@ class CornerBias:
         then = [places[location.pose.marker_ids[place]] for place in now]
         if len(now) < FEWEST_MARKERS:
             return
-        # Moved markers last as well: none counts for more than what makes it inconsistent.
+        # Residuals of moved markers are correlated too: the products are clipped at the limit of inconsistency.
         products = (location.seen.residuals[now] * last.seen.residuals[then]).sum(axis=(1, 2)) / 8.0
         products = np.clip(products, -(INCONSISTENT_PX**2), INCONSISTENT_PX**2)
         shares = shares[now] * before[then]
