@@ -1,8 +1,8 @@
-"""Rough outlines of markers pulled onto the pattern that they show.
+"""Alignment of inaccurate outlines with the pattern of their marker.
 
-An outline of a faint marker has a corner or two off by up to a cell. Once its cells show which marker it is, the whole
-pattern with its white surroundings is fitted to the image: Gauss-Newton on the four corners, together with contrast
-and a background that may bend (B. Lucas, T. Kanade, "An iterative image registration technique", 1981).
+The outline of a faint marker may have a corner or two wrong by up to a cell. With a hypothesis of the marker, the whole
+pattern and its white surroundings are fitted to the image: Gauss-Newton on the four corners, together with contrast
+and a quadratic background (B. Lucas, T. Kanade, "An iterative image registration technique", 1981).
 """
 
 from functools import cache
@@ -17,18 +17,18 @@ from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
 from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, TINY
 
 _STEPS = 3
-# Smoothing of the image [px], so that its slope shows the way from half a cell away.
+# Smoothing of the image [px], so that gradients reach half a cell.
 _SMOOTHING = 1.0
-# The same at most where there is no noise to smooth [cells].
+# Largest smoothing of images without noise [cells].
 _SMOOTHING_CELLS = 0.4
 # Samples along a cell, and one outside the sides, in cells.
 _SAMPLES = (0.17, 0.5, 0.83)
 _OUTSIDE = 0.35
-# What the smoothing, the optics and the pixels make of an edge [cells].
+# Blur of an edge by smoothing, optics and pixels [cells].
 _BLUR = 0.25
-# Share of its own information that each coordinate is held back with.
+# Damping: share of the information's diagonal that is added to it.
 _DAMPING = 0.1
-# What makes a slope per pixel of a Sobel filter's sum.
+# Factor from a Sobel filter's sum to a gradient per pixel.
 _SOBEL = 0.125
 # Longest step of a corner [cells].
 _LONGEST = 0.6
@@ -63,9 +63,9 @@ def aligned(
     *,
     noisy: bool = True,
 ) -> FloatArray:
-    """Quadrilaterals (Q, 4, 2) moved to where ``image`` looks most like the markers ``ids`` (Q,), turned (Q,).
+    """Quadrilaterals (Q, 4, 2) aligned with the patterns of the markers ``ids`` (Q,), in quarter ``turns`` (Q,).
 
-    One that is not ``noisy`` is smoothed no more than the cells of a typical marker bear.
+    An image that is not ``noisy`` is smoothed by no more than a share of a typical cell.
     """
     grid = _grid(decoder.cells)
     cells = np.ones((len(ids), decoder.cells + 2, decoder.cells + 2))
@@ -89,7 +89,7 @@ def aligned(
         information = (J @ np.swapaxes(J, -1, -2)).astype(np.float64)
         diagonal = np.einsum('qii->qi', information)
         diagonal[:, :8] *= 1.0 + _DAMPING
-        # What shows nothing of some direction stays solvable.
+        # Keeps the system solvable where the image has no gradient in some direction.
         diagonal += TINY * (1.0 + diagonal.max(axis=1, keepdims=True))
         step = -np.linalg.solve(information, J @ np.swapaxes(value, -1, -2))[:, :8, 0]
         longest = _LONGEST / decoder.cells * np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)[:, None] / np.sqrt(2.0)
@@ -98,7 +98,7 @@ def aligned(
 
 
 def _window(image: Float32Array, quads: FloatArray, cells: int) -> tuple[Float32Array, FloatArray]:
-    """The part of the image that quadrilaterals (Q, 4, 2) can come to see, and its first pixel (2,)."""
+    """The part of the image that quadrilaterals (Q, 4, 2) may reach in all steps, and its first pixel (2,)."""
     extent = np.ptp(quads, axis=1).max()
     reach = (_STEPS * _LONGEST + _OUTSIDE) / cells * extent + 4.0 * _SMOOTHING + 2.0
     height, width = image.shape

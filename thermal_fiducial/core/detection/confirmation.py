@@ -1,8 +1,7 @@
-"""Whether markers look like themselves where their corners were refined to.
+"""Confirms markers at their refined corners, by the correlation of their pattern and the sharpness of their sides.
 
-Markers that are too small for their sides to be measured one by one show by their whole pattern. Where a cell is hardly
-wider than the blur, the columns of pixels across a side show all of the marker's edges at once: its pattern is fitted
-to the picture then. That speaks for itself only where the markers of a dictionary differ in many bits.
+In pictures for a display, markers whose cells are hardly wider than the blur are refined by fitting the whole pattern,
+as single sides cannot be measured. That is only safe with dictionaries whose markers differ in many bits.
 """
 
 from dataclasses import replace
@@ -20,31 +19,31 @@ from thermal_fiducial.core.detection.refining import RefinedCorners, RefinedMark
 from thermal_fiducial.core.detection.search import accepted
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, TINY
 
-# Cells at least this wide are read at half the resolution, where a pixel has half the noise and less blur.
+# Cells at least this wide are decoded at half resolution, with half the noise and less blur [px].
 _WIDE_CELL_PX = 8.0
-# Correlation at the refined corners.
+# Least correlation at the refined corners.
 _SIMILAR = 0.82
-# The same in a picture for a display, less of a faint marker. Textures of everyday things look like patterns of few
-# bits there, at contrasts at which a marker is all but free of noise. Of 19 false positives of four such dictionaries
-# in 100 pictures the best had 0.90.
+# Least correlation in a picture for a display, and for faint markers there a smaller one that grows with the contrast.
+# Everyday textures resemble patterns of few bits: of 19 false positives of four such dictionaries in 100 pictures the
+# best had 0.90.
 _SIMILAR_IN_PICTURE, _FAINT, _PER_CNR = 0.92, 0.7, 0.07
-# Share of a marker's isolation by which it must stand out among all others. That speaks for itself where markers differ
-# in so many bits that this many wrong ones can be corrected; noise and clutter often look a little like one of the few
-# patterns of a 4 x 4 dictionary.
+# Least margin over the runner-up, as a share of the marker's isolation. It suffices for dictionaries that correct at
+# least _MANY_BITS wrong bits; noise and clutter often resemble one of the patterns of a 4 x 4 dictionary a little.
 _CLEAR_MARGIN = 0.5
 _MANY_BITS = 3
-# White surroundings are as white as white bits, give or take the background; the edge of a plate seen inside out is
-# not.
+# Range of the step from border to surroundings over the contrast: white surroundings are about as white as white bits,
+# the background behind a plate's edge is not.
 _WHITE = (0.4, 1.75)
-# Corner deviation [px] times contrast over noise times root of the side [px]: 4 to 7 for four clean sides.
+# Largest corner standard deviation [px] times contrast-to-noise ratio times root of the side [px]: 4 to 7 for four
+# sharp sides.
 _SHARP = 7.5
-# Contrast over noise beyond which corners deviate by what optics and plates really are, and not by noise.
+# Contrast-to-noise ratio above which model errors dominate the noise of corners.
 _NOISY = 8.0
-# Pixels along a side that the refinement uses of a long one.
+# Length of a side up to which the refinement uses all of its pixels [px].
 _SEEN_PX = 60.0
 # Widest cells of markers too small for their sides to be measured [px].
 _WIDEST_CELL_PX = 2.5
-#: Nearer to the border of the image than this a marker may be cut off, by its refined corners [px].
+#: Distance from the image's border below which a marker, by its refined corners, counts as possibly cut off [px].
 BORDER_PX = 1.0
 
 
@@ -58,15 +57,15 @@ def confirmed(
     *,
     standing_picture: BoolArray,
 ) -> BoolArray:
-    """Which markers (N,) still look like themselves at their refined corners, with sides as sharp as their contrast.
+    """Which markers (N,) show their pattern at the refined corners, with sides as sharp as their contrast allows.
 
-    Noise and clutter that happen to correlate with a pattern have no four straight sharp sides: their corners are far
-    less certain than contrast, noise and size of a marker make them.
+    Noise and clutter that happen to correlate with a pattern have no four straight sharp sides: the standard deviations
+    of their corners are far larger than contrast, noise and size of a marker explain.
 
     Parameters
     ----------
-    there : (N, 4, 2) where the corners should appear [px]
-    standing_picture : (N,) which are seen in a picture for a display, and not blurred by motion
+    there : (N, 4, 2) predicted corners in the image [px]
+    standing_picture : (N,) which are in a picture for a display, without motion blur
     """
     if len(found.ids) == 0:
         return np.zeros(0, dtype=bool)
@@ -86,7 +85,7 @@ def confirmed(
 
 
 def _read(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
-    """Readings of (Q, 4, 2), at half the resolution when all are large enough for it."""
+    """Readings of quadrilaterals (Q, 4, 2), at half resolution if all are large enough."""
     sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
     if sides.min() < _WIDE_CELL_PX * decoder.cells:
         return decoder.read(image, quads)
@@ -94,12 +93,12 @@ def _read(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
 
 
 def speaks_for_itself(reading: Reading, decoder: Decoder) -> BoolArray:
-    """Which readings (N,) show a marker beyond doubt, whatever its sides are like."""
+    """Which readings (N,) suffice without sharp sides: clear margin, white surroundings, a dictionary of many bits."""
     return np.asarray(_stands_out(reading, decoder) & (decoder.correctable >= _MANY_BITS))
 
 
 def _stands_out(reading: Reading, decoder: Decoder) -> BoolArray:
-    """Which readings (N,) are clearly of one marker, in white surroundings."""
+    """Which readings (N,) have a clear margin over other markers and white surroundings."""
     margin = (np.abs(reading.correlation) - reading.runner_up) / decoder.isolation[reading.ids]
     white = (reading.surround >= _WHITE[0]) & (reading.surround <= _WHITE[1])
     return np.asarray((margin >= _CLEAR_MARGIN) & white)
@@ -113,7 +112,7 @@ def with_corners_by_pattern(
     decoder: Decoder,
     config: ArucoDetectorConfig,
 ) -> tuple[RefinedMarkers, BoolArray]:
-    """Refined corners with those by the pattern of small ones among the ``lost`` (N,), and which (N,) these are."""
+    """Refined corners, those of small ``lost`` (N,) markers replaced by a pattern fit; which (N,) were replaced."""
     cell = sides_px(found.places.at.px) / decoder.cells
     small = np.flatnonzero(lost & (cell < _WIDEST_CELL_PX))
     by_pattern = np.zeros(len(lost), dtype=bool)

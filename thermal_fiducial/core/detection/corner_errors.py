@@ -1,7 +1,6 @@
-"""What a corner may be off by for other reasons than noise of pixels: all that widens the covariance of one.
+"""Systematic errors of corners: all that widens a corner's covariance beyond pixel noise.
 
-Each has a unit and a source here, and enters where its name is used. How corners hang together is known of some: what
-all four sides share leaves a square one, a wrong lag displaces them along the motion.
+Each error has its unit and source here, and enters where its name is used.
 """
 
 import numpy as np
@@ -11,19 +10,18 @@ from thermal_fiducial.core.types import FloatArray, TINY
 #: A corner by its four sides, and a corner of a partially visible marker by the edges of its cells [px]: the blur of
 #: the optics is not quite a Gaussian. Rendered frames without noise.
 OF_SIDES_PX = 0.010
-#: What the four sides of a marker share of it [px].
+#: Part of that error that the four sides of a marker have in common [px].
 OF_ALL_SIDES_PX = 0.005
-#: An edge between two cells [px]: optics and cut. Drawn views of markers that the image cuts off.
+#: An edge between two cells [px]: optics and cut. Drawn views of partially visible markers.
 OF_CELL_EDGE_PX = 0.015
-#: A corner that is looked at by itself, on thermal frames [px]: blur rounds it.
+#: A corner by ``cornerSubPix`` on thermal frames [px]: blur rounds it.
 OF_LOCAL_PX = 0.18
 #: A corner by the whole pattern of a marker too small for its sides [cells].
 OF_PATTERN_CELLS = 0.2
-#: A side in a picture for a display, whose scale of counts is bent [px]: if the middle of black and white lies anywhere
-#: from a fifth to four fifths of the step as it was, that of a step blurred by 0.66 px is off by up to 0.55, evenly
-#: spread.
+#: A side in a picture for a display, a nonlinear function of the counts [px]: if its middle gray lies anywhere between
+#: a fifth and four fifths of the original step, a step blurred by 0.66 px is displaced by up to 0.55, evenly spread.
 OF_BENT_SCALE_PX = 0.3
-#: A corner there when the width of the border has shown that displacement [px]: it bends motion blur too.
+#: A corner there, after the correction by the width of the border [px]: motion blur is distorted too.
 OF_BENT_BLUR_PX = 0.1
 #: A segment of a border there, and how much larger the variance of their mean is than if segments erred by themselves:
 #: of rendered frames after the Tau 2's plateau equalisation, errors of the displacement found are 3 to 4 of the sigmas
@@ -64,10 +62,10 @@ def of_motion_blur(by_twist: FloatArray, twist_covariance: FloatArray, lag_blur_
 def unknown_motion(
     displacement: FloatArray, twist_covariance: FloatArray, unsharpness: FloatArray, cell_px: FloatArray
 ) -> FloatArray:
-    """Covariances (N, 4, 2, 2) [px^2] of corners that a motion displaces of which little is known.
+    """Covariances (N, 4, 2, 2) [px^2] of corners by the displacement of a nearly unknown motion.
 
-    Edges that are sharp limit it, and that cells can be distinguished. It displaces all corners of a frame alike, which
-    covariances of single ones cannot say: what many of them say together may be off by more than theirs.
+    Sharp edges and readable cells bound it. All corners of a frame are displaced alike, which covariances of single
+    corners cannot express: their mean is less accurate than these suggest.
 
     Parameters
     ----------

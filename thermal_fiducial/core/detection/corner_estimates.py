@@ -1,8 +1,8 @@
-"""Corners of markers that were found: refined, confirmed, and as they are published.
+"""Published corners of markers: confirmed, and on pictures for a display corrected by the width of the border.
 
-What is meant for a display has been through a gain control that bends the scale of counts. The middle between the grey
-levels of black and white is then not that of the step between them: all that is dark looks larger, or all smaller. A
-marker's sides go out where the inner edges of its border go in, so that the width of the border says by how much.
+A gain control for displays is a nonlinear function of the counts. The middle between the gray levels of black and white
+is then not the middle of the blurred step between them: all dark regions grow, or all shrink. The sides of a marker and
+the inner edges of its border move in opposite directions, so the width of the border measures the displacement.
 """
 
 from dataclasses import replace
@@ -29,26 +29,25 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
 
-# Half the window round a corner that is looked at by itself: in cells, and at most in pixels.
+# Half the window of ``cornerSubPix``: in cells, and at most in pixels.
 _WINDOW_IN_CELLS, _LARGEST_WINDOW = 0.3, 5
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
-# Step beyond which such a corner has left its own [cells].
+# Largest step of ``cornerSubPix`` that is accepted [cells].
 _LOST_CELLS = 0.4
-# Four corners that err together, each with a covariance of its own, claim what they have in common four times too well.
+# Factor on the covariances of four corners with a common error: taken as independent, their mean has a quarter of it.
 _CORNERS = 4.0
-# Columns of pixels in a segment of a border, and blur that these reach across [px].
+# Columns of pixels in a segment of a border, and the blur for which they are long enough [px].
 _COLUMNS, _WIDEST_PX = 6, 2.0
-# A marker that was read off its corners by less than this need not be read again [cells].
+# Largest distance of the refined corners from where the marker was decoded for it not to be decoded again [cells].
 _READ_THERE = 0.1
-# Standard deviation of motion blur below which a marker looks as if it stood still [cells].
+# Standard deviation of motion blur below which a marker counts as at rest [cells].
 _STANDING = 0.1
 
 
 def local_corners(image: Float32Array, refined: RefinedCorners, cells: int) -> RefinedCorners:
-    """Corners (N, 4, 2) by ``cv2.cornerSubPix``, each by itself, from the gradients around; those carried away stay.
+    """Corners (N, 4, 2) by ``cv2.cornerSubPix``; those that move too far keep their refined place.
 
-    The common definition of a corner for pictures without a calibration. It lies a few tenths of a pixel inside that of
-    the sides' lines, because blur rounds corners.
+    These lie a few tenths of a pixel inside the intersections of the sides, because blur rounds corners.
     """
     corners = refined.corners_px.copy()
     for index, start in enumerate(refined.corners_px):
@@ -62,20 +61,20 @@ def local_corners(image: Float32Array, refined: RefinedCorners, cells: int) -> R
 
 
 class DisplayedSides:
-    """Takes the displacement of sides out of the corners of markers with ``bits`` (M, n, n)."""
+    """Corrects corners for the displacement of sides in pictures for a display; markers with ``bits`` (M, n, n)."""
 
     def __init__(self, bits: Gray) -> None:
         self._behind, self._white = edges_behind_border(bits)
         self._bits = bits.shape[1]
 
     def corrected(self, frame: Frame, refined: RefinedMarkers, blur_px: float) -> RefinedCorners:
-        """Corners of N markers at the stamp, with what stays unknown of the displacement."""
+        """Corrected corners of N markers at the stamp; covariances with the remaining error of the correction."""
         if len(refined.ids) == 0:
             return refined.corners
         segments = self._across_border(frame, refined, blur_px)
         known = segments.variance < HOPELESS
         weight = np.where(known, 1.0 / (OF_BORDERS_TOGETHER * (segments.variance + OF_BORDER_PX**2)), 0.0)
-        # Where sides are out by one, the inner edges are in by one, of a border that is drawn too large with them.
+        # Sides displaced outward by 1 scale the pattern, so that the inner edges appear displaced inward by ``gain``.
         gain = 2.0 - 2.0 / (self._bits + 2.0)
         information = gain * gain * weight.sum(axis=1)
         variance = 1.0 / (information + OF_BENT_SCALE_PX**-2)
@@ -87,7 +86,7 @@ class DisplayedSides:
         return replace(refined.corners, corners_px=corners, covariances=refined.corners.covariances + unknown)
 
     def _across_border(self, frame: Frame, refined: RefinedMarkers, blur_px: float) -> Segments:
-        """Displacements of the inner edges of the borders, inward, where white lies behind them."""
+        """Inward displacements of the inner edges of the borders, where the cells behind are white."""
         seen = ImagePoints.at(refined.observed.corners_px, frame.camera)
         inset = 1.0 / (self._bits + 2.0)
         a, b = inset + (1.0 - 2.0 * inset) * np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
@@ -101,7 +100,7 @@ class DisplayedSides:
 
 
 def _outward(corners: FloatArray) -> FloatArray:
-    """How corners (N, 4, 2) of quadrilaterals move when all sides move outward by one (N, 4, 2)."""
+    """Displacement (N, 4, 2) of the corners (N, 4, 2) of quadrilaterals whose sides all move outward by 1."""
     side = np.roll(corners, -1, axis=1) - corners
     side = side / np.linalg.norm(side, axis=-1, keepdims=True)
     normal = np.stack([side[..., 1], -side[..., 0]], axis=-1)
@@ -124,7 +123,7 @@ class CornerEstimator:
     def published(
         self, frame: Frame, found: FoundMarkers, markers: RefinedMarkers, config: ArucoDetectorConfig
     ) -> RefinedMarkers:
-        """Those of the markers ``found`` that their refined corners confirm, with these as they are published."""
+        """The markers ``found`` that are confirmed at their refined corners, with the corners to publish."""
         if len(found.ids) == 0:
             return markers
         keep = self._confirmed(frame, found, markers, config)
@@ -141,7 +140,7 @@ class CornerEstimator:
     def _confirmed(
         self, frame: Frame, found: FoundMarkers, markers: RefinedMarkers, config: ArucoDetectorConfig
     ) -> BoolArray:
-        """Which markers look like themselves at their refined corners: how the motion is known does not matter."""
+        """Which markers show their pattern at the refined corners."""
         blur, observed, cells = markers.blur, markers.observed, self._decoder.cells
         there = found.places.at.px + blur.shift
         off = np.abs(observed.corners_px - there).max(axis=(1, 2))

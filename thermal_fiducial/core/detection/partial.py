@@ -1,8 +1,8 @@
-"""Known markers that the border of the image cuts, or that fill it.
+"""Partially visible known markers: those that the border of the image cuts, or that fill the image.
 
-Where the map and the odometry expect one, its visible cells must look like it and like nothing else there. All edges
-between its cells that are in view, inside and along its sides, then show its pose, and that shows its corners, those
-outside the image as well.
+The visible cells must correlate with the predicted marker, and clearly better than with any other. The pose is then
+fitted to all visible edges between cells, inside the marker and along its sides. The corners follow from the pose,
+those outside the image included.
 """
 
 from dataclasses import dataclass
@@ -31,38 +31,38 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import marker_corners
 from thermal_fiducial.core.types import BoolArray, FloatArray, Gray, IntArray
 
-# Cells narrower than this show no straight edges apart from each other [px]; those of the coarsest layer are no wider.
+# Least width of cells for separate straight edges [px]; approximate width of cells in the coarse layer [px].
 _NARROWEST_PX, _COARSE_PX = 5.0, 8.0
-# So many markers at most, the largest, are looked for in a frame: more show little more.
+# Largest number of markers, the largest ones, that are looked for in a frame.
 _MOST = 2
-# Places farther from the prediction that are tried [cells]: so far apart, as far as so many standard deviations of the
-# prediction reach, but at least and at most so far.
+# Grid of offsets from the prediction that are tried [cells]: spacing; extent in standard deviations of the prediction;
+# least and largest extent.
 _APART, _UNSURE, _LEAST_REACH, _REACH = 0.7, 2.5, 1.4, 4.9
-# Least number of cells in view, and of those by which any other marker differs, lest a stain make it another.
+# Least number of visible cells, and of visible cells in which any other marker differs: a stain may change one.
 _CELLS, _DIFFERENT = 16, 2
-# Least correlation, difference to the most similar other pattern as a share of what a perfect view has, and of squares.
+# Least correlation; least margin over the runner-up as a share of a perfect view's; least evidence (chi square).
 _SIMILAR, _MARGIN, _EVIDENCE = 0.8, 0.5, 25.0
-# Correlation of a marker that need not be looked for elsewhere, and of a place that is worth a closer look.
+# Correlation above which no other offsets are tried, and below which the marker is given up.
 _THERE, _HINT = 0.95, 0.55
-# Least share of the edges in view that show a step like the others', and agree with the pose.
+# Least shares of the visible edges that show a step of the common contrast, and that agree with the pose.
 _SHOWN, _AGREEING = 0.7, 0.6
-# Adjustments on the fine layer at most, and the last step of a pose that has settled [px].
+# Largest number of adjustments on the fine layer, and the step below which a pose has converged [px].
 _STEPS, _SETTLED_PX = 9, 0.1
-# A corner that is known no better shows nothing, nor one so far outside the image, in image widths [px].
+# Standard deviation [px] and distance outside the image [image widths] beyond which a corner is not published.
 _KNOWN_PX, _OUTSIDE = 8.0, 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class _PartialMarker:
-    """A marker that is looked for."""
+    """A predicted marker that is partially in view."""
 
     id: int
     size: float
-    #: (4, 4) where it is expected
+    #: (4, 4) predicted pose
     T_camera_marker: FloatArray
-    #: (4, 2) shares of the sides between which it is in view
+    #: (4, 2) rectangle of the visible cells, in shares of the sides
     window: FloatArray
-    #: width of its cells in view [px], and standard deviation of its place, in cells
+    #: width of its visible cells [px], and standard deviation of its predicted place [cells]
     cell_px: float
     unsure_cells: float
 
@@ -72,7 +72,7 @@ class _PartialMarker:
 
 
 class PartialMarkerSearch:
-    """Looks for known markers that are not wholly in view.
+    """Finds known markers that are partially in view.
 
     Parameters
     ----------
@@ -96,8 +96,8 @@ class PartialMarkerSearch:
         Parameters
         ----------
         frame : whose twist is known
-        unsure_m : standard deviation of where they are expected
-        allowed : (M,) IDs that there may be
+        unsure_m : standard deviation of the predicted camera position [m]
+        allowed : (M,) which IDs may be found
         """
         in_view = (
             self._expected(frame.camera, marker_id, size, T, unsure_m)
@@ -141,7 +141,7 @@ class PartialMarkerSearch:
     def _expected(
         self, camera: Camera, marker_id: int, size: float, T_camera_marker: FloatArray, unsure_m: float
     ) -> _PartialMarker | None:
-        """A marker as far as it should be in view; None where that is too little."""
+        """The prediction of a marker with its visible part; None if that is too small."""
         px = camera.project(se3.apply(T_camera_marker, on_marker(self._visible.places, size)))
         inside = camera.contains(px).reshape(-1, 9).all(axis=1)
         if inside.sum() < _CELLS:
@@ -158,7 +158,7 @@ class PartialMarkerSearch:
         return _PartialMarker(marker_id, size, T_camera_marker, window, cell_px, unsure_m * self._cells / size)
 
     def _moved(self, marker: _PartialMarker, points: FloatArray, layer: Layer, cell_px: float) -> FloatArray | None:
-        """The expected pose (4, 4) moved to where the pattern correlates best; None where it does nowhere."""
+        """The predicted pose (4, 4), translated to the best correlation of the pattern; None without any."""
         px = layer.project(se3.apply(marker.T_camera_marker, points))
 
         def similar(places: FloatArray) -> FloatArray:
@@ -189,7 +189,7 @@ class PartialMarkerSearch:
         noise: float,
         config: ArucoDetectorConfig,
     ) -> bool:
-        """Whether the cells in view show the marker beyond doubt."""
+        """Whether the visible cells identify the marker."""
         places = se3.apply(rough.T_camera_marker, on_marker(self._visible.places, marker.size))
         likeness = self._visible.likeness(layer.image, layer.project(places), marker.id, allowed)
         correlation, margin = abs(likeness.correlation), _MARGIN * (1.0 - likeness.perfect)
@@ -204,7 +204,7 @@ class PartialMarkerSearch:
 
 
 def _agrees(fit: PoseFit) -> bool:
-    """Whether most edges in view are there, where the pose has them."""
+    """Whether most visible edges show a step and agree with the pose."""
     return fit.shown >= _SHOWN * fit.visible and fit.agreeing >= _AGREEING * fit.visible
 
 
@@ -236,7 +236,7 @@ def _corners(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> RefinedCorne
 
 
 def _pose_covariance(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> FloatArray:
-    """Covariance (6, 6) of a pose by its edges' noise, and by what displaces all of them alike or in some order."""
+    """Covariance (6, 6) of a pose by the noise of its edges, and by systematic errors of edges and motion."""
     T = fit.T_camera_marker
     window = on_marker(marker.window, marker.size)
     J = pose_jacobian(T, window, frame.camera).reshape(8, 6)
@@ -251,7 +251,7 @@ def _pose_covariance(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> Floa
 
 
 def _independent(J: FloatArray, information: FloatArray) -> FloatArray:
-    """Covariances (4, 2, 2) of corners that, taken for independent, show a pose no better than it is known.
+    """Covariances (4, 2, 2) of corners that, taken as independent, give a pose no better than its covariance.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Velocity of the camera, how it changes, and what is known of both.
+"""Twist and acceleration of the camera with their covariance, and the motion model of both.
 
-The motion is that of a rigid scene seen from a camera with twist (v, omega) (F. Chaumette, S. Hutchinson, "Visual
-servo control I", 2006, eq. 11). The twist changes by an acceleration that dies down and is driven at random (R. Singer,
-"Estimating optimal tracking filter performance for manned maneuvering targets", 1970).
+The image motion is that of a rigid scene for a camera with twist (v, omega) (F. Chaumette, S. Hutchinson, "Visual
+servo control I", 2006, eq. 11). The acceleration is a first-order Markov process (R. Singer, "Estimating optimal
+tracking filter performance for manned maneuvering targets", 1970).
 """
 
 from collections.abc import Sequence
@@ -15,22 +15,22 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-# Twist of which nothing is known: m/s and rad/s of a brisk flight.
+# Variances of an unknown twist [m^2/s^2, rad^2/s^2]: a brisk flight.
 _UNKNOWN = np.full(6, 1.5**2)
-#: Covariance of an acceleration of which nothing is known [m/s^2, rad/s^2].
+#: Stationary covariance of the acceleration; standard deviations in m/s^2, rad/s^2.
 RANDOM = np.diag([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2
-# How long an acceleration is correlated [s].
+# Correlation time of the acceleration [s].
 _CORRELATED_S = 0.4
-# What the filter's own error of the vertical and of its biases adds to the acceleration by its states.
+# Covariance of the acceleration by odometry due to errors of the filter's vertical and biases.
 _UNSURE = np.diag([0.3, 0.3, 0.3, 0.0, 0.0, 0.0]) ** 2
-# Covariance of a twist that is said to be without error [m^2/s^2, rad^2/s^2].
+# Least covariance of a twist [m^2/s^2, rad^2/s^2].
 _LEAST = 1e-6 * np.eye(6)
 _EYE = np.eye(6)
 
 
 @dataclass(frozen=True, slots=True)
 class Twist:
-    """Velocity of the camera in its own frame, and how it changes.
+    """Twist of the camera in its own frame, with its acceleration.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class Twist:
     acceleration: FloatArray = field(default_factory=lambda: np.zeros(6))
 
     def ago(self, seconds: float) -> FloatArray:
-        """Value (6,) so many seconds before the stamp."""
+        """Twist (6,) the given ``seconds`` before the stamp."""
         return self.value - seconds * self.acceleration
 
     def covariance_ago(self, seconds: float) -> FloatArray:
@@ -72,7 +72,7 @@ def transferred(odometry: Odometry, transfer: FloatArray) -> Twist:
 
 
 def transfer_from_body(T_body_camera: FloatArray) -> FloatArray:
-    """What makes a camera's twist (6,) of the body's."""
+    """Map (6, 6) from the body's twist to the camera's."""
     R = T_body_camera[:3, :3].T
     transfer = np.zeros((6, 6))
     transfer[:3, :3] = transfer[3:, 3:] = R
@@ -81,12 +81,12 @@ def transfer_from_body(T_body_camera: FloatArray) -> FloatArray:
 
 
 def unknown_twist() -> Twist:
-    """That of a camera of which nothing is known."""
+    """Prior of the twist without any information."""
     return Twist(np.zeros(6), np.diag(np.concatenate([_UNKNOWN, RANDOM.diagonal()])))
 
 
 def carried(twist: Twist, seconds: float) -> Twist:
-    """Twist so much later, its acceleration having died down a little and changed at random; or as much earlier."""
+    """Twist predicted by the motion model ``seconds`` later, or earlier if negative."""
     left, sign = math.exp(-abs(seconds) / _CORRELATED_S), math.copysign(1.0, seconds)
     lasting = sign * _CORRELATED_S * (1.0 - left)
     F = np.eye(12)
@@ -101,7 +101,7 @@ def carried(twist: Twist, seconds: float) -> Twist:
 
 
 def growth(seconds: float) -> tuple[float, float, float]:
-    """Times :data:`RANDOM`: what a time adds to the covariance of the twist, to that with its acceleration, and of it.
+    """Process noise over a time in units of :data:`RANDOM`: of the twist, cross-covariance, of the acceleration.
 
     Singer, eq. 7.
     """
@@ -111,9 +111,10 @@ def growth(seconds: float) -> tuple[float, float, float]:
 
 
 def line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatArray, clock_std_s: float) -> Twist:
-    """Twist that changes evenly through those of K states, at a stamp with a standard deviation ``clock_std_s``.
+    """Twist and acceleration at a stamp by a line through the twists of K states.
 
-    The error of the velocity is the same in all, that of a turn rate, a gyroscope's noise, is new in each.
+    The velocity error is common to all states; the error of a rate, gyroscope noise, is independent in each.
+    ``clock_std_s``: standard deviation of the stamp in the odometry's clock [s].
     """
     parts = [part for state in odometry for part in (state.velocity_body, state.angular_velocity_body)]
     values = np.concatenate(parts).reshape(-1, 6) @ transfer.T
@@ -136,10 +137,10 @@ def line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatArr
 
 
 def corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later: float) -> Twist:
-    """Twist when its value so much later is known by ``information`` (6, 6), times the value ``weighted`` (6,).
+    """Twist after a measurement of its value ``later`` seconds later, in information form.
 
-    The update of a Kalman filter with H = [I, later I], ``P - P H^T inv(I + W H P H^T) W H P`` of an information W that
-    need not be invertible.
+    ``information`` (6, 6) and ``weighted`` (6,), information times value. The Kalman update with H = [I, later I],
+    ``P - P H^T inv(I + W H P H^T) W H P`` for an information W that need not be invertible.
     """
     P = twist.covariance
     HP = P[:6] + later * P[6:]
@@ -148,5 +149,5 @@ def corrected(twist: Twist, information: FloatArray, weighted: FloatArray, later
     solved = np.linalg.solve(S, np.concatenate([information @ HP, residual[:, None]], axis=1))
     change = HP.T @ solved
     mean, P = change[:, 12], P - change[:, :12]
-    # What rounding makes of a covariance would add up over the frames.
+    # Symmetric: rounding errors would add up over the frames.
     return Twist(twist.value + mean[:6], 0.5 * (P + P.T), twist.acceleration + mean[6:])

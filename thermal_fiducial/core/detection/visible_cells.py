@@ -1,8 +1,8 @@
-"""Which marker it is of which only some cells are in view.
+"""Identification of a partially visible marker by its visible cells.
 
-So near, an array's shading and a heater's gradient change as much across a marker as a faint pattern does, and even
-across a cell. So it is the steps across the lines between cells, the white ring round the border among them, that are
-correlated with those of the patterns, as far as they are in view.
+At such short distances the array's shading and a heater's gradient vary as much across a marker as a faint pattern
+does. Therefore not the cells are correlated with the patterns, but the steps between neighbouring visible cells, the
+white ring around the border included.
 """
 
 from typing import NamedTuple
@@ -12,23 +12,23 @@ import numpy as np
 from thermal_fiducial.core.detection.patterns import CELL_SAMPLES, Decoder, sampled
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, TINY
 
-# Samples nearer to the border of the image are not seen [px].
+# Samples closer to the border of the image than this count as invisible [px].
 _BORDER_PX = 1.0
 # Least number of steps that are compared, and least sum of their squares in the pattern.
 _FEWEST, _LEAST_PATTERN = 12, 2.0
 
 
 class CellMatch(NamedTuple):
-    """How the visible cells look like the marker that is expected there."""
+    """Similarity of the visible cells to the predicted marker, and to others."""
 
-    #: with its pattern, negative where black and white are swapped
+    #: with the predicted pattern, negative where black and white are swapped
     correlation: float
-    #: of the most similar other marker or turn, and what it would be in a perfect view
+    #: with the most similar other marker or rotation, as observed and in a perfect view
     runner_up: float
     perfect: float
     #: white minus black [counts]
     contrast: float
-    #: number of cells in view, the ring's among them, and in how many of them no other marker is nearer
+    #: number of visible cells, ring included, and the least number of them in which any other marker differs
     cells: int
     distance: int
 
@@ -40,7 +40,7 @@ class CellMatch(NamedTuple):
 
 
 class VisibleCells:
-    """Patterns of a dictionary with their white surroundings, ready for correlation of any of their cells.
+    """Patterns of a dictionary with their white surroundings, for correlation of any subset of their cells.
 
     Parameters
     ----------
