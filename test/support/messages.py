@@ -25,9 +25,10 @@ def info(camera=small_bag.CAMERA):
 
 def imu(k, rate=(0.0, 0.0, 0.0), force=(0.0, 0.0, 9.80665)):
     message = Imu(header=convert.header(START + k * IMU_NS, 'base_link'))
-    # No sensor gives the same reading twice: its last digit moves.
-    message.angular_velocity = convert.vector(np.array(rate) + 1e-6 * np.sin(np.arange(3.0) + k))
-    message.linear_acceleration = convert.vector(np.array(force))
+    # No axis gives the same reading again and again: its last digit moves.
+    moving = 1e-6 * np.sin(np.arange(6.0) + k)
+    message.angular_velocity = convert.vector(np.array(rate) + moving[:3])
+    message.linear_acceleration = convert.vector(np.array(force) + moving[3:])
     return message
 
 

@@ -7,9 +7,8 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 import numpy as np
 import pytest
-from sensor_msgs.msg import Imu
 from support import small_bag
-from support.messages import pose_with_covariance
+from support.messages import imu, pose_with_covariance
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.geometry.se3 import rotation_from_quaternion, so3_exp, transform
@@ -85,10 +84,7 @@ def test_px4_variances_are_those_of_its_frames():
 def fly(graph, samples, poses_until=10**9, step=0.0):
     """A robot at rest: IMU at 200 Hz, a pose every 30 ms, ``step`` [m] aside."""
     for k in samples:
-        message = Imu(header=convert.header(START + k * 5_000_000, 'base_link'))
-        # No sensor gives the same reading twice: its last digit moves.
-        message.linear_acceleration.z = 9.80665 + 1e-9 * float(np.sin(k))
-        graph.send('imu/data', message)
+        graph.send('imu/data', imu(k))
         if k % 6 == 5 and k < poses_until:
             head = convert.header(START + (k - 4) * 5_000_000, 'map')
             T_map_camera = transform(np.eye(3), [step, 0.0, 0.0]) @ small_bag.T_BODY_CAMERA
@@ -202,7 +198,8 @@ def test_with_an_odom_frame_the_smooth_pose_is_in_it_and_both_make_the_pose(monk
     with ros_graph() as graph:
         frames = {'publish_tf': True, 'odom_frame': 'odom', 'smoothing_time': 0.5}
         node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], **frames)
-        fly(graph, range(60))
+        # To the sample behind a pose: what is published is of the samples.
+        fly(graph, range(61))
         smooth = node.filter.smooth
         state = node.filter.state.T_map_body
     map_to_odom, odom_to_base = sent[-1]
