@@ -71,6 +71,10 @@ HOSTILE_POSES = {
     'zero': lambda: camera_pose(covariance=np.zeros((6, 6))),
     'indefinite': lambda: camera_pose(covariance=skewed(np.eye(6), 5.0)),
     'singular': lambda: camera_pose(covariance=np.ones((6, 6))),
+    # LAPACK's answer where squares overflow is no refusal.
+    'vast correlation': lambda: camera_pose(covariance=skewed(GOOD, 1.7e308)),
+    'all vast correlations': lambda: camera_pose(covariance=GOOD + 1.7e308 * (1.0 - np.eye(6))),
+    'infinite correlation': lambda: camera_pose(covariance=skewed(GOOD, np.inf)),
     'vast': lambda: camera_pose(covariance=1e200 * np.eye(6)),
     'far': lambda: camera_pose(moved(1e200)),
     'not finite': lambda: camera_pose(moved(np.nan)),
@@ -140,6 +144,7 @@ HOSTILE_STATES = {
     'zero covariances': {'pose_covariance': np.zeros((6, 6)), 'twist_covariance': np.zeros((6, 6))},
     'negative covariance': {'pose_covariance': -np.eye(6)},
     'negative twist covariance': {'twist_covariance': -np.eye(6)},
+    'vast correlations': {'twist_covariance': GOOD + 1.7e308 * (1.0 - np.eye(6))},
 }
 
 

@@ -51,6 +51,9 @@ def checked_covariance(values: FloatArray, what: str, *, partial: bool = False) 
     low, high = float(variances.min()), float(variances.max())
     if not (low > SMALLEST_VARIANCE and high < LARGEST_VARIANCE):
         raise InputError(f'{what} with a variance of {low if low <= SMALLEST_VARIANCE else high:.3g}')
+    # Of a positive definite matrix the largest is on the diagonal; Cholesky's squares of what is larger may overflow.
+    if not np.abs(P).max() <= high:
+        raise InputError(f'{what} that is not positive definite')
     try:
         # A smaller diagonal asks, in any units of the components, for the least that each has for itself.
         np.linalg.cholesky(P - _LEAST_INDEPENDENT * eye * P)
