@@ -63,11 +63,26 @@ def test_fixed_joints_of_a_urdf_make_a_tree():
 
 @pytest.mark.parametrize(
     ('urdf', 'words'),
-    [('<robot', 'not XML'), (URDF.replace('0.1 0 0.02', '0.1 zero'), "joint mount with an origin of '0.1 zero'")],
+    [
+        ('<robot', 'not XML'),
+        (URDF.replace('0.1 0 0.02', '0.1 zero'), "joint mount with an origin of '0.1 zero'"),
+        (URDF.replace('0.1 0 0.02', '1e308 0 0'), "joint mount with an origin of '1e308 0 0'"),
+        (f'<robot>{"<link/>" * 300_000}</robot>', 'of 2100015 characters'),
+    ],
 )
 def test_a_description_that_is_none_is_refused_in_words(urdf, words):
     with pytest.raises(InputError, match=words):
         list(fixed_joints(urdf))
+
+
+def test_a_tree_takes_no_more_frames_than_a_robot_has():
+    tree = FrameTree()
+    for k in range(10_000):
+        tree.add('base_link', f'frame {k}', np.eye(4))
+    with pytest.raises(InputError, match='more than 10000 frames'):
+        tree.add('base_link', 'another', np.eye(4))
+    tree.add('base_link', 'frame 7', FORWARD)
+    np.testing.assert_allclose(tree.between('base_link', 'frame 7'), FORWARD)
 
 
 def test_frames_in_a_circle_end():
@@ -111,6 +126,25 @@ def test_a_broken_description_is_refused_and_the_node_lives(graph):
     graph.send('robot_description', String(data='<robot>'), profile=qos.LATCHED)
     level, reason, _ = graph.diagnose(node)
     assert (level, 'not XML' in reason) == (WARN, True)
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(
+    ('joint', 'what'), [('0 0 0.05', 'robot 11 m from its IMU'), ('0.1 0 0.02', 'camera_position')]
+)
+def test_a_robot_that_is_too_large_is_refused_and_another_one_taken(graph, joint, what):
+    """The IMU, or the camera, 11 m from the rest of the robot."""
+    node = graph.add(PoseEkfNode)
+    message = imu(0)
+    message.header.frame_id = 'imu_link'
+    graph.send('imu/data', message)
+    graph.send('robot_description', String(data=URDF.replace(joint, '0 0 11')), profile=qos.LATCHED)
+    assert what in node.last_refusal
+    assert node.config.camera_position == (0.0, 0.0, 0.0)
+    graph.send('robot_description', String(data=URDF), profile=qos.LATCHED)
+    np.testing.assert_allclose(in_force(node), transform(np.eye(3), [0.0, 0.0, -0.05]) @ FORWARD, atol=1e-12)
+    live = node.set_parameters([Parameter('gate', value=20.0)])
+    assert all(result.successful for result in live)
 
 
 @pytest.mark.ros

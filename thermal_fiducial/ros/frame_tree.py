@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
 from thermal_fiducial.core.geometry.se3 import inverse, transform
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
@@ -15,6 +16,8 @@ if TYPE_CHECKING:
 
 #: No robot has more links one behind the other: a longer chain goes round in a circle.
 _LONGEST = 100
+#: Frames of a robot, and characters of its description: ten times those of a humanoid with all its fingers.
+_MOST_FRAMES, _LONGEST_TEXT = 10_000, 2_000_000
 
 
 class FrameTree:
@@ -24,7 +27,15 @@ class FrameTree:
         self._parents: dict[str, tuple[str, FloatArray]] = {}
 
     def add(self, parent: str, child: str, T_parent_child: FloatArray) -> None:
-        """Place ``child``; a later place replaces an earlier one."""
+        """Place ``child``; a later place replaces an earlier one.
+
+        Raises
+        ------
+        InputError
+            There are more frames already than any robot has.
+        """
+        if len(self._parents) >= _MOST_FRAMES and child not in self._parents:
+            raise InputError(f'more than {_MOST_FRAMES} frames on the robot')
         self._parents[child] = (parent, T_parent_child)
 
     def between(self, a: str, b: str) -> FloatArray | None:
@@ -48,11 +59,13 @@ def fixed_joints(urdf: str) -> Iterator[tuple[str, str, FloatArray]]:
     Raises
     ------
     InputError
-        What is no URDF, or a joint that says nothing usable.
+        What is no URDF, too long for one, or a joint that says nothing usable.
     """
     # Few robots have one, and it costs a node a tenth of the time that it takes to be back in flight.
     from xml.etree import ElementTree
 
+    if len(urdf) > _LONGEST_TEXT:
+        raise InputError(f'robot_description of {len(urdf)} characters, not {_LONGEST_TEXT} at most')
     try:
         robot = ElementTree.fromstring(urdf)
     except ElementTree.ParseError as error:
@@ -83,6 +96,6 @@ def _three(joint: str, text: str) -> FloatArray:
         values = np.array([float(word) for word in text.split()] or [0.0] * 3)
     except ValueError:
         values = np.empty(0)
-    if values.shape != (3,) or not np.isfinite(values).all():
+    if values.shape != (3,) or not (np.abs(values) < LARGEST_COORDINATE).all():
         raise InputError(f'robot_description: joint {joint} with an origin of {text!r}')
     return values

@@ -87,9 +87,15 @@ class StageNode(CountingNode, Generic[Config]):
             self.create_timer(1.0, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def derive(self, **values: Any) -> None:
-        """Have parameters at other ``values`` than they were set to, from now on and whatever is set."""
+        """Have parameters at other ``values`` than they were set to, from now on and whatever is set.
+
+        Raises
+        ------
+        InputError
+            A value that the parameter cannot have; all stay as they were.
+        """
+        self.config = replace(self._with_derived(self.config), **values)  # type: ignore[type-var]
         self._derived |= values
-        self.config = self._with_derived(self.config)
 
     def _with_derived(self, config: Config) -> Config:
         return replace(config, **self._derived)  # type: ignore[type-var]

@@ -12,6 +12,7 @@ from std_msgs.msg import String
 
 from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.frame_tree import fixed_joints, FrameTree
 from thermal_fiducial.ros.node import StageNode
@@ -23,6 +24,8 @@ _RANKS = (_PARAMETERS, _URDF, _TF)
 _PATIENCE = 2.0
 #: Poses that differ by less are the same, through whatever text or quaternion they went [m, rad].
 _SAME = 1e-6
+#: Farther from its IMU no robot reaches [m]: as far as the parameter ``camera_position`` may be.
+_FARTHEST = 10.0
 
 
 class RobotFrames:
@@ -102,14 +105,17 @@ class RobotFrames:
             return
 
     def _take(self, source: str, T_body_camera: FloatArray, T_imu_base: FloatArray | None, *, moved: bool) -> None:
-        new = source != self.source
-        self.source, self.T_imu_base = source, T_imu_base
+        if T_imu_base is not None and not np.abs(T_imu_base[:3, 3]).max() < _FARTHEST:
+            raise InputError(f'{source} has the robot {np.abs(T_imu_base[:3, 3]).max():.3g} m from its IMU')
+        apart = inverse(_in_force(self._node.config)) @ T_body_camera
         if moved:
-            apart = inverse(_in_force(self._node.config)) @ T_body_camera
             orientation = quaternion_from_rotation(T_body_camera[:3, :3])
             self._node.derive(
                 camera_position=tuple(T_body_camera[:3, 3].tolist()), camera_orientation=tuple(orientation.tolist())
             )
+        new = source != self.source
+        self.source, self.T_imu_base = source, T_imu_base
+        if moved:
             self._say(f', {np.linalg.norm(apart[:3, 3]):.3f} m and {_angle_deg(apart):.2f} deg from what held before')
             self._adopt()
         elif new:
