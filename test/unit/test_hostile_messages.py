@@ -9,6 +9,7 @@ from nav_msgs.msg import Odometry
 import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo, Image, Imu, PointCloud2, TimeReference
+from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support import small_bag
 from support.messages import FRAME_NS, frames, imu, IMU_NS, info, odometry, pose, pose_with_covariance, START
@@ -392,6 +393,19 @@ def test_services_timers_and_parameters_that_fail_end_nothing(graph, monkeypatch
         fault.setattr(node, 'figures', fail)
         graph.spin_until(lambda: node.refused > 0, seconds=20.0)
     assert graph.call(Trigger, 'pose_ekf/reset', Trigger.Request()).success
+
+
+def test_what_is_wrong_with_a_message_is_one_line(graph):
+    """Whatever it quotes: it goes to the console of a pilot, and with the diagnostics to the ground."""
+    camera, ekf = graph.add(Tau2Camera), graph.add(PoseEkfNode)
+    graph.send('thermal/image_raw', Image(encoding='\x1b[2J\n' + 100_000 * 'x'))
+    origin = '<joint type="fixed"><parent link="a"/><child link="b"/><origin xyz="%s"/></joint>' % (100_000 * '1 ')
+    graph.send('robot_description', String(data=f'<robot>{origin}</robot>'), profile=qos.LATCHED)
+    for node, words in ((camera, 'image of encoding'), (ekf, 'robot_description')):
+        reason = graph.diagnose(node)[2]['last refusal']
+        assert words in reason
+        assert reason.isprintable()
+        assert len(reason) < 500
 
 
 def test_a_pose_of_a_map_that_is_no_transform_is_refused(graph):

@@ -107,6 +107,6 @@ def cannot_write(path: str | Path, what: str, error: OSError) -> InputError:
 
 
 def one_line(error: Exception, longest: int = 200) -> str:
-    """What an error of a library says, printable and short enough for one line; its kind where it says nothing."""
+    """What an error says, printable and short enough for one line; its kind where it says nothing."""
     text = ' '.join(str(error).split()) or type(error).__name__
     return ''.join(letter if letter.isprintable() else '?' for letter in text)[:longest]

@@ -15,6 +15,7 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
+from thermal_fiducial.files.reading import one_line
 from thermal_fiducial.ros import convert, params
 from thermal_fiducial.ros.console import Console
 from thermal_fiducial.ros.counting import CountingNode
@@ -30,6 +31,8 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 _ROBOT_FRAMES = ('base_frame', 'camera_frame', 'odom_frame', 'frame_id')
 #: Parameters that say how often the main input of a node comes.
 _RATES = ('image_rate', 'imu_rate')
+#: Characters of what was wrong with an input: it may quote a name of a megabyte, and goes to console and diagnostics.
+_LONGEST_REASON = 400
 
 
 class StageNode(CountingNode, Generic[Config]):
@@ -125,7 +128,7 @@ class StageNode(CountingNode, Generic[Config]):
         try:
             callback(message)
         except InputError as error:
-            self.refuse(str(error))
+            self.refuse(one_line(error, _LONGEST_REASON))
         except Exception as error:
             # Asked to stop in the middle of it, rcl lets it publish nothing: not an error of the node.
             if self.context.ok():
@@ -138,7 +141,7 @@ class StageNode(CountingNode, Generic[Config]):
             try:
                 return answer(request, response)
             except InputError as error:
-                response.message = str(error)
+                response.message = one_line(error, _LONGEST_REASON)
             except Exception as error:
                 response.message = self._unforeseen(error)
             response.success = False
@@ -149,7 +152,7 @@ class StageNode(CountingNode, Generic[Config]):
     def _unforeseen(self, error: Exception) -> str:
         """Log an error that nobody foresaw, and say it in a line."""
         self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
-        return f'{INTERNAL_ERROR}: {type(error).__name__}: {error}'
+        return f'{INTERNAL_ERROR}: {type(error).__name__}: {one_line(error)}'
 
     def refuse(self, reason: str) -> None:
         """Count a message that could not be used; the first and then one a second is logged."""
