@@ -9,6 +9,7 @@ import pytest
 from support import small_bag
 from support.walls import CAMERA, flight, see, SIZE, stamp, wall
 
+from thermal_fiducial.cli import map_sources
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.cli.map_plot import draw_map
 from thermal_fiducial.cli.run_parameters import camera_of_run
@@ -18,6 +19,7 @@ from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.marker_map import load_map, save_map
+from thermal_fiducial.map_tools.map_building import build_map
 from thermal_fiducial.map_tools.map_doubts import doubts
 from thermal_fiducial.map_tools.map_editing import transformed
 
@@ -230,6 +232,20 @@ def test_refine_never_guesses_the_side_of_a_marker(path, poses, tmp_path, capsys
         assert refined.markers[i].size == side
         # As above: tenths of a millimetre.
         assert np.linalg.norm(difference(refined.markers[i].T_map_marker, pose)[:3]) < 2e-3
+
+
+def test_refine_overwrites_no_edit_that_was_made_meanwhile(path, poses, photographed, capsys, monkeypatch):
+    def edited_meanwhile(*arguments):
+        assert run('move', path, 3, '--position', 1, 2, 3) == 0
+        return build_map(*arguments)
+
+    monkeypatch.setattr(map_sources, 'build_map', edited_meanwhile)
+    assert run('refine', path, *photographed) == 2
+    assert 'changed by another program meanwhile' in capsys.readouterr().err
+    np.testing.assert_allclose(load_map(path).markers[3].T_map_marker[:3, 3], [1.0, 2.0, 3.0])
+    out = path.with_name('refined.yaml')
+    assert run('refine', path, *photographed, '--out', out) == 0
+    assert load_map(out).markers.keys() == poses.keys()
 
 
 def test_refine_moves_entries_that_somebody_wrote_by_hand(path, poses, photographed, capsys):

@@ -112,6 +112,23 @@ def test_a_file_that_another_program_has_changed_is_not_overwritten(path):
     assert keeper.save(grown(5)) == path
 
 
+def test_an_edit_right_behind_a_save_is_not_overwritten_by_the_next(path, monkeypatch):
+    """Somebody has waited for the lock of the mapper that saves."""
+    keeper, save = keeper_of(path), map_history.save_with_history
+
+    def saved_and_edited(*arguments):
+        found = save(*arguments)
+        assert main(['map', 'move', str(path), '3', '--position', '1', '2', '3']) == 0
+        return found
+
+    with monkeypatch.context() as busy:
+        busy.setattr(map_history, 'save_with_history', saved_and_edited)
+        assert keeper.save(grown(2)) == path
+    edited = path.read_bytes()
+    assert keeper.save(grown(5)) == path.with_name('hall.new.yaml')
+    assert path.read_bytes() == edited
+
+
 def test_a_file_that_cannot_be_replaced_is_saved_beside(path, monkeypatch):
     keeper = keeper_of(path)
     path.unlink()
@@ -152,6 +169,7 @@ def test_undo_survives_broken_entries_and_strange_names(path):
     (folder / '000003.yaml').write_text('not: [a map')
     (folder / '9a.yaml').write_text('what is this')
     (path.parent / '.hall.yaml.abc.tmp').write_text('left by a writer that was killed')
+    (folder / '.000004.yaml.abc.tmp').write_text('left by another')
     assert [bool(entry.problem) for entry in map_history.entries(path)] == [True, False, True]
     assert map_history.undo(path).revision == 2
     assert whole(path) == 2
@@ -159,6 +177,7 @@ def test_undo_survives_broken_entries_and_strange_names(path):
         map_history.undo(path)
     save(path, grown(5), 'make 5')
     assert sorted(file.name for file in path.parent.iterdir()) == ['hall.yaml', 'hall.yaml.history']
+    assert not list(folder.glob('.*'))
 
 
 def test_a_map_that_has_not_changed_makes_no_history(path):

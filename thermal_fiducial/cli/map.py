@@ -270,8 +270,7 @@ def _undo(args: argparse.Namespace) -> int:
 
 
 def _upgrade(args: argparse.Namespace) -> int:
-    text = upgraded(str(args.map))
     with locked(args.map):
-        map_history.replace(args.map, text, 'upgrade')
+        map_history.replace(args.map, upgraded(str(args.map)), 'upgrade')
     print(f'{args.map}: upgraded; revision {_load(args).revision}')
     return 0

@@ -1,6 +1,7 @@
 """``map build`` and ``map refine``: maps from photos and from the detections of a run."""
 
 import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,7 @@ from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.dictionary import load_dictionary, not_in_dictionary
 from thermal_fiducial.files.images import read_picture
-from thermal_fiducial.files.map_history import save_with_history
+from thermal_fiducial.files.map_history import digest, save_with_history
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.map_tools import map_editing
 from thermal_fiducial.map_tools.map_building import build_map, Built
@@ -62,7 +63,26 @@ def add_refine(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(do=_refine)
 
 
+@dataclass(frozen=True)
+class _MapInProgress:
+    """The file that a new map goes to: nobody's change since the command began is overwritten."""
+
+    path: Path
+    action: str
+    read: str
+
+    @classmethod
+    def of(cls, path: Path, action: str) -> '_MapInProgress':
+        """The file at ``path`` as it is now."""
+        return cls(path, action, digest(path))
+
+    def save(self, marker_map: MarkerMap) -> None:
+        """Write the map. Raises InputError, also where the file has changed."""
+        save_with_history(self.path, marker_map, self.action, self.read)
+
+
 def _build(args: argparse.Namespace) -> int:
+    work = _MapInProgress.of(args.out, f'build from {args.images.name}')
     camera = load_camera(args.calibration)
     start = _start(args)
     args.marker_size = args.marker_size or _only_size(start)
@@ -71,10 +91,11 @@ def _build(args: argparse.Namespace) -> int:
     frames = _detect(_photos(args.images), camera, args)
     if args.origin is not None and not any(args.origin in rows['id'] for rows in frames):
         raise InputError(f'{args.images}: marker {args.origin}, the origin, is in none of the {len(frames)} photos')
-    return _grow(args, frames, camera, start, args.out, f'build from {args.images.name}')
+    return _grow(args, frames, camera, start, work)
 
 
 def _refine(args: argparse.Namespace) -> int:
+    work = _MapInProgress.of(args.out or args.map, f'refine from {args.run_folder.name}')
     camera = camera_of_run(args.run_folder) if args.calibration is None else load_camera(args.calibration)
     size, overrides = sizes_of_run(args.run_folder)
     args.marker_size = args.marker_size or size
@@ -85,7 +106,7 @@ def _refine(args: argparse.Namespace) -> int:
     frames = _read_detections(file, start, args, camera)
     if len(frames) > args.max_frames:
         frames = [frames[i] for i in np.linspace(0, len(frames) - 1, args.max_frames).astype(int)]
-    return _grow(args, frames, camera, start, args.out or args.map, f'refine from {args.run_folder.name}')
+    return _grow(args, frames, camera, start, work)
 
 
 def _only_size(marker_map: MarkerMap) -> float | None:
@@ -95,16 +116,16 @@ def _only_size(marker_map: MarkerMap) -> float | None:
 
 
 def _grow(
-    args: argparse.Namespace, frames: list[Markers], camera: Camera, start: MarkerMap, out: Path, action: str
+    args: argparse.Namespace, frames: list[Markers], camera: Camera, start: MarkerMap, work: _MapInProgress
 ) -> int:
     start = map_editing.with_covariances(start, _HAND_STD_M, np.deg2rad(_HAND_STD_DEG))
     config = _mapper_config(args, start.dictionary)
     with progress_bar('mapping') as progress:
         built = build_map(frames, camera, start, config, lambda markers, share: progress(share, f'{markers} markers'))
     _print_what_was_used(built, len(frames))
-    save_with_history(out, built.map, action)
-    print(f'{out}: {built.map.size_in_words}')
-    return 2 if any(doubt.spoils for doubt in say_doubts(built.map, out)) else 0
+    work.save(built.map)
+    print(f'{work.path}: {built.map.size_in_words}')
+    return 2 if any(doubt.spoils for doubt in say_doubts(built.map, work.path)) else 0
 
 
 def say_doubts(marker_map: MarkerMap, path: Path) -> list[Doubt]:

@@ -57,12 +57,16 @@ def autosave_file(path: Path) -> Path:
 def digest(path: Path) -> str:
     """What distinguishes the present content of ``path`` from any other; empty when there is none that can be read."""
     try:
-        return hashlib.sha256(read_bytes(path, TEXT_LIMIT_BYTES)).hexdigest()
+        return _digest(read_bytes(path, TEXT_LIMIT_BYTES))
     except InputError:
         return ''
 
 
-def save_with_history(path: Path, marker_map: MarkerMap, action: str, read: str | None = None) -> None:
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def save_with_history(path: Path, marker_map: MarkerMap, action: str, read: str | None = None) -> str:
     """Write ``marker_map`` to ``path``, the file that is there now (whatever it holds) into its history.
 
     Parameters
@@ -71,6 +75,10 @@ def save_with_history(path: Path, marker_map: MarkerMap, action: str, read: str 
     marker_map : the map
     action : what was done, in words
     read : :func:`digest` of the file that the map follows; None: whatever there is
+
+    Returns
+    -------
+    :func:`digest` of what was written, whatever others have made of it since.
 
     Raises
     ------
@@ -82,6 +90,7 @@ def save_with_history(path: Path, marker_map: MarkerMap, action: str, read: str 
         if read is not None and digest(path) not in (read, ''):
             raise ChangedMeanwhileError(f'{path}: changed by another program meanwhile; nothing is written')
         replace(path, text, action)
+    return _digest(text.encode())
 
 
 def replace(path: Path, text: str, action: str) -> None:
@@ -113,6 +122,9 @@ def keep(path: Path, text: str, action: str) -> None:
     """Put ``text`` into the history of ``path``; only under :func:`locked`. Raises OSError."""
     folder = history_folder(path)
     folder.mkdir(exist_ok=True)
+    # Of writers that were killed.
+    for litter in folder.glob('.*.tmp'):
+        litter.unlink(missing_ok=True)
     files = _files(path)
     number = int(files[-1].stem) + 1 if files else 1
     write_atomically(folder / f'{number:06d}.yaml', f'{_MARK}{" ".join(action.split())}\n{text}')

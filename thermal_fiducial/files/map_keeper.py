@@ -110,13 +110,13 @@ class MapKeeper:
         self.finish()
         self.obstacle = ''
         try:
-            map_history.save_with_history(self.path, marker_map, 'save', self._read)
+            self._read = map_history.save_with_history(self.path, marker_map, 'save', self._read)
         except InputError as error:
             self.obstacle = str(error)
             elsewhere = self._save_elsewhere(marker_map)
             self.unsaved = False
             return elsewhere
-        self._read, self.unsaved = map_history.digest(self.path), False
+        self.unsaved = False
         self._retire_autosave()
         return self.path
 
