@@ -1,4 +1,4 @@
-"""Mutated messages for the four nodes, and a good flight after every few of them."""
+"""Mutated messages for the nodes, and a good flight after every few of them."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -7,12 +7,14 @@ from pathlib import Path
 from random import Random
 import tempfile
 from typing import Any
+import warnings
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from rclpy.context import Context
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import TimeReference
+from std_msgs.msg import String
 from support import small_bag
 from support.direct_graph import DirectGraph
 from support.messages import FRAME_NS, frames, imu, IMU_NS, info, odometry, pose, START
@@ -23,6 +25,7 @@ from thermal_fiducial.core.measurements import Odometry as State
 from thermal_fiducial.errors import INTERNAL_ERROR
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.nodes.aruco_detector import ArucoDetector
+from thermal_fiducial.nodes.landing_target import LandingTarget
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
@@ -35,6 +38,10 @@ AT_ONCE = 50
 PATIENCE = 15.0
 #: The robot at rest is known to the floor of made-up poses [m].
 GOOD = 0.05
+#: More pictures of this the nodes need not see until they find the camera in one of them.
+_PICTURES = 100
+#: Longest line that an input is refused with: it goes to the console of a pilot.
+_LONGEST_LINE = 1000
 #: Markers in the map.
 MAPPED = (0, 1, 2, 3)
 #: What the filter publishes for every sample of the IMU, and in thirty milliseconds of them.
@@ -43,6 +50,7 @@ _OUTPUTS, _SAMPLES = ('/pose', '/odometry'), 6
 _TOPICS = {
     '/imu/data': 10,
     '/camera_pose': 10,
+    '/camera_pose/map_error': 3,
     '/markers': 5,
     '/odometry': 5,
     '/map_correction': 2,
@@ -51,16 +59,23 @@ _TOPICS = {
     '/marker_map': 2,
     '/thermal/image_raw': 1,
     '/thermal/image': 1,
+    '/robot_description': 1,
 }
+#: Of a robot whose camera it does not know: whatever is changed in it, the camera stays where it is.
+_URDF = """<robot name="drone"><link name="base_link"/><link name="imu"/><link name="tau2"/>
+  <joint name="imu" type="fixed"><parent link="base_link"/><child link="imu"/><origin xyz="0 0 0.05"/></joint>
+  <joint name="mount" type="fixed"><parent link="imu"/><child link="tau2"/><origin rpy="-1.6 0 -1.6"/></joint>
+</robot>"""
 
 
 class Nodes:
-    """The four nodes, fed with mutated messages in a flight at rest."""
+    """The nodes of a flight at rest, with a landing pad, fed with mutated messages."""
 
     def __init__(self, context: Context, folder: Path) -> None:
         self._graph = DirectGraph(context)
         self._samples = 0
         self._latest: np.ndarray | None = None
+        self._located: np.ndarray | None = None
         self._published: Counter[str] = Counter()
         self.not_finite: list[str] = []
         self._map_file = small_bag.side_files(folder, ids=MAPPED)[0]
@@ -69,13 +84,20 @@ class Nodes:
         self._graph.start(ArucoDetector, **small_bag.PARAMETERS)
         self._graph.start(MarkerMapperNode, **small_bag.PARAMETERS, map_file=str(self._map_file), mode='mapping')
         self._graph.start(PoseEkfNode, **camera, bridge_rate=50.0)
+        self._graph.start(LandingTarget, **camera, landing_pad=[MAPPED[0]])
         self._graph.listen('/pose', self._on_pose)
-        for topic in ('/pose', '/odometry', '/bridge/odometry', '/camera_pose', '/camera_clock'):
+        self._graph.listen('/camera_pose', self._on_camera_pose)
+        for topic in ('/pose', '/odometry', '/bridge/odometry', '/camera_pose', '/camera_clock', '/landing_target'):
             self._graph.listen(topic, lambda message, topic=topic: self._check(topic, message))
         self._good = _good_messages(self._graph)
+        self._noise = np.random.default_rng(4)
+        self._picture = small_bag.frame(np.eye(4), self._noise)
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         self._latest = np.array([message.pose.pose.position.x, message.pose.pose.position.y])
+
+    def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
+        self._located = convert.transform_of(message.pose.pose)
 
     def _check(self, topic: str, message: Any) -> None:
         """Whatever the nodes publish themselves is finite."""
@@ -93,10 +115,21 @@ class Nodes:
 
     def internal_errors(self) -> list[str]:
         """Refusals for reasons that nobody foresaw since the last call."""
-        found = [node.last_refusal for node in self._graph.nodes.values() if INTERNAL_ERROR in node.last_refusal]
+        found = [line for line in self._refusals() if INTERNAL_ERROR in line]
+        self.forget()
+        return found
+
+    def long_lines(self) -> list[str]:
+        """Refusals since the last call that are no line for a console."""
+        return [repr(line[:100]) for line in self._refusals() if not line.isprintable() or len(line) > _LONGEST_LINE]
+
+    def _refusals(self) -> list[str]:
+        return [node.last_refusal for node in self._graph.nodes.values()]
+
+    def forget(self) -> None:
+        """Forget all refusals until now."""
         for node in self._graph.nodes.values():
             node.refuse('')
-        return found
 
     def good_flight(self) -> str:
         """Fly until the pose is good; why it is not, in the end, or what does not come with it."""
@@ -108,8 +141,22 @@ class Nodes:
             good = good + 1 if self._latest is not None and np.abs(self._latest).max() < GOOD else 0
             if good == 10:
                 missing = [topic for topic in _OUTPUTS if self._published[topic] != _SAMPLES]
-                return f'{_SAMPLES} samples of the IMU, but {dict(self._published)}' if missing else ''
+                return f'{_SAMPLES} samples of the IMU, but {dict(self._published)}' if missing else self._look()
         return self._graph.nodes['pose_ekf'].headline()
+
+    def _look(self) -> str:
+        """Show pictures until the camera is found in one; why it is not, in the end."""
+        for _ in range(_PICTURES):
+            self._thirty_milliseconds()
+            stamp, self._located = START + self._samples * IMU_NS, None
+            self._graph.send('/thermal/camera_info', info())
+            # No camera gives the same picture twice.
+            picture = self._picture + self._noise.integers(0, 4, self._picture.shape, dtype=np.uint16)
+            self._graph.send('/thermal/image_raw', convert.image(picture, convert.header(stamp, 'camera')))
+            if self._located is not None and np.abs(self._located - small_bag.T_BODY_CAMERA).max() < GOOD:
+                return ''
+        stages = ('tau2_camera', 'aruco_detector', 'marker_mapper')
+        return '; '.join(f'{name}: {self._graph.nodes[name].state()[1]}' for name in stages)
 
     def losses(self) -> list[str]:
         """Markers that are missing from the map."""
@@ -153,6 +200,8 @@ def _good_messages(graph: DirectGraph) -> dict[str, list[Any]]:
     found['/thermal/camera_info'] = [info()]
     found['/imu/data'] = [imu(k) for k in range(5)]
     found['/camera_pose'] = [pose(k) for k in range(5)]
+    found['/camera_pose/map_error'] = [pose(k) for k in range(5)]
+    found['/robot_description'] = [String(data=_URDF)]
     found['/odometry'] = [odometry(state)]
     found['/map_correction'] = [convert.transform_message(np.eye(4), START, 'map', 'map_before')]
     clock = convert.header(START + FRAME_NS, 'camera')
@@ -169,7 +218,9 @@ def run(numbers: range, begin: Callable[[str, int], None]) -> list[Finding]:
     findings: list[Finding] = []
     context = Context()
     # Another process that does the same would receive what is published here.
-    with own_domain() as domain, tempfile.TemporaryDirectory() as folder:
+    with own_domain() as domain, tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        # A number that overflows behind the door should not have come through it.
+        warnings.simplefilter('error', RuntimeWarning)
         context.init(args=['--ros-args', '--log-level', 'FATAL'], domain_id=domain)
         nodes = Nodes(context, Path(folder))
         nodes.good_flight()
@@ -177,6 +228,7 @@ def run(numbers: range, begin: Callable[[str, int], None]) -> list[Finding]:
             begin('messages', number)
             with timed('messages', number, findings):
                 topic = nodes.send_mutated(Random(number))
+            findings += [Finding('messages', number, 'not one line', line) for line in nodes.long_lines()]
             findings += [Finding('messages', number, 'internal error', line) for line in nodes.internal_errors()]
             findings += [Finding('messages', number, 'not finite', f'{bad} after {topic}') for bad in nodes.not_finite]
             nodes.not_finite.clear()

@@ -17,6 +17,8 @@ TOKENS = (
 )  # fmt: skip
 _WORD = re.compile(rb'[-+.\w]+')
 _FLOATS = (np.nan, np.inf, -np.inf, 1.7e308, -1.7e308, 1e200, 1e30, 1e9, -1e9, 1e-320, 0.0, -0.0, -1.0, 1.0)
+#: Share of changed numbers among what becomes of a list; texts of more characters are mutated as files are.
+_CHANGED, _LONG_TEXT = 0.7, 100
 _STRINGS = ('', 'x' * 70_000, '\u202e\ufeff', 'mono16\0', '../../etc', '%s%n', 'nan')
 
 
@@ -73,44 +75,65 @@ def _token(data: bytes, rng: Random) -> bytes:
 def mutate_message(message: Any, rng: Random) -> Any:
     """``message`` itself, one to three of its values replaced by what a publisher may send but should not."""
     for _ in range(rng.choice((1, 1, 2, 3))):
-        kind, replace = rng.choice(list(_leaves(message)))
+        kind, replace = rng.choice(list(_leaves(message, rng)))
         replace(_value(kind, rng))
     return message
 
 
-def _leaves(message: Any) -> Iterator[tuple[str, Callable[[Any], None]]]:
+def _leaves(message: Any, rng: Random) -> Iterator[tuple[str, Callable[[Any], None]]]:
     """Type of each value in a message with what replaces it; of many numbers a single one, or their whole list."""
     for name, kind in message.get_fields_and_field_types().items():
         held = getattr(message, name)
         if hasattr(held, 'get_fields_and_field_types'):
-            yield from _leaves(held)
+            yield from _leaves(held, rng)
         elif isinstance(held, (np.ndarray, array.array, list)) and 'sequence' not in kind:
-            yield kind.partition('[')[0], lambda value, held=held: held.__setitem__(_somewhere(held, value), value)
+            yield kind.partition('[')[0], lambda value, held=held: held.__setitem__(rng.randrange(len(held)), value)
         elif isinstance(held, list) and held and hasattr(held[0], 'get_fields_and_field_types'):
-            yield from _leaves(held[0])
+            yield from _leaves(held[0], rng)
             yield kind, lambda _, held=held: held.pop()
         elif 'sequence' in kind:
-            yield kind, lambda value, name=name: setattr(message, name, _sequence(message, name, value))
+            yield kind, lambda _, name=name: setattr(message, name, _sequence(getattr(message, name), rng))
+        elif isinstance(held, str) and len(held) > _LONG_TEXT:
+            yield kind, lambda _, name=name: setattr(message, name, _text(getattr(message, name), rng))
         else:
             yield kind, lambda value, name=name: setattr(message, name, value)
 
 
-def _somewhere(held: Any, value: Any) -> int:
-    return hash(repr(value)) % len(held)
-
-
-def _sequence(message: Any, name: str, share: Any) -> Any:
-    """The list cut to a share of itself, or with bytes of noise in it."""
-    held = getattr(message, name)
-    cut = held[: int(len(held) * share)] if 0.0 <= share < 1.0 else held + held[:8]
+def _sequence(held: Any, rng: Random) -> Any:
+    """A list that is cut, or longer, or has something else somewhere."""
+    if isinstance(held, array.array) and held and rng.random() < _CHANGED:
+        return _with_another(held, rng)
+    share = rng.choice((0.0, 0.5, 0.99, 2.0))
+    cut = held[: int(len(held) * share)] if share < 1.0 else held + held[:8]
     return array.array(held.typecode, cut) if isinstance(held, array.array) else cut
+
+
+def _with_another(held: 'array.array[Any]', rng: Random) -> 'array.array[Any]':
+    """With another number somewhere: of bytes, which may be the rows of a cloud, with four others."""
+    changed = array.array(held.typecode, held)
+    if held.typecode != 'B':
+        changed[rng.randrange(len(held))] = rng.choice(_FLOATS)
+        return changed
+    begin = 4 * rng.randrange(len(held) // 4 or 1)
+    changed[begin : begin + 4] = array.array('B', rng.choice((_single(rng).tobytes(), rng.randbytes(4))))
+    return changed
+
+
+def _single(rng: Random) -> np.float32:
+    """In single precision, in which what is vast is infinite."""
+    with np.errstate(over='ignore'):
+        return np.float32(rng.choice(_FLOATS))
+
+
+def _text(held: str, rng: Random) -> str:
+    return mutated_bytes(held.encode(), rng).decode(errors='replace')
 
 
 def _value(kind: str, rng: Random) -> Any:
     if 'sequence' in kind:
-        return rng.choice((0.0, 0.5, 0.99, 2.0))
+        return None
     if kind in ('double', 'float', 'float64', 'float32'):
-        return float(np.float32(rng.choice(_FLOATS[5:]))) if kind in ('float', 'float32') else rng.choice(_FLOATS)
+        return float(_single(rng)) if kind in ('float', 'float32') else rng.choice(_FLOATS)
     if kind == 'boolean':
         return rng.random() < 0.5
     if kind.startswith('string'):

@@ -61,7 +61,9 @@ def columns(markers: Markers, names: tuple[str, ...]) -> FloatArray:
 def _numbers(markers: Markers, places: list[int]) -> FloatArray:
     """Columns (N, len(places)) of the table that the rows are."""
     table = np.ascontiguousarray(markers).view(_F4).reshape(len(markers), len(MARKER_DTYPE.names or ()))
-    return table.take(places, axis=1).astype(np.float64)
+    # A NaN that signals (bytes of no number of anybody's) is as good as any.
+    with np.errstate(invalid='ignore'):
+        return table.take(places, axis=1).astype(np.float64)
 
 
 def corners_px(markers: Markers) -> FloatArray:

@@ -103,7 +103,7 @@ def cloud_rows(message: PointCloud2, dtype: 'np.dtype[Any]', optional: Iterable[
     result = np.zeros(count, dtype)
     if count:
         points = np.frombuffer(message.data, source, count)
-        with np.errstate(over='ignore'):
+        with np.errstate(over='ignore', invalid='ignore'):
             for name in names:
                 if dtype[name].kind == 'u' and source[name].kind == 'f':
                     raise InputError(f'cloud whose field {name} is no whole number')
@@ -192,8 +192,10 @@ def markers(message: PointCloud2) -> Markers:
     """
     rows = cloud_rows(message, MARKER_DTYPE, optional=CORNER_COVARIANCE_FIELDS)
     if not {field.name for field in message.fields}.issuperset(CORNER_COVARIANCE_FIELDS):
+        with np.errstate(over='ignore'):
+            variance = rows['sigma_px'] ** 2
         for corner in range(4):
-            rows[f'c{corner}uu'] = rows[f'c{corner}vv'] = rows['sigma_px'] ** 2
+            rows[f'c{corner}uu'] = rows[f'c{corner}vv'] = variance
     return _checked(rows)
 
 
