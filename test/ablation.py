@@ -24,6 +24,7 @@ from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
+from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.scenario import named, Scenario, with_contrast
 from thermal_fiducial.sim.thermal_camera import render_frames
 
@@ -111,7 +112,7 @@ def detector_for(scene: Scene, changes: dict[str, Any]) -> MarkerDetector:
         'bolometer_lag': scenario.sensor.lag,
         'readout_time': scenario.sensor.readout,
     }
-    detector = MarkerDetector(ArucoDetectorConfig(**(parameters | changes)), scenario.aruco_dictionary)
+    detector = MarkerDetector(ArucoDetectorConfig(**(parameters | changes)), load_dictionary(scenario.dictionary))
     if scene.guided:
         detector.set_map({marker.id: (marker.T_map_marker, marker.size) for marker in scenario.markers})
     return detector

@@ -10,6 +10,7 @@ from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, Pos
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.measurements import ImuSample
 from thermal_fiducial.core.pipeline import Pipeline, PipelineConfig
+from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.scenario import named, Scenario, with_contrast
 from thermal_fiducial.sim.scene import Marker
@@ -70,7 +71,7 @@ def fly(flown: Scenario, seconds: float, seed: int = 3, **changes):
         pose_ekf=PoseEkfConfig(**rig),
     )
     markers = {m.id: MapMarker(m.id, m.size, True, m.T_map_marker) for m in flown.markers}
-    pipeline = Pipeline(config, flown.aruco_dictionary, MarkerMap(markers), camera_of(flown))
+    pipeline = Pipeline(config, load_dictionary(flown.dictionary), MarkerMap(markers), camera_of(flown))
     imu = simulate_imu(flown, seconds, seed)
     frames = list(render_frames(flown, seconds, seed))
     results, poses, waiting = [], [], list(frames)

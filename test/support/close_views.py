@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 
 from support.lens_planes import plane_points
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -16,7 +15,7 @@ CAMERAS = {
     'equidistant': Camera(320, 256, K, 'equidistant', [-0.02, -0.006, 0.0055, -0.0019]),
 }
 DICTIONARY = load_dictionary('DICT_4X4_50')
-BITS = marker_bits(DICTIONARY)
+BITS = DICTIONARY.bits
 BLUR = 0.6
 #: Optics, and the pixel's own square over which the drawing averages.
 BLUR_WITH_PIXEL = float(np.hypot(BLUR, np.sqrt(1 / 12)))

@@ -4,6 +4,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.motion_prior import MotionPrior
+from thermal_fiducial.files.dictionary import load_dictionary
 
 
 def camera_of(scenario):
@@ -18,7 +19,7 @@ def detector_of(scenario, *, with_map):
         camera_position=scenario.camera_position,
         camera_orientation=scenario.camera_orientation,
     )
-    detector = MarkerDetector(config, scenario.aruco_dictionary)
+    detector = MarkerDetector(config, load_dictionary(scenario.dictionary))
     if with_map:
         detector.set_map({marker.id: (marker.T_map_marker, marker.size) for marker in scenario.markers})
     return detector

@@ -14,6 +14,7 @@ from rosbags.typesys import get_typestore, Stores
 import yaml
 
 from support.flights import Motion
+from support.opencv import draw_marker
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import marker_corners
 from thermal_fiducial.core.geometry.se3 import apply, inverse, transform
@@ -173,7 +174,7 @@ def _sheet(marker_id):
     sheet = np.zeros((_SHEET_BITS, _SHEET_BITS), np.float32)
     sheet[1:-1, 1:-1] = 1.0
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    sheet[2:-2, 2:-2] = cv2.aruco.generateImageMarker(dictionary, marker_id, 6) / 255.0
+    sheet[2:-2, 2:-2] = draw_marker(dictionary, marker_id, 6) / 255.0
     sharp = np.kron(sheet, np.ones((_PIXELS_PER_BIT, _PIXELS_PER_BIT), np.float32))
     return (_HOT - _COLD) * cv2.GaussianBlur(sharp, (0, 0), _BLUR)
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.core.detection.alignment import aligned
-from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
+from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.files.dictionary import load_dictionary
 
-BITS = marker_bits(load_dictionary('DICT_4X4_50'))
+BITS = load_dictionary('DICT_4X4_50').bits
 DECODER = Decoder(BITS)
 CELL = 6
 CORNERS = np.array([[39.5, 29.5], [75.5, 29.5], [75.5, 65.5], [39.5, 65.5]])

@@ -6,7 +6,6 @@ from support.boards import render
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corners_px
@@ -38,7 +37,7 @@ def raster(drawing, origin):
 @pytest.mark.parametrize('name', ['DICT_6X6_50', 'DICT_APRILTAG_36h11'])
 def test_bits_of_bridged_markers_are_read(name, mount):
     dictionary = load_dictionary(name)
-    bits = marker_bits(dictionary)
+    bits = dictionary.bits
     detector = MarkerDetector(ArucoDetectorConfig(dictionary=name), dictionary)
     options = PlateOptions(size=SIZE_MM, mount=mount)
     # Side of 100 px, tilted 15 degrees about two axes.

@@ -7,7 +7,6 @@ from thermal_fiducial.calibration.intrinsics import calibrate
 from thermal_fiducial.calibration.targets import MarkerBoard
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
@@ -23,7 +22,7 @@ GAP_CELLS = 3
 
 def board():
     """Map of the board and the cells of its plate."""
-    bits = marker_bits(load_dictionary(NAME))
+    bits = load_dictionary(NAME).bits
     centres = marker_grid(COLUMNS, ROWS, SIZE, GAP_CELLS * CELL)
     markers = {
         index: MapMarker(index, SIZE, True, se3.transform(np.eye(3), [*centre, 0.0]))

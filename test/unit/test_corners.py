@@ -6,7 +6,6 @@ import pytest
 from support.lens_planes import plane_points
 
 from thermal_fiducial.core.detection.corners.sides import edges_behind
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.detection.refining import refine_corners
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -19,7 +18,7 @@ CAMERAS = {
     'rational_polynomial': Camera(640, 512, K, 'rational_polynomial', [0.3, 0.05, 1e-4, -2e-4, 0.01, 0.6, 0.1, 0.02]),
     'equidistant': Camera(640, 512, K, 'equidistant', [-0.12, -0.016, 0.0055, 0.0019]),
 }
-BITS = marker_bits(load_dictionary('DICT_4X4_50'))
+BITS = load_dictionary('DICT_4X4_50').bits
 BEHIND = edges_behind(BITS)
 SAMPLES = 8
 BLUR = 0.6

@@ -2,10 +2,10 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.fabrication.bridges import darkest_white, find_bridges
 from thermal_fiducial.fabrication.cuttability import examine
 from thermal_fiducial.fabrication.shape import paint, Rectangle
+from thermal_fiducial.files.dictionary import load_dictionary
 
 
 def bits_of(*rows):
@@ -37,7 +37,7 @@ def test_arm():
 
 def test_standard_dictionary_needs_bridges():
     # Counted by hand from the drawings: in 7 of these 50 markers a cell falls out.
-    bits = marker_bits(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+    bits = load_dictionary('DICT_4X4_50').bits
     found = [examine(marker) for marker in bits]
     assert sum(one.islands > 0 for one in found) == 7
 
@@ -45,7 +45,7 @@ def test_standard_dictionary_needs_bridges():
 @pytest.mark.parametrize('name', ['DICT_4X4_50', 'DICT_6X6_50', 'DICT_APRILTAG_36h11'])
 def test_bridged_markers_are_one_piece_and_keep_their_bits(name):
     width = 0.2
-    for marker in marker_bits(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name)))[:60]:
+    for marker in load_dictionary(name).bits[:60]:
         cells = len(marker) + 2
         bridges = find_bridges(marker)
         rectangles = [Rectangle(0, 0, cells, cells)]

@@ -9,7 +9,6 @@ from support.scenes import camera_of
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corner_estimates import DisplayedSides
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, MARKER_DTYPE
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.scenario import named
@@ -77,7 +76,7 @@ def test_what_a_display_displaces_the_border_shows(frames, bent):
 
 def test_without_markers_a_display_displaces_nothing():
     untouched = SimpleNamespace(ids=np.zeros(0, dtype=np.int64), corners='untouched')
-    bits = marker_bits(load_dictionary('DICT_4X4_50'))
+    bits = load_dictionary('DICT_4X4_50').bits
     assert DisplayedSides(bits).corrected(None, untouched, 0.66) == 'untouched'
 
 

@@ -3,9 +3,10 @@
 import cv2
 import numpy as np
 import pytest
+from support.opencv import draw_marker
 import yaml
 
-from thermal_fiducial.core.detection.patterns import correctable_bits, marker_bits
+from thermal_fiducial.core.detection.patterns import correctable_bits
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary, other_patterns, save_dictionary
 
@@ -14,11 +15,11 @@ NAMES = ['DICT_4X4_50', 'DICT_5X5_1000', 'DICT_6X6_250', 'DICT_7X7_50', 'DICT_AP
 
 @pytest.mark.parametrize('name', NAMES)
 def test_bits_are_what_opencv_draws(name):
-    dictionary = load_dictionary(name)
-    bits = marker_bits(dictionary)
-    cells = dictionary.markerSize + 2
+    theirs = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    bits = load_dictionary(name).bits
+    cells = bits.shape[1] + 2
     for marker_id in (0, 3, len(bits) - 1):
-        drawn = cv2.aruco.generateImageMarker(dictionary, marker_id, 4 * cells)[2::4, 2::4] > 0
+        drawn = draw_marker(theirs, marker_id, 4 * cells)[2::4, 2::4] > 0
         np.testing.assert_array_equal(bits[marker_id], drawn[1:-1, 1:-1])
 
 
@@ -28,7 +29,7 @@ def test_bits_are_what_opencv_draws(name):
 def test_correctable_bits_are_those_of_the_hamming_distance(name, count):
     """As the dictionaries were published; what OpenCV says of them depends on its version."""
     dictionary = load_dictionary(name)
-    assert dictionary.maxCorrectionBits == correctable_bits(marker_bits(dictionary)) == count
+    assert dictionary.correctable == correctable_bits(dictionary.bits) == count
 
 
 @pytest.mark.parametrize('name', NAMES)
@@ -36,8 +37,8 @@ def test_file_gives_the_same_dictionary(name, tmp_path):
     dictionary = load_dictionary(name)
     save_dictionary(tmp_path / 'own.yaml', 'OWN', dictionary)
     again = load_dictionary(tmp_path / 'own.yaml')
-    np.testing.assert_array_equal(again.bytesList, dictionary.bytesList)
-    assert (again.markerSize, again.maxCorrectionBits) == (dictionary.markerSize, dictionary.maxCorrectionBits)
+    np.testing.assert_array_equal(again.bits, dictionary.bits)
+    assert again.correctable == dictionary.correctable
 
 
 GOOD = {'format': 'thermal_fiducial/dictionary', 'version': 1, 'marker_size': 2, 'markers': [['01', '11']]}

@@ -4,9 +4,9 @@ import re
 
 import numpy as np
 import pytest
+from support.opencv import opencv_dictionary
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.bit_patterns import cuttable, pack, rotate, unpack, weight
 from thermal_fiducial.fabrication.cuttability import examine
@@ -53,9 +53,9 @@ def falls_apart(rows):
 def test_packaged_dictionary_keeps_its_promise(name):
     size, least, distance = PACKAGED[name]
     dictionary = load_dictionary(name)
-    markers = [[''.join(map(str, row)) for row in bits] for bits in marker_bits(dictionary).tolist()]
-    assert dictionary.markerSize == size
-    assert dictionary.maxCorrectionBits == (distance - 1) // 2
+    markers = [[''.join(map(str, row)) for row in bits] for bits in dictionary.bits.tolist()]
+    assert dictionary.bits.shape[1:] == (size, size)
+    assert dictionary.correctable == (distance - 1) // 2
     assert len(markers) >= least
     assert not any(falls_apart(rows) for rows in markers)
     all_turns = []
@@ -74,7 +74,7 @@ def negative(rows):
 
 @pytest.mark.parametrize(('name', 'distance'), [('STENCIL_4X4_80_SIGNED', 4), ('STENCIL_5X5_100_SIGNED', 8)])
 def test_bits_of_signed_markers_distinguish_warm_from_cold(name, distance):
-    markers = [[''.join(map(str, row)) for row in bits] for bits in marker_bits(load_dictionary(name)).tolist()]
+    markers = [[''.join(map(str, row)) for row in bits] for bits in load_dictionary(name).bits.tolist()]
     for rows in markers:
         turns = [negative(rows)]
         for _ in range(3):
@@ -84,7 +84,7 @@ def test_bits_of_signed_markers_distinguish_warm_from_cold(name, distance):
 
 def test_check_names_markers_that_are_negatives_of_one_another(capsys):
     # Marker 0 turned by no, one, two or three quarters and inverted: one of the 100 is that.
-    bits = marker_bits(load_dictionary('STENCIL_4X4_100'))
+    bits = load_dictionary('STENCIL_4X4_100').bits
     inverted = [1 - np.rot90(bits[0], turns) for turns in range(4)]
     partners = [key for key, other in enumerate(bits) if any(np.array_equal(other, turn) for turn in inverted)]
     pairs = negatives(bits, 4)
@@ -106,16 +106,17 @@ def test_packaged_dictionary_is_what_its_command_writes(name, tmp_path):
     out = tmp_path / f'{name}.yaml'
     assert main(['markers', 'dictionary', str(out), *arguments]) == 0
     assert out.read_text() == packaged
-    assert len(dictionary.bytesList) == len(load_dictionary(out).bytesList)
+    assert len(dictionary.bits) == len(load_dictionary(out).bits)
 
 
 def test_opencv_reads_the_packaged_markers():
     dictionary = load_dictionary('STENCIL_5X5_100')
-    for marker_id, bits in enumerate(marker_bits(dictionary)):
+    theirs = opencv_dictionary(dictionary)
+    for marker_id, bits in enumerate(dictionary.bits):
         turned_bits = np.rot90(bits, marker_id % 4)
         damaged = turned_bits.copy()
         damaged[0, 0] ^= 1
-        found, identified, _ = dictionary.identify(damaged, 0.6)[:3]
+        found, identified, _ = theirs.identify(damaged, 0.6)[:3]
         assert found
         assert identified == marker_id
 
@@ -155,7 +156,7 @@ def test_search_refuses_what_cannot_be(bits, distance):
 
 @pytest.mark.parametrize(('name', 'bits_apart'), [('STENCIL_4X4_100', 0), ('STENCIL_5X5_100', 1)])
 def test_the_documents_name_the_markers_that_are_like_the_negative_of_another(name, bits_apart):
-    bits = marker_bits(load_dictionary(name))
+    bits = load_dictionary(name).bits
     page = (Path(__file__).resolve().parents[2] / 'doc' / 'markers.md').read_text(encoding='utf-8')
     (listed,) = re.findall(rf'In `{name}`\s+these\b([^.]*)\.', page)
     pairs = [(int(a), int(b), bits_apart) for a, b in re.findall(r'(\d+)\s+and\s+(\d+)', listed)]
@@ -164,5 +165,5 @@ def test_the_documents_name_the_markers_that_are_like_the_negative_of_another(na
 
 @pytest.mark.parametrize('name', ['STENCIL_4X4_80_SIGNED', 'STENCIL_5X5_100_SIGNED'])
 def test_signed_dictionaries_have_no_such_markers(name):
-    bits = marker_bits(load_dictionary(name))
+    bits = load_dictionary(name).bits
     assert negatives(bits, distances(bits)[0]) == []

@@ -12,9 +12,9 @@ import pytest
 from shapely import affinity
 from shapely.geometry import box, Point, Polygon
 from shapely.ops import unary_union
+from support.opencv import opencv_dictionary
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import circle_board
 from thermal_fiducial.fabrication.drawing import Circle, Contour, Drawing
@@ -30,7 +30,7 @@ ezdxf = pytest.importorskip('ezdxf')
 pypdfium2 = pytest.importorskip('pypdfium2')
 svgpathtools = pytest.importorskip('svgpathtools')
 
-BITS = marker_bits(load_dictionary('STENCIL_4X4_100'))
+BITS = load_dictionary('STENCIL_4X4_100').bits
 # Geometry in a file is the pattern to this: DXF holds 16 digits, SVG 9 decimals.
 TOLERANCE_MM = 1e-6
 SVG, INKSCAPE = '{http://www.w3.org/2000/svg}', '{http://www.inkscape.org/namespaces/inkscape}'
@@ -79,7 +79,7 @@ def test_dxf_is_the_pattern(tmp_path, marker_id, mount, kerf):
 @pytest.mark.parametrize('dictionary', ['STENCIL_6X6_100', 'DICT_5X5_50', 'DICT_APRILTAG_36h11'])
 def test_every_drawing_is_sound(dictionary, mount):
     options = PlateOptions(mount=mount)
-    for marker_id, bits in enumerate(marker_bits(load_dictionary(dictionary))[:25]):
+    for marker_id, bits in enumerate(load_dictionary(dictionary).bits[:25]):
         drawing = marker_drawing(bits, str(marker_id), options)
         assert problems(drawing, 1) == []
         cell = options.size / (len(bits) + 2)
@@ -293,7 +293,7 @@ def test_preview_is_detected_as_the_marker(tmp_path):
     path = tmp_path / 'marker.png'
     write(marker_drawing(BITS[21], '21', PlateOptions()), path)
     preview = cv2.copyMakeBorder(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), *[60] * 4, cv2.BORDER_CONSTANT, value=190)
-    _, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(preview)
+    _, ids, _ = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary)).detectMarkers(preview)
     assert ids is not None
     assert ids.ravel().tolist() == [21]
 

@@ -1,5 +1,7 @@
 """What may be missing on a robot: the core runs without ROS, the commands without the tools they don't need."""
 
+import ast
+from pathlib import Path
 import pkgutil
 import subprocess
 import sys
@@ -159,3 +161,34 @@ assert ExtendedKalmanFilter.whole and 'filterpy' in sys.modules
 """
     result = python(code, (), str(tmp_path))
     assert result.returncode == 0, result.stderr
+
+
+#: What the nodes use of OpenCV, each looked up in 4.6, which Ubuntu 24.04 has.
+IN_OPENCV_4_6 = """
+    BORDER_REFLECT_101 BORDER_REPLICATE CAP_FFMPEG CAP_PROP_CONVERT_RGB CHAIN_APPROX_SIMPLE CMP_LT COLOR_GRAY2BGR
+    CV_32F DIST_L2 DIST_LABEL_PIXEL DIST_MASK_5 FONT_HERSHEY_SIMPLEX GaussianBlur IMREAD_ANYDEPTH IMREAD_GRAYSCALE
+    IMREAD_UNCHANGED INTER_AREA INTER_CUBIC INTER_LANCZOS4 INTER_LINEAR REDUCE_AVG RETR_LIST Sobel TERM_CRITERIA_EPS
+    TERM_CRITERIA_MAX_ITER VideoCapture WARP_INVERSE_MAP __version__ absdiff addWeighted approxPolyDP arcLength
+    aruco.getPredefinedDictionary blur circle compare convertScaleAbs convexHull copyMakeBorder cornerSubPix
+    cvtColor distanceTransformWithLabels error fillConvexPoly findContours fisheye.projectPoints
+    fisheye.undistortPoints getNumThreads getPerspectiveTransform imdecode imreadmulti medianBlur polylines
+    projectPoints putText reduce remap resize setNumThreads subtract warpAffine
+"""
+
+
+def test_the_nodes_use_nothing_of_opencv_that_ubuntu_has_not():
+    package = Path(thermal_fiducial.core.__file__).parents[1]
+    files = [file for layer in ('core', 'files', 'cameras', 'ros', 'nodes') for file in (package / layer).rglob('*.py')]
+    nodes = [node for file in files for node in ast.walk(ast.parse(file.read_text()))]
+    parts = {ast.unparse(node).removeprefix('cv2.') for node in nodes if _is_of_opencv(node)}
+    used = {name for name in parts if not any(other.startswith(f'{name}.') for other in parts)}
+    assert 'remap' in used
+    assert used <= set(IN_OPENCV_4_6.split())
+
+
+def _is_of_opencv(node):
+    """An attribute of cv2, or of one of its modules."""
+    owner = node.value if isinstance(node, ast.Attribute) else None
+    if isinstance(owner, ast.Attribute) and owner.attr in ('aruco', 'fisheye'):
+        owner = owner.value
+    return isinstance(owner, ast.Name) and owner.id == 'cv2'

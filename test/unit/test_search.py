@@ -7,13 +7,13 @@ import pytest
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.frame import Frame, Places
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
-from thermal_fiducial.core.detection.patterns import Decoder, marker_bits, Reading, shrunk
+from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
 from thermal_fiducial.core.detection.search import BlindSearch, inside_out, SearchScales
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.files.dictionary import load_dictionary
 
-BITS = marker_bits(load_dictionary('DICT_4X4_50'))
+BITS = load_dictionary('DICT_4X4_50').bits
 DECODER = Decoder(BITS)
 SEARCH = BlindSearch(DECODER)
 EVERY = np.ones(len(BITS), dtype=bool)

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.fabrication.boards import circle_board
 from thermal_fiducial.fabrication.plate import marker_drawing, PlateOptions
 from thermal_fiducial.fabrication.strength import acrylic_of, narrowest_web, neck_stress, RESOLUTION_MM, strength_of
 from thermal_fiducial.files.dictionary import load_dictionary
 
-BITS = marker_bits(load_dictionary('STENCIL_4X4_100'))
+BITS = load_dictionary('STENCIL_4X4_100').bits
 # Webs are found to twice the resolution of the search; arcs of eight chords are 0.005 mm off.
 TOLERANCE_MM = 2.0 * RESOLUTION_MM + 0.005
 

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from support.opencv import draw_marker
 
 from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
@@ -332,7 +333,7 @@ def test_bad_pixels_are_found_and_nothing_else():
 def test_markers_are_never_taken_for_bad_pixels(contrast, polarity):
     """Neither their corners nor bits of two pixels, while the robot stands still for ten seconds."""
     rng = np.random.default_rng(16)
-    bits = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 6)
+    bits = draw_marker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50), 7, 6)
     image = np.full((128, 160), 0.0)
     for scale, at in ((2.0, (20, 20)), (3.3, (20, 60)), (8.0, (60, 20))):
         fine = cv2.resize(bits, None, fx=8, fy=8, interpolation=cv2.INTER_NEAREST).astype(np.float64) / 255.0

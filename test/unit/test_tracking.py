@@ -5,14 +5,13 @@ import pytest
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.detection.search import BlindSearch
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import corners_px
 from thermal_fiducial.files.dictionary import load_dictionary
 
 DICTIONARY = load_dictionary('DICT_4X4_50')
-BITS = marker_bits(DICTIONARY)
+BITS = DICTIONARY.bits
 CAMERA = Camera(640, 512, np.array([[600.0, 0, 319.5], [0, 600.0, 255.5], [0, 0, 1]]))
 PERIOD_NS = 33_333_333
 #: Pixels that the markers move to the right in a frame.

@@ -217,7 +217,7 @@ def _detect(photos: list[Path], camera: Camera, args: argparse.Namespace) -> lis
 
 
 def _detect_in_photo(
-    photo_detector: cv2.aruco.ArucoDetector, gray: Gray, camera: Camera, sizes: MarkerDetector
+    photo_detector: 'cv2.aruco.ArucoDetector', gray: Gray, camera: Camera, sizes: MarkerDetector
 ) -> Markers:
     """Markers of an 8-bit photo.
 
@@ -234,10 +234,16 @@ def _detect_in_photo(
     return rows_from_corners(ids, uv, _isotropic(np.full(len(ids), PHOTO_SIGMA_PX)), side, camera)
 
 
-def _photo_detector(args: argparse.Namespace) -> cv2.aruco.ArucoDetector:
+def _photo_detector(args: argparse.Namespace) -> 'cv2.aruco.ArucoDetector':
+    """OpenCV's own detector. Raises InputError where OpenCV has none of this kind."""
+    if not hasattr(cv2.aruco, 'ArucoDetector'):
+        raise InputError(f"OpenCV {cv2.__version__}: photos need 4.7 or newer, as pip's opencv-python-headless is")
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    return cv2.aruco.ArucoDetector(load_dictionary(args.dictionary), parameters)
+    ours = load_dictionary(args.dictionary)
+    packed = np.concatenate([cv2.aruco.Dictionary.getByteListFromBits(bits) for bits in ours.bits])
+    theirs = cv2.aruco.Dictionary(packed, ours.bits.shape[1], ours.correctable)
+    return cv2.aruco.ArucoDetector(theirs, parameters)
 
 
 def _read_detections(path: Path, start: MarkerMap, args: argparse.Namespace, camera: Camera) -> list[Markers]:

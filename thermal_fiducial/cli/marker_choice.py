@@ -2,7 +2,6 @@
 
 import argparse
 
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.types import Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -22,7 +21,7 @@ def chosen(args: argparse.Namespace) -> tuple[Gray, list[int]]:
     InputError
         No such dictionary, or no such marker in it.
     """
-    bits = marker_bits(load_dictionary(args.dictionary))
+    bits = load_dictionary(args.dictionary).bits
     ids = list(range(len(bits))) if args.ids is None else _id_list(args.ids)
     wrong = [marker_id for marker_id in ids if marker_id >= len(bits)]
     if wrong:

@@ -10,7 +10,6 @@ import numpy as np
 
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
@@ -98,7 +97,7 @@ def _board(args: argparse.Namespace) -> int:
         _write_all([circle_board(columns, rows, spacing, args.diameter, options)], args)
         _say_how_to_use(f'circles --grid {columns} {rows} --spacing {spacing:g} --diameter {args.diameter:g}')
         return 0
-    bits = marker_bits(load_dictionary(args.dictionary))
+    bits = load_dictionary(args.dictionary).bits
     if columns < 1 or rows < 1 or columns * rows > len(bits):
         raise InputError(f'a board of {columns} x {rows} markers: {args.dictionary} has {len(bits)}')
     labels = [str(index) for index in range(columns * rows)]

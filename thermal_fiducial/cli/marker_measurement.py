@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
-from thermal_fiducial.core.detection.patterns import marker_bits
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import columns, corners_px, Markers
@@ -65,7 +64,7 @@ def render_view(side_px: float, contrast: float, tilt_deg: float, rng: np.random
     contrast : [K]
     """
     lens = LENSES[LENS]
-    bits = marker_bits(load_dictionary(DICTIONARY))
+    bits = load_dictionary(DICTIONARY).bits
     T = np.stack([_place(lens, pixel, side_px, np.radians(tilt_deg), rng) for pixel in _places(lens, side_px, rng)])
     ids = rng.choice(len(bits), len(T), replace=False).tolist()
     plates = [_plate(pose, bits[marker_id], contrast) for pose, marker_id in zip(T, ids, strict=True)]

@@ -4,13 +4,11 @@ import argparse
 from collections import Counter
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from thermal_fiducial.cli import marker_drawings, marker_planning
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.terminal_tables import show, table_of
+from thermal_fiducial.core.detection.patterns import Dictionary
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.bridges import darkest_white, find_bridges
 from thermal_fiducial.fabrication.cuttability import examine
@@ -131,9 +129,7 @@ def _dictionary(args: argparse.Namespace) -> int:
     if args.count is not None and args.count > found:
         raise InputError(f'{found} markers found, not {args.count}; try more restarts')
     kept = bits[: args.count]
-    packed = np.concatenate([cv2.aruco.Dictionary.getByteListFromBits(marker) for marker in kept])
-    dictionary = cv2.aruco.Dictionary(packed, args.bits, (args.distance - 1) // 2)
-    save_dictionary(args.out, args.out.stem, dictionary)
+    save_dictionary(args.out, args.out.stem, Dictionary(kept, (args.distance - 1) // 2))
     count = ('' if args.count is None else f' --count {args.count}') + ' --signed' * args.signed
     command = f'--bits {args.bits} --distance {args.distance} --seed {args.seed} --restarts {args.restarts}{count}'
     text = args.out.read_text(encoding='utf-8')

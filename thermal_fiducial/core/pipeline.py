@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from thermal_fiducial.config import (
@@ -20,6 +19,7 @@ from thermal_fiducial.config import (
     Tau2CameraConfig,
 )
 from thermal_fiducial.core.detection.detector import MarkerDetector
+from thermal_fiducial.core.detection.patterns import Dictionary
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.geometry.camera import Camera
@@ -92,7 +92,7 @@ class Pipeline:
     def __init__(
         self,
         config: PipelineConfig,
-        dictionary: cv2.aruco.Dictionary,
+        dictionary: Dictionary,
         marker_map: MarkerMap,
         camera: Camera | None = None,
         bad_pixels: IntArray | None = None,

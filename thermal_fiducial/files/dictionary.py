@@ -21,7 +21,8 @@ import cv2
 import numpy as np
 import yaml
 
-from thermal_fiducial.core.detection.patterns import correctable_bits, marker_bits
+from thermal_fiducial.core.detection.patterns import correctable_bits, Dictionary
+from thermal_fiducial.core.types import Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import read_text
 from thermal_fiducial.files.schema import parse_yaml, Value
@@ -32,7 +33,7 @@ FORMAT = 'thermal_fiducial/dictionary'
 PACKAGED = Path(__file__).resolve().parent.parent / 'dictionaries'
 
 
-def load_dictionary(name_or_path: str | os.PathLike[str]) -> cv2.aruco.Dictionary:
+def load_dictionary(name_or_path: str | os.PathLike[str]) -> Dictionary:
     """Dictionary by OpenCV's name (``DICT_4X4_50``), a packaged name, or the path of a dictionary file.
 
     Raises
@@ -43,10 +44,10 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> cv2.aruco.Dictionar
     name = str(name_or_path)
     predefined = getattr(cv2.aruco, name, None) if name.startswith('DICT_') else None
     if predefined is not None:
-        dictionary = cv2.aruco.getPredefinedDictionary(predefined)
+        theirs = cv2.aruco.getPredefinedDictionary(predefined)
+        bits = _unpacked(theirs.bytesList, theirs.markerSize)
         # OpenCV 4 knows of no bit that the AprilTag families could correct.
-        dictionary.maxCorrectionBits = max(dictionary.maxCorrectionBits, correctable_bits(marker_bits(dictionary)))
-        return dictionary
+        return Dictionary(bits, max(theirs.maxCorrectionBits, correctable_bits(bits)))
     packaged = PACKAGED / f'{name}.yaml'
     path = packaged if '/' not in name and packaged.is_file() else Path(name)
     try:
@@ -76,7 +77,7 @@ def other_patterns(markers: Iterable[int], of: str, read_as: str, folder: Path =
         return ''
     differ = f'the map is of {of}, looked for is {read_as}'
     try:
-        theirs, ours = marker_bits(load_dictionary(_of_map(of, folder))), marker_bits(load_dictionary(read_as))
+        theirs, ours = load_dictionary(_of_map(of, folder)).bits, load_dictionary(read_as).bits
     except InputError as error:
         return f'{differ}: {error}'
     both = min(len(theirs), len(ours))
@@ -87,7 +88,7 @@ def other_patterns(markers: Iterable[int], of: str, read_as: str, folder: Path =
 def not_in_dictionary(markers: Iterable[int], name: str, folder: Path) -> list[int]:
     """Those of ``markers`` that the dictionary of a map in ``folder`` does not have; none where it can't be opened."""
     try:
-        known = len(load_dictionary(_of_map(name, folder)).bytesList)
+        known = len(load_dictionary(_of_map(name, folder)).bits)
     except InputError:
         return []
     return [marker for marker in sorted(markers) if marker >= known]
@@ -108,20 +109,20 @@ def _of_map(name: str, folder: Path) -> str:
     return str(folder / name)
 
 
-def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: cv2.aruco.Dictionary) -> None:
+def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: Dictionary) -> None:
     """Write ``dictionary`` as a dictionary file. Raises InputError where it cannot be written."""
     document = {
         'format': FORMAT,
         'version': 1,
         'name': name,
-        'marker_size': int(dictionary.markerSize),
-        'max_correction_bits': int(dictionary.maxCorrectionBits),
-        'markers': [[''.join(map(str, row)) for row in bits] for bits in marker_bits(dictionary).tolist()],
+        'marker_size': dictionary.bits.shape[1],
+        'max_correction_bits': dictionary.correctable,
+        'markers': [[''.join(map(str, row)) for row in bits] for bits in dictionary.bits.tolist()],
     }
     write_text(path, yaml.safe_dump(document, sort_keys=False, width=120))
 
 
-def _from_document(document: Value) -> cv2.aruco.Dictionary:
+def _from_document(document: Value) -> Dictionary:
     fields = document.mapping() if isinstance(document.content, dict) else {}
     if 'format' not in fields or fields['format'].content != FORMAT:
         raise document.error(f'not of format {FORMAT}')
@@ -135,12 +136,23 @@ def _from_document(document: Value) -> cv2.aruco.Dictionary:
     markers = fields['markers'].items()
     if not markers:
         raise fields['markers'].error('no markers')
-    return cv2.aruco.Dictionary(np.concatenate([_packed(rows, size) for rows in markers]), size, correction)
+    return Dictionary(np.stack([_bits(rows, size) for rows in markers]), correction)
 
 
-def _packed(rows: Value, size: int) -> Any:
+def _bits(rows: Value, size: int) -> Gray:
     words = [row.content if isinstance(row.content, str) else '' for row in rows.items()]
     if len(words) != size or any(len(word) != size or set(word) - {'0', '1'} for word in words):
         raise rows.error(f'not {size} strings of {size} bits')
-    bits = np.array([[int(bit) for bit in word] for word in words], dtype=np.uint8)
-    return cv2.aruco.Dictionary.getByteListFromBits(bits)
+    return np.array([[int(bit) for bit in word] for word in words], dtype=np.uint8)
+
+
+def _unpacked(packed: Any, size: int) -> Gray:
+    """Bits (M, size, size) of OpenCV's packed ones (M, bytes, 4 turns)."""
+    table = np.asarray(packed, dtype=np.uint8)
+    # It holds the four rotations one after the other, whatever the shape says; the first is upright.
+    upright = table.reshape(len(table), -1)[:, : table.shape[1]]
+    unpacked = np.unpackbits(upright, axis=1)
+    # The last byte holds the remaining bits right-aligned.
+    padding = -(size * size) % 8
+    bits = np.concatenate([unpacked[:, :-8], unpacked[:, -8 + padding :]], axis=1)
+    return bits.reshape(-1, size, size)

@@ -98,7 +98,7 @@ def _check_files(settings: Settings) -> list[str]:
         load_bad_pixels(camera.bad_pixel_file)
     if mapper.map_file:
         marker_map = load_map(mapper.map_file, mapper.marker_size, sizes)
-        foreign = sorted(set(marker_map.markers) - set(range(len(dictionary.bytesList))))
+        foreign = sorted(set(marker_map.markers) - set(range(len(dictionary.bits))))
         if foreign:
             raise InputError(f'{mapper.map_file}: marker {foreign[0]} is not in {settings.aruco_detector.dictionary}')
         folder = Path(mapper.map_file).parent

@@ -229,7 +229,8 @@ class Plate:
 def marker_plate(marker: Marker, dictionary: cv2.aruco.Dictionary, acrylic: Acrylic) -> Plate:
     """The stencil of a marker: one cell of warm plate round the black square."""
     cells = dictionary.markerSize + 2
-    bits = cv2.aruco.generateImageMarker(dictionary, marker.id, cells, borderBits=1) > 0
+    packed = dictionary.bytesList[marker.id : marker.id + 1]
+    bits = np.pad(cv2.aruco.Dictionary.getBitsFromByteList(packed, dictionary.markerSize) > 0, 1)
     bits = np.pad(bits, 1, constant_values=True)
     if acrylic.inverted:
         bits = ~bits

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
@@ -12,7 +11,7 @@ from thermal_fiducial.core.detection.finding import Findings, FrameHistory, Mark
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import among, depths, ExpectedMarkers, KnownMarkers
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
-from thermal_fiducial.core.detection.patterns import Decoder, marker_bits
+from thermal_fiducial.core.detection.patterns import Decoder, Dictionary
 from thermal_fiducial.core.detection.refining import refine, RefinedCorners, RefinedMarkers
 from thermal_fiducial.core.detection.tracking import MotionTrack, predict_frame
 from thermal_fiducial.core.geometry import se3
@@ -40,10 +39,10 @@ class MarkerDetector:
     dictionary : of the markers
     """
 
-    def __init__(self, config: ArucoDetectorConfig, dictionary: cv2.aruco.Dictionary) -> None:
+    def __init__(self, config: ArucoDetectorConfig, dictionary: Dictionary) -> None:
         self.config = config
-        bits = marker_bits(dictionary)
-        decoder = Decoder(bits, int(dictionary.maxCorrectionBits))
+        bits = dictionary.bits
+        decoder = Decoder(bits, dictionary.correctable)
         overrides = size_overrides(config.marker_size_overrides)
         self._sizes = np.array([overrides.get(key, config.marker_size) for key in range(decoder.count)])
         self._finder = MarkerFinder(decoder)

@@ -35,17 +35,14 @@ def most_similar(similarity: FloatArray, places: FloatArray) -> FloatArray:
     return np.asarray(mean / np.maximum(weight.sum(axis=1, keepdims=True), TINY))
 
 
-def marker_bits(dictionary: cv2.aruco.Dictionary) -> Gray:
-    """Bits (M, n, n) of all M markers, rows from the top, 1 for white, without the black border."""
-    size = int(dictionary.markerSize)
-    table = np.asarray(dictionary.bytesList, dtype=np.uint8)
-    # It holds the four rotations one after the other, whatever the shape says; the first is upright.
-    upright = table.reshape(len(table), -1)[:, : table.shape[1]]
-    unpacked = np.unpackbits(upright, axis=1)
-    # The last byte holds the remaining bits right-aligned.
-    padding = -(size * size) % 8
-    bits = np.concatenate([unpacked[:, :-8], unpacked[:, -8 + padding :]], axis=1)
-    return bits.reshape(-1, size, size)
+@dataclass(frozen=True, slots=True, eq=False)
+class Dictionary:
+    """The markers that a detector looks for. OpenCV's own class of them crashes in 4.6 when it is made of patterns."""
+
+    #: (M, n, n) of the markers, ID by ID: rows from the top, 1 for white, without the black border
+    bits: Gray
+    #: bit errors that still name a marker
+    correctable: int
 
 
 def correctable_bits(bits: Gray) -> int:
