@@ -5,12 +5,17 @@ about x y z), both in the map frame. With ``p_camera = R' (R_m c + t_m - t)`` fo
 ``dp_camera = R' (dt_m - [R_m c]x dr_m - dt + [R_m c + t_m - t]x dr)``.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import skew, so3_exp, so3_log
 from thermal_fiducial.core.types import FloatArray
+
+if TYPE_CHECKING:
+    # The filter turns covariances too, and is back in flight sooner without OpenCV.
+    from thermal_fiducial.core.geometry.camera import Camera
 
 #: Corners of a marker of side 2, clockwise from its top-left.
 _UNIT_CORNERS = np.array([[-1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [-1.0, -1.0, 0.0]])
@@ -58,14 +63,14 @@ def corners_in_map(T_map_marker: FloatArray, sizes: npt.ArrayLike) -> FloatArray
     return np.asarray(corners + T_map_marker[..., None, :3, 3])
 
 
-def reproject(camera: Camera, T_map_camera: FloatArray, points: FloatArray) -> FloatArray:
+def reproject(camera: 'Camera', T_map_camera: FloatArray, points: FloatArray) -> FloatArray:
     """Pixels (..., 4, 2) of corners ``points`` (..., 4, 3) in the map, for cameras (..., 4, 4); NaN: unseen."""
     relative = points - T_map_camera[..., None, :3, 3]
     return camera.project(relative @ T_map_camera[..., :3, :3])
 
 
 def linearise(
-    camera: Camera, T_map_camera: FloatArray, T_map_marker: FloatArray, sizes: npt.ArrayLike
+    camera: 'Camera', T_map_camera: FloatArray, T_map_marker: FloatArray, sizes: npt.ArrayLike
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Pixels of the corners of markers, and their derivatives with respect to both poses.
 
