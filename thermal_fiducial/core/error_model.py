@@ -39,20 +39,18 @@ class SystematicErrors:
     marker_shape: float = 0.7
 
 
-#: 99.9 % of chi square of six and of eight degrees of freedom, of a pose and of a view of a marker: what is farther off
-#: than promised errors come.
+#: 99.9 % limits of chi square with six and eight degrees of freedom, of a pose and of a view of a marker.
 CHI2_OF_POSE, CHI2_OF_VIEW = 22.5, 26.1
-#: For data that have no systematic errors: simulated corners.
+#: For data without systematic errors: simulated corners.
 NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0)
-#: Share of the variance of the best marker in view that all others have in common with it, as parts of a rigid map: the
-#: place where they all come from, the gauge. Of maps from flights past eight markers nearly all is common; the rest
-#: covers markers that were surveyed one by one.
+#: Share of the variance of the best-known marker in view that is common to all markers of the rigid map: the error of
+#: the gauge. In maps from flights past eight markers nearly all is; the rest covers markers surveyed one by one.
 MAP_COMMON = 0.75
-#: Poses of the odometry in succession are wrong alike: so many are worth one, as its errors last for seconds.
+#: Errors of successive odometry poses are correlated for seconds: this many count as one.
 CORRELATED_ODOMETRY = 30.0
-#: However uncertain odometry says it is, it is no worse than this while it agrees with the markers [m, rad].
+#: Largest standard deviations assumed for odometry that agrees with the markers [m, rad].
 ODOMETRY_AT_WORST = np.repeat([0.3, 0.2], 3)
-#: Re-projection error to allow for before a marker counts as inconsistent [px]: bent plates, and the corners' bias.
+#: Part of the re-projection error, by bent plates and corner bias, that is no sign of an inconsistent marker [px].
 INCONSISTENT_PX = 0.3
 
 
@@ -60,11 +58,11 @@ INCONSISTENT_PX = 0.3
 
 
 def noise_of_pose(gains: FloatArray, covariances: FloatArray, chi2: float) -> FloatArray:
-    """Covariance (6, 6) that the noise of n corners makes of a pose, at least as large as its residuals say.
+    """Covariance (6, 6) of a pose by the noise of n corners, scaled up to the residuals if these are larger.
 
     Parameters
     ----------
-    gains : (n, 6, 2) what a pixel of each corner moves the pose by
+    gains : (n, 6, 2) derivative of the pose by each corner [1/px]
     covariances : (n, 2, 2) [px^2]
     chi2 : of the residuals
     """
@@ -73,18 +71,18 @@ def noise_of_pose(gains: FloatArray, covariances: FloatArray, chi2: float) -> Fl
 
 
 def noise_factor(chi2: float, freedom: int) -> float:
-    """Ratio of the variance of residuals to the promised one, at least 1: covariances that promise too much grow by it.
+    """Ratio of the variance of residuals to the claimed one, at least 1, by which covariances are scaled.
 
     Parameters
     ----------
     chi2 : of the residuals
-    freedom : residuals less what was estimated from them
+    freedom : number of residuals less the number of estimated parameters
     """
     return max(1.0, chi2 / max(freedom, 1))
 
 
 def corner_correlations(corners: FloatArray, width: int, errors: SystematicErrors) -> FloatArray:
-    """Correlations (n, n) of the systematic errors of n corners, of either axis alone.
+    """Correlations (n, n) of the systematic errors of n corners, the same for either axis.
 
     Parameters
     ----------
@@ -97,11 +95,11 @@ def corner_correlations(corners: FloatArray, width: int, errors: SystematicError
 
 
 def corners_of_pose(gains: FloatArray, correlations: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Covariance (m, m) that the systematic errors of n corners make of a pose.
+    """Covariance (m, m) of a pose by the systematic errors of n corners.
 
     Parameters
     ----------
-    gains : (n, m, 2) what a pixel of each corner moves the pose by
+    gains : (n, m, 2) derivative of the pose by each corner [1/px]
     correlations : (n, n) of the errors
     """
     n, m, _ = gains.shape
@@ -110,7 +108,7 @@ def corners_of_pose(gains: FloatArray, correlations: FloatArray, errors: Systema
 
 
 def visible_share(J: FloatArray, correlations: FloatArray) -> float:
-    """Share of the variance of the corners' systematic errors that a pose fitted to them leaves in the residuals.
+    """Share of the corners' systematic variance that is left in the residuals of a fitted pose.
 
     Parameters
     ----------
@@ -127,14 +125,14 @@ def visible_share(J: FloatArray, correlations: FloatArray) -> float:
 def map_of_pose(
     gains: FloatArray, covariances: FloatArray, positions: FloatArray, camera_position: FloatArray
 ) -> FloatArray:
-    """Covariance (6, 6) of a camera pose by the errors of the map, its scale aside.
+    """Covariance (6, 6) of a camera pose by the errors of the map, without its scale.
 
-    What the markers have in common moves the camera as if it hung on the same rigid map; for the rest any correlations
-    are allowed for.
+    The common error of the markers moves the camera rigidly with the map; for the rest the bound of any correlations is
+    used.
 
     Parameters
     ----------
-    gains : (N, 6, 6) what a displacement of each marker moves the pose by; all together moved rigidly take it along
+    gains : (N, 6, 6) derivative of the pose by the pose of each marker
     covariances, positions : (N, 6, 6), (N, 3) of the markers
     camera_position : (3,)
     """
@@ -146,13 +144,12 @@ def map_of_pose(
 
 
 def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
-    """Covariance (m, m) of what moves by ``moved`` (m,) for each unit of one error: scale, clock, or another pose.
+    """Covariance (m, m) by one scalar error with derivative ``moved`` (m,): scale, clock offset, or the other pose.
 
     Parameters
     ----------
-    std : of the error: ``marker_size_std`` of poses that move as all markers grow to twice their size [share], how far
-        a clock may be off of poses by their velocity [s]; of a pose that may as well be another one, 1 of what is
-        between them
+    std : standard deviation of the error: ``marker_size_std`` for the scale, that of the clock offset [s] for a
+        velocity, 1 for the difference of two possible poses
     """
     return np.asarray(std**2 * np.outer(moved, moved))
 
@@ -161,22 +158,22 @@ def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
 
 
 def shape_of_corners(precisions: FloatArray, views: IntArray, errors: SystematicErrors) -> FloatArray:
-    """Standard deviations (M,) [px] of what corners of M markers are off by in all of their views alike.
+    """Standard deviations (M,) [px] of the corner errors of M markers that are the same in all views.
 
     Parameters
     ----------
     precisions : (M,) sum over the views of a marker of its corners' inverse variance [1/px^2]
-    views : (M,) how many they are
+    views : (M,) number of views
     """
     return np.asarray(errors.marker_shape * np.sqrt(views / precisions))
 
 
 def arms_of_scale(positions: FloatArray, held: FloatArray) -> FloatArray:
-    """What markers at ``positions`` (M, 3) move by as the scale grows by 1 (M, 3): from the nearest of ``held``.
+    """Derivatives (M, 3) of the ``positions`` (M, 3) of markers by the map's scale: from the nearest of ``held``.
 
     Parameters
     ----------
-    held : (H, 3) positions that are given, at least one: they carry the scale
+    held : (H, 3) positions of held markers, at least one
     """
     arms = positions[:, None] - held
     nearest = np.argmin(np.sum(arms**2, axis=-1), axis=1)
@@ -184,16 +181,16 @@ def arms_of_scale(positions: FloatArray, held: FloatArray) -> FloatArray:
 
 
 def scale_of_map(arms: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Covariances (M, 6, 6) of markers that move by ``arms`` (M, 3) as the scale grows by 1."""
+    """Covariances (M, 6, 6) of markers by the scale's error; ``arms`` (M, 3) of :func:`arms_of_scale`."""
     covariances = np.zeros((len(arms), 6, 6))
     covariances[:, :3, :3] = errors.marker_size_std**2 * arms[:, :, None] * arms[:, None, :]
     return covariances
 
 
 def divided_prior(covariance: FloatArray, count: int) -> FloatArray:
-    """Covariance (6, 6) of one of ``count`` markers that are known from before, without how their errors hang together.
+    """Covariance (6, 6) of one of ``count`` prior markers whose correlations are unknown.
 
-    Each so many times as large, they are an upper bound of the joint covariance whatever that is.
+    Covariances times their number bound the joint covariance for any correlations.
     """
     return count * covariance
 
@@ -202,12 +199,12 @@ def divided_prior(covariance: FloatArray, count: int) -> FloatArray:
 
 
 def alike_odometry(covariance: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of one of many poses by the odometry whose errors are the same for seconds."""
+    """Covariance (6, 6) of one of many successive odometry poses, as if they were independent."""
     return CORRELATED_ODOMETRY * covariance
 
 
 def bounded_odometry(covariance: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of odometry that has agreed with the markers so far: no worse than at its worst."""
+    """Covariance (6, 6) of odometry that has agreed with the markers, scaled down to ``ODOMETRY_AT_WORST``."""
     scale = float(np.min(ODOMETRY_AT_WORST**2 / np.maximum(np.diag(covariance), 1e-12)))
     return np.asarray(min(1.0, scale) * covariance)
 
@@ -216,10 +213,10 @@ def bounded_odometry(covariance: FloatArray) -> FloatArray:
 
 
 def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Weights (N,) of markers whose places in the map are uncertain by ``pixels`` (N,) [px] in the view at hand.
+    """Weights (N,) of markers whose map errors are ``pixels`` (N,) [px] in the present view.
 
-    They depend on each marker alone and change as slowly as the view does. Weighing with the covariance relative to the
-    best marker in view, poses over a carpet of 81 markers jittered twice as much as with the map taken for exact.
+    They depend on each marker alone and change as slowly as the view. With covariances relative to the best marker in
+    view, poses over a carpet of 81 markers jittered twice as much as with an exact map.
 
     Parameters
     ----------
@@ -230,24 +227,24 @@ def map_weights(noise: FloatArray, pixels: FloatArray, errors: SystematicErrors)
 
 
 def decision_weights(noise: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Weights (N,) of markers with corner noise (N,) [px] that make it what decisions rest on: noise and bias."""
+    """Factors (N,) on weights of markers with corner ``noise`` (N,) [px] that add the bias for decisions."""
     return np.asarray(noise**2 / (noise**2 + errors.decision_px**2))
 
 
 def with_corner_errors(covariances: FloatArray, errors: SystematicErrors) -> FloatArray:
-    """Corner covariances (..., 2, 2) [px^2] to decide between hypotheses with: noise, and what corners are off by."""
+    """Corner covariances (..., 2, 2) [px^2] for decisions between hypotheses: noise and bias."""
     return np.asarray(covariances + errors.decision_px**2 * np.eye(2))
 
 
-# What the others are made of.
+# Helpers.
 
 
 def correlated_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:
-    """Covariance (m, m) of ``sum_i gains_i x_i`` that holds whatever the correlations of the ``x_i`` are.
+    """Upper bound (m, m) of the covariance of ``sum_i gains_i x_i`` for any correlations of the ``x_i``.
 
-    Errors of the markers of a map, and of camera poses that rest on the same map, are correlated by an amount that
-    nobody keeps. For any weights a_i that sum to one, ``sum_i gains_i P_i gains_i' / a_i`` is an upper bound (as in
-    covariance intersection; S. Julier, J. Uhlmann, 1997); these a_i make its trace the smallest.
+    Errors of the markers of a map, and of camera poses in the same map, have unknown correlations. For any weights a_i
+    that sum to one, ``sum_i gains_i P_i gains_i' / a_i`` is an upper bound (as in covariance intersection; S. Julier,
+    J. Uhlmann, 1997); these a_i minimise its trace.
 
     Parameters
     ----------
@@ -267,6 +264,6 @@ def correlated_sum(gains: FloatArray, covariances: FloatArray) -> FloatArray:
 
 
 def positive(covariances: FloatArray) -> FloatArray:
-    """The nearest covariances (..., 6, 6): negative variances become none."""
+    """The nearest positive semidefinite matrices (..., 6, 6)."""
     values, vectors = np.linalg.eigh(0.5 * (covariances + np.swapaxes(covariances, -1, -2)))
     return np.asarray((vectors * np.maximum(values, 0.0)[..., None, :]) @ np.swapaxes(vectors, -1, -2))

@@ -1,4 +1,4 @@
-"""What the stages hand to each other: the rows and records that travel on the topics.
+"""Rows and records that pass between the stages, on topics and in the pipeline.
 
 Pose covariances, here and in every message and file, are in the ROS convention: order (x, y, z, rotation
 about x, y, z), both expressed in the parent frame ``a`` of ``T_a_b``, so that the true pose is
@@ -15,7 +15,7 @@ from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked
 
 _F4 = '<f4'
-#: Frames that come later than this after newer ones are those of a clock that was set back [ns].
+#: Frames older than the newest one by more than this are those of a clock that was set back [ns].
 LATEST_NS = 1_000_000_000
 
 CORNER_FIELDS = tuple(f'{axis}{corner}' for corner in range(4) for axis in 'uv')
@@ -90,7 +90,7 @@ class Observations(Stacked):
 
     @staticmethod
     def of(markers: Markers) -> 'Observations':
-        """Of rows with sound corners whose ID is there once: of two alike, nobody knows which is which."""
+        """Observations of rows with valid corners; rows whose ID occurs twice are left out as ambiguous."""
         corners, covariances, poses = corners_px(markers), corner_covariances(markers), _numbers(markers, _BRANCHES)
         poses = poses.reshape(-1, 2, 7)
         with np.errstate(invalid='ignore', divide='ignore'):
@@ -125,9 +125,9 @@ class CameraPose:
     T_map_camera: FloatArray
     #: (6, 6), ROS convention, in ``map`` [m, rad]
     covariance: FloatArray
-    #: (6, 6) the part of ``covariance`` that stays while the map does: errors of the map and of its scale
+    #: (6, 6) the part of ``covariance`` that is due to errors of the map and its scale
     map_covariance: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
-    #: markers that it rests on
+    #: IDs of the markers that it was estimated from
     marker_ids: tuple[int, ...] = field(default=())
     #: re-projection error, rms over their corners [px]
     rms_px: float = 0.0

@@ -1,7 +1,6 @@
-"""What the filter hands to the stages before it: its latest states, and the offset between the two clocks.
+"""The filter's latest odometry and clock offset, as detector and mapper use them.
 
-The filter alone estimates motion and clock offset once it runs. Detector and mapper ask this one record of it, by the
-stamps of their frames.
+Only the filter estimates motion and clock offset. Detector and mapper query this record by the stamps of their frames.
 """
 
 from bisect import bisect_left, bisect_right
@@ -11,21 +10,21 @@ from typing import Any
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import SECOND_NS
 
-# Frames come no later than this; nothing older is kept [ns].
+# Largest delay of frames, for which states are kept [ns].
 _KEPT_NS = 500_000_000
-# No more, though; of an odometry of 1 kHz these are two seconds.
+# Largest number of states: two seconds of odometry at 1 kHz.
 _MOST = 2000
-# Stamps that go back farther are those of another clock, or of a bag that starts anew.
+# Stamps that go back by more are those of another clock, or of a bag that was restarted [ns].
 _RESTART_NS = 1_000_000_000
 
 
 class MotionPrior:
-    """States in the order of their stamps, read only when somebody wants them, and the camera's clock.
+    """Odometry in the order of its stamps, decoded on demand, and the camera's clock offset.
 
     Parameters
     ----------
-    camera_time_offset : offset of the clocks to begin with, t_odometry = t_camera + offset [s]
-    read : states of what :meth:`add` was given, all at once; those that prove to be unusable are missing
+    camera_time_offset : initial clock offset, t_odometry = t_camera + offset [s]
+    read : decodes several of what :meth:`add` was given to states; leaves unusable ones out
     """
 
     def __init__(self, camera_time_offset: float = 0.0, read: Callable[[Sequence[Any]], list[Odometry]] = list) -> None:
@@ -33,7 +32,7 @@ class MotionPrior:
         self._states: list[Any] = []
         self._read = read
         self._offset_ns = round(camera_time_offset * SECOND_NS)
-        #: whether the filter has estimated the offset of the clocks: before that it is the parameter's
+        #: whether the filter has estimated the clock offset; before that it is the parameter's
         self.clock_is_known = False
 
     def set_clock_offset(self, seconds: float) -> None:
@@ -46,7 +45,7 @@ class MotionPrior:
         return camera_stamp_ns + self._offset_ns
 
     def add(self, stamp_ns: int, state: Any) -> None:
-        """Keep the state of a stamp, or what will be read as it."""
+        """Keep the state of a stamp, decoded or not."""
         if self._stamps_ns and stamp_ns < self._stamps_ns[-1] - _RESTART_NS:
             self._stamps_ns, self._states = [], []
         place = bisect_left(self._stamps_ns, stamp_ns)
@@ -55,7 +54,7 @@ class MotionPrior:
             return
         self._stamps_ns.insert(place, stamp_ns)
         self._states.insert(place, state)
-        # The states of an odometry whose stamps hardly go on would be kept for ever.
+        # Bounds the memory for odometry whose stamps hardly advance.
         if len(self._stamps_ns) > _MOST:
             del self._stamps_ns[: _MOST // 2], self._states[: _MOST // 2]
         if self._stamps_ns[-1] - self._stamps_ns[0] > 2 * _KEPT_NS:
@@ -70,7 +69,7 @@ class MotionPrior:
         return None if best is None else next(iter(self._read([self._states[best]])), None)
 
     def between(self, first_ns: int, last_ns: int, at_most: int) -> list[Odometry]:
-        """States from the first to the last stamp, of more than ``at_most`` so many, as evenly apart as can be."""
+        """States between two stamps; of more than ``at_most`` that many, evenly spaced."""
         first, last = bisect_left(self._stamps_ns, first_ns), bisect_right(self._stamps_ns, last_ns)
         count = last - first
         kept = min(count, at_most)

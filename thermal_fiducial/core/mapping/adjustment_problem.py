@@ -1,4 +1,4 @@
-"""A joint adjustment as arrays: what it works on, and residuals, derivatives and normal equations of all views."""
+"""The bundle adjustment as arrays: its input, and residuals, Jacobians and normal equations of all views."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -12,28 +12,28 @@ from thermal_fiducial.core.mapping.map_data import gauge, MapMarker
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
-# Chi square of a view that no pose near the present one explains.
+# Chi square of a view whose marker is behind the camera.
 _BEHIND_CHI2 = 1e8
 
 
 @dataclass(frozen=True)
 class Priors:
-    """What is known of k poses beside the views: poses (k, 4, 4) and information (k, 6, 6), zero for nothing."""
+    """Priors of k poses: poses (k, 4, 4) and information (k, 6, 6), zero without a prior."""
 
     T: FloatArray
     information: FloatArray
 
     def apart(self, T: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """From poses (k, 4, 4) to the known ones (k, 6), and the chi square of that (k,)."""
+        """Differences (k, 6) from poses (k, 4, 4) to their priors, and chi squares (k,) of these."""
         d = difference(self.T, T)
         return d, np.einsum('ki,kij,kj->k', d, self.information, d)
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What a joint refinement works on: n views of markers in F keyframes, of one moment.
+    """Input of a bundle adjustment: n views of markers in F keyframes. Immutable.
 
-    A few large arrays, as thousands of small ones would take long to hand to another process. Immutable.
+    A few large arrays, as thousands of small ones would take long to send to another process.
     """
 
     #: the markers to adjust, by ID
@@ -41,27 +41,27 @@ class Snapshot:
     #: (F,) of the keyframes, and (F, 4, 4) T_map_camera
     stamps_ns: IntArray
     T_map_camera: FloatArray
-    #: those that took them, and (F,) which of these took each
+    #: calibrations of the cameras, and (F,) which of them took each keyframe
     cameras: tuple[Camera, ...]
     camera: IntArray
-    #: where odometry has the camera
+    #: priors of the camera poses by odometry
     odometry: Priors
-    #: of each view, in the order of the keyframes: (n,) place of the keyframe, (n,) ID of the marker, corners
+    #: of each view, in the order of the keyframes: (n,) index of the keyframe, (n,) ID of the marker, corners
     #: (n, 4, 2) [px] and their covariances (n, 4, 2, 2) [px^2]
     frame: IntArray
     ids: IntArray
     corners: FloatArray
     covariances: FloatArray
-    #: pose and covariance (6, 6) by ID of markers that were known beforehand
+    #: prior pose and covariance (6, 6) by ID, of markers of an earlier map
     known: Mapping[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict)
     map_revision: int = 0
-    #: what the covariances are to allow for beside the noise
+    #: systematic errors that enter the covariances
     errors: SystematicErrors = NO_SYSTEMATIC_ERRORS
 
     def useful(self) -> BoolArray:
-        """Which views (n,) say anything of the map and hang together with what is held.
+        """Which views (n,) constrain the map and are connected with a held or prior marker, or with odometry.
 
-        That is two of its markers in a keyframe, or one and odometry. What has lost its connection stays where it is.
+        A keyframe needs two markers of the map, or one and odometry. Unconnected parts are not adjusted.
         """
         of_map: BoolArray = np.isin(self.ids, list(self.markers))
         number = np.bincount(self.frame[of_map], minlength=len(self.stamps_ns))
@@ -80,7 +80,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Poses:
-    """Of all keyframes (F, 4, 4) and markers (M, 4, 4)."""
+    """Poses of all keyframes (F, 4, 4) and markers (M, 4, 4)."""
 
     T_map_camera: FloatArray
     T_map_marker: FloatArray
@@ -88,7 +88,7 @@ class Poses:
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residuals at a state, and the derivatives of the n views' (n, 8, 6), whitened but not weighted."""
+    """Residuals (n, 8) and Jacobians (n, 8, 6) of the n views at a state, whitened but not weighted."""
 
     state: Poses
     r: FloatArray
@@ -96,7 +96,7 @@ class Linearised:
     J_marker: FloatArray
     chi2: FloatArray
     squared_px: FloatArray
-    #: (F, 6) and (M, 6) from the state to the priors, and (F,), (M,) the chi squares of that
+    #: differences (F, 6) and (M, 6) from the state to the priors, and their chi squares (F,), (M,)
     camera_apart: FloatArray
     camera_chi2: FloatArray
     marker_apart: FloatArray
@@ -137,7 +137,7 @@ class MapProblem:
 
     @classmethod
     def build(cls, snapshot: Snapshot) -> 'MapProblem | None':
-        """The problem of a snapshot; None when it has nothing to adjust."""
+        """The problem of a snapshot; None if there is nothing to adjust."""
         views = snapshot.useful()
         seen, marker = np.unique(snapshot.ids[views], return_inverse=True)
         frames, frame = np.unique(snapshot.frame[views], return_inverse=True)
@@ -172,7 +172,7 @@ class MapProblem:
             uv[own], J_camera[own], J_marker[own] = linearise(
                 camera, T_map_camera[own], T_map_marker[own], self.sizes[self.marker[own]]
             )
-        # Markers that the state has behind the camera say nothing of where to go, and cost as much as any outlier.
+        # Markers behind the camera have no gradient, and the cost of an outlier.
         behind = ~np.all(np.isfinite(uv), axis=(1, 2))
         J_camera[behind], J_marker[behind] = 0.0, 0.0
         residuals = np.where(behind[:, None, None], 0.0, self.corners - uv)

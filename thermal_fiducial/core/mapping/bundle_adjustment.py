@@ -1,12 +1,12 @@
-"""Joint refinement of the map: sparse bundle adjustment over keyframes and markers.
+"""Bundle adjustment of the map: sparse, over keyframes and markers.
 
 Minimises the whitened re-projection errors of all corners over the poses of all keyframes and markers. Keyframes are
-eliminated first (each sees few markers, and none sees another keyframe), which leaves a sparse system of the markers
-(the Schur complement; B. Triggs et al., "Bundle adjustment - a modern synthesis", 2000, section 6). What odometry knows
-of keyframes, and what was known of markers beforehand, are priors of their poses. The gauge is the fixed markers: they
-are held, and their covariance enters that of the others (as consider parameters; S. Schmidt, 1966).
+eliminated first (none has a term with another one), which leaves a sparse system of the markers (the Schur complement;
+B. Triggs et al., "Bundle adjustment - a modern synthesis", 2000, section 6). Odometry gives priors of the keyframes, an
+earlier map priors of the markers. The gauge is the fixed markers: they are held, and their covariance enters that of
+the others (as consider parameters; S. Schmidt, 1966).
 
-A pure function on a snapshot: it may run in another thread or process while the mapper goes on.
+A pure function on a snapshot: it may run in another thread or process while the mapper processes frames.
 """
 
 from dataclasses import dataclass, replace
@@ -27,26 +27,26 @@ from thermal_fiducial.core.mapping.normal_equations import ReducedSystem
 from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
 
 MAX_ITERATIONS = 25
-# Decrease of the cost, in chi squares of the actual noise, that ends the iteration: the last step is a third of the
-# standard deviation of one pose for all together, the next would be half of that.
+# Decrease of the cost, in units of chi square at the actual noise, that ends the iteration: a step of a third of the
+# standard deviation of one pose, for all poses together.
 _CONVERGED = 0.1
 # Median of chi square of eight degrees of freedom.
 _MEDIAN_CHI2 = 7.34
-# Samples of systematic errors: the covariance of six numbers from so many is good to a fifth.
+# Samples of systematic errors: standard deviations are then accurate to a fifth.
 _SAMPLES = 32
-# Of these at a time: bounds the memory.
+# Samples that are propagated at a time, which bounds the memory.
 _AT_ONCE = 8
-# Outlying views of a marker, in number and as a share, of which something can be said; and the share of their squared
-# error that one other pose must explain. Of ten views of noise six parameters explain 0.08; motion blur that lasts for
-# some frames, 0.5.
+# A marker is at two places if it has this many outlying views at least, and this share of all, and another pose
+# explains this share of their squared error. Six parameters explain 0.08 of ten views of noise, and 0.5 of motion blur
+# over some frames.
 _FEWEST, _LEAST, _EXPLAINED = 10, 0.1, 0.8
 
 
 @dataclass(frozen=True)
 class AdjustedMap:
-    """The outcome of a refinement."""
+    """Result of a bundle adjustment."""
 
-    #: adjusted markers by ID; those that were held are not among them
+    #: adjusted markers by ID, without those that were held
     markers: dict[int, MapMarker]
     #: stamp of each keyframe to its adjusted T_map_camera
     keyframes: dict[int, FloatArray]
@@ -56,7 +56,7 @@ class AdjustedMap:
     cost: float
     #: marker ID to the share of its views that are outliers
     outliers: dict[int, float]
-    #: of adjusted markers whose views don't belong to one marker that hangs still, the same
+    #: the same, of adjusted markers that were moved or duplicated
     inconsistent: dict[int, float]
     map_revision: int
 
@@ -70,7 +70,7 @@ def refine(snapshot: Snapshot) -> AdjustedMap | None:
 
 
 def _minimise(problem: MapProblem, now: Linearised) -> Linearised:
-    """Levenberg-Marquardt, the corners' variance anew from the residuals of each step."""
+    """Levenberg-Marquardt; each step scales the corners' variance to the residuals."""
     scale, damping = _scale(now.chi2), 1e-5
     for _ in range(MAX_ITERATIONS):
         if damping >= MOST_DAMPED:
@@ -87,7 +87,7 @@ def _minimise(problem: MapProblem, now: Linearised) -> Linearised:
 
 
 def _scale(chi2: FloatArray) -> float:
-    """Ratio of the corners' variance to the promised one, at least 1; from the median, which outliers don't move."""
+    """Ratio of the corners' variance to the claimed one, at least 1; by the median, for robustness."""
     return max(1.0, float(np.nanmedian(chi2)) / _MEDIAN_CHI2)
 
 
@@ -129,10 +129,10 @@ def _result(problem: MapProblem, snapshot: Snapshot, now: Linearised) -> Adjuste
 def _shape_covariances(
     problem: MapProblem, system: ReducedSystem, now: Linearised, weights: FloatArray, errors: SystematicErrors
 ) -> FloatArray:
-    """Covariances (M, 6, 6) of what corners make of the map that are wrong alike in all views of a marker.
+    """Covariances (M, 6, 6) by corner errors that are the same in all views of a marker.
 
-    Nothing averages that out, and no residual shows it: the shape of a fixed marker turns the whole map. It is
-    sampled, as every corner of every marker has a direction of its own.
+    They do not average out and leave no residuals: the shape of a fixed marker rotates the whole map. They are
+    propagated by samples.
     """
     if errors.marker_shape == 0.0:
         return np.zeros((len(problem.ids), 6, 6))
@@ -151,19 +151,19 @@ def _shape_covariances(
 
 
 def two_places(residuals: FloatArray, J: FloatArray, outlying: BoolArray) -> bool:
-    """Whether one other pose of a marker explains most of its outlying views: it was moved, or is there twice.
+    """Whether one other pose explains most of a marker's outlying views: it was moved or is duplicated.
 
     Parameters
     ----------
     residuals, J : (n, 8), (n, 8, 6), whitened, of all views of one marker, J with respect to its pose
     outlying : (n,)
     """
-    # A marker in the plane of a camera, of a map that has gone wrong, has no residual.
+    # Residuals are not finite for a marker in the plane of the camera, in a diverged map.
     outlying = outlying & np.isfinite(residuals).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
     count = np.count_nonzero(outlying)
     if count < _FEWEST or count < _LEAST * len(residuals):
         return False
-    # Each view counts alike, however far off it is: the linear step is then good enough to decide.
+    # Views are normalised, so that a linear step suffices whatever the size of their residuals.
     norms = np.linalg.norm(residuals[outlying], axis=-1)
     r = (residuals[outlying] / norms[:, None]).ravel()
     A = (J[outlying] / norms[:, None, None]).reshape(-1, 6)

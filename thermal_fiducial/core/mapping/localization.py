@@ -32,13 +32,13 @@ from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray, TINY
 
-#: Difference of chi square that refutes the worse of two poses: odds of e^-10.
+#: Difference of chi square that rules out the worse of two poses: odds of e^-10.
 DECISIVE = 20.0
 #: Poses nearer to each other than this [rad] are one pose whose covariance covers both.
 SAME_POSE = np.deg2rad(2.0)
-#: Markers that fill more of the view than this [rad] show perspective: their pose has no alternative.
+#: Extent of the markers in view [rad] beyond which perspective resolves the planar ambiguity.
 WIDE = np.deg2rad(25.0)
-# Markers that propose hypotheses: with many in view the largest are precise enough, and the rest only votes.
+# Largest number of markers that give initial poses, the largest ones; all take part in their ranking.
 _PROPOSERS = 6
 
 
@@ -56,11 +56,11 @@ def locate(
     ----------
     sight : the markers and their corners
     running_errors : (N,) running rms re-projection error of each [px]
-    prior : (4, 4) roughly expected T_map_camera, decides between alternative poses; or None
+    prior : (4, 4) approximate T_map_camera, which resolves the planar ambiguity; or None
 
     Returns
     -------
-    The location, or why there is none.
+    The location, or the reason for which there is none.
     """
     fit = CameraFit(sight.observed.corners, sight.observed.covariances, sight.points, camera)
     hypotheses = _hypotheses(sight, fit, prior)
@@ -82,7 +82,7 @@ def locate(
 
 
 def _either(frame: '_JointFit', found: Location, T_other: FloatArray, prior: FloatArray | None) -> Location | Refusal:
-    """One of two poses that the corners allow; without a prior they are refused, unless they are nearly the same."""
+    """Choose between two poses that the corners allow, by the prior; without one refuse, unless they nearly agree."""
     pose = found.pose
     T = pose.T_map_camera
     if rotation_angle(T[:3, :3].T @ T_other[:3, :3]) < SAME_POSE:
@@ -102,7 +102,7 @@ def _either(frame: '_JointFit', found: Location, T_other: FloatArray, prior: Flo
 
 @dataclass(frozen=True)
 class _JointFit:
-    """The known markers of a frame, with what all fits of the camera to them have in common."""
+    """The known markers of a frame, and the fit of the camera to them."""
 
     stamp_ns: int
     sight: Sight
@@ -111,10 +111,10 @@ class _JointFit:
     fit: CameraFit
 
     def refined(self, T_map_camera: FloatArray, seen: Reprojected, weights: FloatArray) -> Location | None:
-        """Where a step of Gauss and Newton with ``weights`` (N,) of the markers leads from a pose (4, 4) near by.
+        """One Gauss-Newton step from a pose (4, 4) near the solution, with ``weights`` (N,) of the markers.
 
-        The same linearisation gives the covariances, of an estimate that is linear in corners, map and scale there.
-        None where the markers do not determine it.
+        The same linearisation, in corners, map and scale, gives the covariances. None if the markers do not determine
+        the pose.
         """
         n, residuals = len(weights), seen.residuals[..., None]
         information = np.linalg.inv(self.sight.observed.covariances) * weights[:, None, None, None]

@@ -65,7 +65,7 @@ class Sight(Stacked):
 
     @staticmethod
     def of(observed: Observations, marker_map: MarkerMap) -> 'Sight':
-        """Of markers that are all in the map."""
+        """The observed markers, all in the map, with their entries there."""
         known = [marker_map.markers[key] for key in observed.ids.tolist()]
         sizes = np.array([marker.size for marker in known])
         T_map_marker = np.array([marker.T_map_marker for marker in known]).reshape(-1, 4, 4)
@@ -84,12 +84,12 @@ class Sight(Stacked):
         )
 
     def trusted(self) -> 'Sight':
-        """Those that are not in quarantine."""
+        """The markers that are not in quarantine."""
         chosen = np.array([marker.trusted for marker in self.markers], dtype=np.bool_)
         return self if chosen.all() else self.only(chosen)
 
     def reprojected(self, camera: Camera, T_map_camera: FloatArray) -> 'Reprojected':
-        """The markers of the map as a camera at (4, 4) should see them."""
+        """The map's markers projected into a camera at ``T_map_camera`` (4, 4)."""
         T = np.broadcast_to(T_map_camera, self.T_map_marker.shape)
         uv, J_camera, J_marker = linearise(camera, T, self.T_map_marker, self.sizes)
         return Reprojected(self.observed.corners - uv, J_camera, J_marker)
@@ -97,7 +97,7 @@ class Sight(Stacked):
 
 @dataclass(frozen=True)
 class Reprojected:
-    """Corners of N markers against what map and camera pose make them."""
+    """Re-projection of N markers: residuals and Jacobians."""
 
     #: (N, 4, 2) measured minus predicted [px], NaN behind the camera
     residuals: FloatArray
@@ -113,24 +113,24 @@ class Reprojected:
 
 @dataclass(frozen=True)
 class Location:
-    """Where the camera is, how well that is known, and by what."""
+    """A located camera: its pose with covariance, and the linearised fit that it comes from."""
 
     pose: CameraPose
-    #: the N markers that it rests on, and how they look from there
+    #: the N markers of the fit, and their re-projection
     sight: Sight
     seen: Reprojected
-    #: (N,) their weights, 1 for one as good as the rest
+    #: (N,) their weights, at most 1
     weights: FloatArray
-    #: (N, 6, 6) what a displacement of each moves the pose by
+    #: (N, 6, 6) derivative of the pose by the poses of the markers in the map
     map_gains: FloatArray
-    #: (4 N, 4 N) of the systematic errors of the corners
+    #: (4 N, 4 N) correlations of the corners' systematic errors
     correlations: FloatArray
-    #: (6, 6) the part of the covariance that the next frames don't share: noise of the corners
+    #: (6, 6) the white part of the covariance, by noise of the corners
     noise: FloatArray
 
     @cached_property
     def reason(self) -> str:
-        """Why the pose is not published, in words; empty where it is."""
+        """Why the pose is not published, in words; empty if it is."""
         std = math.sqrt(self.pose.covariance[3:, 3:].trace())
         if std <= VAGUE:
             return ''
@@ -139,9 +139,9 @@ class Location:
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """The camera for new markers: what is not relative to the map is an error that all their views share.
+        """The camera as viewpoint of new markers: the map's error is common to all views.
 
-        Of the map that is what the best-known marker in view is uncertain by.
+        It is taken as the covariance of the best-known marker in view.
         """
         pose, of_map = self.pose, self.sight.map_covariances
         best = of_map[np.argmin(np.trace(of_map, axis1=1, axis2=2))]
@@ -151,24 +151,24 @@ class Location:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why nobody knows where the camera is, in words."""
+    """The reason, in words, for which a frame has no pose."""
 
     reason: str
-    #: where the camera may be, if that is one of the two poses of an ambiguity
+    #: the two possible poses, where the reason is the planar ambiguity
     viewpoint: Viewpoint | None = None
 
 
 @dataclass(frozen=True)
 class LocatedFrame:
-    """Markers of a frame, and what they say of the camera."""
+    """Markers of a frame with the result of localization."""
 
     stamp_ns: int
     camera: Camera
-    #: all N markers, (N,) which of them are in the map, and these
+    #: all N markers, which of them (N,) are in the map, and these
     observed: Observations
     is_known: BoolArray
     known: Sight
-    #: where odometry has the camera
+    #: the camera pose by odometry
     predicted: PredictedCamera | None
     outcome: Location | Refusal
 
@@ -179,7 +179,7 @@ class LocatedFrame:
 
     @cached_property
     def contradicts_odometry(self) -> bool:
-        """Whether the camera is where odometry cannot be, even odometry that is in doubt itself."""
+        """Whether pose and odometry contradict each other, even with the covariance of uncertain odometry."""
         if self.predicted is None or isinstance(self.outcome, Refusal):
             return False
         pose, odometry = self.outcome.pose, self.predicted.pose
@@ -188,9 +188,9 @@ class LocatedFrame:
         return bool(apart @ np.linalg.solve(covariance, apart) > CONTRADICTION)
 
     def known_errors(self, location: Location) -> tuple[FloatArray, FloatArray]:
-        """Errors (K,) [px], rms, of the K known markers, and what noise, pose and map explain of them (K,).
+        """Rms errors (K,) [px] of the K known markers, and their standard deviations (K,) by noise, pose and map.
 
-        The error of one behind the camera is the image's width.
+        The error of a marker behind the camera is the image's width.
         """
         known, pose = self.known, location.pose
         seen = location.seen if location.sight is known else known.reprojected(self.camera, pose.T_map_camera)
@@ -202,7 +202,7 @@ class LocatedFrame:
 
     @property
     def pose(self) -> CameraPose | None:
-        """The pose to publish; None where there is none, or one too vague."""
+        """The pose to publish; None without one, or if its attitude is too uncertain."""
         return None if isinstance(self.outcome, Refusal) or self.outcome.reason else self.outcome.pose
 
 
@@ -213,8 +213,8 @@ def predicted_camera(
 
     Parameters
     ----------
-    prior : the filter's states, and the offset of the two clocks
-    time_offset_std : how far that offset may be wrong while the filter has not estimated it [s]
+    prior : the filter's odometry and clock offset
+    time_offset_std : standard deviation of the clock offset before the filter has estimated it [s]
     """
     if prior is None:
         return None
@@ -234,10 +234,10 @@ def predicted_camera(
 
 
 def growth(first: CameraPose, predicted: PredictedCamera) -> FloatArray:
-    """Covariance (6, 6) of the odometry from ``first`` to ``pose``, from either of two bounds, whichever is closer.
+    """Covariance (6, 6) of the displacement by odometry since ``first``: the smaller of two bounds.
 
-    Errors of odometry that grow add up like independent ones at most as the difference of the covariances says; and a
-    displacement is off by no more than the speed is, all the time.
+    One is the difference of the covariances, as if the error grew by independent increments; the other the error of
+    the velocity, constant over that time.
     """
     seconds, now = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS, predicted.odometry
     of_speed = seconds**2 * turned(now.twist_covariance, now.T_map_body[:3, :3])

@@ -20,7 +20,7 @@ _FULL = 0.15
 class Blocks:
     """Gauss-Newton terms of n views of M markers in F keyframes."""
 
-    #: (F, 6, 6) and (M, 6, 6) J' J of each keyframe and marker, over its views and what else is known of it
+    #: (F, 6, 6) and (M, 6, 6) J' J of each keyframe and marker, over its views and its prior
     frame: FloatArray
     marker: FloatArray
     #: (n, 6, 6) J' J of each view's keyframe with its marker
@@ -33,7 +33,7 @@ class NormalEquations:
     Parameters
     ----------
     frame, marker : (n,) of each view; views are ordered by keyframe
-    held : (M,) markers that are no unknowns
+    held : (M,) markers that are held fixed
     """
 
     def __init__(self, frame: IntArray, marker: IntArray, held: BoolArray) -> None:
@@ -64,13 +64,13 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class ReducedSystem:
-    """Schur complement over the markers, when the keyframes are eliminated."""
+    """Schur complement: the system of the markers after the keyframes are eliminated."""
 
     #: (F, 6, 6) inverse Cholesky factors of the keyframes' blocks
     root: FloatArray
-    #: (6 F, 6 M) these with the keyframes' blocks with the markers
+    #: (6 F, 6 M) these factors times the cross blocks of keyframes and markers
     coupling: Any
-    #: (6 M, 6 M), and the factors of its part of free markers
+    #: (6 M, 6 M) Schur complement, and the factorisation of its part of free markers
     matrix: Any
     factor: Any
     #: (M,)
@@ -87,7 +87,7 @@ class ReducedSystem:
         return np.swapaxes(self.root, -1, -2) @ left.reshape(of_frames.shape), markers
 
     def covariances(self, factor: float, held_covariances: FloatArray) -> FloatArray:
-        """Covariances (M, 6, 6) of the markers: noise times ``factor``, and what the held markers (M, 6, 6) pass on."""
+        """Covariances (M, 6, 6) of the markers: noise times ``factor``, plus those by held markers (M, 6, 6)."""
         free = np.flatnonzero(~self.held)
         unknowns = (6 * free[:, None] + np.arange(6)).ravel()
         result = held_covariances.copy()
@@ -101,7 +101,7 @@ class ReducedSystem:
 
 
 def _damped(H: FloatArray, damping: float) -> FloatArray:
-    """Marquardt's damping of (..., 6, 6); a trace of it always, lest an unseen direction makes the block singular."""
+    """Marquardt damping of (..., 6, 6); a little of it always, so that no block is singular."""
     diagonal = np.einsum('...ii->...i', H)
     floor = SINGULAR * (np.max(diagonal, axis=-1, keepdims=True) + SINGULAR)
     return np.asarray(H + (damping * diagonal + floor)[..., None] * np.eye(6))

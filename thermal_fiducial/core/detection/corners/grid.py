@@ -1,8 +1,7 @@
-"""The edges between the cells of a marker, inside and along its sides, as a camera at a pose sees them.
+"""Pose of a marker fitted to the edges between its cells, inside and along its sides.
 
-Each is a straight step between black and white whose place on the marker is known, so all that are in view show the
-marker's pose, wherever its corners are. They are looked for in layers of the frame: at lower resolution, or freed of
-the lag tail.
+Each edge is a straight step between black and white at a known place on the marker, so that all visible edges determine
+the marker's pose without its corners. They are measured in layers of the frame, which are images of lower resolution.
 """
 
 from collections.abc import Callable
@@ -28,9 +27,9 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 
 # Columns of pixels across an edge: every so many pixels, but no fewer and no more than this.
 _EVERY_PX, _FEWEST, _MOST = 3.0, 6, 24
-# So many blurs from its ends, and from its neighbours, an edge is a straight step.
+# Distance from its ends and from other edges, in blurs, at which an edge is a straight step.
 _QUIET = 2.0
-# How far a pose may be off before it is adjusted, as a shift of each edge [px].
+# Standard deviation of the prior of a pose, as a displacement of each edge [px].
 _PRIOR_PX = 30.0
 
 
@@ -38,11 +37,11 @@ _PRIOR_PX = 30.0
 class GridEdges(Stacked):
     """The E edges of a marker, in shares of its sides: a from left to right, b from the top down."""
 
-    #: (E, 5, 2) points of each, equally far apart
+    #: (E, 5, 2) equally spaced points of each
     nodes: FloatArray
-    #: (E, 2) to the next line of cells, to the right of upright edges and below others
+    #: (E, 2) step to the next line of cells, to the right of vertical edges and below horizontal ones
     onward: FloatArray
-    #: (E,) change of value on the way there, 1 from black to white
+    #: (E,) change of value along that step, 1 from black to white
     step: FloatArray
 
 
@@ -73,24 +72,24 @@ def on_marker(shares: FloatArray, size: float) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """An image at some resolution, and what displaces and blurs the scene in it."""
+    """An image at some resolution, with its camera, and displacement and blur by motion."""
 
     image: Float32Array
     camera: Camera
-    #: points (P, 3) in the camera -> by how much (P, 2) they appear displaced [px]
+    #: displacement (P, 2) by motion [px] of points (P, 3) in the camera frame
     displacement: Callable[[FloatArray], FloatArray]
-    #: standard deviation of optics and pixels [px], and what motion adds to it (2,), along itself
+    #: standard deviation of the blur by optics and pixels [px], and motion blur (2,) along the motion [px]
     blur: float
     lag_blur: FloatArray
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Pixels (..., 2) in which points (..., 3) in the camera appear, NaN where the lens shows none."""
+        """Pixels (..., 2) of points (..., 3) in the camera frame, displaced by motion; NaN outside the lens model."""
         flat = points.reshape(-1, 3)
         return np.asarray((self.camera.project(flat) + self.displacement(flat)).reshape(*points.shape[:-1], 2))
 
 
 class PoseFit(NamedTuple):
-    """A marker's pose by its edges."""
+    """Result of a fit of a marker's pose to its edges."""
 
     #: (4, 4)
     T_camera_marker: FloatArray
@@ -98,7 +97,7 @@ class PoseFit(NamedTuple):
     information: FloatArray
     #: longest move of an edge in this step [px], along its normal
     moved_px: float
-    #: edges in view, those with a step like the others', and those that agree with the pose
+    #: numbers of edges in view, of those with a step of the common contrast, and of those that agree with the pose
     visible: int
     shown: int
     agreeing: int
@@ -108,7 +107,7 @@ class PoseFit(NamedTuple):
 
 
 def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> PoseFit | None:
-    """One linearised adjustment of a pose ``T`` (4, 4) of a marker in the camera; None where too little is seen."""
+    """One linearised adjustment of a marker's pose ``T`` (4, 4) in the camera; None with too few visible edges."""
     nodes = layer.project(se3.apply(T, on_marker(pattern.nodes, size)))
     inside: BoolArray = np.asarray(layer.camera.contains(nodes).any(axis=1) & np.isfinite(nodes).all(axis=(1, 2)))
     if inside.sum() < 6:
@@ -179,7 +178,7 @@ def pose_jacobian(T: FloatArray, points: FloatArray, camera: Camera) -> FloatArr
 
 
 def layer_of(frame: Frame, window: FloatArray, blur_px: float, factor: int = 1) -> Layer:
-    """The frame at one resolution in ``factor``, as blurred as it is round a ``window`` (4, 3) in the camera."""
+    """The frame reduced by ``factor``, with the motion blur at a ``window`` (4, 3) in the camera frame."""
     camera = _coarser(frame.camera, factor)
     image, lag_blur = frame.image, np.zeros(2)
     if factor > 1:
@@ -200,7 +199,7 @@ def layer_of(frame: Frame, window: FloatArray, blur_px: float, factor: int = 1) 
 
 
 def _coarser(camera: Camera, factor: int) -> Camera:
-    """The camera of an image of which each pixel is the mean of so many squared."""
+    """The camera of an image reduced by ``factor``."""
     if factor == 1:
         return camera
     K = camera.K.copy()

@@ -1,8 +1,7 @@
-"""Displacements of a marker's sides, segment by segment, and of the corners that explain them.
+"""Displacements of a marker's sides, segment by segment, and a robust adjustment of the corners to them.
 
-One segment, a bit long, measures how far its side is off with a level and a contrast of its own and a variance from its
-own residuals; a robust adjustment of the four corners to all segments of the marker follows. Clutter, dead pixels and
-hidden stretches cost the segments that they touch.
+A segment is as long as a cell. It measures the displacement of its side, with a level and a contrast of its own and a
+variance from its own residuals. Clutter, dead pixels and covered parts make outliers of the segments that they affect.
 """
 
 from typing import NamedTuple
@@ -15,27 +14,27 @@ from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, SIGMA_OF_MEDIAN, TINY
 
-#: A linearised displacement is good for this many blurs.
+#: Largest displacement for which the linearisation holds, in standard deviations of the blur.
 REACHED = 2.0
 #: Variance of a segment that measures nothing.
 HOPELESS = 1e6
 # Least number of pixels of a segment: two more than its unknowns.
 _FEWEST_PIXELS = 5
-# Variance of a segment's pixels over the marker's typical one beyond which it counts by itself.
+# Ratio of a segment's pixel variance to the marker's typical one beyond which its own variance is used.
 _NOISIER = 2.5
 # Weight of a pixel or segment falls off beyond this many standard deviations.
 _PIXEL_OUTLIER = 4.5
 _SEGMENT_OUTLIER = 2.5
-# Keeps columns that hardly differ over a segment apart, in sums of single precision.
+# Regularisation of nearly collinear columns, for sums in single precision.
 _RIDGE = 1e-6
-# So many segments, beyond the unknowns, make their scatter count as much as the noise of their pixels.
+# Degrees of freedom at which the scatter of the segments and the noise of their pixels have equal weight.
 _SCATTER_COUNTS = 24.0
-# Variance of a standard normal variable of which no more than that is kept.
+# Variance of a standard normal variable that is clipped at _SEGMENT_OUTLIER.
 _KEPT_VARIANCE = 0.911
-# Contrast of a segment over that of the marker: less is hidden, more is the edge of something else; and by how much the
-# contrast of a plate varies.
+# Range of a segment's contrast over the marker's: less is covered, more is another object's edge; standard deviation of
+# the contrast within a plate.
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
-# Weights of segments are found in so many rounds, or fewer when they no longer change by more.
+# Largest number of rounds of robust weighting, and the change of weights below which it ends.
 _ROUNDS, _SETTLED = 3, 0.1
 # (4, 1, 4, 1) which corner each side begins at, and ends at.
 _AT_START, _AT_END = (np.eye(4)[corners, None, :, None] for corners in (STARTS, ENDS))
@@ -45,11 +44,11 @@ _PLANES = 4 + len(_PRODUCTS)
 
 
 class Segments(NamedTuple):
-    """What the S segments of each of N markers measured, (N, S) each."""
+    """Measurements of the S segments of each of N markers, (N, S) each."""
 
     #: displacement of their sides along the normals, inward [px]
     shift: FloatArray
-    #: its variance [px^2]
+    #: variance of the displacement [px^2]
     variance: FloatArray
     contrast: FloatArray
     #: variance of a pixel about the model
@@ -61,11 +60,11 @@ class RobustFit(NamedTuple):
 
     #: (N, P)
     moved: FloatArray
-    #: (N, P, P) on it, with what was known before, if the deviations of the shifts are true
+    #: (N, P, P) information on it, prior included, for the given standard deviations of the shifts
     information: FloatArray
-    #: (N,) what the scatter of the shifts makes of it, as far as there are enough of them: a factor
+    #: (N,) factor on the information by the scatter of the shifts
     trust: FloatArray
-    #: (N, S) those that are no outliers
+    #: (N, S) inliers
     kept: BoolArray
 
 
@@ -154,7 +153,7 @@ def _fit(moments: Float32Array, segments: int) -> _SegmentFit:
 
 
 def _judged(fit: _SegmentFit, reach: FloatArray) -> Segments:
-    """Which segments measure anything, within their reach (N, S)."""
+    """Displacements and variances (N, S) of the segments; ``HOPELESS`` for unusable ones and those beyond ``reach``."""
     contrast, product, noise, usable = fit.contrast, fit.product, fit.noise, fit.number >= _FEWEST_PIXELS
     typical = median_of(contrast, usable)
     own = noise * fit.contrast_variance
@@ -180,9 +179,9 @@ def median_of(values: FloatArray, good: BoolArray) -> FloatArray:
 def adjust(
     sides: Sides, segments: Segments, prior_px: float, at: ImagePoints
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """How corners move (N, 4, 2) to explain the shifts of all segments, and their covariances (N, 4, 2, 2).
+    """Displacements (N, 4, 2) of the corners that fit all segments, and their covariances (N, 4, 2, 2).
 
-    And the variances (N,) [px^2] of corners that make no square, zero where they do.
+    Also additional variances (N,) [px^2] where the corners are inconsistent with a square, else 0.
 
     Parameters
     ----------
@@ -194,21 +193,21 @@ def adjust(
     fit = robust_fit(_design(sides) * sharpness[..., None], segments.shift * sharpness, used, np.eye(8) / prior_px**2)
     covariance = np.linalg.inv(fit.information) / fit.trust[:, None, None] + OF_SIDES_PX**2 * np.eye(8)
     known = as_squares(at, fit.moved[..., None], covariance)
-    # Corners that constrain one another err together. Taken for independent, they would claim so much too much.
+    # Corners that constrain one another have correlated errors: as independent ones they would claim too much.
     together = (8 / (8 - known.constrained))[:, None, None, None]
     blocks = together * known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
-    # A side of an outline that is no square's is that of something else.
+    # In an outline that is inconsistent with a square, some side belongs to another object.
     doubt = known.doubt * sides.along.reshape(-1, 4).mean(axis=1) ** 2
     return known.moved.reshape(-1, 4, 2), blocks + OF_ALL_SIDES_PX**2 * np.eye(2), doubt
 
 
 def robust_fit(A: FloatArray, shift: FloatArray, used: BoolArray, prior: FloatArray) -> RobustFit:
-    """Least squares of shifts (N, S) on A (N, S, P), both over their deviations, outliers aside.
+    """Robust least squares of shifts (N, S) on A (N, S, P), both divided by their standard deviations.
 
     Parameters
     ----------
-    used : (N, S) which of them measure anything
-    prior : (P, P) or (N, P, P) information beforehand
+    used : (N, S) which of them are measurements
+    prior : (P, P) or (N, P, P) information
     """
     weighted = turned = A.swapaxes(1, 2)
     robust = np.ones_like(shift)

@@ -1,8 +1,8 @@
-"""The sides of markers in the image, the pixels across them, and the model of these.
+"""The sides of markers in the image, columns of pixels across them, and the model of their values.
 
-A side is straight in normalised image coordinates, a gentle curve in the raw image. Columns of whole pixels cross it,
-or rows, whichever cross it more squarely. No pixel is interpolated, so noise stays white. The model of a column is a
-blurred step from white to black, and the nearest edges behind it.
+A side is straight in normalised image coordinates and slightly curved in the raw image. It is sampled by columns of
+whole pixels, or by rows if these cross it at a larger angle. Pixels are not interpolated, so their noise stays white.
+The model of a column is a blurred step from white to black, plus the nearest parallel edges inside the marker.
 """
 
 from dataclasses import dataclass
@@ -18,23 +18,23 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 #: Corners between which the sides lie: top and bottom from left to right, left and right from the top down.
 STARTS, ENDS = np.array([0, 3, 0, 1]), np.array([1, 2, 3, 2])
 _OPPOSITE = np.array([1, 0, 3, 2])
-#: A curved side is a quartic through five of its points, at these shares of it.
+#: A curved side is a quartic through five points at these shares of its length.
 NODES = np.linspace(0.0, 1.0, 5)
-# Half the length of columns: a pixel more than so many blurs, within bounds [px].
+# Half the length of columns: this many blurs and a pixel, within limits [px].
 _REACHES, _SHORTEST, _LONGEST = 2.5, 4, 10
-# Pixels of the image that a side must have on both sides, and by how many a curve may pass the nodes it goes through.
+# Pixels of the image needed on both sides of a side; largest distance of a curve beyond its nodes [px].
 _BOTH_SIDES, _BEYOND_NODES = 3, 3.0
-#: Neighbouring edges that the model knows: so many cells behind the side.
+#: Parallel edges in the model, by their distance from the side [cells].
 NEIGHBOURS = (1, 2)
-# Cells narrower than this many blurs show their neighbours' edges in every profile.
+# Width of cells, in blurs, below which parallel edges overlap the side's profile.
 _NARROW = 5.0
 # Approximation of the normal distribution by a hyperbolic tangent, good to 2e-4 (E. Page, "Approximations to the
 # cumulative normal function and its inverse for use on a pocket calculator", 1977).
 _LINEAR, _CUBIC = 0.7988, 0.7988 * 0.04417
-# The plate ends one cell outside, at an edge that the model does not know: so many blurs from it nothing of it shows;
-# and what must be seen of the plate all the same [px].
+# The plate ends one cell outside, at an edge that is not in the model: distance from it that is left out [blurs], and
+# least part of the plate that is used nevertheless [px].
 _PLATE_EDGE_SHOWS, _LEAST_QUIET_PX = 1.5, 0.8
-# Share of the side that a column must see: beyond its ends there is none.
+# Least share of the side's step in a column: it falls off at the ends of the side.
 _MOSTLY = 0.7
 
 
@@ -44,11 +44,11 @@ class Sides:
 
     #: (C, E, m) share of the side at which a column crosses it
     t: FloatArray
-    #: (C, E, m) which columns lie in the image and repeat no other
+    #: (C, E, m) which columns lie in the image and are not duplicates
     fresh: BoolArray
     #: (M, C, E, m) distance of each pixel from the side, inward [px]
     distance: Float32Array
-    #: (M, C, E, m) place of each pixel in the flat image
+    #: (M, C, E, m) index of each pixel in the flat image
     pixel: IntArray
     #: (M, C, E, m) whether it lies in the image; None: all do
     inside: BoolArray | None
@@ -86,7 +86,7 @@ def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, 
 def columns_across(
     nodes: FloatArray, opposite: FloatArray, shape: tuple[int, ...], cells: int, columns: int, blur_px: float
 ) -> Sides:
-    """Columns across E sides, or across other edges.
+    """Columns of pixels across E sides, or across other edges.
 
     Parameters
     ----------
@@ -102,11 +102,11 @@ def columns_across(
     (along, rate), (across, climb) = (
         (np.where(upright, nodes[..., 1], nodes[..., 0]) @ weights).reshape(by_column) for upright in (steep, ~steep)
     )
-    # From where the columns should be it is at most half a pixel to a whole one: over that the side is straight.
+    # Columns are rounded to whole pixels, by at most half a pixel: over that distance the side is straight.
     whole, slope = np.rint(along), climb / rate
     ahead = whole - along
     centre = across + slope * ahead
-    # On which side of the line the opposite one lies: of a steeply tilted square it may lie mostly further along.
+    # Sign of the inward normal, by the side of the line on which the opposite side lies.
     turn = du * opposite[:, 1:] - dv * opposite[:, :1]
     inward = np.sign(turn * np.where(steep, -dv, du))
     pitch = inward / np.sqrt(1.0 + slope * slope)
@@ -202,7 +202,7 @@ def blurs(normal: FloatArray, optics: float, lag_blur: FloatArray) -> tuple[Floa
 def model(
     sides: Sides, behind: Float32Array, blur: tuple[FloatArray, FloatArray]
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """White's share of every pixel but for a constant, its derivative by distance, and the pixel's weight.
+    """Share of white in every pixel, up to a constant, its derivative by distance, and the pixel's weight.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ def model(
     """
     cells = behind.shape[2]
     cell = sides.across / cells
-    # How much of its side a column sees, blurred along it: less than 1 near its ends.
+    # Share of the side's step in a column, blurred along the side: less than 1 near the ends.
     t = sides.t.astype(np.float32)
     z = np.stack([t, 1.0 - t]) * (sides.along / blur[1]).astype(np.float32)
     own = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0)

@@ -1,9 +1,9 @@
-"""What is known of a marker's outline beforehand: that it is a square.
+"""The constraint that a marker's outline is a square: two pseudo-measurements for its four corners.
 
-A square's view has 6 unknowns, its four corners 8 numbers. The homography ``(h1 h2 h3)`` from it to normalised image
-coordinates has ``h1 . h2 = 0`` and ``|h1| = |h2|`` (Z. Zhang, "A flexible new technique for camera calibration", 2000,
-eq. 3 and 4), whatever its size. With corners ``p q r s``, third coordinate 1, and ``[p q r]`` for determinants,
-Cramer's rule gives it: ``h3 = [q r s] p``, ``h1 + h3 = [p r s] q``, ``h2 + h3 = [p q r] s``.
+A view of a square has 6 unknowns, its four corners have 8 coordinates. The homography ``(h1 h2 h3)`` from a square of
+any size to normalised image coordinates has ``h1 . h2 = 0`` and ``|h1| = |h2|`` (Z. Zhang, "A flexible new technique
+for camera calibration", 2000, eq. 3 and 4). With corners ``p q r s``, third coordinate 1, and ``[p q r]`` for
+determinants, Cramer's rule gives ``h3 = [q r s] p``, ``h1 + h3 = [p r s] q``, ``h2 + h3 = [p q r] s``.
 """
 
 from typing import NamedTuple
@@ -13,14 +13,14 @@ import numpy as np
 from thermal_fiducial.core.geometry.camera import ImagePoints, inverse_2x2
 from thermal_fiducial.core.types import FloatArray
 
-# Standard deviation of what markers, flat and cut to size, and calibrations of lenses make of that.
+# Standard deviation of the two constraints, by the cut of markers and by lens calibrations.
 _SQUARE_STD = 0.003
-# Standard deviation of the linear form of an outline that is far from a square, as a share of how far it is.
+# Linearisation error of the constraints as a share of their values.
 _BENT = 0.1
-# Perspective comes into it squared: it is taken again where the corners are by then, if these are so far away [px].
+# The constraints are nonlinear: largest number of linearisations, and the step below which they are not repeated [px].
 _STEPS, _BENDS_PX = 3, 0.05
-# Squared Mahalanobis distances, of two degrees of freedom, from a square near the last corners beyond which one of the
-# other tilt may be nearer, and from any beyond which an outline is not that of the marker alone.
+# Squared Mahalanobis distances (2 d.o.f.): beyond which a square of the second planar pose is tried, and beyond which
+# an outline is inconsistent with any square.
 _OTHER_TILT, _TOO_FAR = 9.0, 12.0
 _EYE, _MIRRORED = np.eye(2), np.array([[1.0], [-1.0]])
 
@@ -49,7 +49,7 @@ _FORMS, _OWN = _quadratic_forms(), _own_corners()
 
 
 class Squareness(NamedTuple):
-    """How far N outlines are from those of squares, and the derivative of that by their corners."""
+    """The two constraints of N outlines, 0 for squares, and their derivatives by the corners."""
 
     #: (N, 2, 1) cosine of the angle, and difference of the sides over their length
     value: FloatArray
@@ -58,29 +58,29 @@ class Squareness(NamedTuple):
 
 
 class Squared(NamedTuple):
-    """Corners of N markers by what is known of squares."""
+    """Corners of N markers after the constraints."""
 
-    #: (N, 8, 1) how far they are off, and its covariance (N, 8, 8) [px]
+    #: (N, 8, 1) displacements of the corners, and their covariances (N, 8, 8) [px]
     moved: FloatArray
     covariance: FloatArray
     #: (N,) squared Mahalanobis distance from the nearest square
     chi2: FloatArray
-    #: (N,) squares of the errors of shapes that are none of squares, zero of the others
+    #: (N,) squared residual of the constraints where the outline is inconsistent with a square, else 0
     doubt: FloatArray
-    #: (N,) how many of the two conditions, rather than the image, constrain the corners
+    #: (N,) number of the two degrees of freedom that the constraints determine rather than the image
     constrained: FloatArray
 
 
 def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squared:
-    """Corners corrected by what is known of squares.
+    """Displacements of corners with the constraint of a square.
 
-    Two tilts of a small square look almost alike. That of the corners so far, which are seen to have moved together
-    first of all, is taken unless the image refutes it.
+    Two planar poses of a small square look almost alike. The one nearer to the initial corners, translated, is taken
+    unless the image rules it out.
 
     Parameters
     ----------
-    at : (N, 4) corners
-    seen, covariance : (N, 8, 1), (N, 8, 8) how far they are off, as the image shows [px]
+    at : (N, 4) initial corners
+    seen, covariance : (N, 8, 1), (N, 8, 8) measured displacements of the corners [px]
     """
     together = np.empty((len(seen), 4, 2))
     together[:] = seen.reshape(-1, 4, 2).mean(axis=1, keepdims=True)
@@ -95,7 +95,7 @@ def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squ
 
 
 def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance: FloatArray) -> Squared:
-    """Update of an iterated Kalman filter, its derivatives at first where corners have ``moved`` (N, 8, 1) to."""
+    """Update of an iterated Kalman filter, linearised first at the displacements ``moved`` (N, 8, 1)."""
     for _ in range(_STEPS):
         value, J = squareness(at.x + (at.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0], at.inverse)
         error = value + J @ (seen - moved)
@@ -113,7 +113,7 @@ def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance:
 
 
 def squareness(x: FloatArray, inverse: FloatArray) -> Squareness:
-    """Of corners (N, 4, 2) in normalised coordinates, with the derivatives (N, 4, 2, 2) of these by pixels."""
+    """Constraints of corners (N, 4, 2) in normalised coordinates, which have derivatives (N, 4, 2, 2) by pixels."""
     count, flat = len(x), x.reshape(-1, 8, 1)
     by_corner = (flat[..., 0] @ _FORMS).reshape(count, 4, 8)
     determinant = 0.5 * (by_corner @ flat)
