@@ -33,7 +33,9 @@ def scene(shift=0.0, contrast=150.0, shape=(512, 640)):
 
 
 def noisy(image, rng, sigma=NOISE):
-    return (image + rng.normal(0.0, sigma, image.shape)).round().clip(0, 16383).astype(np.uint16)
+    # In single precision, which takes a third of the time.
+    noise = np.float32(sigma) * rng.standard_normal(image.shape, dtype=np.float32)
+    return (image + noise).round().clip(0, 16383).astype(np.uint16)
 
 
 class Camera:
