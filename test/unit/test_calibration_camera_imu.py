@@ -262,7 +262,7 @@ READOUT = 0.016
 def test_noiseless_rolling_recording_gives_the_readout_time_back():
     scenario = replace(SCENARIO, imu=NO_NOISE)
     frames, camera, imu = rolling_recording(scenario, 13.0, 2, READOUT, sigma_px=0.0)
-    result = calibrate_rolling_camera_imu(frames[::4], camera, imu, START_NS, ImuNoise())
+    result = calibrate_rolling_camera_imu(frames[::3], camera, imu, START_NS, ImuNoise())
     error = np.abs(error_of(result, scenario))
     # As without a read-out: samples are interpolated. A microsecond at 1000 px/s is 0.001 px.
     assert abs(result.readout_time - READOUT) < 1e-6
