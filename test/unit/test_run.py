@@ -147,6 +147,31 @@ def test_arguments_that_ros_cannot_read_are_an_input_error(arguments):
     assert arguments[1] in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ('keystore', 'enclave', 'words'),
+    [
+        ('', '/drone', 'ROS_SECURITY_KEYSTORE is not set'),
+        ('keys', '/drone', "enclaves/drone' does not exist"),
+        ('keys', '/empty', 'error creating node'),
+    ],
+)
+def test_a_node_that_security_keeps_out_says_why_and_is_not_tried_again(tmp_path, keystore, enclave, words):
+    """Without a keystore, without its enclave, and with one that has no keys (or a middleware without security)."""
+    (tmp_path / 'keys' / 'enclaves' / 'empty').mkdir(parents=True)
+    secured = {
+        'ROS_SECURITY_ENABLE': 'true',
+        'ROS_SECURITY_STRATEGY': 'Enforce',
+        'ROS_SECURITY_KEYSTORE': keystore and str(tmp_path / keystore),
+    }
+    command = [sys.executable, '-m', 'thermal_fiducial.nodes.landing_target', '--ros-args', '--enclave', enclave]
+    done = subprocess.run(
+        command, env={**os.environ, **secured}, capture_output=True, text=True, timeout=60, check=False
+    )
+    last = done.stderr.splitlines()[-1]
+    assert (done.returncode, last.partition(':')[0]) == (2, 'landing_target.py')
+    assert words in last
+
+
 def test_arguments_that_ros_leaves_are_named():
     """One letter missing, and the parameters behind it would be nobody's."""
     command = [sys.executable, '-m', 'thermal_fiducial.nodes.landing_target', '--ros-arg', '-p', 'landing_pad:=[1]']

@@ -63,8 +63,18 @@ def initialise(
             signal_handler_options=signals,
         )
     except RuntimeError as error:
-        reason = str(error).splitlines()[0].removeprefix('failed to initialize rcl: ').partition(', at /')[0]
-        raise InputError(reason) from None
+        if _is_secured() and not os.environ.get('ROS_SECURITY_KEYSTORE'):
+            raise InputError('ROS_SECURITY_ENABLE is true, and ROS_SECURITY_KEYSTORE is not set') from None
+        raise InputError(_first_line(error)) from None
+
+
+def _is_secured() -> bool:
+    return os.environ.get('ROS_SECURITY_ENABLE', '') == 'true'
+
+
+def _first_line(error: RuntimeError) -> str:
+    """What rcl says, without the line of its source."""
+    return str(error).splitlines()[0].removeprefix('failed to initialize rcl: ').partition(', at /')[0]
 
 
 def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = None) -> int:
@@ -97,7 +107,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
         try:
             initialise(args, signals=SignalHandlerOptions.NO)
             _refuse_others(args)
-            node = make_node()
+            node = _made(make_node)
             ending.callback(node.destroy_node)
             executor = make_executor()
             ending.callback(executor.shutdown)
@@ -114,6 +124,16 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             if ok() and not stop.asked:
                 raise
             limit_the_end()
+
+
+def _made(make_node: Callable[[], StageNode[Any]]) -> StageNode[Any]:
+    """The node; an :class:`InputError` where security keeps it out, which no second try would change."""
+    try:
+        return make_node()
+    except RuntimeError as error:
+        if _is_secured() and ok():
+            raise InputError(f'ROS_SECURITY_ENABLE is true: {_first_line(error)}') from None
+        raise
 
 
 def _refuse_others(args: Sequence[str] | None) -> None:
