@@ -94,9 +94,12 @@ class FrameCleaner:
         late = stamp_ns < self._newest_ns
         self._newest_ns = max(stamp_ns, self._newest_ns)
         self._stamps = {stamp for stamp in self._stamps if stamp >= self._newest_ns - LATEST_NS} | {stamp_ns}
-        reason = self._stale(stamp_ns, image, coarse=counts.dtype == np.uint8)
-        if reason:
-            return CleanFrame(None, reason, late)
+        frozen = self._freeze.repeats(image, coarse=counts.dtype == np.uint8)
+        if frozen or self._shutter.closed(stamp_ns, image):
+            self._pauses.add_old(stamp_ns, self.config.settle_frames)
+            return CleanFrame(None, FROZEN if frozen else SHUTTER, late)
+        if self._pauses.add_new(stamp_ns):
+            return CleanFrame(None, SETTLING, late)
         self._replace_bad_pixels(image)
         return CleanFrame(image, late=late)
 
@@ -104,7 +107,9 @@ class FrameCleaner:
         """A copy of the image rows as counts."""
         if counts.ndim != 2 or counts.dtype not in (np.uint8, np.uint16):
             raise InputError(f'frame of {counts.dtype} with shape {counts.shape} is not an 8 or 16 bit image')
-        image = self._without_telemetry(counts)
+        height = counts.shape[0]
+        extra = next((height - h for h in STANDARD_HEIGHTS if 0 < height - h <= MAX_TELEMETRY_ROWS), 0)
+        image = self._without_telemetry(counts, extra) if extra else counts
         if min(image.shape) < 16:
             raise InputError(f'frame of {image.shape[1]}x{image.shape[0]} pixels is too small')
         # Some drivers shift counts up: in no living picture the lowest bits are zero in all pixels.
@@ -117,22 +122,9 @@ class FrameCleaner:
         own &= np.uint16((1 << self.config.bits) - 1)
         return own
 
-    def _stale(self, stamp_ns: int, image: Counts, *, coarse: bool) -> str:
-        if self._freeze.repeats(image, coarse=coarse):
-            reason = FROZEN
-        elif self._shutter.closed(stamp_ns, image):
-            reason = SHUTTER
-        else:
-            return SETTLING if self._pauses.add_new(stamp_ns) else ''
-        self._pauses.add_old(stamp_ns, self.config.settle_frames)
-        return reason
-
-    def _without_telemetry(self, frame: Counts | Gray) -> Counts | Gray:
-        """Without the rows that carry no image, from the side where the picture breaks off."""
+    def _without_telemetry(self, frame: Counts | Gray, extra: int) -> Counts | Gray:
+        """Without ``extra`` rows that carry no image, from the side where the picture breaks off."""
         height = frame.shape[0]
-        extra = next((height - h for h in STANDARD_HEIGHTS if 0 < height - h <= MAX_TELEMETRY_ROWS), 0)
-        if not extra:
-            return frame
         top, bottom = _break_between(frame, extra), _break_between(frame, height - extra)
         self._telemetry_on_top = int(np.clip(self._telemetry_on_top + (1 if top > 2 * bottom else -1), -10, 10))
         return frame[extra:] if self._telemetry_on_top > 0 else frame[: height - extra]

@@ -164,8 +164,7 @@ class MarkerMapper:
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, Waiting]:
         """Add views to the candidates of new markers; whether any entered the map, and what the others wait for."""
         placed, waiting = self._new.show(frame.stamp_ns, frame.new, frame.camera, viewpoint)
-        for marker in placed:
-            self._take_in(marker)
+        self.map.markers |= {marker.id: marker for marker in placed}
         self.map.revision += bool(placed)
         return bool(placed), waiting
 
@@ -235,8 +234,4 @@ class MarkerMapper:
     def enter(self, stamp_ns: int, candidate: Candidate, T_map_marker: FloatArray, covariance: FloatArray) -> None:
         """Take a candidate into the map."""
         del self._new.candidates[candidate.id]
-        self._take_in(entry(stamp_ns, candidate, T_map_marker, covariance))
-
-    def _take_in(self, marker: MapMarker) -> None:
-        self._trust.forget([marker.id])
-        self.map.markers[marker.id] = marker
+        self.map.markers[candidate.id] = entry(stamp_ns, candidate, T_map_marker, covariance)

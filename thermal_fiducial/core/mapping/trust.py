@@ -109,11 +109,6 @@ class Trust:
         if reason:
             self.quarantined[marker_id] = reason
 
-    def forget(self, ids: Iterable[int]) -> None:
-        """Reset the statistics of ``ids``, as their poses have changed."""
-        for marker_id in ids:
-            self._records.pop(marker_id, None)
-
     def _record(self, marker: MapMarker) -> _Record:
         record = self._records.get(marker.id)
         if record is None:
