@@ -229,8 +229,8 @@ def _homography_derivative(c: FloatArray, sizes: FloatArray) -> tuple[FloatArray
     """Derivative (N, 2, 2) [1/m] at, and image (N, 2) of, the centre under the homography of a square to ``c``."""
     weight = se3.perspective(c)[..., None]
     weight[np.abs(weight) <= TINY] = np.nan
-    corners = np.concatenate([c, np.ones((len(c), 4, 1))], axis=-1) * weight
-    centre, right, up = corners.mean(axis=1), corners[:, 1] - corners[:, 0], corners[:, 0] - corners[:, 3]
+    corners = np.concatenate([weight * c, weight], axis=-1)
+    centre, right, up = 0.25 * corners.sum(axis=1), corners[:, 1] - corners[:, 0], corners[:, 0] - corners[:, 3]
     depth = centre[:, 2:]
     v = centre[:, :2] / depth
     along = np.stack([right, up], axis=-1)

@@ -75,14 +75,11 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
     -------
     Poses (B, 4, 4), costs (B,), inf from an unusable start, and information matrices (B, 6, 6).
     """
-    possible: BoolArray = np.asarray(np.isfinite(T).all(axis=(-1, -2)))
-    if not possible.all():
-        T = np.where(possible[:, None, None], T, _AHEAD)
+    possible: BoolArray = np.asarray(np.isfinite(T).all(axis=(1, 2)))
+    T = np.where(possible[:, None, None], T, _AHEAD)
     cost, gradient, information = evaluated(T)
-    possible = possible & np.isfinite(cost)
-    if not possible.all():
-        information = np.where(possible[:, None, None], information, np.eye(6))
-        gradient = np.where(possible[:, None], gradient, 0.0)
+    possible &= np.isfinite(cost)
+    information[~possible], gradient[~possible] = np.eye(6), 0.0
     damping = np.full(len(T), 1e-6)
     active = possible
     for steps in range(_MAX_STEPS):
@@ -90,25 +87,19 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
         best = cost
         if alternatives > 1:
             best = np.repeat(cost.reshape(-1, alternatives).min(axis=1), alternatives)
-        gain = np.einsum('bi,bi->b', step, gradient)
+        gain = (step * gradient).sum(axis=1)
         last = gain < np.maximum(_LAST_GAIN, _LAST_SHARE * (cost - np.minimum(best, _REFUTED)))
         if steps > 0:
             active = active & (damping <= MOST_DAMPED) & (cost <= _REFUTED + _TIMES_THE_BEST * best)
-        trial = retract(T, -step)
-        done = active & last
-        if done.any():
-            T, active = np.where(done[:, None, None], trial, T), active & ~last
+        trial, done = retract(T, -step), active & last
+        T[done] = trial[done]
+        active = active & ~last
         if not active.any():
             break
         new = evaluated(trial)
         better = active & (new[0] <= cost)
-        if better.all():
-            T, (cost, gradient, information) = trial, new
-        else:
-            T = np.where(better[:, None, None], trial, T)
-            cost = np.where(better, new[0], cost)
-            gradient = np.where(better[:, None], new[1], gradient)
-            information = np.where(better[:, None, None], new[2], information)
+        for mine, its in zip((T, cost, gradient, information), (trial, *new), strict=True):
+            mine[better] = its[better]
         damping *= np.where(better, EASED, STIFFENED)
     return T, np.where(possible, cost, np.inf), information
 
@@ -171,7 +162,7 @@ def covariances(information: FloatArray) -> FloatArray:
 
 def _solve(information: FloatArray, damping: FloatArray, gradient: FloatArray) -> FloatArray:
     damped = information.copy()
-    diagonal = np.einsum('bii->bi', damped)
+    diagonal = damped.reshape(-1, 36)[:, ::7]
     floor = SINGULAR * np.maximum(diagonal.max(axis=-1, keepdims=True), SINGULAR)
     diagonal += damping[:, None] * diagonal + floor
     return np.asarray(np.linalg.solve(damped, gradient[..., None])[..., 0])

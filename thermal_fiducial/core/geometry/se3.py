@@ -91,10 +91,10 @@ def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
 
 
 def transform(R: npt.ArrayLike, p: npt.ArrayLike) -> FloatArray:
-    """T_a_b (..., 4, 4) of R_a_b (..., 3, 3) and the origin of b in a (..., 3)."""
+    """T_a_b (..., 4, 4) of R_a_b (..., 3, 3) and the origin of b in a (..., 3), of either of them one or as many."""
     R = np.asarray(R, dtype=np.float64)
     p = np.asarray(p, dtype=np.float64)
-    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], p.shape[:-1]), 4, 4))
+    T = np.zeros((*max(R.shape[:-2], p.shape[:-1], key=len), 4, 4))
     T[..., :3, :3] = R
     T[..., :3, 3] = p
     T[..., 3, 3] = 1.0
@@ -136,11 +136,11 @@ def quaternion_from_rotation(R: npt.ArrayLike) -> FloatArray:
         x, y, z, w = listed[max(range(4), key=lambda k: listed[k][k])]
         scale = (-1.0 if w < 0.0 else 1.0) / math.sqrt(x * x + y * y + z * z + w * w)
         return np.array([x * scale, y * scale, z * scale, w * scale])
-    flat = R.reshape(*R.shape[:-2], 9)
-    products = (flat @ _PRODUCTS_OF_ENTRIES).reshape(*R.shape[:-2], 4, 4) + np.eye(4)
-    largest = np.einsum('...ii->...i', products).argmax(axis=-1)
-    q = np.take_along_axis(products, largest[..., None, None], axis=-2)[..., 0, :]
-    return np.asarray(q * np.copysign(1.0 / np.sqrt(np.sum(q * q, axis=-1)), q[..., 3])[..., None])
+    products = R.reshape(-1, 9) @ _PRODUCTS_OF_ENTRIES + _PRODUCTS_OF_NONE
+    largest = products[:, ::5].argmax(axis=1)
+    q = products.reshape(-1, 4, 4)[np.arange(len(largest)), largest]
+    q *= np.copysign(1.0 / np.sqrt((q * q).sum(axis=1)), q[:, 3])[:, None]
+    return np.asarray(q.reshape(*R.shape[:-2], 4))
 
 
 def _quaternion_products(R: list[list[float]]) -> tuple[tuple[float, ...], ...]:
@@ -155,8 +155,9 @@ def _quaternion_products(R: list[list[float]]) -> tuple[tuple[float, ...], ...]:
 
 
 # The products grow linearly with the entries of the matrix, (9, 16), from the identity.
+_PRODUCTS_OF_NONE = np.eye(4).ravel()
 _PRODUCTS_OF_ENTRIES = np.array(
-    [np.ravel(_quaternion_products(entry.tolist()) - np.eye(4)) for entry in np.eye(9).reshape(9, 3, 3)]
+    [np.ravel(_quaternion_products(entry.tolist())) - _PRODUCTS_OF_NONE for entry in np.eye(9).reshape(9, 3, 3)]
 )
 
 
