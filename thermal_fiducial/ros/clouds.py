@@ -5,7 +5,7 @@ from functools import lru_cache
 import struct
 from typing import Any
 
-from geometry_msgs.msg import Point, Pose, PoseArray, Quaternion
+from geometry_msgs.msg import PoseArray
 import numpy as np
 import numpy.typing as npt
 from rclpy.serialization import serialize_message
@@ -25,7 +25,7 @@ from thermal_fiducial.core.measurements import (
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros import message_bytes
-from thermal_fiducial.ros.convert import data_bytes, NORM_TOLERANCE
+from thermal_fiducial.ros.convert import data_bytes, NORM_TOLERANCE, pose_of_row
 
 _POINT_TYPES = {
     PointField.INT8: 'i1',
@@ -214,14 +214,7 @@ def _checked(rows: Markers) -> Markers:
 
 def marker_poses(rows: Markers, head: Header) -> PoseArray:
     """The markers in the camera, for display."""
-    fields = zip(*(rows[name].tolist() for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')), strict=True)
-    return PoseArray(
-        header=head,
-        poses=[
-            Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
-            for x, y, z, qx, qy, qz, qw in fields
-        ],
-    )
+    return PoseArray(header=head, poses=[pose_of_row(row) for row in rows])
 
 
 def map_poses(message: PointCloud2) -> dict[int, tuple[FloatArray, float]]:

@@ -78,6 +78,12 @@ def pose(T: FloatArray) -> Pose:
     return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
 
 
+def pose_of_row(row: Any) -> Pose:
+    """Pose message of a row with fields x y z qx qy qz qw."""
+    x, y, z, qx, qy, qz, qw = (float(row[name]) for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'))
+    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
 def transform_of(message: Pose, what: str = 'pose') -> FloatArray:
     """T_a_b (4, 4) of a pose message.
 

@@ -9,12 +9,13 @@ import importlib
 from typing import Any
 
 import cv2
-from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped, Vector3
+from geometry_msgs.msg import TransformStamped, Vector3
 import numpy as np
 from std_msgs.msg import Header
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
 from thermal_fiducial.core.measurements import corners_px, Markers
+from thermal_fiducial.ros import convert
 from thermal_fiducial.ros.annotations import image_annotations
 from thermal_fiducial.ros.node import StageNode
 
@@ -90,7 +91,7 @@ def aruco_opencv(messages: Any, markers: Markers, head: Header) -> Any:
     result.header = head
     for row in markers:
         marker = messages.MarkerPose()
-        marker.marker_id, marker.pose = int(row['id']), _pose(row)
+        marker.marker_id, marker.pose = int(row['id']), convert.pose_of_row(row)
         result.markers.append(marker)
     return result
 
@@ -119,7 +120,7 @@ def vision(messages: Any, markers: Markers, head: Header, sides: list[float]) ->
     for row, side in zip(markers, sides, strict=True):
         detection, hypothesis = messages.Detection3D(), messages.ObjectHypothesisWithPose()
         hypothesis.hypothesis.class_id, hypothesis.hypothesis.score = str(row['id']), 1.0
-        hypothesis.pose.pose = detection.bbox.center = _pose(row)
+        hypothesis.pose.pose = detection.bbox.center = convert.pose_of_row(row)
         detection.bbox.size = Vector3(x=side, y=side, z=_THICKNESS)
         detection.header, detection.id = head, str(row['id'])
         detection.results.append(hypothesis)
@@ -127,13 +128,8 @@ def vision(messages: Any, markers: Markers, head: Header, sides: list[float]) ->
     return result
 
 
-def _pose(row: Any) -> Pose:
-    x, y, z, qx, qy, qz, qw = (float(row[name]) for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'))
-    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
-
-
 def _transform(row: Any, head: Header, prefix: str) -> TransformStamped:
-    place = _pose(row)
+    place = convert.pose_of_row(row)
     transform = TransformStamped(header=head, child_frame_id=f'{prefix}marker_{row["id"]}')
     p = place.position
     transform.transform.translation = Vector3(x=p.x, y=p.y, z=p.z)

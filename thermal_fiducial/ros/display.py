@@ -3,13 +3,14 @@
 from typing import Any
 
 import cv2
-from geometry_msgs.msg import Point, Pose, Quaternion, Vector3
+from geometry_msgs.msg import Vector3
 import numpy as np
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import Gray
+from thermal_fiducial.ros import convert
 
 _IN_VIEW = ColorRGBA(r=0.9, g=0.1, b=0.1, a=0.9)
 _OUT_OF_VIEW = ColorRGBA(r=0.1, g=0.7, b=0.1, a=0.9)
@@ -32,7 +33,9 @@ def map_markers(rows: 'np.ndarray[Any, np.dtype[Any]]', head: Header, *, whole: 
 
 def _plate(row: Any, head: Header) -> Marker:
     size = float(row['size'])
-    marker = Marker(header=head, ns='plates', id=int(row['id']), type=Marker.CUBE, action=Marker.ADD, pose=_pose(row))
+    marker = Marker(
+        header=head, ns='plates', id=int(row['id']), type=Marker.CUBE, action=Marker.ADD, pose=convert.pose_of_row(row)
+    )
     marker.scale = Vector3(x=size, y=size, z=_THICKNESS)
     marker.color = _IN_VIEW if row['in_view'] else _OUT_OF_VIEW if row['trusted'] else _DISTRUSTED
     return marker
@@ -41,17 +44,12 @@ def _plate(row: Any, head: Header) -> Marker:
 def _label(row: Any, head: Header) -> Marker:
     size = float(row['size'])
     marker = Marker(header=head, ns='ids', id=int(row['id']), type=Marker.TEXT_VIEW_FACING, action=Marker.ADD)
-    marker.pose = _pose(row)
+    marker.pose = convert.pose_of_row(row)
     marker.pose.position.z += 0.75 * size
     marker.scale.z = 0.4 * size
     marker.color = ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0)
     marker.text = str(int(row['id']))
     return marker
-
-
-def _pose(row: Any) -> Pose:
-    x, y, z, qx, qy, qz, qw = (float(row[name]) for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw'))
-    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
 
 
 def annotated(view: Gray, markers: Markers) -> 'np.ndarray[Any, np.dtype[np.uint8]]':
