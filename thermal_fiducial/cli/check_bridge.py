@@ -5,11 +5,16 @@ import json
 from pathlib import Path
 import sys
 import textwrap
+from typing import TYPE_CHECKING
 
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.bridge_check import check_bridge, Finding, Level
+from thermal_fiducial.report.bridge_links import check_links
 from thermal_fiducial.report.bridge_record import BridgeRecord, BridgeRecorder, read_bridge
 from thermal_fiducial.report.landing_check import check_landing
+
+if TYPE_CHECKING:
+    from thermal_fiducial.ros.bridge_listener import Links
 
 _WIDTH = 118
 
@@ -34,11 +39,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Check and print. 0: no fault; 1: an autopilot would not fly on it."""
+    findings: list[Finding] = []
     if args.recording is not None:
         record = read_bridge(args.recording, args.topic, args.imu)
     else:
-        record = _listen(args.topic, args.seconds, args.ros_args)
-    findings = check_bridge(record) + check_landing(record)
+        record, links = _listen(args.topic, args.seconds, args.ros_args)
+        findings += check_links(links)
+    findings += check_bridge(record) + check_landing(record)
     if args.json:
         print(json.dumps([_as_json(finding) for finding in findings], indent=2))
     else:
@@ -58,7 +65,7 @@ def _line(finding: Finding) -> str:
     )
 
 
-def _listen(topic: str, seconds: float, ros_arguments: list[str]) -> BridgeRecord:
+def _listen(topic: str, seconds: float, ros_arguments: list[str]) -> 'tuple[BridgeRecord, Links]':
     if not 0.0 < seconds < 3600.0:
         raise InputError(f'--seconds {seconds:g}: between 0 and 3600')
     try:
@@ -74,7 +81,7 @@ def _listen(topic: str, seconds: float, ros_arguments: list[str]) -> BridgeRecor
             file=sys.stderr,
         )
 
-    listen(
+    links = listen(
         seconds,
         recorder.odometry,
         recorder.imu,
@@ -83,7 +90,7 @@ def _listen(topic: str, seconds: float, ros_arguments: list[str]) -> BridgeRecor
         announce=announce,
         ros_arguments=ros_arguments,
     )
-    return recorder.record()
+    return recorder.record(), links
 
 
 def _as_json(finding: Finding) -> dict[str, str]:

@@ -1,10 +1,11 @@
 """Listens to what a flight controller would get, on the topics that the running filter really has."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 import time
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
@@ -16,6 +17,8 @@ from thermal_fiducial.ros.run import initialise, make_executor
 
 _FILTER, _LANDING = 'pose_ekf', 'landing_target'
 _ODOMETRY, _IMU, _POSE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu', 'geometry_msgs/msg/PoseStamped'
+#: What PX4 over uXRCE-DDS gets.
+PX4_KIND = 'px4_msgs/msg/VehicleOdometry'
 #: What the filter publishes for others than a flight controller.
 _NOT_FOR_IT = ('odometry', 'odometry_smooth')
 #: How long a filter is looked for [s].
@@ -29,6 +32,22 @@ class Topics:
     odometry: str
     imu: str
     landing: str
+    #: what the autopilot gets, which for PX4 over uXRCE-DDS is a message of its own beside the odometry
+    autopilot: str
+    #: name of the node that sends it
+    sender: str
+
+
+@dataclass(frozen=True)
+class Links:
+    """Who is at the ends of the autopilot's topic, and what the filter said last."""
+
+    topic: str
+    #: nodes that publish the odometry, and that receive what is for the autopilot, this one left out
+    senders: int
+    receivers: int
+    #: why the filter has nothing to fly on; empty where it has
+    complaint: str
 
 
 def listen(
@@ -41,7 +60,7 @@ def listen(
     announce: Callable[[Topics], None] = lambda topics: None,
     ros_arguments: Sequence[str] = (),
     domain_id: int | None = None,
-) -> None:
+) -> Links:
     """Hand on odometry (with the time of arrival [ns]), IMU messages and landing targets for some seconds.
 
     Parameters
@@ -63,7 +82,10 @@ def listen(
         )
         node.create_subscription(Imu, topics.imu, on_imu, qos.IMU_INPUT)
         node.create_subscription(PoseStamped, topics.landing, on_landing_target, qos.RESULT)
+        said: dict[str, DiagnosticStatus] = {}
+        node.create_subscription(DiagnosticArray, '/diagnostics', lambda array: _note(array, said), qos.RESULT)
         _spin(executor, seconds, lambda: False)
+        return _links(node, topics, said)
     finally:
         executor.shutdown()
         node.destroy_node()
@@ -81,8 +103,10 @@ def _find(node: Node, executor: Any, topic: str) -> Topics:
         return bool(found)
 
     _spin(executor, DISCOVERY_S, look)
-    topics = found[0] if found else Topics('bridge/odometry', 'imu/data', _LANDING)
-    return Topics(topic or topics.odometry, topics.imu, _landing_topic(node) or topics.landing)
+    ours = 'bridge/odometry'
+    topics = found[0] if found else Topics(ours, 'imu/data', _LANDING, ours, _FILTER)
+    topics = replace(topics, landing=_landing_topic(node) or topics.landing)
+    return replace(topics, odometry=topic, autopilot=topic) if topic else topics
 
 
 def _topics_of_filter(node: Node, namespace: str) -> Topics | None:
@@ -94,7 +118,9 @@ def _topics_of_filter(node: Node, namespace: str) -> Topics | None:
         return None
     base = namespace.rstrip('/')
     bridge = [name for name in odometry if name not in {f'{base}/{own}' for own in _NOT_FOR_IT}]
-    return Topics((bridge or odometry)[0], imu[0], f'{base}/{_LANDING}')
+    sent = (bridge or odometry)[0]
+    px4 = [name for name, kinds in published if PX4_KIND in kinds]
+    return Topics(sent, imu[0], f'{base}/{_LANDING}', (px4 or [sent])[0], f'{base}/{_FILTER}')
 
 
 def _landing_topic(node: Node) -> str:
@@ -104,6 +130,19 @@ def _landing_topic(node: Node) -> str:
             published = node.get_publisher_names_and_types_by_node(name, namespace)
             return next((topic for topic, kinds in published if _POSE in kinds), '')
     return ''
+
+
+def _note(array: DiagnosticArray, said: dict[str, DiagnosticStatus]) -> None:
+    said.update({status.name: status for status in array.status})
+
+
+def _links(node: Node, topics: Topics, said: dict[str, DiagnosticStatus]) -> Links:
+    receivers = node.count_subscribers(topics.autopilot)
+    if topics.autopilot == topics.odometry:
+        receivers -= 1
+    status = said.get(topics.sender.lstrip('/'), DiagnosticStatus())
+    complaint = status.message if status.level == DiagnosticStatus.ERROR else ''
+    return Links(topics.autopilot, node.count_publishers(topics.odometry), receivers, complaint)
 
 
 def _spin(executor: Any, seconds: float, done: Callable[[], bool]) -> None:

@@ -1,0 +1,76 @@
+"""``check-bridge`` in a graph that runs: who sends, who listens, and what the filter itself complains of."""
+
+from concurrent.futures import ThreadPoolExecutor
+import sys
+from types import ModuleType
+
+from geometry_msgs.msg import TwistStamped
+from nav_msgs.msg import Odometry
+import pytest
+from support.ros_graph import ros_graph
+
+from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
+from thermal_fiducial.report.bridge_check import Level
+from thermal_fiducial.report.bridge_links import check_links
+from thermal_fiducial.ros import bridge_listener
+
+pytestmark = pytest.mark.ros
+MAVROS = ('-r', 'bridge/odometry:=mavros/odometry/out')
+
+
+def listened(graph, filter_node, topics):
+    """Levels and words of the links, by what they check; ``topics`` gets what was listened to."""
+
+    def listen():
+        return bridge_listener.listen(
+            1.5, lambda message, arrival_ns: None, lambda message: None, lambda message: None, announce=topics.append
+        )
+
+    with ThreadPoolExecutor(1) as pool:
+        links = pool.submit(listen)
+        while not links.done():
+            graph.executor.spin_once(timeout_sec=0.05)
+            if topics:
+                filter_node.diagnose(0)
+        return {finding.check: (finding.level, finding.seen) for finding in check_links(links.result())}
+
+
+def test_one_sender_and_a_listener_are_in_order():
+    with ros_graph(*MAVROS) as graph:
+        node = graph.add(PoseEkfNode, bridge_rate=30.0)
+        graph.listen(Odometry, 'mavros/odometry/out')
+        topics = []
+        found = listened(graph, node, topics)
+        assert found == {'receivers': (Level.OK, '1 listen to /mavros/odometry/out')}
+        assert topics[0].odometry == '/mavros/odometry/out'
+
+
+def test_two_senders_and_nobody_who_listens_are_said():
+    with ros_graph(*MAVROS) as graph:
+        node = graph.add(PoseEkfNode, bridge_rate=30.0)
+        graph.tester.advertise(Odometry, 'mavros/odometry/out')
+        assert listened(graph, node, []) == {
+            'senders': (Level.FAULT, '2 nodes send the odometry'),
+            'receivers': (Level.WARNING, '0 listen to /mavros/odometry/out'),
+        }
+
+
+def test_px4_without_its_messages_is_a_fault_though_the_odometry_is_sound():
+    with ros_graph() as graph:
+        node = graph.add(PoseEkfNode, bridge_rate=50.0, px4=True)
+        assert listened(graph, node, [])['filter'] == (
+            Level.FAULT,
+            'pose_ekf says: parameter px4: px4_msgs is not installed',
+        )
+
+
+def test_px4_is_listened_for_on_its_own_topic(monkeypatch):
+    """px4_msgs, for which another message stands, is what PX4 gets; the odometry beside it is what is checked."""
+    px4 = ModuleType('px4_msgs.msg')
+    px4.VehicleOdometry = TwistStamped
+    monkeypatch.setitem(sys.modules, 'px4_msgs', ModuleType('px4_msgs'))
+    monkeypatch.setitem(sys.modules, 'px4_msgs.msg', px4)
+    monkeypatch.setattr(bridge_listener, 'PX4_KIND', 'geometry_msgs/msg/TwistStamped')
+    with ros_graph() as graph:
+        node = graph.add(PoseEkfNode, bridge_rate=50.0, px4=True)
+        assert listened(graph, node, [])['receivers'] == (Level.WARNING, '0 listen to /fmu/in/vehicle_visual_odometry')

@@ -1,0 +1,25 @@
+"""Whether what is for an autopilot comes from one node and reaches somebody."""
+
+from typing import TYPE_CHECKING
+
+from thermal_fiducial.report.bridge_check import Finding, Level
+
+if TYPE_CHECKING:
+    # Recordings are checked without ROS too.
+    from thermal_fiducial.ros.bridge_listener import Links
+
+
+def check_links(links: 'Links') -> list[Finding]:
+    """What stands against it in a graph of nodes that runs; what the filter itself complains of comes first."""
+    findings = []
+    if links.complaint:
+        text = 'There is nothing to fly on, or nothing is sent, whatever else is in order.'
+        findings.append(Finding('filter', Level.FAULT, f'pose_ekf says: {links.complaint}', text))
+    if links.senders > 1:
+        seen = f'{links.senders} nodes send the odometry'
+        findings.append(Finding('senders', Level.FAULT, seen, 'The autopilot gets a mixture; only one may.'))
+    seen = f'{links.receivers} listen to {links.topic}'
+    if links.receivers:
+        return [*findings, Finding('receivers', Level.OK, seen, '')]
+    text = 'Is mavros running with its odometry plugin, or for PX4 the Micro XRCE-DDS agent?'
+    return [*findings, Finding('receivers', Level.WARNING, seen, text)]
