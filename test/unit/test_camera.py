@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.camera import Camera, ImagePoints, MODELS
 from thermal_fiducial.errors import InputError
 
 K = np.array([[441.2, 0.0, 322.1], [0.0, 439.8, 251.3], [0.0, 0.0, 1.0]])
@@ -80,6 +80,23 @@ def test_distortion_jacobian_is_the_difference_quotient(name):
 def test_what_lies_behind_is_not_seen(name):
     points = np.array([[0.1, 0.1, -1.0], [0.0, 0.0, 0.0], [0.1, 0.2, 1.0]])
     assert np.isnan(CAMERAS[name].project(points)).all(axis=1).tolist() == [True, True, False]
+
+
+@pytest.mark.parametrize('model', ['plumb_bob', 'rational_polynomial', 'equidistant'])
+def test_the_fold_is_where_the_distorted_radius_falls(model):
+    rng, r = np.random.default_rng(3), np.linspace(0.0, 6.0, 2401)
+    folds = 0
+    for _ in range(30):
+        D = rng.normal(0.0, 0.2, MODELS[model])
+        if model != 'equidistant':
+            D[2:4] = 0.0
+        lens = Camera(640, 512, K, model, D)
+        falling = np.flatnonzero(np.diff(lens.distort(np.stack([r, 0.0 * r], axis=-1))[:, 0]) <= 0.0)
+        visible = np.isfinite(lens.project(np.stack([r, 0.0 * r, np.ones_like(r)], axis=-1))).all(axis=-1)
+        folds += len(falling) > 0
+        # To a step or two of the grid.
+        assert abs(np.count_nonzero(visible) - (falling[0] if len(falling) else len(r))) <= 2
+    assert folds > 5
 
 
 def test_points_beyond_the_fold_are_not_seen():

@@ -8,9 +8,11 @@ fish-eye lenses", 2006).
 
 from dataclasses import dataclass
 from functools import cached_property
+import math
 
 import cv2
 import numpy as np
+from numpy.polynomial import Polynomial
 import numpy.typing as npt
 
 from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked, TINY
@@ -21,8 +23,8 @@ MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 # Newton's iteration doubles the digits: after a step this small nothing is left, and ten are enough at any lens's
 # border.
 _STEPS, _SHORT = 10, 1e-6
-# Places of p1 and p2 among the coefficients.
-_TANGENTIAL = slice(2, 4)
+# Coefficients of the derivative of angle + k1 angle^3 + k2 angle^5 ... with respect to the angle.
+_RISE = np.array([1.0, 3.0, 5.0, 7.0, 9.0])
 _EYE = np.eye(3)
 
 
@@ -155,14 +157,14 @@ class Camera:
     @cached_property
     def _fold_radius(self) -> float:
         """Normalised radius up to which the distorted radius grows: beyond it two points share a pixel."""
-        radial = self.D.copy()
-        if self.model != 'equidistant':
-            radial[_TANGENTIAL] = 0.0
-        r = np.linspace(0.0, 12.0, 4801)
-        lens = Camera(self.width, self.height, self.K, self.model, radial)
-        across = lens.distort(np.stack([r, np.zeros_like(r)], axis=-1))
-        falling = np.flatnonzero(np.diff(across[:, 0]) <= 0.0)
-        return float(r[falling[0]]) if len(falling) else np.inf
+        if self.model == 'equidistant':
+            angle = math.sqrt(_least_root(Polynomial(_RISE * [1.0, *self.D])))
+            return math.tan(angle) if angle < 0.5 * math.pi else math.inf
+        k1, k2, _, _, k3, k4, k5, k6 = [*self.D, 0.0, 0.0, 0.0][:8]
+        above, below, s = Polynomial((1.0, k1, k2, k3)), Polynomial((1.0, k4, k5, k6)), Polynomial((0.0, 1.0))
+        # Numerator of the derivative of r above(r^2) / below(r^2), and the pole.
+        rise = above * below + 2.0 * s * (above.deriv() * below - above * below.deriv())
+        return math.sqrt(min(_least_root(rise), _least_root(below)))
 
     @cached_property
     def _last_pixel(self) -> FloatArray:
@@ -205,6 +207,13 @@ class ImagePoints(Stacked):
     def at_pixels(self, px: FloatArray) -> 'ImagePoints':
         """Those at pixels (..., 2) that are so near that what is left of the distortion's curvature is nothing."""
         return ImagePoints(px, self.x + (self.inverse @ (px - self.px)[..., None])[..., 0], self.J, self.inverse)
+
+
+def _least_root(polynomial: Polynomial) -> float:
+    """Smallest positive real root; inf if there is none."""
+    roots = polynomial.trim().roots()
+    real = roots.real[np.abs(roots.imag) < TINY * (1.0 + np.abs(roots.real))]
+    return float(real[real > 0.0].min(initial=np.inf))
 
 
 def inverse_2x2(J: FloatArray) -> FloatArray:
