@@ -7,9 +7,10 @@ from thermal_fiducial.core.detection.frame import (
 )
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers
 from thermal_fiducial.core.detection.tracking import MotionTrack
-from thermal_fiducial.core.detection.twist import interaction, transfer_from_body, transferred, Twist
+from thermal_fiducial.core.detection.twist import interaction, transferred, Twist
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.reprojection import twist_transfer
 from thermal_fiducial.core.measurements import Odometry
 
 CAMERA = Camera(640, 512, [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
@@ -41,7 +42,7 @@ def test_twist_of_the_camera_from_that_of_the_body():
     T_camera = se3.inverse(T_body_camera) @ T_body @ T_body_camera
     numeric = np.concatenate([T_camera[:3, 3], se3.so3_log(T_camera[:3, :3])]) / dt
     odometry = Odometry(0, np.eye(4), body[:3], body[3:], np.eye(6), np.eye(6))
-    np.testing.assert_allclose(transferred(odometry, transfer_from_body(T_body_camera)).value, numeric, atol=1e-5)
+    np.testing.assert_allclose(transferred(odometry, twist_transfer(T_body_camera)).value, numeric, atol=1e-5)
 
 
 def test_tracker_finds_the_twist_from_two_frames():

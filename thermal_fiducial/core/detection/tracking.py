@@ -19,12 +19,12 @@ from thermal_fiducial.core.detection.twist import (
     interaction,
     line_through,
     RANDOM,
-    transfer_from_body,
     transferred,
     Twist,
     unknown_twist,
 )
 from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.reprojection import twist_transfer
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
@@ -70,7 +70,7 @@ class MotionTrack:
     @staticmethod
     def of_rig(T_body_camera: FloatArray, lag: float = 0.0) -> 'MotionTrack':
         """The track before the first frame of a camera at ``T_body_camera`` (4, 4)."""
-        return MotionTrack(T_body_camera, transfer_from_body(T_body_camera), lag)
+        return MotionTrack(T_body_camera, twist_transfer(T_body_camera), lag)
 
     def predict(
         self,

@@ -11,7 +11,6 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
@@ -66,18 +65,9 @@ def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
 
 
 def transferred(odometry: Odometry, transfer: FloatArray) -> Twist:
-    """Twist of the camera from that of the body, by :func:`transfer_from_body`."""
+    """Twist of the camera from that of the body, by :func:`twist_transfer`."""
     body = np.concatenate([odometry.velocity_body, odometry.angular_velocity_body])
     return Twist(transfer @ body, transfer @ odometry.twist_covariance @ transfer.T)
-
-
-def transfer_from_body(T_body_camera: FloatArray) -> FloatArray:
-    """Map (6, 6) from the body's twist to the camera's."""
-    R = T_body_camera[:3, :3].T
-    transfer = np.zeros((6, 6))
-    transfer[:3, :3] = transfer[3:, 3:] = R
-    transfer[:3, 3:] = -R @ se3.skew(T_body_camera[:3, 3])
-    return transfer
 
 
 def unknown_twist() -> Twist:

@@ -6,6 +6,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.filter.state import Estimate, GYROSCOPE_BIAS, POSITION, ROTATION, VELOCITY
+from thermal_fiducial.core.geometry.reprojection import lever_arm, twist_transfer
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray
@@ -57,12 +58,8 @@ def odometry(
 
 def in_frame(odometry: Odometry, T_body_frame: FloatArray) -> Odometry:
     """Odometry of another frame on the same rigid body, at ``T_body_frame`` (4, 4)."""
-    T_map_body, R, lever = odometry.T_map_body, T_body_frame[:3, :3], T_body_frame[:3, 3]
-    pose = np.eye(6)
-    pose[:3, 3:] = -skew(T_map_body[:3, :3] @ lever)
-    twist = np.zeros((6, 6))
-    twist[:3, :3] = twist[3:, 3:] = R.T
-    twist[:3, 3:] = -R.T @ skew(lever)
+    T_map_body = odometry.T_map_body
+    pose, twist = lever_arm(T_map_body[:3, :3] @ T_body_frame[:3, 3]), twist_transfer(T_body_frame)
     velocities = twist @ np.concatenate((odometry.velocity_body, odometry.angular_velocity_body))
     return replace(
         odometry,

@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.error_model import CHI2_OF_POSE
+from thermal_fiducial.core.geometry.reprojection import turned
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.types import FloatArray
 
@@ -85,11 +86,10 @@ class PoseNoise:
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'PoseNoise':
         """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
-        turn = np.kron(np.eye(2), T_new_old[:3, :3])
         last = replace(
             self.last,
             T_map_body=T_new_old @ self.last.T_map_body,
-            map_covariance=turn @ self.last.map_covariance @ turn.T,
+            map_covariance=turned(self.last.map_covariance, T_new_old[:3, :3]),
         )
         return replace(self, last=last)
 

@@ -21,6 +21,7 @@ from thermal_fiducial.core.filter.state import (
     TIME_OFFSET,
     VELOCITY,
 )
+from thermal_fiducial.core.geometry.reprojection import lever_arm
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_left_jacobian_inverse, so3_log
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
@@ -82,8 +83,7 @@ def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> Body
     J[:3, 3:] = J[3:, :3] = R.T
     J[3:, 3:] = -R.T @ skew(lever)
     relative = scale**2 * (J @ (pose.covariance - pose.map_covariance) @ J.T)
-    to_body = np.eye(6)
-    to_body[:3, 3:] = -skew(lever)
+    to_body = lever_arm(lever)
     return BodyPose(pose.stamp_ns, T_map_body, relative, to_body @ pose.map_covariance @ to_body.T)
 
 

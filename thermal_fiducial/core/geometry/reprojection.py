@@ -45,6 +45,15 @@ def lever_arm(arm: FloatArray) -> FloatArray:
     return J
 
 
+def twist_transfer(T_body_frame: FloatArray) -> FloatArray:
+    """Map (6, 6) from the twist of a body to that of a frame at ``T_body_frame`` (4, 4) on it, each in its own axes."""
+    R = T_body_frame[:3, :3].T
+    transfer = np.zeros((6, 6))
+    transfer[:3, :3] = transfer[3:, 3:] = R
+    transfer[:3, 3:] = -R @ skew(T_body_frame[:3, 3])
+    return transfer
+
+
 def turned(covariance: FloatArray, R: FloatArray) -> FloatArray:
     """Covariance (6, 6) of a pose or of a twist in axes that ``R`` (3, 3) turns its own to."""
     turn = np.zeros((6, 6))
