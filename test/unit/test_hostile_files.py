@@ -164,6 +164,15 @@ def test_clouds_that_promise_more_than_they_hold(tmp_path, count):
         assert 'promises' in refused(load_cloud, tmp_path / name)
 
 
+@pytest.mark.parametrize('count', [10**4, 10**9, 10**18])
+@pytest.mark.parametrize('kind', ['ascii', 'binary', 'binary_compressed'])
+def test_clouds_that_promise_points_of_more_values_than_any_sensor_has(tmp_path, count, kind):
+    """The library behind makes a name for each of them."""
+    head = PCD.format(1, kind).replace('COUNT 1 1 1', f'COUNT 1 {count} 1')
+    (tmp_path / 'a.pcd').write_bytes(head.encode() + 100 * b'\0')
+    assert 'promises points of more than 1000 values' in refused(load_cloud, tmp_path / 'a.pcd')
+
+
 def test_a_cloud_without_a_header(tmp_path):
     (tmp_path / 'a.ply').write_bytes(os.urandom(100_000))
     assert 'no header' in refused(load_cloud, tmp_path / 'a.ply')

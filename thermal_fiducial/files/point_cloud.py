@@ -15,6 +15,9 @@ from thermal_fiducial.files.schema import load_yaml
 
 # Counts of a header of PLY or PCD: its elements, points, and their width and height.
 _COUNTS = re.compile(rb'^(?:element +\S+|POINTS|WIDTH|HEIGHT) +([0-9]{1,18})[0-9]*\s*$', re.MULTILINE)
+# How many values each field of a point has, of PCD: the library makes one after the other.
+_VALUES = re.compile(rb'^COUNT((?: +-?[0-9]{1,18})+)', re.MULTILINE)
+_MOST_VALUES = 1000
 _PACKED = re.compile(rb'^DATA +binary_compressed', re.MULTILINE)
 _HEADER_BYTES = 65_536
 _NEEDED = "reading point clouds needs the extra 'cloud': pip install '.[cloud]' in the package's folder"
@@ -104,7 +107,7 @@ def load_alignment(path: str | Path) -> FloatArray:
 
 
 def _check_promise(path: Path) -> None:
-    """Refuse a file whose header promises more points than its bytes can be: a reader would make room for them.
+    """Refuse a file whose header promises more than its bytes can be: a reader would make room for it.
 
     Raises
     ------
@@ -121,6 +124,8 @@ def _check_promise(path: Path) -> None:
     packed = _PACKED.search(header) is not None
     if max(counts) > size * (100 if packed else 1):
         raise InputError(f'{path}: the header promises {max(counts)} points, the file has {size} bytes')
+    if any(int(values) > _MOST_VALUES for line in _VALUES.findall(header) for values in line.split()):
+        raise InputError(f'{path}: the header promises points of more than {_MOST_VALUES} values')
 
 
 def _read_ply(path: Path) -> FloatArray:
