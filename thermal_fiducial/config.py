@@ -15,6 +15,8 @@ from thermal_fiducial.errors import InputError
 Config = TypeVar('Config')
 #: By how much the norm of a quaternion that somebody typed may be off.
 _NORM_TOLERANCE = 0.01
+#: Characters of a value that an error shows.
+_LONGEST_SHOWN = 100
 #: Parameters that rclpy declares on every node.
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
 
@@ -126,11 +128,11 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
     limits = item.metadata
     result = _typed(name, item.default, limits['length'], value)
     if limits['choices'] and result not in limits['choices']:
-        raise InputError(f'parameter {name}: {result!r} is not one of {", ".join(limits["choices"])}')
+        raise InputError(f'parameter {name}: {_shown(result)} is not one of {", ".join(limits["choices"])}')
     low, high = limits['minimum'], limits['maximum']
     for element in result if isinstance(result, tuple) else (result,):
         if (low is not None and not element >= low) or (high is not None and not element <= high):
-            raise InputError(f'parameter {name}: {element!r} is outside {low} .. {high}')
+            raise InputError(f'parameter {name}: {_shown(element)} is outside {low} .. {high}')
     if limits['normed'] and not abs(math.hypot(*result) - 1.0) < _NORM_TOLERANCE:
         raise InputError(f'parameter {name}: {list(result)} is no unit quaternion')
     if limits['verify']:
@@ -138,10 +140,16 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
     return result
 
 
+def _shown(value: object) -> str:
+    """A value as an error shows it: in a line, whatever it is."""
+    text = repr(value)
+    return text if len(text) <= _LONGEST_SHOWN else f'{text[:_LONGEST_SHOWN]}...'
+
+
 def _typed(name: str, default: Any, length: int | None, value: Any) -> Any:
     if isinstance(default, tuple):
         if isinstance(value, str) or not hasattr(value, '__iter__'):
-            raise InputError(f'parameter {name}: {value!r} is not a list')
+            raise InputError(f'parameter {name}: {_shown(value)} is not a list')
         elements = tuple(value)
         if length is not None and len(elements) != length:
             raise InputError(f'parameter {name}: {len(elements)} values, not {length}')
@@ -149,13 +157,13 @@ def _typed(name: str, default: Any, length: int | None, value: Any) -> Any:
     if isinstance(default, float):
         return _number(name, value)
     if not isinstance(value, type(default)) or (isinstance(value, bool) and not isinstance(default, bool)):
-        raise InputError(f'parameter {name}: {value!r} is not of type {type(default).__name__}')
+        raise InputError(f'parameter {name}: {_shown(value)} is not of type {type(default).__name__}')
     return value
 
 
 def _number(name: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f'parameter {name}: {value!r} is not a number')
+        raise InputError(f'parameter {name}: {_shown(value)} is not a number')
     return float(value)
 
 
@@ -269,9 +277,9 @@ def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
         try:
             sizes[int(marker_id)] = float(size)
         except ValueError:
-            raise InputError(f'parameter marker_size_overrides: {entry!r} is not "ID:SIZE"') from None
+            raise InputError(f'parameter marker_size_overrides: {_shown(entry)} is not "ID:SIZE"') from None
         if not 0.0 < sizes[int(marker_id)] < 100.0:
-            raise InputError(f'parameter marker_size_overrides: {entry!r} has no usable size')
+            raise InputError(f'parameter marker_size_overrides: {_shown(entry)} has no usable size')
     return sizes
 
 
@@ -742,4 +750,5 @@ def check_names(names: Iterable[str]) -> None:
         if name.startswith('qos_overrides.'):
             continue
         close = difflib.get_close_matches(name, known, 1)
-        raise InputError(f'parameter {name}: no node has it' + (f'; did you mean {close[0]}?' if close else ''))
+        shown = _shown(name).strip('\'"')
+        raise InputError(f'parameter {shown}: no node has it' + (f'; did you mean {close[0]}?' if close else ''))

@@ -143,6 +143,8 @@ def test_a_name_that_no_node_has_is_refused_with_the_closest_one():
         match=r'noise_densty: no node has it; did you mean imu\.gyroscope_noise_density',
     ):
         check_names(['marker_size', 'imu.gyroscope_noise_densty'])
+    with pytest.raises(InputError, match=r'parameter \\ufeffxyzzy: no node has it$'):
+        check_names(['\ufeffxyzzy'])
     with pytest.raises(InputError, match=r'parameter xyzzy: no node has it$'):
         check_names(['xyzzy'])
     check_names(['gate', 'use_sim_time', 'qos_overrides./tf.publisher.depth'])
