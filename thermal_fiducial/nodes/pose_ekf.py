@@ -18,9 +18,9 @@ from thermal_fiducial.ros.node import ERROR, StageNode, WARN
 from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.run import run
 
-#: IMU messages that have waited so long are a queue: they are taken in together, with one pose at the newest [s].
+#: Waiting time [s] above which IMU messages are processed together, with one pose at the newest.
 _QUEUE_S = 0.03
-#: A pose that comes so late is too old to fly well on; autopilots take none that is older (VISO_DELAY_MS) [s].
+#: Lateness of poses [s]: above the first a warning, above the second an error (autopilots: VISO_DELAY_MS).
 _LATE_S, _TOO_LATE_S = 0.1, 0.25
 
 
@@ -36,9 +36,9 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._status = FilterStatus(self.filter, self.console)
         self._corrections = MapCorrections(self.config.max_delay)
         self._imu = self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT, raw=True)
-        #: for how long [s] the latest IMU message that was looked at has waited; the longest since the diagnostics
+        #: waiting time of the latest IMU message, and the longest since the last diagnostics [s]
         self._waited = self._longest = 0.0
-        #: and the longest before these
+        #: the longest in the period before [s]
         self._behind = 0.0
         #: IMU messages without a pose of their own
         self._without_pose = 0
@@ -55,7 +55,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.filter.configure(config)
 
     def _mount(self) -> None:
-        """Begin anew with the camera where TF has it."""
+        """Reset the filter after TF has changed the pose of the camera on the robot."""
         self.filter.configure(self.config)
         self.filter.reset('the camera is elsewhere on the robot')
 
@@ -71,7 +71,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
             self._outputs.send(odometry, self.filter.smooth, lost=lost, jumps=jumps)
 
     def _newest(self, message: bytes) -> bytes:
-        """The newest IMU message that waits. Poses at those before it would be old, and make the next ones late."""
+        """The newest waiting IMU message; older ones are buffered without a pose, which would make later ones late."""
         for later in self._imu.waiting(qos.IMU_INPUT.depth):
             self.guard(self._keep, message)
             message = later
@@ -115,7 +115,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._memory.save(self.filter, self._outputs.stamp_ns)
 
     def _look_behind(self) -> None:
-        """How long the next IMU message has waited, which is by how much the pose is late."""
+        """Process the next IMU message, and note how long it has waited: by so much the pose is late."""
         oldest = self._imu.take()
         if oldest is not None:
             message, self._waited = oldest
@@ -123,7 +123,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
             self.guard(self._on_imu, message)
 
     def state(self) -> tuple[bytes, str]:
-        """What the filter says of itself, why it refused the last pose, and by how much it is late."""
+        """Level and words: status of the filter, reason of the last refused pose, lateness."""
         level, words = self._status.state()
         if self._behind < _LATE_S:
             return level, words
@@ -131,12 +131,12 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         return max(level, late), f'{words}; no time: IMU messages wait for {self._behind:.2g} s'
 
     def headline(self) -> str:
-        """What the filter does, without numbers."""
+        """Status of the filter without numbers."""
         words = self._status.headline()
         return words if self._behind < _LATE_S else f'{words}; no time: the pose comes late'
 
     def figures(self) -> dict[str, object]:
-        """The filter in numbers."""
+        """Numbers of the filter for the diagnostics."""
         return self._status.figures() | {'IMU messages without a pose': self._without_pose}
 
 

@@ -68,11 +68,11 @@ class CameraStageNode(StageNode[Config]):
         return {'calibrations': self._calibrations}
 
     def _on_odometry(self, message: bytes) -> None:
-        """A few of these are wanted at frame rate, and only they are read."""
+        """Keep odometry as bytes: only the few states that frames need are decoded."""
         self.odometry.add(message_bytes.stamp_ns(message), message)
 
     def _read_odometry(self, messages: Sequence[bytes]) -> list[Odometry]:
-        """A hint that cannot be used is dropped, not the frame that asks for it."""
+        """Decode odometry; unusable messages are refused, the frame is processed without them."""
         try:
             return message_bytes.odometry(messages)
         except InputError as error:
@@ -85,7 +85,7 @@ class CameraStageNode(StageNode[Config]):
         self.odometry.set_clock_offset(message_bytes.clock_offset(message))
 
     def _on_camera_info(self, message: bytes) -> None:
-        """Most drivers send the same calibration with each frame: only another one is read, and checked."""
+        """Read and check a calibration that differs from the last; most drivers send the same one with each frame."""
         if message[message_bytes.BEHIND_STAMP :] == self._camera_info:
             return
         camera = convert.camera(message_bytes.read(message, CameraInfo, 'camera_info'))

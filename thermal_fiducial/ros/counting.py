@@ -1,6 +1,6 @@
-"""A node that counts what comes in and what goes out.
+"""A node that counts received and published messages.
 
-From the counts a lock-step replay knows when everything that was published has been received.
+By these counts a lock-step replay knows when everything that was published has been received.
 """
 
 from collections.abc import Callable, Iterator
@@ -38,23 +38,23 @@ class Input:
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
-        #: messages that were taken, or left for newer ones
+        #: messages that were taken, or skipped for newer ones
         self.count = 0
-        #: messages that were left because a newer one had come when their turn was
+        #: messages that were skipped because a newer one had arrived
         self.left = self._left_before = 0
         self._subscription: Any = None
 
     def left_since(self) -> int:
-        """Messages that were left since the last time that this was asked."""
+        """Messages that were skipped since the last call."""
         left, self._left_before = self.left - self._left_before, self.left
         return left
 
     def attach(self, subscription: Any) -> None:
-        """Remember the subscription that counts here."""
+        """Set the subscription that is counted."""
         self._subscription = subscription
 
     def take(self) -> tuple[Any, float] | None:
-        """The message that has waited longest, and for how long [s]; it is counted. None where none waits."""
+        """Take and count the oldest waiting message; returns it and its waiting time [s], None if there is none."""
         subscription = self._subscription
         with subscription.handle:
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
@@ -79,7 +79,7 @@ class Input:
 
 
 class CountingNode(Node):
-    """A node that knows how much came in and went out on each of its topics."""
+    """A node that counts messages on each of its topics."""
 
     def __init__(self, name: str, **kwargs: Any) -> None:
         #: subscriptions whose messages wait until they are wanted
@@ -111,9 +111,9 @@ class CountingNode(Node):
     def subscribe_newest(
         self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile, *, raw: bool = False
     ) -> Input:
-        """Call ``callback`` with the newest message that has come; what is older by then is left and counted.
+        """Call ``callback`` with the newest message; older ones are skipped and counted.
 
-        What waits on other topics (:meth:`subscribe_lazily`) is taken first.
+        Messages that wait on other topics (:meth:`subscribe_lazily`) are taken first.
         """
         source = Input(self.resolve_topic_name(topic))
 
@@ -130,9 +130,9 @@ class CountingNode(Node):
         return source
 
     def subscribe_lazily(self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile) -> Input:
-        """Have messages wait, as many as ``profile`` keeps, for :meth:`take_waiting`: their bytes go to ``callback``.
+        """Let messages wait, as many as ``profile`` keeps; :meth:`take_waiting` passes their bytes to ``callback``.
 
-        Nobody is woken for a message that is wanted with the next frame only.
+        They do not wake the executor, as they are needed with the next frame only.
         """
         source = Input(self.resolve_topic_name(topic))
         subscription = self.create_subscription(kind, topic, callback, profile, raw=True)
@@ -143,15 +143,15 @@ class CountingNode(Node):
 
     @property
     def subscriptions(self) -> Iterator[Any]:
-        """Those whose messages the executor takes."""
+        """Inputs whose messages the executor takes."""
         return (subscription for subscription in super().subscriptions if subscription not in self.lazy)
 
     def take_waiting(self) -> None:
-        """Take the messages that wait until they are wanted, in the order of their topics' subscription."""
+        """Take all waiting messages of lazy subscriptions, in the order of subscription."""
         for subscription, source in self.lazy.items():
             for message in source.waiting(subscription.qos_profile.depth):
                 self.guard(subscription.callback, message)
 
     def guard(self, callback: Callable[[Any], None], message: Any) -> None:
-        """Call ``callback``; what a node makes of unusable input is its own matter."""
+        """Call ``callback``; subclasses handle its errors."""
         callback(message)

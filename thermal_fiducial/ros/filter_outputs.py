@@ -1,4 +1,4 @@
-"""What the filter publishes for every IMU message: pose, odometry, the bridge's messages, TF, and the path."""
+"""Outputs of the filter for every IMU message: pose, odometry, the bridge's messages, TF; and the path."""
 
 from collections import deque
 from collections.abc import Callable

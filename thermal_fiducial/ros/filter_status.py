@@ -1,4 +1,4 @@
-"""What a filter says of itself: diagnostics in words and numbers, and how often its pose has jumped."""
+"""Status of the filter: diagnostics in words and numbers, lines on the console, count of jumps of the pose."""
 
 import re
 
@@ -9,7 +9,7 @@ from thermal_fiducial.ros.console import Console
 from thermal_fiducial.ros.node import ERROR, OK, WARN
 
 _WAITING = 'waiting for markers'
-#: No pose is on its way for so long, nor is it so far ahead [s].
+#: Difference of the stamps of IMU and poses that no delay explains [s]: they have two clocks.
 _APART_S = 2.5
 
 
@@ -18,10 +18,10 @@ class FilterStatus:
 
     def __init__(self, filter_: PoseEkf, console: Console) -> None:
         self._filter, self._console = filter_, console
-        #: how often the pose has jumped: starts, resets and corrections of the map
+        #: number of jumps of the pose: initialisations, resets, corrections of the map
         self.jumps = 0
         self._resets: int | None = None
-        #: the status without numbers and what was said of it, whether it was lost then, and ever not
+        #: last status without numbers, its console line, whether the pose was lost then, and ever initialised
         self._words, self._headline, self._was_lost, self._initialised = '', '', True, False
         self._last_refusal = ''
         #: of the latest IMU sample and camera pose; None before there is one

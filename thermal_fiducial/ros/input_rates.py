@@ -1,7 +1,7 @@
-"""How often the inputs of a node come, and which have stopped: what diagnostic_updater checks in C++ nodes.
+"""Rates of a node's inputs, and inputs that have stopped: what diagnostic_updater checks in C++ nodes.
 
-The main input is the first that the node subscribed to. Its rate is compared with the one that is expected, which is a
-parameter or what the first seconds showed; any other input that came all the time is missed when it stops.
+The main input is the first one that the node subscribed to. Its rate is compared with the expected one, a parameter or
+the rate of the first seconds. Any other steady input is reported when it stops.
 """
 
 from collections import deque

@@ -1,4 +1,4 @@
-"""What a mapper says of itself: diagnostics in words and numbers, and what is worth a line on the console."""
+"""Status of the mapper: diagnostics in words and numbers, lines on the console."""
 
 from collections.abc import Iterable
 

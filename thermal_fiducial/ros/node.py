@@ -1,7 +1,7 @@
 """Base of the nodes: parameters, a guard round each callback, diagnostics and console lines once a second.
 
-A node lives on whatever it is given: a message that cannot be used raises :class:`InputError` in the conversion or in
-the core, the guard turns it into a warning and a diagnostic.
+Unusable input never ends a node: it raises :class:`InputError` in the conversion or in the core, which the guard turns
+into a warning and a diagnostic.
 """
 
 from collections.abc import Callable
@@ -29,9 +29,9 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 
 #: Parameters with names of frames that are on the robot; the map is nobody's.
 _ROBOT_FRAMES = ('base_frame', 'camera_frame', 'odom_frame', 'frame_id')
-#: Parameters that say how often the main input of a node comes.
+#: Parameters with the expected rate of a node's main input.
 _RATES = ('image_rate', 'imu_rate')
-#: Characters of what was wrong with an input: it may quote a name of a megabyte, and goes to console and diagnostics.
+#: Longest error message [characters] on console and in diagnostics: it may quote input of any length.
 _LONGEST_REASON = 400
 
 
@@ -52,7 +52,7 @@ class StageNode(CountingNode, Generic[Config]):
         A parameter that no node has, of the wrong type, out of range, or not among the choices.
     """
 
-    #: how many stages a frame has behind it when it comes here: what is nearly done goes before what begins
+    #: number of stages before this one: later stages have a higher priority
     stage = 0
 
     def __init__(self, name: str, kind: type[Config], *, live: bool = True, **kwargs: Any) -> None:
@@ -63,20 +63,20 @@ class StageNode(CountingNode, Generic[Config]):
         except InputError:
             self.destroy_node()
             raise
-        #: last work of its parts before the node is destroyed
+        #: called before the node is destroyed
         self.endings: list[Callable[[], None]] = []
-        #: parameters that something else decides than their values
+        #: parameters whose values are overridden, for example by TF
         self._derived: dict[str, Any] = {}
-        #: before the names of the robot's frames
+        #: prefix of the names of the robot's frames
         self.frame_prefix = ''
         if getattr(self.config, 'prefix_frames', False):
             self.frame_prefix = f'{self.get_namespace()}/'.lstrip('/')
             frames = {name: getattr(self.config, name, '') for name in _ROBOT_FRAMES}
             self.derive(**{name: self.frame_prefix + frame for name, frame in frames.items() if frame})
         asked = int(getattr(self.config, 'realtime_priority', 0))
-        #: of its process under SCHED_FIFO; 0: ordinary
+        #: priority of the process under SCHED_FIFO; 0: an ordinary process
         self.realtime_priority = asked + self.stage if asked else 0
-        #: what was configured and cannot be used, in words; the node does without it
+        #: faults of the configuration, in words; the node runs without the parts concerned
         self.faults: list[str] = []
         self.refused = 0
         self.last_refusal = ''
@@ -90,7 +90,7 @@ class StageNode(CountingNode, Generic[Config]):
             self.create_timer(1.0, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def derive(self, **values: Any) -> None:
-        """Have parameters at other ``values`` than they were set to, from now on and whatever is set.
+        """Override parameters by ``values``, whatever they are set to, now or later.
 
         Raises
         ------
@@ -104,11 +104,11 @@ class StageNode(CountingNode, Generic[Config]):
         return replace(config, **self._derived)  # type: ignore[type-var]
 
     def configure(self, config: Config) -> None:
-        """Take over a config with other live parameters."""
+        """Take over a config with changed live parameters."""
         self.config = config
 
     def attempt(self, make: Callable[[], Made], default: Made) -> Made:
-        """What ``make`` makes of something configured; ``default``, and a fault, if that cannot be used."""
+        """Result of ``make``; if it raises InputError, ``default`` and a fault of the configuration."""
         try:
             return make()
         except InputError as error:
@@ -121,21 +121,18 @@ class StageNode(CountingNode, Generic[Config]):
         self.get_logger().error(reason)
 
     def guard(self, callback: Callable[[Any], None], message: Any) -> None:
-        """Call ``callback``; warn of unusable input and live on.
-
-        What nobody foresaw is logged with its traceback: a node that dies in flight helps nobody find it.
-        """
+        """Call ``callback``; warn of unusable input, and log any other exception with its traceback."""
         try:
             callback(message)
         except InputError as error:
             self.refuse(one_line(error, _LONGEST_REASON))
         except Exception as error:
-            # Asked to stop in the middle of it, rcl lets it publish nothing: not an error of the node.
+            # While the node is being shut down publishing fails: no error of the node.
             if self.context.ok():
                 self.refuse(self._unforeseen(error))
 
     def serve(self, kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
-        """A service; what ``answer`` cannot do is said in the response, which has ``success`` and ``message``."""
+        """Offer a service; errors of ``answer`` go into the response's ``success`` and ``message``."""
 
         def guarded(request: Any, response: Any) -> Any:
             try:
@@ -150,12 +147,12 @@ class StageNode(CountingNode, Generic[Config]):
         self.create_service(kind, name, guarded)
 
     def _unforeseen(self, error: Exception) -> str:
-        """Log an error that nobody foresaw, and say it in a line."""
+        """Log an unexpected exception; returns a line about it."""
         self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
         return f'{INTERNAL_ERROR}: {type(error).__name__}: {one_line(error)}'
 
     def refuse(self, reason: str) -> None:
-        """Count a message that could not be used; the first and then one a second is logged."""
+        """Count a refused message; the first and then at most one a second is logged."""
         if self.refused == self._diagnosed_refused:
             self.get_logger().warning(reason)
         self.refused += 1
@@ -166,7 +163,7 @@ class StageNode(CountingNode, Generic[Config]):
         return OK, 'ok'
 
     def headline(self) -> str:
-        """What a pilot must know of the stage, in few words without numbers: a change of it goes to the console."""
+        """Status of the stage for a pilot, a few words without numbers: changes are printed on the console."""
         return ''
 
     def figures(self) -> dict[str, object]:
@@ -179,7 +176,7 @@ class StageNode(CountingNode, Generic[Config]):
             end()
 
     def diagnose(self, stamp_ns: int) -> None:
-        """Publish the diagnostics of the time since the last call, and what a pilot must know of it."""
+        """Publish the diagnostics of the time since the last call, and print changes of the headline."""
         self.take_waiting()
         self._rates.look(time.monotonic_ns() if self.live else stamp_ns)
         level, reason = self._level()
@@ -196,7 +193,7 @@ class StageNode(CountingNode, Generic[Config]):
         self._diagnosed_refused = self.refused
 
     def _level(self) -> tuple[bytes, str]:
-        """What is worst: something configured, unusable input, none, what the stage says, its rate."""
+        """Level and words of the worst of: configuration, refused input, missing input, stage, rate."""
         if self.faults:
             return ERROR, '; '.join(self.faults)
         if self.refused > self._diagnosed_refused:

@@ -51,13 +51,13 @@ class PlanarPoses:
     def ambiguous(self, ratio: float = 10.0) -> BoolArray:
         """Of which markers (N,) the image allows the other branch.
 
-        Its squared error is below ``ratio`` times the first one's, or of 2, which is what the errors of corners with
-        consistent covariances come to.
+        Its squared error is below ``ratio`` times that of the first branch, or times 2 if that is larger, the
+        expectation for consistent covariances.
         """
         return np.asarray(self.chi2[:, 1] <= ratio * np.maximum(self.chi2[:, 0], 2.0))
 
     def swapped(self, which: BoolArray) -> 'PlanarPoses':
-        """The other branch of the markers ``which`` (N,) first."""
+        """The poses with the branches of the markers ``which`` (N,) swapped."""
         return self.ordered(np.stack([which, ~which], axis=1).astype(np.intp))
 
     def ordered(self, branches: IntArray) -> 'PlanarPoses':
@@ -82,7 +82,7 @@ def solve_marker_poses(
 
 
 def planar_poses(corners: ImagePoints, corner_covs: FloatArray, sizes: FloatArray) -> PlanarPoses:
-    """:func:`solve_marker_poses` of corners (N, 4) that are known in both coordinates."""
+    """:func:`solve_marker_poses` for corners (N, 4) given as image points."""
     twice = np.repeat(np.arange(len(sizes)), 2)
     once, points = Images.of(corners, whitening(corner_covs)), marker_corners(sizes[twice])
     images = Images(once.whitening[twice], once.target[twice])
@@ -110,8 +110,8 @@ def choose_branches(
 ) -> PlanarPoses:
     """The poses of a frame's markers with the likelier branch first.
 
-    What decides between branches that the image allows is the attitude of the camera. Where several known markers are
-    in view, it is that of the branch, or of the prediction, that explains all of them best; else the predicted one.
+    Between branches that the image allows, the attitude of the camera decides: with several known markers in view the
+    one, of all branches and the prediction, that explains all of them best; else the predicted one.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def choose_branches(
 
 
 class CameraFit:
-    """What all fits of the camera to one frame's N markers of known pose have in common.
+    """Fits of the camera to N markers of known pose in one frame; holds what all of them share.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ class CameraFit:
     """
 
     def __init__(self, corners: FloatArray, covs: FloatArray, squares: FloatArray, camera: Camera) -> None:
-        # Turned about the middle between the markers, translation and rotation hardly depend on each other.
+        # Rotations about the centre of the markers: translation and rotation are then nearly uncorrelated.
         middle = squares.mean(axis=(0, 1))
         self._T_map_middle = se3.transform(np.eye(3), middle)
         self._points = (squares - middle).reshape(1, -1, 3)

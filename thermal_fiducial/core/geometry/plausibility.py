@@ -1,6 +1,6 @@
-"""What a camera, a position and a covariance can be: the bounds that every stage may rely on.
+"""Plausible ranges of cameras, positions and covariances, which every stage may rely on.
 
-They are far beyond anything real, and near enough that squares and products of what passes stay finite.
+They are far beyond anything real, and small enough that squares and products of accepted values stay finite.
 """
 
 from typing import TYPE_CHECKING
@@ -19,14 +19,14 @@ LARGEST_COORDINATE = 1e5
 SMALLEST_VARIANCE, LARGEST_VARIANCE = 1e-20, 1e8
 #: Least share of a variance that the other components may leave unexplained; rounding takes less than a tenth of it.
 _LEAST_INDEPENDENT = 1e-12
-#: What stands for no variance where there may be none: a share of the largest, and this [m^2, rad^2].
+#: Added to variances that may be zero, before the check: a share of the largest one, and this [m^2, rad^2].
 _NO_SHARE, _NO_VARIANCE = 1e-9, 1e-15
 #: Relative difference of entries that should be equal, by rounding of a few operations.
 _ROUNDING = 1e-9
 #: Focal length and distance of the principal point from the image, in longer sides of the image.
 _FOCAL_RANGE, _FARTHEST_CENTRE = (0.02, 1000.0), 1.0
 _IMAGE_SIDES = (8, 16384)
-#: Half-way from the centre to the corners a distortion must be one that can be undone, to this [px].
+#: Error [px] to which a distortion must be invertible half-way from the centre to the corners.
 _ROUND_TRIP_PX = 1.0
 
 
@@ -55,7 +55,7 @@ def checked_covariance(values: FloatArray, what: str, *, partial: bool = False) 
     if not np.abs(P).max() <= high:
         raise InputError(f'{what} that is not positive definite')
     try:
-        # A smaller diagonal asks, in any units of the components, for the least that each has for itself.
+        # A reduced diagonal tests the least own variance of each component, whatever their units.
         np.linalg.cholesky(P - _LEAST_INDEPENDENT * eye * P)
     except np.linalg.LinAlgError:
         raise InputError(f'{what} that is not positive definite') from None
@@ -63,7 +63,7 @@ def checked_covariance(values: FloatArray, what: str, *, partial: bool = False) 
 
 
 def require_usable(camera: 'Camera') -> 'Camera':
-    """``camera``, if it can be that of a lens.
+    """``camera``, if it is plausible.
 
     Raises
     ------

@@ -38,7 +38,7 @@ def difference(T: npt.ArrayLike, T_reference: npt.ArrayLike) -> FloatArray:
 
 
 def lever_arm(arm: FloatArray) -> FloatArray:
-    """What moves (..., 6, 6) a point fixed on a body, at ``arm`` (..., 3) from its origin, as ``d`` moves the body."""
+    """Map (..., 6, 6) from a displacement ``d`` of a body to that of a point at ``arm`` (..., 3) from its origin."""
     J = np.zeros((*arm.shape[:-1], 6, 6))
     J[...] = np.eye(6)
     J[..., :3, 3:] = -skew(arm)
@@ -55,7 +55,7 @@ def twist_transfer(T_body_frame: FloatArray) -> FloatArray:
 
 
 def turned(covariance: FloatArray, R: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of a pose or of a twist in axes that ``R`` (3, 3) turns its own to."""
+    """Covariance (6, 6) of a pose or twist, rotated by ``R`` (3, 3) into other axes."""
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = R
     return np.asarray(turn @ covariance @ turn.T)

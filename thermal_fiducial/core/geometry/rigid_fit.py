@@ -1,8 +1,8 @@
-"""Poses by Levenberg-Marquardt on a batch; above all those of rigid bodies of known points from their noisy images.
+"""Batched Levenberg-Marquardt for poses, in particular of rigid bodies of known points from their noisy images.
 
-For images the lens is taken out once: at the measured pixel its distortion is undone, and what a small deviation there
-means in pixels is folded into the whitening. What is left to be minimised is a pinhole projection. The weight of a
-residual is right to the order of residual over focal length, and a residual of zero stays zero.
+The lens distortion is removed once: measured pixels are undistorted, and the derivative of the distortion there enters
+the whitening. What is minimised is a pinhole projection. The weight of a residual is exact to the order of residual
+over focal length, and a residual of zero stays zero.
 """
 
 from collections.abc import Callable
@@ -24,13 +24,13 @@ _LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-2, 50.0, 1e-2, 10.0
 #: Damping of Levenberg-Marquardt: factors on it after a step that was better, and one that was not; and that at which
 #: no better one is found at all.
 EASED, STIFFENED, MOST_DAMPED = 0.1, 10.0, 1e6
-# Depth [m] from which a point is in front of the camera.
+# Least depth [m] of a point in front of the camera.
 _NEAR = 1e-6
-# Stands in for a start that does not exist.
+# Replaces an initial pose that is not finite.
 _AHEAD = se3.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.0])
-# Variance of a parameter, over what it would be with the others known, from which it counts as unknown.
+# Ratio of a parameter's variance to its variance with the others known, above which it counts as undetermined.
 _UNKNOWN = 1e13
-#: Share of the largest information that keeps the others from being none.
+#: Ridge that keeps information matrices regular, as a share of their largest entry.
 SINGULAR = 1e-12
 _MINUS_SKEW = -se3.SKEW
 
@@ -53,7 +53,7 @@ class Images:
 
     @staticmethod
     def of(points: ImagePoints, whitening: FloatArray) -> 'Images':
-        """Of points (B, K) whose noise ``whitening`` (B, K, 2, 2) [1/px] makes unit white."""
+        """The whitened image of points (B, K); ``whitening`` (B, K, 2, 2) [1/px] of their noise."""
         W = whitening @ points.J
         return Images(W, (W @ points.x[..., None])[..., 0])
 
@@ -69,7 +69,7 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
     ----------
     evaluated : of poses the cost, half its gradient and half its Gauss-Newton Hessian for steps of the origin and
         rotations about it, both in the parent frame
-    alternatives : so many starts in a row are of the same body, and matter only where they may be the best
+    alternatives : number of consecutive starts of the same body, of which only the best is needed
 
     Returns
     -------
@@ -141,7 +141,7 @@ def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = 
 
 
 def _robust(squared: FloatArray, inlier: float) -> tuple[FloatArray, FloatArray | None]:
-    """Costs of squared errors, and by how much their influence falls; None: of none."""
+    """Robust costs of squared errors, and the factors on their influence; None if all are inliers."""
     if inlier == np.inf:
         return squared, None
     excess = np.maximum(squared / inlier**2, 1.0)
@@ -149,10 +149,10 @@ def _robust(squared: FloatArray, inlier: float) -> tuple[FloatArray, FloatArray 
 
 
 def covariances(information: FloatArray) -> FloatArray:
-    """Covariances (B, 6, 6); where nothing is known of some direction, the pseudo-inverse would hide it: inf."""
+    """Covariances (B, 6, 6); inf where some direction is undetermined, which a pseudo-inverse would hide."""
     scale = np.sqrt(np.maximum(np.einsum('...ii->...i', information), 1e-300))
     scale = scale[..., :, None] * scale[..., None, :]
-    # The ridge is below the rounding of what is known, and keeps what is not from being exactly singular.
+    # The ridge is below the rounding of determined directions, and keeps undetermined ones from being singular.
     inflation = np.linalg.inv(information / scale + 1e-14 * np.eye(6))
     own = np.einsum('...ii->...i', inflation)
     known = np.all((own > 0.0) & (own < _UNKNOWN), axis=-1)
