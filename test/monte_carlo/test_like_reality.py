@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support.corner_runs import fly
 from support.filter_scenes import of_flights, starved
+from support.opencv import opencv_detector
 from support.sim_flights import simulated
 
 from thermal_fiducial.sim.corner_flight import corner_frames
@@ -30,7 +31,7 @@ def test_edges_of_the_carpet_bleed():
     (frame,) = render_frames('carpet', 20.0, start=150, stop=151)
     assert frame.counts.max() == 255
     seen = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
-    found, ids, _ = cv2.aruco.ArucoDetector(seen).detectMarkers(frame.counts.astype(np.uint8))
+    found, ids, _ = opencv_detector(seen).detectMarkers(frame.counts.astype(np.uint8))
     assert len(found) > 15
     profile = [_edge_displacement(frame, frame.corners_px[int(key)]) for key in ids.ravel() if key in frame.corners_px]
     # Half of full scale against half of the step from black to white, by the same blur everywhere.

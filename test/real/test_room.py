@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from support.batch_map import adjust
-from support.opencv import opencv_dictionary
+from support.opencv import opencv_detector, opencv_dictionary
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry.camera import Camera
@@ -18,9 +18,7 @@ from thermal_fiducial.files.marker_map import load_map
 
 def opencv_corners(photos):
     """Photo, ID and corners of every tag that OpenCV finds."""
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    detector = cv2.aruco.ArucoDetector(opencv_dictionary(load_dictionary('DICT_APRILTAG_36h11')), parameters)
+    detector = opencv_detector(opencv_dictionary(load_dictionary('DICT_APRILTAG_36h11')), subpixel=True)
     views = []
     for photo in sorted(photos.iterdir()):
         corners, ids, _ = detector.detectMarkers(cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE))

@@ -6,7 +6,7 @@ import csv
 import cv2
 import numpy as np
 import pytest
-from support.opencv import opencv_dictionary
+from support.opencv import opencv_detector, opencv_dictionary
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
@@ -32,9 +32,7 @@ def ours(picture):
 
 
 def opencv(picture):
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    corners, ids, _ = cv2.aruco.ArucoDetector(opencv_dictionary(DICTIONARY), parameters).detectMarkers(picture)
+    corners, ids, _ = opencv_detector(opencv_dictionary(DICTIONARY), subpixel=True).detectMarkers(picture)
     found = [] if ids is None else ids.ravel().tolist()
     return {key: quad.reshape(4, 2).astype(float) for key, quad in zip(found, corners, strict=True)}
 

@@ -1,13 +1,29 @@
-"""OpenCV's own drawing and detection of markers, to compare with."""
+"""OpenCV's own drawing and detection of markers, to compare with; before 4.7 it has them otherwise, or not."""
 
 import cv2
 import numpy as np
+import pytest
 
-#: Picture of a marker, from a dictionary of OpenCV, its ID and the side in pixels; it has its later name since 4.7.
+#: Picture of a marker, from a dictionary of OpenCV, its ID and the side in pixels.
 draw_marker = getattr(cv2.aruco, 'generateImageMarker', None) or cv2.aruco.drawMarker
 
 
 def opencv_dictionary(dictionary):
     """A dictionary of ours as OpenCV's detector wants it."""
+    _need_4_7()
     packed = np.concatenate([cv2.aruco.Dictionary.getByteListFromBits(bits) for bits in dictionary.bits])
     return cv2.aruco.Dictionary(packed, dictionary.bits.shape[1], dictionary.correctable)
+
+
+def opencv_detector(dictionary, *, subpixel=False):
+    """OpenCV's detector of a dictionary of its own."""
+    _need_4_7()
+    parameters = cv2.aruco.DetectorParameters()
+    if subpixel:
+        parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return cv2.aruco.ArucoDetector(dictionary, parameters)
+
+
+def _need_4_7():
+    if not hasattr(cv2.aruco, 'ArucoDetector'):
+        pytest.skip(f'OpenCV {cv2.__version__} has no ArucoDetector')

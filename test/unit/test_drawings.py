@@ -12,7 +12,7 @@ import pytest
 from shapely import affinity
 from shapely.geometry import box, Point, Polygon
 from shapely.ops import unary_union
-from support.opencv import opencv_dictionary
+from support.opencv import opencv_detector, opencv_dictionary
 
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.errors import InputError
@@ -293,7 +293,7 @@ def test_preview_is_detected_as_the_marker(tmp_path):
     path = tmp_path / 'marker.png'
     write(marker_drawing(BITS[21], '21', PlateOptions()), path)
     preview = cv2.copyMakeBorder(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), *[60] * 4, cv2.BORDER_CONSTANT, value=190)
-    _, ids, _ = cv2.aruco.ArucoDetector(opencv_dictionary(dictionary)).detectMarkers(preview)
+    _, ids, _ = opencv_detector(opencv_dictionary(dictionary)).detectMarkers(preview)
     assert ids is not None
     assert ids.ravel().tolist() == [21]
 

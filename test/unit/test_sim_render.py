@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
+from support.opencv import opencv_detector
 from support.tiny import LENS, TINY
 
 from thermal_fiducial.errors import InputError
@@ -143,7 +144,7 @@ def test_corners_are_clockwise_from_the_top_left_and_the_code_reads():
     low, high = np.percentile(frame.counts, [1, 99])
     gray = np.clip((frame.counts - low) / (high - low) * 255, 0, 255).astype(np.uint8)
     gray = cv2.resize(gray, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
-    corners, ids, _ = cv2.aruco.ArucoDetector(TINY.aruco_dictionary).detectMarkers(gray)
+    corners, ids, _ = opencv_detector(TINY.aruco_dictionary).detectMarkers(gray)
     assert sorted(ids.ravel().tolist()) == [5, 7]
     for found, marker_id in zip(corners, ids.ravel().tolist(), strict=True):
         # Unrefined corners in an enlarged picture: a pixel is enough to show the order.
