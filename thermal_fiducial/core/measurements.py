@@ -91,8 +91,10 @@ class Observations(Stacked):
     @staticmethod
     def of(markers: Markers) -> 'Observations':
         """Observations of rows with valid corners; rows whose ID occurs twice are left out as ambiguous."""
-        corners, covariances, poses = corners_px(markers), corner_covariances(markers), _numbers(markers, _BRANCHES)
-        poses = poses.reshape(-1, 2, 7)
+        numbers = _numbers(markers, _CORNERS + _COVARIANCES + _BRANCHES)
+        corners = numbers[:, : len(_CORNERS)].reshape(-1, 4, 2)
+        covariances = numbers[:, len(_CORNERS) : -len(_BRANCHES)].reshape(-1, 4, 2, 2)
+        poses = numbers[:, -len(_BRANCHES) :].reshape(-1, 2, 7)
         with np.errstate(invalid='ignore', divide='ignore'):
             branches = transform_from_quaternion(poses[..., :3], poses[..., 3:])
         observations = Observations(markers['id'].astype(np.int64), corners, covariances, branches)

@@ -171,6 +171,8 @@ class LocatedFrame:
     #: the camera pose by odometry
     predicted: PredictedCamera | None
     outcome: Location | Refusal
+    #: to publish; None without one, or if its attitude is too uncertain
+    pose: CameraPose | None
 
     @property
     def new(self) -> Observations:
@@ -199,11 +201,6 @@ class LocatedFrame:
         by_marker = np.einsum('nri,nri->n', seen.J_marker @ known.map_covariances, seen.J_marker)
         explained = 2.0 * known.noise_px**2 + np.nan_to_num(by_camera + by_marker) / 4.0 + INCONSISTENT_PX**2
         return errors, np.sqrt(explained)
-
-    @property
-    def pose(self) -> CameraPose | None:
-        """The pose to publish; None without one, or if its attitude is too uncertain."""
-        return None if isinstance(self.outcome, Refusal) or self.outcome.reason else self.outcome.pose
 
 
 def predicted_camera(

@@ -121,7 +121,8 @@ class MarkerMapper:
             outcome = locate(stamp_ns, sight, running_errors, camera, T_expected, self._errors)
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
-        return LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome)
+        pose = None if isinstance(outcome, Refusal) or outcome.reason else outcome.pose
+        return LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome, pose)
 
     @property
     def _errors(self) -> SystematicErrors:

@@ -74,7 +74,9 @@ class Trust:
         if len(known) < 2:
             return False
         ratios = errors_px / explained_px
-        blamed = inconsistent(ratios > DISAGREEMENT, known.tolist())
+        blamed = ratios > DISAGREEMENT
+        if blamed.any():
+            blamed = inconsistent(blamed, known.tolist())
         changed = False
         for marker, record, bad, error, ratio in zip(known, records, blamed, errors_px, ratios, strict=True):
             record.disagreement += MEMORY * (float(bad) - record.disagreement)
