@@ -36,6 +36,12 @@ def test_tables_are_up_to_date():
         assert page.read_text(encoding='utf-8') == text
 
 
+def test_each_measured_table_is_on_a_page():
+    pages = ''.join(page.read_text(encoding='utf-8') for page in documents.PAGES)
+    missing = [path.stem for path in (ROOT / 'doc' / 'tables').glob('*.md') if f'<!-- {path.stem} -->' not in pages]
+    assert missing == []
+
+
 @pytest.mark.parametrize('node', NODES | OPTIONAL_NODES)
 def test_each_node_is_on_the_page(node):
     page = (ROOT / 'doc' / 'nodes.md').read_text(encoding='utf-8')
