@@ -145,8 +145,9 @@ class MarkerMapper:
             # Step 8: new markers placed relative to the camera.
             if not self.frozen:
                 self._memory.keep(frame.observed, outcome.pose, frame.camera, frame.predicted)
-                placed, waiting = self._place_new(frame, outcome.viewpoint)
-                changed |= placed
+                if not frame.is_known.all():
+                    placed, waiting = self._place_new(frame, outcome.viewpoint)
+                    changed |= placed
         return MapperResult(
             frame.stamp_ns, frame.pose, outcome.reason, changed, frozenset(frame.known.observed.ids.tolist()), waiting,
             dict(self._trust.quarantined), not self.frozen and (changed or updated),
@@ -172,7 +173,7 @@ class MarkerMapper:
     def _without_pose(self, frame: LocatedFrame, refusal: Refusal) -> tuple[bool, Waiting]:
         """Views of new markers from a frame without a pose: with two possible camera poses, or one by odometry."""
         predicted, longest = frame.predicted, self.config.bridge_duration
-        if self.frozen or not len(frame.new.ids):
+        if self.frozen or frame.is_known.all():
             return False, {}
         if refusal.viewpoint is not None:
             return self._place_new(frame, refusal.viewpoint)
