@@ -99,6 +99,14 @@ def test_the_fold_is_where_the_distorted_radius_falls(model):
     assert folds > 5
 
 
+@pytest.mark.parametrize('model', ['plumb_bob', 'rational_polynomial', 'equidistant'])
+@pytest.mark.parametrize('size', [5e-324, 1e-313, 1e-160, 1e160, 1e300])
+def test_coefficients_of_any_size_do_not_break_a_projection(model, size):
+    D = np.full(MODELS[model], size)
+    with np.errstate(all='ignore'):
+        assert Camera(640, 512, K, model, D).project([0.0, 0.0, 1.0]).shape == (2,)
+
+
 def test_points_beyond_the_fold_are_not_seen():
     """A strong barrel polynomial folds back: a point far outside would land in the image."""
     camera = Camera(640, 512, K, 'plumb_bob', [-0.3, 0.0, 0.0, 0.0, 0.0])

@@ -23,6 +23,8 @@ MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 # Newton's iteration doubles the digits: after a step this small nothing is left, and ten are enough at any lens's
 # border.
 _STEPS, _SHORT = 10, 1e-6
+# A last coefficient below this has no root at any angle that a lens can have, but makes the others' overflow.
+_NO_COEFFICIENT = 1e-15
 # Coefficients of the derivative of angle + k1 angle^3 + k2 angle^5 ... with respect to the angle.
 _RISE = np.array([1.0, 3.0, 5.0, 7.0, 9.0])
 _EYE = np.eye(3)
@@ -163,7 +165,8 @@ class Camera:
         k1, k2, _, _, k3, k4, k5, k6 = [*self.D, 0.0, 0.0, 0.0][:8]
         above, below, s = Polynomial((1.0, k1, k2, k3)), Polynomial((1.0, k4, k5, k6)), Polynomial((0.0, 1.0))
         # Numerator of the derivative of r above(r^2) / below(r^2), and the pole.
-        rise = above * below + 2.0 * s * (above.deriv() * below - above * below.deriv())
+        with np.errstate(over='ignore', invalid='ignore'):
+            rise = above * below + 2.0 * s * (above.deriv() * below - above * below.deriv())
         return math.sqrt(min(_least_root(rise), _least_root(below)))
 
     @cached_property
@@ -211,7 +214,9 @@ class ImagePoints(Stacked):
 
 def _least_root(polynomial: Polynomial) -> float:
     """Smallest positive real root; inf if there is none."""
-    roots = polynomial.trim().roots()
+    if not np.isfinite(polynomial.coef).all():
+        return math.inf
+    roots = polynomial.trim(_NO_COEFFICIENT).roots()
     real = roots.real[np.abs(roots.imag) < TINY * (1.0 + np.abs(roots.real))]
     return float(real[real > 0.0].min(initial=np.inf))
 
