@@ -44,6 +44,7 @@ def _imu() -> list[Fault]:
         'frozen: the last sample again and again': imu_faults.frozen,
         'all zero': imu_faults.reading(np.zeros_like),
         'saturated: vertical force and yaw rate at full scale': imu_faults.reading(imu_faults.saturated),
+        'saturated: forward force at full scale': imu_faults.one_axis(3, 156.9),
         'gyroscope dead: zero': imu_faults.scaled(0.0, 1.0),
         'accelerometer dead: zero': imu_faults.scaled(1.0, 0.0),
         'one axis of the gyroscope dead (yaw)': imu_faults.one_axis(2, 0.0),

@@ -51,3 +51,11 @@ def test_full_scale_is_not_frozen(imu):
     cut = noise(60)
     cut[:, 2] = -10.0
     assert set(verdicts(imu, cut)) == {Verdict.USE}
+
+
+def test_an_accelerometer_stays_at_full_scale_for_a_tenth_of_a_second_at_most(imu):
+    cut = noise(60)
+    cut[:, 4] = -100.0
+    # twenty steps
+    assert verdicts(imu, cut, 200) == [Verdict.USE] * 20 + [Verdict.FROZEN] * 40
+    assert verdicts(imu, noise(20), 260) == [Verdict.AHEAD] + [Verdict.USE] * 19

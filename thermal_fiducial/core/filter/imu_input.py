@@ -16,6 +16,9 @@ IMPOSSIBLE_RANGES = 2.0
 #: An axis is frozen once it has repeated a value for this long [s], in at least this many samples, and in this multiple
 #: of its longest run so far, which is due to quantisation: runs of up to 4 and 30 samples in two recorded IMUs.
 FROZEN_SECONDS, FROZEN_SAMPLES, FROZEN_FACTOR = 0.045, 4, 3
+#: An accelerometer that stays at full scale for longer [s] is dead: impacts are over by then, and thrust is less than
+#: its range. A gyroscope may turn faster than its range for as long as it likes.
+SATURATED_SECONDS = 0.1
 
 
 class Verdict(Enum):
@@ -32,10 +35,10 @@ class Verdict(Enum):
 
 
 class Axis:
-    """Runs of equal values of one of the six axes; at ``full_scale`` they may be long."""
+    """Runs of equal values of one of the six axes; at ``full_scale`` they may last for ``saturated`` [s]."""
 
-    def __init__(self, full_scale: float) -> None:
-        self._full_scale = full_scale
+    def __init__(self, full_scale: float, saturated: float) -> None:
+        self._full_scale, self._saturated = full_scale, saturated
         self._value = math.nan
         self._since_ns = self._count = 0
         self._longest = 1
@@ -47,8 +50,10 @@ class Axis:
                 self._longest = max(self._longest, self._count)
             self._value, self._since_ns, self._count = value, stamp_ns, 0
         self._count += 1
-        lasting = stamp_ns - self._since_ns >= FROZEN_SECONDS * SECOND_NS
-        return lasting and self._count >= self._too_many and abs(value) < self._full_scale
+        seconds = (stamp_ns - self._since_ns) / SECOND_NS
+        if abs(value) >= self._full_scale:
+            return seconds >= self._saturated
+        return seconds >= FROZEN_SECONDS and self._count >= self._too_many
 
     @property
     def _too_many(self) -> int:
@@ -68,7 +73,8 @@ class ImuInput:
         self._max_gap_ns = round(max_gap * SECOND_NS)
         ranges = [gyroscope_range] * 3 + [accelerometer_range] * 3
         self._limits = [IMPOSSIBLE_RANGES * full_scale for full_scale in ranges]
-        self._axes = [Axis(full_scale) for full_scale in ranges]
+        saturated = [math.inf] * 3 + [SATURATED_SECONDS] * 3
+        self._axes = [Axis(*of_axis) for of_axis in zip(ranges, saturated, strict=True)]
         self._last_ns: int | None = None
         self._stray_ns = self._first_stray_ns = 0
         self._strays = 0
