@@ -1,8 +1,8 @@
 """Dead, stuck and hot pixels of a bolometer array: finding them while running and filling them in.
 
-A pixel is bad when it stands out from its neighbours, one at most excepted. The lens forbids that to the scene: its
-point spread, even a sharp one, puts part of any hot point on the pixels beside it, and on an edge or at
-the corner of a marker a pixel always has several neighbours of its own kind.
+A pixel is bad when it stands out from all of its neighbours, or all but one. The scene cannot look like that: the point
+spread of the lens distributes any hot point over neighbouring pixels, and on an edge or at the corner of a marker a
+pixel has several neighbours of similar value.
 """
 
 import cv2

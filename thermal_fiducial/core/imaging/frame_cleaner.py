@@ -1,6 +1,6 @@
-"""Raw long-wave infrared frames: what is cut off, masked, filled in or withheld before anybody looks for markers.
+"""Front end for raw infrared frames: telemetry rows, flag bits, bad pixels, and frames that show no new scene.
 
-A stream of frames stands still where frames are repeated and while the shutter is closed. Shutter behaviour follows the
+The latter are withheld: repeated frames, and frames while the shutter is closed. Shutter behaviour follows the
 FLIR Tau 2 user's manual: during a flat-field correction (FFC, under half a second) a digital stream repeats the last
 frame, shows the shutter, or pauses, depending on the driver.
 """
@@ -32,7 +32,7 @@ MAX_TELEMETRY_ROWS = 4
 
 @dataclass(frozen=True, slots=True)
 class CleanFrame:
-    """A frame to look at, or why there is none."""
+    """A clean frame, or the reason for which it is withheld."""
 
     #: (height, width) counts without telemetry, flags and bad pixels; None: withheld
     counts: Counts | None
@@ -104,7 +104,7 @@ class FrameCleaner:
         return CleanFrame(image, late=late)
 
     def _image(self, counts: Counts | Gray) -> Counts:
-        """A copy of the image rows as counts."""
+        """A copy of the image rows as counts, without telemetry and flag bits."""
         if counts.ndim != 2 or counts.dtype not in (np.uint8, np.uint16):
             raise InputError(f'frame of {counts.dtype} with shape {counts.shape} is not an 8 or 16 bit image')
         height = counts.shape[0]
@@ -145,7 +145,7 @@ def _break_between(frame: Counts | Gray, row: int) -> float:
 
 
 class Pauses:
-    """How often the camera shows something new, and which new frames after a longer pause may still hold old counts.
+    """Period of new frames, and which new frames after a longer pause may still hold old counts.
 
     A driver may send each frame several times. The period is the median of the last intervals between new frames, so
     that neither a shutter event nor the beat of two clocks (a frame now and then stands for two ticks of the driver)
@@ -166,8 +166,8 @@ class Pauses:
         self._paused_ns = self._settled_ns = 0
 
     def add_new(self, stamp_ns: int) -> bool:
-        """Take in a frame that shows something new; whether it may still hold old counts all the same."""
-        # Late ones say nothing of the rate.
+        """Log a new frame; whether it may still hold old counts."""
+        # Late frames are no measure of the period.
         if self._newest_ns is not None and stamp_ns > self._newest_ns:
             self._intervals_ns.append(stamp_ns - self._newest_ns)
         self._newest_ns = stamp_ns if self._newest_ns is None else max(stamp_ns, self._newest_ns)
@@ -180,7 +180,7 @@ class Pauses:
         return True
 
     def add_old(self, stamp_ns: int, settling: int) -> None:
-        """Take in a frame that shows nothing new; after a longer pause withhold the next ``settling`` that do.
+        """Log a repeated or shutter frame; after a longer pause the next ``settling`` new frames are withheld.
 
         A few repeated frames are a driver that runs faster than the camera. After a longer pause the first new frame
         may still hold old counts: in the bolometers, which lag, and in the driver's buffers.
