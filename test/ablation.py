@@ -178,9 +178,7 @@ _DISPLAYED = 'corner_estimates:DisplayedSides', 'corner_estimates:_outward'
 _BORDER_WIDTH = {'corner_estimates:DisplayedSides.corrected': lambda _, __, refined, ___: refined.corners}
 
 MECHANISMS = {
-    'corners of squares': Mechanism(
-        'slow, 0.5 K, blind', ('corners.squares',), {'corners.segments:as_squares': _as_seen}
-    ),
+    'corners of squares': Mechanism('slow, 0.5 K, blind', ('corners.squares',), {'refining:as_squares': _as_seen}),
     'other tilt of a square': Mechanism('slow, 0.1 K, blind', (), {'corners.squares:_OTHER_TILT': np.inf}),
     'passes until settled': Mechanism('fast, 8 K, blind', (), {'refining:_PASSES': 1}),
     'second round': Mechanism('fast, 8 K, blind', (), {'refining:_ROUNDS': 1}),

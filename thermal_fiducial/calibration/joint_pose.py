@@ -8,12 +8,13 @@ import numpy.typing as npt
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import CameraFit, ippe_square
-from thermal_fiducial.core.geometry.rigid_fit import covariances
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
 # Two branches whose chi-squares differ by less than this factor are ambiguous: then the prediction decides.
 _AMBIGUOUS_RATIO = 4.0
+# Ratio of a parameter's variance to its variance with the others known, above which it counts as undetermined.
+_UNKNOWN = 1e13
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +73,7 @@ def solve_camera_pose(
     squared = np.sum((corners - seen.reshape(-1, 4, 2)) ** 2, axis=-1)
     if not (np.isfinite(chi2[best]) and np.isfinite(squared).all()):
         raise InputError(f'no camera pose explains the {len(corners)} markers')
-    covariance = _of_camera(covariances(information[best]), T[best], squares.mean(axis=(0, 1)))
+    covariance = _of_camera(_covariances(information[best]), T[best], squares.mean(axis=(0, 1)))
     return JointPose(T[best], covariance, float(np.sqrt(squared.mean())))
 
 
@@ -89,6 +90,18 @@ def _single_markers(normalised: FloatArray, squares: FloatArray) -> FloatArray:
     x, y = right / sizes[:, None], up / np.linalg.norm(up, axis=-1, keepdims=True)
     T_map_square = se3.transform(np.stack([x, y, np.cross(x, y)], axis=-1), squares.mean(axis=1))
     return (T_map_square[:, None] @ se3.inverse(ippe_square(normalised, sizes))).reshape(-1, 4, 4)
+
+
+def _covariances(information: FloatArray) -> FloatArray:
+    """Covariances (B, 6, 6); inf where some direction is undetermined, which a pseudo-inverse would hide."""
+    scale = np.sqrt(np.maximum(np.einsum('...ii->...i', information), 1e-300))
+    scale = scale[..., :, None] * scale[..., None, :]
+    # The ridge is below the rounding of determined directions, and keeps undetermined ones from being singular.
+    inflation = np.linalg.inv(information / scale + 1e-14 * np.eye(6))
+    own = np.einsum('...ii->...i', inflation)
+    known = np.all((own > 0.0) & (own < _UNKNOWN), axis=-1)
+    covariance = 0.5 * (inflation + np.swapaxes(inflation, -1, -2)) / scale
+    return np.where(known[..., None, None], covariance, np.inf)
 
 
 def _of_camera(covariance: FloatArray, T_map_camera: FloatArray, middle: FloatArray) -> FloatArray:

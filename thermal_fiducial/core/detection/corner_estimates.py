@@ -90,7 +90,7 @@ class DisplayedSides:
         seen = ImagePoints.at(refined.observed.corners_px, frame.camera)
         inset = 1.0 / (self._bits + 2.0)
         a, b = inset + (1.0 - 2.0 * inset) * np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
-        inner = np.moveaxis(se3.in_quadrilaterals(seen.x, a, b), 0, -1)
+        inner = np.moveaxis(se3.seen_between(seen.x, se3.bilinear(a, b)), 0, -1)
         sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _WIDEST_PX)
         blur = blurs(sides.normal[:, self._bits // 2], blur_px, refined.blur.spread)
         value, slope, weight = model(sides, self._behind[refined.ids], blur)

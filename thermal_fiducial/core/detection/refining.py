@@ -14,9 +14,10 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corner_errors import of_motion_blur, unknown_motion
+from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, of_motion_blur, unknown_motion
 from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED
 from thermal_fiducial.core.detection.corners.sides import blurs, model, sides_of
+from thermal_fiducial.core.detection.corners.squares import as_squares
 from thermal_fiducial.core.detection.frame import (
     counts_of,
     delays,
@@ -260,11 +261,17 @@ def _pass(
     sides = sides_of(start.x, camera, image.shape, cells, columns, widest)
     blur = blurs(sides.normal[:, cells // 2], blur_px, lag_blur)
     segments = measure(counts_of(sides.pixel, image, to_tails), model(sides, behind, blur), REACHED * blur[0])
-    shift, covariances, doubt = adjust(sides, segments, _PRIOR_PX, start)
+    known = as_squares(start, *adjust(sides, segments, _PRIOR_PX))
+    # Corners that constrain one another have correlated errors: as independent ones they would claim too much.
+    together = (8 / (8 - known.constrained))[:, None, None, None]
+    blocks = known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
+    covariances = together * blocks + OF_ALL_SIDES_PX**2 * _EYE
+    # In an outline that is inconsistent with a square, some side belongs to another object.
+    doubt = known.doubt * sides.along.reshape(-1, 4).mean(axis=1) ** 2
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]
     contrast, noise = (segments.contrast * share).sum(axis=1), np.sqrt((segments.noise * share).sum(axis=1))
-    deviation = np.sqrt(covariances.diagonal(axis1=2, axis2=3))
+    shift, deviation = known.moved.reshape(-1, 4, 2), np.sqrt(covariances.diagonal(axis1=2, axis2=3))
     moving: BoolArray = np.asarray((np.abs(shift) > np.clip(_UNSURE * deviation, *_SETTLED_PX)).any(axis=(1, 2)))
     corners = sides.ends.reshape(-1, 8, 2).take(_CORNERS, axis=1) + shift
     return RefinedCorners(corners, covariances, contrast, noise, doubt), moving

@@ -13,7 +13,7 @@ import numpy as np
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints, inverse_2x2
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners, whitening
-from thermal_fiducial.core.geometry.rigid_fit import costs, covariances, evaluate, Images, minimise
+from thermal_fiducial.core.geometry.rigid_fit import costs, evaluate, Images, minimise
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
 __all__ = [
@@ -42,11 +42,6 @@ class PlanarPoses:
     rms_px: FloatArray
     #: (N, 2) weighted squared errors: with consistent corner covariances, chi-square of two degrees of freedom
     chi2: FloatArray
-
-    @property
-    def covariances(self) -> FloatArray:
-        """(N, 2, 6, 6) of the poses [m, rad]."""
-        return covariances(self.information)
 
     def ambiguous(self, ratio: float = 10.0) -> BoolArray:
         """Of which markers (N,) the image allows the other branch.

@@ -28,8 +28,6 @@ EASED, STIFFENED, MOST_DAMPED = 0.1, 10.0, 1e6
 _NEAR = 1e-6
 # Replaces an initial pose that is not finite.
 _AHEAD = se3.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.0])
-# Ratio of a parameter's variance to its variance with the others known, above which it counts as undetermined.
-_UNKNOWN = 1e13
 #: Ridge that keeps information matrices regular, as a share of their largest entry.
 SINGULAR = 1e-12
 _MINUS_SKEW = -se3.SKEW
@@ -146,18 +144,6 @@ def _robust(squared: FloatArray, inlier: float) -> tuple[FloatArray, FloatArray 
         return squared, None
     excess = np.maximum(squared / inlier**2, 1.0)
     return np.where(excess > 1.0, inlier**2 * (1.0 + np.log(excess)), squared), excess
-
-
-def covariances(information: FloatArray) -> FloatArray:
-    """Covariances (B, 6, 6); inf where some direction is undetermined, which a pseudo-inverse would hide."""
-    scale = np.sqrt(np.maximum(np.einsum('...ii->...i', information), 1e-300))
-    scale = scale[..., :, None] * scale[..., None, :]
-    # The ridge is below the rounding of determined directions, and keeps undetermined ones from being singular.
-    inflation = np.linalg.inv(information / scale + 1e-14 * np.eye(6))
-    own = np.einsum('...ii->...i', inflation)
-    known = np.all((own > 0.0) & (own < _UNKNOWN), axis=-1)
-    covariance = 0.5 * (inflation + np.swapaxes(inflation, -1, -2)) / scale
-    return np.where(known[..., None, None], covariance, np.inf)
 
 
 def _solve(information: FloatArray, damping: FloatArray, gradient: FloatArray) -> FloatArray:

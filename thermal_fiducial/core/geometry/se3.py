@@ -175,14 +175,6 @@ def rotation_angle(R: npt.ArrayLike) -> FloatArray:
     return np.asarray(np.arctan2(np.sqrt(x * x + y * y + z * z), trace - 1.0))
 
 
-def in_quadrilaterals(c: FloatArray, a: FloatArray, b: FloatArray) -> FloatArray:
-    """Points (2, Q, P) at shares a, b, (P,) or (Q, P), of plane quadrilaterals (Q, 4, 2).
-
-    a from the first corner to the second, b from the first to the fourth.
-    """
-    return seen_between(c, bilinear(a, b))
-
-
 def bilinear(a: FloatArray, b: FloatArray) -> FloatArray:
     """Weights (..., 4, P) of a square's corners in its points at shares a, b (..., P)."""
     return np.stack([(1.0 - a) * (1.0 - b), a * (1.0 - b), a * b, (1.0 - a) * b], axis=-2)

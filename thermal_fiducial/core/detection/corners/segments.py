@@ -8,10 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, OF_SIDES_PX
+from thermal_fiducial.core.detection.corner_errors import OF_SIDES_PX
 from thermal_fiducial.core.detection.corners.sides import ENDS, Sides, STARTS
-from thermal_fiducial.core.detection.corners.squares import as_squares
-from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, SIGMA_OF_MEDIAN, TINY
 
 #: Largest displacement for which the linearisation holds, in standard deviations of the blur.
@@ -36,6 +34,7 @@ _KEPT_VARIANCE = 0.911
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
 # Largest number of rounds of robust weighting, and the change of weights below which it ends.
 _ROUNDS, _SETTLED = 3, 0.1
+_EYE = np.eye(8)
 # (4, 1, 4, 1) which corner each side begins at, and ends at.
 _AT_START, _AT_END = (np.eye(4)[corners, None, :, None] for corners in (STARTS, ENDS))
 # Products of the columns of a segment's least squares, and of columns and products together.
@@ -176,29 +175,17 @@ def median_of(values: FloatArray, good: BoolArray) -> FloatArray:
     return np.asarray(median[:, None])
 
 
-def adjust(
-    sides: Sides, segments: Segments, prior_px: float, at: ImagePoints
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Displacements (N, 4, 2) of the corners that fit all segments, and their covariances (N, 4, 2, 2).
-
-    Also additional variances (N,) [px^2] where the corners are inconsistent with a square, else 0.
+def adjust(sides: Sides, segments: Segments, prior_px: float) -> tuple[FloatArray, FloatArray]:
+    """Displacements (N, 8, 1) of the corners that fit all segments, and their covariances (N, 8, 8).
 
     Parameters
     ----------
     prior_px : standard deviation of what is known of the corners beforehand [px]
-    at : (N, 4) corners so far
     """
     used = segments.variance < HOPELESS
     sharpness = 1.0 / np.sqrt(segments.variance)
-    fit = robust_fit(_design(sides) * sharpness[..., None], segments.shift * sharpness, used, np.eye(8) / prior_px**2)
-    covariance = np.linalg.inv(fit.information) / fit.trust[:, None, None] + OF_SIDES_PX**2 * np.eye(8)
-    known = as_squares(at, fit.moved[..., None], covariance)
-    # Corners that constrain one another have correlated errors: as independent ones they would claim too much.
-    together = (8 / (8 - known.constrained))[:, None, None, None]
-    blocks = together * known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
-    # In an outline that is inconsistent with a square, some side belongs to another object.
-    doubt = known.doubt * sides.along.reshape(-1, 4).mean(axis=1) ** 2
-    return known.moved.reshape(-1, 4, 2), blocks + OF_ALL_SIDES_PX**2 * np.eye(2), doubt
+    fit = robust_fit(_design(sides) * sharpness[..., None], segments.shift * sharpness, used, _EYE / prior_px**2)
+    return fit.moved[..., None], np.linalg.inv(fit.information) / fit.trust[:, None, None] + OF_SIDES_PX**2 * _EYE
 
 
 def robust_fit(A: FloatArray, shift: FloatArray, used: BoolArray, prior: FloatArray) -> RobustFit:
