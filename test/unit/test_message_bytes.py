@@ -10,6 +10,7 @@ from support.messages import odometry, pose_of, pose_with_covariance
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.ros import convert, message_bytes
 
 
@@ -168,6 +169,22 @@ def test_errors_of_the_map_may_have_no_variance_in_some_directions():
     np.testing.assert_array_equal(message_bytes.map_error(message).covariance.diagonal(), variances)
     with pytest.raises(InputError, match='variance of 0'):
         message_bytes.camera_pose(message)
+
+
+@pytest.mark.parametrize('frame', ['', 'a', 'ab', 'abc', 'camera'])
+@pytest.mark.parametrize('kind', [np.uint8, np.uint16])
+def test_an_image_is_what_it_says(frame, kind):
+    pixels = np.arange(15, dtype=kind).reshape(3, 5)
+    message = convert.image(pixels, convert.header(1_700_000_000_123_456_789, frame))
+    whole = bytes(serialize_message(message))
+    read = message_bytes.image(whole)
+    assert (read.stamp_ns, read.frame_id) == (1_700_000_000_123_456_789, frame)
+    np.testing.assert_array_equal(image_to_array(read), pixels)
+    for name in ('height', 'width', 'encoding', 'is_bigendian', 'step'):
+        assert getattr(read, name) == getattr(message, name)
+    for length in range(whole.index(bytes(pixels.data)) + pixels.nbytes):
+        with pytest.raises(InputError):
+            image_to_array(message_bytes.image(whole[:length]))
 
 
 @pytest.mark.parametrize('frame', ['', 'a', 'ab', 'abc', 'abcd'])

@@ -15,7 +15,7 @@ from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import image_to_array
-from thermal_fiducial.ros import clouds, convert, display, qos
+from thermal_fiducial.ros import clouds, convert, display, message_bytes, qos
 from thermal_fiducial.ros.camera_node import CameraStageNode
 from thermal_fiducial.ros.detections import OtherDetections
 from thermal_fiducial.ros.node import OK, WARN
@@ -40,7 +40,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         self._marker_poses = self.advertise(PoseArray, 'marker_poses')
         self._others = OtherDetections(self, self.config, self.fault)
         self._annotated = self.advertise(Image, 'thermal/image_markers', qos.IMAGE_OUTPUT)
-        self._images = self.subscribe_newest(Image, 'thermal/image', self._on_image, qos.IMAGE_INPUT)
+        self._images = self.subscribe_newest(Image, 'thermal/image', self._on_image, qos.IMAGE_INPUT, raw=True)
         self.follow_hints()
         self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
 
@@ -53,20 +53,20 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         if self.detector is not None:
             self.detector.configure(config)
 
-    def _on_image(self, message: Image) -> None:
+    def _on_image(self, message: bytes) -> None:
         if self.detector is None:
             return
-        stamp = convert.stamp_ns(message.header.stamp)
-        counts = image_to_array(message)
+        image = message_bytes.image(message)
+        counts, head = image_to_array(image), convert.header(image.stamp_ns, image.frame_id)
         camera = self.camera_of(counts)
-        markers = self.detector.detect(stamp, counts, camera, self.odometry)
+        markers = self.detector.detect(image.stamp_ns, counts, camera, self.odometry)
         self._seen = len(markers)
-        self._markers.send(clouds.MARKER_CLOUDS.message(markers, message.header))
+        self._markers.send(clouds.MARKER_CLOUDS.message(markers, head))
         if self._marker_poses.listeners:
-            self._marker_poses.send(clouds.marker_poses(markers, message.header))
-        self._others.send(markers, message.header)
+            self._marker_poses.send(clouds.marker_poses(markers, head))
+        self._others.send(markers, head)
         if self._annotated.listeners:
-            self._annotated.send(convert.image(display.annotated(self._gray(counts), markers), message.header))
+            self._annotated.send(convert.image(display.annotated(self._gray(counts), markers), head))
 
     def _gray(self, counts: Counts | Gray) -> Gray:
         return self.view(counts.astype(np.uint16, copy=False))

@@ -11,10 +11,11 @@ from thermal_fiducial.config import Tau2CameraConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
+from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.images import image_to_array
-from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros import convert, message_bytes, qos
 from thermal_fiducial.ros.node import OK, StageNode, WARN
 from thermal_fiducial.ros.run import run
 
@@ -43,18 +44,23 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
         if config.image_transport == 'compressed':
             # As image_transport names it: under the name that the raw topic has after remapping.
             topic = self.resolve_topic_name('thermal/image_raw') + '/compressed'
-            self.subscribe(CompressedImage, topic, self._on_image, qos.CAMERA_INPUT)
+            self.subscribe(CompressedImage, topic, self._on_compressed, qos.CAMERA_INPUT)
         else:
-            self.subscribe(Image, 'thermal/image_raw', self._on_image, qos.CAMERA_INPUT)
+            self.subscribe(Image, 'thermal/image_raw', self._on_image, qos.CAMERA_INPUT, raw=True)
 
     def configure(self, config: Tau2CameraConfig) -> None:
         """Take over live parameters."""
         super().configure(config)
         self.cleaner.config = self.view.config = config
 
-    def _on_image(self, message: Image | CompressedImage) -> None:
-        stamp = convert.stamp_ns(message.header.stamp)
-        pixels = image_to_array(message)
+    def _on_image(self, message: bytes) -> None:
+        image = message_bytes.image(message)
+        self._take_in(image.stamp_ns, image_to_array(image))
+
+    def _on_compressed(self, message: CompressedImage) -> None:
+        self._take_in(convert.stamp_ns(message.header.stamp), image_to_array(message))
+
+    def _take_in(self, stamp: int, pixels: Counts | Gray) -> None:
         self._displayed = pixels.dtype == np.uint8
         frame = self.cleaner.process(stamp, pixels)
         self._reason = frame.reason

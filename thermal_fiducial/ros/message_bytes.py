@@ -5,6 +5,7 @@ little-endian): four bytes that say so, then the fields one after the other, eac
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 import struct
 from typing import Any
 
@@ -23,6 +24,8 @@ _HEADER, _LITTLE_ENDIAN = 4, b'\x00\x01'
 _STAMP, _LENGTH, _NUMBERS = struct.Struct('<iI'), struct.Struct('<I'), np.dtype('<f8')
 #: Where the frames begin; all that comes before them is the stamp.
 BEHIND_STAMP = _HEADER + _STAMP.size
+# Of an image: height, width, length of the encoding's name; bytes of a row and of all.
+_SIZES, _ROWS = struct.Struct('<III'), struct.Struct('<II')
 # Position, quaternion, their covariance, then velocity, turn rate, their covariance.
 _POSE, _ODOMETRY = 7 + 36, 7 + 36 + 6 + 36
 # Orientation and its covariance, turn rate and its covariance, specific force and its covariance.
@@ -117,6 +120,44 @@ def map_error(message: bytes) -> CameraPose:
         As :func:`camera_pose`.
     """
     return _camera_pose(message, 'camera_pose/map_error', partial=True)
+
+
+@dataclass(frozen=True, slots=True)
+class ImageBytes:
+    """A sensor_msgs/Image for ``files.images.image_to_array``: the pixels are left where they are."""
+
+    stamp_ns: int
+    frame_id: str
+    height: int
+    width: int
+    encoding: str
+    is_bigendian: int
+    step: int
+    data: memoryview
+
+
+def image(message: bytes) -> ImageBytes:
+    """An image.
+
+    Raises
+    ------
+    InputError
+        Of another encoding, or cut short.
+    """
+    what = 'image'
+    stamp = stamp_ns(message, what, longest=len(message))
+    try:
+        place = behind_header(message)
+        height, width, length = _SIZES.unpack_from(message, place)
+        place += _SIZES.size + length
+        encoding = message[place - length : place].rstrip(b'\x00').decode()
+        is_bigendian = message[place]
+        step, size = _ROWS.unpack_from(message, _aligned(place + 1, _LENGTH.size))
+        begin = _aligned(place + 1, _LENGTH.size) + _ROWS.size
+        data = memoryview(message)[begin : begin + size]
+    except (struct.error, IndexError, UnicodeDecodeError):
+        raise InputError(f'{what} of {len(message)} bytes is cut short') from None
+    return ImageBytes(stamp, frame_id(message), height, width, encoding, is_bigendian, step, data)
 
 
 def clock_offset(message: bytes) -> float:
