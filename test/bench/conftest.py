@@ -1,8 +1,12 @@
 """What the benchmarks share."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+#: Without pytest-benchmark there is nothing to measure with, and its marker is unknown.
+collect_ignore_glob = [] if find_spec('pytest_benchmark') else ['test_*.py']
 
 TABLES = Path(__file__).resolve().parents[2] / 'doc' / 'tables'
 

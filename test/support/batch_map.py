@@ -2,7 +2,7 @@
 large sparse system, plain least squares."""
 
 import numpy as np
-from scipy.sparse import coo_array, diags_array
+from scipy.sparse import coo_array, diags
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
@@ -71,7 +71,8 @@ def adjust(K, size, views, cameras, markers, held, steps=30):
         previous, cost = cost, float(np.sum(r * r))
         if abs(previous - cost) < 1e-9 * cost:
             break
-        step = spsolve(H + diags_array(damping * H.diagonal() + 1e-9).tocsc(), J.T @ r.ravel()).reshape(-1, 6)
+        damped = (H + diags(damping * H.diagonal() + 1e-9)).tocsc()
+        step = spsolve(damped, J.T @ r.ravel()).reshape(-1, 6)
         damping *= 0.1
         C, M = _moved(C, step[: len(frames)]), _moved(M, step[len(frames) :])
     return dict(zip(ids, M, strict=True)), float(np.sqrt(cost / (4 * n)))

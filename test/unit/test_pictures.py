@@ -1,6 +1,7 @@
 """Recorded pictures in the place of a camera."""
 
 import os
+from pathlib import Path
 import struct
 import subprocess
 import sys
@@ -91,6 +92,8 @@ def test_a_video_of_16_bits(tmp_path):
     for picture in PICTURES:
         writer.write(picture)
     writer.release()
+    if not Path(path).exists():
+        pytest.skip(f'OpenCV {cv2.__version__} writes no video of 16 bits')
     source = Pictures(path, 1000.0, repeat=False)
     source.open()
     for frame, expected in zip(shown(source, 3), PICTURES, strict=True):

@@ -1,6 +1,7 @@
 """Frames with their markers in the report and in a video, from a small bag; where bag or encoder are missing."""
 
 import base64
+from importlib.util import find_spec
 import json
 import shutil
 
@@ -23,6 +24,7 @@ from thermal_fiducial.report.page import write_report
 from thermal_fiducial.report.run_folder import read_run
 
 SECONDS = 0.4
+needs_encoder = pytest.mark.skipif(not (shutil.which('ffmpeg') or find_spec('av')), reason='neither ffmpeg nor PyAV')
 
 
 @pytest.fixture(scope='module')
@@ -85,6 +87,7 @@ def test_the_page_holds_the_strip(flight):
     assert '4 markers</figcaption>' in page
 
 
+@needs_encoder
 def test_a_bag_that_is_gone_is_said_and_may_be_named(flight, tmp_path, capsys):
     shutil.copytree(flight / 'run', tmp_path / 'run')
     run = read_run(tmp_path / 'run')
@@ -145,6 +148,7 @@ def test_letters_can_be_read_on_white():
     assert on_white[edge].mean() < 60
 
 
+@needs_encoder
 def test_the_video_calls_the_shutter_by_its_name(flight, monkeypatch):
     """Its first frames look frozen to the camera node, which knows only later why."""
     run = read_run(flight / 'run')
