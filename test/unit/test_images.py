@@ -89,3 +89,13 @@ def test_a_compressed_image_whose_chunk_promises_gigabytes_is_refused_at_once():
     # A tenth of what it took.
     assert time.process_time() - begin < 0.17
     np.testing.assert_array_equal(image_to_array(compressed(whole)), PIXELS)
+
+
+def test_a_broken_compressed_image_writes_nothing_past_the_log(capfd):
+    """libpng wrote a line a frame."""
+    whole = bytearray(cv2.imencode('.png', PIXELS)[1].tobytes())
+    # In the check sum of the first chunk of pixels.
+    whole[-14] ^= 0xFF
+    with pytest.raises(InputError, match='cannot be decoded'):
+        image_to_array(compressed(bytes(whole)))
+    assert capfd.readouterr() == ('', '')

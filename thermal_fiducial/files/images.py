@@ -60,7 +60,8 @@ def _decompressed(message: Any) -> Counts | Gray:
     if not data[:4].tobytes().startswith(_LOSSLESS):
         raise InputError(f'compressed image of format {message.format!r}: only PNG keeps the counts')
     try:
-        pixels = None if _is_cut_png(data) else cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        with without_libraries_lines():
+            pixels = None if _is_cut_png(data) else cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:
         pixels = None
     if pixels is None:
@@ -110,7 +111,7 @@ def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
 
 @contextmanager
 def without_libraries_lines() -> Iterator[None]:
-    """Keep what libpng and others write about a broken picture, past OpenCV, off the console of a command."""
+    """Keep what libpng and others write about a broken picture, past OpenCV, off the console."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:
