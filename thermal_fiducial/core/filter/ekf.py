@@ -190,16 +190,13 @@ class PoseEkf:
         main = self._history.main
         if main is None:
             return None
-        covariance, with_bias = self._hypotheses.core_covariance(main, self._contradicting(main))
-        rate_variance = float(self._history.imu.last_densities[0]) ** 2 / self._history.imu.last_step_seconds
-        return odometry(main.estimate, covariance, with_bias, imu, rate_variance)
+        other = self._contradicting() if main.in_doubt else None
+        return odometry(main.estimate, other, imu, self._history.imu.last_rate_variance)
 
-    def _contradicting(self, main: Hypothesis) -> Hypothesis | None:
-        """The alternative hypothesis, while the latest poses support it and contradict the estimate."""
-        other = self._history.belief.alternative
-        if other is None or not main.in_doubt or other.hits < self._config.initial_poses:
-            return None
-        return self._history.alternative
+    def _contradicting(self) -> Estimate | None:
+        """The alternative estimate, where the latest poses support it."""
+        other = self._history.alternative
+        return other.estimate if other and other.hits >= self._config.initial_poses else None
 
     @property
     def decided(self) -> Mapping[int, PoseUpdate]:

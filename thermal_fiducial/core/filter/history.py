@@ -36,17 +36,13 @@ class History:
         self.imu = ImuBuffer()
         self._poses: list[CameraPose] = []
         self._beliefs = [Belief()]
-        self._main: Hypothesis | None = None
+        #: the estimate at the newest sample
+        self.main: Hypothesis | None = None
 
     @property
     def belief(self) -> Belief:
         """Belief after the latest pose."""
         return self._beliefs[-1]
-
-    @property
-    def main(self) -> Hypothesis | None:
-        """The main hypothesis, the estimate, at the newest sample."""
-        return self._main
 
     @property
     def alternative(self) -> Hypothesis | None:
@@ -92,7 +88,7 @@ class History:
 
     def _forget_belief(self) -> None:
         del self._beliefs[-1]
-        self._main = None
+        self.main = None
 
     def is_forgotten(self, pose: CameraPose) -> bool:
         """Whether a pose is older than the oldest belief, so that it cannot be inserted."""
@@ -120,7 +116,7 @@ class History:
         """Apply a correction of the map to beliefs and poses: T_new = T_new_old @ T_old."""
         self._beliefs = [belief.in_moved_map(T_new_old) for belief in self._beliefs]
         self._poses = [in_moved_map(pose, T_new_old) for pose in self._poses]
-        self._main = self._main and self._main.in_moved_map(T_new_old)
+        self.main = self.main and self.main.in_moved_map(T_new_old)
 
     # --- taking in poses ------------------------------------------------------------------------------
 
@@ -130,7 +126,7 @@ class History:
         while (pose := self._next_due()) is not None:
             belief, decided = self._after(pose)
             self._beliefs.append(belief)
-            self._main = None
+            self.main = None
             updates += decided
         self._go_on()
         return updates
@@ -149,9 +145,9 @@ class History:
         belief = self.belief
         if belief.main is None:
             return
-        self._main = self._hypotheses.carried(self._main or belief.main, self.imu, self.imu.newest_ns)
-        if self._main.estimate.stamp_ns - belief.main.estimate.stamp_ns > _KEPT_EVERY_NS:
-            self._beliefs.append(belief._replace(main=self._main, alternative=self.alternative))
+        self.main = self._hypotheses.carried(self.main or belief.main, self.imu, self.imu.newest_ns)
+        if self.main.estimate.stamp_ns - belief.main.estimate.stamp_ns > _KEPT_EVERY_NS:
+            self._beliefs.append(belief._replace(main=self.main, alternative=self.alternative))
 
     def _after(self, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
         """The belief after the next pose, and the verdicts on that pose."""

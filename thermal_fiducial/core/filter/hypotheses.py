@@ -14,14 +14,13 @@ from thermal_fiducial.core.filter.propagation import propagated
 from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
-    CORE,
     GYROSCOPE_BIAS,
     NavigationState,
     POSE,
     SIZE,
     TIME_OFFSET,
 )
-from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_innovation, PoseUpdater
+from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, PoseUpdater
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
@@ -147,31 +146,12 @@ class Hypotheses:
             return None
         return Hypothesis(estimate, time_ns, time_ns)
 
-    def core_covariance(self, main: Hypothesis, other: Hypothesis | None) -> tuple[FloatArray, FloatArray]:
-        """Published covariance (9, 9) of an estimate's core, and cross-covariance (9, 3) with the gyroscope's bias.
-
-        An ``other`` hypothesis at the same instant widens the covariance by its own and by the difference of the two.
-        """
-        P = main.estimate.covariance
-        covariance, with_bias = P[CORE, CORE], P[CORE, GYROSCOPE_BIAS]
-        if other:
-            apart = _difference(main.estimate.state, other.estimate.state)
-            covariance = covariance + other.estimate.covariance[CORE, CORE] + np.outer(apart, apart)
-        return covariance, with_bias
-
 
 def _far_covariance(covariance: FloatArray) -> FloatArray:
     """The covariance (48, 48) against which a pose counts as far, see ``_FAR_TOO_SURE`` and ``_FAR``."""
     widened = _FAR_TOO_SURE**2 * covariance
     widened[POSE, POSE] += np.square(_FAR)
     return widened
-
-
-def _difference(state: NavigationState, other: NavigationState) -> FloatArray:
-    """Core error (9,) of ``state`` if ``other`` is the true state."""
-    apart = pose_innovation(state, other.T_map_body)
-    velocity = (other.velocity - state.velocity) @ state.R_map_body
-    return np.concatenate((apart[:3], velocity, apart[3:]))
 
 
 def _random_walks(config: PoseEkfConfig) -> FloatArray:

@@ -57,9 +57,10 @@ class ImuBuffer:
         return np.asarray(self._rows[len(self._stamps_ns) - 1, 1])
 
     @property
-    def last_step_seconds(self) -> float:
-        """Length of the step that ends with the last sample [s]."""
-        return (self._stamps_ns[-1] - self._stamps_ns[-2]) / SECOND_NS
+    def last_rate_variance(self) -> float:
+        """White noise of the rate that the last sample says, of one axis [rad^2/s^2]."""
+        seconds = (self._stamps_ns[-1] - self._stamps_ns[-2]) / SECOND_NS
+        return float(self._rows[len(self._stamps_ns) - 1, 1, 0]) ** 2 / seconds
 
     def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
         """Add a sample (6,) and the noise densities (6,) of the step that ends with it; gaps are interpolated."""

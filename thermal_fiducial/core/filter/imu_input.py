@@ -41,23 +41,19 @@ class Axis:
         self._full_scale, self._saturated = full_scale, saturated
         self._value = math.nan
         self._since_ns = self._count = 0
-        self._longest = 1
+        self._too_many = FROZEN_SAMPLES
 
     def is_frozen(self, stamp_ns: int, value: float) -> bool:
         """Whether the run that a sample's value continues is too long."""
         if value != self._value or stamp_ns < self._since_ns:
             if self._count < self._too_many:
-                self._longest = max(self._longest, self._count)
+                self._too_many = max(self._too_many, FROZEN_FACTOR * self._count)
             self._value, self._since_ns, self._count = value, stamp_ns, 0
         self._count += 1
         seconds = (stamp_ns - self._since_ns) / SECOND_NS
         if abs(value) >= self._full_scale:
             return seconds >= self._saturated
         return seconds >= FROZEN_SECONDS and self._count >= self._too_many
-
-    @property
-    def _too_many(self) -> int:
-        return max(FROZEN_SAMPLES, FROZEN_FACTOR * self._longest)
 
 
 class ImuInput:

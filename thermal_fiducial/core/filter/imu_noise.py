@@ -62,7 +62,9 @@ class ImuNoiseMonitor:
         """(6,) densities for the step of ``seconds`` that ends with sample ``imu`` (6,)."""
         self._follow_spectrum(imu, seconds)
         self._motion.add(imu, seconds)
-        between = self._motion.hidden(seconds) if self._interrupted(seconds) else (0.0, 0.0)
+        # Shorter steps are covered by the floor of the spectrum, once it has been measured.
+        covered = seconds <= _INTERRUPTED and any(self._floor.densities)
+        between = (0.0, 0.0) if covered else self._motion.hidden(seconds)
         largest = np.abs(imu)
         squares = []
         for triad, motion in enumerate(self._size_of_motion(imu, seconds)):
@@ -74,10 +76,6 @@ class ImuNoiseMonitor:
             self._saturated[triad] = lost
         rate, force = map(math.sqrt, squares)
         return np.array((rate, rate, rate, force, force, force))
-
-    def _interrupted(self, seconds: float) -> bool:
-        """Whether the floor of the spectrum does not hold for a step: too long, or nothing measured yet."""
-        return seconds > _INTERRUPTED or not any(self._floor.densities)
 
     def _size_of_motion(self, imu: FloatArray, seconds: float) -> tuple[float, float]:
         """Magnitudes of the rate, and of the force less its slow mean, which is gravity."""

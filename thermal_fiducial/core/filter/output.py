@@ -5,7 +5,8 @@ import math
 
 import numpy as np
 
-from thermal_fiducial.core.filter.state import Estimate, GYROSCOPE_BIAS, POSITION, ROTATION, VELOCITY
+from thermal_fiducial.core.filter.state import CORE, Estimate, NavigationState, POSITION, PUBLISHED, ROTATION, VELOCITY
+from thermal_fiducial.core.filter.update import pose_innovation
 from thermal_fiducial.core.geometry.reprojection import lever_arm, twist_transfer
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import Odometry
@@ -22,23 +23,22 @@ _RATE_VARIANCES = slice(9 * 13, None, 13)
 LARGEST_STEP = 1.0
 
 
-def odometry(
-    estimate: Estimate, core: FloatArray, with_bias: FloatArray, imu: FloatArray, rate_variance: float
-) -> Odometry:
+def odometry(estimate: Estimate, other: Estimate | None, imu: FloatArray, rate_variance: float) -> Odometry:
     """Odometry at an IMU sample.
 
     Parameters
     ----------
-    core : (9, 9) covariance of rotation, velocity and position errors
-    with_bias : (9, 3) cross-covariance of these and the gyroscope's bias
+    other : estimate of the same instant that contradicts it: it widens the covariance by its own and their difference
     imu : (6,) the sample
     rate_variance : white noise of the sample's rate [rad^2/s^2]
     """
     state = estimate.state
     R, velocity_body = state.R_map_body, state.velocity_body
-    joint = np.empty((12, 12))
-    joint[:9, :9], joint[:9, 9:], joint[9:, :9] = core, with_bias, with_bias.T
-    joint[9:, 9:] = estimate.covariance[GYROSCOPE_BIAS, GYROSCOPE_BIAS]
+    joint = estimate.covariance[PUBLISHED, PUBLISHED]
+    if other:
+        apart = _difference(state, other.state)
+        joint = joint.copy()
+        joint[CORE, CORE] += other.covariance[CORE, CORE] + np.outer(apart, apart)
     # Position and rotation errors turn from the robot frame into the map; that of v_body depends on nu and phi.
     J = _AT_REST.copy()
     J[0:3, POSITION] = J[3:6, ROTATION] = R
@@ -54,6 +54,13 @@ def odometry(
         covariance[:6, :6] + of_map,
         covariance[6:, 6:],
     )
+
+
+def _difference(state: NavigationState, other: NavigationState) -> FloatArray:
+    """Core error (9,) of ``state`` if ``other`` is the true state."""
+    apart = pose_innovation(state, other.T_map_body)
+    velocity = (other.velocity - state.velocity) @ state.R_map_body
+    return np.concatenate((apart[:3], velocity, apart[3:]))
 
 
 def in_frame(odometry: Odometry, T_body_frame: FloatArray) -> Odometry:

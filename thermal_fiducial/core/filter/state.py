@@ -35,6 +35,8 @@ SYSTEMATIC = slice(42, 48)
 SIZE = 48
 #: Coordinates that an IMU step propagates, and coordinates that they are propagated from.
 CORE, MOVED_BY = slice(0, 9), slice(0, 35)
+#: Core and bias of the gyroscope, whose errors those of the published odometry are.
+PUBLISHED = slice(0, 12)
 #: Coordinates that a pose measures.
 POSE = np.r_[ROTATION, POSITION]
 
