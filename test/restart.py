@@ -43,7 +43,7 @@ class Flight:
         self._executor.add_node(self._node)
         #: stamp of the last pose on each topic [ns]
         self.came = dict.fromkeys((CAMERA_POSE_TOPIC, 'pose'), 0)
-        #: of the last message that was sent, when it was taken [ns]
+        #: newest of the messages that were sent, when it was taken [ns]; images are older than the samples before them
         self.stamp_ns = laps.start_ns
         for topic in self.came:
             self._node.subscribe(PoseWithCovarianceStamped, topic, partial(self._note, topic), qos.RESULT)
@@ -61,7 +61,7 @@ class Flight:
                 self._executor.spin_once(timeout_sec=left)
             self._executor.spin_once(timeout_sec=0.0)
             self._outputs[message.topic].send(message.cdr)
-            self.stamp_ns = header_stamp_ns(message.cdr)
+            self.stamp_ns = max(self.stamp_ns, header_stamp_ns(message.cdr))
 
     def close(self) -> None:
         """Leave the graph."""
