@@ -470,8 +470,8 @@ class MarkerMapperConfig(SelfChecked):
     map_frame: str = param('map', 'Frame of the map.')
     second_camera: str = param(
         '',
-        'Name of a second camera, which stands in where the first has no pose: NAME/markers and '
-        'NAME/thermal/camera_info are read. Empty: none.',
+        'Name of a second camera, which makes poses better and stands in: NAME/markers and NAME/thermal/camera_info '
+        'are read. Empty: none.',
     )
     second_camera_position: tuple[float, ...] = _camera_position()
     second_camera_orientation: tuple[float, ...] = _camera_orientation()

@@ -24,6 +24,7 @@ from thermal_fiducial.core.geometry.se3 import (
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.mapping.second_camera import SecondCamera
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Markers, Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 
@@ -172,6 +173,19 @@ class _Chain:
         self.config = PoseEkfConfig(**({'imu': flight.imu_noise} | camera | config))
         self.filter = PoseEkf(self.config)
         self._prior = MotionPrior(flight.time_offset)
+        self._pair: SecondCamera | None = None
+
+    def add_camera(self, flight):
+        """The same flight through a second camera, in the same map."""
+        self._second = _Chain(flight, self.mapper.map, 'localization', {})
+        self._pair = SecondCamera(self.flight.T_body_camera, flight.T_body_camera)
+
+    def add_second_frame(self, stamp_ns) -> None:
+        flight, mapper = self._second.flight, self._second.mapper
+        pose = mapper.process(stamp_ns, flight.frames[stamp_ns], flight.camera, self._prior).pose
+        alone = None if pose is None else self._pair.add_second(pose)
+        if alone is not None:
+            self.filter.add_pose(alone)
 
     def add_imu(self, sample) -> Odometry | None:
         odometry = self.filter.add_imu(sample)
@@ -183,6 +197,7 @@ class _Chain:
         rows = self.flight.frames[stamp_ns]
         pose = self.mapper.process(stamp_ns, rows, self.flight.camera, self._prior).pose
         if pose is not None:
+            pose = self._pair.with_second(pose, self._prior) if self._pair else pose
             self.filter.add_pose(pose)
         if (offset := self.filter.camera_time_offset) is not None:
             self._prior.set_clock_offset(offset)
@@ -193,7 +208,7 @@ class _Chain:
         return pose
 
 
-def fly(flight, marker_map=None, *, mode='localization', late=0.03, left_out=(), **config) -> Run:
+def fly(flight, marker_map=None, *, mode='localization', late=0.03, left_out=(), second=None, **config) -> Run:
     """The flight through mapper and filter.
 
     Parameters
@@ -202,21 +217,27 @@ def fly(flight, marker_map=None, *, mode='localization', late=0.03, left_out=(),
     marker_map : to start from; default that of the flight
     mode : ``localization`` on the map as it is, or ``mapping``
     late : poses come so long after their stamps [s]
+    second : the same flight through a second camera, whose poses arrive before those of the first
     left_out : (begin, end) [s after the first IMU sample] without frames
     config : parameters of the filter other than the defaults, the flight's camera and its IMU's densities
     """
     chain = _Chain(flight, marker_map or flight.marker_map, mode, config)
+    if second is not None:
+        chain.add_camera(second)
     offset_ns = round(flight.time_offset * _SECOND_NS)
     begin_ns = flight.samples[0].stamp_ns
     gaps = [[begin_ns + round(1e9 * edge) for edge in gap] for gap in left_out]
     frames = [s for s in flight.frames if not any(a <= s + offset_ns < b for a, b in gaps)]
     arrivals = [(sample.stamp_ns, 0, sample) for sample in flight.samples]
     late_ns = offset_ns + round(late * _SECOND_NS)
-    arrivals += [(stamp + late_ns, 1, stamp) for stamp in frames]
+    arrivals += [(stamp + late_ns, 2, stamp) for stamp in frames]
+    arrivals += [] if second is None else [(stamp + late_ns, 1, stamp) for stamp in second.frames]
     states, poses = [], []
     for _, kind, item in sorted(arrivals, key=lambda entry: entry[:2]):
         if kind == 0:
             states.append(chain.add_imu(item))
+        elif kind == 1:
+            chain.add_second_frame(item)
         else:
             poses.append(chain.add_frame(item))
     poses = [pose for pose in poses if pose is not None]

@@ -1,4 +1,4 @@
-"""A second camera, whose poses stand in for those of the first."""
+"""A second camera: its poses join those of the first, or stand in for them."""
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
@@ -10,16 +10,44 @@ from support.ros_graph import ros_graph
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, transform
-from thermal_fiducial.core.measurements import CameraPose, seen_from
+from thermal_fiducial.core.mapping.second_camera import intersection, SecondCamera, seen_from
+from thermal_fiducial.core.measurements import CameraPose, Odometry
+from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.replay.settings import read_settings
 from thermal_fiducial.ros import clouds, convert
 
+MS = 1_000_000
 T_BODY_FIRST = small_bag.T_BODY_CAMERA
 #: Beside the first, turned by half a radian.
 T_BODY_SECOND = T_BODY_FIRST @ transform(so3_exp([0.0, 0.5, 0.0]), [0.2, 0.0, 0.0])
+
+
+def pose(stamp_ns, T, variances=(1e-4,) * 6):
+    return CameraPose(stamp_ns, T, np.diag(variances))
+
+
+def second_pose(stamp_ns, T_map_body, variances=(1e-4,) * 6):
+    return pose(stamp_ns, T_map_body @ T_BODY_SECOND, variances)
+
+
+def flying(speed):
+    """Odometry along x at ``speed`` [m/s], every 5 ms for 0.2 s."""
+    prior = MotionPrior()
+    for k in range(41):
+        T = transform(np.eye(3), [speed * 0.005 * k, 0.0, 0.0])
+        state = Odometry(5 * MS * k, T, np.array([speed, 0.0, 0.0]), np.zeros(3), 1e-6 * np.eye(6), 1e-6 * np.eye(6))
+        prior.add(state.stamp_ns, state)
+    return prior
+
+
+def test_an_exact_pose_of_the_second_is_one_of_the_first():
+    cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND)
+    alone = cameras.add_second(second_pose(0, np.eye(4)))
+    np.testing.assert_allclose(alone.T_map_camera, T_BODY_FIRST, atol=1e-15)
+    assert cameras.alone == 1
 
 
 def test_the_covariance_follows_the_lever_arm():
@@ -33,6 +61,49 @@ def test_the_covariance_follows_the_lever_arm():
         J[:, k] = np.r_[(moved - T @ T_there)[:3, 3], d[3:]] / step
     # Differences over 1e-6 are good to 1e-6 of numbers of about 10.
     np.testing.assert_allclose(found, J @ A @ A.T @ J.T, rtol=0, atol=1e-4)
+
+
+def test_both_at_an_instant_weigh_by_what_they_know_and_claim_no_more_than_the_better():
+    vague_in_x, vague_in_y = (1e-2, *(1e-4,) * 5), (1e-4, 1e-2, *(1e-4,) * 4)
+    first, second = pose(0, np.eye(4), vague_in_x), pose(0, transform(np.eye(3), [0.02, 0.02, 0.0]), vague_in_y)
+    joint = intersection(first, second)
+    # A hundred to one.
+    np.testing.assert_allclose(joint.T_map_camera[:2, 3], [0.02 * 100 / 101, 0.02 / 101], rtol=1e-9)
+    np.testing.assert_allclose(np.diag(joint.covariance)[:3], [2e-2 / 101, 2e-2 / 101, 1e-4], rtol=1e-9)
+
+
+def test_poses_that_contradict_each_other_are_not_joined():
+    cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND)
+    first = pose(100 * MS, T_BODY_FIRST)
+    cameras.with_second(pose(0, T_BODY_FIRST), MotionPrior())
+    cameras.add_second(second_pose(100 * MS, transform(np.eye(3), [0.5, 0.0, 0.0])))
+    assert cameras.with_second(first, MotionPrior()) is first
+    assert (cameras.joined, cameras.contradicted) == (0, 1)
+
+
+@pytest.mark.parametrize('lead_ms', [0, 50, -10])
+def test_a_pose_of_another_instant_is_carried_by_the_odometry(lead_ms):
+    """At 4 m/s, the second seen ``lead_ms`` before the first: 20 cm in 50 ms, to a micrometre."""
+    cameras, prior, stamp = SecondCamera(T_BODY_FIRST, T_BODY_SECOND), flying(4.0), 100 * MS
+    cameras.with_second(pose(30 * MS, T_BODY_FIRST), prior)
+    seen = stamp - lead_ms * MS
+    cameras.add_second(second_pose(seen, transform(np.eye(3), [4e-9 * seen, 0.0, 0.0])))
+    truth = transform(np.eye(3), [0.4, 0.0, 0.0]) @ T_BODY_FIRST
+    joint = cameras.with_second(pose(stamp, truth), prior)
+    assert (cameras.joined, joint.stamp_ns) == (1, stamp)
+    np.testing.assert_allclose(joint.T_map_camera, truth, atol=1e-6)
+
+
+def test_each_pose_counts_once_and_an_old_one_not_at_all():
+    cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND)
+    cameras.with_second(pose(0, T_BODY_FIRST), flying(0.0))
+    cameras.add_second(second_pose(20 * MS, np.eye(4)))
+    for stamp in (33, 66):
+        cameras.with_second(pose(stamp * MS, T_BODY_FIRST), flying(0.0))
+    assert cameras.joined == 1
+    cameras.add_second(second_pose(80 * MS, np.eye(4)))
+    late = pose(180 * MS, T_BODY_FIRST)
+    assert cameras.with_second(late, flying(0.0)) is late
 
 
 def test_parameters_in_the_second_cameras_namespace_are_its_own(tmp_path):
@@ -73,7 +144,7 @@ def test_the_mapper_reads_both_and_goes_on_with_the_second_alone(graph, tmp_path
     # Frame 4 is 100 ms after the first camera's last: it might still come.
     graph.spin_until(lambda: len(graph.heard['camera_pose']) == 3)
     figures = graph.diagnose(node)[2]
-    assert figures['second camera: alone'] == '1'
+    assert (figures['second camera: joined'], figures['second camera: alone']) == ('1', '1')
     stamps = [convert.stamp_ns(message.header.stamp) for message in graph.heard['camera_pose']]
     assert stamps == [convert.stamp_ns(seen[k].header.stamp) for k in (0, 1, 8)]
     for message, k in zip(graph.heard['camera_pose'], (0, 1, 8), strict=True):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.reprojection import lever_arm, turned
+from thermal_fiducial.core.geometry.reprojection import turned
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked
 
@@ -143,18 +143,6 @@ def in_moved_map(pose: CameraPose, T_new_old: FloatArray) -> CameraPose:
         T_map_camera=T_new_old @ pose.T_map_camera,
         covariance=turned(pose.covariance, R),
         map_covariance=turned(pose.map_covariance, R),
-    )
-
-
-def seen_from(pose: CameraPose, T_camera_other: FloatArray) -> CameraPose:
-    """The pose of something fixed at ``T_camera_other`` (4, 4) on the camera."""
-    T_map_other = pose.T_map_camera @ T_camera_other
-    J = lever_arm(T_map_other[:3, 3] - pose.T_map_camera[:3, 3])
-    return replace(
-        pose,
-        T_map_camera=T_map_other,
-        covariance=J @ pose.covariance @ J.T,
-        map_covariance=J @ pose.map_covariance @ J.T,
     )
 
 

@@ -1,0 +1,99 @@
+"""A second camera on the robot: its poses, as poses of the first camera, are fused with those or replace them.
+
+The filter has one camera, and models errors that its poses have in common from frame to frame as that camera's. Poses
+of two cameras in turn would violate this. So both are fused to one pose per frame of the first, by covariance
+intersection, which is consistent for any correlation (S. Julier, J. Uhlmann, "A non-divergent estimation algorithm in
+the presence of unknown correlations", ACC 1997). Without a known marker in the first, the second's pose is published.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from thermal_fiducial.core.error_model import CHI2_OF_POSE
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
+from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.mapping.located import predicted_camera
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.motion_prior import MotionPrior
+from thermal_fiducial.core.types import FloatArray
+
+#: A pose of the second camera is carried on to a frame of the first over at most this [ns]: two periods at 30 Hz.
+_CARRIED_NS = 70_000_000
+#: The second camera stands in when the first has had no pose for this long [ns].
+_ALONE_NS = 120_000_000
+
+
+class SecondCamera:
+    """Takes poses of both cameras in the order of their arrival.
+
+    Parameters
+    ----------
+    T_body_first, T_body_second : (4, 4) the cameras on the robot
+    """
+
+    def __init__(self, T_body_first: FloatArray, T_body_second: FloatArray) -> None:
+        self._T_body_first = T_body_first
+        self._T_second_first = inverse(T_body_second) @ T_body_first
+        self._waiting: CameraPose | None = None
+        self._first_ns: int | None = None
+        #: number of fused frames, of the second's poses published alone, and of those that contradicted the first
+        self.joined = self.alone = self.contradicted = 0
+
+    def add_second(self, pose: CameraPose) -> CameraPose | None:
+        """Add a pose of the second camera; returned as a pose of the first while that has none, else None."""
+        pose = seen_from(pose, self._T_second_first)
+        if self._first_ns is None or pose.stamp_ns - self._first_ns > _ALONE_NS:
+            self.alone += 1
+            return pose
+        self._waiting = pose
+        return None
+
+    def with_second(self, pose: CameraPose, prior: MotionPrior) -> CameraPose:
+        """A pose of the first camera fused with the latest of the second, extrapolated by odometry."""
+        waiting, self._waiting = self._waiting, None
+        self._first_ns = pose.stamp_ns
+        if waiting is None or abs(pose.stamp_ns - waiting.stamp_ns) > _CARRIED_NS:
+            return pose
+        there = carried(waiting, pose.stamp_ns, prior, self._T_body_first)
+        joint = None if there is None else intersection(pose, there)
+        if joint is None:
+            self.contradicted += there is not None
+            return pose
+        self.joined += 1
+        return joint
+
+
+def seen_from(pose: CameraPose, T_camera_other: FloatArray) -> CameraPose:
+    """The pose of something fixed at ``T_camera_other`` (4, 4) on the camera."""
+    T_map_other = pose.T_map_camera @ T_camera_other
+    J = lever_arm(T_map_other[:3, 3] - pose.T_map_camera[:3, 3])
+    return replace(
+        pose,
+        T_map_camera=T_map_other,
+        covariance=J @ pose.covariance @ J.T,
+        map_covariance=J @ pose.map_covariance @ J.T,
+    )
+
+
+def intersection(first: CameraPose, second: CameraPose) -> CameraPose | None:
+    """Both poses of one instant as one, each with half its information; None where they contradict each other."""
+    apart = difference(second.T_map_camera, first.T_map_camera)
+    if apart @ np.linalg.solve(first.covariance + second.covariance, apart) > CHI2_OF_POSE:
+        return None
+    informations = [0.5 * np.linalg.inv(pose.covariance) for pose in (first, second)]
+    covariance = np.linalg.inv(informations[0] + informations[1])
+    T_map_camera = retract(first.T_map_camera, covariance @ informations[1] @ apart)
+    return replace(first, T_map_camera=T_map_camera, covariance=0.5 * (covariance + covariance.T))
+
+
+def carried(pose: CameraPose, stamp_ns: int, prior: MotionPrior, T_body_camera: FloatArray) -> CameraPose | None:
+    """``pose`` at another stamp, moved as the odometry has moved in between; None where there is none near both."""
+    if stamp_ns == pose.stamp_ns:
+        return pose
+    # No offset of the clocks widens this: it moves both ends alike.
+    then, now = (predicted_camera(prior, stamp, T_body_camera, 0.0) for stamp in (pose.stamp_ns, stamp_ns))
+    if then is None or now is None:
+        return None
+    T_then_now = inverse(then.pose.T_map_camera) @ now.pose.T_map_camera
+    return replace(pose, stamp_ns=stamp_ns, T_map_camera=pose.T_map_camera @ T_then_now)
