@@ -88,7 +88,7 @@ MECHANISMS = {
     'floor of the vibration': Mechanism(('shaken',), ('imu_noise:NoiseFloor',), changes={'vibration': 0.0}),
     'noise in motion': Mechanism(
         ('nonlinear',),
-        ('imu_noise:ImuNoiseMonitor._size_of_motion',),
+        ('imu_noise:ImuNoiseMonitor._motion_of',),
         changes={'gyroscope_nonlinearity': 0.0, 'accelerometer_nonlinearity': 0.0},
     ),
     'what gaps hide': Mechanism(

@@ -59,3 +59,11 @@ def test_an_accelerometer_stays_at_full_scale_for_a_tenth_of_a_second_at_most(im
     # twenty steps
     assert verdicts(imu, cut, 200) == [Verdict.USE] * 20 + [Verdict.FROZEN] * 40
     assert verdicts(imu, noise(20), 260) == [Verdict.AHEAD] + [Verdict.USE] * 19
+
+
+def test_an_axis_that_has_never_changed_is_at_rest(imu):
+    """A simulator without noise, before it takes off and once it hovers again."""
+    still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 9.80665], (400, 1))
+    assert set(verdicts(imu, still)) == {Verdict.USE}
+    assert set(verdicts(imu, noise(50), 400)) == {Verdict.USE}
+    assert set(verdicts(imu, still, 450)) == {Verdict.USE}

@@ -14,7 +14,8 @@ UNUSUAL_FACTOR, UNUSUAL_NS, MEMORY_NS = 3.0, 30_000_000, 2_000_000_000
 #: A sensor saturates at its full scale; a reading beyond this multiple of it is a corrupt message.
 IMPOSSIBLE_RANGES = 2.0
 #: An axis is frozen once it has repeated a value for this long [s], in at least this many samples, and in this multiple
-#: of its longest run so far, which is due to quantisation: runs of up to 4 and 30 samples in two recorded IMUs.
+#: of its longest run so far, which is due to quantisation: runs of up to 4 and 30 samples in two recorded IMUs. Before
+#: its first change it may be at rest, in a simulator without noise or behind a dead zone.
 FROZEN_SECONDS, FROZEN_SAMPLES, FROZEN_FACTOR = 0.045, 4, 3
 #: An accelerometer that stays at full scale for longer [s] is dead: impacts are over by then, and thrust is less than
 #: its range. A gyroscope may turn faster than its range for as long as it likes.
@@ -41,19 +42,20 @@ class Axis:
         self._full_scale, self._saturated = full_scale, saturated
         self._value = math.nan
         self._since_ns = self._count = 0
-        self._too_many = FROZEN_SAMPLES
+        self._longest, self._too_many = 0, FROZEN_SAMPLES
 
     def is_frozen(self, stamp_ns: int, value: float) -> bool:
         """Whether the run that a sample's value continues is too long."""
         if value != self._value or stamp_ns < self._since_ns:
-            if self._count < self._too_many:
-                self._too_many = max(self._too_many, FROZEN_FACTOR * self._count)
+            if self._count < self._too_many or not self._longest:
+                self._longest = max(self._longest, self._count)
+                self._too_many = max(FROZEN_SAMPLES, FROZEN_FACTOR * self._longest)
             self._value, self._since_ns, self._count = value, stamp_ns, 0
         self._count += 1
         seconds = (stamp_ns - self._since_ns) / SECOND_NS
         if abs(value) >= self._full_scale:
             return seconds >= self._saturated
-        return seconds >= FROZEN_SECONDS and self._count >= self._too_many
+        return seconds >= FROZEN_SECONDS and self._count >= self._too_many and self._longest > 0
 
 
 class ImuInput:

@@ -45,9 +45,9 @@ class ImuNoiseMonitor:
         self._noise = noise
         self._floor = NoiseFloor()
         self._motion = StructureFunction()
-        self._mean_force: FloatArray | None = None
+        self._mean_force: list[float] = []
         self._recent: list[FloatArray] = []
-        # Of gyroscope and accelerometer, as single numbers: arrays of two take ten times as long.
+        # Of gyroscope and accelerometer, as single numbers: small arrays take ten times as long.
         self._sheet = noise.gyroscope_noise_density, noise.accelerometer_noise_density
         self._nonlinearity = noise.gyroscope_nonlinearity, noise.accelerometer_nonlinearity
         self._ranges = noise.gyroscope_range, noise.accelerometer_range
@@ -65,26 +65,26 @@ class ImuNoiseMonitor:
         # Shorter steps are covered by the floor of the spectrum, once it has been measured.
         covered = seconds <= _INTERRUPTED and any(self._floor.densities)
         between = (0.0, 0.0) if covered else self._motion.hidden(seconds)
-        largest = np.abs(imu)
+        values = imu.tolist()
+        rates, forces = values[:3], values[3:]
+        motions = math.hypot(*rates), self._motion_of(forces, seconds)
         squares = []
-        for triad, motion in enumerate(self._size_of_motion(imu, seconds)):
+        for triad, (readings, motion) in enumerate(zip((rates, forces), motions, strict=True)):
             white = max(self._sheet[triad], self._noise.vibration * self._floor.densities[triad]) ** 2
             moving = (self._nonlinearity[triad] * motion) ** 2 * _MOTION_TIME
-            beyond = largest[3 * triad : 3 * triad + 3].max() >= self._ranges[triad]
+            beyond = max(map(abs, readings)) >= self._ranges[triad]
             lost = _SATURATED[triad] ** 2 * seconds if beyond else 0.0
             squares.append(white + moving + between[triad] + max(lost, self._saturated[triad]))
             self._saturated[triad] = lost
         rate, force = map(math.sqrt, squares)
         return np.array((rate, rate, rate, force, force, force))
 
-    def _size_of_motion(self, imu: FloatArray, seconds: float) -> tuple[float, float]:
-        """Magnitudes of the rate, and of the force less its slow mean, which is gravity."""
-        rate, force = imu[:3], imu[3:]
-        if self._mean_force is None:
-            self._mean_force = force
-        self._mean_force = self._mean_force + min(seconds / _SLOW, 1.0) * (force - self._mean_force)
-        moved = force - self._mean_force
-        return math.sqrt(float(rate @ rate)), math.sqrt(float(moved @ moved))
+    def _motion_of(self, forces: list[float], seconds: float) -> float:
+        """Magnitude of the force (3,) less its slow mean, which is gravity."""
+        self._mean_force = self._mean_force or forces
+        share = min(seconds / _SLOW, 1.0)
+        self._mean_force = [mean + share * (now - mean) for mean, now in zip(self._mean_force, forces, strict=True)]
+        return math.dist(forces, self._mean_force)
 
     def _follow_spectrum(self, imu: FloatArray, seconds: float) -> None:
         if seconds > _INTERRUPTED:
