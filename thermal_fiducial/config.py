@@ -1,7 +1,7 @@
-"""Every parameter of the four nodes: default, range, unit, description.
+"""Every parameter of the nodes: default, range, unit, description.
 
-The nodes declare these as ROS parameters, the offline pipeline takes the same objects, and
-``config/thermal_fiducial.yaml`` is checked against them, so a default lives in one place.
+The nodes declare them as ROS parameters, the offline pipeline uses the same config objects, and
+``config/thermal_fiducial.yaml`` is generated from them, so each default is defined once.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -13,9 +13,9 @@ from typing import Any, TypeVar
 from thermal_fiducial.errors import InputError
 
 Config = TypeVar('Config')
-#: By how much the norm of a quaternion that somebody typed may be off.
+#: Largest deviation from 1 of the norm of a quaternion parameter: typed values are rounded.
 _NORM_TOLERANCE = 0.01
-#: Characters of a value that an error shows.
+#: Longest quotation of a value in an error message [characters].
 _LONGEST_SHOWN = 100
 #: Parameters that rclpy declares on every node.
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
@@ -34,7 +34,7 @@ def param(
     verify: Callable[[Any], object] | None = None,
     live: bool = False,
 ) -> Any:
-    """One parameter: a dataclass field with what ROS wants to know of it.
+    """One parameter: a dataclass field whose metadata fill ROS's parameter descriptor.
 
     Parameters
     ----------
@@ -44,9 +44,9 @@ def param(
     minimum, maximum : inclusive range of a number or of each number of a tuple
     choices : the allowed values of a string
     length : number of elements of a tuple of floats
-    normed : whether their squares must add up to one, as a rotation's quaternion's do
-    verify : called with the value, raises InputError if it cannot be used
-    live : whether it may be set while the node runs; otherwise it is declared read-only
+    normed : whether the tuple must have unit norm (a quaternion)
+    verify : called with the value; raises InputError if it is unusable
+    live : whether the parameter is dynamic; otherwise it is declared read-only
     """
     metadata = {
         'description': f'{description} [{unit}]' if unit else description,
@@ -63,7 +63,7 @@ def param(
 
 @dataclass(frozen=True)
 class SelfChecked:
-    """Base of the configs: values are checked wherever an object is made, also by hand or by ``replace``.
+    """Base of the configs: values are checked at every construction, including ``dataclasses.replace``.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def parameters(config: Any, prefix: str = '') -> Iterator[tuple[str, 'Field[Any]
 def from_mapping(kind: type[Config], values: dict[str, Any]) -> Config:
     """Config of dataclass ``kind`` with ``values`` (ROS name to value) in place of the defaults.
 
-    Names that ``kind`` doesn't have are left alone, as one parameter file serves all nodes; see :func:`check_names`.
+    Names that ``kind`` lacks are ignored, since one parameter file serves all nodes; see :func:`check_names`.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
     Raises
     ------
     InputError
-        Wrong type, out of range, not among the choices, or no unit quaternion.
+        Wrong type, out of range, not among the choices, or not a unit quaternion.
     """
     limits = item.metadata
     result = _typed(name, item.default, limits['length'], value)
@@ -141,7 +141,7 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
 
 
 def _shown(value: object) -> str:
-    """A value as an error shows it: in a line, whatever it is."""
+    """``repr`` of a value for an error message, truncated to one line."""
     text = repr(value)
     return text if len(text) <= _LONGEST_SHOWN else f'{text[:_LONGEST_SHOWN]}...'
 
@@ -216,7 +216,7 @@ def _camera_orientation() -> Any:
 
 
 def _base_frame() -> Any:
-    return param('base_link', 'Frame of the robot: that of the IMU, unless TF or a URDF say otherwise.')
+    return param('base_link', 'Frame of the robot; identical to the IMU frame unless TF or a URDF says otherwise.')
 
 
 def _camera_frame() -> Any:
@@ -226,14 +226,14 @@ def _camera_frame() -> Any:
 def _extrinsics() -> Any:
     return param(
         'auto',
-        'auto: camera_position and camera_orientation from /tf_static (needs tf2_msgs) or robot_description, where '
-        'they connect camera_frame with the robot; parameters: always as set.',
+        'Source of camera_position and camera_orientation. auto: /tf_static (needs tf2_msgs) or robot_description, if '
+        'they connect camera_frame with the robot, else the parameters; parameters: always the parameters.',
         choices=('auto', 'parameters'),
     )
 
 
 def _prefix_frames() -> Any:
-    return param(False, "Put the node's namespace before the frames of the robot, not before that of the map.")
+    return param(False, "Prefix the robot's frames, but not the map frame, with the node's namespace.")
 
 
 def _camera_time_offset() -> Any:
@@ -243,7 +243,7 @@ def _camera_time_offset() -> Any:
 def _time_offset_std() -> Any:
     return param(
         0.03,
-        'How far camera_time_offset may be wrong (standard deviation); when it is not estimated, what is allowed for.',
+        'Standard deviation of camera_time_offset: prior if it is estimated, else noise of each pose.',
         unit='s',
         minimum=0.0,
         maximum=0.2,
@@ -251,14 +251,14 @@ def _time_offset_std() -> Any:
 
 
 def _image_rate() -> Any:
-    text = 'Rate of the images, by which the diagnostics judge them; 0: that of the first seconds.'
+    text = 'Expected image rate for the diagnostics; 0: the rate of the first seconds.'
     return param(0.0, text, unit='Hz', minimum=0.0, maximum=1000.0)
 
 
 def _realtime_priority() -> Any:
     text = (
-        'Priority of the camera under SCHED_FIFO, where the user may (rtprio in limits.conf); detector, mapper and '
-        'filter have one, two and three more; 0: ordinary processes.'
+        'SCHED_FIFO priority of tau2_camera, if the user may set one (rtprio in limits.conf); detector, mapper and '
+        'filter get 1, 2 and 3 more. 0: ordinary scheduling.'
     )
     return param(1, text, minimum=0, maximum=96)
 
@@ -269,7 +269,7 @@ def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
     Raises
     ------
     InputError
-        An entry that is not of this form, or a side that is not positive.
+        An entry of another form, or a side that is not positive.
     """
     sizes: dict[int, float] = {}
     for entry in entries:
@@ -293,27 +293,27 @@ class Tau2CameraConfig(SelfChecked):
     calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
     image_transport: str = param(
         'raw',
-        'raw: thermal/image_raw; compressed: thermal/image_raw/compressed, PNG of 16 bits as image_transport makes it.',
+        'raw: thermal/image_raw; compressed: thermal/image_raw/compressed, 16-bit PNG of image_transport.',
         choices=('raw', 'compressed'),
     )
     bad_pixel_file: str = param('', 'List of dead pixels: a text file, "column row" a line. Empty: none.')
     find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.', live=True)
     bits: int = param(
         14,
-        'Significant bits of a 16-bit pixel; flags above them are masked, counts that are shifted up are shifted back.',
+        'Significant bits of a 16-bit pixel; flag bits above them are masked, left-aligned counts are shifted right.',
         minimum=8,
         maximum=16,
     )
     settle_frames: int = param(
         1,
-        'Frames withheld after a shutter event, while they may still hold old counts.',
+        'Frames dropped after a shutter event, since they may still contain counts from before it.',
         minimum=0,
         maximum=30,
         live=True,
     )
     view_tail_percent: float = param(
         0.5,
-        '8-bit view: share of the pixels beyond either end of the scale.',
+        '8-bit view: share of the pixels clipped at either end of the scale.',
         unit='%',
         minimum=0.0,
         maximum=25.0,
@@ -321,14 +321,14 @@ class Tau2CameraConfig(SelfChecked):
     )
     view_smoothing: float = param(
         0.05,
-        '8-bit view: share of a new frame in the scale; small values follow slowly.',
+        '8-bit view: weight of a new frame in the exponential average of the scale.',
         minimum=0.001,
         maximum=1.0,
         live=True,
     )
     view_minimum_span: float = param(
         40.0,
-        '8-bit view: narrowest scale, so that noise alone does not fill it.',
+        '8-bit view: smallest range of the scale, so that noise alone does not fill it.',
         unit='counts',
         minimum=1.0,
         live=True,
@@ -341,7 +341,7 @@ class Tau2CameraConfig(SelfChecked):
 
 @dataclass(frozen=True)
 class ArucoDetectorConfig(SelfChecked):
-    """Detection of markers and the pose of each."""
+    """Detection and pose estimation of markers."""
 
     dictionary: str = _dictionary()
     marker_size: float = _marker_size()
@@ -355,25 +355,24 @@ class ArucoDetectorConfig(SelfChecked):
     camera_time_offset: float = _camera_time_offset()
     bolometer_lag: float = param(
         0.010,
-        'Thermal time constant of the bolometers; 0: none, or a camera of another kind.',
+        'Thermal time constant of the bolometers; 0: no lag (a cooled detector, say).',
         unit='s',
         minimum=0.0,
         maximum=0.05,
     )
     readout_time: float = param(
         0.0,
-        'From the sampling of the first row to that of the last; the stamp is that of the middle row. '
-        '0: all rows at once.',
+        'Rolling-shutter readout time from first to last row; the stamp refers to the middle row. 0: global shutter.',
         unit='s',
         minimum=0.0,
         maximum=0.05,
     )
     blur_px: float = param(
-        0.66, 'Standard deviation of the blur by optics and pixel.', unit='px', minimum=0.3, maximum=3.0
+        0.66, 'Standard deviation of the blur of optics and pixels.', unit='px', minimum=0.3, maximum=3.0
     )
     refinement: str = param(
         'auto',
-        'Corners from the lines of the sides (auto and edges are the same), or each locally as OpenCV does.',
+        "Corner refinement. auto, edges: intersections of fitted side lines; subpix: OpenCV's cornerSubPix.",
         choices=('auto', 'edges', 'subpix'),
         live=True,
     )
@@ -381,25 +380,25 @@ class ArucoDetectorConfig(SelfChecked):
     whitelist_from_map: bool = param(False, 'Find only the markers of the map, where there is one.')
     polarity: str = param(
         'alike',
-        'Which markers a blind search may find: dark ones (colder than their background), bright ones, any, or those '
-        'that are like the ones seen in the last seconds.',
+        'Polarity that a blind search accepts: dark (colder than the background), bright, any, or alike: the polarity '
+        'of the markers seen in the last seconds.',
         choices=('alike', 'any', 'dark', 'bright'),
         live=True,
     )
     min_side_px: float = param(12.0, 'Shortest side of a marker.', unit='px', minimum=8.0, maximum=400.0, live=True)
     min_contrast: float = param(
         0.7,
-        'Smallest contrast of white over black, in standard deviations of the noise of a pixel.',
+        'Smallest contrast-to-noise ratio: white minus black over the noise standard deviation of a pixel.',
         minimum=0.0,
         maximum=1000.0,
         live=True,
     )
     min_correlation: float = param(
-        0.65, 'Smallest correlation of the cells with the pattern of a marker.', minimum=0.5, maximum=1.0, live=True
+        0.65, 'Smallest correlation of the cells with the bit pattern.', minimum=0.5, maximum=1.0, live=True
     )
     min_margin: float = param(
         0.07,
-        'By how much the pattern must correlate better than that of any other marker.',
+        'Smallest lead of the correlation over that of every other marker.',
         minimum=0.0,
         maximum=0.5,
         live=True,
@@ -413,23 +412,25 @@ class ArucoDetectorConfig(SelfChecked):
     )
     max_bit_errors: int = param(
         -1,
-        'Bits on the wrong side of the middle between black and white. -1: as many as the dictionary can correct.',
+        'Most bits on the wrong side of the threshold between black and white. -1: as many as the dictionary corrects.',
         minimum=-1,
         maximum=20,
         live=True,
     )
-    max_border_errors: int = param(2, 'The same for the cells of the black border.', minimum=0, maximum=20, live=True)
-    guided: bool = param(True, 'With a map and odometry: look for known markers where they should be.', live=True)
+    max_border_errors: int = param(
+        2, 'Most cells of the black border on the wrong side.', minimum=0, maximum=20, live=True
+    )
+    guided: bool = param(True, 'Search for mapped markers where map and odometry predict them.', live=True)
     blind_interval: int = param(
         10,
-        'A blind search follows every so many frames, and sooner without a map or where most of its markers are not '
-        'seen. Where all are clear, small markers (at full resolution) and faint ones (at half) take turns.',
+        'Frames between blind searches; fewer without a map or when most of the expected markers are not seen. When '
+        'all are seen, the searches alternate between full resolution (small markers) and half (faint ones).',
         minimum=1,
         maximum=1000,
         live=True,
     )
     max_odometry_age: float = param(
-        0.1, 'Oldest odometry that predicts where markers are.', unit='s', minimum=0.0, maximum=1.0, live=True
+        0.1, 'Largest age of the odometry for a guided search.', unit='s', minimum=0.0, maximum=1.0, live=True
     )
     guided_min_contrast: float = param(
         0.35, 'min_contrast of an expected marker.', minimum=0.0, maximum=1000.0, live=True
@@ -440,8 +441,8 @@ class ArucoDetectorConfig(SelfChecked):
     guided_min_margin: float = param(0.05, 'min_margin of an expected marker.', minimum=0.0, maximum=0.5, live=True)
     detections: str = param(
         '',
-        'Publish `detections` in the message of another package too, where it is installed: aruco_opencv_msgs, '
-        'apriltag_msgs or vision_msgs. Empty: none.',
+        'Also publish `detections` as a message of aruco_opencv_msgs, apriltag_msgs or vision_msgs, which must be '
+        'installed. Empty: none.',
         choices=('', 'aruco_opencv', 'apriltag', 'vision'),
     )
     image_annotations: bool = param(
@@ -450,7 +451,7 @@ class ArucoDetectorConfig(SelfChecked):
     publish_marker_tf: bool = param(False, 'Publish each marker as marker_ID on /tf (needs tf2_ros).')
     duplicates: str = param(
         'drop',
-        'An ID at two places of a frame, as in a reflection. drop: neither counts; best: the clearer one does.',
+        'An ID seen twice in a frame (a reflection, say). drop: discard both; best: keep the better correlated one.',
         choices=('drop', 'best'),
         live=True,
     )
@@ -470,14 +471,14 @@ class MarkerMapperConfig(SelfChecked):
     map_frame: str = param('map', 'Frame of the map.')
     second_camera: str = param(
         '',
-        'Name of a second camera, which makes poses better and stands in: NAME/markers and NAME/thermal/camera_info '
-        'are read. Empty: none.',
+        'Name of a second camera, whose poses are fused with those of the first or replace them: subscribes to '
+        'NAME/markers and NAME/thermal/camera_info. Empty: none.',
     )
     second_camera_position: tuple[float, ...] = _camera_position()
     second_camera_orientation: tuple[float, ...] = _camera_orientation()
-    cloud_file: str = param('', 'Point cloud of the place (.ply or .pcd) to show beside the markers. Empty: none.')
+    cloud_file: str = param('', 'Point cloud of the site (.ply or .pcd) to publish for RViz. Empty: none.')
     cloud_alignment_file: str = param(
-        '', 'Where the map lies in cloud_file, as map align writes it. Empty: both are in the same frame.'
+        '', 'Transform from the map to the frame of cloud_file, written by map align. Empty: the frames are the same.'
     )
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
@@ -489,29 +490,30 @@ class MarkerMapperConfig(SelfChecked):
     time_offset_std: float = _time_offset_std()
     marker_size_std: float = param(
         0.003,
-        'Common relative error of all marker sizes and of the focal length: part of the covariance of map and poses.',
+        'Scale error common to all marker sizes and the focal length (relative standard deviation); enters the '
+        'covariances of map and poses.',
         minimum=0.0,
         maximum=0.1,
         live=True,
     )
     bridge_duration: float = param(
         3.0,
-        'How long after the last known marker new ones may still be placed from the odometry.',
+        'Time since the last mapped marker during which new markers may be placed by odometry alone.',
         unit='s',
         minimum=0.0,
         maximum=60.0,
         live=True,
     )
-    keyframe_budget: int = param(800, 'Frames kept for the joint refinement.', minimum=10, maximum=20000)
+    keyframe_budget: int = param(800, 'Most keyframes of the bundle adjustment.', minimum=10, maximum=20000)
     autosave_period: float = param(
         30.0,
-        'A map that has learned something is written to <map_file>.autosave this often; 0: never.',
+        'Period at which a changed map is written to <map_file>.autosave; 0: never.',
         unit='s',
         minimum=0.0,
         maximum=3600.0,
     )
     refinement_period: float = param(
-        2.0, 'Shortest time between two joint refinements; 0: never.', unit='s', minimum=0.0, maximum=3600.0, live=True
+        2.0, 'Shortest time between two bundle adjustments; 0: none.', unit='s', minimum=0.0, maximum=3600.0, live=True
     )
     image_rate: float = _image_rate()
     realtime_priority: int = _realtime_priority()
@@ -529,26 +531,26 @@ class ImuNoise(SelfChecked):
     )
     gyroscope_scale_std: float = param(
         0.005,
-        'Scale and cross-axis errors of the gyroscope (standard deviation of each: half the tolerance of the data '
-        'sheet), which are estimated while running; 0: none.',
+        'Prior standard deviation of the scale and cross-axis errors of the gyroscope, which are estimated: half the '
+        'tolerance of the data sheet. 0: none.',
         minimum=0.0,
         maximum=0.1,
     )
     accelerometer_scale_std: float = param(
         0.005,
-        'Scale and cross-axis errors of the accelerometer, likewise; 0: none.',
+        'The same for scale and cross-axis errors of the accelerometer.',
         minimum=0.0,
         maximum=0.1,
     )
     gyroscope_nonlinearity: float = param(
         0.001,
-        'What is left of the errors of the gyroscope in motion (nonlinearity, bandwidth), as a share of the rate.',
+        'Residual error of the gyroscope in motion (nonlinearity, bandwidth), relative to the rate.',
         minimum=0.0,
         maximum=0.1,
     )
     accelerometer_nonlinearity: float = param(
         0.004,
-        'The same of the accelerometer (size effect too), as a share of the specific force beside gravity.',
+        'Residual error of the accelerometer (also size effect), relative to the specific force without gravity.',
         minimum=0.0,
         maximum=0.1,
     )
@@ -556,8 +558,8 @@ class ImuNoise(SelfChecked):
     accelerometer_range: float = param(156.0, 'Readings beyond this are saturated.', unit='m/s^2', minimum=10.0)
     vibration: float = param(
         1.0,
-        'Share of the vibration that may count as white noise where it exceeds the densities: the floor of its '
-        'spectrum between the tones of the rotors; 0: none.',
+        'Factor on the noise density measured under vibration (the spectral floor between the rotor tones), which '
+        'replaces the white noise of the data sheet where it is larger. 0: ignore vibration.',
         minimum=0.0,
         maximum=1.0,
     )
@@ -574,19 +576,17 @@ class PoseEkfConfig(SelfChecked):
     camera_frame: str = _camera_frame()
     prefix_frames: bool = _prefix_frames()
     camera_time_offset: float = _camera_time_offset()
-    estimate_time_offset: bool = param(True, 'Estimate what is left of the time offset while running.')
+    estimate_time_offset: bool = param(True, 'Estimate the error of camera_time_offset.')
     time_offset_std: float = _time_offset_std()
-    time_offset_random_walk: float = param(
-        5.0e-5, 'Drift of the two clocks against each other.', unit='s/sqrt(s)', minimum=0.0
-    )
+    time_offset_random_walk: float = param(5.0e-5, 'Random walk of the clock offset.', unit='s/sqrt(s)', minimum=0.0)
     stamp_jitter: float = param(
         0.0005,
-        'Jitter of the camera stamps to begin with; it is learned from the poses. 0: exact, nothing is learned.',
+        'Initial standard deviation of the jitter of the camera stamps, estimated from the poses. 0: no jitter.',
         unit='s',
         minimum=0.0,
         maximum=0.05,
     )
-    estimate_extrinsics: bool = param(False, 'Refine camera_position and camera_orientation while running.')
+    estimate_extrinsics: bool = param(False, 'Estimate the errors of camera_position and camera_orientation.')
     extrinsics_position_std: float = param(0.02, 'Standard deviation of camera_position.', unit='m', minimum=0.0)
     extrinsics_orientation_std: float = param(
         0.02, 'Standard deviation of camera_orientation.', unit='rad', minimum=0.0
@@ -595,62 +595,68 @@ class PoseEkfConfig(SelfChecked):
     gravity: float = param(9.80665, 'Local gravity.', unit='m/s^2', minimum=9.7, maximum=9.9)
     map_tilt_std: float = param(
         0.005,
-        'How far z of the map may be off the vertical; the tilt is estimated. 0: exactly vertical.',
+        'Prior standard deviation of the tilt of the map against gravity, which is estimated. 0: z is vertical.',
         unit='rad',
         minimum=0.0,
         maximum=0.2,
     )
-    initial_velocity_std: float = param(3.0, 'Speed at the first pose.', unit='m/s', minimum=0.01)
-    initial_gyroscope_bias_std: float = param(0.02, 'Gyroscope bias at the start.', unit='rad/s', minimum=0.0)
-    initial_accelerometer_bias_std: float = param(0.2, 'Accelerometer bias at the start.', unit='m/s^2', minimum=0.0)
-    initial_poses: int = param(3, 'Poses that must agree before the filter starts.', minimum=1, maximum=100)
+    initial_velocity_std: float = param(3.0, 'Initial standard deviation of the velocity.', unit='m/s', minimum=0.01)
+    initial_gyroscope_bias_std: float = param(
+        0.02, 'Initial standard deviation of the gyroscope bias.', unit='rad/s', minimum=0.0
+    )
+    initial_accelerometer_bias_std: float = param(
+        0.2, 'Initial standard deviation of the accelerometer bias.', unit='m/s^2', minimum=0.0
+    )
+    initial_poses: int = param(3, 'Consistent poses needed to initialise the filter.', minimum=1, maximum=100)
     pose_noise_scale: float = param(
         1.0,
-        'Factor on the standard deviation of the camera poses; where they scatter more, that is learned.',
+        'Factor on the standard deviation of the camera poses; larger scatter is estimated on top of it.',
         minimum=0.1,
         live=True,
     )
     systematic_pose_std: float = param(
         1.0,
-        'Error of camera poses that lasts as long as the view (lens, corners), in their own standard deviations.',
+        'Systematic error of camera poses in a constant view (lens, corners), in their standard deviations.',
         minimum=0.01,
         maximum=100.0,
     )
     systematic_angle: float = param(
-        0.3, 'Change of the view after which that error is another.', unit='rad', minimum=0.001, maximum=10.0
+        0.3, 'Change of the view that decorrelates the systematic error.', unit='rad', minimum=0.001, maximum=10.0
     )
     gate: float = param(
         22.5,
-        'A pose is refused beyond this squared Mahalanobis distance (22.5: 99.9 % of chi-square, 6 d.o.f.).',
+        'Gate: a pose with a larger NIS is refused (22.5: 99.9 % quantile of chi-square, 6 degrees of freedom).',
         minimum=1.0,
         live=True,
     )
     reset_after: float = param(
         1.0,
-        'Reset when refused poses have agreed with each other for so long; a metre off all of a sudden, only '
-        'when they are as many as had borne out the estimate (at most 300), or that is lost.',
+        'Reset when refused poses have been consistent with each other for this long. If they are far from the '
+        'estimate, as many are needed as the estimate has accepted (at most 300), unless it is lost.',
         unit='s',
         minimum=0.0,
         live=True,
     )
-    max_delay: float = param(1.0, 'Poses that arrive later than this are refused.', unit='s', minimum=0.0, maximum=10.0)
-    max_imu_gap: float = param(1.0, 'Reset after an IMU gap or clock jump beyond this.', unit='s', minimum=0.01)
+    max_delay: float = param(
+        1.0, 'Largest delay of a pose; later ones are refused.', unit='s', minimum=0.0, maximum=10.0
+    )
+    max_imu_gap: float = param(1.0, 'Longest IMU gap or clock jump without a reset.', unit='s', minimum=0.01)
     lost_position_std: float = param(
         0.3,
-        'The pose counts as lost when its position is known no better than this.',
+        'The pose is lost when the standard deviation of the position exceeds this.',
         unit='m',
         minimum=0.001,
         live=True,
     )
     reinitialise_after: float = param(
-        60.0, 'Reset after so long without an accepted pose.', unit='s', minimum=1.0, live=True
+        60.0, 'Reset after this time without an accepted pose.', unit='s', minimum=1.0, live=True
     )
     smoothing_time: float = param(
-        0.0, 'Spread corrections of the smooth output over this time; 0: no smooth output.', unit='s', minimum=0.0
+        0.0, 'Time over which the smooth output spreads corrections; 0: no smooth output.', unit='s', minimum=0.0
     )
     imu_rate: float = param(
         0.0,
-        'Rate of imu/data, by which the diagnostics judge it; 0: that of the first seconds.',
+        'Expected rate of imu/data for the diagnostics; 0: the rate of the first seconds.',
         unit='Hz',
         minimum=0.0,
         maximum=10000.0,
@@ -658,47 +664,47 @@ class PoseEkfConfig(SelfChecked):
     map_frame: str = param('map', 'Frame of the pose.')
     odom_frame: str = param(
         '',
-        'With publish_tf and smoothing_time, as REP-105: the smooth output from here to base_frame, the rest from '
-        'map_frame to here. Empty: map_frame to base_frame.',
+        'REP-105 odom frame, with publish_tf and smoothing_time: /tf gets odom_frame to base_frame (smooth output) and '
+        'map_frame to odom_frame (the difference). Empty: map_frame to base_frame.',
     )
     resume: bool = param(
         True,
-        'After a crash in flight: the last pose and clock offset of before, which are kept in ~/.ros (ROS_HOME), are a '
-        'hint to the first poses.',
+        'After a crash in flight, check the first poses against the last pose and start from the last clock offset, '
+        'both stored in ~/.ros (ROS_HOME).',
     )
-    publish_lost: bool = param(False, 'Publish `pose` also while it counts as lost; `odometry` is always published.')
+    publish_lost: bool = param(False, 'Publish `pose` also while it is lost; `odometry` is always published.')
     publish_tf: bool = param(False, 'Publish map to base_frame and base_frame to camera_frame on /tf (needs tf2_ros).')
     bridge_rate: float = param(
         0.0,
-        'Rate of bridge/odometry and bridge/pose for a flight controller, silent while lost, smooth with '
-        'smoothing_time; 0: none.',
+        'Rate of bridge/odometry and bridge/pose for a flight controller; nothing is sent while the pose is lost, and '
+        'the smooth output with smoothing_time. 0: none.',
         unit='Hz',
         minimum=0.0,
         maximum=1000.0,
     )
-    px4: bool = param(False, 'Publish fmu/in/vehicle_visual_odometry at bridge_rate too (needs px4_msgs).')
+    px4: bool = param(False, 'Also publish fmu/in/vehicle_visual_odometry at bridge_rate (needs px4_msgs).')
     realtime_priority: int = _realtime_priority()
 
 
 @dataclass(frozen=True)
 class ThermalSourceConfig(SelfChecked):
-    """The camera's driver, where no other one is used."""
+    """A camera driver, for cameras without one of their own."""
 
     camera: str = param(
         '',
-        'Where frames come from: a V4L2 device (/dev/video0), a TeAx ThermalGrabber ("teax", or "teax:SERIAL" where '
-        'there are several), or a folder or video of 16-bit pictures.',
+        'Source of the frames: a V4L2 device (/dev/video0), a TeAx ThermalGrabber ("teax", or "teax:SERIAL" if there '
+        'are several), or a folder or video of 16-bit pictures.',
     )
-    image_width: int = param(0, 'Width to ask the camera for; 0: as it is set.', unit='px', minimum=0, maximum=4096)
-    image_height: int = param(0, 'Height to ask the camera for; 0: as it is set.', unit='px', minimum=0, maximum=4096)
+    image_width: int = param(0, 'Requested width; 0: as the camera is set.', unit='px', minimum=0, maximum=4096)
+    image_height: int = param(0, 'Requested height; 0: as the camera is set.', unit='px', minimum=0, maximum=4096)
     frame_rate: float = param(
         0.0,
-        'Rate to ask a V4L2 device for, or to show pictures at; 0: as the device is set, pictures at 30.',
+        'Rate requested of a V4L2 device, or at which pictures are published; 0: as the device is set, pictures at 30.',
         unit='Hz',
         minimum=0.0,
         maximum=1000.0,
     )
-    repeat: bool = param(True, 'Show a folder or video again when it ends.')
+    repeat: bool = param(True, 'Restart a folder or video at its end.')
     calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
     frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
     prefix_frames: bool = _prefix_frames()
@@ -709,7 +715,7 @@ class LandingTargetConfig(SelfChecked):
     """The landing pad, for an autopilot behind mavros."""
 
     landing_pad: tuple[int, ...] = param(
-        (), 'Markers of the landing pad. Its place is the middle between them, its axes are those of the first.'
+        (), 'IDs of the markers of the landing pad: its origin is their centroid, its axes are those of the first.'
     )
     landing_target_frame: str = param(
         'body',
@@ -733,17 +739,17 @@ NODES: dict[str, type] = {
     'pose_ekf': PoseEkfConfig,
 }
 
-#: Nodes beside them, which run only where they are asked for.
+#: Optional nodes beside the pipeline.
 OPTIONAL_NODES: dict[str, type] = {'thermal_source': ThermalSourceConfig, 'landing_target': LandingTargetConfig}
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Refuse a parameter that no node has: most likely a name that was mistyped.
+    """Refuse a parameter that no node has, most likely a mistyped name.
 
     Raises
     ------
     InputError
-        With the name that comes closest.
+        An unknown name; the message suggests the closest known one.
     """
     known = {name for kind in (NODES | OPTIONAL_NODES).values() for name, _, _ in parameters(kind)}
     for name in sorted(set(names) - known - set(_OF_ROS)):
