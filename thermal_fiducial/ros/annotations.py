@@ -7,13 +7,13 @@ from std_msgs.msg import Header
 from thermal_fiducial.core.measurements import corners_px, Markers
 
 _LINE_PX, _FONT_PX, _CORNER_PX = 2.0, 18.0, 8.0
-#: Of Foxglove's pixels (0, 0) is the corner of the first, of ours its centre.
+#: In Foxglove (0, 0) is the corner of the first pixel, here its centre.
 _CENTRE_PX = 0.5
 _EDGE, _FIRST_CORNER, _GROUND = (0.13, 0.83, 0.93, 1.0), (1.0, 0.85, 0.0, 1.0), (0.0, 0.0, 0.0, 0.5)
 
 
 def image_annotations(messages: Any, markers: Markers, head: Header) -> Any:
-    """Outlines, first corners and IDs of the markers; empty where there are none, so that old ones disappear.
+    """Outlines, first corners and IDs of the markers; empty if there are none, which clears those of earlier frames.
 
     Parameters
     ----------

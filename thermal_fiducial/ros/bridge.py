@@ -1,6 +1,6 @@
-"""What leaves for a flight controller: odometry at its rate, only while it may be used, as each autopilot wants it.
+"""Outputs for a flight controller: decimated odometry, only while the pose is usable, in each autopilot's format.
 
-The autopilots: mavros takes nav_msgs/Odometry (``odometry/out``) or PoseWithCovarianceStamped
+mavros takes nav_msgs/Odometry (``odometry/out``) or PoseWithCovarianceStamped
 (``vision_pose/pose_cov``) in ENU and FLU and converts; PX4 over uXRCE-DDS takes px4_msgs/VehicleOdometry in FRD.
 """
 
@@ -25,13 +25,13 @@ PX4_TOPIC = 'fmu/in/vehicle_visual_odometry'
 
 
 class FlightControllerBridge:
-    """Outputs for a flight controller, every ``1 / bridge_rate``; none where ``bridge_rate`` is 0.
+    """Outputs for a flight controller at ``bridge_rate``; none if it is 0.
 
     Parameters
     ----------
-    node : whose outputs they are
+    node : the filter's node, which gets the publishers
     config : frames, rate
-    fault : says in words what was asked for and cannot be had
+    fault : called with a message if a configured output is unavailable
     """
 
     def __init__(self, node: CountingNode, config: PoseEkfConfig, fault: Callable[[str], None]) -> None:
@@ -51,17 +51,17 @@ class FlightControllerBridge:
                 self._px4_odometry = node.advertise(self._px4, PX4_TOPIC, qos.RESULT)
 
     def send(self, odometry: Odometry, written: StateBytes, resets: int) -> None:
-        """Publish ``odometry`` if its turn has come.
+        """Publish ``odometry`` if the next message is due.
 
         Parameters
         ----------
-        written : the same as bytes
-        resets : how often the pose has jumped; autopilots that know of a counter take the jump over with it
+        written : the same state, serialised
+        resets : number of jumps of the pose; PX4 applies a jump to its state when this counter changes
         """
         stamp = odometry.stamp_ns
         if not self._period_ns or self._due_ns - self._period_ns < stamp < self._due_ns:
             return
-        # In step with the IMU, however its period divides ours; reset after a gap or a clock that was set back.
+        # Due times advance by whole periods (exact mean rate); a gap or backward clock jump resets them.
         on_time = abs(stamp - self._due_ns) < self._period_ns
         self._due_ns = (self._due_ns if on_time else stamp) + self._period_ns
         self._odometry.send(written.odometry)
@@ -73,11 +73,11 @@ class FlightControllerBridge:
 def px4_odometry(kind: Any, odometry: Odometry, resets: int) -> Any:
     """px4_msgs/VehicleOdometry (``kind``) of the robot's state.
 
-    The map's axes become forward-right-down with an arbitrary heading (pose_frame FRD), velocities those of the
-    body; quaternions are w x y z, variances the three diagonals, the orientation's in the body.
+    The pose is in pose_frame FRD (the map turned to z down, arbitrary heading), velocities are in the body frame.
+    Quaternions are w x y z; variances are diagonals, that of the orientation in the body frame.
     """
     message = kind()
-    # PX4 fills in the time of arrival for 0 and takes the other, in its microseconds, for that of the measurement.
+    # timestamp 0: PX4 fills in the arrival time. timestamp_sample is the time of measurement [us].
     message.timestamp = 0
     message.timestamp_sample = odometry.stamp_ns // 1000
     place = convert.pose(odometry.T_map_body)

@@ -1,4 +1,4 @@
-"""Listens to what a flight controller would get, on the topics that the running filter really has."""
+"""Subscribes to the outputs for a flight controller, on the remapped topics of the running filter."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, replace
@@ -17,36 +17,36 @@ from thermal_fiducial.ros.run import initialise, make_executor
 
 _FILTER, _LANDING = 'pose_ekf', 'landing_target'
 _ODOMETRY, _IMU, _POSE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu', 'geometry_msgs/msg/PoseStamped'
-#: What PX4 over uXRCE-DDS gets.
+#: Message type for PX4 over uXRCE-DDS.
 PX4_KIND = 'px4_msgs/msg/VehicleOdometry'
-#: What the filter publishes for others than a flight controller.
+#: Odometry topics of the filter that are not for a flight controller.
 _NOT_FOR_IT = ('odometry', 'odometry_smooth')
-#: How long a filter is looked for [s].
+#: Timeout of the search for a filter [s].
 DISCOVERY_S = 5.0
 
 
 @dataclass(frozen=True)
 class Topics:
-    """Names to listen to."""
+    """Resolved topic names."""
 
     odometry: str
     imu: str
     landing: str
-    #: what the autopilot gets, which for PX4 over uXRCE-DDS is a message of its own beside the odometry
+    #: topic for the autopilot: px4_msgs/VehicleOdometry for PX4 over uXRCE-DDS, else the same as ``odometry``
     autopilot: str
-    #: name of the node that sends it
+    #: name of the publishing node
     sender: str
 
 
 @dataclass(frozen=True)
 class Links:
-    """Who is at the ends of the autopilot's topic, and what the filter said last."""
+    """Publishers and subscribers of the autopilot's topic, and the filter's last diagnostic."""
 
     topic: str
-    #: nodes that publish the odometry, and that receive what is for the autopilot, this one left out
+    #: publishers of the odometry, and subscribers of the autopilot's topic without this node
     senders: int
     receivers: int
-    #: why the filter has nothing to fly on; empty where it has
+    #: message of the filter's diagnostic if it is an error, else empty
     complaint: str
 
 
@@ -61,12 +61,12 @@ def listen(
     ros_arguments: Sequence[str] = (),
     domain_id: int | None = None,
 ) -> Links:
-    """Hand on odometry (with the time of arrival [ns]), IMU messages and landing targets for some seconds.
+    """Pass odometry (with its arrival time [ns]), IMU messages and landing targets to callbacks for ``seconds``.
 
     Parameters
     ----------
-    topic : of the odometry; empty: what the running filter sends to a flight controller, whatever it was remapped to
-    announce : called with what is listened to
+    topic : odometry to subscribe to; empty: the running filter's output for a flight controller, remapped or not
+    announce : called with the topics once they are resolved
     ros_arguments : as after ``--ros-args``
     """
     context = Context()
@@ -93,7 +93,7 @@ def listen(
 
 
 def _find(node: Node, executor: Any, topic: str) -> Topics:
-    """Topics of the filter in the graph; our own names where there is none."""
+    """Topics of the filter in the graph; the default names if there is none."""
     found: list[Topics] = []
 
     def look() -> bool:
@@ -124,7 +124,7 @@ def _topics_of_filter(node: Node, namespace: str) -> Topics | None:
 
 
 def _landing_topic(node: Node) -> str:
-    """What the node landing_target publishes, whatever it was remapped to; empty where there is none."""
+    """Remapped topic of the node landing_target; empty if it does not run."""
     for name, namespace in node.get_node_names_and_namespaces():
         if name == _LANDING:
             published = node.get_publisher_names_and_types_by_node(name, namespace)

@@ -1,4 +1,4 @@
-"""Base of the nodes that look at markers: the camera's calibration, and the filter's odometry as a hint."""
+"""Base of detector and mapper: the camera calibration, and the filter's odometry as a motion prior."""
 
 from collections.abc import Sequence
 from typing import Any, TypeVar
@@ -20,7 +20,7 @@ Config = TypeVar('Config', bound=ArucoDetectorConfig | MarkerMapperConfig)
 
 
 class CameraStageNode(StageNode[Config]):
-    """A stage node that follows ``thermal/camera_info`` (the last usable calibration counts) and ``odometry``."""
+    """A stage node that subscribes to ``thermal/camera_info`` (keeping the last valid one) and ``odometry``."""
 
     def __init__(self, name: str, kind: type[Config], **kwargs: Any) -> None:
         super().__init__(name, kind, **kwargs)
@@ -31,7 +31,7 @@ class CameraStageNode(StageNode[Config]):
         self.odometry = MotionPrior(self.config.camera_time_offset, self._read_odometry)
 
     def follow_hints(self) -> None:
-        """Subscribe to calibration and odometry; after the node's main input."""
+        """Subscribe to calibration and odometry; call it after subscribing to the node's main input."""
         self.subscribe_lazily(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
         self.subscribe_lazily(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT)
         RobotFrames(self, lambda: self.configure(self.config))
@@ -43,19 +43,19 @@ class CameraStageNode(StageNode[Config]):
         Raises
         ------
         InputError
-            None has come yet.
+            None has been received yet.
         """
         if self._camera is None:
             raise InputError('no camera_info')
         return self._camera
 
     def camera_of(self, image: Counts | Gray) -> Camera:
-        """The calibration, which must be that of ``image`` (H, W).
+        """The calibration, which must have the size of ``image`` (H, W).
 
         Raises
         ------
         InputError
-            None has come yet, or one of another size.
+            None has been received yet, or it has another size.
         """
         camera = self.camera()
         if image.shape != (camera.height, camera.width):
@@ -64,15 +64,15 @@ class CameraStageNode(StageNode[Config]):
         return camera
 
     def figures(self) -> dict[str, object]:
-        """How many different calibrations came."""
+        """Number of different calibrations received."""
         return {'calibrations': self._calibrations}
 
     def _on_odometry(self, message: bytes) -> None:
-        """Keep odometry as bytes: only the few states that frames need are decoded."""
+        """Keep odometry serialised: only the few states that a frame needs are decoded."""
         self.odometry.add(message_bytes.stamp_ns(message), message)
 
     def _read_odometry(self, messages: Sequence[bytes]) -> list[Odometry]:
-        """Decode odometry; unusable messages are refused, the frame is processed without them."""
+        """Decode odometry; invalid messages are refused, and the frame is processed without prior."""
         try:
             return message_bytes.odometry(messages)
         except InputError as error:
@@ -85,7 +85,7 @@ class CameraStageNode(StageNode[Config]):
         self.odometry.set_clock_offset(message_bytes.clock_offset(message))
 
     def _on_camera_info(self, message: bytes) -> None:
-        """Read and check a calibration that differs from the last; most drivers send the same one with each frame."""
+        """Validate a calibration if it differs from the last one; most drivers repeat it with each frame."""
         if message[message_bytes.BEHIND_STAMP :] == self._camera_info:
             return
         camera = convert.camera(message_bytes.read(message, CameraInfo, 'camera_info'))

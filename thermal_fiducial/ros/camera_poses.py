@@ -1,4 +1,4 @@
-"""The output of a mapper: the pose of the camera at each frame, made better by a second camera where there is one."""
+"""Output of the mapper: the camera pose of each frame, fused with that of a second camera if there is one."""
 
 from dataclasses import replace
 
@@ -19,17 +19,15 @@ from thermal_fiducial.ros.message_bytes import PoseBytes
 
 
 class CameraPoses:
-    """Publishes ``camera_pose`` for ``node``, and what of its covariance is the map's error.
+    """Publishes ``camera_pose``, and separately the part of its covariance that is due to the map's error.
 
-    The camera that the parameter ``second_camera`` names takes part.
-
-    The second camera is located in the map of ``mapper`` and never changes it: what both cameras see enters the map
-    through the first.
+    A second camera (parameter ``second_camera``) is located in the map of ``mapper`` but never changes it: new
+    markers enter the map through the first camera only.
     """
 
     def __init__(self, node: CameraStageNode[MarkerMapperConfig], mapper: MarkerMapper) -> None:
         self._node, self._mapper = node, mapper
-        #: which map the poses are of
+        #: transforms poses into the map as of their stamps
         self.late = LatePoses()
         self._output = node.advertise(PoseWithCovarianceStamped, 'camera_pose')
         self._map_error = node.advertise(PoseWithCovarianceStamped, 'camera_pose/map_error')
@@ -44,7 +42,7 @@ class CameraPoses:
             node.subscribe(CameraInfo, f'{name}/thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
 
     def configure(self) -> None:
-        """Take over where the cameras are on the robot."""
+        """Update the extrinsics of both cameras."""
         config = self._node.config
         self._locator.configure(_of_second(config))
         if config.second_camera:
@@ -53,7 +51,7 @@ class CameraPoses:
             self._second = SecondCamera(first, second)
 
     def send(self, stamp_ns: int, pose: CameraPose | None) -> None:
-        """Publish the pose of a frame of the first camera, where there is one, in the map of its stamp."""
+        """Publish the pose of a frame of the first camera, if it has one, in the map as of its stamp."""
         self.late.add(stamp_ns)
         if pose is not None:
             self._publish(pose if self._second is None else self._second.with_second(pose, self._node.odometry))
@@ -61,7 +59,7 @@ class CameraPoses:
     def _publish(self, pose: CameraPose) -> None:
         pose = self.late.as_of_its_stamp(pose)
         self._bytes.fill(pose.stamp_ns, pose.T_map_camera)
-        # First what belongs to the pose: who uses both has it then.
+        # Before the pose, so that a subscriber of both has the map's error when the pose arrives.
         self._map_error.send(self._bytes.of(pose.map_covariance))
         self._output.send(self._bytes.of(pose.covariance))
 
@@ -79,7 +77,7 @@ class CameraPoses:
                 self._publish(alone)
 
     def figures(self) -> dict[str, object]:
-        """What became of the second camera's poses."""
+        """Counters of the second camera's poses."""
         second = self._second
         if second is None:
             return {}
@@ -88,7 +86,7 @@ class CameraPoses:
 
 
 def _of_second(config: MarkerMapperConfig) -> MarkerMapperConfig:
-    """Parameters of a mapper that locates the second camera, on a map that it leaves alone."""
+    """Parameters of the mapper that localizes the second camera in a frozen map."""
     return replace(
         config,
         mode='localization',

@@ -1,4 +1,4 @@
-"""Rows of numpy as point clouds, and back: markers of a frame, the marker map."""
+"""Structured numpy arrays as point clouds, and back: markers of a frame, the marker map."""
 
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
@@ -38,22 +38,22 @@ _POINT_TYPES = {
     PointField.FLOAT64: 'f8',
 }
 _POINT_CODES = {code: datatype for datatype, code in _POINT_TYPES.items()}
-#: More rows than any map has; a cloud may promise four billion.
+#: Largest number of points accepted: more than any map has. A malformed header may claim four billion.
 _MOST_ROWS = 20_000
-# A ten-thousandth of a pixel, which no corner is known to [px^2].
+# (1e-4 px)^2, below what any corner detection achieves [px^2].
 _SMALLEST_CORNER_VARIANCE = 1e-8
 # Longest side of a marker [m].
 _LARGEST_MARKER = 100.0
-# Two whole numbers: height and width, or bytes of a row and of all.
+# Two uint32: height and width, or row_step and length of the data.
 _TWO = struct.Struct('<II')
-# Offset, type and number of a field; whether numbers are big-endian, and the length of a point.
+# Of a field: offset, datatype, count; of the cloud: is_bigendian, point_step.
 _PLACE, _POINT = struct.Struct('<IB3xI'), struct.Struct('<B3xI')
 _POSE_FIELDS = ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw', 'ax', 'ay', 'az', 'aqx', 'aqy', 'aqz', 'aqw')
 _VARIANCE_FIELDS = tuple(name for name in CORNER_COVARIANCE_FIELDS if name[-2:] in ('uu', 'vv'))
 
 
 def cloud(rows: npt.NDArray[Any], head: Header) -> PointCloud2:
-    """PointCloud2 with one point a row of a structured array, fields as in its dtype."""
+    """PointCloud2 with one point per row of a structured array; the fields are those of its dtype."""
     return PointCloud2(
         header=head,
         height=1,
@@ -69,7 +69,7 @@ def cloud(rows: npt.NDArray[Any], head: Header) -> PointCloud2:
 
 @lru_cache(maxsize=16)
 def _fields(dtype: 'np.dtype[Any]') -> list[PointField]:
-    """Shared by all clouds of these rows, since making 40 messages takes longer than all else of a cloud."""
+    """PointFields of a dtype, cached: making 40 messages takes longer than the rest of a cloud."""
     layout: Mapping[str, Any] = dtype.fields or {}
     return [
         PointField(name=name, offset=layout[name][1], datatype=_POINT_CODES[layout[name][0].str[1:]], count=1)
@@ -78,12 +78,12 @@ def _fields(dtype: 'np.dtype[Any]') -> list[PointField]:
 
 
 def cloud_rows(message: PointCloud2, dtype: 'np.dtype[Any]', optional: Iterable[str] = ()) -> npt.NDArray[Any]:
-    """Rows (N,) of ``dtype`` of a cloud, its fields looked up by name; missing ``optional`` ones are 0.
+    """Rows (N,) of ``dtype`` from a cloud, fields looked up by name; missing ``optional`` ones are 0.
 
     Raises
     ------
     InputError
-        A missing field, one of fractions where whole numbers are wanted, sizes that don't fit the data, too many rows.
+        A missing field, a float field for an integer one, sizes that contradict the data, or too many rows.
     """
     fields = {field.name: field for field in message.fields}
     names = [name for name in dtype.names or () if name in fields]
@@ -98,7 +98,7 @@ def cloud_rows(message: PointCloud2, dtype: 'np.dtype[Any]', optional: Iterable[
     if message.row_step != message.point_step * message.width or len(message.data) < count * message.point_step:
         raise InputError(f'cloud of {count} points of {message.point_step} bytes has {len(message.data)} bytes')
     if source == dtype:
-        # Our own detector's.
+        # The layout of this package's nodes: no conversion.
         return np.frombuffer(message.data, dtype, count).copy()
     result = np.zeros(count, dtype)
     if count:
@@ -113,12 +113,12 @@ def cloud_rows(message: PointCloud2, dtype: 'np.dtype[Any]', optional: Iterable[
 
 @lru_cache(maxsize=16)
 def _source_dtype(places: tuple[tuple[str, int, int], ...], step: int, *, big_endian: bool) -> 'np.dtype[Any]':
-    """The dtype of points of ``step`` bytes with fields of these names, offsets and types."""
+    """The dtype of points of ``step`` bytes; ``places`` are name, offset and datatype of each field."""
     order = '>' if big_endian else '<'
     try:
         formats = [np.dtype(order + _POINT_TYPES[kind]) for _, _, kind in places]
         names, offsets = [name for name, _, _ in places], [offset for _, offset, _ in places]
-        # numpy adds them as numbers of 32 bits, and reads outside the points where the sum passes those.
+        # numpy adds them in 32 bits: on overflow it would read outside the points.
         if any(offset + kind.itemsize > step for offset, kind in zip(offsets, formats, strict=True)):
             raise ValueError
         return np.dtype({'names': names, 'formats': formats, 'offsets': offsets, 'itemsize': step})
@@ -127,11 +127,11 @@ def _source_dtype(places: tuple[tuple[str, int, int], ...], step: int, *, big_en
 
 
 class CloudBytes:
-    """Clouds of rows of one dtype as bytes: where these have many fields, ten times faster than their messages."""
+    """Serialises clouds of one dtype: with many fields ten times faster than through a message."""
 
     def __init__(self, dtype: 'np.dtype[Any]') -> None:
         self._dtype = dtype
-        # From the fields to the length of a point; which of these bytes mean something is added up beside them.
+        # Expected bytes from the fields to point_step; ``meant`` masks the padding, which may hold anything.
         layout, meant = struct.pack('<I', len(dtype.names or ())), b'\xff' * 4
         for field in _fields(dtype):
             name = field.name.encode() + b'\x00'
@@ -142,14 +142,14 @@ class CloudBytes:
         self._meant = np.frombuffer(meant + _POINT.pack(0xFF, 0xFFFFFFFF), np.uint8)
 
     def message(self, rows: npt.NDArray[Any], head: Header) -> bytes:
-        """The bytes of :func:`cloud`."""
+        """:func:`cloud`, serialised."""
         begin = bytes(serialize_message(head))
         begin += bytes(-len(begin) % 4)
         data, sizes = rows.tobytes(), _TWO.pack(1, len(rows))
         return b''.join((begin, sizes, self._layout.tobytes(), _TWO.pack(len(data), len(data)), data, b'\x01'))
 
     def rows(self, message: bytes) -> npt.NDArray[Any] | None:
-        """Rows (N,) of a cloud; None of one that is laid out in another way, or that does not fit its sizes."""
+        """Rows (N,) of a serialised cloud; None if its layout differs or its sizes contradict its data."""
         try:
             begin = message_bytes.behind_header(message)
             height, width = _TWO.unpack_from(message, begin)
@@ -166,7 +166,7 @@ class CloudBytes:
         return np.frombuffer(message, self._dtype, count, behind + _TWO.size)
 
 
-#: Those of our own detector.
+#: The layout of this package's detector.
 MARKER_CLOUDS = CloudBytes(MARKER_DTYPE)
 
 
@@ -176,19 +176,19 @@ def stamped_markers(message: bytes) -> tuple[int, Markers]:
     Raises
     ------
     InputError
-        As :func:`markers`, or bytes that are no message.
+        As :func:`markers`, or bytes that are not a PointCloud2.
     """
     stamp, rows = message_bytes.stamp_ns(message, 'markers', longest=len(message)), MARKER_CLOUDS.rows(message)
     return stamp, markers(message_bytes.read(message, PointCloud2, 'markers')) if rows is None else _checked(rows)
 
 
 def markers(message: PointCloud2) -> Markers:
-    """Rows of :data:`MARKER_DTYPE`; corner covariances from ``sigma_px`` where the cloud has none.
+    """Rows of :data:`MARKER_DTYPE`; without corner covariances in the cloud they are those of ``sigma_px``.
 
     Raises
     ------
     InputError
-        A missing field, sizes that don't fit, or corners, covariances or poses that cannot be.
+        A missing field, inconsistent sizes, or invalid corners, covariances or poses.
     """
     rows = cloud_rows(message, MARKER_DTYPE, optional=CORNER_COVARIANCE_FIELDS)
     if not {field.name for field in message.fields}.issuperset(CORNER_COVARIANCE_FIELDS):
@@ -200,7 +200,7 @@ def markers(message: PointCloud2) -> Markers:
 
 
 def _checked(rows: Markers) -> Markers:
-    """Markers whose corners, variances and poses can be."""
+    """The markers, after validation of corners, variances and poses."""
     variances = columns(rows, _VARIANCE_FIELDS)
     if not np.abs(columns(rows, CORNER_FIELDS)).max(initial=0.0) < LARGEST_COORDINATE:
         raise InputError('markers with corners that are not finite or far outside any image')
@@ -213,7 +213,7 @@ def _checked(rows: Markers) -> Markers:
 
 
 def marker_poses(rows: Markers, head: Header) -> PoseArray:
-    """The markers in the camera, for display."""
+    """Poses of the markers in the camera frame, for display."""
     return PoseArray(header=head, poses=[pose_of_row(row) for row in rows])
 
 
@@ -223,7 +223,7 @@ def map_poses(message: PointCloud2) -> dict[int, tuple[FloatArray, float]]:
     Raises
     ------
     InputError
-        A missing field, sizes that don't fit, or a marker whose pose or side cannot be.
+        A missing field, inconsistent sizes, or a marker with an invalid pose or side.
     """
     rows = cloud_rows(message, MAP_DTYPE)
     rows = rows[rows['trusted'] != 0]

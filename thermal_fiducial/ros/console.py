@@ -1,4 +1,4 @@
-"""What a pilot must know, on the console: a line where it changes, at most one a second of each kind."""
+"""Console lines for the pilot: printed on change, at most one of each kind a second."""
 
 from typing import Any
 
@@ -12,18 +12,18 @@ class Console:
         self._events: dict[str, str] = {}
 
     def event(self, kind: str, line: str) -> None:
-        """Keep a line for the next second; a later one of its ``kind`` replaces it."""
+        """Queue a line for the next :meth:`say`; a later line of the same ``kind`` replaces it."""
         self._events[kind] = line
 
     def say(self, headline: str, *, calm: bool) -> None:
-        """Print the events since the last time, and the ``headline`` where it has changed."""
+        """Print the queued events, and the ``headline`` if it has changed."""
         for line in self._events.values():
             self._logger.warning(line)
         self._events.clear()
         if headline == self._said:
             return
         self._said = headline
-        # Two lines of code, as rclpy takes no two severities from one.
+        # Separate calls: rclpy refuses another severity from the same line of code.
         if headline and calm:
             self._logger.info(headline)
         elif headline:

@@ -1,6 +1,6 @@
-"""Between ROS messages and numpy: the only module that knows both.
+"""Conversion between ROS messages and numpy: the only module that knows both.
 
-Messages check nothing, so what comes in is checked here and what goes out is converted to the exact type
+Messages validate nothing, so inputs are checked here, and outputs are converted to the exact type
 (``float(...)``): a numpy scalar or an int in a float field would be published as garbage.
 """
 
@@ -29,7 +29,7 @@ from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transfo
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 
-# What a bag without ROS needs as well.
+# Re-exported: bags are also read without ROS.
 from thermal_fiducial.files.records import camera as camera
 from thermal_fiducial.files.records import checked_stamp as checked_stamp
 from thermal_fiducial.files.records import imu_sample as imu_sample
@@ -38,9 +38,9 @@ from thermal_fiducial.files.records import stamp_ns as stamp_ns
 if TYPE_CHECKING:
     from thermal_fiducial.core.geometry.camera import Camera
 
-#: By how much the norm of a quaternion may be off.
+#: Largest deviation of a quaternion's norm from 1.
 NORM_TOLERANCE = 0.1
-# Clocks farther apart than this are not those of one robot [s].
+# Largest offset of two clocks of one robot [s].
 _LARGEST_CLOCK_OFFSET = 10.0
 # --- stamps, headers, poses ---------------------------------------------------------------------------
 
@@ -52,12 +52,12 @@ def clock_reference(camera_stamp_ns: int, offset: float) -> TimeReference:
 
 
 def checked_clock_offset(imu_stamp_ns: int, camera_stamp_ns: int) -> float:
-    """What :func:`clock_reference` says [s].
+    """Clock offset [s] of a :func:`clock_reference`.
 
     Raises
     ------
     InputError
-        Clocks that are farther apart than any the filter follows.
+        An offset larger than any that the filter estimates.
     """
     offset = (imu_stamp_ns - camera_stamp_ns) / SECOND_NS
     if abs(offset) > _LARGEST_CLOCK_OFFSET:
@@ -90,7 +90,7 @@ def transform_of(message: Pose, what: str = 'pose') -> FloatArray:
     Raises
     ------
     InputError
-        A value that is not finite or beyond the bounds, or a quaternion that is none.
+        A value that is not finite or out of bounds, or a quaternion without unit norm.
     """
     p, q = message.position, message.orientation
     return transform_of_values(np.array([p.x, p.y, p.z, q.x, q.y, q.z, q.w]), what)
@@ -112,7 +112,7 @@ def transform_of_values(values: FloatArray, what: str = 'pose') -> FloatArray:
 
 
 def image(pixels: npt.NDArray[Any], head: Header) -> Image:
-    """Image message of (H, W) uint16 as mono16, (H, W) uint8 as mono8, (H, W, 3) uint8 as bgr8."""
+    """Image message: (H, W) uint16 as mono16, (H, W) uint8 as mono8, (H, W, 3) uint8 as bgr8."""
     encoding = 'bgr8' if pixels.ndim == 3 else 'mono16' if pixels.dtype == np.uint16 else 'mono8'
     message = Image(header=head, height=pixels.shape[0], width=pixels.shape[1], encoding=encoding)
     message.is_bigendian = 0
@@ -122,7 +122,7 @@ def image(pixels: npt.NDArray[Any], head: Header) -> Image:
 
 
 def data_bytes(values: npt.NDArray[Any]) -> 'array[int]':
-    """The one type that a message takes without looping over its bytes."""
+    """The data as ``array('B')``, the only type that a message setter accepts without a loop over the bytes."""
     data = array('B')
     data.frombytes(np.ascontiguousarray(values).view(np.uint8).data if values.size else b'')
     return data
@@ -160,18 +160,18 @@ def transform_message(T_a_b: FloatArray, stamp: int, a: str, b: str) -> Transfor
 def correction_of(message: TransformStamped) -> tuple[int, FloatArray]:
     """Stamp [ns] and T_new_old (4, 4) of a ``map_correction``.
 
-    It moves coordinates of the map as poses up to the stamp have them to those of poses after it.
+    It maps coordinates of poses up to the stamp to those of later poses.
 
     Raises
     ------
     InputError
-        A value that is not finite, or a quaternion that is none.
+        A value that is not finite, or a quaternion without unit norm.
     """
     return stamp_ns(message.header.stamp), transform_of_message(message, 'map_correction')
 
 
 def transform_of_message(message: TransformStamped, what: str) -> FloatArray:
-    """T_a_b (4, 4) of a transform's message.
+    """T_a_b (4, 4) of a transform message.
 
     Raises
     ------
@@ -190,7 +190,7 @@ def path(poses: Iterable[tuple[int, Pose]], head: Header) -> Path:
 
 
 def diagnostics(name: str, level: bytes, message: str, values: Mapping[str, object], stamp: int) -> DiagnosticArray:
-    """One status with its figures."""
+    """DiagnosticArray with one status and its key-value pairs."""
     status = DiagnosticStatus(level=level, name=name, message=message, hardware_id='thermal_fiducial')
     status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     return DiagnosticArray(header=header(stamp, ''), status=[status])

@@ -1,6 +1,6 @@
 """A node that counts received and published messages.
 
-By these counts a lock-step replay knows when everything that was published has been received.
+A lock-step replay compares the counts to know when every published message has been received.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,7 +23,7 @@ class Output:
         self._publisher = publisher
 
     def send(self, message: Any) -> None:
-        """Publish a message, or the bytes of one."""
+        """Publish a message, serialised or not."""
         self.count += 1
         self._publisher.publish(message)
 
@@ -38,14 +38,14 @@ class Input:
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
-        #: messages that were taken, or skipped for newer ones
+        #: messages taken or skipped
         self.count = 0
-        #: messages that were skipped because a newer one had arrived
+        #: messages skipped because a newer one had arrived
         self.left = self._left_before = 0
         self._subscription: Any = None
 
     def left_since(self) -> int:
-        """Messages that were skipped since the last call."""
+        """Number of messages skipped since the last call."""
         left, self._left_before = self.left - self._left_before, self.left
         return left
 
@@ -54,7 +54,7 @@ class Input:
         self._subscription = subscription
 
     def take(self) -> tuple[Any, float] | None:
-        """Take and count the oldest waiting message; returns it and its waiting time [s], None if there is none."""
+        """Take and count the oldest queued message; returns it and its time in the queue [s], None if there is none."""
         subscription = self._subscription
         with subscription.handle:
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
@@ -65,7 +65,7 @@ class Input:
         return message, (time.time_ns() - info['received_timestamp']) / SECOND_NS
 
     def waiting(self, at_most: int) -> Iterator[Any]:
-        """Take and count messages until none is waiting, or ``at_most`` of them."""
+        """Take and count queued messages, ``at_most`` so many."""
         for _ in range(at_most):
             taken = self.take()
             if taken is None:
@@ -82,7 +82,7 @@ class CountingNode(Node):
     """A node that counts messages on each of its topics."""
 
     def __init__(self, name: str, **kwargs: Any) -> None:
-        #: subscriptions whose messages wait until they are wanted
+        #: subscriptions that the executor ignores: their messages stay queued until :meth:`take_waiting`
         self.lazy: dict[Any, Input] = {}
         super().__init__(name, **kwargs)
         self.inputs: list[Input] = []
@@ -97,7 +97,7 @@ class CountingNode(Node):
     def subscribe(
         self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile, *, raw: bool = False
     ) -> Input:
-        """Call ``callback`` with every message (its bytes if ``raw``)."""
+        """Call ``callback`` with every message (serialised if ``raw``)."""
         source = Input(self.resolve_topic_name(topic))
 
         def receive(message: Any) -> None:
@@ -113,7 +113,7 @@ class CountingNode(Node):
     ) -> Input:
         """Call ``callback`` with the newest message; older ones are skipped and counted.
 
-        Messages that wait on other topics (:meth:`subscribe_lazily`) are taken first.
+        Lazy subscriptions (:meth:`subscribe_lazily`) are taken first.
         """
         source = Input(self.resolve_topic_name(topic))
 
@@ -130,9 +130,9 @@ class CountingNode(Node):
         return source
 
     def subscribe_lazily(self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile) -> Input:
-        """Let messages wait, as many as ``profile`` keeps; :meth:`take_waiting` passes their bytes to ``callback``.
+        """Leave messages in the queue of ``profile``; :meth:`take_waiting` passes them to ``callback``, serialised.
 
-        They do not wake the executor, as they are needed with the next frame only.
+        They do not wake the executor, since they are needed with the next frame only.
         """
         source = Input(self.resolve_topic_name(topic))
         subscription = self.create_subscription(kind, topic, callback, profile, raw=True)
@@ -143,11 +143,11 @@ class CountingNode(Node):
 
     @property
     def subscriptions(self) -> Iterator[Any]:
-        """Inputs whose messages the executor takes."""
+        """Subscriptions that the executor serves."""
         return (subscription for subscription in super().subscriptions if subscription not in self.lazy)
 
     def take_waiting(self) -> None:
-        """Take all waiting messages of lazy subscriptions, in the order of subscription."""
+        """Take all queued messages of the lazy subscriptions, in the order of subscription."""
         for subscription, source in self.lazy.items():
             for message in source.waiting(subscription.qos_profile.depth):
                 self.guard(subscription.callback, message)

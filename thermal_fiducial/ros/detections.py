@@ -1,7 +1,7 @@
-"""Markers of a frame in the messages that other packages expect, and on /tf.
+"""Markers of a frame as messages of other packages, and on /tf.
 
 ``aruco_opencv`` (aruco_opencv_msgs/ArucoDetection), ``apriltag`` (apriltag_msgs/AprilTagDetectionArray) and ``vision``
-(vision_msgs/Detection3DArray), each where its package is installed.
+(vision_msgs/Detection3DArray), each only if its package is installed.
 """
 
 from collections.abc import Callable
@@ -25,19 +25,19 @@ KINDS = {
     'apriltag': ('apriltag_msgs', 'AprilTagDetectionArray'),
     'vision': ('vision_msgs', 'Detection3DArray'),
 }
-# AprilTag begins at the lower left and goes round against the clock; its square reaches from -1 to 1, y down.
+# AprilTag's corners start at the lower left, counter-clockwise, in a square from -1 to 1 with y down.
 _APRILTAG_ORDER = [3, 2, 1, 0]
 _APRILTAG_SQUARE = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]], np.float32)
 _THICKNESS = 0.01
 
 
 class OtherDetections:
-    """What a detector publishes beside our own ``markers``, if anything.
+    """Optional outputs of the detector beside ``markers``.
 
     Parameters
     ----------
-    node : whose outputs they are; its prefix stands before the frames of the markers
-    fault : called in words with what was asked for and cannot be had
+    node : the detector's node; its frame prefix applies to the markers' frames
+    fault : called with a message if a configured output is unavailable
     """
 
     def __init__(self, node: StageNode[Any], config: ArucoDetectorConfig, fault: Callable[[str], None]) -> None:
@@ -86,7 +86,7 @@ class OtherDetections:
 
 
 def aruco_opencv(messages: Any, markers: Markers, head: Header) -> Any:
-    """aruco_opencv_msgs/ArucoDetection, its marker's frame as ours: x right, y up, z out of the face."""
+    """aruco_opencv_msgs/ArucoDetection, with the same marker frame: x right, y up, z out of the face."""
     result = messages.ArucoDetection()
     result.header = head
     for row in markers:
@@ -97,7 +97,7 @@ def aruco_opencv(messages: Any, markers: Markers, head: Header) -> Any:
 
 
 def apriltag(messages: Any, markers: Markers, head: Header, family: str) -> Any:
-    """apriltag_msgs/AprilTagDetectionArray; the margin is our contrast [counts]."""
+    """apriltag_msgs/AprilTagDetectionArray; ``decision_margin`` is the contrast [counts]."""
     result = messages.AprilTagDetectionArray()
     result.header = head
     for row, corners in zip(markers, corners_px(markers), strict=True):

@@ -1,4 +1,4 @@
-"""What only people look at: markers of the map for RViz, detections drawn into the image."""
+"""For display only: markers of the map for RViz, detections drawn into the image."""
 
 from typing import Any
 
@@ -21,9 +21,9 @@ _BGR_FIRST_CORNER = (0, 255, 255)
 
 
 def map_markers(rows: 'np.ndarray[Any, np.dtype[Any]]', head: Header, *, whole: bool = True) -> MarkerArray:
-    """Plates and IDs of the rows (N,) of a marker map: in view red, out of view green, distrusted grey.
+    """Plates and IDs of the rows (N,) of a marker map: red in view, green out of view, grey if distrusted.
 
-    ``whole``: these are all, others disappear; else they are drawn over what is there.
+    ``whole``: delete all earlier drawings first; else redraw only these.
     """
     array = MarkerArray(markers=[Marker(header=head, action=Marker.DELETEALL)] if whole else [])
     for row in rows:

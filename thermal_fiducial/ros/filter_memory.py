@@ -1,4 +1,4 @@
-"""What outlives a filter that crashes in flight: its last pose and clock offset, in a file, once a second."""
+"""Restart after a crash in flight: the filter's last pose and clock offset, saved to a file once a second."""
 
 from contextlib import suppress
 import math
@@ -17,11 +17,11 @@ from thermal_fiducial.ros.node import StageNode
 
 
 class FilterMemory:
-    """Remembers for the next filter of this name, and takes up what the last one left; only where nodes are ``live``.
+    """Saves the filter's state, and uses the one that a crashed filter of the same name left; only in live nodes.
 
     Parameters
     ----------
-    node : of the filter; its config may get the clock offset of before
+    node : the filter's node, whose config takes over the saved clock offset
     """
 
     def __init__(self, node: StageNode[PoseEkfConfig]) -> None:
@@ -48,7 +48,7 @@ class FilterMemory:
         self._node.get_logger().warning(line)
 
     def refusal(self, filter_: PoseEkf, pose: CameraPose) -> PoseUpdate | None:
-        """The verdict on a pose that should not start the filter, by where it was before; None: it may."""
+        """The refusal of an initial pose that contradicts the saved one; None if it does not."""
         if self._hint is None or filter_.state is not None:
             return None
         distance = self._hint.contradiction(pose)
@@ -56,12 +56,12 @@ class FilterMemory:
         return PoseUpdate(pose.stamp_ns, False, reason, math.nan) if distance else None
 
     def save(self, filter_: PoseEkf, stamp_ns: int) -> None:
-        """Leave the pose at the IMU's ``stamp_ns`` for the next filter.
+        """Save the state at the IMU's ``stamp_ns`` for a restart.
 
         Raises
         ------
         InputError
-            It cannot be written; this is said once.
+            The file cannot be written; raised once.
         """
         if not self._active or filter_.lost or filter_.state is None:
             return
@@ -70,8 +70,8 @@ class FilterMemory:
         self._active = True
 
     def _close(self) -> None:
-        """Ended in order: the next start is none in flight."""
+        """On an orderly end delete the file: the next start is not in flight."""
         if self._active:
-            # On a disk that became read-only it stays, and is too old for a hint soon.
+            # On a disk that became read-only the file stays; its age soon invalidates it.
             with suppress(OSError):
                 self._path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Outputs of the filter for every IMU message: pose, odometry, the bridge's messages, TF; and the path."""
+"""Outputs of the filter: for every IMU message pose, odometry, bridge and TF; at a low rate the path."""
 
 from collections import deque
 from collections.abc import Callable
@@ -23,14 +23,14 @@ _PATH_LENGTH = 3000
 
 
 class FilterOutputs:
-    """The outputs of a filter's node.
+    """Publishers of the filter's node.
 
     Parameters
     ----------
-    node : whose outputs they are
-    config : frames, rates, what is asked for
-    fault : called in words with what was asked for and cannot be had
-    frames : where the robot is in the frame of the IMU
+    node : the filter's node
+    config : frames, rates, optional outputs
+    fault : called with a message if a configured output is unavailable
+    frames : pose of the robot in the IMU frame
     """
 
     def __init__(
@@ -51,13 +51,13 @@ class FilterOutputs:
         self._transforms = TransformBroadcaster(node, config, frames, fault) if config.publish_tf else None
 
     def send(self, odometry: Odometry, smooth: Odometry | None, *, lost: bool, jumps: int) -> None:
-        """Publish the state, which the filter has of the IMU's frame, after an IMU message.
+        """Publish the state of the IMU frame after an IMU message, transformed to the robot's frame.
 
         Parameters
         ----------
-        smooth : the same without steps, where it is asked for
-        lost : whether nobody may fly on it
-        jumps : how often the pose has jumped so far
+        smooth : the same with corrections spread over time; None if not configured
+        lost : whether the pose is unfit to fly on
+        jumps : number of jumps of the pose so far
         """
         if (T_imu_base := self._frames.T_imu_base) is not None:
             odometry = in_frame(odometry, T_imu_base)
@@ -73,12 +73,12 @@ class FilterOutputs:
             self._state.fill(smooth)
             self._smooth_odometry.send(self._state.odometry)
         if not lost:
-            # Filled with the smooth one last, where there is one.
+            # _state holds the smooth output if there is one, else the odometry.
             self._bridge.send(smooth or odometry, self._state, jumps)
         self._extend_path(odometry)
 
     def send_clock(self, camera_stamp_ns: int, offset: float | None) -> None:
-        """Publish the offset [s] of the camera's clock at a frame, where it is known."""
+        """Publish the camera's clock offset [s] at the stamp of a frame, if it is known."""
         if offset is not None:
             self._camera_clock.send(convert.clock_reference(camera_stamp_ns, offset))
 
@@ -87,11 +87,11 @@ class FilterOutputs:
             self._path.append((odometry.stamp_ns, convert.pose(odometry.T_map_body)))
 
     def clear_path(self) -> None:
-        """What follows does not continue what was."""
+        """Start a new path after a discontinuity."""
         self._path.clear()
 
     def send_path(self) -> None:
-        """Publish the path so far where someone listens."""
+        """Publish the path so far if it has subscribers."""
         if self._path and self._path_output.listeners:
             head = convert.header(self._path[-1][0], self._config.map_frame)
             self._path_output.send(convert.path(self._path, head))

@@ -1,4 +1,4 @@
-"""Status of the filter: diagnostics in words and numbers, lines on the console, count of jumps of the pose."""
+"""Status of the filter: diagnostics, console lines, count of jumps of the pose."""
 
 import re
 
@@ -9,25 +9,25 @@ from thermal_fiducial.ros.console import Console
 from thermal_fiducial.ros.node import ERROR, OK, WARN
 
 _WAITING = 'waiting for markers'
-#: Difference of the stamps of IMU and poses that no delay explains [s]: they have two clocks.
+#: Difference of IMU and pose stamps beyond any delay [s]: their clocks are not synchronised.
 _APART_S = 2.5
 
 
 class FilterStatus:
-    """Watches ``filter_``; its resets are lines of ``console``."""
+    """Monitors ``filter_``; resets are printed on ``console``."""
 
     def __init__(self, filter_: PoseEkf, console: Console) -> None:
         self._filter, self._console = filter_, console
         #: number of jumps of the pose: initialisations, resets, corrections of the map
         self.jumps = 0
         self._resets: int | None = None
-        #: last status without numbers, its console line, whether the pose was lost then, and ever initialised
+        #: last status without numbers, last headline, whether the pose was lost then, whether ever initialised
         self._words, self._headline, self._was_lost, self._initialised = '', '', True, False
         self._last_refusal = ''
-        #: of the latest IMU sample and camera pose; None before there is one
+        #: stamps of the latest IMU sample and camera pose; None before the first
         self._imu_ns: int | None = None
         self._pose_ns: int | None = None
-        #: stamps of the poses whose innovations were published
+        #: stamps of poses whose innovations have been published
         self._published: set[int] = set()
 
     def after_imu(self, stamp_ns: int) -> None:
@@ -42,19 +42,19 @@ class FilterStatus:
         self._resets = resets
 
     def after_pose(self, update: PoseUpdate) -> None:
-        """Remember why a pose was refused, until one is not."""
+        """Keep the reason of the last refusal until a pose is accepted."""
         self._pose_ns = update.stamp_ns
         self._last_refusal = '' if update.accepted or update.pending else update.reason
 
     def state(self) -> tuple[bytes, str]:
-        """Level, and in words what the filter does and why it refused the last pose."""
+        """Diagnostic level and message: state of the filter, reason of the last refusal."""
         status, lost = self._status(), self._filter.lost
         if self._last_refusal and (not lost or status == _WAITING):
             return ERROR if lost else WARN, f'{status}; pose {self._last_refusal}'
         return ERROR if lost else OK if status == 'tracking' else WARN, status
 
     def headline(self) -> str:
-        """What the filter does, without numbers, and what has changed if it has a pose again."""
+        """State of the filter without numbers, with the reason of a reset when it has a pose again."""
         words, lost = re.split(r'[:\d]', self._status())[0].removesuffix(' for '), self._filter.lost
         if words != self._words:
             again = 'recovered' if self._initialised else 'initialised'
@@ -64,7 +64,7 @@ class FilterStatus:
         return self._headline
 
     def _status(self) -> str:
-        """That of the filter; poses that no IMU sample is near are no lack of markers."""
+        """Status of the filter, or that poses and IMU have different clocks, which must not read as lack of markers."""
         status = self._filter.status
         if status != _WAITING or self._imu_ns is None or self._pose_ns is None:
             return status
@@ -75,12 +75,12 @@ class FilterStatus:
         return f'camera and IMU have two clocks: poses are {abs(apart):.4g} s {side} the IMU'
 
     def figures(self) -> dict[str, object]:
-        """The filter in numbers."""
+        """Key-value pairs of the diagnostics."""
         numbers: dict[str, object] = {name: f'{value:.6g}' for name, value in self._filter.diagnostics().items()}
         return numbers | {'lost': self._filter.lost, 'jumps': self.jumps, INNOVATIONS: self._innovations()}
 
     def _innovations(self) -> str:
-        """Those of the poses since the last time."""
+        """Innovations of the poses since the last call."""
         decided = self._filter.decided
         text = innovations_text(update for stamp, update in decided.items() if stamp not in self._published)
         self._published = set(decided)

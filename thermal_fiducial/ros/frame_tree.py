@@ -1,4 +1,4 @@
-"""Frames that are fixed on a robot: from /tf_static, or the fixed joints of a URDF."""
+"""Static frames of a robot: from /tf_static, or the fixed joints of a URDF."""
 
 from collections.abc import Iterator
 import math
@@ -14,32 +14,32 @@ from thermal_fiducial.errors import InputError
 if TYPE_CHECKING:
     from xml.etree.ElementTree import Element
 
-#: No robot has more links one behind the other: a longer chain goes round in a circle.
+#: Longest chain of links; a longer one is a cycle.
 _LONGEST = 100
-#: Frames of a robot, and characters of its description: ten times those of a humanoid with all its fingers.
+#: Most frames of a robot, and characters of its URDF: ten times those of a humanoid with all its fingers.
 _MOST_FRAMES, _LONGEST_TEXT = 10_000, 2_000_000
 
 
 class FrameTree:
-    """Each frame's place on its parent."""
+    """Pose of each frame in its parent."""
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, FloatArray]] = {}
 
     def add(self, parent: str, child: str, T_parent_child: FloatArray) -> None:
-        """Place ``child``; a later place replaces an earlier one.
+        """Set the pose of ``child``; it replaces an earlier one.
 
         Raises
         ------
         InputError
-            There are more frames already than any robot has.
+            The tree has too many frames.
         """
         if len(self._parents) >= _MOST_FRAMES and child not in self._parents:
             raise InputError(f'more than {_MOST_FRAMES} frames on the robot')
         self._parents[child] = (parent, T_parent_child)
 
     def between(self, a: str, b: str) -> FloatArray | None:
-        """T_a_b (4, 4); None where they are not connected."""
+        """T_a_b (4, 4); None if the frames are not connected."""
         (root_a, T_root_a), (root_b, T_root_b) = self._in_root(a), self._in_root(b)
         return inverse(T_root_a) @ T_root_b if root_a == root_b else None
 
@@ -59,9 +59,9 @@ def fixed_joints(urdf: str) -> Iterator[tuple[str, str, FloatArray]]:
     Raises
     ------
     InputError
-        What is no URDF, too long for one, or a joint that says nothing usable.
+        Not a URDF, too long, or a joint with unusable attributes.
     """
-    # Few robots have one, and it costs a node a tenth of the time that it takes to be back in flight.
+    # Imported only if a robot has a URDF: the import takes a tenth of a node's start.
     from xml.etree import ElementTree
 
     if len(urdf) > _LONGEST_TEXT:
@@ -91,7 +91,7 @@ def _origin(joint: 'Element') -> FloatArray:
 
 
 def _three(joint: str, text: str) -> FloatArray:
-    """(3,) of an attribute; zeros where it is left out."""
+    """Three numbers (3,) of an attribute; zeros if it is missing."""
     try:
         values = np.array([float(word) for word in text.split()] or [0.0] * 3)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Rates of a node's inputs, and inputs that have stopped: what diagnostic_updater checks in C++ nodes.
+"""Rates of a node's inputs, and inputs that have stopped, as diagnostic_updater checks in C++ nodes.
 
 The main input is the first one that the node subscribed to. Its rate is compared with the expected one, a parameter or
 the rate of the first seconds. Any other steady input is reported when it stops.
@@ -11,13 +11,13 @@ from statistics import median
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.ros.counting import Input
 
-#: Looks, a second apart, over which a rate is averaged: a shutter event of half a second is 5 % of it.
+#: Length of the averaging window [samples, one a second]: a shutter event of half a second is 5 % of it.
 _WINDOW = 10
-#: Looks in a row with messages that make an input a steady one, and the first of them that show its rate.
+#: Consecutive samples with messages after which an input is steady, and samples that determine its first rate.
 _STEADY = 5
-#: Share by which a rate may be off: more than a shutter event takes, less than a second publisher adds.
+#: Relative tolerance of a rate: above the loss by a shutter event, below what a second publisher adds.
 _TOLERANCE = 0.2
-#: A shutter event takes half a second; an input that gives nothing for two looks has stopped.
+#: Samples without a message after which an input has stopped; a shutter event takes half a second.
 _STOPPED = 2
 
 
@@ -33,7 +33,7 @@ class _Watch:
         self._first_rates: list[float] = []
 
     def look(self, time_ns: int) -> None:
-        """Take in the count at a time; one that does not advance (a paused clock) says nothing of the rate."""
+        """Sample the count at a time; while the clock is paused the rate is not updated."""
         count = self.source.count
         before_ns, before = self._looks[-1] if self._looks else (time_ns - SECOND_NS, 0)
         came = count > before
@@ -48,23 +48,23 @@ class _Watch:
 
     @property
     def is_steady(self) -> bool:
-        """Whether it has come all the time."""
+        """Whether messages arrived in enough consecutive samples."""
         return self._steady >= _STEADY
 
     @property
     def stopped(self) -> bool:
-        """Whether it came, and does so no more."""
+        """Whether messages arrived before but no longer do."""
         return self.source.count > 0 and self.silent >= _STOPPED
 
     @property
     def rate(self) -> float:
-        """Over the window [Hz]; 0 before there is one."""
+        """Mean over the window [Hz]; 0 before the second sample."""
         (first_ns, first), (last_ns, last) = (self._looks[0], self._looks[-1]) if self._looks else ((0, 0), (0, 0))
         return (last - first) / (last_ns - first_ns) * SECOND_NS if last_ns > first_ns else 0.0
 
     @property
     def first_rate(self) -> float:
-        """Of the first seconds [Hz]; 0 before they are over."""
+        """Median over the first seconds [Hz]; 0 before they are over."""
         return median(self._first_rates) if len(self._first_rates) == _STEADY else 0.0
 
     @property
@@ -74,11 +74,11 @@ class _Watch:
 
 
 class InputRates:
-    """Watches the ``inputs`` of a node, a list that may still grow.
+    """Monitors the ``inputs`` of a node, a list that may still grow.
 
     Parameters
     ----------
-    expected : rate of the main one [Hz]; 0: that of its first seconds
+    expected : rate of the main input [Hz]; 0: its rate in the first seconds
     """
 
     def __init__(self, inputs: Sequence[Input], expected: float = 0.0) -> None:
@@ -87,7 +87,7 @@ class InputRates:
         self._watches: dict[str, _Watch] = {}
 
     def look(self, time_ns: int) -> None:
-        """Once a second."""
+        """Sample all inputs; call it once a second."""
         for source in self._inputs:
             self._watches.setdefault(source.topic, _Watch(source)).look(time_ns)
 
@@ -102,12 +102,12 @@ class InputRates:
 
     @property
     def silent(self) -> bool:
-        """Whether the main input gave nothing since the last look."""
+        """Whether the main input had no message since the last sample."""
         return self._main is not None and self._main.silent > 0
 
     @property
     def stopped(self) -> bool:
-        """Whether the main input came, and does so no more."""
+        """Whether the main input has stopped."""
         return self._main is not None and self._main.stopped
 
     @property
@@ -117,18 +117,18 @@ class InputRates:
 
     @property
     def stale(self) -> list[str]:
-        """Topics of the other inputs that came all the time and have stopped."""
+        """Topics of the other inputs that were steady and have stopped."""
         return [watch.topic for watch in list(self._watches.values())[1:] if watch.is_steady and watch.stopped]
 
     def trouble(self) -> str:
-        """What a pilot must know: that the main input is waited for, or has stopped."""
+        """Message for the pilot if the main input has not arrived yet or has stopped; else empty."""
         main = self._main
         if main is not None and not main.source.count:
             return f'waiting for {main.topic}'
         return f'{main.topic} has stopped' if main is not None and main.stopped else ''
 
     def doubt(self) -> str:
-        """In words what is wrong with inputs while the main one comes: its rate, others that have stopped."""
+        """Faults of the inputs while the main one arrives: its rate, other inputs that have stopped; else empty."""
         words = [f'no {topic} any more' for topic in self.stale]
         main = self._main
         if main is not None and main.has_rate and self.expected and abs(main.rate / self.expected - 1.0) > _TOLERANCE:
@@ -136,7 +136,7 @@ class InputRates:
         return '; '.join(words)
 
     def figures(self) -> dict[str, object]:
-        """Rate of each input that comes, what is expected of the main one, and which have stopped."""
+        """Rates of the inputs, expected rate of the main one, stale inputs."""
         if not self._watches:
             return {}
         rates: dict[str, object] = {

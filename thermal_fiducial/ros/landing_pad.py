@@ -1,4 +1,4 @@
-"""Where a landing pad is: a marker of the map, or several that belong together."""
+"""Pose of a landing pad: one marker of the map, or a group of them."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,13 +7,13 @@ import numpy as np
 from thermal_fiducial.core.geometry.se3 import transform
 from thermal_fiducial.core.types import FloatArray
 
-#: mavros turns east-north-up into north-east-down, (x, y, z) into (y, x, -z), whatever frame it then names. A robot's
-#: forward-left-up becomes forward-right-down by it when it is turned by a quarter first: right-forward-up.
+#: mavros applies the ENU to NED conversion (x, y, z) -> (y, x, -z) in every frame. Given right-forward-up axes it
+#: yields forward-right-down, so forward-left-up is turned by 90 degrees first.
 _T_RFU_FLU = transform([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], np.zeros(3))
 
 
 def pad_in_map(T_map_markers: Mapping[int, FloatArray], pad_ids: Sequence[int]) -> FloatArray | None:
-    """T_map_pad (4, 4): in the middle between the pad's markers, with the axes of the first; None if one is unknown.
+    """T_map_pad (4, 4): origin at the centroid of the pad's markers, axes of the first; None if one is not mapped.
 
     Parameters
     ----------
@@ -29,10 +29,10 @@ def pad_in_map(T_map_markers: Mapping[int, FloatArray], pad_ids: Sequence[int]) 
 
 
 def for_mavros(T_body_pad: FloatArray) -> FloatArray:
-    """T_rfu_pad (4, 4), which mavros sends on as the pad in the robot's forward-right-down frame (BODY_FRD)."""
+    """T_rfu_pad (4, 4), which mavros converts to the pad in the robot's forward-right-down frame (BODY_FRD)."""
     return np.asarray(_T_RFU_FLU @ T_body_pad)
 
 
 def from_mavros(positions: FloatArray) -> FloatArray:
-    """Positions (N, 3) in ``base_link`` [m] of those that :func:`for_mavros` made."""
+    """Inverse of :func:`for_mavros` for positions (N, 3) [m]: right-forward-up to ``base_link``."""
     return positions @ _T_RFU_FLU[:3, :3]

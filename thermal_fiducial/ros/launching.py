@@ -1,4 +1,4 @@
-"""What the launch files share. Needs ROS's ``launch`` and ``launch_ros``, which a robot has and PyPI has not."""
+"""Common code of the launch files. Needs ROS's ``launch`` and ``launch_ros``, which are not on PyPI."""
 
 from collections.abc import Iterable, Mapping
 import difflib
@@ -17,10 +17,10 @@ from thermal_fiducial.config import NODES
 from thermal_fiducial.errors import InputError
 
 PACKAGE = 'thermal_fiducial'
-#: A node that crashed is started again after this [s].
+#: Delay before a crashed node is restarted [s].
 _RESPAWN_DELAY = 1.0
 _LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
-#: Exit status of a node that was asked to stop, or that refuses its parameters: neither is tried again.
+#: Exit status of a node that was stopped, or that refuses its parameters: neither is restarted.
 _STOPPED, _REFUSED = 0, 2
 
 _ARGUMENTS = {
@@ -48,7 +48,7 @@ _ARGUMENTS = {
     'rviz': ('false', 'start RViz with the view of the package'),
 }
 _DISCOVERY = 'ROS_AUTOMATIC_DISCOVERY_RANGE'
-#: What it may be; OFF and SYSTEM_DEFAULT are for whoever lists peers, or has a middleware of his own settings.
+#: Its values; OFF is for static peers, SYSTEM_DEFAULT for settings of the middleware itself.
 _RANGES = ('LOCALHOST', 'SUBNET', 'OFF', 'SYSTEM_DEFAULT')
 _TOPICS = ('image_topic', 'camera_info_topic', 'imu_topic')
 
@@ -59,14 +59,14 @@ def describe(
     parameters: Mapping[str, Any] | None = None,
     defaults: Mapping[str, str] | None = None,
 ) -> LaunchDescription:
-    """The nodes, one process each, started again if one crashes.
+    """Launch description of the nodes, one process each, restarted after a crash.
 
     Parameters
     ----------
     mode : mapping or localization
     remappings : (from, to) for all nodes
-    parameters : name to value, before those of the parameter file
-    defaults : launch argument to its default, where it is not that of all launch files
+    parameters : name to value, which override the parameter file
+    defaults : launch argument to its default, if it differs from the common one
     """
 
     def start(context: LaunchContext) -> list[Any]:
@@ -110,7 +110,7 @@ def _actions(
 
 def _node(name: str, settings: dict[str, Any]) -> Node:
     def after(event: Any, context: LaunchContext) -> list[Any]:
-        """Crashed: once more. Refused its parameters: it would refuse them again."""
+        """Restart after a crash, but not after refused parameters, which would be refused again."""
         if context.is_shutdown or event.returncode == _STOPPED:
             return []
         if event.returncode == _REFUSED:
@@ -122,7 +122,7 @@ def _node(name: str, settings: dict[str, Any]) -> Node:
 
 
 def _second_camera(given: dict[str, str], settings: dict[str, Any]) -> list[Node]:
-    """Front end and detector of a second camera, which look for the same markers as those of the first."""
+    """Front end and detector of a second camera; the map and odometry topics are those of the first."""
     name, device = given['second_camera'], given['second_camera_device']
     if not name:
         return []
@@ -135,9 +135,9 @@ def _second_camera(given: dict[str, str], settings: dict[str, Any]) -> list[Node
 
 
 def _unknown_arguments(context: LaunchContext) -> list[Any]:
-    """A warning of each argument on the command line that is not ours; one that is nearly ours is refused.
+    """Warnings of unknown arguments on the command line; one that resembles a known argument is refused.
 
-    A launch file that includes ours may have others.
+    Only a warning, since a launch file that includes this one may declare more.
     """
     given = [argument.partition(':=')[0] for argument in context.argv if ':=' in argument]
     warnings = []
@@ -176,7 +176,7 @@ def _log_level(level: str) -> str:
 
 
 def _discovery_range(given: str) -> str:
-    """Whoever finds the nodes may reset the filter and send poses: nobody but this computer, unasked."""
+    """The discovery range; LOCALHOST by default, as any participant could reset the filter and send poses."""
     asked = given or os.environ.get(_DISCOVERY, '') or _RANGES[0]
     if asked.upper() not in _RANGES:
         raise InputError(f'discovery_range {asked}: not one of {", ".join(_RANGES)}')

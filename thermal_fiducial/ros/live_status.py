@@ -1,6 +1,6 @@
-"""What a pilot wants to know while flying, from messages as they come: may the pose be flown on, and if not, why.
+"""Live status for a pilot, from messages as they arrive: whether the pose may be flown on, and if not, why.
 
-Nothing here needs ROS or a display; times are seconds of one monotonic clock.
+Independent of ROS and of the display; times are seconds of one monotonic clock.
 """
 
 from collections import deque
@@ -11,13 +11,13 @@ import re
 
 from thermal_fiducial.core.imaging.frame_cleaner import SHUTTER
 
-#: Without odometry for longer than this there is no pose to fly on; without diagnostics, nobody who says so [s].
+#: Timeouts of odometry, after which there is no pose to fly on, and of a node's diagnostics [s].
 SILENT_S, MUTE_S = 0.5, 3.0
-#: Rates are those of the last seconds; a topic of which nothing came in this time has none.
+#: Window of the rates [s]; a topic without a message in it has no rate.
 WINDOW_S = 2.0
-#: Older refusals are of no interest to a pilot any more [s], and more of them no help.
+#: Largest age [s] and number of the refusals shown.
 REFUSAL_S, MOST_REFUSALS = 60.0, 5
-#: Stamps that differ more than this from the time are of another clock [s].
+#: Stamps farther than this from the present time are of another clock [s].
 _ONE_CLOCK_S = 5.0
 _FILTER, _CAMERA, _DETECTOR, _MAPPER = 'pose_ekf', 'tau2_camera', 'aruco_detector', 'marker_mapper'
 STAGES = (_CAMERA, _DETECTOR, _MAPPER, _FILTER)
@@ -49,20 +49,20 @@ class LiveState:
     advice: Advice
     reasons: tuple[str, ...]
     readings: tuple[LiveFigure, ...]
-    #: node, level (0 ok, 1 warning, 2 error) and what it says
+    #: node, level (0 ok, 1 warning, 2 error), message of its diagnostic
     nodes: tuple[tuple[str, int, str], ...]
-    #: how long ago [s] and what
+    #: age [s] and message
     refusals: tuple[tuple[float, str], ...]
 
     @property
     def headline(self) -> str:
-        """The advice with its reasons, in one line."""
+        """Advice and reasons in one line."""
         reasons = f': {"; ".join(self.reasons)}' if self.reasons else ''
         return f'The pose {self.advice.value}{reasons}'
 
     @property
     def line(self) -> str:
-        """All in one line of plain text."""
+        """The whole state in one line of plain text."""
         figures = [f'{r.name} {r.value} {r.unit}'.strip() for r in self.readings if r.value]
         return ' | '.join(
             [self.headline, *figures, *(f'refused {age:.0f} s ago: {why}' for age, why in self.refusals[:1])]
@@ -71,7 +71,7 @@ class LiveState:
 
 @dataclass
 class _Topic:
-    """Arrivals of a topic in the last seconds, and how late each was."""
+    """Arrival times of a topic in the last seconds, and latencies."""
 
     arrivals: deque[float] = field(default_factory=deque)
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=50))
@@ -84,7 +84,7 @@ class _Topic:
             self.latencies.append(age)
 
     def silent(self, now: float) -> float:
-        """Since the last message [s]."""
+        """Time since the last message [s]."""
         return now - self.arrivals[-1] if self.arrivals else float('inf')
 
     def rate(self, now: float) -> str:
@@ -95,7 +95,7 @@ class _Topic:
 
     @property
     def latency(self) -> str:
-        """Median [ms]; empty where stamps are of another clock."""
+        """Median [ms]; empty if the stamps are of another clock."""
         if not self.latencies:
             return ''
         return f'{1e3 * sorted(self.latencies)[len(self.latencies) // 2]:.0f}'
@@ -110,11 +110,11 @@ class _Node:
 
 
 class LiveStatus:
-    """Gathers messages; :meth:`snapshot` says what they come to.
+    """Collects messages; :meth:`snapshot` evaluates them.
 
     Parameters
     ----------
-    namespace : of the robot; what nodes elsewhere say does not count
+    namespace : of the robot; diagnostics of nodes outside it are ignored
     """
 
     def __init__(self, namespace: str = '') -> None:
@@ -126,21 +126,21 @@ class LiveStatus:
         self._refusals: deque[tuple[float, str]] = deque(maxlen=MOST_REFUSALS)
 
     def odometry(self, now: float, age: float, sigma_m: float, sigma_deg: float) -> None:
-        """Odometry came, ``age`` [s] after its stamp; its standard deviations, three axes together."""
+        """Odometry arrived ``age`` [s] after its stamp, with standard deviations over the three axes together."""
         self._odometry.add(now, age)
         self._sigma = (sigma_m, sigma_deg)
 
     def camera_pose(self, now: float, age: float) -> None:
-        """A pose from markers came."""
+        """A camera pose arrived ``age`` [s] after its stamp."""
         self._camera_pose.add(now, age)
 
     def markers(self, now: float, ids: Iterable[int]) -> None:
-        """The markers of a frame came."""
+        """The detections of a frame arrived."""
         self._frames.add(now, -1.0)
         self._markers = tuple(sorted(ids))
 
     def diagnostic(self, now: float, name: str, level: int, message: str, figures: Mapping[str, str]) -> None:
-        """A node said something of itself."""
+        """A diagnostic status of a node arrived."""
         if not name.startswith(self._prefix):
             return
         node = name.removeprefix(self._prefix)
@@ -187,7 +187,7 @@ class LiveStatus:
         return reasons
 
     def _cares(self, now: float) -> list[str]:
-        """Why it may be flown on with care only."""
+        """Why the pose may be flown on with care only."""
         reasons = []
         for node in STAGES:
             said = self._nodes.get(node)
@@ -198,7 +198,7 @@ class LiveStatus:
         return reasons
 
     def _is_shutter(self, node: str, said: _Node) -> bool:
-        """Whether it is the camera's shutter, which is as it should be."""
+        """Whether the warning is a shutter event of the camera, which is normal operation."""
         return node == _CAMERA and SHUTTER in said.message and said.level == _WARNING
 
     def _said(self, node: str, now: float) -> tuple[str, int, str]:

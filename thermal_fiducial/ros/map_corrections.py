@@ -1,4 +1,4 @@
-"""Corrections of the map while poses are on their way: for the publisher and for the subscriber of ``camera_pose``."""
+"""Map corrections during the delay of poses, at the publisher and at the subscriber of ``camera_pose``."""
 
 from collections import deque
 from dataclasses import replace
@@ -10,12 +10,12 @@ from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: Corrections, and covariances of the map, that are kept.
+#: Number of corrections and of map covariances kept.
 _REMEMBERED = 10
 
 
 class LatePoses:
-    """For the publisher: poses of frames that are processed after the map has moved, in the map as of their stamps."""
+    """For the publisher: transforms poses of frames processed after a correction into the map as of their stamps."""
 
     def __init__(self) -> None:
         #: stamp of the newest frame so far
@@ -24,7 +24,7 @@ class LatePoses:
         self._T_new_old: FloatArray = np.eye(4)
 
     def add(self, stamp_ns: int) -> None:
-        """Log the stamp of a frame; a much older one is that of a clock that was set back."""
+        """Log the stamp of a frame; a much older stamp means a backward clock jump."""
         self.newest_ns = max(stamp_ns, self.newest_ns) if stamp_ns >= self.newest_ns - LATEST_NS else stamp_ns
 
     def moved(self, T_new_old: FloatArray) -> None:
@@ -32,23 +32,23 @@ class LatePoses:
         self._moved_ns, self._T_new_old = self.newest_ns, T_new_old
 
     def as_of_its_stamp(self, pose: CameraPose) -> CameraPose:
-        """``pose``, which is in the present map, in the map as of its stamp."""
+        """``pose``, given in the present map, in the map as of its stamp."""
         if 0 <= self._moved_ns - pose.stamp_ns <= LATEST_NS:
             return in_moved_map(pose, inverse(self._T_new_old))
         return pose
 
 
 class MapCorrections:
-    """For the subscriber: poses in the present map, with the map's covariance.
+    """For the subscriber: transforms poses into the present map and adds the covariance of the map's error.
 
-    ``window`` [s]: differences of stamps beyond it are those of another clock.
+    ``window`` [s]: larger differences of stamps are due to another clock.
     """
 
     def __init__(self, window: float) -> None:
         self._window_ns = window * SECOND_NS
         self._corrections: deque[tuple[int, FloatArray]] = deque(maxlen=_REMEMBERED)
         self._errors: deque[CameraPose] = deque(maxlen=_REMEMBERED)
-        #: map error of the latest pose that had one
+        #: the last map error received with a pose
         self._error: CameraPose | None = None
 
     def add(self, stamp_ns: int, T_new_old: FloatArray) -> None:
@@ -56,15 +56,15 @@ class MapCorrections:
         self._corrections.append((stamp_ns, T_new_old))
 
     def note_error(self, error: CameraPose) -> None:
-        """Log the covariance of the map's error at a pose: that of ``error``."""
+        """Log the map's error at a pose (the covariance of ``error``)."""
         self._errors.append(error)
 
     def in_present_map(self, pose: CameraPose) -> CameraPose:
-        """``pose``, which is in the map as of its stamp, in the present map, with the covariance of the map's error."""
+        """``pose``, given in the map as of its stamp, in the present map, with the covariance of the map's error."""
         self._error = next((error for error in self._errors if error.stamp_ns == pose.stamp_ns), self._error)
         error = self._error
         if error is not None and abs(pose.stamp_ns - error.stamp_ns) <= self._window_ns:
-            # The map's error changes slowly: that of the last frame serves, as far as this covariance contains it.
+            # The map's error changes slowly, so the last one is used, limited to what the pose's covariance contains.
             of_map, relative = error.covariance, pose.covariance - error.covariance
             if np.linalg.eigvalsh(relative)[0] < 0.0:
                 of_map = pose.covariance - positive(relative)

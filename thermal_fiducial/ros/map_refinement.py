@@ -1,4 +1,4 @@
-"""The joint refinement of a mapper, beside the frames: in a process of its own as soon as the map may change."""
+"""Bundle adjustment of the map in the background: in a separate process while the map may change."""
 
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
@@ -10,7 +10,7 @@ Worker = Background[Snapshot, AdjustedMap | None] | Foreground[Snapshot, Adjuste
 
 
 class MapRefinement:
-    """Refines the map of ``mapper``; ``live``: in the background, else at once (a replay in lock-step)."""
+    """Refines the map of ``mapper``; ``live``: in the background, else synchronously (lock-step replay)."""
 
     def __init__(self, mapper: MarkerMapper, *, live: bool) -> None:
         self._mapper = mapper
@@ -20,16 +20,16 @@ class MapRefinement:
 
     @property
     def busy(self) -> bool:
-        """Whether no refinement can be started: one is under way, or the process for it starts."""
+        """Whether no refinement can be started: one is running, or its process is starting."""
         return self._worker is not None and self._worker.busy
 
     def prepare(self) -> None:
-        """Start the process, which takes a while, where the map may change."""
+        """Start the process if the map may change; it takes a while to be ready."""
         if self._worker is None and not self._mapper.frozen:
             self._worker = Background(refine) if self._live else Foreground(refine)
 
     def step(self, stamp_ns: int) -> bool:
-        """After each frame: start a refinement where one is due, take over one that is done; whether one was.
+        """After each frame: start a refinement if one is due, apply a finished one; returns whether one was applied.
 
         Raises
         ------
@@ -49,7 +49,7 @@ class MapRefinement:
         Raises
         ------
         InputError
-            The map is frozen, one is under way already, or there is nothing to refine yet.
+            The map is frozen, a refinement is running already, or there is nothing to refine yet.
         """
         if self._mapper.frozen or self._worker is None:
             raise InputError('the map is frozen')
@@ -65,6 +65,6 @@ class MapRefinement:
         return snapshot is not None
 
     def close(self) -> None:
-        """End it, also in the middle of its work."""
+        """Terminate the process, even during a refinement."""
         if self._worker is not None:
             self._worker.close()

@@ -23,12 +23,12 @@ Answer = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
 
 
 class MapServices:
-    """Makes the mapper of ``node`` from its map file, and answers its services.
+    """Creates the mapper of ``node`` from its map file, and offers the map services.
 
     Parameters
     ----------
     node : a mapper's node
-    publish_jump : called with what becomes of the map when a service has replaced it
+    publish_jump : called with the mapper's result when a service has replaced the map
     """
 
     def __init__(self, node: StageNode[MarkerMapperConfig], publish_jump: Callable[[FloatArray | None], None]) -> None:
@@ -38,7 +38,7 @@ class MapServices:
         file = Path(config.map_file) if config.map_file else None
         sizes = size_overrides(config.marker_size_overrides)
         self._keeper = MapKeeper(file, config.marker_size, sizes, flown=node.live)
-        #: in words: the map is of another dictionary than the one that is looked for
+        #: warning if the map's dictionary differs from the detector's; else empty
         self.other_dictionary = ''
         self.mapper = MarkerMapper(config, self._first_map())
         self.refinement = MapRefinement(self.mapper, live=node.live)
@@ -75,29 +75,29 @@ class MapServices:
         self._node.guard(self._keeper.autosave, self.mapper.map)
 
     def note_learned(self) -> None:
-        """The map has learned something that is not in its file."""
+        """Mark the map as changed since the last save."""
         self._keeper.unsaved = True
 
     def save(self) -> str:
-        """Write the map file, or another one, and why, where it cannot be replaced."""
+        """Write the map file, or another one if it cannot be replaced; returns a message with path and reason."""
         path = self._keeper.save(self.mapper.map)
         why = f', as {self._keeper.obstacle}' if self._keeper.obstacle else ''
         return f'{self.mapper.map.size_in_words} saved to {path}{why}'
 
     def load(self) -> str:
-        """Take over the map file as it is now: what ``thermal-fiducial map`` has made of it."""
+        """Reload the map file, for example after edits with ``thermal-fiducial map``."""
         self._refuse_frozen()
         loaded = self._read()
         self._publish_jump(self.mapper.load(loaded))
         return f'{loaded.size_in_words} loaded from {self._keeper.path}'
 
     def undo(self) -> str:
-        """Put the earlier version of the map file back, and take it over."""
+        """Restore the previous version of the map file and load it."""
         self._refuse_frozen()
         return f'undone: {self._keeper.undo()}; {self.load()}'
 
     def reset(self) -> str:
-        """Back to the map that was loaded last."""
+        """Reset to the map loaded last."""
         self._refuse_frozen()
         self._publish_jump(self.mapper.reset())
         left = f'{self.mapper.map.size_in_words} left'
@@ -105,7 +105,7 @@ class MapServices:
         return left
 
     def refine(self) -> str:
-        """Start a joint refinement now."""
+        """Start a bundle adjustment now."""
         self.refinement.start()
         return 'refinement started'
 
@@ -120,12 +120,12 @@ class MapServices:
         return response
 
     def close(self) -> None:
-        """End the refinement; save what was mapped.
+        """Terminate a running refinement; save the map if it has changed.
 
         Raises
         ------
         InputError
-            It cannot be saved anywhere.
+            The map cannot be saved anywhere.
         """
         try:
             self.refinement.close()
@@ -144,7 +144,7 @@ class MapServices:
 
 
 def _answer(act: Callable[[], str]) -> Answer:
-    """A service that says what ``act`` did."""
+    """Trigger callback that returns the message of ``act``."""
 
     def answer(_: Trigger.Request, response: Trigger.Response) -> Any:
         response.message, response.success = act(), True

@@ -1,4 +1,4 @@
-"""Status of the mapper: diagnostics in words and numbers, lines on the console."""
+"""Status of the mapper: diagnostics and console lines."""
 
 from collections.abc import Iterable
 
@@ -7,9 +7,9 @@ from thermal_fiducial.ros.node import OK, WARN
 
 
 def state(result: MapperResult, other_dictionary: str, *, frozen: bool, left: int = 0) -> tuple[bytes, str]:
-    """Level and words: why the last frame gave no pose, whether the map is meant, which markers are not trusted.
+    """Diagnostic level and message: why the last frame gave no pose, another dictionary, quarantined markers.
 
-    ``left``: frames that were left for newer ones since the last time.
+    ``left``: frames skipped for newer ones since the last call.
     """
     if result.reason or other_dictionary:
         return WARN, '; '.join(filter(None, (result.reason, other_dictionary)))
@@ -21,7 +21,7 @@ def state(result: MapperResult, other_dictionary: str, *, frozen: bool, left: in
 
 
 def figures(marker_map: MarkerMap, corrections: int, result: MapperResult) -> dict[str, object]:
-    """The map in numbers, what waits to enter it, and why markers are in quarantine."""
+    """Key-value pairs of the diagnostics: size of the map, candidates, reasons of quarantines."""
     return {
         'markers in map': len(marker_map.markers),
         'map revision': marker_map.revision,
@@ -34,7 +34,7 @@ def figures(marker_map: MarkerMap, corrections: int, result: MapperResult) -> di
 
 
 def news(before: MapperResult, now: MapperResult) -> dict[int, str]:
-    """Lines for the console by marker: it went into quarantine, with the reason, or came out."""
+    """Console line by marker ID: quarantined, with the reason, or trusted again."""
     new = set(now.quarantined) - set(before.quarantined)
     into = {key: f'marker {key} quarantined: {now.quarantine_reasons[key]}' for key in sorted(new)}
     out = {key: f'marker {key} is trusted again' for key in before.quarantined if key not in now.quarantined}

@@ -1,4 +1,4 @@
-"""The marker map as topics: its rows, how it has moved, and what RViz shows of it."""
+"""Topics of the marker map: its rows, its corrections, and its display in RViz."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -16,21 +16,21 @@ from thermal_fiducial.files.point_cloud import load_alignment, load_cloud, thinn
 from thermal_fiducial.ros import clouds, convert, display, qos
 from thermal_fiducial.ros.node import StageNode
 
-# Points of the cloud that is shown: 0.7 MB, which goes through shared memory in one piece.
+# Most points of the displayed cloud: 0.7 MB, which fits shared memory unfragmented.
 _CLOUD_POINTS = 60_000
 _XYZ = np.dtype([(axis, '<f4') for axis in 'xyz'])
 
 
 @dataclass(frozen=True)
 class _MapDrawing:
-    """What RViz has been shown, and how many it was."""
+    """State of the display: markers drawn as in view, number of subscribers."""
 
     in_view: frozenset[int]
     listeners: int
 
 
 class MapTopics:
-    """The topics of ``node`` that show the map, and the point cloud of the place where it names one."""
+    """Publishers of the map, and of the point cloud of the site if one is configured."""
 
     def __init__(self, node: StageNode[MarkerMapperConfig]) -> None:
         config = node.config
@@ -44,17 +44,17 @@ class MapTopics:
             node.attempt(lambda: self._publish_cloud(config.cloud_file, config.cloud_alignment_file), None)
 
     def publish(self, marker_map: MarkerMap, in_view: Collection[int], stamp_ns: int) -> None:
-        """The map as it is after the frame of ``stamp_ns``, which shows the markers ``in_view``."""
+        """Publish the map after the frame of ``stamp_ns``, in which the markers ``in_view`` were seen."""
         self._rows.send(clouds.cloud(marker_map.rows(in_view), convert.header(stamp_ns, self._frame_id)))
         self._drawn = None
 
     def publish_correction(self, T_new_old: FloatArray, stamp_ns: int) -> None:
-        """How the map has moved after the frame of ``stamp_ns``: (4, 4) from the old to the new."""
+        """Publish the correction ``T_new_old`` (4, 4) of the map after the frame of ``stamp_ns``."""
         old = f'{self._frame_id}_before'
         self._correction.send(convert.transform_message(T_new_old, stamp_ns, self._frame_id, old))
 
     def draw(self, marker_map: MarkerMap, in_view: frozenset[int], stamp_ns: int) -> None:
-        """The markers for RViz: all when they have changed or someone new looks on, else those of another colour."""
+        """Publish the markers for RViz: all after a change or for a new subscriber, else those that change colour."""
         now = _MapDrawing(in_view, self._drawing.listeners)
         whole = self._drawn is None or now.listeners > self._drawn.listeners
         recoloured = in_view if self._drawn is None else in_view ^ self._drawn.in_view
@@ -66,19 +66,19 @@ class MapTopics:
         self._drawn = now
 
     def draw_for_listeners(self, marker_map: MarkerMap, in_view: frozenset[int], stamp_ns: int) -> None:
-        """The same where anybody looks on."""
+        """:meth:`draw` if there are subscribers."""
         if self._drawing.listeners:
             self.draw(marker_map, in_view, stamp_ns)
         else:
             self._drawn = None
 
     def _publish_cloud(self, cloud_file: str, alignment_file: str) -> None:
-        """The point cloud of the place, in the frame of the map, once: for RViz beside the markers.
+        """Publish the point cloud of the site in the map frame, once.
 
         Raises
         ------
         InputError
-            A file that cannot be used.
+            An unusable file.
         """
         T_cloud_map = load_alignment(alignment_file) if alignment_file else np.eye(4)
         points = apply(inverse(T_cloud_map), thinned(load_cloud(cloud_file), _CLOUD_POINTS))

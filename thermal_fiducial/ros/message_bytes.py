@@ -1,7 +1,7 @@
-"""Messages at the rate of an IMU, read from their bytes and written as such: making messages of them takes longer.
+"""Serialisation of messages at IMU rate without message objects, which take longer to make.
 
 The encoding is that of ROS 2 (Object Management Group, "DDS Interoperability Wire Protocol", plain CDR,
-little-endian): four bytes that say so, then the fields one after the other, each aligned to its own size.
+little-endian): a header of four bytes, then the fields in order, each aligned to its own size.
 """
 
 from collections.abc import Sequence
@@ -22,27 +22,27 @@ from thermal_fiducial.ros import convert
 
 _HEADER, _LITTLE_ENDIAN = 4, b'\x00\x01'
 _STAMP, _LENGTH, _NUMBERS = struct.Struct('<iI'), struct.Struct('<I'), np.dtype('<f8')
-#: Where the frames begin; all that comes before them is the stamp.
+#: Offset of the first string, ``frame_id``, behind the stamp.
 BEHIND_STAMP = _HEADER + _STAMP.size
-# Of an image: height, width, length of the encoding's name; bytes of a row and of all.
+# Of an image: height, width, length of ``encoding``; ``step`` and length of the data.
 _SIZES, _ROWS = struct.Struct('<III'), struct.Struct('<II')
-# Position, quaternion, their covariance, then velocity, turn rate, their covariance.
+# Position, quaternion, pose covariance; velocity, angular velocity, twist covariance.
 _POSE, _ODOMETRY = 7 + 36, 7 + 36 + 6 + 36
-# Orientation and its covariance, turn rate and its covariance, specific force and its covariance.
+# Orientation, angular velocity, specific force, each with its covariance.
 _IMU = 4 + 9 + 3 + 9 + 3 + 9
-# Hundreds of messages are kept: numbers have 712 bytes, and nobody's frames have names of kilobytes.
+# Longest message accepted [bytes], since hundreds are kept: the numbers take 712, the rest are names of frames.
 _LONGEST = 8192
-# No camera that sees markers moves faster: such odometry shows nothing [m/s, rad/s].
+# Largest velocity and angular velocity accepted: no camera that sees markers moves faster [m/s, rad/s].
 _FASTEST = np.array([20.0, 20.0, 20.0, 30.0, 30.0, 30.0])
 
 
 def read(message: bytes, kind: type, what: str) -> Any:
-    """The message of a ``kind`` itself, where it comes seldom; it is called ``what``.
+    """Deserialise a message of type ``kind``, for rare topics; ``what`` names it in errors.
 
     Raises
     ------
     InputError
-        Bytes that are none.
+        Bytes that are not a message of that type.
     """
     try:
         return deserialize_message(message, kind)
@@ -51,12 +51,12 @@ def read(message: bytes, kind: type, what: str) -> Any:
 
 
 def stamp_ns(message: bytes, what: str = 'odometry', longest: int = _LONGEST) -> int:
-    """Stamp of the header of a message, which is called ``what``.
+    """Stamp of a message's header [ns]; ``what`` names the message in errors.
 
     Raises
     ------
     InputError
-        Of another encoding, too short or longer than ``longest``, or with a stamp that is none.
+        Another encoding, too short, longer than ``longest``, or an invalid stamp.
     """
     if len(message) > longest:
         raise InputError(f'{what} of {len(message)} bytes')
@@ -66,12 +66,12 @@ def stamp_ns(message: bytes, what: str = 'odometry', longest: int = _LONGEST) ->
 
 
 def odometry(messages: Sequence[bytes]) -> list[Odometry]:
-    """States of the robot, for whoever can do without them: N messages at once take little longer than one.
+    """States of N odometry messages: decoding N at once takes little longer than one.
 
     Raises
     ------
     InputError
-        One of them has a value that is not finite or beyond the bounds, a quaternion or a covariance that is none.
+        A value of any message is not finite or out of bounds, or a quaternion or covariance is invalid.
     """
     stamps = [stamp_ns(message) for message in messages]
     numbers = np.stack([_numbers(message, 2, _ODOMETRY, 'odometry') for message in messages]).astype(np.float64)
@@ -91,7 +91,7 @@ def imu_sample(message: bytes) -> ImuSample:
     Raises
     ------
     InputError
-        As :func:`thermal_fiducial.files.records.imu_sample`, or an encoding that is not known.
+        As :func:`thermal_fiducial.files.records.imu_sample`, or an unknown encoding.
     """
     stamp = stamp_ns(message, 'IMU message')
     numbers = _numbers(message, 1, _IMU, 'IMU message').tolist()
@@ -101,18 +101,18 @@ def imu_sample(message: bytes) -> ImuSample:
 
 
 def camera_pose(message: bytes) -> CameraPose:
-    """The camera in the map.
+    """Camera pose in the map.
 
     Raises
     ------
     InputError
-        Of another encoding or cut short, a pose that cannot be, or a covariance that is none.
+        Another encoding, a truncated message, or an invalid pose or covariance.
     """
     return _camera_pose(message, 'camera_pose', partial=False)
 
 
 def map_error(message: bytes) -> CameraPose:
-    """The camera in the map, its covariance by errors of the map alone: in some directions there may be none.
+    """Camera pose with the covariance due to the map's error alone, which may be singular.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def map_error(message: bytes) -> CameraPose:
 
 @dataclass(frozen=True, slots=True)
 class ImageBytes:
-    """A sensor_msgs/Image for ``files.images.image_to_array``: the pixels are left where they are."""
+    """A sensor_msgs/Image for ``files.images.image_to_array``; the pixels are not copied."""
 
     stamp_ns: int
     frame_id: str
@@ -137,12 +137,12 @@ class ImageBytes:
 
 
 def image(message: bytes) -> ImageBytes:
-    """An image.
+    """Image message without a copy of its pixels.
 
     Raises
     ------
     InputError
-        Of another encoding, or cut short.
+        Another encoding, or a truncated message.
     """
     what = 'image'
     stamp = stamp_ns(message, what, longest=len(message))
@@ -161,12 +161,12 @@ def image(message: bytes) -> ImageBytes:
 
 
 def clock_offset(message: bytes) -> float:
-    """What :func:`thermal_fiducial.ros.convert.clock_reference` says [s].
+    """Clock offset [s] of a :func:`thermal_fiducial.ros.convert.clock_reference`.
 
     Raises
     ------
     InputError
-        As :func:`thermal_fiducial.ros.convert.checked_clock_offset`, or an encoding that is not known.
+        As :func:`thermal_fiducial.ros.convert.checked_clock_offset`, or an unknown encoding.
     """
     what = 'camera_clock'
     imu_stamp_ns = stamp_ns(message, what)
@@ -178,12 +178,12 @@ def clock_offset(message: bytes) -> float:
 
 
 def frame_id(message: bytes) -> str:
-    """The frame that the header of a message names.
+    """``frame_id`` of a message's header.
 
     Raises
     ------
     InputError
-        Cut short, or not UTF-8.
+        A truncated message, or a name that is not UTF-8.
     """
     try:
         length = int(_LENGTH.unpack_from(message, BEHIND_STAMP)[0])
@@ -194,7 +194,7 @@ def frame_id(message: bytes) -> str:
 
 
 def _camera_pose(message: bytes, what: str, *, partial: bool) -> CameraPose:
-    """Of a geometry_msgs/PoseWithCovarianceStamped; ``partial``: in some directions there may be no variance."""
+    """Pose of a geometry_msgs/PoseWithCovarianceStamped; ``partial``: the covariance may be singular."""
     stamp, numbers = stamp_ns(message, what), _numbers(message, 1, _POSE, what).astype(np.float64)
     T_map_camera = convert.transform_of_values(numbers[:7], what)
     covariance = checked_covariance(numbers[7:].reshape(6, 6), f'{what} with a covariance', partial=partial)
@@ -202,7 +202,7 @@ def _camera_pose(message: bytes, what: str, *, partial: bool) -> CameraPose:
 
 
 def _numbers(message: bytes, names: int, count: int, what: str) -> FloatArray:
-    """``count`` numbers behind the stamp and so many ``names`` of frames."""
+    """``count`` float64 values that follow the stamp and ``names`` strings."""
     try:
         return np.frombuffer(message, _NUMBERS, count, _aligned(_behind_names(message, names), _NUMBERS.itemsize))
     except (struct.error, ValueError):
@@ -210,7 +210,7 @@ def _numbers(message: bytes, names: int, count: int, what: str) -> FloatArray:
 
 
 def _behind_names(message: bytes, names: int) -> int:
-    """Where so many names of frames behind the stamp end; struct.error where the message ends before."""
+    """Offset behind the stamp and ``names`` strings; struct.error if the message is truncated."""
     place = BEHIND_STAMP
     for _ in range(names):
         place = _aligned(place, _LENGTH.size)
@@ -219,24 +219,24 @@ def _behind_names(message: bytes, names: int) -> int:
 
 
 def behind_header(message: bytes) -> int:
-    """Where the first whole number behind the header of a message stands; struct.error where it ends before."""
+    """Offset of the first uint32 behind a message's header; struct.error if the message is truncated."""
     return _aligned(_behind_names(message, 1), _LENGTH.size)
 
 
 def _aligned(place: int, size: int) -> int:
-    """The next place that is a multiple of a size, counted from behind the header."""
+    """``place`` rounded up to a multiple of ``size``, counted from behind the encapsulation header."""
     return place + -(place - _HEADER) % size
 
 
 class StateBytes:
-    """The robot's state as nav_msgs/Odometry and as geometry_msgs/PoseWithCovarianceStamped, in memory of its own."""
+    """The robot's state, serialised as nav_msgs/Odometry and geometry_msgs/PoseWithCovarianceStamped in own buffers."""
 
     def __init__(self, frame: str, child_frame: str) -> None:
         self._odometry, self._numbers = _blank((frame, child_frame), _ODOMETRY)
         self._pose, self._pose_numbers = _blank((frame,), _POSE)
 
     def fill(self, odometry: Odometry) -> None:
-        """Take over a state."""
+        """Write a state into the buffers."""
         numbers, stamp = self._numbers, divmod(int(odometry.stamp_ns), SECOND_NS)
         numbers[0:3] = odometry.T_map_body[:3, 3]
         numbers[3:7] = quaternion_from_rotation(odometry.T_map_body[:3, :3])
@@ -250,35 +250,35 @@ class StateBytes:
 
     @property
     def odometry(self) -> bytes:
-        """The whole state."""
+        """The state as nav_msgs/Odometry."""
         return bytes(self._odometry)
 
     @property
     def pose(self) -> bytes:
-        """Its pose."""
+        """The pose as geometry_msgs/PoseWithCovarianceStamped."""
         return bytes(self._pose)
 
 
 class PoseBytes:
-    """A pose with one covariance or another as geometry_msgs/PoseWithCovarianceStamped, in memory of its own."""
+    """A pose, serialised as geometry_msgs/PoseWithCovarianceStamped with varying covariances, in an own buffer."""
 
     def __init__(self, frame: str) -> None:
         self._pose, self._numbers = _blank((frame,), _POSE)
 
     def fill(self, stamp: int, T_frame_body: FloatArray) -> None:
-        """Take over a pose (4, 4)."""
+        """Write a pose (4, 4) into the buffer."""
         self._numbers[0:3] = T_frame_body[:3, 3]
         self._numbers[3:7] = quaternion_from_rotation(T_frame_body[:3, :3])
         _STAMP.pack_into(self._pose, _HEADER, *divmod(int(stamp), SECOND_NS))
 
     def of(self, covariance: FloatArray) -> bytes:
-        """That pose with a covariance (6, 6)."""
+        """The message of that pose with a covariance (6, 6)."""
         self._numbers[7:] = covariance.ravel()
         return bytes(self._pose)
 
 
 def _blank(frames: tuple[str, ...], count: int) -> tuple[bytearray, FloatArray]:
-    """A message with names of ``frames`` and ``count`` zeros, and a view of these."""
+    """Buffer of a message with the strings ``frames`` and ``count`` float64 zeros, and a view of the zeros."""
     message = bytearray(_LITTLE_ENDIAN + bytes(BEHIND_STAMP - len(_LITTLE_ENDIAN)))
     for frame in frames:
         name = frame.encode() + b'\x00'

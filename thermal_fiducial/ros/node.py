@@ -1,4 +1,4 @@
-"""Base of the nodes: parameters, a guard round each callback, diagnostics and console lines once a second.
+"""Base of the nodes: parameters, error handling of callbacks, diagnostics and console lines once a second.
 
 Unusable input never ends a node: it raises :class:`InputError` in the conversion or in the core, which the guard turns
 into a warning and a diagnostic.
@@ -27,24 +27,24 @@ Made = TypeVar('Made')
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
 
-#: Parameters with names of frames that are on the robot; the map is nobody's.
+#: Parameters with frames of the robot, which get the namespace as a prefix; the map frame is common to all robots.
 _ROBOT_FRAMES = ('base_frame', 'camera_frame', 'odom_frame', 'frame_id')
-#: Parameters with the expected rate of a node's main input.
+#: Parameters for the expected rate of a node's main input.
 _RATES = ('image_rate', 'imu_rate')
 #: Longest error message [characters] on console and in diagnostics: it may quote input of any length.
 _LONGEST_REASON = 400
 
 
 class StageNode(CountingNode, Generic[Config]):
-    """A node round one stage of the pipeline.
+    """A node for one stage of the pipeline.
 
     Parameters
     ----------
     name : of the node
     kind : config dataclass; its fields become the node's parameters
-    live : diagnostics by the wall clock; a replay in lock-step calls :meth:`diagnose` itself, by the bag's clock, and
-        has background work done in the foreground
-    **kwargs : of :class:`rclpy.node.Node`
+    live : diagnostics run on a wall-clock timer; a lock-step replay passes False, calls :meth:`diagnose` by the bag's
+        clock, and gets background work done synchronously
+    **kwargs : passed to :class:`rclpy.node.Node`
 
     Raises
     ------
@@ -65,7 +65,7 @@ class StageNode(CountingNode, Generic[Config]):
             raise
         #: called before the node is destroyed
         self.endings: list[Callable[[], None]] = []
-        #: parameters whose values are overridden, for example by TF
+        #: parameter values overridden by the node, for example by TF
         self._derived: dict[str, Any] = {}
         #: prefix of the names of the robot's frames
         self.frame_prefix = ''
@@ -74,15 +74,15 @@ class StageNode(CountingNode, Generic[Config]):
             frames = {name: getattr(self.config, name, '') for name in _ROBOT_FRAMES}
             self.derive(**{name: self.frame_prefix + frame for name, frame in frames.items() if frame})
         asked = int(getattr(self.config, 'realtime_priority', 0))
-        #: priority of the process under SCHED_FIFO; 0: an ordinary process
+        #: SCHED_FIFO priority of the process; 0: ordinary scheduling
         self.realtime_priority = asked + self.stage if asked else 0
-        #: faults of the configuration, in words; the node runs without the parts concerned
+        #: messages on faults of the configuration; the node runs without the parts concerned
         self.faults: list[str] = []
         self.refused = 0
         self.last_refusal = ''
         self._diagnosed_refused = 0
         self._rates = InputRates(self.inputs, _expected_rate(self.config))
-        #: lines for a pilot
+        #: console lines for a pilot
         self.console = Console(self.get_logger())
         self._diagnostics = self.advertise(DiagnosticArray, '/diagnostics')
         params.follow(self, kind, lambda config: self.configure(self._with_derived(config)))
@@ -90,12 +90,12 @@ class StageNode(CountingNode, Generic[Config]):
             self.create_timer(1.0, self._on_timer, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def derive(self, **values: Any) -> None:
-        """Override parameters by ``values``, whatever they are set to, now or later.
+        """Override parameters by ``values``, which also hold after later changes of the parameters.
 
         Raises
         ------
         InputError
-            A value that the parameter cannot have; all stay as they were.
+            A value that is invalid for its parameter; none is changed.
         """
         self.config = replace(self._with_derived(self.config), **values)  # type: ignore[type-var]
         self._derived |= values
@@ -104,11 +104,11 @@ class StageNode(CountingNode, Generic[Config]):
         return replace(config, **self._derived)  # type: ignore[type-var]
 
     def configure(self, config: Config) -> None:
-        """Take over a config with changed live parameters."""
+        """Apply a config with changed dynamic parameters."""
         self.config = config
 
     def attempt(self, make: Callable[[], Made], default: Made) -> Made:
-        """Result of ``make``; if it raises InputError, ``default`` and a fault of the configuration."""
+        """Result of ``make``; if it raises InputError, ``default``, and the error is reported as a fault."""
         try:
             return make()
         except InputError as error:
@@ -116,7 +116,7 @@ class StageNode(CountingNode, Generic[Config]):
             return default
 
     def fault(self, reason: str) -> None:
-        """Remember, log and report something configured that cannot be used."""
+        """Log a fault of the configuration and keep it in the diagnostics."""
         self.faults.append(reason)
         self.get_logger().error(reason)
 
@@ -127,12 +127,12 @@ class StageNode(CountingNode, Generic[Config]):
         except InputError as error:
             self.refuse(one_line(error, _LONGEST_REASON))
         except Exception as error:
-            # While the node is being shut down publishing fails: no error of the node.
+            # Publishing fails during shutdown, which is not an error of the node.
             if self.context.ok():
                 self.refuse(self._unforeseen(error))
 
     def serve(self, kind: Any, name: str, answer: Callable[[Any, Any], Any]) -> None:
-        """Offer a service; errors of ``answer`` go into the response's ``success`` and ``message``."""
+        """Offer a service; errors of ``answer`` are reported in the response's ``success`` and ``message``."""
 
         def guarded(request: Any, response: Any) -> Any:
             try:
@@ -147,31 +147,31 @@ class StageNode(CountingNode, Generic[Config]):
         self.create_service(kind, name, guarded)
 
     def _unforeseen(self, error: Exception) -> str:
-        """Log an unexpected exception; returns a line about it."""
+        """Log an unexpected exception; returns it as one line."""
         self.get_logger().error(traceback.format_exc(), throttle_duration_sec=1.0)
         return f'{INTERNAL_ERROR}: {type(error).__name__}: {one_line(error)}'
 
     def refuse(self, reason: str) -> None:
-        """Count a refused message; the first and then at most one a second is logged."""
+        """Count a refused message; at most one between two diagnostics is logged."""
         if self.refused == self._diagnosed_refused:
             self.get_logger().warning(reason)
         self.refused += 1
         self.last_refusal = reason
 
     def state(self) -> tuple[bytes, str]:
-        """Level and reason in words of a stage that gets usable input."""
+        """Diagnostic level and message of the stage while its input is usable."""
         return OK, 'ok'
 
     def headline(self) -> str:
-        """Status of the stage for a pilot, a few words without numbers: changes are printed on the console."""
+        """Short status for a pilot, without numbers, as changes of it are printed on the console."""
         return ''
 
     def figures(self) -> dict[str, object]:
-        """Numbers of the stage for the diagnostics."""
+        """Key-value pairs of the stage for the diagnostics."""
         return {}
 
     def close(self) -> None:
-        """Last work before the node is destroyed: save what must be saved."""
+        """Run the ``endings`` before the node is destroyed, for example to save files."""
         for end in self.endings:
             end()
 
@@ -193,7 +193,7 @@ class StageNode(CountingNode, Generic[Config]):
         self._diagnosed_refused = self.refused
 
     def _level(self) -> tuple[bytes, str]:
-        """Level and words of the worst of: configuration, refused input, missing input, stage, rate."""
+        """Level and message by precedence: faults, refused messages, missing main input, stage and rates."""
         if self.faults:
             return ERROR, '; '.join(self.faults)
         if self.refused > self._diagnosed_refused:

@@ -1,4 +1,4 @@
-"""The parameter file with every parameter, its default and its meaning, written out of the config dataclasses.
+"""Generates the parameter file, with default and description of every parameter, from the config dataclasses.
 
 ``python -m thermal_fiducial.ros.parameter_file > config/thermal_fiducial.yaml``
 """
@@ -24,7 +24,7 @@ _HEAD = """\
 
 
 def parameter_file() -> str:
-    """Text of the file: what several nodes share first, then node by node."""
+    """Text of the file: parameters of several nodes first, then node by node."""
     nodes = NODES | OPTIONAL_NODES
     uses = Counter(name for kind in nodes.values() for name, _, _ in parameters(kind))
     shared: dict[str, str] = {}
@@ -45,7 +45,7 @@ def _entry(name: str, item: 'Field[Any]', default: Any) -> Iterator[str]:
     text = ' '.join([limits['description'], *_limits(limits)])
     yield textwrap.indent(textwrap.fill(text, _WIDTH - 6), '    # ') + '\n'
     value = yaml.safe_dump(list(default) if isinstance(default, tuple) else default, default_flow_style=True)
-    # Dotted names are as good as nested ones to ROS, and keep each entry whole.
+    # ROS accepts dotted names like nested ones; they keep each entry on one line.
     yield f'    {name}: {value.removesuffix(_END_OF_SCALAR).strip()}\n'
 
 

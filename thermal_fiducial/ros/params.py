@@ -1,4 +1,4 @@
-"""ROS parameters out of the config dataclasses: declared, described, checked, some of them live."""
+"""ROS parameters from the config dataclasses: declaration with descriptor, validation, dynamic changes."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import Field
@@ -23,11 +23,11 @@ _UNBOUNDED = 1e300
 
 
 def declare(node: Node, kind: type[Config]) -> Config:
-    """Declare all parameters of config dataclass ``kind`` on ``node``; their values from file and command line.
+    """Declare all parameters of config dataclass ``kind`` on ``node``; returns their values as a config.
 
     Parameters
     ----------
-    node : whose parameters they become; those of other nodes in the same file are left alone
+    node : declares the parameters; those of other nodes in the same file are ignored
     kind : config dataclass
 
     Raises
@@ -35,8 +35,8 @@ def declare(node: Node, kind: type[Config]) -> Config:
     InputError
         A name that no node has, or a value of the wrong type, out of range, or not among the choices.
     """
-    # rclpy has no public way to ask what was given: declaring it all (automatically_declare_parameters_from_overrides)
-    # fails on an empty list, which has no type.
+    # rclpy has no public access to the overrides, and automatically_declare_parameters_from_overrides fails on an
+    # empty list, which has no type.
     own = {name for name, _, _ in parameters(kind)}
     check_names(set(getattr(node, '_parameter_overrides', {})) - own)
     for name, item, default in parameters(kind):
@@ -49,7 +49,7 @@ def declare(node: Node, kind: type[Config]) -> Config:
 
 
 def follow(node: Node, kind: type[Config], apply: Callable[[Config], None]) -> None:
-    """Call ``apply`` with the new config whenever a live parameter is set; refuse what the config refuses."""
+    """Call ``apply`` with the new config whenever a dynamic parameter is set; refuse invalid values."""
 
     def on_set(changes: Iterable[Parameter]) -> SetParametersResult:
         values = current_values(node, kind) | {change.name: change.value for change in changes}
@@ -57,7 +57,7 @@ def follow(node: Node, kind: type[Config], apply: Callable[[Config], None]) -> N
             apply(from_mapping(kind, values))
         except InputError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        except Exception as error:  # a parameter that cannot be set is no reason to end
+        except Exception as error:  # a failed change must not end the node
             return SetParametersResult(successful=False, reason=f'{INTERNAL_ERROR}: {type(error).__name__}: {error}')
         return SetParametersResult(successful=True)
 
@@ -65,7 +65,7 @@ def follow(node: Node, kind: type[Config], apply: Callable[[Config], None]) -> N
 
 
 def current_values(node: Node, kind: type) -> dict[str, Any]:
-    """Name to value of the parameters of ``kind`` as they are set on ``node``."""
+    """Name to present value on ``node`` of the parameters of ``kind``."""
     values = {name: node.get_parameter_or(name).value for name, _, _ in parameters(kind)}
     return {name: value for name, value in values.items() if value is not None}
 
@@ -74,8 +74,8 @@ def _declare(node: Node, name: str, item: 'Field[Any]', default: Any) -> None:
     if default != ():
         node.declare_parameter(name, list(default) if isinstance(default, tuple) else default, _descriptor(item))
         return
-    # ROS cannot infer the type of an empty list, and leaves a parameter unset that is declared by its type alone;
-    # asked for all parameters, it then gives none. It can be set only until it is read-only.
+    # An empty list has no type, and a parameter that is declared by type alone stays unset until it is assigned;
+    # while one is unset, a request for all parameters fails. It is assigned while still writable, then made read-only.
     kind = _ARRAYS[get_args(item.type)[0]]
     writable, final = _descriptor(item), _descriptor(item)
     writable.read_only, final.type = False, kind.value

@@ -1,4 +1,4 @@
-"""Being on time although others want the processor: real-time priority, no pauses of the garbage collector."""
+"""Low latency under load: real-time priority, no pauses of the garbage collector."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -8,17 +8,17 @@ from pathlib import Path
 
 
 def keep_for_good() -> None:
-    """Take all that exists out of the garbage collector's sight: going through it halts the process for 50 ms."""
+    """Exempt all present objects from garbage collection: traversing them halts the process for 50 ms."""
     gc.collect()
     gc.freeze()
 
 
 def take_priority(priority: int) -> bool:
-    """Put all threads of this process before ordinary ones, unless the user has already chosen for them.
+    """Set SCHED_FIFO for all threads of this process, unless the user has already chosen a policy.
 
     Parameters
     ----------
-    priority : of SCHED_FIFO, 1 to 99
+    priority : SCHED_FIFO priority, 1 to 99
 
     Returns
     -------
@@ -35,7 +35,7 @@ def take_priority(priority: int) -> bool:
 
 @contextmanager
 def prompt(priority: int) -> Iterator[None]:
-    """Priority and an undisturbed memory for as long as the context lasts."""
+    """Context with the priority and without pauses of the garbage collector."""
     keep_for_good()
     ordinary = os.sched_getscheduler(0) == os.SCHED_OTHER
     take_priority(priority)

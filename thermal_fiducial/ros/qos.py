@@ -18,7 +18,7 @@ def _profile(depth: int, *, reliable: bool = True, latched: bool = False) -> QoS
 
 #: subscription to images and camera_info of any publisher
 CAMERA_INPUT = _profile(5, reliable=False)
-#: subscription of whoever takes the newest image only, and counts the others that have come meanwhile
+#: subscription that processes only the newest image, and counts the skipped ones
 IMAGE_INPUT = _profile(10, reliable=False)
 #: subscription to the IMU of any publisher
 IMU_INPUT = _profile(400, reliable=False)
@@ -28,7 +28,7 @@ IMAGE_OUTPUT = _profile(5)
 RESULT = _profile(30)
 #: results at IMU rate
 IMU_RATE_RESULT = _profile(400)
-#: /tf_static of several publishers, each with what a late subscriber must get too
+#: /tf_static: transient local, deep enough for several publishers
 STATIC_TF = _profile(100, latched=True)
-#: what a late subscriber must get too: the map
+#: transient local, for late subscribers: the map
 LATCHED = _profile(1, latched=True)

@@ -1,4 +1,4 @@
-"""Where the camera and the IMU are on the robot: from TF or a URDF where they have it, else from the parameters."""
+"""Extrinsics of camera and IMU on the robot: from TF, else from a URDF, else from the parameters."""
 
 from collections.abc import Callable
 import importlib
@@ -18,34 +18,34 @@ from thermal_fiducial.ros.frame_tree import fixed_joints, FrameTree
 from thermal_fiducial.ros.node import StageNode
 
 _PARAMETERS, _URDF, _TF = 'the parameters', 'robot_description', '/tf_static'
-#: What TF has replaces what a URDF has, which replaces the parameters.
+#: Ascending precedence of the sources.
 _RANKS = (_PARAMETERS, _URDF, _TF)
-#: After so long [s] it is said that the parameters hold; what TF and URDFs have is latched, and comes within one.
+#: Wait for TF and URDF [s] before the parameters are reported as in use; both are latched and arrive within 1 s.
 _PATIENCE = 2.0
-#: Poses that differ by less are the same, through whatever text or quaternion they went [m, rad].
+#: Tolerance for equal poses, above the rounding of texts and quaternions [m, rad].
 _SAME = 1e-6
-#: Farther from its IMU no robot reaches [m]: as far as the parameter ``camera_position`` may be.
+#: Largest distance of the robot frame from the IMU [m]: the range of the parameter ``camera_position``.
 _FARTHEST = 10.0
 
 
 class RobotFrames:
-    """Follows ``/tf_static`` and ``robot_description``; create it after the node's main input.
+    """Subscribes to ``/tf_static`` and ``robot_description``; create it after the node's main input.
 
     Parameters
     ----------
-    node : whose config has ``extrinsics``, ``base_frame``, ``camera_frame`` and the camera's pose
-    adopt : called without arguments after that pose has changed in the node's config
+    node : its config has ``extrinsics``, ``base_frame``, ``camera_frame`` and the camera's pose
+    adopt : called after the camera's pose has changed in the node's config
     """
 
     def __init__(self, node: StageNode[Any], adopt: Callable[[], None]) -> None:
         self._node, self._adopt = node, adopt
         self._trees = {_URDF: FrameTree(), _TF: FrameTree()}
         self._imu_frame = ''
-        #: what the camera's pose is from
+        #: source of the camera's pose
         self.source = _PARAMETERS
-        #: whether nothing better than the parameters is waited for
+        #: whether the wait for TF and URDF is over
         self.decided = not node.live
-        #: (4, 4) robot in the frame of the IMU; None: they are the same
+        #: pose (4, 4) of the robot frame in the IMU frame; None: they are identical
         self.T_imu_base: FloatArray | None = None
         if node.config.extrinsics == 'parameters':
             self.decided = True
@@ -55,7 +55,7 @@ class RobotFrames:
         try:
             message = importlib.import_module('tf2_msgs.msg').TFMessage
         except ImportError:
-            pass  # then there is no TF on this machine
+            pass  # tf2_msgs is not installed: no TF
         else:
             node.subscribe(message, '/tf_static', self._on_static, qos.STATIC_TF)
         if node.live:
@@ -64,11 +64,11 @@ class RobotFrames:
 
     @property
     def parameters_hold(self) -> bool:
-        """Whether it is decided that the camera is where the parameters say."""
+        """Whether the wait is over and the parameters are the source."""
         return self.decided and self.source == _PARAMETERS
 
     def note_imu_frame(self, frame: str) -> None:
-        """Take the frame of an IMU message for that of the IMU, where TF or the URDF know it."""
+        """Use the frame of an IMU message as the IMU frame, if TF or the URDF know it."""
         if frame != self._imu_frame:
             self._imu_frame = frame
             self._look()
@@ -86,7 +86,7 @@ class RobotFrames:
         self._look()
 
     def _look(self) -> None:
-        """Take over what the better source has; one that changes its mind in flight is only reported."""
+        """Adopt the pose of the best source; a later change by the same source is only reported."""
         for source in (_TF, _URDF):
             config, tree = self._node.config, self._trees[source]
             T_imu_base = tree.between(self._imu_frame, config.base_frame)

@@ -1,4 +1,4 @@
-"""One run loop for all nodes."""
+"""The run loop of all nodes."""
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -19,18 +19,18 @@ from thermal_fiducial.ros.promptness import keep_for_good, take_priority
 from thermal_fiducial.ros.stopping import limit_the_end, StopSignals
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
-#: Fast DDS 2 (Jazzy) reads the first, Fast DDS 3 the second.
+#: Environment variables of Fast DDS 2 (Jazzy) and Fast DDS 3.
 _PROFILE_VARIABLES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
 
 
 def use_transport_profile() -> None:
-    """Have Fast DDS take images whole, through shared memory, unless the user has a profile; before ``rclpy.init``."""
+    """Let Fast DDS send images through shared memory, unless the user has a profile; call before ``rclpy.init``."""
     if not any(os.environ.get(name) for name in _PROFILE_VARIABLES):
         os.environ.update(dict.fromkeys(_PROFILE_VARIABLES, str(PROFILE)))
 
 
 def make_executor(context: Context | None = None) -> Any:
-    """The executor that costs 22 us a callback where this rclpy has it, else the one that costs 96.
+    """EventsExecutor (22 us a callback) if this rclpy has it, else SingleThreadedExecutor (96 us).
 
     Never the MultiThreadedExecutor: it loses two thirds of a 200 Hz stream.
     """
@@ -47,7 +47,7 @@ def initialise(
     domain_id: int | None = None,
     signals: SignalHandlerOptions | None = None,
 ) -> None:
-    """``rclpy.init`` whose refusal of arguments or of a parameter file is an :class:`InputError`.
+    """``rclpy.init`` that raises :class:`InputError` for bad arguments or parameter files.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def _is_secured() -> bool:
 
 
 def _first_line(error: RuntimeError) -> str:
-    """What rcl says, without the line of its source."""
+    """The message of rcl, without its source line."""
     return str(error).splitlines()[0].removeprefix('failed to initialize rcl: ').partition(', at /')[0]
 
 
@@ -83,7 +83,7 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     Parameters
     ----------
     make_node : constructor of the node
-    args : ROS arguments; default: those of the process
+    args : ROS arguments; default: the command line
 
     Returns
     -------
@@ -101,7 +101,7 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
 
 
 def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None, stop: StopSignals) -> None:
-    # What must be saved is saved first, before anything is taken down that may fail or hang.
+    # Saving comes first in the shutdown, before steps that may fail or hang.
     with ExitStack() as ending:
         ending.callback(try_shutdown)
         try:
@@ -120,14 +120,14 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
         except ExternalShutdownException:
             pass
         except Exception:
-            # Asked to stop while the node is being made, rcl refuses the rest of it: not an error of the node.
+            # A stop request during construction makes rcl fail: not an error of the node.
             if ok() and not stop.asked:
                 raise
             limit_the_end()
 
 
 def _made(make_node: Callable[[], StageNode[Any]]) -> StageNode[Any]:
-    """The node; an :class:`InputError` where security keeps it out, which no second try would change."""
+    """The node; InputError if SROS2 denies it, so that it is not restarted."""
     try:
         return make_node()
     except RuntimeError as error:
@@ -137,7 +137,7 @@ def _made(make_node: Callable[[], StageNode[Any]]) -> StageNode[Any]:
 
 
 def _refuse_others(args: Sequence[str] | None) -> None:
-    """What ROS does not read, as a mistyped ``--ros-args`` and all that follows it, would be left out silently."""
+    """Refuse arguments that ROS would ignore silently, such as all after a mistyped ``--ros-args``."""
     others = remove_ros_args(sys.argv)[1:] if args is None else remove_ros_args(list(args))
     if others:
         raise InputError(f'argument {others[0]}: a node has none but those behind --ros-args')
@@ -147,6 +147,6 @@ def _spin(node: StageNode[Any], executor: Any, stop: StopSignals) -> None:
     keep_for_good()
     if node.realtime_priority and not take_priority(node.realtime_priority):
         node.get_logger().info('no real-time priority: this user may not')
-    # EventsExecutor.spin() and spin_once(None) fire nothing on some builds.
+    # EventsExecutor.spin() and spin_once(None) run no callbacks on some builds.
     while ok() and not stop.asked:
         executor.spin_once(timeout_sec=1.0)

@@ -1,4 +1,4 @@
-"""Signals that end a node: the first one stops it, and none interrupts what it still has to save."""
+"""Signals that stop a node: the first one requests the stop, and none interrupts a save."""
 
 from collections.abc import Callable
 import os
@@ -6,19 +6,19 @@ import signal
 from threading import Thread
 from types import FrameType
 
-#: A terminal that is closed ends a node like the others do, with all that it has to save.
+#: Signals that stop a node; SIGHUP comes from a closed terminal.
 STOPS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-#: What a node that has saved what it must may take to leave the graph: processor time [s], of which it takes 0.1 to
-#: 0.2, and time [s], of which it took 8 on a machine with ten times as much to do as it can.
+#: Timeouts of leaving the graph after all is saved: processor time [s], of which it takes 0.1 to 0.2, and wall time
+#: [s], of which it took 8 under tenfold overload.
 LEAVING_CPU_S, LEAVING_S = 2.0, 20.0
 
 
 class StopSignals:
-    """Takes SIGINT, SIGTERM and SIGHUP for one request to stop, from now to the end of the process.
+    """Handles SIGINT, SIGTERM and SIGHUP as one stop request, from now to the end of the process.
 
-    Python's own answer, KeyboardInterrupt, comes out of whatever the main thread is doing: a second one (``ros2
-    launch`` forwards what the terminal has sent already) out of the middle of a save. So none is raised at all. And
-    since Python's handlers wait for the main thread, which waits for messages in C, a thread of its own wakes it.
+    Python's default, KeyboardInterrupt, is raised anywhere in the main thread: a second signal (``ros2 launch``
+    forwards what the terminal has sent already) would interrupt a save. So none is raised. Python's handlers run in
+    the main thread, which may be waiting for messages in C, so another thread wakes it.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class StopSignals:
         os.set_blocking(writing, False)
         signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
         for number in STOPS:
-            # Under nohup a closed terminal is to be ignored.
+            # nohup has set SIGHUP to be ignored.
             if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
                 signal.signal(number, self._on_signal)
         Thread(target=self._watch, daemon=True).start()
@@ -48,16 +48,16 @@ class StopSignals:
                 self._wake()
 
     def ignore(self) -> None:
-        """Let no further signal end the process: the interpreter, while it ends, would take it for the default one."""
+        """Ignore further signals: in its finalisation the interpreter would restore the default handlers."""
         for number in STOPS:
             signal.signal(number, signal.SIG_IGN)
 
 
 def limit_the_end() -> None:
-    """End the process by SIGPROF or SIGALRM when it does not end by itself; when nothing is left to be saved.
+    """Arm SIGPROF and SIGALRM to end a process that hangs at its end; call it once all is saved.
 
-    Fast DDS 2 waits for a callback of the discovery to end, in a loop that holds nearly all the time the lock which the
-    callback needs: minutes on a busy machine, with Python's interpreter locked. So no thread of Python could end it.
+    Fast DDS 2 waits for a discovery callback in a loop that almost always holds the lock which that callback needs:
+    minutes on a busy machine. It holds the GIL meanwhile, so that no Python thread could end it.
     """
     for number, timer, seconds in (
         (signal.SIGPROF, signal.ITIMER_PROF, LEAVING_CPU_S),

@@ -1,4 +1,4 @@
-"""The pose on /tf, where tf2_ros is installed and it is asked for."""
+"""The pose on /tf (parameter ``publish_tf``, needs tf2_ros)."""
 
 from collections.abc import Callable
 import importlib
@@ -13,16 +13,16 @@ from thermal_fiducial.ros.robot_frames import RobotFrames
 
 
 class TransformBroadcaster:
-    """Broadcasts the robot in the map, and once the camera on the robot; nothing where tf2_ros is missing.
+    """Broadcasts map to robot, and once robot to camera; nothing without tf2_ros.
 
-    With ``odom_frame`` as REP-105 has it: the smooth output from odom to the robot, and what it lacks from map to odom.
+    With ``odom_frame``, as in REP-105: odom to robot is the smooth output, map to odom the difference to the estimate.
 
     Parameters
     ----------
-    node : that broadcasts
-    config : names of the frames, pose of the camera
-    frames : where that pose is from: one that TF has is not broadcast again
-    fault : called in words with what is missing
+    node : for the publishers
+    config : frames, pose of the camera
+    frames : source of the camera's pose; one from TF is not broadcast again
+    fault : called with a message if tf2_ros or a parameter is missing
     """
 
     def __init__(
@@ -41,7 +41,7 @@ class TransformBroadcaster:
         self._static: Any = tf2_ros.StaticTransformBroadcaster(node)
 
     def send(self, odometry: Odometry, smooth: Odometry | None) -> None:
-        """Broadcast the robot's pose, and with ``odom_frame`` the smooth one of the same stamp."""
+        """Broadcast the robot's pose, with ``odom_frame`` split into map to odom and odom to robot."""
         if self._broadcaster is None:
             return
         if self._static is not None and self._frames.parameters_hold:
@@ -62,7 +62,7 @@ class TransformBroadcaster:
         )
 
     def _send_camera(self) -> None:
-        """Once: it is latched."""
+        """Broadcast robot to camera, once: /tf_static is latched."""
         config = self._config
         T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
         self._static.sendTransform(convert.transform_message(T_body_camera, 0, config.base_frame, config.camera_frame))

@@ -1,4 +1,4 @@
-"""Listens to the topics of the running nodes and to /diagnostics, and hands what they say to a :class:`LiveStatus`."""
+"""Subscribes to the topics of the running nodes and to /diagnostics, and feeds a :class:`LiveStatus`."""
 
 from collections.abc import Callable, Sequence
 import math
@@ -21,11 +21,11 @@ from thermal_fiducial.ros.run import initialise, make_executor
 
 
 class Watcher:
-    """A node that only listens.
+    """Subscriptions that feed a :class:`LiveStatus`.
 
     Parameters
     ----------
-    node : its topics are relative, so that remaps and namespaces hold
+    node : its topics are relative, so that remaps and namespaces apply
     """
 
     def __init__(self, node: Node) -> None:
@@ -54,7 +54,7 @@ class Watcher:
         try:
             ids = clouds.markers(message)['id'].tolist()
         except InputError:
-            return  # the mapper refuses it, and its diagnostics say why
+            return  # the mapper refuses it too and reports the reason in its diagnostics
         self.status.markers(time.monotonic(), ids)
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -70,7 +70,7 @@ def watch(
     ros_arguments: Sequence[str] = (),
     domain_id: int | None = None,
 ) -> None:
-    """Listen, and call ``show`` every ``period`` [s] until it says that it has had enough.
+    """Call ``show`` with the live status every ``period`` [s] until it returns True.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""One long calculation at a time, in a process of its own, so that it never delays a callback."""
+"""Runs one long computation at a time in a separate process, so that it never delays a callback."""
 
 from collections.abc import Callable
 import multiprocessing
@@ -16,7 +16,7 @@ _ENDED = 'the background process ended'
 
 
 class Foreground(Generic[Task, Result]):
-    """The same interface, at once and here: for a replay in lock-step."""
+    """The interface of :class:`Background`, run synchronously, for a lock-step replay."""
 
     def __init__(self, function: Callable[[Task], Result]) -> None:
         self._function = function
@@ -25,7 +25,7 @@ class Foreground(Generic[Task, Result]):
         self.busy = False
 
     def start(self, task: Task) -> None:
-        """Work on ``task``."""
+        """Process ``task``."""
         self._result = self._function(task)
 
     def take(self) -> Result | None:
@@ -34,39 +34,39 @@ class Foreground(Generic[Task, Result]):
         return result
 
     def close(self) -> None:
-        """Nothing is left running."""
+        """Nothing to stop."""
 
 
 class Background(Generic[Task, Result]):
-    """Runs ``function`` on one task after the other in a spawned process of low priority.
+    """Runs ``function`` on one task at a time in a spawned process of low priority.
 
     Parameters
     ----------
-    function : of a module, as it is found by name over there; tasks and results are pickled
+    function : of a module, as the process imports it by name; tasks and results are pickled
     """
 
     def __init__(self, function: Callable[[Task], Result]) -> None:
-        # Not forked: threads of DDS hold locks that a forked child would wait for.
+        # Spawned, since a forked child would wait for locks held by DDS threads.
         context = multiprocessing.get_context('spawn')
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_serve, args=(function, theirs), daemon=True)
         self._process.start()
         theirs.close()
-        #: whether it cannot take a task: it starts, or works
+        #: whether the process is starting or working
         self._waiting = True
 
     @property
     def busy(self) -> bool:
-        """Whether it cannot take a task: it is starting, working, or has ended."""
+        """Whether no task can be started: the process is starting, working, or has ended."""
         return self._waiting or not self._process.is_alive()
 
     def start(self, task: Task) -> None:
-        """Have it work on ``task``; only when not busy.
+        """Send ``task`` to the process; only when not busy.
 
         Raises
         ------
         InputError
-            Its process ended.
+            The process has ended.
         """
         try:
             self._connection.send(task)
@@ -80,7 +80,7 @@ class Background(Generic[Task, Result]):
         Raises
         ------
         InputError
-            The calculation failed, or its process ended.
+            The computation failed, or the process has ended.
         """
         if not self._waiting or not self._connection.poll():
             return None
@@ -96,13 +96,13 @@ class Background(Generic[Task, Result]):
         return outcome  # type: ignore[no-any-return]
 
     def close(self) -> None:
-        """End it, also in the middle of its work."""
+        """Terminate the process, even during a task."""
         self._process.kill()
         self._process.join()
 
 
 def _serve(function: Callable[[Task], Result], connection: Connection) -> None:
-    """Answer tasks until the other end is gone; the first answer, None, says that all is imported."""
+    """Process tasks until the connection closes; the first answer, None, signals that all imports are done."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(10)
     connection.send(None)
@@ -113,6 +113,6 @@ def _serve(function: Callable[[Task], Result], connection: Connection) -> None:
             return
         try:
             outcome: Result | Exception = function(task)
-        except Exception as error:  # whatever it is, the node must hear of it
+        except Exception as error:  # sent to the node, whatever it is
             outcome = error
         connection.send(outcome)
