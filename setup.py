@@ -66,7 +66,7 @@ setup(
         # Pinned: a new version of a linter must not turn an untouched commit red.
         'lint': ['ruff==0.17.6', 'mypy==2.4.1', 'import-linter==2.16', 'types-PyYAML==6.0.12.20261113'],
         'docs': ['mkdocs-material==9.8.1', 'mkdocstrings[python]==1.0.8'],
-        'colcon': ['colcon-core', 'colcon-ros', 'colcon-python-setup-py', 'colcon-bash'],
+        'colcon': ['colcon-core', 'colcon-ros', 'colcon-python-setup-py', 'colcon-package-selection', 'colcon-bash'],
     },
     python_requires='>=3.11',
     zip_safe=False,
