@@ -34,8 +34,8 @@ def test_a_dead_axis_is_found_within_50_ms(imu, axis, value):
     found = verdicts(imu, dead, 100)
     # ten samples last 45 ms
     assert found == [Verdict.USE] * 9 + [Verdict.FROZEN] * 91
-    # The end of a gap is believed with its second sample.
-    assert verdicts(imu, noise(20), 200) == [Verdict.AHEAD] + [Verdict.USE] * 19
+    # The end of a gap is believed with its third sample.
+    assert verdicts(imu, noise(20), 200) == [Verdict.AHEAD] * 2 + [Verdict.USE] * 18
 
 
 def test_coarse_steps_repeat_themselves(imu):
@@ -58,7 +58,15 @@ def test_an_accelerometer_stays_at_full_scale_for_a_tenth_of_a_second_at_most(im
     cut[:, 4] = -100.0
     # twenty steps
     assert verdicts(imu, cut, 200) == [Verdict.USE] * 20 + [Verdict.FROZEN] * 40
-    assert verdicts(imu, noise(20), 260) == [Verdict.AHEAD] + [Verdict.USE] * 19
+    assert verdicts(imu, noise(20), 260) == [Verdict.AHEAD] * 2 + [Verdict.USE] * 18
+
+
+def test_two_bad_stamps_in_a_row_end_no_gap(imu):
+    """A pose at such a stamp is one of a time that has not come yet."""
+    good, ahead = noise(100), noise(2)
+    assert set(verdicts(imu, good)) == {Verdict.USE}
+    assert verdicts(imu, ahead, 150) == [Verdict.AHEAD] * 2
+    assert set(verdicts(imu, noise(20), 102)) == {Verdict.USE}
 
 
 def test_an_axis_that_has_never_changed_is_at_rest(imu):

@@ -7,7 +7,7 @@ from thermal_fiducial.core.measurements import ImuSample
 from thermal_fiducial.core.types import SECOND_NS
 
 #: Samples in a row that must follow each other after a jump: for a stepped clock, and for the end of a gap.
-CLOCK_EVIDENCE, GAP_EVIDENCE = 10, 2
+CLOCK_EVIDENCE, GAP_EVIDENCE = 10, 3
 #: A step between stamps is unusual beyond this multiple of the longest recent one and beyond this length [ns]; time
 #: constant [ns] with which the longest one decays.
 UNUSUAL_FACTOR, UNUSUAL_NS, MEMORY_NS = 3.0, 30_000_000, 2_000_000_000
