@@ -54,9 +54,10 @@ def test_what_is_not_finite_is_refused(name):
         message_bytes.odometry([serialize_message(odometry(state(**{name: broken})))])
 
 
-@pytest.mark.parametrize(('name', 'speed'), [('velocity_body', 19.0), ('angular_velocity_body', 29.0)])
-def test_what_is_faster_than_any_camera_that_sees_markers_is_refused(name, speed):
-    possible, impossible = (state(**{name: np.array([0.0, -factor * speed, 0.0])}) for factor in (1.0, 1.1))
+@pytest.mark.parametrize('name', ['velocity_body', 'angular_velocity_body'])
+def test_what_is_faster_than_any_camera_that_sees_markers_is_refused(name):
+    # Far beyond a brisk flight, and beyond the full scale of a gyroscope.
+    possible, impossible = (state(**{name: np.array([0.0, -speed, 0.0])}) for speed in (49.0, 51.0))
     assert len(message_bytes.odometry([serialize_message(odometry(possible))])) == 1
     with pytest.raises(InputError, match='beyond all bounds'):
         message_bytes.odometry([serialize_message(odometry(impossible))])

@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from support.scenes import motion_prior
 
 from thermal_fiducial.core.measurements import Odometry
@@ -30,6 +31,18 @@ def test_nearest_and_between_whatever_the_order_of_arrival():
     assert [log.nearest(t).stamp_ns // PERIOD_NS for t in (-(10**9), 12_000_000, 13_000_000, 10**12)] == [0, 2, 3, 19]
     assert stamps(log.between(4 * PERIOD_NS, 8 * PERIOD_NS, 10)) == [k * PERIOD_NS for k in range(4, 9)]
     assert log.between(10**12, 10**13, 10) == []
+
+
+@pytest.mark.parametrize('name', ['velocity_body', 'angular_velocity_body'])
+@pytest.mark.parametrize('speed', [51.0, np.nan])
+def test_what_no_camera_that_sees_markers_can_do_is_left_out(name, speed):
+    """As where messages are read: a detector that believed a filter that diverges would never see a marker again."""
+    first, second = states(2)
+    fast = replace(first, **{name: np.array([0.0, 0.0, -49.0])})
+    impossible = replace(second, **{name: np.array([0.0, 0.0, -speed])})
+    log = motion_prior(fast, impossible)
+    assert stamps(log.between(0, 10**9, 10)) == [0]
+    assert log.nearest(PERIOD_NS) is None
 
 
 def test_many_are_thinned_out_evenly():

@@ -7,15 +7,25 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import SECOND_NS
 
+#: Fastest component of a twist [m/s, rad/s]: no camera that sees markers moves like this, a filter that diverges does.
+FASTEST = 50.0
 # Largest delay of frames, for which states are kept [ns].
 _KEPT_NS = 500_000_000
 # Largest number of states: two seconds of odometry at 1 kHz.
 _MOST = 2000
 # Stamps that go back by more are those of another clock, or of a bag that was restarted [ns].
 _RESTART_NS = 1_000_000_000
+
+
+def possible(states: Sequence[Odometry]) -> list[Odometry]:
+    """The states with a twist below ``FASTEST``."""
+    twists = (np.concatenate([state.velocity_body, state.angular_velocity_body]) for state in states)
+    return [state for state, twist in zip(states, twists, strict=True) if np.abs(twist).max() < FASTEST]
 
 
 class MotionPrior:
@@ -27,7 +37,9 @@ class MotionPrior:
     read : decodes several of what :meth:`add` was given to states; leaves unusable ones out
     """
 
-    def __init__(self, camera_time_offset: float = 0.0, read: Callable[[Sequence[Any]], list[Odometry]] = list) -> None:
+    def __init__(
+        self, camera_time_offset: float = 0.0, read: Callable[[Sequence[Any]], list[Odometry]] = possible
+    ) -> None:
         self._stamps_ns: list[int] = []
         self._states: list[Any] = []
         self._read = read

@@ -15,6 +15,7 @@ from rclpy.serialization import deserialize_message
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
 from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
+from thermal_fiducial.core.motion_prior import FASTEST
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files import records
@@ -32,8 +33,6 @@ _POSE, _ODOMETRY = 7 + 36, 7 + 36 + 6 + 36
 _IMU = 4 + 9 + 3 + 9 + 3 + 9
 # Longest message accepted [bytes], since hundreds are kept: the numbers take 712, the rest are names of frames.
 _LONGEST = 8192
-# Largest velocity and angular velocity accepted: no camera that sees markers moves faster [m/s, rad/s].
-_FASTEST = np.array([20.0, 20.0, 20.0, 30.0, 30.0, 30.0])
 
 
 def read(message: bytes, kind: type, what: str) -> Any:
@@ -76,7 +75,7 @@ def odometry(messages: Sequence[bytes]) -> list[Odometry]:
     stamps = [stamp_ns(message) for message in messages]
     numbers = np.stack([_numbers(message, 2, _ODOMETRY, 'odometry') for message in messages]).astype(np.float64)
     twists = numbers[:, 43:49]
-    if not (np.abs(twists) < _FASTEST).all():
+    if not (np.abs(twists) < FASTEST).all():
         raise InputError('odometry with a twist that is not finite or beyond all bounds')
     covariances = np.stack([numbers[:, 7:43], numbers[:, 49:]], axis=1).reshape(-1, 2, 6, 6)
     covariances = checked_covariance(covariances, 'odometry with a covariance')
