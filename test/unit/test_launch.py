@@ -3,6 +3,7 @@
 from pathlib import Path
 import re
 import runpy
+import signal
 import sys
 from types import ModuleType, SimpleNamespace
 
@@ -238,7 +239,7 @@ def test_a_crash_is_followed_by_another_start_and_refused_parameters_are_not(lau
     _, nodes = launched('localization.launch.py')
     context = Context()
     ekf = nodes[3]
-    for status in (1, -11, 134):
+    for status in (1, -11, -signal.SIGALRM, 134):
         log, timer = ekf.on_exit(SimpleNamespace(returncode=status), context)
         assert f'status {status}' in log.msg
         (again,) = timer.actions
@@ -246,7 +247,8 @@ def test_a_crash_is_followed_by_another_start_and_refused_parameters_are_not(lau
         assert len(again.on_exit(SimpleNamespace(returncode=status), context)) == 2
     (log,) = ekf.on_exit(SimpleNamespace(returncode=2), context)
     assert 'not started again' in log.msg
-    assert ekf.on_exit(SimpleNamespace(returncode=0), context) == []
+    for status in (0, -signal.SIGPROF):
+        assert ekf.on_exit(SimpleNamespace(returncode=status), context) == []
     context.is_shutdown = True
     assert ekf.on_exit(SimpleNamespace(returncode=-9), context) == []
 

@@ -256,6 +256,12 @@ PUBLISHES = """
             time.sleep(0.01)
         self.output.send(DiagnosticArray())"""
 LONG = 'LEAVING_S = 60.0'
+SHORT = 'LEAVING_CPU_S = stopping.CRASHED_S = 0.1'
+CRASHES = """
+def crash(*_):
+    raise RuntimeError('as no guard catches')
+run._spin = crash
+sys.exit(run.run(Stage))"""
 HOLDS_THE_INTERPRETER = "re.match('(a+)+$', 64 * 'a' + 'b')"
 
 
@@ -273,3 +279,10 @@ def test_a_node_ends_without_a_word(at_work, while_destroyed, while_python_ends,
     program = ENDED % (at_work, while_destroyed, while_python_ends, limit)
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout, done.stderr) == (status, 'saved\n', '')
+
+
+def test_a_node_that_crashes_and_does_not_end_is_no_stopped_one():
+    """It is to be started again: SIGPROF would say that it was asked to stop."""
+    program = ENDED.replace('sys.exit(run.run(Stage))', CRASHES) % ('pass', HOLDS_THE_INTERPRETER, 'pass', SHORT)
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (-signal.SIGALRM, 'saved\n')

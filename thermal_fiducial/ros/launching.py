@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping
 import difflib
 import os
 from pathlib import Path
+import signal
 from typing import Any
 
 from ament_index_python.packages import get_package_prefix, get_package_share_directory, PackageNotFoundError
@@ -20,8 +21,9 @@ PACKAGE = 'thermal_fiducial'
 #: Delay before a crashed node is restarted [s].
 _RESPAWN_DELAY = 1.0
 _LEVELS = ('debug', 'info', 'warn', 'error', 'fatal')
-#: Exit status of a node that was stopped, or that refuses its parameters: neither is restarted.
-_STOPPED, _REFUSED = 0, 2
+#: Exit status of a node that was asked to stop, whether DDS let go of it or not (``stopping.limit_the_end``), or that
+#: refuses its parameters: neither is restarted.
+_STOPPED, _REFUSED = (0, -signal.SIGPROF), 2
 
 _ARGUMENTS = {
     'params_file': ('', 'parameter file of the rig; default: the one of the package'),
@@ -111,7 +113,7 @@ def _actions(
 def _node(name: str, settings: dict[str, Any]) -> Node:
     def after(event: Any, context: LaunchContext) -> list[Any]:
         """Restart after a crash, but not after refused parameters, which would be refused again."""
-        if context.is_shutdown or event.returncode == _STOPPED:
+        if context.is_shutdown or event.returncode in _STOPPED:
             return []
         if event.returncode == _REFUSED:
             return [LogInfo(msg=f'{name}: unusable parameters or arguments (see above); it is not started again')]

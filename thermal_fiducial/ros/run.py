@@ -111,7 +111,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             ending.callback(node.destroy_node)
             executor = make_executor()
             ending.callback(executor.shutdown)
-            ending.callback(limit_the_end)
+            ending.push(limit_the_end)
             ending.callback(node.close)
             executor.add_node(node)
             _spin(node, executor, stop)
