@@ -21,12 +21,12 @@ from thermal_fiducial.ros.detections import OtherDetections
 from thermal_fiducial.ros.node import OK, WARN
 from thermal_fiducial.ros.run import run
 
-#: The oldest that the tests have run with: Ubuntu 24.04's own.
+#: Oldest version that the tests have run with, that of Ubuntu 24.04.
 _OPENCV = (4, 6)
 
 
 class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
-    """Finds markers; with the map and the filter's odometry it looks where they must be."""
+    """Detects markers; given the map and the filter's odometry it searches where they are predicted."""
 
     stage = 1
 
@@ -48,7 +48,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         return MarkerDetector(self.config, load_dictionary(self.config.dictionary))
 
     def configure(self, config: ArucoDetectorConfig) -> None:
-        """Take over live parameters."""
+        """Apply dynamic parameters."""
         super().configure(config)
         if self.detector is not None:
             self.detector.configure(config)
@@ -76,14 +76,14 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
             self.detector.set_map(clouds.map_poses(message))
 
     def state(self) -> tuple[bytes, str]:
-        """Number of markers in the last frame, and of images that there was no time for since the last word."""
+        """Number of markers in the last frame, and of images skipped since the last diagnostics."""
         if left := self._images.left_since():
             return WARN, f'{self._seen} markers; {left} older images left'
         return OK, '1 marker' if self._seen == 1 else f'{self._seen} markers'
 
 
 def _require_opencv() -> None:
-    """An older one is said in words, not by what it lacks in flight."""
+    """Report an OpenCV that is too old at the start, before a missing function fails in flight."""
     if tuple(int(part) for part in cv2.__version__.split('.')[:2]) < _OPENCV:
         needed = '.'.join(map(str, _OPENCV))
         raise InputError(f'OpenCV {cv2.__version__}: {needed} or newer is needed')

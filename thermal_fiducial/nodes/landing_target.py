@@ -1,4 +1,4 @@
-"""Node ``landing_target``: where the landing pad is, for an autopilot behind mavros."""
+"""Node ``landing_target``: pose of the landing pad, for an autopilot behind mavros."""
 
 from collections import OrderedDict
 import sys
@@ -18,7 +18,7 @@ from thermal_fiducial.ros.node import OK, StageNode, WARN
 from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.run import run
 
-_WAITING = 10  # frames that may wait for their pose
+_WAITING = 10  # most frames waiting for their camera pose
 
 
 class LandingTarget(StageNode[LandingTargetConfig]):
@@ -29,7 +29,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         if not self.config.landing_pad:
             self.fault('parameter landing_pad: name the markers of the pad')
         self._T_map_pad: FloatArray | None = None
-        #: stamps of frames that show the pad, whose pose is still to come
+        #: stamps of frames that show the pad and wait for their camera pose
         self._frames: OrderedDict[int, None] = OrderedDict()
         self._in_view = False
         self._target = self.advertise(PoseStamped, 'landing_target')
@@ -62,7 +62,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
 
     @property
     def _needs_no_map(self) -> bool:
-        """Whether the pad is one marker, wanted in the body: its own detection says where it is."""
+        """Whether a single marker's detection gives the pad's pose: one marker, output in the body frame."""
         return len(self.config.landing_pad) == 1 and self.config.landing_target_frame == 'body'
 
     def _on_camera_pose(self, message: bytes) -> None:

@@ -1,4 +1,4 @@
-"""Node ``marker_mapper``: markers to the camera's pose in the map, and the map itself."""
+"""Node ``marker_mapper``: detections to the camera's pose in the map, and the map itself."""
 
 import sys
 from typing import Any
@@ -17,7 +17,7 @@ from thermal_fiducial.ros.run import run
 
 
 class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
-    """Algorithm 1 of the paper behind topics and services; saves the map on request and on shutdown."""
+    """Topics and services of the mapper (the paper's Algorithm 1); saves the map on request and on shutdown."""
 
     stage = 2
 
@@ -34,7 +34,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._topics.draw(self.mapper.map, self._result.in_view, 0)
 
     def configure(self, config: MarkerMapperConfig) -> None:
-        """Take over live parameters."""
+        """Apply dynamic parameters."""
         super().configure(config)
         self.mapper.configure(config)
         self._poses.configure()
@@ -43,7 +43,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         stamp, markers = clouds.stamped_markers(message)
         frame = self.mapper.locate(stamp, markers, self.camera(), self.odometry)
         self._poses.send(stamp, frame.pose)
-        # The pose is on its way by now.
+        # After publishing the pose, which must not wait for the map.
         before, self._result = self._result, self.mapper.learn(frame)
         for marker_id, line in map_status.news(before, self._result).items():
             self.console.event(f'marker {marker_id}', line)
@@ -53,7 +53,7 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
             self._publish_map()
 
     def _publish_jump(self, T_new_old: FloatArray | None) -> None:
-        """Publish a map that was taken over, and how poses move with it, with the stamp of the newest frame before."""
+        """Publish a replaced map, and the correction of poses with the stamp of the newest frame before it."""
         if T_new_old is not None:
             self._poses.late.moved(T_new_old)
             self._topics.publish_correction(T_new_old, self._poses.late.newest_ns)
@@ -63,21 +63,21 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._topics.publish(self.mapper.map, self._result.in_view, self._result.stamp_ns)
 
     def diagnose(self, stamp_ns: int) -> None:
-        """Publish the diagnostics, and draw the map: once a second, as a thousand markers take a while."""
+        """Publish the diagnostics and the display of the map: only once a second, as a thousand markers take long."""
         super().diagnose(stamp_ns)
         self._topics.draw_for_listeners(self.mapper.map, self._result.in_view, self._result.stamp_ns)
 
     def close(self) -> None:
-        """End the refinement; save what was mapped."""
+        """Terminate a running refinement; save the map if it has changed."""
         self._map.close()
 
     def state(self) -> tuple[bytes, str]:
-        """Why the last frame gave no pose, whether the map is meant, which markers are not trusted, frames left."""
+        """Why the last frame gave no pose, another dictionary, quarantined markers, skipped frames."""
         left = self._frames.left_since()
         return map_status.state(self._result, self._map.other_dictionary, frozen=self.mapper.frozen, left=left)
 
     def figures(self) -> dict[str, object]:
-        """The map in numbers, and what waits to enter it."""
+        """Key-value pairs: size of the map, candidates."""
         own = map_status.figures(self.mapper.map, self.mapper.resets, self._result)
         return super().figures() | own | self._poses.figures()
 

@@ -18,14 +18,14 @@ from thermal_fiducial.ros.node import ERROR, StageNode, WARN
 from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.run import run
 
-#: Waiting time [s] above which IMU messages are processed together, with one pose at the newest.
+#: Queueing delay [s] above which IMU messages are processed as a batch, with one pose for the newest.
 _QUEUE_S = 0.03
-#: Lateness of poses [s]: above the first a warning, above the second an error (autopilots: VISO_DELAY_MS).
+#: Delay of the output [s] above which a warning and an error is reported (autopilots: VISO_DELAY_MS).
 _LATE_S, _TOO_LATE_S = 0.1, 0.25
 
 
 class PoseEkfNode(StageNode[PoseEkfConfig]):
-    """The filter behind topics."""
+    """Topics and services of the filter."""
 
     stage = 3
 
@@ -36,11 +36,11 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._status = FilterStatus(self.filter, self.console)
         self._corrections = MapCorrections(self.config.max_delay)
         self._imu = self.subscribe(Imu, 'imu/data', self._on_imu, qos.IMU_INPUT, raw=True)
-        #: waiting time of the latest IMU message, and the longest since the last diagnostics [s]
+        #: queueing delay of the latest IMU message, and the longest since the last diagnostics [s]
         self._waited = self._longest = 0.0
-        #: the longest in the period before [s]
+        #: the longest in the previous diagnostics period [s]
         self._behind = 0.0
-        #: IMU messages without a pose of their own
+        #: number of IMU messages without an output of their own
         self._without_pose = 0
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT, raw=True)
         self.subscribe_lazily(PoseWithCovarianceStamped, 'camera_pose/map_error', self._on_map_error, qos.RESULT)
@@ -50,7 +50,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self.serve(Trigger, '~/reset', self._on_reset)
 
     def configure(self, config: PoseEkfConfig) -> None:
-        """Take over the live parameters of ``config``."""
+        """Apply the dynamic parameters of ``config``."""
         super().configure(config)
         self.filter.configure(config)
 
@@ -71,7 +71,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
             self._outputs.send(odometry, self.filter.smooth, lost=lost, jumps=jumps)
 
     def _newest(self, message: bytes) -> bytes:
-        """The newest waiting IMU message; older ones are buffered without a pose, which would make later ones late."""
+        """The newest queued IMU message; older ones are buffered without output, to catch up."""
         for later in self._imu.waiting(qos.IMU_INPUT.depth):
             self.guard(self._keep, message)
             message = later
@@ -115,7 +115,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._memory.save(self.filter, self._outputs.stamp_ns)
 
     def _look_behind(self) -> None:
-        """Process the next IMU message, and note how long it has waited: by so much the pose is late."""
+        """Process the next IMU message; its time in the queue is the delay of the output."""
         oldest = self._imu.take()
         if oldest is not None:
             message, self._waited = oldest
@@ -123,7 +123,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
             self.guard(self._on_imu, message)
 
     def state(self) -> tuple[bytes, str]:
-        """Level and words: status of the filter, reason of the last refused pose, lateness."""
+        """Level and message: status of the filter, reason of the last refusal, delay."""
         level, words = self._status.state()
         if self._behind < _LATE_S:
             return level, words
@@ -136,7 +136,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         return words if self._behind < _LATE_S else f'{words}; no time: the pose comes late'
 
     def figures(self) -> dict[str, object]:
-        """Numbers of the filter for the diagnostics."""
+        """Key-value pairs of the filter for the diagnostics."""
         return self._status.figures() | {'IMU messages without a pose': self._without_pose}
 
 

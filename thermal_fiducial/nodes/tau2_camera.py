@@ -21,7 +21,7 @@ from thermal_fiducial.ros.run import run
 
 
 class Tau2Camera(StageNode[Tau2CameraConfig]):
-    """Cuts telemetry, fills in bad pixels, withholds shutter and frozen frames, publishes a calibration from file."""
+    """Removes telemetry, replaces bad pixels, drops shutter and frozen frames, publishes a calibration from a file."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('tau2_camera', Tau2CameraConfig, **kwargs)
@@ -42,14 +42,14 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
         self._reason = ''
         self._displayed = False
         if config.image_transport == 'compressed':
-            # As image_transport names it: under the name that the raw topic has after remapping.
+            # image_transport's convention: a suffix to the remapped raw topic.
             topic = self.resolve_topic_name('thermal/image_raw') + '/compressed'
             self.subscribe(CompressedImage, topic, self._on_compressed, qos.CAMERA_INPUT)
         else:
             self.subscribe(Image, 'thermal/image_raw', self._on_image, qos.CAMERA_INPUT, raw=True)
 
     def configure(self, config: Tau2CameraConfig) -> None:
-        """Take over live parameters."""
+        """Apply dynamic parameters."""
         super().configure(config)
         self.cleaner.config = self.view.config = config
 
@@ -76,18 +76,18 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
             self._image_mono8.send(convert.image(self.view(frame.counts), head))
 
     def state(self) -> tuple[bytes, str]:
-        """Why the last frame was withheld, and what is wrong with those that are not."""
+        """Why the last frame was dropped, and faults of the published frames."""
         if self._reason:
             return WARN, self._reason
         return OK, 'ok, but of 8 bits: raw counts show corners ten times as well' if self._displayed else 'ok'
 
     def headline(self) -> str:
-        """That the camera gives nothing new, though frames come: one shutter event is over within a second."""
+        """Message if the image has been frozen for longer than a shutter event, which is over within a second."""
         sent_before, self._sent_before = self._sent_before, self._image.count
         return f'camera stalled: {self._reason}' if self._reason and self._image.count == sent_before else ''
 
     def figures(self) -> dict[str, object]:
-        """Withheld frames by reason, those that came out of order, and bad pixels."""
+        """Dropped frames by reason, frames out of order, number of bad pixels."""
         withheld: dict[str, object] = {f'withheld: {reason}': count for reason, count in self._withheld.items()}
         return withheld | {'late': self._late, 'bad pixels': len(self.cleaner.bad_pixels)}
 

@@ -1,4 +1,4 @@
-"""Node ``thermal_source``: frames of a thermal camera, as it sends them, with stamps of capture."""
+"""Node ``thermal_source``: raw frames of a thermal camera with capture stamps."""
 
 import sys
 from typing import Any
@@ -17,7 +17,7 @@ from thermal_fiducial.ros.run import run
 
 
 class ThermalSource(StageNode[ThermalSourceConfig]):
-    """Publishes a camera's counts and calibration; a thread reads the camera, and publishes without delay."""
+    """Publishes a camera's counts and calibration from a reader thread, without delay by the executor."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('thermal_source', ThermalSourceConfig, **kwargs)
@@ -33,7 +33,7 @@ class ThermalSource(StageNode[ThermalSourceConfig]):
             self._capture = Capture(self._source, self.on_frame, self._on_change)
 
     def on_frame(self, frame: CapturedFrame) -> None:
-        """Publish a frame; the camera's thread calls it."""
+        """Publish a frame; called by the reader thread."""
         self.guard(self._publish, frame)
 
     def _publish(self, frame: CapturedFrame) -> None:
@@ -54,12 +54,12 @@ class ThermalSource(StageNode[ThermalSourceConfig]):
         return (ERROR, trouble) if trouble else (OK, 'ok')
 
     def figures(self) -> dict[str, object]:
-        """Frames that were damaged, by reason, and how often the camera was connected again."""
+        """Damaged frames by reason, number of reconnections."""
         events = {} if self._source is None else dict(self._source.events)
         return {'reconnections': self._capture.reconnections if self._capture else 0, **events}
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Release the camera."""
         if self._capture is not None:
             self._capture.close()
         super().close()

@@ -28,7 +28,7 @@ class MapServices:
     Parameters
     ----------
     node : a mapper's node
-    publish_jump : called with the mapper's result when a service has replaced the map
+    publish_jump : called with T_new_old (4, 4), None without common markers, when a service has replaced the map
     """
 
     def __init__(self, node: StageNode[MarkerMapperConfig], publish_jump: Callable[[FloatArray | None], None]) -> None:
