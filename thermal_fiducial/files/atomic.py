@@ -1,4 +1,4 @@
-"""Files that are replaced as a whole: a kill at any moment leaves the old content or the new one, and nothing else."""
+"""Atomic replacement of files: a kill at any moment leaves either the old or the new content."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,21 +11,21 @@ import time
 
 from thermal_fiducial.errors import InputError
 
-#: How long to wait for another program that writes in the same folder [s].
+#: Timeout for the lock of another program that writes in the same folder [s].
 PATIENCE_S = 5.0
 _POLL_S = 0.02
 _MODE = 0o644
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Replace the content of ``path``; whoever reads it, at any time, sees the old text or the new one.
+    """Replace the content of ``path`` atomically: a concurrent reader sees the old text or the new one.
 
-    A symbolic link stays one: the file that it points to is replaced.
+    A symbolic link is followed: its target is replaced.
 
     Raises
     ------
     OSError
-        As the file system says; the old file is then untouched.
+        From the file system; the old file is then unchanged.
     """
     path = _target(path)
     if path.exists() and not path.is_file():
@@ -46,7 +46,7 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make renames and removals in ``folder`` survive a power cut."""
+    """``fsync`` of ``folder``, so that renames and removals survive a power cut."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -55,7 +55,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def clean_up(path: Path) -> None:
-    """Remove what killed writers of ``path`` have left; only under :func:`locked`."""
+    """Remove temporary files of killed writers of ``path``; only under :func:`locked`."""
     path = _target(path)
     for litter in path.parent.glob(f'.{_literal(path.name)}.*.tmp'):
         litter.unlink(missing_ok=True)
@@ -63,14 +63,14 @@ def clean_up(path: Path) -> None:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Keep others that ask for it from writing in the folder of ``path``, for as long as the context lasts.
+    """Context with an exclusive advisory lock on the folder of ``path``.
 
-    The folder itself carries the lock: there is no lock file to be left behind or to be put there by somebody else.
+    The lock is on the folder itself, so no lock file can be left behind or planted.
 
     Raises
     ------
     InputError
-        No such folder, or another program does not give it free.
+        No such folder, or another program holds the lock for too long.
     """
     folder = path.parent
     try:
@@ -96,12 +96,12 @@ def _wait_for(descriptor: int, folder: Path) -> None:
                 raise InputError(f'{folder}: another program is writing there') from None
             time.sleep(_POLL_S)
         except OSError:
-            # A file system without locks: as good as one writer.
+            # A file system without locks: a single writer is assumed.
             return
 
 
 def _target(path: Path) -> Path:
-    """Where ``path`` is behind its symbolic links. Raises OSError where they go round in a circle."""
+    """``path`` with symbolic links resolved. Raises OSError for a cycle of links."""
     try:
         return path.resolve()
     except RuntimeError:
@@ -109,5 +109,5 @@ def _target(path: Path) -> Path:
 
 
 def _literal(name: str) -> str:
-    """``name`` as a pattern that matches only itself."""
+    """``name`` as a glob pattern that matches only itself."""
     return ''.join(f'[{character}]' if character in '*?[' else character for character in name)

@@ -1,4 +1,4 @@
-"""Lists of bad pixels: a text file with "column row" a line; ``#`` starts a comment."""
+"""Lists of bad pixels: a text file with one "column row" per line; ``#`` starts a comment."""
 
 from pathlib import Path
 import re
@@ -19,7 +19,7 @@ def load_bad_pixels(path: str | Path) -> IntArray:
     Raises
     ------
     InputError
-        Unreadable, or a line that is not two whole numbers from 0 up.
+        Unreadable, or a line that is not two non-negative integers.
     """
     try:
         lines = read_text(path).splitlines()
@@ -37,6 +37,6 @@ def _pixel(path: str | Path, number: int, line: str) -> tuple[int, int]:
 
 
 def save_bad_pixels(path: str | Path, pixels: IntArray) -> None:
-    """Write pixels (N, 2) so that :func:`load_bad_pixels` reads them. Raises InputError where it cannot be written."""
+    """Write pixels (N, 2) for :func:`load_bad_pixels`. Raises InputError if the file cannot be written."""
     lines = ['# column row', *(f'{column} {row}' for column, row in np.asarray(pixels).reshape(-1, 2))]
     write_text(path, '\n'.join(lines) + '\n')

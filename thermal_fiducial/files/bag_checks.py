@@ -1,4 +1,4 @@
-"""What is asked of a bag before its library reads it, and of what the library then says of it."""
+"""Validation of a bag: before the library opens it, and of the metadata that the library returns."""
 
 from pathlib import Path
 
@@ -9,16 +9,16 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import require_regular
 from thermal_fiducial.files.schema import load_yaml
 
-#: Of files that are a bag by themselves.
+#: Suffixes of bags that are a single file.
 SINGLE_FILES = ('.mcap', '.db3', '.bag')
-#: Of the files of bags; what else lies in their folder is not opened.
+#: Suffixes of a bag's files; other files in its folder are not opened.
 _SUFFIXES = (*SINGLE_FILES, '.zstd')
 _ROS1_BEGIN = b'#ROSBAG V2.0\n'
 _LARGEST_NUMBER = 2**63
 
 
 def check_file(path: Path) -> None:
-    """Raise InputError for what the library would wait for, or read whole, before it finds that it is no bag."""
+    """Raise InputError for files on which the library would block, or which it would read whole before refusing."""
     if path.suffix in _SUFFIXES:
         require_regular(path)
     if path.suffix == '.bag':
@@ -28,10 +28,10 @@ def check_file(path: Path) -> None:
 
 
 def check_metadata(path: Path) -> None:
-    """Raise InputError for what hurts the library's parser, or is no number where it counts on one."""
+    """Raise InputError for a ``metadata.yaml`` that breaks the library's parser or has a non-number for a number."""
     root = load_yaml(path).mapping()
     information = root['rosbag2_bagfile_information'].mapping() if 'rosbag2_bagfile_information' in root else {}
-    # What is missing, the library names.
+    # Missing entries are reported by the library.
     for name, part in (('duration', 'nanoseconds'), ('starting_time', 'nanoseconds_since_epoch')):
         numbers = information[name].mapping() if name in information else {}
         if part in numbers:
@@ -41,10 +41,10 @@ def check_metadata(path: Path) -> None:
 
 
 def check_announced(path: Path, reader: Rosbag1Reader | Rosbag2Reader) -> None:
-    """Raise InputError where what a bag says of itself is of another kind: metadata.yaml may hold anything."""
+    """Raise InputError for metadata of a wrong type: metadata.yaml may contain anything."""
     numbers = [reader.start_time, reader.duration, reader.message_count]
     numbers += [connection.msgcount for connection in reader.connections]
-    # As many nanoseconds as 64 bits have, and one: the library's end is behind the last message.
+    # The range of int64 nanoseconds plus one, since the library's end time lies one behind the last message.
     if not all(type(number) is int and 0 <= number <= _LARGEST_NUMBER for number in numbers):
         raise InputError(f'{path}: the bag cannot be read: its metadata has times or counts that are none')
     names = [name for connection in reader.connections for name in (connection.topic, connection.msgtype)]

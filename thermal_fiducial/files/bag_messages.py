@@ -1,4 +1,4 @@
-"""Messages that are written to bags without ROS, as objects of rosbags."""
+"""Messages for bags written without ROS, as rosbags objects."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -12,7 +12,7 @@ from thermal_fiducial.core.measurements import CameraPose, ImuSample, Markers
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.files.rosbags_types import BODY_FRAME, CAMERA_FRAME, header, make, MAP_FRAME
 
-#: sensor_msgs/msg/PointField's codes of the types that rows have.
+#: Datatype codes of sensor_msgs/msg/PointField for the dtypes of the rows.
 _POINT_CODES = {'<f4': 7, '<u4': 6, '|u1': 2}
 _NO_ORIENTATION = np.array([-1.0] + [0.0] * 8)
 
@@ -27,7 +27,7 @@ def _pose(T: FloatArray) -> Any:
 
 
 def imu(sample: ImuSample) -> Any:
-    """sensor_msgs/msg/Imu without orientation; its covariances say nothing."""
+    """sensor_msgs/msg/Imu without orientation; covariances are unknown."""
     return make(
         'sensor_msgs/msg/Imu',
         header=header(sample.stamp_ns, BODY_FRAME),

@@ -1,4 +1,4 @@
-"""Bags written: rosbag2, mcap and sqlite3. No ROS is needed for it."""
+"""Writer of rosbag2 bags, mcap and sqlite3, without ROS."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +19,7 @@ STORAGES = {'mcap': StoragePlugin.MCAP, 'sqlite3': StoragePlugin.SQLITE3}
 
 
 class BagWriter:
-    """A new rosbag2, opened by ``with``; the same messages give the same bytes. What is left early is removed.
+    """A new rosbag2, a context manager; the output is deterministic. An incomplete bag is removed on an exception.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class BagWriter:
         try:
             yield
         except BaseException:
-            # Half a flight looks like a whole one.
+            # An incomplete bag could be taken for a complete flight.
             shutil.rmtree(self._path, ignore_errors=True)
             raise
 
@@ -73,12 +73,12 @@ class BagWriter:
             raise InputError(f'{self._path}: {error}') from None
 
     def add_topic(self, topic: str, msgtype: str) -> None:
-        """Record that there is ``topic``, also if it never gets a message.
+        """Add ``topic``, even if it never gets a message.
 
         Raises
         ------
         InputError
-            A type that ROS 2 Jazzy does not bring.
+            A type that is not part of ROS 2 Jazzy.
         """
         if msgtype not in self._typestore.fielddefs:
             raise InputError(f'{topic}: message type {msgtype} is unknown')
@@ -91,14 +91,14 @@ class BagWriter:
 
         Parameters
         ----------
-        topic : as :meth:`add_topic` got it; a new one is added
+        topic : added if it is new
         stamp_ns : bag stamp
         message : one of rosbags' message objects, or its CDR bytes together with ``msgtype``
 
         Raises
         ------
         InputError
-            It cannot be written: the disk is full, say.
+            The bag cannot be written, for example because the disk is full.
         """
         kind = msgtype or message.__msgtype__
         if topic not in self._connections:

@@ -1,7 +1,7 @@
-"""Bags read: rosbag2 (mcap and sqlite3) and ROS 1 bags. No ROS is needed for it.
+"""Reader of bags, rosbag2 (mcap and sqlite3) and ROS 1, without ROS.
 
-Topics carry the names of the package's interface, relative and without the leading slash: a bag recorded with a
-leading slash or in a namespace needs nothing, other names need a remap, as in ROS.
+Topics have the names of the package's interface, relative and without the leading slash. Bags recorded with a
+leading slash or in a namespace are resolved automatically; other names need a remap, as in ROS.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -32,10 +32,10 @@ CAMERA_POSE_TOPIC = 'camera_pose'
 MAP_ERROR_TOPIC = 'camera_pose/map_error'
 TRUTH_TOPIC = 'ground_truth/odometry'
 
-#: Names that are looked for in any namespace of the bag.
+#: Names that are resolved in any namespace of the bag.
 INTERFACE_TOPICS = (IMAGE_TOPIC, COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, IMU_TOPIC, TRUTH_TOPIC)
-#: The same for what nodes publish; other programs' topics may end alike (``marker_map/markers``), so that these are
-#: left alone where several do.
+#: The same for outputs of the nodes. Other topics may have the same ending (``marker_map/markers``), so these names
+#: are not resolved if several match.
 _COMMON_NAMES = (MARKERS_TOPIC, CAMERA_POSE_TOPIC, MAP_ERROR_TOPIC)
 
 
@@ -45,10 +45,10 @@ class BagMessage:
 
     Parameters
     ----------
-    topic : name of the interface, see :func:`resolve_topics`
+    topic : interface name, see :func:`resolve_topics`
     msgtype : e.g. ``sensor_msgs/msg/Image``
-    stamp_ns : when the bag got it (not the header's stamp)
-    cdr : serialised, as rclpy's ``publish`` takes it
+    stamp_ns : time of recording (not the header's stamp)
+    cdr : serialised message, as accepted by rclpy's ``publish``
     """
 
     topic: str
@@ -64,24 +64,24 @@ class BagMessage:
         Raises
         ------
         InputError
-            Bytes that are no message of this type.
+            Bytes that are not a message of this type.
         """
         try:
             return self._typestore.deserialize_cdr(self.cdr, self.msgtype)
-        except Exception as error:  # the library lets through whatever reading garbage raises
+        except Exception as error:  # the library does not wrap errors of malformed data
             raise InputError(f'{self.topic} at {self.stamp_ns}: no {self.msgtype}: {one_line(error)}') from None
 
 
 def resolve_topics(recorded: Iterable[str], remap: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Recorded topic to the name it is known by here.
+    """Recorded topic to interface name.
 
-    A remapped topic gets its new name. Else, a topic ``/any/namespace/imu/data`` is ``imu/data`` unless the bag has
-    that name itself; everything else just loses its leading slash.
+    A remapped topic gets its new name. Otherwise ``/any/namespace/imu/data`` becomes ``imu/data`` unless the bag has
+    that name itself; every other topic only loses its leading slash.
 
     Raises
     ------
     InputError
-        A remap of a topic that isn't there, or two topics for one name.
+        A remap of a missing topic, or two topics for one name.
     """
     plain = {topic.strip('/'): topic for topic in recorded}
     renamed = {source.strip('/'): target.strip('/') for source, target in (remap or {}).items()}
@@ -105,7 +105,7 @@ def resolve_topics(recorded: Iterable[str], remap: Mapping[str, str] | None = No
 
 
 def parse_remaps(arguments: Iterable[str]) -> dict[str, str]:
-    """Remaps of the command line, ``from:=to`` each.
+    """Remaps of the command line, each ``from:=to``.
 
     Raises
     ------
@@ -122,12 +122,12 @@ def parse_remaps(arguments: Iterable[str]) -> dict[str, str]:
 
 
 class BagReader:
-    """A recorded bag, opened by ``with``.
+    """A recorded bag, a context manager.
 
     Parameters
     ----------
     path : a rosbag2 folder, a single ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``
-    remap : topic of the bag to name of the interface
+    remap : topic of the bag to interface name
 
     Raises
     ------
@@ -175,7 +175,7 @@ class BagReader:
 
     @property
     def topics(self) -> dict[str, str]:
-        """Name of the interface to message type."""
+        """Interface name to message type."""
         return {self._names[connection.topic]: connection.msgtype for connection in self._open.connections}
 
     @property
@@ -185,12 +185,12 @@ class BagReader:
 
     @property
     def duration_ns(self) -> int:
-        """From the first to the last message."""
-        return max(0, int(self._open.duration) - 1)  # the library's ends one after the last
+        """Time from the first to the last message."""
+        return max(0, int(self._open.duration) - 1)  # the library's end time lies 1 ns behind the last message
 
     @property
     def image_topic(self) -> str:
-        """Where the frames are: raw, else compressed; the raw topic too where there are none."""
+        """Topic of the frames: raw, else compressed; raw if there are none."""
         return COMPRESSED_TOPIC if COMPRESSED_TOPIC in self.topics and IMAGE_TOPIC not in self.topics else IMAGE_TOPIC
 
     def require(self, topics: Mapping[str, str]) -> None:
@@ -199,7 +199,7 @@ class BagReader:
         Raises
         ------
         InputError
-            One is missing (what there is, is named), has another type, or no message.
+            A topic is missing (the message lists those present), has another type, or no messages.
         """
         there = self.topics
         for topic, msgtype in topics.items():
@@ -218,12 +218,12 @@ class BagReader:
     def messages(
         self, topics: Iterable[str] | None = None, between_ns: tuple[int, int] | None = None
     ) -> Iterator[BagMessage]:
-        """Messages on ``topics`` (default: all) in recorded order, whose bag stamps are ``between_ns`` (default: any).
+        """Messages on ``topics`` (default: all) in recorded order, with bag stamps in ``between_ns`` (default: any).
 
         Raises
         ------
         InputError
-            The bag ends or becomes unreadable on the way.
+            The bag is truncated or becomes unreadable.
         """
         connections = self._connections(topics)
         if not connections:
@@ -250,7 +250,7 @@ class BagReader:
         return bytes(raw)
 
     def _learn(self, connection: Connection) -> None:
-        """Take the definition of a type that ROS does not bring from the bag, where it has one."""
+        """Register a type that is not part of ROS from its definition in the bag, if it has one."""
         text = connection.msgdef.data
         if connection.msgtype in self._typestore.fielddefs or not text:
             return
@@ -261,7 +261,7 @@ class BagReader:
 
     @contextmanager
     def _readable(self) -> Iterator[None]:
-        """Whatever the library lets through on a damaged file becomes one line."""
+        """Convert any exception of the library on a damaged file to InputError."""
         try:
             yield
         except InputError:

@@ -1,4 +1,4 @@
-"""Calibration files: the YAML of ROS camera_info, as camera_calibration and camera_info_manager write it."""
+"""Calibration files: the camera_info YAML of ROS's camera_calibration and camera_info_manager."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from thermal_fiducial.files.schema import load_yaml, Value
 from thermal_fiducial.files.writing import write_text
 
 _LARGEST_SIDE = 65_535
-#: Names that other tools use for our models.
+#: Other tools' names of the distortion models.
 MODEL_SYNONYMS = {'fisheye': 'equidistant', 'radtan': 'plumb_bob', 'radial-tangential': 'plumb_bob'}
 
 
@@ -23,7 +23,7 @@ def load_camera(path: str | Path) -> Camera:
     Raises
     ------
     InputError
-        Unreadable, not a calibration, or values that no camera has.
+        Unreadable, not a calibration, or impossible values.
     """
     try:
         root = load_yaml(path)
@@ -32,7 +32,7 @@ def load_camera(path: str | Path) -> Camera:
     try:
         return _camera(root.mapping())
     except InputError as error:
-        # What is wrong with a value says where it stands; what the values together are not does not.
+        # Errors of a single value name its place; errors of their combination do not.
         place = '' if str(error).startswith(str(path)) else f'{path}: '
         raise InputError(f'calibration {place}{error}') from None
 

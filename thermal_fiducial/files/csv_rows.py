@@ -1,4 +1,4 @@
-"""Tables of comma-separated values, line by line, with the number that an error names."""
+"""CSV files line by line, with line numbers for error messages."""
 
 from collections.abc import Iterator, Sequence
 import csv
@@ -7,7 +7,7 @@ from pathlib import Path
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import text_lines
 
-#: Bytes of a table: half a day of frames with eight markers each.
+#: Largest file [bytes]: half a day of frames with eight markers each.
 TABLE_LIMIT_BYTES = 1 << 30
 
 
@@ -17,21 +17,21 @@ def csv_rows(path: str | Path) -> Iterator[tuple[int, list[str]]]:
     Raises
     ------
     InputError
-        Unreadable, or not a text.
+        Unreadable, or not a text file.
     """
     for number, line in text_lines(path, TABLE_LIMIT_BYTES):
-        # Line by line: a quotation mark that is never closed ends with its line, instead of swallowing the file.
+        # Line by line: an unclosed quotation mark ends with its line instead of swallowing the file.
         cells = next(csv.reader([line.replace('\r', ' ')])) if '"' in line else line.split(',')
         yield number, [cell.strip() for cell in cells]
 
 
 def named_rows(path: str | Path, names: Sequence[str]) -> Iterator[tuple[int, list[str]]]:
-    """Number of each line after the first, which names the columns, and its cells in the columns ``names``.
+    """Number of each line after the header, and its cells in the columns ``names``.
 
     Raises
     ------
     InputError
-        As :func:`csv_rows`, no such columns, or a line that does not reach them.
+        As :func:`csv_rows`, a missing column, or a line that is too short.
     """
     rows = csv_rows(path)
     _, head = next(rows, (0, []))

@@ -1,7 +1,7 @@
-"""Compressed bags expand no further than recordings do: 600 KB of zstd may hold 20 GB of zeros.
+"""Limits the decompression of bags, as 600 KB of zstd may expand to 20 GB of zeros.
 
-rosbags expands chunks (mcap, ROS 1), messages and files (rosbag2) whole, whatever comes of them. It looks its
-decompressors up in tables and modules, where :func:`bound_decompression` puts some that stop.
+rosbags expands chunks (mcap, ROS 1), messages and files (rosbag2) without a limit. It looks its decompressors up in
+tables and modules, where :func:`bound_decompression` replaces them by limited ones.
 """
 
 import bz2
@@ -10,20 +10,20 @@ from contextlib import contextmanager
 import os
 from typing import Any, BinaryIO
 
-#: Times that what was recorded may be larger than its compressed form; thermal images reach 4.
+#: Largest accepted compression ratio; thermal images reach 4.
 _LARGEST_RATIO = 200
-#: Of what is small, more: a chunk of empty messages, say.
+#: Expanded size that is always accepted: small chunks, of empty messages say, may have a higher ratio.
 _ALWAYS_BYTES = 32 << 20
 
 
 def bound_decompression() -> None:
-    """From now on the readers of rosbags raise ValueError for what expands beyond all that anybody records."""
+    """Let the readers of rosbags raise ValueError for data that expand beyond the limits."""
     from lz4.frame import LZ4FrameDecompressor
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import reader as ros2
     from rosbags.rosbag2 import storage_mcap
 
-    # Another version of the library may have its decompressors elsewhere; it is read without a bound then.
+    # Another version of the library may have its decompressors elsewhere; then there is no limit.
     module = vars(ros2).get('zstd')
     if module is None or isinstance(module, _BoundedZstd):
         return
@@ -37,24 +37,24 @@ def bound_decompression() -> None:
 
 
 class _BoundedZstd:
-    """What rosbags uses of the module zstd."""
+    """The part of the module zstd that rosbags uses."""
 
     def __init__(self, zstd: Any) -> None:
         self._zstd = zstd
 
     def decompress(self, data: bytes) -> bytes:
-        """Of a message or chunk."""
+        """Expand a message or chunk."""
         return _expanded(self._zstd.ZstdDecompressor, data)
 
     @contextmanager
     def open(self, file: BinaryIO, mode: str) -> 'Iterator[_BoundedFile]':
-        """Of a file."""
+        """Expand a file."""
         with self._zstd.open(file, mode) as expanding:
             yield _BoundedFile(expanding, os.fstat(file.fileno()).st_size)
 
 
 class _BoundedFile:
-    """A file that is read once, from its beginning."""
+    """A file that is read once, sequentially."""
 
     def __init__(self, file: BinaryIO, compressed: int) -> None:
         self._file, self._compressed = file, compressed
@@ -78,7 +78,7 @@ def _too_much(compressed: int) -> ValueError:
 
 
 def _expanded(decompressor: Callable[[], Any], data: bytes) -> bytes:
-    """All frames of ``data``."""
+    """All zstd or lz4 frames of ``data``, expanded."""
     pieces, left, rest = [], _limit(len(data)), data
     while rest:
         frame = decompressor()

@@ -34,7 +34,7 @@ PACKAGED = Path(__file__).resolve().parent.parent / 'dictionaries'
 
 
 def load_dictionary(name_or_path: str | os.PathLike[str]) -> Dictionary:
-    """Dictionary by OpenCV's name (``DICT_4X4_50``), a packaged name, or the path of a dictionary file.
+    """Dictionary by OpenCV name (``DICT_4X4_50``), packaged name, or path of a dictionary file.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> Dictionary:
     if predefined is not None:
         theirs = cv2.aruco.getPredefinedDictionary(predefined)
         bits = _unpacked(theirs.bytesList, theirs.markerSize)
-        # OpenCV 4 knows of no bit that the AprilTag families could correct.
+        # OpenCV 4 has maxCorrectionBits 0 for the AprilTag families.
         return Dictionary(bits, max(theirs.maxCorrectionBits, correctable_bits(bits)))
     packaged = PACKAGED / f'{name}.yaml'
     path = packaged if '/' not in name and packaged.is_file() else Path(name)
@@ -69,9 +69,9 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> Dictionary:
 
 
 def other_patterns(markers: Iterable[int], of: str, read_as: str, folder: Path = Path()) -> str:
-    """In words, whether a map's ``markers`` of dictionary ``of`` may be others in ``read_as``; empty: they are not.
+    """Warning if IDs ``markers`` of a map with dictionary ``of`` have other patterns in ``read_as``; else empty.
 
-    A map comes from anybody: what it calls its dictionary is a name, or a file in its own ``folder``.
+    A map is untrusted input: its dictionary may only be a name, or a file in the map's ``folder``.
     """
     if Path(of).name == Path(read_as).name:
         return ''
@@ -86,7 +86,7 @@ def other_patterns(markers: Iterable[int], of: str, read_as: str, folder: Path =
 
 
 def not_in_dictionary(markers: Iterable[int], name: str, folder: Path) -> list[int]:
-    """Those of ``markers`` that the dictionary of a map in ``folder`` does not have; none where it can't be opened."""
+    """IDs ``markers`` that the dictionary of a map in ``folder`` lacks; none if it cannot be opened."""
     try:
         known = len(load_dictionary(_of_map(name, folder)).bits)
     except InputError:
@@ -95,7 +95,7 @@ def not_in_dictionary(markers: Iterable[int], name: str, folder: Path) -> list[i
 
 
 def _of_map(name: str, folder: Path) -> str:
-    """What a map in ``folder`` calls its dictionary: a name, or a file beside it; nothing else is opened.
+    """The dictionary of a map in ``folder``: a name, or a file beside the map; other paths are refused.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def _of_map(name: str, folder: Path) -> str:
 
 
 def save_dictionary(path: str | os.PathLike[str], name: str, dictionary: Dictionary) -> None:
-    """Write ``dictionary`` as a dictionary file. Raises InputError where it cannot be written."""
+    """Write ``dictionary`` as a dictionary file. Raises InputError if the file cannot be written."""
     document = {
         'format': FORMAT,
         'version': 1,
@@ -147,9 +147,9 @@ def _bits(rows: Value, size: int) -> Gray:
 
 
 def _unpacked(packed: Any, size: int) -> Gray:
-    """Bits (M, size, size) of OpenCV's packed ones (M, bytes, 4 turns)."""
+    """Bits (M, size, size) from OpenCV's packed bytes (M, bytes, 4 rotations)."""
     table = np.asarray(packed, dtype=np.uint8)
-    # It holds the four rotations one after the other, whatever the shape says; the first is upright.
+    # Whatever the shape says, the memory holds the four rotations one after the other; the first is upright.
     upright = table.reshape(len(table), -1)[:, : table.shape[1]]
     unpacked = np.unpackbits(upright, axis=1)
     # The last byte holds the remaining bits right-aligned.

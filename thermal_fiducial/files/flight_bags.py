@@ -1,4 +1,4 @@
-"""A recording as a bag for ``replay``, with the parameters of its rig beside it."""
+"""Converts a recording to a bag for ``replay``, with a parameter file of its rig."""
 
 from collections.abc import Callable, Iterator
 import heapq
@@ -42,14 +42,14 @@ def write_recording(
 
     Parameters
     ----------
-    sigma_px : standard deviation of corners whose file does not say it [px]
-    late : frames reach the recorder so long after their stamps [s]
+    sigma_px : standard deviation of corners whose file has none [px]
+    late : delay of the frames between stamp and recording [s]
     progress : called with the number of frames written since the last call
 
     Raises
     ------
     InputError
-        ``out`` exists or cannot be written, a picture is none, or corners without a marker size.
+        ``out`` exists or cannot be written, an unreadable picture, or corners without a marker size.
     """
     if recording.corners and recording.rig.marker_size <= 0.0:
         raise InputError('the recording does not say how large its markers are: give --marker-size')
@@ -66,12 +66,12 @@ def write_recording(
 
 
 def frame_count(recording: Recording) -> int:
-    """Number of frames, of whatever kind."""
+    """Number of frames: pictures, corners or camera poses."""
     return len(recording.pictures) + len(recording.corners) + len(recording.poses)
 
 
 def _imu(recording: Recording) -> Iterator[_Event]:
-    """Samples as they came, also those whose stamp goes back: they reach the recorder after the ones before."""
+    """IMU samples in recorded order; the recording time of a backward stamp is that of the sample before."""
     arrival_ns = 0
     for sample in recording.samples:
         arrival_ns = max(arrival_ns, sample.stamp_ns)
@@ -106,7 +106,7 @@ def _truth(recording: Recording) -> Iterator[_Event]:
 
 
 def _parameters(rig: Rig) -> dict[str, Any]:
-    """The rig under the names that the nodes use; no thermal camera, so no lag."""
+    """Parameters of the nodes for the rig; not a thermal camera, so without bolometer lag."""
     return {
         **({'dictionary': rig.dictionary} if rig.dictionary else {}),
         **({'marker_size': rig.marker_size} if rig.marker_size > 0.0 else {}),

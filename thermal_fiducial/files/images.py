@@ -15,16 +15,16 @@ from thermal_fiducial.core.types import Counts, Gray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import read_bytes
 
-#: Bytes a pixel of the encodings that a thermal camera may have.
+#: Accepted encodings to bytes per pixel.
 ENCODINGS = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
-# Of a picture file: 33 million pixels of 16 bits, uncompressed, in colour.
+# Largest picture file: 33 megapixels of 16 bits, uncompressed, in colour.
 _LARGEST_FILE_BYTES = 250_000_000
-#: How files begin whose compression loses nothing: PNG, and TIFF of either byte order.
+#: Magic bytes of lossless formats: PNG, and TIFF of either byte order.
 _LOSSLESS = (b'\x89PNG', b'II*\0', b'MM\0*')
 
 
 def image_to_array(message: Any) -> Counts | Gray:
-    """Pixels (H, W) in native byte order without row padding, a view where that is possible.
+    """Pixels (H, W) in native byte order without row padding, a view if possible.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def image_to_array(message: Any) -> Counts | Gray:
     Raises
     ------
     InputError
-        An encoding other than 8 or 16 bit mono, sizes that don't fit the data, or a compression that loses something.
+        An encoding other than 8 or 16 bit mono, sizes that contradict the data, or a lossy compression.
     """
     if hasattr(message, 'format'):
         return _decompressed(message)
@@ -74,7 +74,7 @@ def _decompressed(message: Any) -> Counts | Gray:
 
 
 def _is_cut_png(data: npt.NDArray[np.uint8]) -> bool:
-    """Whether a PNG promises more than there is, for which its decoder would take gigabytes and a second.
+    """Whether a PNG is truncated; for its claimed size the decoder would allocate gigabytes.
 
     Chunks follow each other from byte 8 on: length, name, content, check sum (PNG specification, 5.3).
     """
@@ -95,7 +95,7 @@ def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
     Raises
     ------
     InputError
-        No such file, or not a picture, or a larger one than any camera takes.
+        No such file, not a picture, or too large.
     """
     data = np.frombuffer(read_bytes(path, _LARGEST_FILE_BYTES), np.uint8)
     try:
@@ -111,7 +111,7 @@ def read_picture(path: str | Path, flags: int) -> npt.NDArray[Any]:
 
 @contextmanager
 def without_libraries_lines() -> Iterator[None]:
-    """Keep what libpng and others write about a broken picture, past OpenCV, off the console."""
+    """Suppress what libpng and other libraries print to stderr about a broken picture."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:

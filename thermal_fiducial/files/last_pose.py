@@ -1,4 +1,4 @@
-"""The file with the last pose of a running filter, for the one that is started after it crashed."""
+"""The file with the last pose of a running filter, for its restart after a crash."""
 
 import json
 import os
@@ -13,18 +13,18 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import read_text
 
 _FORMAT = {'format': 'thermal_fiducial/last_pose', 'version': 1}
-#: Of the parameter camera_time_offset [s].
+#: Range of the parameter camera_time_offset [s].
 _LARGEST_OFFSET = 1.0
 _LIMIT_BYTES = 10_000
 
 
 def save_last_pose(path: Path, last: LastPose) -> None:
-    """Replace the file; whoever reads it sees the old pose or the new one. It need not outlive a power cut.
+    """Replace the file: a reader sees the old pose or the new one. It need not survive a power cut.
 
     Raises
     ------
     InputError
-        It cannot be written.
+        The file cannot be written.
     """
     document = _FORMAT | {
         'stamp_ns': last.stamp_ns,
@@ -34,7 +34,7 @@ def save_last_pose(path: Path, last: LastPose) -> None:
     new = path.with_name(path.name + '.new')
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # What somebody else has put there, a link or a pipe, is neither followed nor waited for.
+        # A link or pipe planted at this path is neither followed nor waited for.
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         with os.fdopen(os.open(new, flags, 0o600), 'w', encoding='utf-8') as file:
             json.dump(document, file)
@@ -44,9 +44,9 @@ def save_last_pose(path: Path, last: LastPose) -> None:
 
 
 def recent_pose(path: Path) -> LastPose | None:
-    """The pose of a filter that ended without order within the last seconds; None where there is none.
+    """The pose of a filter that crashed within the last seconds; None if there is none.
 
-    A file that is not of this form is as good as none: it is a hint.
+    A malformed file counts as none, since the pose is only a hint.
     """
     try:
         if not 0.0 <= time.time() - path.stat().st_mtime <= HINT_SECONDS:

@@ -1,8 +1,8 @@
-"""The text of a marker map: one schema, one reader, one writer, without geometry.
+"""The file format of marker maps: schema, reader and writer, without geometry.
 
-``version`` is the schema: files of another one are refused. ``revision`` counts the changes of a map. Until 0.2 there
-was no ``revision`` and ``version`` counted: such a file is refused too, as it may be one of a schema to come, and
-``map upgrade`` rewrites it.
+``version`` is the version of the schema; others are refused. ``revision`` counts the changes of a map. Until 0.2 there
+was no ``revision``, and ``version`` was the counter: such a file is refused too, since it looks like a future schema,
+and ``map upgrade`` converts it.
 """
 
 from collections.abc import Callable, Iterable
@@ -21,10 +21,10 @@ T = TypeVar('T')
 FORMAT = 'thermal_fiducial/marker_map'
 VERSION = 1
 
-# Positions are written to a nanometre, rotations to a nanoradian: below any measurement.
+# Written decimals: nanometres and nanoradians, below any measurement.
 _DIGITS = 9
 _NORM_TOLERANCE = 0.01
-# Asymmetry and negative eigenvalues of a covariance that six written digits leave, as a share of its largest element.
+# Tolerance of a covariance's symmetry and eigenvalues, relative to its largest element: rounding to six digits.
 _ROUNDING = 1e-6
 _MOST = 2**63 - 1
 _LARGEST_ID = 2**31 - 1
@@ -40,17 +40,17 @@ _WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
 
 @dataclass(frozen=True)
 class MarkerEntry:
-    """A marker as its file has it."""
+    """A marker entry of a file."""
 
     id: int
     #: side of the black square [m]; None: left out
     size: float | None
     fixed: bool
-    #: of its centre in the map [m]
+    #: position of its centre in the map [m]
     position: tuple[float, ...]
-    #: in the map, x y z w
+    #: orientation in the map, quaternion x y z w
     orientation: tuple[float, ...]
-    #: 36 numbers, rows first; empty: left out
+    #: 36 numbers, row-major; empty: left out
     covariance: tuple[float, ...] = ()
     reprojection_error_px: float = 0.0
     observations: int = 0
@@ -61,7 +61,7 @@ class MarkerEntry:
 
 @dataclass(frozen=True)
 class MapDocument:
-    """What a map file holds."""
+    """Content of a map file."""
 
     markers: tuple[MarkerEntry, ...]
     frame_id: str = 'map'
@@ -75,7 +75,7 @@ def read_document(path: str) -> MapDocument:
     Raises
     ------
     InputError
-        Unreadable, no marker map, of another schema, or with a broken entry; the message names file, line and field.
+        Unreadable, not a marker map, another schema, or an invalid entry; the message names file, line and field.
     """
     return _document(load_yaml(path))
 
@@ -86,7 +86,7 @@ def parse_document(path: str, text: str) -> MapDocument:
 
 
 def upgraded(path: str) -> str:
-    """The text of a map file from before 0.2, whose ``version`` counted changes, in the schema of today.
+    """Convert a map file from before 0.2, whose ``version`` counted changes, to the present schema.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def _document(root: Value) -> MapDocument:
 
 
 def _head(root: Value) -> dict[str, Value]:
-    """The fields of a file that says that it is a marker map."""
+    """The fields of a file with the marker map's ``format``."""
     if not isinstance(root.content, dict):
         raise root.error(f'not a marker map: no "format: {FORMAT}"')
     kind = root.content.get('format')
@@ -208,7 +208,7 @@ def dump_document(document: MapDocument) -> str:
     Raises
     ------
     InputError
-        The map holds something that could not be read back.
+        The map has a value that the reader would refuse.
     """
     lines = [
         f'format: {FORMAT}',
@@ -249,7 +249,7 @@ def _list(values: Iterable[float]) -> str:
 
 
 def _number(value: float) -> str:
-    """A number that YAML 1.1 takes for one: it asks for a decimal point before an exponent."""
+    """A number as YAML 1.1 parses it: with a decimal point before an exponent."""
     text = repr(float(value))
     return text.replace('e', '.0e', 1) if 'e' in text and '.' not in text else text
 

@@ -1,6 +1,6 @@
-"""Earlier versions of a map file, kept in a folder beside it, for undo; and the copy that a running mapper leaves.
+"""History of a map file for undo, in a folder beside it, and the autosaved copy of a running mapper.
 
-Everybody who changes a map goes through here: one at a time, and only on top of what he has read.
+Every change of a map file goes through this module: under a lock, and only if the file is still the one that was read.
 """
 
 from contextlib import suppress
@@ -16,9 +16,9 @@ from thermal_fiducial.files.map_format import parse_document
 from thermal_fiducial.files.marker_map import dump_map
 from thermal_fiducial.files.reading import cannot_write, read_bytes, read_text, TEXT_LIMIT_BYTES
 
-#: Earlier versions kept.
+#: Number of earlier versions kept.
 KEPT = 50
-#: What is said of an autosaved map that is taken up, or put aside.
+#: Action of the history for an autosaved map.
 TAKE_UP = 'take up the autosaved map'
 PUT_ASIDE = 'an autosaved map that was never taken up'
 _MARK = '# before: '
@@ -26,7 +26,7 @@ _NAME = re.compile(r'[0-9]{1,9}\.yaml')
 
 
 class ChangedMeanwhileError(InputError):
-    """Somebody else has changed the map since it was read."""
+    """The map file has changed since it was read."""
 
 
 @dataclass(frozen=True)
@@ -35,27 +35,27 @@ class MapVersion:
 
     number: int
     path: Path
-    #: what was done to it then
+    #: the change that replaced it
     action: str
-    #: revision and number of markers that it had; 0 when it cannot be read
+    #: its revision and number of markers; 0 if it cannot be read
     revision: int = 0
     markers: int = 0
-    #: why it cannot be read, in words
+    #: why it cannot be read; else empty
     problem: str = ''
 
 
 def history_folder(path: Path) -> Path:
-    """Where the earlier versions of the map at ``path`` are."""
+    """Folder of the earlier versions of the map at ``path``."""
     return path.with_name(f'{path.name}.history')
 
 
 def autosave_file(path: Path) -> Path:
-    """Where a running mapper leaves its copy of the map at ``path``."""
+    """Autosave file of the map at ``path``."""
     return path.with_name(f'{path.name}.autosave')
 
 
 def digest(path: Path) -> str:
-    """What distinguishes the present content of ``path`` from any other; empty when there is none that can be read."""
+    """Hash of the present content of ``path``; empty if it cannot be read."""
     try:
         return _digest(read_bytes(path, TEXT_LIMIT_BYTES))
     except InputError:
@@ -67,23 +67,23 @@ def _digest(content: bytes) -> str:
 
 
 def save_with_history(path: Path, marker_map: MarkerMap, action: str, read: str | None = None) -> str:
-    """Write ``marker_map`` to ``path``, the file that is there now (whatever it holds) into its history.
+    """Write ``marker_map`` to ``path`` and move the present file, whatever its content, to the history.
 
     Parameters
     ----------
     path : the map file
     marker_map : the map
-    action : what was done, in words
-    read : :func:`digest` of the file that the map follows; None: whatever there is
+    action : description of the change
+    read : :func:`digest` of the file that the map was made from; None: do not check
 
     Returns
     -------
-    :func:`digest` of what was written, whatever others have made of it since.
+    :func:`digest` of the written text, even if the file has changed since.
 
     Raises
     ------
     InputError
-        The folder can't be written to, or (:class:`ChangedMeanwhileError`) the file is not the one that was read.
+        The folder can't be written to, or (:class:`ChangedMeanwhileError`) the file has changed since it was read.
     """
     text = dump_map(marker_map)
     with locked(path):
@@ -94,12 +94,12 @@ def save_with_history(path: Path, marker_map: MarkerMap, action: str, read: str 
 
 
 def replace(path: Path, text: str, action: str) -> None:
-    """Put ``text`` into ``path``, what was there into its history; only under :func:`locked`.
+    """Write ``text`` to ``path`` and its present content to the history; only under :func:`locked`.
 
     Raises
     ------
     InputError
-        The folder can't be written to, or what is there is larger than any map, or no file.
+        The folder can't be written to, or the present file is too large or not a regular file.
     """
     try:
         clean_up(path)
@@ -114,15 +114,15 @@ def replace(path: Path, text: str, action: str) -> None:
 
 
 def _whatever(path: Path) -> str:
-    """The text in a file, whatever it is; raises InputError for what no map can be."""
+    """The text of a file, valid map or not; raises InputError if it is too large or not a regular file."""
     return read_bytes(path, TEXT_LIMIT_BYTES).decode('utf-8', errors='replace')
 
 
 def keep(path: Path, text: str, action: str) -> None:
-    """Put ``text`` into the history of ``path``; only under :func:`locked`. Raises OSError."""
+    """Add ``text`` to the history of ``path``; only under :func:`locked`. Raises OSError."""
     folder = history_folder(path)
     folder.mkdir(exist_ok=True)
-    # Of writers that were killed.
+    # Temporary files of killed writers.
     for litter in folder.glob('.*.tmp'):
         litter.unlink(missing_ok=True)
     files = _files(path)
@@ -133,7 +133,7 @@ def keep(path: Path, text: str, action: str) -> None:
 
 
 def entries(path: Path) -> list[MapVersion]:
-    """Earlier versions of the map at ``path``, the oldest first; those that cannot be read say why."""
+    """Earlier versions of the map at ``path``, oldest first; unreadable ones with their ``problem``."""
     return [_entry(file) for file in _files(path)]
 
 
@@ -161,12 +161,12 @@ def _files(path: Path) -> list[Path]:
 
 
 def undo(path: Path) -> MapVersion:
-    """Put the latest earlier version that can be read back in place, byte for byte.
+    """Restore the latest readable version, byte for byte.
 
     Raises
     ------
     InputError
-        There is none, or it can't be written.
+        There is none, or the file can't be written.
     """
     with locked(path):
         earlier = [entry for entry in entries(path) if not entry.problem]
@@ -184,7 +184,7 @@ def undo(path: Path) -> MapVersion:
 
 
 def autosaved(path: Path) -> MapVersion | None:
-    """The copy of a mapper that ended without saving, if it is newer than the map itself."""
+    """The autosave of a mapper that ended without saving, if it is newer than the map."""
     file = autosave_file(path)
     try:
         if path.exists() and file.stat().st_mtime_ns < path.stat().st_mtime_ns:
@@ -196,7 +196,7 @@ def autosaved(path: Path) -> MapVersion | None:
 
 
 def take_up_autosave(path: Path) -> None:
-    """Make the autosaved map the map; the present one goes into the history.
+    """Replace the map by the autosaved one; the present map goes into the history.
 
     Raises
     ------
@@ -213,14 +213,14 @@ def take_up_autosave(path: Path) -> None:
 
 
 def put_autosave_aside(path: Path) -> None:
-    """Move an autosaved map that nobody has taken up into the history; only under :func:`locked`.
+    """Move an unused autosaved map into the history; only under :func:`locked`.
 
     Raises
     ------
     OSError
         The history cannot be written.
     InputError
-        What is there is larger than any map.
+        The autosave is too large for a map.
     """
     file = autosave_file(path)
     if file.is_file():

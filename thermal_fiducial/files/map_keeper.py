@@ -1,4 +1,4 @@
-"""The map file of a running mapper: loaded, saved, autosaved, and in no case lost."""
+"""The map file of a running mapper: load, save, autosave, recovery."""
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -14,19 +14,19 @@ from thermal_fiducial.files.atomic import locked, write_atomically
 from thermal_fiducial.files.marker_map import dump_map, load_map
 from thermal_fiducial.files.robot_folder import robot_folder
 
-#: A mapper that starts so many autosave periods after the last autosave has crashed and goes on where it was.
+#: A mapper that starts within so many autosave periods of the last autosave resumes it as after a crash.
 RESTART_PERIODS = 2.0
 
 
 class MapKeeper:
-    """Keeps one map file.
+    """Loads and saves one map file.
 
     Parameters
     ----------
-    path : the file; None: nothing is kept
+    path : the file; None: no file
     marker_size : side of markers whose entry has none [m]
-    size_overrides : marker ID to side [m], before ``marker_size``
-    flown : the map cannot be made again: it is saved in another folder rather than lost
+    size_overrides : marker ID to side [m], instead of ``marker_size``
+    flown : the map was made in flight and cannot be repeated: if its folder is not writable, save it elsewhere
     """
 
     def __init__(
@@ -35,14 +35,14 @@ class MapKeeper:
         self._path = path
         self._sizes = marker_size, size_overrides
         self._flown = flown
-        # Of what the map follows. Nothing that is there follows from what could not be read.
+        # Digest of the file that the map was made from. 'nothing' matches no file: an unread one is not overwritten.
         self._read = 'nothing'
         self._own_autosave = False
         self._writer: Thread | None = None
         self._fault = ''
-        #: whether the map has learned something since it was loaded or saved
+        #: whether the map has changed since it was loaded or saved
         self.unsaved = False
-        #: why the last save did not go to the file; empty: it did
+        #: why the last save could not replace the file; empty if it did
         self.obstacle = ''
 
     @property
@@ -59,7 +59,7 @@ class MapKeeper:
         return self._path
 
     def load(self) -> MarkerMap:
-        """The map as the file has it now.
+        """Load the map from the file.
 
         Raises
         ------
@@ -72,11 +72,11 @@ class MapKeeper:
         return marker_map
 
     def recover(self, autosave_period: float) -> tuple[MarkerMap | None, str]:
-        """The autosaved map of a mapper that has just crashed (or None), and what there is to say of one.
+        """The autosaved map of a mapper that has just crashed (or None), and a message about an autosave.
 
         Parameters
         ----------
-        autosave_period : of mappers here [s]; 0: none is taken up
+        autosave_period : of this mapper [s]; 0: no autosave is resumed
         """
         entry = None if self._path is None else map_history.autosaved(self._path)
         if entry is None:
@@ -93,14 +93,14 @@ class MapKeeper:
         return recovered, f'goes on with {found}, {age_s:.0f} s old, as the last mapper did not end in order'
 
     def save(self, marker_map: MarkerMap) -> Path:
-        """Write the map: to its file, or beside it where that holds something that the map does not follow.
+        """Write the map to its file, or beside it if the file is not the one that was loaded.
 
-        Where its folder takes nothing (a full disk, one that is read-only) a map that was flown goes to where the
-        filter keeps its last pose, or else to a new temporary folder.
+        If that folder cannot be written to (full or read-only disk), a flown map is saved in the folder of the
+        filter's last pose, or else in a new temporary folder.
 
         Returns
         -------
-        Where it was written; :attr:`obstacle` says why not to its file.
+        Path of the written file; :attr:`obstacle` says why it is not the map file.
 
         Raises
         ------
@@ -131,22 +131,22 @@ class MapKeeper:
         raise InputError(f'the map is not saved: {self.obstacle}')
 
     def undo(self) -> str:
-        """Put the latest earlier version of the file back in place; what was undone.
+        """Restore the previous version of the file; returns the undone action.
 
         Raises
         ------
         InputError
-            There is none.
+            There is no earlier version.
         """
         return map_history.undo(self.path).action
 
     def autosave(self, marker_map: MarkerMap) -> None:
-        """Leave a copy of the map beside its file, where it has learned something; in a thread, as disks are slow.
+        """Write a copy of a changed map beside its file, in a thread, since disks are slow.
 
         Raises
         ------
         InputError
-            The last one failed.
+            The previous autosave failed.
         """
         fault, self._fault = self._fault, ''
         if self._path is not None and self.unsaved and (self._writer is None or not self._writer.is_alive()):
@@ -167,7 +167,7 @@ class MapKeeper:
             self._fault = f'autosave failed: {error}'
 
     def _retire_autosave(self) -> None:
-        """The map is saved: its copy goes, an earlier one that was never taken up is kept in the history."""
+        """After a save delete the own autosave; move one of an earlier mapper into the history."""
         with suppress(OSError, InputError), locked(self.path):
             if self._own_autosave:
                 map_history.autosave_file(self.path).unlink(missing_ok=True)
@@ -176,7 +176,7 @@ class MapKeeper:
         self._own_autosave = False
 
     def finish(self) -> None:
-        """Wait for what is being written."""
+        """Wait for a running autosave."""
         if self._writer is not None:
             self._writer.join()
 

@@ -1,4 +1,4 @@
-"""Marker maps on disk: YAML, written so that a kill at any moment leaves the old map or the new one, whole."""
+"""Marker maps on disk: YAML, written atomically."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,12 +22,12 @@ def load_map(
     ----------
     path : the file
     marker_size : side of markers whose entry has none [m]
-    size_overrides : marker ID to side [m], before ``marker_size``
+    size_overrides : marker ID to side [m], instead of ``marker_size``
 
     Raises
     ------
     InputError
-        The file can't be read, is no marker map, or has a broken entry; the message names file and entry.
+        The file can't be read, is not a marker map, or has an invalid entry; the message names file and entry.
     """
     document = read_document(str(path))
     sizes = size_overrides or {}
@@ -41,7 +41,7 @@ def load_map(
 
 
 def other_frame(of: str, published: str) -> str:
-    """In words, whether a map is in another frame than that of the published poses; empty: it is not."""
+    """Warning if a map's frame differs from that of the published poses; else empty."""
     return (
         '' if of == published else f'the map is in frame {of!r}, but poses are published in {published!r} (map_frame)'
     )
@@ -53,7 +53,7 @@ def save_map(path: str | Path, marker_map: MarkerMap) -> None:
     Raises
     ------
     InputError
-        The folder doesn't exist or can't be written to, or the map could not be read back.
+        The folder doesn't exist or can't be written to, or the map has a value that the reader would refuse.
     """
     path = Path(path)
     try:
@@ -68,7 +68,7 @@ def dump_map(marker_map: MarkerMap) -> str:
     Raises
     ------
     InputError
-        The map holds something that could not be read back.
+        The map has a value that the reader would refuse.
     """
     entries = tuple(_entry(marker) for marker in marker_map.markers.values())
     return dump_document(MapDocument(entries, marker_map.frame_id, marker_map.dictionary, marker_map.revision))

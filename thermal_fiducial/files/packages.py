@@ -1,4 +1,4 @@
-"""Which of the libraries that only some commands need are installed."""
+"""Checks for optional libraries."""
 
 from importlib.util import find_spec
 
@@ -6,7 +6,7 @@ from thermal_fiducial.errors import InputError
 
 
 def is_installed(package: str) -> bool:
-    """Whether a package could be imported; it is not, as that may take a second."""
+    """Whether a package can be imported, without importing it, which may take a second."""
     try:
         return find_spec(package) is not None
     except ImportError:
@@ -14,7 +14,7 @@ def is_installed(package: str) -> bool:
 
 
 def require_plots(option: str = '--plot') -> None:
-    """Say that nothing can be drawn before work begins.
+    """Check for the plotting library before the work begins.
 
     Raises
     ------

@@ -1,7 +1,6 @@
-"""YAML files whose fields are not of ours alone, as plain objects: parameters of ROS, for one.
+"""YAML files with arbitrary fields, such as ROS parameters, as plain objects.
 
-The text passes the checks of :mod:`thermal_fiducial.files.schema` first: neither aliases nor tags, nor a depth or
-length that no such file has.
+The text passes the checks of :mod:`thermal_fiducial.files.schema` first: no aliases, no tags, limited depth and size.
 """
 
 from pathlib import Path
@@ -15,12 +14,12 @@ from thermal_fiducial.files.schema import parse_yaml
 
 
 def load_plain(path: str | Path) -> Any:
-    """The one document of a YAML file, None of an empty one.
+    """The single document of a YAML file; None if it is empty.
 
     Raises
     ------
     InputError
-        As :func:`thermal_fiducial.files.schema.load_yaml`, or a value that is spelt like a date or number and is none.
+        As :func:`thermal_fiducial.files.schema.load_yaml`, or a malformed date or number.
     """
     text = read_text(path)
     parse_yaml(str(path), text)
@@ -33,7 +32,7 @@ def load_plain(path: str | Path) -> Any:
 
 
 def _check_integers(path: str, value: Any) -> None:
-    """Raise for a whole number that no field can hold: none of the libraries behind says so in a line."""
+    """Raise InputError for an integer that overflows every field; the libraries' errors would be unreadable."""
     if isinstance(value, dict):
         value = [*value.keys(), *value.values()]
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""Point clouds of a place: PLY and PCD files, read by the libraries of the extra ``cloud``; where a map lies in one."""
+"""Point clouds of a site (PLY and PCD, needs the extra ``cloud``), and alignments of maps with them."""
 
 from pathlib import Path
 import re
@@ -13,9 +13,9 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.atomic import write_atomically
 from thermal_fiducial.files.schema import load_yaml
 
-# Counts of a header of PLY or PCD: its elements, points, and their width and height.
+# Sizes in a PLY or PCD header: elements, points, width and height.
 _COUNTS = re.compile(rb'^(?:element +\S+|POINTS|WIDTH|HEIGHT) +([0-9]{1,18})[0-9]*\s*$', re.MULTILINE)
-# How many values each field of a point has, of PCD: the library makes one after the other.
+# Values per field in a PCD header; the library allocates them one by one.
 _VALUES = re.compile(rb'^COUNT((?: +-?[0-9]{1,18})+)', re.MULTILINE)
 _MOST_VALUES = 1000
 _PACKED = re.compile(rb'^DATA +binary_compressed', re.MULTILINE)
@@ -24,7 +24,7 @@ _NEEDED = "reading point clouds needs the extra 'cloud': pip install '.[cloud]' 
 
 
 def load_cloud(path: str | Path) -> FloatArray:
-    """Points (N, 3) [m] of a ``.ply`` or ``.pcd`` file; those that are not finite are left out.
+    """Finite points (N, 3) [m] of a ``.ply`` or ``.pcd`` file.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def load_cloud(path: str | Path) -> FloatArray:
     except ImportError as error:
         raise InputError(_NEEDED) from error
     except Exception as error:
-        # The readers raise whatever a broken file makes them stumble over.
+        # The readers raise arbitrary exceptions for malformed files.
         raise InputError(f'{path}: not a readable point cloud: {type(error).__name__}') from error
     points = points[np.all(np.isfinite(points), axis=1)]
     if not len(points):
@@ -55,7 +55,7 @@ def load_cloud(path: str | Path) -> FloatArray:
 
 
 def thinned(points: FloatArray, most: int) -> FloatArray:
-    """At most ``most`` of the points (N, 3): one of each cell of a grid just coarse enough."""
+    """At most ``most`` of the points (N, 3), by a voxel grid of the smallest sufficient cell."""
     if len(points) <= most:
         return points
     extent = np.ptp(points, axis=0).max()
@@ -68,7 +68,7 @@ def thinned(points: FloatArray, most: int) -> FloatArray:
 
 
 def save_alignment(path: Path, T_cloud_map: FloatArray, cloud: str, frame_id: str) -> None:
-    """Write where the map ``frame_id`` lies in ``cloud``: (4, 4), as position and quaternion.
+    """Write T_cloud_map (4, 4) of the map ``frame_id`` in ``cloud``, as position and quaternion.
 
     Raises
     ------
@@ -93,7 +93,7 @@ def load_alignment(path: str | Path) -> FloatArray:
     Raises
     ------
     InputError
-        Not such a file.
+        Not an alignment file.
     """
     root = load_yaml(path)
     fields = root.mapping()
@@ -107,12 +107,12 @@ def load_alignment(path: str | Path) -> FloatArray:
 
 
 def _check_promise(path: Path) -> None:
-    """Refuse a file whose header promises more than its bytes can be: a reader would make room for it.
+    """Refuse a header that claims more data than the file can have, for which a reader would allocate memory.
 
     Raises
     ------
     InputError
-        It does, or it has no header.
+        The claim is too large, or there is no header.
     """
     with path.open('rb') as file:
         header = file.read(_HEADER_BYTES)
@@ -120,7 +120,7 @@ def _check_promise(path: Path) -> None:
     counts = [int(count) for count in _COUNTS.findall(header.partition(b'end_header')[0])]
     if not counts:
         raise InputError(f'{path}: not a readable point cloud: no header')
-    # A value takes a byte at least; compressed clouds of the PCD library shrink no further than to a hundredth.
+    # A value takes at least one byte; PCD's compression reaches at most a factor of 100.
     packed = _PACKED.search(header) is not None
     if max(counts) > size * (100 if packed else 1):
         raise InputError(f'{path}: the header promises {max(counts)} points, the file has {size} bytes')

@@ -1,4 +1,4 @@
-"""Reading of files that anybody may have written: regular ones only, and no more of them than they may hold."""
+"""Reading of untrusted files: regular files only, with a size limit."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,18 +9,18 @@ from typing import BinaryIO
 
 from thermal_fiducial.errors import InputError
 
-#: Of a text that is taken into memory at once: a map of 1,700 markers has 2 MB.
+#: Largest text read into memory at once; a map of 1,700 markers has 2 MB.
 TEXT_LIMIT_BYTES = 6_000_000
-#: Of a line of a table: a camera pose with its covariance has 1,200 bytes.
+#: Longest line of a table; a camera pose with its covariance has 1,200 bytes.
 LINE_LIMIT_BYTES = 10_000
-#: Blank lines in a row: where there are more, nobody meant to write a table.
+#: Most consecutive blank lines of a table.
 _BLANK_LINES = 100_000
-#: Characters of a path in an error.
+#: Longest path in an error message [characters].
 _LONGEST_NAME = 400
 
 
 def read_bytes(path: str | Path, limit: int) -> bytes:
-    """What is in a file of at most ``limit`` bytes.
+    """Content of a file of at most ``limit`` bytes.
 
     Raises
     ------
@@ -32,7 +32,7 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
 
 
 def require_regular(path: str | Path) -> None:
-    """Raise InputError for what is no regular file that can be opened: whoever read from it might wait for ever."""
+    """Raise InputError unless ``path`` is a readable regular file; reading a pipe or device might block forever."""
     with _opened(path, 1 << 63):
         pass
 
@@ -40,7 +40,7 @@ def require_regular(path: str | Path) -> None:
 @contextmanager
 def _opened(path: str | Path, limit: int) -> Iterator[BinaryIO]:
     try:
-        # A pipe without a writer would be waited for.
+        # Without O_NONBLOCK, opening a pipe without a writer blocks.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:
         name = str(path) if str(path).isprintable() else repr(str(path))
@@ -61,12 +61,12 @@ def _opened(path: str | Path, limit: int) -> Iterator[BinaryIO]:
 
 
 def read_text(path: str | Path, limit: int = TEXT_LIMIT_BYTES) -> str:
-    """The same as UTF-8 text.
+    """:func:`read_bytes` as UTF-8 text.
 
     Raises
     ------
     InputError
-        As :func:`read_bytes`, or not a text.
+        As :func:`read_bytes`, or not UTF-8.
     """
     try:
         return read_bytes(path, limit).decode('utf-8')
@@ -75,14 +75,14 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT_BYTES) -> str:
 
 
 def text_lines(path: str | Path, limit: int) -> Iterator[tuple[int, str]]:
-    """Number, from 1, and text of each line that is not blank, of a file of at most ``limit`` bytes.
+    """Number, from 1, and text of each non-blank line of a file of at most ``limit`` bytes.
 
-    One line is held at a time, so that the first that cannot be used is all that a broken file of any size costs.
+    Lines are read one at a time, so that reading a broken file ends at its first bad line.
 
     Raises
     ------
     InputError
-        As :func:`read_bytes`, not a text, or lines that nobody writes.
+        As :func:`read_bytes`, not UTF-8, a line that is too long, or too many blank lines.
     """
     number = last = 0
     with _opened(path, limit) as file:
@@ -102,11 +102,11 @@ def text_lines(path: str | Path, limit: int) -> Iterator[tuple[int, str]]:
 
 
 def cannot_write(path: str | Path, what: str, error: OSError) -> InputError:
-    """The one line for a file that cannot be written."""
+    """The error for a file that cannot be written."""
     return InputError(f'{path}: cannot write {what}: {error.strerror or error}')
 
 
 def one_line(error: Exception, longest: int = 200) -> str:
-    """What an error says, printable and short enough for one line; its kind where it says nothing."""
+    """The message of an error as one printable line of limited length; its type if the message is empty."""
     text = ' '.join(str(error).split()) or type(error).__name__
     return ''.join(letter if letter.isprintable() else '?' for letter in text)[:longest]

@@ -1,8 +1,8 @@
-"""Recordings that are no bags: folders of CSV files of ours, of EuRoC and of Kalibr, as one flight.
+"""Recordings other than bags: folders of CSV files and pictures of this package, EuRoC and Kalibr.
 
-Ours: ``imu.csv`` (``stamp_ns,wx,wy,wz,ax,ay,az``), ``rig.yaml``, and of a camera either ``detections.csv`` (or
+This package: ``imu.csv`` (``stamp_ns,wx,wy,wz,ax,ay,az``), ``rig.yaml``, and either ``detections.csv`` (or
 ``CAMERA.csv``: ``stamp_ns,id,u0,v0,u1,v1,u2,v2,u3,v3[,sigma_px]``) or ``camera_pose.csv``
-(``stamp_ns,x,y,z,qx,qy,qz,qw`` and the 36 numbers of the covariance); ``reference.tum`` where there is a truth.
+(``stamp_ns,x,y,z,qx,qy,qz,qw`` and the 36 numbers of the covariance); optionally the ground truth ``reference.tum``.
 EuRoC (ASL): ``[mav0/]imu0/data.csv``, ``CAMERA/data.csv`` with pictures, a ``sensor.yaml`` in each.
 Kalibr: ``imu0.csv`` and pictures ``CAMERA/STAMP.png``, with a camchain and an IMU file.
 """
@@ -28,13 +28,13 @@ from thermal_fiducial.files.records import is_imu_reading
 from thermal_fiducial.files.rig_files import densities, of_camchain, of_rig, of_sensor, Rig
 from thermal_fiducial.files.trajectory_file import load_tum
 
-#: Of markers, more than any dictionary has; of a quaternion, as in maps.
+#: Limit of marker IDs, above any dictionary; deviation of a quaternion's norm from 1, as in maps.
 _IDS, _NORM_TOLERANCE = 100_000, 0.01
-#: Messages have seconds of 32 bits.
+#: Limit of stamps: messages have 32-bit seconds.
 _LATEST_NS = 2**31 * SECOND_NS
-#: Of corners [px]: a marker may reach out of a picture, but not by more than the largest has.
+#: Limits of corners and their standard deviation [px]: a corner may lie outside the picture, but within this range.
 _FARTHEST_CORNER, _LARGEST_SIGMA = 1e5, 100.0
-#: Of an IMU's samples: time between them [s], force at rest in g, and how fast hardly anything turns [rad/s].
+#: Plausible IMU samples: period [s], specific force at rest [g], largest turn rate [rad/s].
 _STEPS_S, _IN_G, _FAST = (2e-5, 1.0), (0.8, 1.2), 35.0
 
 
@@ -71,31 +71,31 @@ class Picture:
 
 @dataclass(frozen=True)
 class Recording:
-    """A flight from a folder, frames either as pictures, as corners or as camera poses."""
+    """A flight from a folder; the frames are pictures, corners or camera poses."""
 
     rig: Rig
     samples: list[ImuSample]
     pictures: list[Picture] = field(default_factory=list)
     corners: list[Corners] = field(default_factory=list)
     poses: list[CameraPose] = field(default_factory=list)
-    #: (N,) [ns], (N, 4, 4) T_map_body
+    #: stamps (N,) [ns] and T_map_body (N, 4, 4)
     truth: tuple[IntArray, FloatArray] | None = None
 
 
 def read_recording(
     folder: Path, camera: str = 'cam0', camchain: Path | None = None, imu: Path | None = None
 ) -> Recording:
-    """The flight in ``folder``, whichever of the three layouts it has.
+    """The flight in ``folder``, in any of the three layouts.
 
     Parameters
     ----------
-    camera : which of the cameras
+    camera : name of the camera
     camchain, imu : Kalibr's files of the rig; default: those in the folder
 
     Raises
     ------
     InputError
-        None of the layouts, a missing file, or content that is none; the message names file and line.
+        None of the layouts, a missing file, or invalid content; the message names file and line.
     """
     if not folder.is_dir():
         raise InputError(f'{folder}: no such folder')
@@ -167,12 +167,12 @@ def _kalibr(folder: Path, camera: str, camchain: Path | None, imu: Path | None) 
 
 
 def _lines(path: Path, least: int) -> Iterator[tuple[int, list[str]]]:
-    """Number and cells of each line, without comments and the head.
+    """Number and cells of each line, without comments and header.
 
     Raises
     ------
     InputError
-        Unreadable, no line, or one of fewer cells than ``least``.
+        Unreadable, no lines, or a line with fewer cells than ``least``.
     """
     head, empty = True, True
     for number, words in csv_rows(path):
@@ -192,7 +192,7 @@ def _lines(path: Path, least: int) -> Iterator[tuple[int, list[str]]]:
 def _table(
     path: Path, columns: int, possible: Callable[[list[float]], bool] = lambda _: True
 ) -> tuple[IntArray, FloatArray]:
-    """Stamps (N,) [ns] and the values (N, M) after them, at least ``columns`` with the stamp; all ``possible``."""
+    """Stamps (N,) [ns] and values (N, M) of at least ``columns`` columns, stamp included; each row is ``possible``."""
     stamps, rows = [], []
     for number, words in _lines(path, columns):
         where = f'{path} line {number}'
@@ -206,7 +206,7 @@ def _table(
 
 
 def _stamp(where: str, word: str) -> int:
-    # As many digits as 64 bits have; the length first, since a word of thousands of them is no number.
+    # At most the digits of int64; the length is checked first, since int() of thousands of digits raises.
     if not (word.isascii() and word.isdigit() and len(word) <= 19 and int(word) < _LATEST_NS):
         raise InputError(f'{where}: {word[:40]!r} is no stamp in nanoseconds')
     return int(word)
@@ -229,7 +229,7 @@ def _samples(path: Path) -> list[ImuSample]:
 
 
 def _check_units(path: Path, stamps: IntArray, values: FloatArray) -> None:
-    """Raise InputError for stamps, turn rates or forces that are most likely in another unit."""
+    """Raise InputError for stamps, turn rates or specific forces that are most likely in another unit."""
     step = float(np.median(np.diff(np.sort(stamps)))) / SECOND_NS if len(stamps) > 1 else _STEPS_S[1]
     if not _STEPS_S[0] <= step <= _STEPS_S[1]:
         raise InputError(f'{path}: samples {step:.3g} s apart: are the stamps in nanoseconds?')
@@ -240,7 +240,7 @@ def _check_units(path: Path, stamps: IntArray, values: FloatArray) -> None:
 
 
 def _is_detection(row: list[float]) -> bool:
-    """Whether it is an ID, eight coordinates and, where there is more, a standard deviation."""
+    """Whether a row has an ID, eight coordinates and optionally a standard deviation."""
     corners, sigma = row[1:9], row[9:10]
     return (
         row[0] in range(_IDS)

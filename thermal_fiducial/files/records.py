@@ -1,4 +1,4 @@
-"""Records out of messages, from rclpy or from a bag, checked at the door."""
+"""Validated records from messages of rclpy or a bag."""
 
 from collections.abc import Sequence
 import math
@@ -14,17 +14,17 @@ from thermal_fiducial.errors import InputError
 if TYPE_CHECKING:
     from thermal_fiducial.core.geometry.camera import Camera
 
-# What no IMU measures: seven times the widest gyroscopes' range [rad/s], and four times the widest accelerometers'.
+# Limits [rad/s, m/s^2]: seven times the widest gyroscope range, four times the widest accelerometer range.
 _FASTEST_TURN, _LARGEST_FORCE = 500.0, 8000.0
 
 
 def stamp_ns(stamp: Any) -> int:
-    """Integer nanoseconds of a stamp.
+    """Integer nanoseconds of a stamp message.
 
     Raises
     ------
     InputError
-        A time before 1970, or with a second or more of nanoseconds.
+        A time before 1970, or 1e9 nanoseconds or more.
     """
     return checked_stamp(int(stamp.sec), int(stamp.nanosec))
 
@@ -37,7 +37,7 @@ def checked_stamp(seconds: int, nanoseconds: int) -> int:
 
 
 def camera(message: Any) -> 'Camera':
-    """Intrinsics of a camera_info message.
+    """Camera model of a camera_info message.
 
     Parameters
     ----------
@@ -46,9 +46,9 @@ def camera(message: Any) -> 'Camera':
     Raises
     ------
     InputError
-        No calibration in it, one that no lens has, an unknown model, or a binned or cropped image.
+        No calibration, impossible values, an unknown model, or a binned or cropped image.
     """
-    # With OpenCV: a filter reads IMU samples alone, and is back in flight sooner without it.
+    # Imported here, as it imports OpenCV: the filter needs only IMU samples, and restarts faster without it.
     from thermal_fiducial.core.geometry.camera import Camera
 
     if max(message.binning_x, message.binning_y) > 1 or message.roi.width or message.roi.height:
@@ -62,8 +62,8 @@ def camera(message: Any) -> 'Camera':
 
 
 def is_imu_reading(turn: Sequence[float], force: Sequence[float]) -> bool:
-    """Whether an IMU can have measured it [rad/s, m/s^2]."""
-    # Plain numbers: of six of them, 200 times a second, numpy takes three times as long. NaN is below no bound.
+    """Whether the values are within the limits of an IMU [rad/s, m/s^2]."""
+    # Plain floats: for six values numpy takes three times as long. NaN fails the comparisons.
     return all(abs(x) <= _FASTEST_TURN for x in turn) and all(abs(x) <= _LARGEST_FORCE for x in force)
 
 
@@ -77,7 +77,7 @@ def imu_sample(message: Any) -> ImuSample:
     Raises
     ------
     InputError
-        A value that is not finite or that no IMU measures, or a measurement that the driver marks as not there
+        A value that is not finite or beyond any IMU, or a measurement that the driver marks as missing
         (REP-145).
     """
     w, a = message.angular_velocity, message.linear_acceleration
@@ -86,7 +86,7 @@ def imu_sample(message: Any) -> ImuSample:
 
 
 def checked_imu_sample(stamp: int, turn: Sequence[float], force: Sequence[float], *, missing: bool) -> ImuSample:
-    """:func:`imu_sample` of its numbers; ``missing``: the driver marks one of the measurements as not there."""
+    """:func:`imu_sample` of its numbers; ``missing``: the driver marks a measurement as missing."""
     if not is_imu_reading(turn, force):
         finite = all(math.isfinite(x) for x in (*turn, *force))
         raise InputError('IMU message beyond what any IMU measures' if finite else 'IMU message that is not finite')

@@ -1,4 +1,4 @@
-"""Camera and IMU of a recording from the YAML files of ours, of EuRoC (ASL) and of Kalibr."""
+"""Camera and IMU of a recording from YAML files of this package, EuRoC (ASL) and Kalibr."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,17 +15,17 @@ from thermal_fiducial.files.camera_info import MODEL_SYNONYMS
 from thermal_fiducial.files.reading import read_text
 from thermal_fiducial.files.schema import parse_yaml, Value
 
-#: Kalibr's names of the densities, which are ours.
+#: Names of the noise densities, those of Kalibr.
 NOISE_NAMES = (
     'gyroscope_noise_density',
     'accelerometer_noise_density',
     'gyroscope_random_walk',
     'accelerometer_random_walk',
 )
-# Of these, in any of their units: no sensor that anybody flies comes near.
+# Limit of the noise densities, in any of their units: above any sensor.
 _LARGEST_NOISE = 100.0
 _LONGEST_SIDE, LARGEST_MARKER_M, _LARGEST_OFFSET_S = 65_535, 100.0, 1.0
-#: OpenCV's head, as some of EuRoC's files have it, is no YAML of version 1.1.
+#: Header of OpenCV in some of EuRoC's files, which YAML 1.1 does not allow.
 _OPENCV_HEAD = '%YAML:1.0'
 
 
@@ -34,21 +34,21 @@ class Rig:
     """A camera and an IMU."""
 
     camera: Camera
-    #: (4, 4)
+    #: pose (4, 4) of the camera in the IMU frame
     T_body_camera: FloatArray
-    #: by :data:`NOISE_NAMES`; what is not known is not there
+    #: noise densities by :data:`NOISE_NAMES`; unknown ones are missing
     imu_noise: dict[str, float] = field(default_factory=dict)
     #: t_imu = t_camera + offset [s]
     time_offset: float = 0.0
-    #: of the markers [m], 0: unknown
+    #: side of the markers [m]; 0: unknown
     marker_size: float = 0.0
     dictionary: str = ''
 
 
 def of_rig(path: Path, camera: str) -> Rig:
-    """Of our ``rig.yaml``: ``cameras: {cam0: {width, height, model, K, D, T_body_camera}}``, ``imu``, ``marker_size``.
+    """Read ``rig.yaml``: ``cameras: {cam0: {width, height, model, K, D, T_body_camera}}``, ``imu``, ``marker_size``.
 
-    Instead of ``T_body_camera``, ``camera_position`` and ``camera_orientation``, as the parameters have them.
+    ``camera_position`` and ``camera_orientation``, as in the parameters, may stand in for ``T_body_camera``.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def of_rig(path: Path, camera: str) -> Rig:
 
 
 def of_sensor(camera: Path, imu: Path) -> Rig:
-    """Of EuRoC's two ``sensor.yaml``; ``T_BS`` maps the sensor's coordinates to the body's.
+    """Rig from EuRoC's two ``sensor.yaml``; ``T_BS`` maps sensor coordinates to body coordinates.
 
     Raises
     ------
@@ -83,17 +83,17 @@ def of_sensor(camera: Path, imu: Path) -> Rig:
     entry, other = _document(camera), _document(imu)
     lens = _lens(entry, *_resolution(entry), _pinhole(entry), 'distortion_model', 'distortion_coefficients')
     T_body_camera, T_body_imu = (_rigid(_needed(_needed(sensor, 'T_BS'), 'data')) for sensor in (entry, other))
-    # ASL's gyroscope_random_walk and so on are Kalibr's.
+    # ASL's names of the noise densities are those of Kalibr.
     return Rig(lens, inverse(T_body_imu) @ T_body_camera, _noise(other))
 
 
 def of_camchain(path: Path, camera: str, noise: Mapping[str, float]) -> Rig:
-    """Of Kalibr's camchain with ``T_cam_imu`` and ``timeshift_cam_imu``, which is our offset.
+    """Rig from Kalibr's camchain with ``T_cam_imu`` and ``timeshift_cam_imu``, which equals ``time_offset``.
 
     Raises
     ------
     InputError
-        A missing or unusable entry, or a camera model that is no pinhole.
+        A missing or unusable entry, or a camera model other than pinhole.
     """
     entry = _needed(_document(path), camera)
     fields = entry.mapping()
@@ -105,12 +105,12 @@ def of_camchain(path: Path, camera: str, noise: Mapping[str, float]) -> Rig:
 
 
 def densities(path: Path) -> dict[str, float]:
-    """Of Kalibr's IMU file, by :data:`NOISE_NAMES`; what it does not have is not there.
+    """Noise densities of Kalibr's IMU file by :data:`NOISE_NAMES`; missing ones are omitted.
 
     Raises
     ------
     InputError
-        Unreadable, or values that are none.
+        Unreadable, or invalid values.
     """
     root = _document(path)
     return _noise(root.mapping().get('imu0', root))
@@ -132,7 +132,7 @@ def _needed(value: Value, name: str) -> Value:
 
 
 def _numbers(value: Value, size: int, limit: float = np.inf) -> FloatArray:
-    """As many finite numbers, in a list or in rows of one."""
+    """``size`` finite numbers from a list or a list of rows."""
     rows = [entry.items() if isinstance(entry.content, list) else [entry] for entry in value.items()]
     numbers = [entry.number(-limit, limit) for row in rows for entry in row]
     if len(numbers) != size:
@@ -174,7 +174,7 @@ def _pinhole(entry: Value) -> FloatArray:
 
 
 def _lens(entry: Value, width: int, height: int, K: 'FloatArray | Value', model: str, coefficients: str) -> Camera:
-    """The camera of ``entry``, whose fields ``model`` and ``coefficients`` say how it distorts."""
+    """Camera of ``entry``; ``model`` and ``coefficients`` are the names of its fields for the distortion."""
     fields = entry.mapping()
     matrix = _numbers(K, 9).reshape(3, 3) if isinstance(K, Value) else K
     name = fields[model].text() if model in fields else 'plumb_bob'

@@ -1,9 +1,9 @@
-"""The folder of the nodes themselves, for what outlives them."""
+"""The folder for files that must survive a restart of the nodes."""
 
 import os
 from pathlib import Path
 
 
 def robot_folder() -> Path:
-    """Where ROS lets programs keep what outlives them; it need not be there."""
+    """ROS's folder for persistent files (ROS_HOME); it may not exist."""
     return Path(os.environ.get('ROS_HOME', '~/.ros')).expanduser() / 'thermal_fiducial'

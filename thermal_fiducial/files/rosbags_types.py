@@ -1,4 +1,4 @@
-"""ROS messages as objects of rosbags: what all writers of bags share."""
+"""ROS messages as rosbags objects, for all writers of bags."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ _TYPES = get_typestore(Stores.ROS2_JAZZY).types
 
 
 def make(kind: str, *args: Any, **fields: Any) -> Any:
-    """A message of ``kind``, e.g. 'std_msgs/msg/Header', of its fields in order or by name."""
+    """A message of type ``kind``, e.g. 'std_msgs/msg/Header', from its fields by position or name."""
     return _TYPES[kind](*args, **fields)
 
 

@@ -1,13 +1,12 @@
-"""The schema of every YAML file that the package reads: typed values that know their file, line and field.
+"""Schema validation of the package's YAML files: typed values that know their file, line and field.
 
-A small one of our own. The nodes read maps and calibrations when they start in flight, and what they need must come
+Why not a library: the nodes read maps and calibrations when they restart in flight, and their dependencies must come
 with ROS. Importing pydantic takes 150 ms, msgspec 75 ms, this module 8 ms beside PyYAML's 90 (one busy machine, one
-run), and neither of the two knows the line that a value came from. What they would bring beyond that (models,
-conversion) the few records of the package do not need.
+run), and neither library knows the line of a value. Their further features (models, conversion) are not needed for
+the package's few records.
 
-The text is read as libyaml's events, not as PyYAML's objects: nothing is built that was not asked for (dates, tags,
-aliases that expand), nothing recurses, and a value is a number because the field is one, not because of how it is
-spelt.
+The text is parsed as libyaml's events, not as PyYAML's objects: no implicit dates, tags or expanding aliases, no
+recursion, and the field, not the spelling, determines whether a value is a number.
 """
 
 from collections.abc import Collection, Iterator
@@ -22,11 +21,11 @@ import yaml
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import read_text
 
-#: Levels of lists and mappings in each other; no file of ours has more than five.
+#: Deepest nesting of lists and mappings; the package's files have at most five levels.
 DEEPEST = 16
-#: Values in a file: a map of 1,700 markers with all that is known of them.
+#: Most values in a file: a map of 1,700 markers with all fields.
 MOST_VALUES = 100_000
-#: Characters of a value that are quoted in an error.
+#: Longest quotation of a value in an error [characters].
 _QUOTED = 60
 
 _NUMBER = re.compile(r'[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?')
@@ -40,20 +39,20 @@ Content: TypeAlias = 'str | list[Value] | dict[str, Value]'
 
 @dataclass(slots=True)
 class Value:
-    """A value of a file, and where it stands there."""
+    """A value of a file with its location."""
 
     #: the file
     path: str
     #: counted from 1
     line: int
-    #: its field, as errors name it: ``markers[3]: position``
+    #: name of the field in errors: ``markers[3]: position``
     field: str
     content: Content
-    #: of a text: whether it was written without quotes
+    #: whether a scalar was written without quotes
     plain: bool = False
 
     def error(self, what: str) -> InputError:
-        """What is wrong with this value, in one line."""
+        """Error in one line: file, line, field and ``what``."""
         field = f' {self.field}:' if self.field else ''
         return InputError(f'{self.path}: line {self.line}:{field} {what}')
 
@@ -62,12 +61,12 @@ class Value:
         return value
 
     def mapping(self, known: Collection[str] | None = None) -> dict[str, 'Value']:
-        """Fields by name; ``known``: all that there may be.
+        """Fields by name; ``known``: the allowed names.
 
         Raises
         ------
         InputError
-            Not a mapping, or a field that is not known.
+            Not a mapping, or an unknown field.
         """
         if not isinstance(self.content, dict):
             raise self.error(f'{self.quoted()} is not a set of fields')
@@ -93,7 +92,7 @@ class Value:
 
     @property
     def empty(self) -> bool:
-        """Whether nothing is written there (or null)."""
+        """Whether the value is missing or null."""
         return self.plain and self.content in _EMPTY
 
     def number(self, low: float = -math.inf, high: float = math.inf) -> float:
@@ -129,7 +128,7 @@ class Value:
         return value
 
     def flag(self) -> bool:
-        """A truth value.
+        """A boolean.
 
         Raises
         ------
@@ -142,7 +141,7 @@ class Value:
         return word in _TRUE
 
     def text(self, longest: int = 200) -> str:
-        """A text that is not empty, of printable characters.
+        """A non-empty text of printable characters.
 
         Raises
         ------
@@ -168,7 +167,7 @@ class Value:
         return [value.number(-limit, limit) for value in self.items()]
 
     def quoted(self) -> str:
-        """The value as an error shows it."""
+        """The value, shortened for an error message."""
         if isinstance(self.content, list):
             return f'a list of {len(self.content)}'
         if isinstance(self.content, dict):
@@ -177,18 +176,18 @@ class Value:
 
 
 def load_yaml(path: str | Path) -> Value:
-    """The one document of a YAML file.
+    """The single document of a YAML file.
 
     Raises
     ------
     InputError
-        Unreadable, not YAML, more than one document, aliases, foreign tags, or nested or long beyond any use.
+        Unreadable, not YAML, more than one document, aliases, unknown tags, or too deeply nested or too long.
     """
     return parse_yaml(str(path), read_text(path))
 
 
 def parse_yaml(path: str, text: str) -> Value:
-    """The one document of a YAML text; ``path`` names it in errors. Raises as :func:`load_yaml`."""
+    """The single document of a YAML text; ``path`` names it in errors. Raises as :func:`load_yaml`."""
     try:
         root = _Builder(path).build(yaml.parse(text, Loader=getattr(yaml, 'CSafeLoader', yaml.SafeLoader)))
     except yaml.YAMLError as error:
@@ -200,7 +199,7 @@ def parse_yaml(path: str, text: str) -> Value:
 
 
 class _Builder:
-    """Puts events together, without recursion."""
+    """Assembles events to values, without recursion."""
 
     def __init__(self, path: str) -> None:
         self._path = path

@@ -1,4 +1,4 @@
-"""What the algorithms take from a bag: calibration, IMU samples and raw frames. No ROS is needed for it."""
+"""Inputs of the pipeline from a bag, without ROS: calibration, IMU samples and raw frames."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from thermal_fiducial.files.records import camera, imu_sample, stamp_ns
 
 @dataclass(frozen=True, slots=True)
 class ThermalFrame:
-    """One raw frame, as the camera's driver published it."""
+    """One raw frame of the camera driver."""
 
     stamp_ns: int
     #: (H, W), uint16 counts or uint8
@@ -23,18 +23,18 @@ class ThermalFrame:
 
 
 def read_bag(path: str | Path, remap: Mapping[str, str] | None = None) -> Iterator[Camera | ImuSample | ThermalFrame]:
-    """Calibrations, IMU samples and raw frames of a bag, in the order of their arrival.
+    """Calibrations, IMU samples and raw frames of a bag, in recorded order.
 
     Parameters
     ----------
     path : rosbag2 folder, ``.mcap``, ``.db3`` or ROS 1 ``.bag``, with the topics ``thermal/image_raw``,
-        ``thermal/camera_info`` and ``imu/data``; those that are missing give nothing
+        ``thermal/camera_info`` and ``imu/data``; missing ones are skipped
     remap : topic of the bag to one of these names
 
     Raises
     ------
     InputError
-        A bag or a message that cannot be used.
+        An unusable bag or message.
     """
     convert: dict[str, Callable[[Any], Camera | ImuSample | ThermalFrame]] = {
         CAMERA_INFO_TOPIC: camera,

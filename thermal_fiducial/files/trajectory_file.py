@@ -12,16 +12,16 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import text_lines
 from thermal_fiducial.files.writing import write_text
 
-# What an integer of 64 bits holds in nanoseconds: the year 2262.
+# Range of int64 nanoseconds [s]: the year 2262.
 _LATEST_S = 9_200_000_000
-# Of a position [m], as in the messages.
+# Limit of a position [m], as in the messages.
 _LARGEST = 1e5
 # Two hours at 200 Hz have 140 MB.
 _LIMIT_BYTES = 500_000_000
 
 
 def tum_line(stamp_ns: int, position: Iterable[float], orientation_xyzw: Iterable[float]) -> str:
-    """One line without its end: nine decimals of the stamp, values to the nanometre."""
+    """One line without newline: stamp and values with nine decimals."""
     seconds, rest = divmod(int(stamp_ns), SECOND_NS)
     values = ' '.join(f'{float(value):.9f}' for value in (*position, *orientation_xyzw))
     return f'{seconds}.{rest:09d} {values}'
@@ -47,7 +47,7 @@ def load_tum(path: str | Path) -> tuple[IntArray, FloatArray, FloatArray]:
     Raises
     ------
     InputError
-        Unreadable, empty, a line that isn't eight finite numbers, a quaternion of no length, stamps that go back.
+        Unreadable, empty, a line other than eight finite numbers, a zero quaternion, or decreasing stamps.
     """
     numbers: list[int] = []
     rows: list[tuple[int, list[float]]] = []

@@ -1,4 +1,4 @@
-"""Writing of files: whole or not at all, and one line of what cannot be written."""
+"""Atomic writing of files, with one-line errors."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -12,31 +12,31 @@ from thermal_fiducial.files.atomic import write_atomically
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a file, whole or not at all, and never into a pipe or a device.
+    """Write a file atomically, and never into a pipe or a device.
 
     Raises
     ------
     InputError
-        It cannot be written.
+        The file cannot be written.
     """
     with into(path):
         write_atomically(Path(path), text)
 
 
 def unfinished(path: Path) -> Path:
-    """Where a file that grows lies until it is whole."""
+    """Temporary path of a growing file until it is complete."""
     return path.with_name(f'{path.name}.part')
 
 
 def claim(file: TextIO) -> None:
-    """Let others see, by :func:`is_claimed`, that this process writes an open file, until it is closed."""
-    # Where the file system has no locks.
+    """Lock an open file until it is closed, to show others by :func:`is_claimed` that it is being written."""
+    # The file system may have no locks.
     with suppress(OSError):
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_claimed(path: Path) -> bool:
-    """Whether somebody is writing a file that he has claimed; what a killed process has left is nobody's."""
+    """Whether a process holds the claim on a file; that of a killed process is released."""
     try:
         with path.open('rb') as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -49,12 +49,12 @@ def is_claimed(path: Path) -> bool:
 
 @contextmanager
 def new_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A file beside ``path`` for a library to write, which takes the place of ``path`` when it is whole.
+    """Context with a temporary path for a library to write; on success it replaces ``path``.
 
     Raises
     ------
     InputError
-        It cannot be written.
+        The file cannot be written.
     """
     place = Path(path)
     new = place.with_name(f'.{place.stem}.{os.getpid()}{place.suffix}')
@@ -63,19 +63,19 @@ def new_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             yield new
             new.replace(place)
     finally:
-        # Where nothing can be written nothing can be removed either.
+        # If the folder is not writable, the removal fails too.
         with suppress(OSError):
             new.unlink()
 
 
 @contextmanager
 def into(path: str | os.PathLike[str]) -> Iterator[None]:
-    """What the file system refuses while ``path`` is written (a full disk, a folder that is read-only) as one line.
+    """Context that converts an OSError while ``path`` is written (a full or read-only disk) to InputError.
 
     Raises
     ------
     InputError
-        In the place of an OSError.
+        Instead of the OSError.
     """
     try:
         yield
