@@ -1,1 +1,1 @@
-"""Maps off the robot: built from photos and recordings, edited, doubted, laid into point clouds."""
+"""Offline map tools: building from photos and recordings, editing, plausibility checks, alignment to point clouds."""

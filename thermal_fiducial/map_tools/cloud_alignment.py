@@ -1,9 +1,9 @@
-"""A marker map held against a point cloud of the place.
+"""Alignment of a marker map to a point cloud of the site.
 
-Each marker hangs on, or in front of, a surface: its plane and the plane of the cloud's points around it should be one.
+Each marker hangs on, or close to, a surface, so its plane should coincide with that of the cloud's points around it.
 ICP (small_gicp: K. Koide, "small_gicp: Efficient and parallel algorithms for point cloud registration", JOSS 2024)
-brings the marker squares near; a least-squares fit to the plane under each marker finishes, and leaves alone those
-directions that planes don't fix (along a lone wall, say).
+aligns the marker squares roughly; a least-squares fit to the plane under each marker refines, except in directions
+that the planes leave unobservable (along a single wall, say).
 """
 
 from collections.abc import Iterable
@@ -16,36 +16,36 @@ from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
-# Points along the side of a marker's square that stand for it in ICP.
+# Points along a side of the grid that represents a marker in ICP.
 _GRID = 5
-# Points that make a plane.
+# Fewest points of a plane.
 _FEWEST = 12
-# Information of the weakest direction, as a share of the strongest, below which it counts as open.
+# Smallest eigenvalue of the information matrix, relative to the largest, of an observable direction.
 _OPEN = 1e-3
 _ITERATIONS = 20
 
 
 @dataclass(frozen=True)
 class PlaneFit:
-    """The surface under one marker, after the alignment."""
+    """The surface plane at one marker, after the alignment."""
 
     id: int
-    #: from the surface to the marker's centre, along the surface's normal [m]
+    #: distance from the surface to the marker's centre, along the surface's normal [m]
     distance_m: float
-    #: between the marker's normal and the surface's [rad]
+    #: angle between the normals of marker and surface [rad]
     angle: float
-    #: points of the cloud that make the surface
+    #: number of cloud points on the surface
     points: int
 
 
 @dataclass(frozen=True)
 class CloudAlignment:
-    """Where the map lies in the cloud."""
+    """Pose of the map in the cloud."""
 
     #: (4, 4) T_cloud_map
     T: FloatArray
     fits: list[PlaneFit]
-    #: directions, of six, that the surfaces leave open; there the initial transform stands
+    #: number of unobservable directions, of six, in which the initial transform is kept
     open_directions: int
     #: markers with too few points around them
     without_surface: tuple[int, ...]
@@ -76,7 +76,7 @@ def align_to_cloud(
     planes = _planes(markers, cloud, tree, T, reach_m)
     opened = 6
     if _step(markers, planes, T)[1]:
-        # ICP slides along what is open: begin where the user said, and move only where the surfaces say.
+        # ICP drifts in unobservable directions: start from the initial transform, and move only in observable ones.
         T = T_initial
     for _ in range(_ITERATIONS):
         planes = _planes(markers, cloud, tree, T, reach_m)
@@ -110,7 +110,7 @@ def _icp(markers: list[MapMarker], cloud: FloatArray, T_initial: FloatArray, rea
 
 
 def _grid(marker: MapMarker) -> FloatArray:
-    """Points (25, 3) of a marker's square in the map."""
+    """Grid of points (25, 3) on a marker's square, in the map."""
     u = np.linspace(-0.5, 0.5, _GRID) * marker.size
     x, y = np.meshgrid(u, u)
     return apply(marker.T_map_marker, np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=-1))
@@ -119,7 +119,7 @@ def _grid(marker: MapMarker) -> FloatArray:
 def _planes(
     markers: list[MapMarker], cloud: FloatArray, tree: object, T: FloatArray, reach_m: float
 ) -> dict[int, _Plane]:
-    """The plane of the points around each marker, by total least squares on those near its surface."""
+    """Plane of the points around each marker, by total least squares on those near its surface."""
     planes = {}
     for marker in markers:
         centre = apply(T, marker.T_map_marker[None, :3, 3])[0]
@@ -144,7 +144,7 @@ def _planes(
 
 
 def _step(markers: list[MapMarker], planes: dict[int, _Plane], T: FloatArray) -> tuple[FloatArray, int]:
-    """T_cloud_map after a least-squares step towards all planes, and the number of directions that stay open."""
+    """T_cloud_map after a least-squares step towards all planes, and the number of unobservable directions."""
     rows, residuals = [], []
     middle = apply(T, np.stack([marker.T_map_marker[:3, 3] for marker in markers])).mean(axis=0)
     for marker in markers:

@@ -1,4 +1,4 @@
-"""A map from frames in any order: photos of a place, or the detections of a whole run at once."""
+"""A map from frames in any order: photos of a site, or the detections of a whole run."""
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -18,22 +18,22 @@ from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-# Passes over all frames: more than any chain of markers needs of which each is seen with the last alone.
+# Most passes over all frames: more than a chain of markers needs, each seen only together with the previous one.
 _MAX_PASSES = 50
-# What an alternative pose starts its joint adjustment with: as good as unknown.
+# Initial covariance of an alternative pose in its bundle adjustment: practically unknown.
 _UNKNOWN = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 
 
 @dataclass(frozen=True)
 class Built:
-    """A map from frames, and how it came out."""
+    """A map from frames, and the result of its adjustment."""
 
     map: MarkerMap
-    #: the last joint adjustment; None: there was nothing to adjust
+    #: the last bundle adjustment; None: there was nothing to adjust
     refinement: AdjustedMap | None
-    #: markers that were seen but could not be placed, with the reason in words
+    #: markers that were seen but could not be placed, with the reason
     unplaced: dict[int, str]
-    #: frames that gave a camera pose in the end
+    #: number of frames with a camera pose in the final map
     frames_used: int
 
 
@@ -44,16 +44,15 @@ def build_map(
     config: MarkerMapperConfig,
     progress: Callable[[int, float], None] = lambda markers, share: None,
 ) -> Built:
-    """Grow ``marker_map`` by all markers that hang together with it, and adjust all jointly.
+    """Extend ``marker_map`` by all markers connected to it by common views, and run a bundle adjustment.
 
-    The frames are shown to the mapper again and again, for as long as any brings a new marker: a frame in which
-    nothing is known yet may be the link to the rest later. Where views alone leave two poses of a marker, the joint
-    adjustment of either decides.
+    The mapper processes all frames repeatedly until no pass adds a marker, since a frame without known markers may
+    become a link later. If the views leave a marker's pose ambiguous, a bundle adjustment with either pose decides.
 
     Parameters
     ----------
     frames : rows of MARKER_DTYPE of each frame
-    progress : receives the number of markers in the map and the share of the frames that this pass has done
+    progress : called with the number of markers in the map and the share of this pass that is done
     """
     config = replace(config, mode='mapping', keyframe_budget=max(len(frames), config.keyframe_budget))
     mapper = MarkerMapper(config, marker_map)
@@ -74,12 +73,12 @@ def build_map(
 
 
 def _stamp(k: int) -> int:
-    """Stamp of frame k, in every pass the same; seconds apart, since unordered frames have no continuity."""
+    """Stamp of frame k, the same in every pass; frames are seconds apart, since unordered ones have no continuity."""
     return (k + 1) * SECOND_NS
 
 
 def _settle(mapper: MarkerMapper, camera: Camera) -> bool:
-    """Decide between the alternative poses of a candidate by adjusting the map jointly with either; whether one was."""
+    """Resolve one candidate's pose ambiguity by a bundle adjustment with either pose; returns whether one was."""
     snapshot = mapper.snapshot()
     if snapshot is None:
         return False
@@ -93,7 +92,7 @@ def _settle(mapper: MarkerMapper, camera: Camera) -> bool:
 
 
 def decide(snapshot: Snapshot, marker_id: int, size: float, alternatives: Sequence[FloatArray]) -> MapMarker | None:
-    """The new marker at that one of ``alternatives``, poses (4, 4), which the joint adjustment clearly prefers."""
+    """The new marker at the one of ``alternatives``, poses (4, 4), that the bundle adjustment clearly prefers."""
     outcomes = []
     for T in alternatives:
         trial = MapMarker(marker_id, size, False, T, _UNKNOWN)
@@ -114,9 +113,9 @@ def decide(snapshot: Snapshot, marker_id: int, size: float, alternatives: Sequen
 def _residuals(
     built: MarkerMap, frames: Sequence[Markers], camera: Camera, config: MarkerMapperConfig
 ) -> tuple[int, dict[int, float]]:
-    """In how many frames the camera is found with the map, and each marker's re-projection error in them [px].
+    """Number of frames that are located in the map, and each marker's re-projection error in them [px].
 
-    The mapper's own is a running mean that begins before the map is adjusted. This is the median of its views.
+    The error is the median over the views; the mapper's own is a running mean from before the adjustment.
     """
     mapper = MarkerMapper(replace(config, mode='localization'), built)
     used, errors = 0, defaultdict[int, list[float]](list)
@@ -137,7 +136,7 @@ def _residuals(
 def _with_statistics(
     built: MarkerMap, frames: Sequence[Markers], start: MarkerMap, errors: Mapping[int, float]
 ) -> MarkerMap:
-    """Errors of the finished map; observations counted once, however often frames were shown; no made-up stamps."""
+    """The map with its final errors, observations counted once in spite of several passes, and no artificial stamps."""
     ids, counts = np.unique(np.concatenate([rows['id'] for rows in frames]), return_counts=True)
     seen = dict(zip(ids.tolist(), counts.tolist(), strict=True))
     for key, marker in built.markers.items():

@@ -1,4 +1,4 @@
-"""What is doubtful about a map, and whether one can fly with it all the same."""
+"""Plausibility checks of a map."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -8,25 +8,25 @@ import numpy as np
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 
-#: Re-projection error of a marker beyond which some of its views are wrong [px]. They have little weight in its pose.
+#: Re-projection error of a marker above which some views are outliers [px]; these have little weight in its pose.
 LARGE_PX = 2.0
-#: Re-projection error that nearly all markers exceed only where something that they share is wrong, the calibration.
-#: Corners of OpenCV are good to 0.2 px in photos, ours to 0.03 in counts; photos taken for free of distortion left 0.4.
+#: Re-projection error [px] that nearly all markers exceed only with a common cause, a wrong calibration. OpenCV's
+#: corners are accurate to 0.2 px in photos, those of this package to 0.03 px in counts; ignored distortion left 0.4.
 ALL_LARGE_PX = 0.3
-# Nearly all, and so many make a rule.
+# Share of the markers that counts as nearly all, and fewest markers for that verdict.
 _NEARLY_ALL, _FEW = 0.9, 3
 _WIDE_M = 0.1
 
 
 class Doubt(NamedTuple):
-    """A line of text, and whether poses from the map are further off than they claim."""
+    """A message, and whether poses from the map are less accurate than their covariance says."""
 
     text: str
     spoils: bool
 
 
 def doubts(marker_map: MarkerMap) -> list[Doubt]:
-    """What is doubtful about a map; empty for a sound one."""
+    """Doubts about a map; empty if it is plausible."""
     markers = [marker_map.markers[key] for key in sorted(marker_map.markers)]
     if not markers:
         return [Doubt('the map has no marker', True)]

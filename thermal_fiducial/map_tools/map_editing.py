@@ -1,4 +1,4 @@
-"""Editing of marker maps: each function answers a new map of the next revision and leaves its input alone."""
+"""Editing of marker maps: each function returns a new map with the next revision; the input is unchanged."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -24,7 +24,7 @@ def set_fixed(marker_map: MarkerMap, ids: Iterable[int], fixed: bool) -> MarkerM
 
 
 def move(marker_map: MarkerMap, marker_id: int, T_map_marker: FloatArray, covariance: FloatArray) -> MarkerMap:
-    """Put a marker somewhere else; its statistics start anew.
+    """Set a marker's pose; its statistics are reset.
 
     Raises
     ------
@@ -42,7 +42,7 @@ def rename(marker_map: MarkerMap, old: int, new: int) -> MarkerMap:
     Raises
     ------
     InputError
-        No marker ``old``, or there is a marker ``new`` already.
+        There is no marker ``old``, or already a marker ``new``.
     """
     marker = _get(marker_map, old)
     if new in marker_map.markers:
@@ -53,7 +53,7 @@ def rename(marker_map: MarkerMap, old: int, new: int) -> MarkerMap:
 
 
 def delete(marker_map: MarkerMap, ids: Iterable[int]) -> MarkerMap:
-    """Take markers out.
+    """Remove markers.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def delete(marker_map: MarkerMap, ids: Iterable[int]) -> MarkerMap:
 
 
 def transformed(marker_map: MarkerMap, T_new_old: FloatArray) -> MarkerMap:
-    """The whole map in another frame; covariances turn along."""
+    """The map in another frame, covariances included."""
     return _changed(
         marker_map,
         {
@@ -85,13 +85,13 @@ def transformed(marker_map: MarkerMap, T_new_old: FloatArray) -> MarkerMap:
 def merge(resting: MarkerMap, moving: MarkerMap) -> tuple[MarkerMap, Alignment]:
     """Both maps in the frame of ``resting``.
 
-    Common markers keep the pose of whichever map knows it better; the others of ``moving`` come over, their covariance
-    enlarged by how badly the common ones fit.
+    Common markers keep the pose with the smaller covariance. The others of ``moving`` are added, their covariance
+    inflated by the misfit of the common ones.
 
     Raises
     ------
     InputError
-        No marker in common, sizes or dictionaries that differ.
+        No common marker, or different sizes or dictionaries.
     """
     if resting.dictionary != moving.dictionary:
         raise InputError(f'the maps are of different dictionaries: {resting.dictionary} and {moving.dictionary}')
@@ -119,7 +119,7 @@ def merge(resting: MarkerMap, moving: MarkerMap) -> tuple[MarkerMap, Alignment]:
 
 
 def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[MarkerMap, dict[int, float]]:
-    """Move the whole map onto surveyed positions (3,) [m] of the centres of at least three markers.
+    """Align the map to surveyed positions (3,) [m] of the centres of at least three markers.
 
     Returns
     -------
@@ -128,7 +128,7 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[M
     Raises
     ------
     InputError
-        Fewer than three surveyed markers in the map, or all on a line.
+        Fewer than three surveyed markers in the map, or all collinear.
     """
     common = sorted(marker_map.markers.keys() & surveyed.keys())
     if len(common) < 3:
@@ -144,9 +144,9 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[M
 
 
 def with_covariances(marker_map: MarkerMap, position_std: float, rotation_std: float) -> MarkerMap:
-    """The map with standard deviations [m, rad] for the markers that are neither fixed nor have any.
+    """The map with standard deviations [m, rad] for markers that have no covariance and are not fixed.
 
-    The mapper takes such a marker for exact and never moves it; whoever writes one by hand does not mean that.
+    The mapper would take such a marker for exact and never move it, which is not meant in a map written by hand.
     """
     covariance = np.diag([position_std**2] * 3 + [rotation_std**2] * 3)
     exact = [key for key, m in marker_map.markers.items() if not m.fixed and not np.any(m.covariance)]
