@@ -128,6 +128,17 @@ def test_a_pad_of_one_marker_needs_no_map(graph):
     assert graph.diagnose(node)[:2] == (OK, 'ok')
 
 
+@pytest.mark.parametrize('quaternion', [(0.0, 0.0, 0.0, 0.0), (np.nan, 0.0, 0.0, 1.0)])
+def test_a_marker_whose_detector_has_no_pose_of_it_is_no_target(graph, quaternion):
+    """The autopilot would get numbers that are none."""
+    graph.add(LandingTarget, landing_pad=[7], **EXTRINSICS)
+    rows = clouds.markers(markers(7)).copy()
+    rows['qx'], rows['qy'], rows['qz'], rows['qw'] = quaternion
+    graph.send('markers', clouds.cloud(rows, convert.header(STAMP, 'thermal_camera_optical')))
+    graph.send('markers', markers(7, stamp=STAMP + 1))
+    assert convert.stamp_ns(heard(graph)[0].header.stamp) == STAMP + 1
+
+
 @pytest.mark.parametrize('parameters', [{'landing_pad': [7, 8]}, {'landing_pad': [7], 'landing_target_frame': 'map'}])
 def test_what_cannot_be_known_without_the_map_is_said(graph, parameters):
     node = graph.add(LandingTarget, **parameters, **EXTRINSICS)

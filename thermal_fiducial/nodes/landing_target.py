@@ -57,7 +57,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
             self._frames[stamp] = None
             if len(self._frames) > _WAITING:
                 self._frames.popitem(last=False)
-        elif self._needs_no_map:
+        elif self._needs_no_map and np.isfinite(seen.branches[0, 0]).all():
             self._send_in_body(stamp, self._T_body_camera @ seen.branches[0, 0])
 
     @property
