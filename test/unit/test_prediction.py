@@ -47,6 +47,12 @@ def test_an_unknown_clock_widens_what_is_said_of_motion_and_place():
     assert 0.08 < np.sqrt(unknown.twist.covariance[0, 0]) < 0.3
 
 
+def test_impossible_odometry_is_left_alone():
+    found = predicted(motion_prior(*(replace(state, angular_velocity_body=np.full(3, 1e3)) for state in states())))
+    assert found.twist is None
+    assert found.T_camera_map is None
+
+
 @pytest.mark.parametrize('offset_s', [pytest.param(0.0, marks=pytest.mark.nightly), 0.035])
 def test_markers_are_found_whatever_the_offset_of_a_clock_that_is_not_known_yet(offset_s):
     scenario = named('fast')
