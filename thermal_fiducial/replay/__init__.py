@@ -1,1 +1,1 @@
-"""Recorded bags through the real nodes: in lock-step in one process, or one process a node in real time."""
+"""Replays recorded bags through the real nodes: in lock-step in one process, or one process a node in real time."""

@@ -1,4 +1,4 @@
-"""The four nodes as processes of their own."""
+"""Runs the four nodes as separate processes."""
 
 from collections.abc import Sequence
 import os
@@ -12,7 +12,7 @@ from typing import Self
 
 from thermal_fiducial.errors import InputError, RunError
 
-#: A node that has been asked to end, and has not worked for so long since, hangs [s].
+#: Idle time after SIGINT beyond which a node counts as hung [s].
 _IDLE_S = 15.0
 _GLANCE_S = 0.05
 _TICK = os.sysconf('SC_CLK_TCK')
@@ -24,7 +24,7 @@ class NodeProcesses:
     Parameters
     ----------
     domain_id : DDS domain
-    nodes : their names
+    nodes : names of the nodes
     ros_arguments : for the nodes, after ``--ros-args``
     """
 
@@ -33,7 +33,7 @@ class NodeProcesses:
         self._environment = {**os.environ, 'ROS_DOMAIN_ID': str(domain_id)}
         self._arguments = ['--ros-args', *ros_arguments]
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
-        #: after the end, in words: nodes that did not end as they should
+        #: after the end: messages on nodes that did not end properly
         self.unclean: list[str] = []
 
     def __enter__(self) -> Self:
@@ -79,14 +79,14 @@ class NodeProcesses:
             raise RunError(f'node {node} ended: {reason}')
 
     def crash(self, node: str) -> None:
-        """Kill a node, and start it again as a launch file that respawns does."""
+        """Kill a node and restart it, as a launch file with respawn does."""
         self._processes[node].kill()
         self._processes[node].wait()
         self._start(node)
 
     @property
     def working(self) -> bool:
-        """Whether any of them computes, or would if the machine let it."""
+        """Whether any node computes or waits for a processor."""
         return any(_works(process.pid) for process in self._processes.values())
 
     def cpu_seconds(self) -> dict[str, float]:
@@ -98,11 +98,11 @@ class NodeProcesses:
 
 
 def _await_end(process: subprocess.Popen[bytes]) -> str:
-    """Let a process end its work, however slow the machine; end it when it has none and stays.
+    """Wait while a process works, however slow the machine; kill it if it stays idle without ending.
 
     Returns
     -------
-    What was wrong with its end, in words.
+    Message if it did not end properly; else empty.
     """
     idle = 0
     while process.poll() is None and idle * _GLANCE_S < _IDLE_S:
@@ -128,6 +128,6 @@ def _works(pid: int) -> bool:
 
 
 def _cpu_seconds(pid: int) -> float:
-    # Fields 14 and 15 of proc(5) stat, user and system; the name before them may hold blanks.
+    # Fields 14 and 15 of proc(5) stat, user and system; the name before them may contain blanks.
     words = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()
     return (int(words[11]) + int(words[12])) / _TICK

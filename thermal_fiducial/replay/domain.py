@@ -1,4 +1,4 @@
-"""A DDS domain of one's own, so that a replay meets neither a robot nor another replay."""
+"""A separate DDS domain, which isolates a replay from robots and other replays."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,7 +9,7 @@ import tempfile
 
 from thermal_fiducial.errors import InputError
 
-#: Domains above 101 reach into the ports that Linux hands out to anybody; 0 is everybody's default.
+#: Domains above 101 use Linux's ephemeral ports; 0 is the default domain.
 _DOMAINS = range(1, 90)
 
 
@@ -22,13 +22,13 @@ def own_domain() -> Iterator[int]:
     Raises
     ------
     InputError
-        All are taken.
+        All domains are in use.
     """
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     for domain in _DOMAINS:
         path = Path(tempfile.gettempdir()) / f'thermal_fiducial_{os.getuid()}_domain_{domain}.lock'
         try:
-            # In a folder that everybody may write to: what somebody else has put there is neither followed nor cut.
+            # The folder is world-writable: a planted link is not followed, a planted file not truncated.
             file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600), 'r+')
         except OSError:
             continue

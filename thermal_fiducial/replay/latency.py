@@ -1,4 +1,4 @@
-"""How long the nodes take: from an IMU message to its pose, from a frame to the first pose that it corrected."""
+"""Latencies of the nodes: from an IMU message to its pose, from a frame to the first pose that it corrected."""
 
 import csv
 from pathlib import Path
@@ -11,7 +11,7 @@ IMAGE_TO_CORRECTED_POSE = 'image_to_corrected_pose'
 
 
 class LatencyMeter:
-    """Pairs what was sent with what came back, all times from one monotonic clock [ns]."""
+    """Pairs sent messages with the results received, all times of one monotonic clock [ns]."""
 
     def __init__(self) -> None:
         self._sent: dict[str, dict[int, int]] = {'image': {}, 'imu': {}}
@@ -20,17 +20,17 @@ class LatencyMeter:
         self._rows: list[tuple[str, int, float]] = []
 
     def sent(self, kind: str, stamp_ns: int, now_ns: int) -> None:
-        """An ``image`` or ``imu`` message went out."""
+        """Record that an ``image`` or ``imu`` message was published."""
         self._sent[kind][stamp_ns] = now_ns
 
     def camera_pose(self, stamp_ns: int, now_ns: int) -> None:
-        """A camera pose came. It corrects something if the filter is running, else it is one of those that start it."""
+        """Record a camera pose: a correction if the filter runs, else part of its initialisation."""
         self._pair(IMAGE_TO_CAMERA_POSE, 'image', stamp_ns, now_ns)
         if self._running:
             self._uncorrected.append(stamp_ns)
 
     def pose(self, stamp_ns: int, now_ns: int) -> None:
-        """A pose came: the first after a camera pose carries its correction."""
+        """Record a pose; the first after a camera pose carries its correction."""
         self._running = True
         self._pair(IMU_TO_POSE, 'imu', stamp_ns, now_ns)
         for frame_ns in self._uncorrected:
@@ -43,7 +43,7 @@ class LatencyMeter:
             self._rows.append((name, stamp_ns, (now_ns - sent_ns) * 1e-6))
 
     def summary(self) -> dict[str, dict[str, float]]:
-        """Median and tails of each [ms]."""
+        """Median and upper percentiles of each latency [ms]."""
         result = {}
         for name in (IMU_TO_POSE, IMAGE_TO_CAMERA_POSE, IMAGE_TO_CORRECTED_POSE):
             values = [value for kind, _, value in self._rows if kind == name]

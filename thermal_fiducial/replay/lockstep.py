@@ -1,8 +1,8 @@
 """Lock-step: the real nodes in one process, over real DDS, deterministic, as fast as they go.
 
-After each message of the bag the executor runs until everything that was published has been received: each
-subscription's count equals the count of the publishers on its topic. So no queue ever holds more than one step, nothing
-is lost or reordered, and time does not matter.
+After each message of the bag the executor runs until every published message has been received: each subscription's
+count equals that of the publishers on its topic. So no queue ever holds more than one step, nothing is lost or
+reordered, and the result does not depend on timing.
 """
 
 from collections import Counter
@@ -34,7 +34,7 @@ _KINDS: dict[str, type[StageNode[Any]]] = {
     'marker_mapper': MarkerMapperNode,
     'pose_ekf': PoseEkfNode,
 }
-#: Longest sleep of the executor [s]: inputs that nodes poll (``take_waiting``) do not wake it.
+#: Longest sleep of the executor [s]: lazy subscriptions (``take_waiting``) do not wake it.
 _POLL_S = 0.002
 
 
@@ -53,22 +53,22 @@ def replay_lockstep(
     Parameters
     ----------
     bag : the bag, open
-    nodes : names of those that run
+    nodes : names of the nodes to run
     played : topics to play
-    files : what takes the published messages
-    recorded : the topics that it takes
+    files : sink of the published messages
+    recorded : the topics to record
     ros_arguments : for the nodes, after ``--ros-args``
     progress : called with the bag's time [ns since its start]
-    warn : takes a line about what is waited for, where nothing has happened for long
+    warn : called with a message on a long wait without progress
 
     Returns
     -------
-    Nothing to add to the summary: there is no time in lock-step.
+    An empty dictionary: a lock-step replay has no timing for the summary.
 
     Raises
     ------
     InputError
-        A parameter that a node refuses, something configured that it cannot use, or a damaged bag.
+        A parameter that a node refuses, a fault of the configuration, or a damaged bag.
     """
     context = Context()
     with own_domain() as domain:
@@ -104,7 +104,7 @@ class _Graph:
             self._executor.add_node(node)
 
     def play(self, bag: Playable, played: Sequence[str], files: Sink, progress: Callable[[int], None]) -> None:
-        """Play it all, with diagnostics once a second of the bag's time."""
+        """Play the bag, with diagnostics once a second of the bag's time."""
         faults = [fault for stage in self._stages for fault in stage.faults]
         if faults:
             raise InputError('; '.join(faults))
@@ -122,7 +122,7 @@ class _Graph:
             outputs[message.topic].send(message.cdr)
             self._settle(message.stamp_ns, files)
             last_ns = message.stamp_ns
-        # Not a second later: rates would count the time after the end.
+        # At the last message, not a full second later: rates would include the time after the end.
         self._diagnose(max(last_ns, next_diagnosis - SECOND_NS + 1), files)
 
     def _diagnose(self, time_ns: int, files: Sink) -> None:
@@ -134,7 +134,7 @@ class _Graph:
         self._arrived.append((topic, data))
 
     def _connect(self) -> None:
-        """Pair the topics' two ends, and wait until DDS has done so too, at both of them."""
+        """Pair publishers and subscriptions, and wait until DDS has matched them at both ends."""
         self._inputs = [source for node in self._nodes for source in node.inputs]
         outputs = [output for node in self._nodes for output in node.outputs]
         readers = [(output, sum(source.topic == output.topic for source in self._inputs)) for output in outputs]
@@ -144,7 +144,7 @@ class _Graph:
         self._heard = [(output, count) for output, count in readers if count]
 
     def _settle(self, time_ns: int, files: Sink) -> None:
-        """Run callbacks until nothing is under way; hand what was recorded on in a fixed order of topics."""
+        """Run callbacks until no message is in transit; pass recorded ones to ``files`` in a fixed order of topics."""
         self._wait(self._under_way)
         self._arrived.sort(key=lambda entry: self._order[entry[0]])
         for topic, data in self._arrived:
@@ -152,7 +152,7 @@ class _Graph:
         self._arrived.clear()
 
     def _under_way(self) -> list[str]:
-        """Topics with messages under way; as no topic can receive more than was sent, sums that are equal say none."""
+        """Topics with messages in transit; none if the sums are equal, as no topic receives more than was sent."""
         sent = sum([output.count * readers for output, readers in self._heard])
         if sent == sum([source.count for source in self._inputs]):
             return []
@@ -164,7 +164,7 @@ class _Graph:
         return [topic for topic, count in left.items() if count]
 
     def _wait(self, missing: Callable[[], list[str]]) -> None:
-        """Run callbacks until nothing is ``missing``, however long one of them takes."""
+        """Run callbacks until ``missing`` returns nothing, however long one callback takes."""
         wait = Wait(lambda: f'messages on {", ".join(missing())}', self._warn)
         while missing():
             self._executor.spin_once(timeout_sec=_POLL_S)
@@ -173,7 +173,7 @@ class _Graph:
             wait.go_on(sum([source.count for source in self._inputs]))
 
     def close(self) -> None:
-        """Have the nodes finish (the map is saved) and destroy them, all of them also where one cannot finish."""
+        """Close the nodes (which saves the map) and destroy all of them, even if one fails to close."""
         with ExitStack() as ending:
             for node in reversed(self._nodes):
                 ending.callback(node.destroy_node)
@@ -183,7 +183,7 @@ class _Graph:
 
 
 def _check(message: BagMessage) -> None:
-    """Raise for bytes that are no message: DDS would drop them silently."""
+    """Raise InputError for a malformed message, which DDS would drop silently."""
     try:
         deserialize_message(message.cdr, PLAYED[message.topic][0])
     except Exception:  # rclpy's own error class is private

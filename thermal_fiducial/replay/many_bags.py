@@ -1,7 +1,7 @@
-"""Many bags, one map: a replay of each bag on workers of Dask distributed, then one joint adjustment of all markers.
+"""Many bags, one map: a replay of each bag on Dask distributed workers, then one bundle adjustment of all markers.
 
-A replay is a function of its bag alone, so that it may run anywhere and again: a worker that dies costs the time of
-its bag. Run folders appear whole or not at all.
+A replay depends on its bag alone, so it may run on any worker and be repeated: a worker's death costs only the time
+of its bag. Run folders appear atomically.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -30,10 +30,10 @@ from thermal_fiducial.replay.session import MAP_FILE, Options, replay
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.ros import clouds, convert
 
-#: Written last; one of an earlier batch goes before the first replay.
+#: Written last; that of an earlier batch is deleted before the first replay.
 SUMMARY_FILE = 'batch.json'
-#: Of a cluster on this machine: workers that one bag may outlive, as whatever ends more of them is in the bag; and a
-#: worker that the machine starves is not given up, as its end shows in its connection.
+#: Settings of a local cluster: how many workers may die with a bag before the bag is to blame; and no timeout of a
+#: starved worker, since a dead one shows by its connection.
 _PATIENT = {
     'distributed.scheduler.allowed-failures': 10,
     'distributed.scheduler.worker-ttl': None,
@@ -43,14 +43,14 @@ _PATIENT = {
 
 @dataclass(frozen=True)
 class Batch:
-    """What to replay and where to.
+    """Bags to replay, and the output folder.
 
     Parameters
     ----------
     bags : one run each
     out : folder of the runs, of the joint map and of ``batch.json``
-    options : of each replay, but for bag and run folder
-    max_frames : of all bags together, evenly chosen, for the joint adjustment
+    options : of each replay, except bag and run folder
+    max_frames : most frames, evenly chosen from all bags, for the bundle adjustment
     """
 
     bags: tuple[Path, ...]
@@ -64,7 +64,7 @@ class Batch:
         Raises
         ------
         InputError
-            Two bags of one name: their runs would share a folder.
+            Two bags of the same name, whose runs would share a folder.
         """
         names = [bag.resolve().stem for bag in self.bags]
         doubles = sorted({name for name in names if names.count(name) > 1})
@@ -76,7 +76,7 @@ class Batch:
         ]
 
     def check(self) -> None:
-        """Raise InputError for what no replay could begin with, before workers are started for it."""
+        """Raise InputError for unusable input before any workers are started."""
         self.runs()
         missing = [str(bag) for bag in self.bags if not bag.exists()]
         if missing:
@@ -116,25 +116,25 @@ def workers(count: int, scheduler: str = '') -> Iterator[Any]:
 def run_batch(
     batch: Batch, client: Any, progress: Callable[[float], None], warn: Callable[[str], None]
 ) -> dict[str, Any]:
-    """Replay all bags on the workers of ``client``, then adjust one map to the markers of all.
+    """Replay all bags on the workers of ``client``, then adjust one map to all detections.
 
     Parameters
     ----------
-    batch : bags and options; the workers must find the paths
+    batch : bags and options; the paths must be valid on the workers
     client : of Dask distributed
     progress : called with the share done, 0 to 1
-    warn : takes lines about what is suspicious
+    warn : called with warnings
 
     Returns
     -------
-    Content of ``batch.json``; nothing in it depends on the number of workers.
+    Content of ``batch.json``, independent of the number of workers.
 
     Raises
     ------
     InputError
-        A bag, a map or a parameter that cannot be used; the other bags have their runs nevertheless.
+        An unusable bag, map or parameter; the other bags are replayed nevertheless.
     RunError
-        A bag that worker after worker dies of.
+        Repeated deaths of workers on the same bag.
     """
     runs = batch.runs()
     settings = read_settings(batch.options.params, {})
@@ -176,7 +176,7 @@ def _replay_all(
             warnings[name] = future.result()
         progress(done / len(runs))
     for run in runs:
-        # What a worker that died had begun.
+        # Unfinished folders of a worker that died.
         for unfinished in run.run.parent.glob(f'.{run.run.name}-*'):
             shutil.rmtree(unfinished, ignore_errors=True)
         for line in warnings.get(run.run.name, []):
@@ -189,7 +189,7 @@ def _replay_all(
 
 
 def _as_error(run: Options, failure: BaseException) -> Exception:
-    """What became of a bag, as one line that names it once."""
+    """The failure of a bag as an error of one line that names the bag once."""
     if isinstance(failure, InputError):
         words = str(failure)
         return failure if words.startswith(str(run.bag)) else InputError(f'{run.run.name}: {words}')
@@ -198,7 +198,7 @@ def _as_error(run: Options, failure: BaseException) -> Exception:
 
 
 def replay_whole(options: Options) -> list[str]:
-    """A replay whose run folder is there whole or not at all, in the place of an earlier one; its warnings."""
+    """Replay into a run folder that replaces an earlier one atomically; returns the warnings."""
     warnings: list[str] = []
     with into(options.run):
         options.run.parent.mkdir(parents=True, exist_ok=True)
@@ -236,7 +236,7 @@ def _camera(run: Options, settings: Settings) -> Camera:
 
 
 def _frames(run: Options, most: int) -> list[Markers]:
-    """Rows of the frames with markers, evenly chosen."""
+    """Detections of at most ``most`` frames with markers, evenly chosen."""
     with BagReader(run.run / 'output') as output:
         messages = [deserialize_message(item.cdr, PointCloud2) for item in output.messages([MARKERS_TOPIC])]
     messages = [message for message in messages if message.width]

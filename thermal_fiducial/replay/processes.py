@@ -1,4 +1,4 @@
-"""One process a node, in real time: what the robot would see, with latencies and processor load measured."""
+"""One process a node, in real time as on the robot; measures latencies and processor load."""
 
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -27,15 +27,15 @@ from thermal_fiducial.ros.counting import CountingNode
 from thermal_fiducial.ros.promptness import prompt
 from thermal_fiducial.ros.run import initialise, make_executor
 
-#: After both ends of each topic are known to the graph, the nodes still need a moment to match among themselves.
+#: Time for the nodes to match among themselves after both ends of each topic are in the graph [s].
 _MATCHING_S = 0.7
-#: The replay is over when nothing has come for so long in which no node worked, looked at every so often.
+#: The replay ends after this time without messages while all nodes are idle; polling period of that check [s].
 _SILENCE_S, _GLANCE_S = 1.5, 0.05
-#: With less time than this to the next message, nothing is written to disk before it.
+#: Least time to the next message in which recorded messages are written to disk [ns].
 _SPARE_NS = 2_000_000
-#: What measures must not wait for what is measured: priority of the player, where the user may.
+#: SCHED_FIFO priority of the player, if the user may set one: the nodes must not delay its measurements.
 _PRIORITY = 5
-#: Messages read ahead; a piece of a bag takes 25 ms to read.
+#: Number of messages read ahead; reading a chunk of a bag takes 25 ms.
 _AHEAD = 60
 _KINDS = {IMAGE_TOPIC: 'image', COMPRESSED_TOPIC: 'image', IMU_TOPIC: 'imu'}
 
@@ -54,11 +54,11 @@ def replay_processes(
 ) -> dict[str, Any]:
     """Play topics ``played`` of ``bag`` at ``rate`` times real time; otherwise as in lock-step.
 
-    ``say`` gets a line on where the nodes can be listened to.
+    ``say`` is called with a line on the DDS domain of the nodes.
 
     Returns
     -------
-    ``latency_ms`` and ``cpu_percent`` for the summary, and how late the player was at worst.
+    ``latency_ms`` and ``cpu_percent`` for the summary, and the player's largest delay.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def replay_processes(
 
 
 class _Player:
-    """Publishes the bag on time, and between its messages takes what the nodes publish."""
+    """Publishes the bag on time, and between its messages receives the nodes' outputs."""
 
     def __init__(self, context: Context, played: Sequence[str], files: Sink, recorded: Topics) -> None:
         quiet: dict[str, Any] = {
@@ -108,7 +108,7 @@ class _Player:
         self._executor.add_node(self._recorder)
 
     def connect(self, processes: NodeProcesses, nodes: Sequence[str], warn: Callable[[str], None]) -> None:
-        """Wait until the nodes are there."""
+        """Wait until the nodes are connected."""
         # camera_info is read by the detector and by the mapper.
         readers = {CAMERA_INFO_TOPIC: len({'aruco_detector', 'marker_mapper'} & set(nodes))}
         wait = Wait(lambda: f'the nodes at {", ".join(missing)}', warn)
@@ -153,7 +153,7 @@ class _Player:
         }
 
     def _drain(self, nodes: NodeProcesses) -> None:
-        """Take what still comes, until all is silent and no node has work: on a slow machine that may be long."""
+        """Receive the remaining outputs until all topics are silent and all nodes idle; slow machines may take long."""
         heard, idle = -1, 0
         while idle * _GLANCE_S < _SILENCE_S:
             nodes.check()
@@ -165,7 +165,7 @@ class _Player:
             self._file_one()
 
     def _results(self) -> list[Any]:
-        """Inputs that fall silent when the bag ends, as diagnostics don't."""
+        """Recorded topics that fall silent after the bag's end, so without diagnostics."""
         return [source for source in self._recorder.inputs if source.topic != '/diagnostics']
 
     def _take(self, topic: str, data: bytes) -> None:
@@ -190,14 +190,14 @@ class _Player:
         self._files.add(topic, self._bag_start_ns + elapsed, data)
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Destroy the player's nodes."""
         self._executor.shutdown()
         self._player.destroy_node()
         self._recorder.destroy_node()
 
 
 def _read_ahead(messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
-    """``messages``, read by another thread some way ahead."""
+    """``messages``, read ahead by another thread."""
     with ThreadPoolExecutor(1) as reader:
         ahead = deque(reader.submit(next, messages, None) for _ in range(_AHEAD))
         while (message := ahead.popleft().result()) is not None:

@@ -1,4 +1,4 @@
-"""What the nodes publish, gathered into a run folder while it comes."""
+"""Records the nodes' outputs into a run folder as they arrive."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -29,7 +29,7 @@ _TABLES = ('fused.tum', 'fiducial.tum', 'detections.csv')
 
 
 class Sink(Protocol):
-    """What takes the messages that nodes publish."""
+    """Receiver of the nodes' outputs."""
 
     folder: Path
 
@@ -38,19 +38,19 @@ class Sink(Protocol):
 
 
 def refuse_folder_in_use(folder: Path) -> None:
-    """Raise InputError if a replay is writing into a run folder: two would mix their lines."""
+    """Raise InputError if another replay is writing into a run folder; both would mix their lines."""
     if is_claimed(unfinished(folder / _TABLES[0])):
         raise InputError(f'{folder}: another replay is writing there')
 
 
 class RunFiles:
-    """The files of a run folder that grow with the messages; a context manager. What is left early is removed.
+    """Files of a run folder that grow with the messages; a context manager that removes them on an exception.
 
-    Tables have a name of their own until they are whole: a replay that is killed leaves none that looks whole.
+    Tables have temporary names until they are complete, so that a killed replay leaves none that looks complete.
 
     Parameters
     ----------
-    folder : the run folder; what an earlier run left there under these names is replaced
+    folder : the run folder; files of an earlier run are replaced
     T_body_camera : (4, 4) extrinsics, to turn camera poses into body poses
     topics : topics of ``output`` with their types
     """
@@ -61,7 +61,7 @@ class RunFiles:
         self.counts: Counter[str] = Counter()
         self.frames_with_markers = 0
         self.warnings: Counter[str] = Counter()
-        #: node to what it said last and was not well then
+        #: node to its last diagnostic message, if that was not OK
         self.complaints: dict[str, str] = {}
         self._last_figures: dict[str, dict[str, str]] = {}
         shutil.rmtree(folder / 'output', ignore_errors=True)
@@ -100,7 +100,7 @@ class RunFiles:
             _sort_by_stamp(unfinished(self.folder / 'fiducial.tum'))
 
     def _put_in_place(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Half a run looks like a whole one."""
+        """Give the tables their final names; after an exception remove them, as half a run looks like a whole one."""
         for path in (self.folder / name for name in _TABLES):
             if kind is None:
                 unfinished(path).replace(path)
@@ -147,7 +147,7 @@ class RunFiles:
 
 
 class Recorder(CountingNode):
-    """Subscribes to what the nodes publish and hands it on as (topic, bytes)."""
+    """Subscribes to the nodes' outputs and passes them on as (topic, bytes)."""
 
     def __init__(self, take: Callable[[str, bytes], None], topics: Topics, **kwargs: Any) -> None:
         super().__init__('recorder', **kwargs)
@@ -161,7 +161,7 @@ def extrinsics(config: Any) -> FloatArray:
 
 
 def _sort_by_stamp(path: Path) -> None:
-    """Put the lines of late frames where they belong: a trajectory's stamps increase."""
+    """Sort the lines of late frames in, since a trajectory's stamps must increase."""
     lines = path.read_text(encoding='utf-8').splitlines(keepends=True)
     write_text(path, ''.join(sorted(lines, key=lambda line: Decimal(line.split(maxsplit=1)[0]))))
 

@@ -1,4 +1,4 @@
-"""A replay from start to end: check what is given, play, leave the run folder of the contract."""
+"""A replay from start to end: validate the inputs, play, write the run folder."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -27,7 +27,7 @@ MAP_FILE, SUMMARY_FILE = 'marker_map.yaml', 'summary.json'
 
 @dataclass(frozen=True)
 class Options:
-    """What to replay and how."""
+    """Options of a replay."""
 
     bag: Path
     run: Path
@@ -37,7 +37,7 @@ class Options:
     transport: str = 'lockstep'
     rate: float = 1.0
     images: bool = False
-    #: a key of ENTRIES: where the bag enters the chain; empty: as early as it can
+    #: a key of ENTRIES: stage at which the bag enters; empty: the earliest possible
     entry: str = ''
     remaps: Mapping[str, str] = field(default_factory=dict)
 
@@ -48,14 +48,14 @@ def replay(
     warn: Callable[[str], None],
     say: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Play a bag through the nodes that its topics are for and write the run folder, all but the report.
+    """Play a bag through the nodes that its topics require, and write the run folder except the report.
 
     Parameters
     ----------
-    options : what and how
+    options : bag, run folder and settings
     progress : called with the share done, 0 to 1
-    warn : called with a line about what is suspicious but can be used
-    say : called with a line about what a user may want to know
+    warn : called with warnings
+    say : called with information for the user
 
     Returns
     -------
@@ -64,8 +64,8 @@ def replay(
     Raises
     ------
     InputError
-        An unusable bag, parameter or file, or a run folder that cannot be written to; the message says which and why.
-        What was written until then is removed, but for parameters and map.
+        An unusable bag, parameter or file, or a run folder that cannot be written to. Files written until then are
+        removed, except parameters and map.
     """
     settings = _settings(options)
     for line in settings.warnings:
@@ -114,7 +114,7 @@ def _settings(options: Options) -> Settings:
 
 
 def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[[str], None]) -> list[str]:
-    """Make the run folder, with parameters and a map of its own: the nodes never write to the user's."""
+    """Create the run folder with copies of parameters and map, since the nodes never write to the user's files."""
     refuse_folder_in_use(options.run)
     try:
         options.run.mkdir(parents=True, exist_ok=True)
@@ -124,7 +124,7 @@ def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[
     except OSError as error:
         raise InputError(f'run folder {options.run}: {error.strerror}') from None
     run_map, given = options.run / MAP_FILE, settings.marker_mapper.map_file
-    # One recording after the other is no flight that goes on.
+    # No restart in flight: successive recordings are separate flights.
     arguments = ['--params-file', str(options.run / 'parameters.yaml'), '-p', 'resume:=false']
     if not given:
         run_map.unlink(missing_ok=True)
@@ -138,7 +138,7 @@ def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[
 
 
 def _final_map(path: Path, config: MarkerMapperConfig) -> MarkerMap:
-    """The map at the end, whole in its file: also one that no node saved, and with the sizes that it left out."""
+    """The final map; writes its file if no node has saved it, and completes marker sizes that the file leaves out."""
     if not path.exists():
         marker_map = MarkerMap(frame_id=config.map_frame, dictionary=config.dictionary)
     else:
@@ -150,12 +150,12 @@ def _final_map(path: Path, config: MarkerMapperConfig) -> MarkerMap:
 
 
 def _report_refusals(files: RunFiles, entry: Entry, warn: Callable[[str], None]) -> None:
-    """Say which nodes refused messages.
+    """Warn of nodes that refused messages.
 
     Raises
     ------
     InputError
-        Not one of the images (or what stands for them), of the calibrations or of the IMU messages could be used.
+        All images (or the inputs in their place), all calibrations or all IMU messages were refused.
     """
     needed = {'aruco_detector': ['thermal/image'], entry.nodes[0]: [entry.topic], 'pose_ekf': [IMU_TOPIC]}
     for node in entry.nodes:
@@ -163,7 +163,7 @@ def _report_refusals(files: RunFiles, entry: Entry, warn: Callable[[str], None])
         refused, reason = int(figures.get('refused messages', 0)), figures.get('last refusal', '')
         if figures.get('calibrations') == '0':
             raise InputError(f'not one message on {CAMERA_INFO_TOPIC} holds a usable calibration')
-        # An error of the node itself says nothing of the input.
+        # An internal error of the node is not a fault of the input.
         for topic in [] if reason.startswith(INTERNAL_ERROR) else needed.get(node, []):
             if refused and refused >= int(figures[f'received /{topic}']):
                 raise InputError(f'not one message on {topic} could be used: {reason}')
@@ -172,7 +172,7 @@ def _report_refusals(files: RunFiles, entry: Entry, warn: Callable[[str], None])
 
 
 def _summary(options: Options, settings: Settings, bag: BagReader, files: RunFiles) -> dict[str, Any]:
-    """What can be said in numbers without a truth; nothing in it depends on the time that the replay took."""
+    """Figures that need no ground truth, independent of the replay's speed."""
     return {
         'format': 'thermal_fiducial/run',
         'version': 1,

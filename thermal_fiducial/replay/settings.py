@@ -30,17 +30,17 @@ from thermal_fiducial.files.writing import write_text
 
 @dataclass(frozen=True)
 class Settings:
-    """What the four nodes are started with, complete and checked."""
+    """Complete and validated parameters of the four nodes."""
 
     tau2_camera: Tau2CameraConfig
     aruco_detector: ArucoDetectorConfig
     marker_mapper: MarkerMapperConfig
     pose_ekf: PoseEkfConfig
-    #: what is suspicious but can be used, in words
+    #: warnings about usable but suspicious values
     warnings: tuple[str, ...] = ()
 
     def write(self, path: Path) -> None:
-        """Write all parameters as a ROS parameter file. Raises InputError where it cannot be written."""
+        """Write all parameters as a ROS parameter file. Raises InputError if the file cannot be written."""
         document = {
             f'/{node}': {'ros__parameters': {name: _plain(value) for name, _, value in parameters(getattr(self, node))}}
             for node in NODES
@@ -54,8 +54,8 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any]) -> Settings
     Raises
     ------
     InputError
-        An unreadable file, a parameter that no node has, a value of the wrong type or out of range, or a file named in
-        a parameter that cannot be used.
+        An unreadable file, a parameter that no node has, a value of the wrong type or out of range, or an unusable file
+        named by a parameter.
     """
     document = {} if params is None else _document(params)
     configs: dict[str, Any] = {}
@@ -76,7 +76,7 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> PipelineCon
     Parameters
     ----------
     path : ROS parameter file; None: the defaults
-    overrides : name to value, before those of the file
+    overrides : name to value, which override the file
 
     Raises
     ------
@@ -88,7 +88,7 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> PipelineCon
 
 
 def _check_files(settings: Settings) -> list[str]:
-    """Raise what a node would report as a fault, return what it would warn of."""
+    """Validate files named by parameters: raises what a node would report as a fault, returns its warnings."""
     camera, mapper = settings.tau2_camera, settings.marker_mapper
     dictionary = load_dictionary(settings.aruco_detector.dictionary)
     sizes = size_overrides(mapper.marker_size_overrides)
@@ -131,7 +131,7 @@ def _values_for(node: str, document: Mapping[str, Mapping[str, Any]]) -> dict[st
     values: dict[str, Any] = {}
     second = {str(section['second_camera']) for section in document.values() if section.get('second_camera')}
     for pattern, section in document.items():
-        # What is in the namespace of the second camera is not for the nodes of the first.
+        # Entries in the second camera's namespace do not apply to the nodes of the first.
         if second & set(pattern.split('/')[:-1]):
             continue
         if pattern.rsplit('/', 1)[-1] in ('**', '*', node):

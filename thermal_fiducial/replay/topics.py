@@ -1,4 +1,4 @@
-"""What a replay plays and what it records: topic to message type and quality of service, by where the bag begins."""
+"""Played and recorded topics with message types and QoS, by the stage at which the bag enters."""
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ Topics: TypeAlias = dict[str, tuple[type, Any]]
 
 
 class Playable(Protocol):
-    """What can be played: a bag, or what passes for one."""
+    """A source of messages with the interface of a bag."""
 
     @property
     def start_ns(self) -> int:
@@ -68,14 +68,14 @@ _IMAGES: Topics = {'thermal/image': (Image, qos.IMAGE_OUTPUT)}
 
 @dataclass(frozen=True)
 class Entry:
-    """Where a bag enters the chain of nodes.
+    """Stage at which a bag enters the chain of nodes.
 
     Parameters
     ----------
-    topic : what its first node reads
-    skipped : nodes that the bag stands in for
-    needs_calibration : whether some node that runs reads ``thermal/camera_info``
-    also : topics that are played where the bag has them
+    topic : main input of the first node
+    skipped : number of nodes whose outputs the bag provides
+    needs_calibration : whether a running node subscribes to ``thermal/camera_info``
+    also : optional topics, played if the bag has them
     """
 
     topic: str
@@ -85,11 +85,11 @@ class Entry:
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """The nodes that run, in their order."""
+        """The nodes to run, in order of the stages."""
         return tuple(NODES)[self.skipped :]
 
     def played(self, *, calibration_from_file: bool) -> dict[str, str]:
-        """Topic to message type of what a bag must have."""
+        """Required topics of the bag, with message types."""
         topics = [self.topic, IMU_TOPIC]
         # Only the first node publishes a calibration from a file.
         if self.needs_calibration and not (calibration_from_file and self.skipped == 0):
@@ -97,14 +97,14 @@ class Entry:
         return {topic: type_name(PLAYED[topic][0]) for topic in topics}
 
     def recorded(self, *, calibration_from_file: bool, images: bool) -> Topics:
-        """What the nodes publish, and what the bag has in their place; images only on request, as they are large."""
+        """Topics to record: outputs of the nodes, or the bag's in their place; images only on request."""
         topics = {name: entry for node in self.nodes for name, entry in _RESULTS[node].items()}
         if self.skipped:
             return {self.topic: PLAYED[self.topic]} | topics | _DIAGNOSTICS
         return topics | _DIAGNOSTICS | (_CALIBRATION if calibration_from_file else {}) | (_IMAGES if images else {})
 
 
-#: By name, the earliest first.
+#: Entries by name, the earliest stage first.
 ENTRIES = {
     'images': Entry(IMAGE_TOPIC, 0),
     'compressed': Entry(COMPRESSED_TOPIC, 0),
@@ -114,10 +114,10 @@ ENTRIES = {
 
 
 def entry_of(topics: Collection[str]) -> Entry:
-    """The earliest entry that a bag with ``topics`` has; images where it has none, for what is missing to be named."""
+    """The earliest entry for a bag with ``topics``; if there is none, that of images, for the error message."""
     return next((entry for entry in ENTRIES.values() if entry.topic in topics), ENTRIES['images'])
 
 
 def type_name(kind: Any) -> str:
-    """E.g. ``sensor_msgs/msg/Image`` of a message class."""
+    """ROS name of a message class, e.g. ``sensor_msgs/msg/Image``."""
     return f'{kind.__module__.split(".")[0]}/msg/{kind.__name__}'

@@ -1,9 +1,9 @@
-"""Waits of a replay: as long as it takes, however slow the machine. What is waited for is said; nothing is ended."""
+"""Waits of a replay without a timeout, for slow machines; long waits are reported."""
 
 from collections.abc import Callable
 import time
 
-#: Without progress for so long, what is waited for is said.
+#: Time without progress after which a wait is reported [s].
 PATIENCE_S = 30.0
 
 
@@ -12,9 +12,9 @@ class Wait:
 
     Parameters
     ----------
-    what : says what is waited for, in words
-    say : takes a line for the user
-    now : seconds of a monotonic clock
+    what : describes what is awaited
+    say : called with a message for the user
+    now : returns seconds of a monotonic clock
     """
 
     def __init__(
@@ -26,11 +26,11 @@ class Wait:
         self._progress: object = None
 
     def go_on(self, progress: object) -> None:
-        """Wait on; ``progress`` is anything that changes when something happens."""
+        """Report a wait without progress; ``progress`` is any value that changes with progress."""
         now = self._now()
         if progress != self._progress:
             self._progress, self._since, self._patience = progress, now, PATIENCE_S
         elif now - self._since >= self._patience:
             self._say(f'nothing for {now - self._since:.0f} s, waiting for {self._what()}')
-            # Said again after twice the time, and so on: a night's wait is ten lines.
+            # The interval doubles with each report: a night's wait gives ten lines.
             self._patience *= 2.0
