@@ -1,1 +1,1 @@
-"""Reports: measures of a run, pictures, one HTML page; and what a flight controller would receive."""
+"""Reports: measures of a run, pictures, one HTML page; and checks of the outputs for a flight controller."""

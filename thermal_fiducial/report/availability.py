@@ -1,8 +1,8 @@
-"""What a controller has: the errors of the newest pose at each instant, fused and from the markers alone.
+"""Errors as seen by a controller: of the newest available pose at each instant, fused and from the markers alone.
 
-Poses from markers come at the camera's rate and late; fused ones at the IMU's rate and nearly at once. Compared at the
-instants of frames alone, markers look better than a controller would find them. Here, the newest pose that had come
-counts at each instant until the next one comes, as it is, for both alike.
+Poses from markers arrive at the camera's rate and late, fused ones at the IMU's rate with little delay. A comparison
+at the stamps of frames only would flatter the markers. Here each pose is held from its arrival to that of the next one,
+for both kinds.
 """
 
 from dataclasses import dataclass
@@ -18,21 +18,21 @@ from thermal_fiducial.report.output_bag import Arrivals
 from thermal_fiducial.report.run_folder import Run
 from thermal_fiducial.report.trajectory import Trajectory
 
-#: Instants are this far apart [ns], so that they fall in no step with poses, and no more than so many.
+#: Interval of the instants [ns], incommensurate with the rates of the poses; largest number of instants.
 STEP_NS = 1_730_000
 MOST_INSTANTS = 200_000
-#: Stamps and arrivals of one clock differ by no more than this [ns].
+#: Largest difference of stamp and arrival on one clock [ns].
 _ONE_CLOCK_NS = 500_000_000
 
 
 @dataclass(frozen=True)
 class Available:
-    """Errors at instants (N,) [ns] of the newest pose that had come: (N, 2) position [m] and attitude [rad]."""
+    """Errors of the newest available pose at instants (N,) [ns]: (N, 2) position [m] and attitude [rad]."""
 
     instants_ns: IntArray
     fused: FloatArray
     markers: FloatArray
-    #: (N,) the newest pose from markers is not older than an interruption is long
+    #: (N,) whether the newest pose from markers is younger than the shortest interruption
     in_view: BoolArray
     #: median age of the newest pose [ms]
     fused_age_ms: float
@@ -65,7 +65,7 @@ def spread(errors: FloatArray) -> dict[str, float]:
 
 
 def available(run: Run) -> Available | None:
-    """Errors as a controller would have had them; None without truth or without the times of arrival."""
+    """Errors as seen by a controller; None without truth or arrival times."""
     fused, markers = run.output.fused_arrivals, run.output.camera_arrivals
     if run.truth is None or not (len(fused.stamps_ns) and len(markers.stamps_ns)):
         return None
@@ -92,7 +92,7 @@ def available(run: Run) -> Available | None:
 
 
 def at_frames(run: Run) -> dict[str, dict[str, float]] | None:
-    """Errors at the instants of the frames that gave a pose, of both; None without truth."""
+    """Errors of both kinds of poses at the stamps of frames with a pose; None without truth."""
     if run.truth is None or not (len(run.fused) and len(run.fiducial)):
         return None
     stamps = run.fiducial.stamps_ns
@@ -108,13 +108,13 @@ def at_frames(run: Run) -> dict[str, dict[str, float]] | None:
 
 
 def _clock_shift_ns(fused: Arrivals) -> int:
-    """What to take off times of arrival that are of another clock than the stamps; 0 when they are of the same."""
+    """Offset to subtract from arrival times if their clock differs from that of the stamps; else 0."""
     least = int(np.min(fused.times_ns - fused.stamps_ns))
     return least if not 0 <= least < _ONE_CLOCK_NS else 0
 
 
 def _times_of(trajectory: Trajectory, arrivals: Arrivals, shift_ns: int) -> IntArray:
-    """When each pose of a trajectory had come, and no sooner than those before it; empty where that is unknown."""
+    """Arrival time of each pose, made non-decreasing; empty if unknown."""
     at = np.searchsorted(arrivals.stamps_ns, trajectory.stamps_ns)
     at = np.clip(at, 0, len(arrivals.stamps_ns) - 1)
     if np.mean(arrivals.stamps_ns[at] == trajectory.stamps_ns) < 0.99:
@@ -125,7 +125,7 @@ def _times_of(trajectory: Trajectory, arrivals: Arrivals, shift_ns: int) -> IntA
 def _held(
     trajectory: Trajectory, times_ns: IntArray, instants_ns: IntArray, T_true: FloatArray
 ) -> tuple[FloatArray, IntArray]:
-    """Errors (N, 2) of the newest pose at each instant, and how old it is (N,) [ns]."""
+    """Errors (N, 2) of the newest pose at each instant, and its age (N,) [ns]."""
     newest = np.maximum(np.searchsorted(times_ns, instants_ns, side='right') - 1, 0)
     age = instants_ns - trajectory.stamps_ns[newest]
     return _errors(trajectory.T_map_body[newest], T_true), age

@@ -1,6 +1,6 @@
-"""Whether a flight controller could fly on what it would get, and what it would do with it, in words.
+"""Checks whether a flight controller could fly on the outputs for it, and how it would react to faults.
 
-Limits are those of mavros, PX4's EKF2 and ArduPilot's EKF3 as their sources and documentation state them.
+Limits are from the sources and documentation of mavros, PX4's EKF2 and ArduPilot's EKF3.
 """
 
 from collections.abc import Callable
@@ -14,27 +14,27 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, SECOND_NS
 from thermal_fiducial.report.bridge_record import BridgeRecord
 
 GRAVITY = 9.81
-#: PX4 wants 30 to 50 Hz, starts only below 0.2 s between messages and stops after 0.4 s; ArduPilot wants 4 Hz.
+#: PX4 needs 30 to 50 Hz, starts with intervals below 0.2 s and stops after 0.4 s; ArduPilot needs 4 Hz.
 PX4_RATE, PX4_START, PX4_STOP, ARDUPILOT_RATE, TELEMETRY_RATE = 30.0, 0.2, 0.4, 4.0, 100.0
 #: ArduPilot's largest VISO_DELAY_MS [s].
 ARDUPILOT_DELAY = 0.25
-#: Lower bounds that the autopilots put under a position's standard deviation [m].
+#: The autopilots' lower bounds of the position's standard deviation [m].
 PX4_FLOOR, ARDUPILOT_FLOOR = 0.1, 0.2
-#: A standard deviation below this [m, rad] is a made-up one; PX4 has diverged on it.
+#: Standard deviations below this [m, rad] are placeholders; PX4 has diverged on them.
 MADE_UP = 1e-5
-#: Turning about the vertical that a yaw check needs [rad/s], and moving that a velocity check needs [m/s].
+#: Least yaw rate for the yaw check [rad/s], least speed for the velocity check [m/s].
 TURN, MOVE = 0.15, 0.2
-#: ... which is seen over so long [s].
+#: Interval of the velocity check [s].
 MOVE_SECONDS = 0.5
-#: At rest: rate [rad/s] and speed [m/s] below this, and specific force this near to gravity [m/s^2], for so long [ns]:
-#: where a flight turns back a drone is as slow for an instant, while it accelerates most.
+#: At rest: limits of turn rate [rad/s], speed [m/s] and specific force minus gravity [m/s^2], for at least so long
+#: [ns], since a drone that reverses is slow for an instant too, at its largest acceleration.
 STILL_RATE, STILL_SPEED, STILL_FORCE, STILL_NS = 0.05, 0.05, 0.5, 500_000_000
-#: Farthest that gravity may be off the map's vertical [rad].
+#: Largest tilt of the map's vertical against gravity [rad].
 LARGEST_TILT = np.radians(5.0)
 
 
 class Level(Enum):
-    """How bad a finding is."""
+    """Severity of a finding."""
 
     OK = 'ok'
     UNTESTED = 'not tested'
@@ -44,7 +44,7 @@ class Level(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check: what was seen, and what an autopilot does with it."""
+    """Result of one check: the observation, and the autopilot's reaction."""
 
     check: str
     level: Level
@@ -53,7 +53,7 @@ class Finding:
 
 
 def check_bridge(record: BridgeRecord) -> list[Finding]:
-    """All findings, in the order in which they are worth mending."""
+    """All findings, in the order in which they should be fixed."""
     if len(record.stamps_ns) < 2:
         text = 'mavros, PX4 and ArduPilot get nothing: is the filter initialised, does it see markers, is it lost?'
         return [Finding('messages', Level.FAULT, f'{len(record.stamps_ns)} messages', text)]
@@ -150,7 +150,7 @@ def _names(record: BridgeRecord) -> list[Finding]:
 
 
 def _gravity(record: BridgeRecord) -> list[Finding]:
-    """At rest the specific force points up, +z of an ENU map, whatever the attitude."""
+    """Check that the specific force at rest points up, +z of an ENU map, at any attitude."""
     up = _specific_force_in_map(record)
     if up is None:
         return [Finding('gravity', Level.UNTESTED, 'no IMU at rest', 'Let it listen to imu/data of a still drone.')]
@@ -183,7 +183,7 @@ def _specific_force_in_map(record: BridgeRecord) -> FloatArray | None:
 
 
 def _turns(record: BridgeRecord) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Turn rates (N-1, 3) of the poses in the body, the same by the messages' twists, and where steps are usable."""
+    """Turn rates (N-1, 3) in the body from the poses and from the twists, and which intervals are usable."""
     dt = np.diff(record.stamps_ns) / SECOND_NS
     usable = (dt > 1e-4) & (dt < PX4_START)
     R = record.rotations
@@ -192,7 +192,7 @@ def _turns(record: BridgeRecord) -> tuple[FloatArray, FloatArray, BoolArray]:
 
 
 def _yaw(record: BridgeRecord) -> list[Finding]:
-    """A turn to the left is positive in pose and gyroscope alike."""
+    """Check that yaw rates of pose and gyroscope have the same sign, positive to the left."""
     turn, rates, usable = _turns(record)
     if len(record.imu):
         gyroscope = np.interp(record.stamps_ns[1:], record.imu_stamps_ns, record.imu[:, 2])
@@ -214,15 +214,15 @@ def _yaw(record: BridgeRecord) -> list[Finding]:
 
 
 def _velocity(record: BridgeRecord) -> list[Finding]:
-    """The twist in the robot's axes, summed up over half a second, is how the position has changed.
+    """Check that the twist in the robot's axes, integrated over half a second, equals the change of the position.
 
-    Over one message it needn't be: corrections by markers, of millimetres, are as large as the motion.
+    Single intervals are too short: corrections by markers, of millimetres, are as large as the motion.
     """
     t = (record.stamps_ns - record.stamps_ns[0]) / SECOND_NS
     end = np.searchsorted(t, t + MOVE_SECONDS)
     begin = np.flatnonzero(end < len(t))
     end = end[begin]
-    # Stamps that go back have a finding of their own.
+    # Decreasing stamps have their own finding.
     seconds = np.maximum(t[end] - t[begin], MOVE_SECONDS)[:, None]
     velocity = (record.positions[end] - record.positions[begin]) / seconds
     in_map = (record.rotations @ record.velocities[..., None])[..., 0]
@@ -270,7 +270,7 @@ def _covariance(record: BridgeRecord) -> list[Finding]:
 
 
 def _jumps(record: BridgeRecord) -> list[Finding]:
-    """Steps of the position that the speed doesn't explain."""
+    """Check for steps of the position beyond the speed."""
     dt = np.diff(record.stamps_ns) / SECOND_NS
     claimed = 0.5 * (record.velocities[:-1] + record.velocities[1:])
     expected = (record.rotations[:-1] @ claimed[..., None])[..., 0] * dt[:, None]

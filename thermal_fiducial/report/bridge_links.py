@@ -1,16 +1,16 @@
-"""Whether what is for an autopilot comes from one node and reaches somebody."""
+"""Checks that the autopilot's topic has one publisher and a subscriber."""
 
 from typing import TYPE_CHECKING
 
 from thermal_fiducial.report.bridge_check import Finding, Level
 
 if TYPE_CHECKING:
-    # Recordings are checked without ROS too.
+    # Recordings are also checked without ROS.
     from thermal_fiducial.ros.bridge_listener import Links
 
 
 def check_links(links: 'Links') -> list[Finding]:
-    """What stands against it in a graph of nodes that runs; what the filter itself complains of comes first."""
+    """Findings on a running graph of nodes; an error reported by the filter comes first."""
     findings = []
     if links.complaint:
         text = 'There is nothing to fly on, or nothing is sent, whatever else is in order.'

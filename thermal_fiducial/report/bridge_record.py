@@ -1,4 +1,4 @@
-"""What leaves for a flight controller, and the IMU beside it, as arrays: live or from a bag."""
+"""Outputs for a flight controller, with the IMU samples, as arrays: live or from a bag."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +11,7 @@ from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.images import stamp_to_ns
 
-#: Topics that a bridge is looked for on, the first one that there is.
+#: Candidate topics of the odometry for a flight controller; the first existing one is used.
 ODOMETRY_TOPICS = ('bridge/odometry', 'mavros/odometry/out', 'odometry')
 
 LANDING_TOPIC = 'landing_target'
@@ -19,7 +19,7 @@ LANDING_TOPIC = 'landing_target'
 
 @dataclass(frozen=True)
 class LandingRecord:
-    """Messages of ``landing_target`` (N of them): stamps, positions (N, 3) [m], and the frames that they name."""
+    """Messages of ``landing_target`` (N): stamps, positions (N, 3) [m], frame IDs."""
 
     stamps_ns: IntArray
     positions: FloatArray
@@ -31,10 +31,10 @@ _NO_LANDING = LandingRecord(np.zeros(0, np.int64), np.zeros((0, 3)), ())
 
 @dataclass(frozen=True)
 class BridgeRecord:
-    """Odometry messages (N of them) and IMU samples (M).
+    """Odometry messages (N) and IMU samples (M).
 
-    ``arrivals_ns`` and ``imu_stamps_ns`` are compared with ``stamps_ns``; velocities are as the messages have them,
-    which should be the robot's frame.
+    ``arrivals_ns``, ``imu_stamps_ns`` and ``stamps_ns`` are of comparable clocks; velocities are as in the messages,
+    supposedly in the robot's frame.
     """
 
     stamps_ns: IntArray
@@ -47,13 +47,13 @@ class BridgeRecord:
     frames: tuple[tuple[str, str], ...]
     imu_stamps_ns: IntArray
     imu: FloatArray
-    #: whether arrivals are of the clock that stamps are of
+    #: whether arrivals and stamps have the same clock
     live: bool = False
     landing: LandingRecord = _NO_LANDING
 
     @property
     def rotations(self) -> FloatArray:
-        """(N, 3, 3) R_map_body; identity for a quaternion that is none."""
+        """(N, 3, 3) R_map_body; identity for an invalid quaternion."""
         valid = np.linalg.norm(self.quaternions, axis=1, keepdims=True) > 1e-6
         return rotation_from_quaternion(np.where(valid, self.quaternions, (0.0, 0.0, 0.0, 1.0)))
 
@@ -87,7 +87,7 @@ class BridgeRecorder:
         self._landing.append((stamp_to_ns(message.header.stamp), (p.x, p.y, p.z), message.header.frame_id))
 
     def record(self) -> BridgeRecord:
-        """What was collected."""
+        """The collected messages as arrays."""
         rows = np.array([entry[2] for entry in self._odometry], dtype=np.float64).reshape(-1, 13)
         return BridgeRecord(
             stamps_ns=np.array([entry[0] for entry in self._odometry], dtype=np.int64),
@@ -114,15 +114,15 @@ def read_bridge(path: Path, topic: str = '', imu_bag: Path | None = None) -> Bri
 
     Parameters
     ----------
-    topic : of the odometry; empty: the first of ``ODOMETRY_TOPICS`` that there is
-    imu_bag : bag with the IMU, where the first one has none
+    topic : of the odometry; empty: the first existing one of ``ODOMETRY_TOPICS``
+    imu_bag : bag with the IMU, if ``path`` has none
 
     Raises
     ------
     InputError
         Unreadable, or no such topic.
     """
-    # Only a recording needs what reads recordings.
+    # Imported here, since only recordings need it.
     from thermal_fiducial.files.bags import BagReader, IMU_TOPIC
 
     recorder = BridgeRecorder()

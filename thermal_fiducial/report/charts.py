@@ -1,4 +1,4 @@
-"""The plots of the report that run over time."""
+"""Time plots of the report."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ from thermal_fiducial.report.metrics import CHI2_BAND_6
 from thermal_fiducial.report.time_plots import BAND, Chart, FIDUCIAL, FUSED, GOOD, TimePlots, TRUTH
 
 LATENCY_COLOURS = {'imu_to_pose': FUSED, 'image_to_camera_pose': FIDUCIAL, 'image_to_corrected_pose': '#a855f7'}
-#: Less than this is drawn as this: the axes are logarithmic.
+#: Lower limits of the logarithmic axes, to which smaller values are clipped.
 LEAST_NIS, LEAST_MM = 0.03, 0.03
 
 
@@ -23,7 +23,7 @@ def euler_deg(T: FloatArray) -> FloatArray:
 
 
 def near(angles: FloatArray, reference: FloatArray) -> FloatArray:
-    """``angles`` (N, 3) [deg] on the turn on which ``reference`` (3,) is."""
+    """``angles`` (N, 3) [deg] plus the multiples of 360 that bring the first row nearest to ``reference`` (3,)."""
     return angles - 360.0 * np.round((angles[:1] - reference) / 360.0) if len(angles) else angles
 
 
@@ -61,7 +61,7 @@ def _draw(plots: TimePlots, row: int, t: FloatArray, values: FloatArray, name: s
 
 
 def error_charts(evaluation: Evaluation) -> list[Chart]:
-    """Errors with the filter's own three sigma; none where truth is unknown."""
+    """Errors with the filter's three-sigma bounds; none without truth."""
     fused, fiducial, output = evaluation.fused_errors, evaluation.fiducial_errors, evaluation.run.output
     if fused is None or not len(fused):
         return []
@@ -88,7 +88,7 @@ def error_charts(evaluation: Evaluation) -> list[Chart]:
 
 
 def _limit(fused: FloatArray, three_sigma: FloatArray) -> float:
-    """End of the axis: a wild pose from markers must not hide the fused errors and their band."""
+    """Limit of the axis, so that outliers from markers do not hide the fused errors and their band."""
     typical = float(np.percentile(three_sigma, 95)) if len(three_sigma) else 0.0
     return 1.25 * max(float(np.percentile(np.abs(fused), 99.5)), typical, 1e-3)
 
@@ -138,7 +138,7 @@ def innovation_chart(evaluation: Evaluation) -> list[Chart]:
 
 
 def clock_chart(evaluation: Evaluation) -> list[Chart]:
-    """The camera's clock offset and the claimed position error, once a second."""
+    """Clock offset of the camera and standard deviation of the position, once a second."""
     figures = evaluation.run.output.figures
     if 'time offset' not in figures or 'position std' not in figures:
         return []
@@ -159,7 +159,7 @@ def clock_chart(evaluation: Evaluation) -> list[Chart]:
 
 
 def detections_chart(evaluation: Evaluation) -> list[Chart]:
-    """Which marker was seen when, and how many at once."""
+    """Visibility of each marker over time, and number of visible markers."""
     detections = evaluation.run.detections
     ids = np.unique(detections.ids)
     plots = TimePlots(('marker', 'in a frame'), (max(len(ids), 4), 4))
@@ -183,7 +183,7 @@ def detections_chart(evaluation: Evaluation) -> list[Chart]:
 
 
 def visible_spans(stamps_ns: IntArray) -> list[tuple[int, int]]:
-    """Times from first to last sight without a break of more than an interruption."""
+    """Spans (first and last stamp) of sight without a gap as long as an interruption."""
     if not len(stamps_ns):
         return []
     breaks = np.flatnonzero(np.diff(stamps_ns) > GAP_NS)
@@ -193,7 +193,7 @@ def visible_spans(stamps_ns: IntArray) -> list[tuple[int, int]]:
 
 
 def latency_chart(evaluation: Evaluation) -> list[Chart]:
-    """Time from measurement to result; none for a run that was not in real time."""
+    """Latency from measurement to result; none for a run that was not in real time."""
     if not evaluation.run.latencies:
         return []
     plots = TimePlots(('latency [ms]',))

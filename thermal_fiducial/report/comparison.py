@@ -1,8 +1,8 @@
 """Several runs side by side, with the measures of evo, computed by evo (M. Grupp, github.com/MichaelGrupp/evo).
 
-As ``evo_ape`` and ``evo_rpe`` do: poses are paired with the nearest of the truth within 10 ms; the absolute pose error
-is that of the translation, as it is and after a rigid alignment (``--align``), and of the rotation angle; the relative
-pose error is over 1 m of path (``--delta 1 --delta_unit m``).
+As in ``evo_ape`` and ``evo_rpe``, poses are paired with the nearest pose of the truth within 10 ms. The absolute pose
+error is that of the translation, without and with rigid alignment (``--align``), and of the rotation angle; the
+relative pose error is over 1 m of path (``--delta 1 --delta_unit m``).
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ from thermal_fiducial.report.trajectory import Trajectory
 MOST_APART_S = 0.01
 _STATISTICS = ('rmse', 'mean', 'median', 'std', 'min', 'max')
 _COLOURS = ('#3b82f6', '#ef4444', '#22c55e', '#f59e0b', '#a855f7', '#14b8a6', '#ec4899', '#84cc16')
-#: Of our own measures: name, unit, path in the numbers of a run.
+#: Measures of this package: name, unit, path in the numbers of a run.
 _OWN = (
     ('jitter over 1/30 s, position, rms', 'mm', ('fused', 'jitter', 'position_mm')),
     ('NEES of the pose (consistent: 1)', 'per d.o.f.', ('fused', 'consistency', 'pose_nees_per_dof')),
@@ -46,11 +46,11 @@ _OWN = (
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs by name, and what they come to."""
+    """Names of the runs and their measures."""
 
     names: tuple[str, ...]
     evaluations: tuple[Evaluation, ...]
-    #: name of the run to evo's measures and ours
+    #: run name to the measures of evo and of this package
     numbers: dict[str, dict[str, Any]]
 
     @property
@@ -64,7 +64,7 @@ class Comparison:
 
     @property
     def note(self) -> str:
-        """Which runs have no errors, and why; empty where all have them."""
+        """Runs without errors, and why; empty if all have them."""
         without = [name for name in self.names if not self.numbers[name]['evo']]
         if not without:
             return ''
@@ -77,7 +77,7 @@ class Comparison:
         return [(key, unit, *(number(values.get(key), 4) for values in every)) for key in _STATISTICS]
 
     def write(self, path: Path) -> None:
-        """Write the comparison as a page that stands alone."""
+        """Write the comparison as a self-contained page."""
         from thermal_fiducial.report.html import Page, render, Section
 
         wide = Section('measures', 'Measures', tables=tuple(self.tables))
@@ -120,7 +120,7 @@ def compare(folders: Sequence[Path], truth: Path | None = None) -> Comparison:
 
 
 def _names(folders: Sequence[Path]) -> tuple[str, ...]:
-    """What the folders are called; with what stands above where two are called alike."""
+    """Names of the folders, with the parent folder if two names are the same."""
     paths = [folder.resolve() for folder in folders]
     short = [path.name for path in paths]
     names = [
@@ -133,7 +133,7 @@ def _names(folders: Sequence[Path]) -> tuple[str, ...]:
 
 
 def evo_numbers(estimate: Trajectory, truth: Trajectory) -> dict[str, dict[str, float]]:
-    """Statistics of evo's errors [mm, deg]; empty where nothing can be paired.
+    """Statistics of evo's errors [mm, deg]; empty if no poses can be paired.
 
     Parameters
     ----------

@@ -14,13 +14,13 @@ from thermal_fiducial.report.map_error import map_accuracy
 from thermal_fiducial.report.run_folder import Run
 from thermal_fiducial.report.tags import Tag, tags
 
-#: NEES looks at one pose in this time: its errors change slowly, so more are no more evidence [ns].
+#: Sampling interval of the NEES [ns]: errors are correlated over time, so denser samples add no evidence.
 CONSISTENCY_NS = 100_000_000
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A run and how good it is; errors are None where there is no truth."""
+    """A run with its errors, which are None without truth."""
 
     run: Run
     fused_errors: metrics.Errors | None
@@ -29,17 +29,17 @@ class Evaluation:
 
     @cached_property
     def available(self) -> Available | None:
-        """What a controller would have had; None where that is unknown."""
+        """Errors as seen by a controller; None if unknown."""
         return available(self.run)
 
     @cached_property
     def tags(self) -> list[Tag]:
-        """One row a marker."""
+        """One row per marker."""
         return tags(self.run)
 
     @property
     def start_ns(self) -> int:
-        """First stamp of anything: zero of the plots' time."""
+        """First stamp of all data: zero of the plots' time."""
         run = self.run
         firsts = [
             stamps[0]
@@ -58,7 +58,7 @@ class Evaluation:
 
     @property
     def covariances(self) -> tuple[metrics.Errors, FloatArray] | None:
-        """Errors of the fused poses whose covariance was recorded, and these (N, 6, 6)."""
+        """Errors of the fused poses with recorded covariances, and the covariances (N, 6, 6)."""
         e, output = self.fused_errors, self.run.output
         if e is None or not len(e) or not len(output.stamps_ns):
             return None
@@ -69,13 +69,13 @@ class Evaluation:
 
     @property
     def unmapped(self) -> BoolArray:
-        """Which detections are of markers that never entered the map: false positives, or seen too seldom."""
+        """Mask of detections whose marker never entered the map: false positives, or seen too seldom."""
         known = self.run.marker_map
         ids = self.run.detections.ids
         return np.zeros(len(ids), np.bool_) if known is None else ~np.isin(ids, list(known.markers))
 
     def numbers(self) -> dict[str, Any]:
-        """All measures; what can't be known is left out."""
+        """All measures; unknown ones are left out."""
         result: dict[str, Any] = {
             'fused': metrics.output(self.run.fused),
             'fiducial': {'poses': len(self.run.fiducial), 'path_length_m': metrics.path_length(self.run.fiducial)},

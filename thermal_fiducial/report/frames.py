@@ -17,13 +17,13 @@ from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.images import image_to_array, stamp_to_ns
 from thermal_fiducial.report.run_folder import bag_of_run, Detections, Run
 
-#: Pictures of a strip, and how wide each is [px].
+#: Number of pictures of a strip, and their width [px].
 STRIP, STRIP_WIDTH = 12, 480
-#: Frames are read from so long before the one that is shown, for its bad pixels and its scale [ns].
+#: Frames are read from this long before the shown one, to initialise bad pixels and scale, to this long after [ns].
 _BEFORE_NS, _AFTER_NS = 150_000_000, 100_000_000
 _QUALITY = 72
 _CYAN, _YELLOW, _WHITE = (238, 211, 34), (0, 255, 255), (255, 255, 255)
-#: Where black stands round white letters [px]. The fonts of OpenCV 5 do not grow with the thickness of their lines.
+#: Offsets of the black outline of white letters [px]: OpenCV 5's fonts ignore the line thickness.
 _EDGE = ((-2, 0), (-1, -1), (0, -2), (1, -1), (2, 0), (1, 1), (0, 2), (-1, 1))
 #: Corners are drawn to a sixteenth of a pixel.
 _SHIFT = 4
@@ -31,7 +31,7 @@ _SHIFT = 4
 
 @dataclass(frozen=True)
 class ThermalView:
-    """A frame in false colours: pixels (H, W, 3) BGR; None: it was withheld, for ``reason``."""
+    """A frame in false colours: pixels (H, W, 3) BGR; None if it was dropped, for ``reason``."""
 
     stamp_ns: int
     pixels: npt.NDArray[np.uint8] | None
@@ -40,14 +40,14 @@ class ThermalView:
 
 @dataclass(frozen=True)
 class FramePicture:
-    """A picture of the page, as a data URI, with what stands below it."""
+    """A picture of the page, as a data URI, with its caption."""
 
     uri: str
     caption: str
 
 
 def bag_of(run: Run, bag: Path | None = None) -> tuple[Path, Mapping[str, str]] | None:
-    """The bag that a run was replayed from, with its remaps; None where it cannot be found any more."""
+    """The bag that a run was replayed from, with its remaps; None if it is not found."""
     remaps = run.summary.get('remaps', {})
     remaps = remaps if isinstance(remaps, dict) else {}
     if bag is not None:
@@ -57,7 +57,7 @@ def bag_of(run: Run, bag: Path | None = None) -> tuple[Path, Mapping[str, str]] 
 
 
 def strip(run: Run, bag: Path | None = None) -> list[FramePicture]:
-    """Pictures at even intervals over the run; none where the bag is gone."""
+    """Pictures at even intervals over the run; none if the bag is not found."""
     found = bag_of(run, bag)
     stamps = run.detections.stamps_ns
     if found is None or not len(stamps):
@@ -78,7 +78,7 @@ def strip(run: Run, bag: Path | None = None) -> list[FramePicture]:
 
 
 def _even(stamps_ns: IntArray) -> IntArray:
-    """Stamps of :data:`STRIP` frames, evenly over the time (not over the frames)."""
+    """Stamps of :data:`STRIP` frames, evenly spaced in time."""
     wanted = np.linspace(stamps_ns[0], stamps_ns[-1], STRIP)
     return np.unique(stamps_ns[np.clip(np.searchsorted(stamps_ns, wanted), 0, len(stamps_ns) - 1)])
 
@@ -88,7 +88,7 @@ def view_at(reader: BagReader, stamp_ns: int) -> ThermalView | None:
     first = next(reader.messages([reader.image_topic]), None)
     if first is None:
         return None
-    # What stamps and the recorder's clock are apart, which may be years.
+    # Offset between stamps and the recorder's clock, which may be years.
     apart = first.stamp_ns - stamp_to_ns(first.message.header.stamp)
     between = stamp_ns + apart - _BEFORE_NS, stamp_ns + apart + _AFTER_NS
     for view in views(reader, between):
@@ -128,7 +128,7 @@ def _draw_marker(picture: npt.NDArray[np.uint8], marker: int, corners: FloatArra
 
 
 def write(picture: npt.NDArray[np.uint8], text: str, place: tuple[int, int]) -> None:
-    """Write into a picture so that it can be read on any ground: white, with an edge of black."""
+    """Write text into a picture, white with a black outline, readable on any background."""
     x, y = place
     for dx, dy in _EDGE:
         _put(picture, text, (x + dx, y + dy), (0, 0, 0))

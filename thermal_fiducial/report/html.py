@@ -1,4 +1,4 @@
-"""Pages that stand alone: one file each, with its plots' library in it, that needs no network."""
+"""Self-contained HTML pages: one file each, with the plot library embedded, usable offline."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,14 +27,14 @@ _FOOTER = (
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a page, to which its navigation leads."""
+    """A section of a page with an entry in its navigation."""
 
     name: str
     title: str
     charts: tuple[Chart, ...] = ()
     tables: tuple[Table, ...] = ()
     pictures: tuple[FramePicture, ...] = ()
-    #: what stands in place of pictures that are missing
+    #: text in place of missing pictures
     note: str = ''
     #: file name of a video beside the page
     video: str = ''
@@ -81,7 +81,7 @@ def _text(name: str) -> str:
 
 
 def _json(chart: Chart) -> str:
-    """The figure, in a form that may stand within a script element."""
+    """The figure as JSON, escaped for a script element."""
     text: str = chart.figure.to_json(engine='json')
     return text.replace('<', '\\u003c')
 

@@ -1,4 +1,4 @@
-"""Times without a pose from the markers, and why: the shutter, no image, no marker in view."""
+"""Times without a pose from the markers, and their cause: shutter, no image, no marker in view."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -11,14 +11,14 @@ from thermal_fiducial.report.metrics import Errors, FRAME_NS, steps
 from thermal_fiducial.report.run_folder import Run
 from thermal_fiducial.report.trajectory import Trajectory
 
-#: Two poses from markers farther apart than this have an interruption between them [ns].
+#: Gap between poses from markers above which it is an interruption [ns].
 GAP_NS = 300_000_000
-#: So many periods of the camera without a frame are no late frame any more: the shutter stops several.
+#: Camera periods without a frame above which frames are missing, not just late: the shutter drops several.
 _HOLE_PERIODS = 2.5
 
 
 class Cause(Enum):
-    """Why there was no pose from the markers."""
+    """Cause of an interruption."""
 
     SHUTTER = 'shutter (FFC)'
     WITHHELD = 'frames withheld'
@@ -34,27 +34,27 @@ class Interruption:
     start_ns: int
     end_ns: int
     cause: Cause
-    #: poses that the filter gave in it
+    #: number of fused poses during it
     fused_poses: int
-    #: change of the fused position at its end, when markers are seen again [mm]
+    #: step of the fused position at its end, when markers are seen again [mm]
     step_mm: float
-    #: error at its end [mm, deg], where truth is known
+    #: errors at its end [mm, deg]; None without truth
     error_mm: float | None = None
     error_deg: float | None = None
 
     @property
     def seconds(self) -> float:
-        """Its length."""
+        """Duration [s]."""
         return (self.end_ns - self.start_ns) / SECOND_NS
 
     @property
     def is_shutter(self) -> bool:
-        """Whether the camera calibrated itself: that is as it should be, and no drop-out."""
+        """Whether it is a flat-field correction of the camera, which is normal operation."""
         return self.cause is Cause.SHUTTER
 
 
 def interruptions(run: Run, fused_errors: Errors | None) -> list[Interruption]:
-    """Breaks of the poses from markers of more than :data:`GAP_NS`, and shorter ones that the shutter made."""
+    """Gaps of the poses from markers above :data:`GAP_NS`, and shorter ones caused by the shutter."""
     stamps = run.fiducial.stamps_ns
     ends = np.flatnonzero(np.diff(stamps) > GAP_NS)
     spans = [(int(stamps[i]), int(stamps[i + 1])) for i in ends]
@@ -63,7 +63,7 @@ def interruptions(run: Run, fused_errors: Errors | None) -> list[Interruption]:
 
 
 def frame_holes(frames_ns: IntArray) -> list[tuple[int, int]]:
-    """Stamps of the frames before and after each time in which the camera gave none."""
+    """Stamps of the frames before and after each gap of the camera."""
     if len(frames_ns) < 3:
         return []
     between = np.diff(frames_ns)
@@ -118,7 +118,7 @@ def _described(run: Run, start_ns: int, end_ns: int, e: Errors | None) -> Interr
 def _step_mm(fused: Trajectory, inside: BoolArray, end_ns: int) -> float:
     if not inside.any():
         return 0.0
-    # The frame that ends the interruption corrects the filter a few tens of milliseconds later, when it is worked on.
+    # The frame that ends the interruption corrects the filter after its processing, tens of milliseconds later.
     after = (fused.stamps_ns > end_ns) & (fused.stamps_ns <= end_ns + 3 * FRAME_NS)
     last = fused.stamps_ns == fused.stamps_ns[inside][-1]
     return 1e3 * float(steps(fused.take(after | last)).max(initial=0.0))

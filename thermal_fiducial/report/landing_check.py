@@ -1,4 +1,4 @@
-"""Whether an autopilot could land on the target that it would get."""
+"""Checks whether an autopilot could land on the published target."""
 
 import numpy as np
 
@@ -7,11 +7,11 @@ from thermal_fiducial.report.bridge_check import Finding, Level
 from thermal_fiducial.report.bridge_record import BridgeRecord, LandingRecord
 from thermal_fiducial.ros.landing_pad import from_mavros
 
-#: ArduPilot wants a target once a second; both autopilots forget one that they have not heard of for some seconds.
+#: ArduPilot needs a target once a second; both autopilots drop a target after some seconds without a message [s].
 LONGEST_GAP = 1.0
-#: How far [m] a target that lies still may seem to wander while the drone moves, and when its axes are surely wrong.
+#: Largest scatter of a static target while the drone moves, and scatter that proves wrong axes [m].
 WANDERS, WRONG = 0.1, 0.5
-#: Odometry this near to the target's stamp says where the robot was [s].
+#: Largest stamp difference of target and odometry for a match [s].
 _NEAR = 0.05
 
 
@@ -38,7 +38,7 @@ def _rate(record: LandingRecord) -> Finding:
 
 
 def _place(record: LandingRecord, robot: BridgeRecord) -> list[Finding]:
-    """Below the robot, and in one place of the map whatever the robot does."""
+    """Check that the target is below the robot and static in the map."""
     nearest, near = _nearest(record.stamps_ns, robot.stamps_ns)
     if not near.any():
         return [Finding('landing target', Level.UNTESTED, 'no odometry beside it', 'Its place is not compared.')]

@@ -1,4 +1,4 @@
-"""How far a map lies from the true one, marker by marker."""
+"""Errors of a map against the true one, per marker."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,22 +10,22 @@ from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.metrics import rigid_residuals
 
-#: With fewer markers than this, an alignment leaves nothing over.
+#: Fewest markers whose residuals after a rigid alignment are meaningful.
 _FEWEST_TO_ALIGN = 4
 
 
 @dataclass(frozen=True)
 class MarkerError:
-    """Error of one marker, and what the map claims of it."""
+    """Error of one marker, with the map's standard deviations."""
 
     id: int
     fixed: bool
     position_mm: float
     attitude_deg: float
-    #: standard deviations as the map has them: of the position (three axes together) and of the attitude
+    #: standard deviations of the map: position (three axes together) and attitude
     sigma_mm: float
     sigma_deg: float
-    #: normalised error squared per degree of freedom; None where the map claims nothing
+    #: NEES per degree of freedom; None without covariance
     nees: float | None
 
 
@@ -57,7 +57,7 @@ def _marker_error(marker: MapMarker, true: MapMarker) -> MarkerError:
 
 
 def map_accuracy(estimate: MarkerMap, truth: MarkerMap) -> dict[str, float]:
-    """Errors of the markers that are not fixed, in the map's own frame; of positions also after rigid alignment.
+    """Errors of the markers that are not fixed, in the map frame; positions also after rigid alignment.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""How good a trajectory is: errors against ground truth, jitter, consistency, latency.
+"""Measures of a trajectory: errors against ground truth, jitter, consistency, latency.
 
-Truth is interpolated at the stamps of the estimate (nearest neighbours within 10 ms, as some tools take them, are a
-phantom error of 10 mm at 1 m/s). Errors are ``d`` of the package's covariance convention: the true pose is
-``p_hat + d[:3]``, ``exp(d[3:]) R_hat``, all in ``map``; the accuracy is that in the map, not after an alignment.
+Truth is interpolated at the stamps of the estimate (nearest neighbours within 10 ms, as in some tools, add an error of
+up to 10 mm at 1 m/s). Errors are ``d`` of the package's covariance convention: the true pose is
+``p_hat + d[:3]``, ``exp(d[3:]) R_hat``, all in ``map``; accuracy is measured in the map, without alignment.
 
 Terms: J. Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 2012 (absolute and relative
 error); S. Umeyama, "Least-squares estimation of transformation parameters", 1991 (alignment); Y. Bar-Shalom et al.,
@@ -24,7 +24,7 @@ FRAME_NS = 33_333_333
 RELATIVE_NS = SECOND_NS
 #: Truth is not interpolated over holes longer than this [ns].
 TRUTH_HOLE_NS = 200_000_000
-#: 95 % point of chi-square, by degrees of freedom; and where 95 % lie of a pose's, as much below as above.
+#: 95 % quantile of chi-square by degrees of freedom; two-sided 95 % interval for a pose.
 CHI2_95 = {3: 7.815, 6: 12.592}
 CHI2_BAND_6 = (1.237, 14.449)
 
@@ -49,7 +49,7 @@ def interpolate(truth: Trajectory, stamps_ns: IntArray) -> tuple[FloatArray, Boo
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of a trajectory where truth is known.
+    """Errors of the poses of a trajectory that have a truth.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class Errors:
 
 
 def errors(estimate: Trajectory, truth: Trajectory) -> Errors:
-    """Errors of ``estimate`` at its own stamps, where ``truth`` knows them."""
+    """Errors of ``estimate`` at its stamps within ``truth``."""
     T_true, exists = interpolate(truth, estimate.stamps_ns)
     T_true, T_hat = T_true[exists], estimate.T_map_body[exists]
     rotation = so3_log(T_true[:, :3, :3] @ np.swapaxes(T_hat[:, :3, :3], 1, 2))
@@ -136,7 +136,7 @@ def pairs_apart(stamps_ns: IntArray, interval_ns: int) -> tuple[IntArray, IntArr
 
 
 def jitter(e: Errors) -> dict[str, float]:
-    """What a controller feels: rms of the change of the error over one camera period [mm, deg]."""
+    """Rms of the change of the error over one camera period [mm, deg], which excites a controller."""
     i, j = pairs_apart(e.stamps_ns, FRAME_NS)
     if not len(i):
         return {}
@@ -165,7 +165,7 @@ def relative_pose_error(e: Errors, interval_ns: int = RELATIVE_NS) -> dict[str, 
 
 
 def consistency(e: Errors, covariances: FloatArray) -> dict[str, float]:
-    """NEES of the pose and of its two halves: mean (1 a degree of freedom is perfect) and share within 95 %.
+    """NEES of pose, position and attitude: mean (ideally 1 per degree of freedom) and share within 95 %.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def consistency(e: Errors, covariances: FloatArray) -> dict[str, float]:
 
 
 def innovation_consistency(innovations: Innovations) -> dict[str, float]:
-    """NIS of the accepted poses: mean (1 a degree of freedom is perfect, less is cautious), share within the band."""
+    """NIS of the accepted poses: mean (ideally 1 per degree of freedom), share within the 95 % interval."""
     result: dict[str, float] = {
         'poses': len(innovations.nis),
         'refused': int(np.sum(~innovations.accepted)),
@@ -202,7 +202,7 @@ def innovation_consistency(innovations: Innovations) -> dict[str, float]:
 
 
 def steps(trajectory: Trajectory) -> FloatArray:
-    """How far each position lies from where the two before it led to [m]: the steps that corrections make."""
+    """Distance of each position from the linear extrapolation of the two before it [m]: the steps by corrections."""
     p = trajectory.positions
     if len(p) < 3:
         return np.zeros(0)
@@ -212,7 +212,7 @@ def steps(trajectory: Trajectory) -> FloatArray:
 
 
 def output(trajectory: Trajectory) -> dict[str, float]:
-    """Rate and smoothness of the output itself, without truth: rate, longest pause, steps between poses."""
+    """Rate and smoothness of the output, without truth: rate, longest gap, steps."""
     if len(trajectory) < 3:
         return {'poses': len(trajectory)}
     dt = np.diff(trajectory.stamps_ns)

@@ -1,4 +1,4 @@
-"""What the recorded messages of the nodes say beyond the text files of a run folder."""
+"""Data of the recorded messages that are not in the text files of a run folder."""
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
@@ -14,18 +14,18 @@ from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.files.bags import BagReader, CAMERA_POSE_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.images import header_stamp_ns, stamp_to_ns
 
-#: Covariances are read from no more than so many messages, evenly over the run.
+#: Most messages from which covariances are read, evenly over the run.
 MOST_COVARIANCES = 6000
 _POSE, _DIAGNOSTICS = 'pose', 'diagnostics'
 _WITHHELD = 'withheld: '
-# "coasting for 0.6 s" and "coasting for 0.8 s" are one thing to say.
+# "coasting for 0.6 s" and "coasting for 0.8 s" are counted as the same message.
 _NUMBER = re.compile(r'\d+(\.\d+)?')
 _LEVELS = ('ok', 'warning', 'error', 'stale')
 
 
 @dataclass(frozen=True)
 class Diagnostic:
-    """How often a node said something."""
+    """Count of a diagnostic message of a node."""
 
     node: str
     level: str
@@ -35,7 +35,7 @@ class Diagnostic:
 
 @dataclass(frozen=True)
 class Arrivals:
-    """Stamps (N,) of messages and when each reached its readers (N,) [ns], in the order of the stamps."""
+    """Stamps (N,) of messages and their arrival times (N,) [ns], in the order of the stamps."""
 
     stamps_ns: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
     times_ns: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -48,11 +48,11 @@ class RecordedOutput:
     Parameters
     ----------
     stamps_ns, covariances : (N,), (N, 6, 6) of some of the ``pose`` messages
-    diagnostics : what the nodes said, most frequent first
-    innovations : how well each camera pose fitted what the filter expected, at the IMU's stamps
-    frames_ns : (F,) IMU's stamps of the frames in which markers were looked for; withheld ones are missing
-    withheld : time of a diagnostic [ns] and frames withheld until then, by reason
-    figures : name of a number of the filter to times (D,) [ns] and values (D,), once a second
+    diagnostics : messages of the nodes, most frequent first
+    innovations : of the camera poses, at the IMU's stamps
+    frames_ns : (F,) IMU's stamps of the processed frames, without dropped ones
+    withheld : time of a diagnostic [ns] and number of frames dropped until then, by reason
+    figures : key of the filter's diagnostics to times (D,) [ns] and values (D,), once a second
     fused_arrivals, camera_arrivals : of ``pose`` and ``camera_pose``, at the IMU's stamps
     """
 
@@ -67,7 +67,7 @@ class RecordedOutput:
     camera_arrivals: Arrivals = field(default_factory=Arrivals)
 
     def withheld_between(self, start_ns: int, end_ns: int) -> dict[str, int]:
-        """Frames withheld between two times by reason; as it is counted once a second, up to a second more."""
+        """Frames dropped between two times by reason; counted once a second, so up to a second more."""
         before: dict[str, int] = {}
         for time_ns, counts in self.withheld:
             if time_ns <= start_ns:
@@ -78,7 +78,7 @@ class RecordedOutput:
 
 
 def read_output(path: Path, offset_ns: int) -> RecordedOutput:
-    """What the ``output`` of a run folder holds; nothing where there is none.
+    """Read the ``output`` of a run folder; empty if there is none.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def read_output(path: Path, offset_ns: int) -> RecordedOutput:
     Raises
     ------
     InputError
-        A bag that cannot be read.
+        An unreadable bag.
     """
     if not path.is_dir():
         return RecordedOutput()

@@ -1,4 +1,4 @@
-"""The top of the page: key figures with their units, and what was flown."""
+"""The top of the page: key figures, and facts about the flight."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +18,7 @@ class Card:
 
 
 def facts(evaluation: Evaluation, numbers: dict[str, Any]) -> list[tuple[str, str]]:
-    """What was flown, in names and values."""
+    """Facts about the flight as names and values."""
     summary, marker_map = evaluation.run.summary, evaluation.run.marker_map
     known = [
         ('flight', f'{summary["duration_s"]:.1f} s' if 'duration_s' in summary else ''),
@@ -32,7 +32,7 @@ def facts(evaluation: Evaluation, numbers: dict[str, Any]) -> list[tuple[str, st
 
 
 def cards(evaluation: Evaluation, numbers: dict[str, Any]) -> list[Card]:
-    """The figures that one looks for first."""
+    """The key figures."""
     fused, markers = numbers['fused'], numbers['markers']
     made = [
         _compared('Position error', 'mm', numbers, 'position_rms_mm'),
@@ -52,7 +52,7 @@ def cards(evaluation: Evaluation, numbers: dict[str, Any]) -> list[Card]:
 
 
 def _compared(name: str, unit: str, numbers: dict[str, Any], key: str) -> Card | None:
-    """As a controller has it, where that is known; else at each pose's own stamp."""
+    """Card of an error as seen by a controller if known, else at each pose's stamp."""
     held = numbers.get('as_available', {}).get('in_view')
     if held:
         return Card(

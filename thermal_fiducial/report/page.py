@@ -16,7 +16,7 @@ REPORT, VIDEO = 'report.html', 'flight.mp4'
 
 
 def require_packages(*, tables: bool = False) -> None:
-    """Check, before minutes of work, that what the report (and ``tables`` on the terminal) needs is installed.
+    """Check for the packages of the report (and of ``tables`` on the terminal) before minutes of work.
 
     Raises
     ------
@@ -37,8 +37,8 @@ def evaluate_run(
     Parameters
     ----------
     run_dir : the run folder
-    truth : TUM file or bag with ground truth; default: the folder's own, where it has one
-    true_map : the map as it really is; default: ``map_true.yaml`` beside the truth, where there is one
+    truth : TUM file or bag with ground truth; default: that of the folder, if any
+    true_map : the true map; default: ``map_true.yaml`` beside the truth, if any
 
     Raises
     ------
@@ -61,18 +61,18 @@ def evaluate_run(
 
 
 def write_report(run_dir: Path, truth: Path | None = None, bag: Path | None = None) -> Path:
-    """Measure a run folder and write ``report.html`` into it; the path of that page.
+    """Measure a run folder and write ``report.html`` into it; returns its path.
 
     Raises
     ------
     InputError
-        As :func:`evaluate_run`; or without the libraries that draw (extra ``tools``).
+        As :func:`evaluate_run`; or the plot libraries (extra ``tools``) are missing.
     """
     return write_page(*evaluate_run(run_dir, truth), bag)
 
 
 def write_page(evaluation: Evaluation, numbers: dict[str, Any], bag: Path | None = None) -> Path:
-    """Write ``report.html`` of a run that has been measured, with frames of ``bag`` (default: where it came from)."""
+    """Write ``report.html`` of a measured run, with frames of ``bag`` (default: the replayed one)."""
     require_packages()
     from thermal_fiducial.report.frames import strip
     from thermal_fiducial.report.html import render, report_page

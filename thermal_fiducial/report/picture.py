@@ -1,4 +1,4 @@
-"""One picture that says what the package does: a thermal frame with its markers, the map, the error."""
+"""Summary picture of a run: a thermal frame with its markers, the map, the error."""
 
 import io
 from pathlib import Path
@@ -17,7 +17,7 @@ from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.frames import annotated, view_at
 
-#: A picture for a README: few colours keep it small.
+#: Number of colours of the PNG; few keep it small for a README.
 COLOURS = 160
 FIDUCIAL, FUSED, TRUTH, INK, FAINT = '#e5484d', '#2563eb', '#64748b', '#0f172a', '#64748b'
 STYLE: Any = {
@@ -46,13 +46,13 @@ def draw_picture(evaluation: Evaluation, bag: Path, path: Path) -> None:
     Parameters
     ----------
     evaluation : the run
-    bag : what it was replayed from
+    bag : the replayed bag
     path : the file to write
 
     Raises
     ------
     InputError
-        A run without detections, a bag without the frame, or a path that can't be written.
+        A run without detections, a bag without the frame, or a path that cannot be written to.
     """
     stamp_ns = _frame_to_show(evaluation)
     with BagReader(bag) as reader:
@@ -77,7 +77,7 @@ def draw_picture(evaluation: Evaluation, bag: Path, path: Path) -> None:
 
 
 def _frame_to_show(evaluation: Evaluation) -> int:
-    """Stamp of the frame with most markers of the map; of several, one in the middle of the flight."""
+    """Stamp of the frame with most mapped markers; of several, the middle one of the flight."""
     frames, counts = np.unique(evaluation.run.detections.stamps_ns[~evaluation.unmapped], return_counts=True)
     if not len(frames):
         raise InputError(f'{evaluation.run.path}: no marker was detected, so there is nothing to draw')
@@ -104,7 +104,7 @@ def _draw_map(axis: Axes, evaluation: Evaluation) -> None:
 
 
 def _draw_error(axis: Axes, evaluation: Evaluation) -> None:
-    """Errors as a controller has them, or at each pose's own stamp where the times of arrival are unknown."""
+    """Errors as seen by a controller, or at each pose's stamp if arrival times are unknown."""
     axis.set(title='Error against ground truth', xlabel='time [s]', ylabel='position error [mm]')
     for name, colour, t, error in _errors(evaluation):
         rms = float(np.sqrt(np.mean(error**2)))

@@ -1,4 +1,4 @@
-"""What a run folder holds, read into arrays."""
+"""Reads a run folder into arrays."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
 FUSED, FIDUCIAL, TRUTH, TRUTH_OF_BAG = 'fused.tum', 'fiducial.tum', 'truth.tum', 'ground_truth.tum'
 DETECTIONS, LATENCY, PARAMETERS = 'detections.csv', 'latency.csv', 'parameters.yaml'
 MARKER_MAP, TRUE_MAP, SUMMARY, OUTPUT = 'marker_map.yaml', 'map_true.yaml', 'summary.json', 'output'
-#: Longer words are no numbers; whole ones fit into 64 bits.
+#: Longest cell of a number [characters]; limit of integers (int64).
 _LONGEST_CELL, _LARGEST_WHOLE = 40, 2**63
 
 
@@ -41,7 +41,7 @@ class Detections:
 class Run:
     """A run folder.
 
-    The fiducial poses are stamped by the camera's clock; here they have the IMU's stamps, as the filter takes them.
+    Fiducial poses, recorded in the camera's clock, are converted to stamps of the IMU's clock, as in the filter.
     """
 
     path: Path
@@ -54,9 +54,9 @@ class Run:
     marker_map: MarkerMap | None
     summary: dict[str, Any]
     truth: Trajectory | None
-    #: where the truth was read from
+    #: source of the truth
     truth_path: Path | None = None
-    #: the map as it really is; None where nobody knows
+    #: the true map; None if unknown
     true_map: MarkerMap | None = None
     #: t_imu - t_camera as configured
     offset_ns: int = 0
@@ -107,14 +107,14 @@ def read_run(path: Path, truth: Path | None = None, true_map: Path | None = None
 
 
 def _own_truth(path: Path, summary: dict[str, Any]) -> Path | None:
-    """The truth that a run folder has, or the bag that it came from."""
+    """The truth of a run folder, or of the replayed bag."""
     bag = bag_of_run(path, summary)
     places = [path / TRUTH, *([] if bag is None else [bag / TRUTH_OF_BAG])]
     return next((place for place in places if place.exists()), None)
 
 
 def bag_of_run(path: Path, summary: dict[str, Any]) -> Path | None:
-    """The bag that a run was replayed from; None where it cannot be found any more."""
+    """The bag that a run was replayed from; None if it is not found."""
     known, name = summary.get('bag_path'), summary.get('bag')
     places = [Path(known)] if isinstance(known, str) else []
     # A run folder may have been moved, with the bag in it or beside it.
@@ -134,12 +134,12 @@ def _camera_time_offset_ns(path: Path) -> int:
 
 
 def read_summary(path: Path) -> dict[str, Any]:
-    """What a replay wrote of itself; nothing where there is no such file.
+    """Content of ``summary.json``; empty if there is none.
 
     Raises
     ------
     InputError
-        Another file under its name.
+        The file is not a summary.
     """
     if not path.exists():
         return {}
@@ -167,7 +167,7 @@ def _is_table_of(is_kind: Callable[[Any], bool]) -> Callable[[Any], bool]:
     return lambda value: isinstance(value, dict) and all(map(_is_text, value)) and all(map(is_kind, value.values()))
 
 
-#: What the report reads of a summary; anything else in it is left as it is.
+#: Keys of a summary that the report reads, and their validation; others are ignored.
 _SUMMARY_KINDS: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(('bag', 'bag_path', 'mode', 'transport'), _is_text),
     'duration_s': _is_number,
@@ -178,7 +178,7 @@ _SUMMARY_KINDS: dict[str, Callable[[Any], bool]] = {
 
 
 def _rows(path: Path, kinds: dict[str, type]) -> list[list[Any]]:
-    """Columns ``kinds`` (name to type) of a CSV file, empty where there is no file."""
+    """Columns ``kinds`` (name to type) of a CSV file; empty if there is no file."""
     if not path.exists():
         return [[] for _ in kinds]
     rows: list[list[Any]] = []

@@ -1,4 +1,4 @@
-"""The flight in three dimensions: path, markers, and what their covariances claim."""
+"""The flight in three dimensions: path, markers and covariance ellipsoids."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,17 +13,17 @@ from thermal_fiducial.report.evaluation import Evaluation
 from thermal_fiducial.report.time_plots import Chart, FIDUCIAL, FUSED, GOOD, MOST_DOTS, thinned, TRUTH
 from thermal_fiducial.report.trajectory import Trajectory
 
-#: Points of a path in space.
+#: Most points of the path.
 MOST_PATH_POINTS = 4_000
-#: Ellipsoids of markers and along the path: more of them only hide each other.
+#: Most ellipsoids of markers and along the path; more would hide each other.
 MOST_MARKERS, MOST_POSES = 300, 16
-#: A typical ellipsoid is drawn about this large [m]; millimetres would not be seen in a picture of metres.
+#: Drawn size of a typical ellipsoid [m]; its millimetres would be invisible at the scale of the flight.
 _TYPICAL_M = 0.1
 _LARGEST_FACTOR = 500.0
-#: Larger ones, before the filter has settled, would hide everything else [m].
+#: Largest drawn size [m]; ellipsoids from before the convergence of the filter would hide everything else.
 _LARGEST_M = 0.4
 _SIGMAS = 3.0
-#: Far and low enough that the titles of all axes are in the picture.
+#: View point, chosen so that the titles of all axes are visible.
 _CAMERA = {'eye': {'x': -1.6, 'y': -1.26, 'z': 0.95}, 'center': {'x': 0.0, 'y': 0.0, 'z': -0.15}}
 _COLOURS = {'fixed': '#e2a400', 'seen': FIDUCIAL, 'not seen': GOOD, 'quarantined': TRUTH}
 
@@ -79,7 +79,7 @@ def _kind(marker: MapMarker, seen: set[int]) -> str:
 
 
 def _plates(evaluation: Evaluation, markers: Sequence[MapMarker]) -> list[Any]:
-    """Squares of the markers, a trace for each kind, with what is known of each under the pointer."""
+    """Squares of the markers, one trace per kind, with details of each as hover text."""
     seen = set(np.unique(evaluation.run.detections.ids).tolist())
     words = {tag.id: f'{tag.status}: {tag.why}<br>{tag.views} views' for tag in evaluation.tags}
     made: list[Any] = []

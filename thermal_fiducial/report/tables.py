@@ -1,4 +1,4 @@
-"""The measures as rows of text, for the page and the terminal alike."""
+"""The measures as tables of text, for page and terminal."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,13 +7,13 @@ from typing import Any
 from thermal_fiducial.core.filter.innovations import INNOVATIONS
 from thermal_fiducial.report.evaluation import Evaluation
 
-#: Tables of more columns stand alone.
+#: Most columns of a table that stands beside another one.
 _NARROW = 4
 
 
 @dataclass(frozen=True)
 class Table:
-    """A title, column heads with units, and rows of cells; ``words``: columns of words, which begin at the left."""
+    """A title, column heads with units, and rows of cells; ``words``: left-aligned text columns."""
 
     title: str
     heads: tuple[str, ...]
@@ -21,22 +21,22 @@ class Table:
     words: tuple[str, ...] = ('unit', 'status', 'why')
 
     def is_text(self, column: int) -> bool:
-        """Whether a column holds words; the first one always does."""
+        """Whether a column contains text; the first one always does."""
         return column == 0 or self.heads[column] in self.words
 
     @property
     def is_wide(self) -> bool:
-        """Whether it takes the width of a page."""
+        """Whether the table takes the width of the page."""
         return len(self.heads) > _NARROW
 
     def of(self, columns: Sequence[int]) -> 'Table':
-        """The same of some columns."""
+        """The table with some of the columns."""
         rows = [tuple(row[column] for column in columns) for row in self.rows]
         return Table(self.title, tuple(self.heads[column] for column in columns), rows, self.words)
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """``value`` to ``digits`` significant digits, never in powers of ten."""
+    """``value`` with ``digits`` significant digits, without exponent."""
     if value is None:
         return '–'
     if value == 0.0:
@@ -98,7 +98,7 @@ _SPREAD = (
     ('attitude error, 95 %', 'deg', 'attitude_p95_deg'),
 )
 
-#: What the nodes count has no unit but these.
+#: Units of the nodes' figures; the others have none.
 _UNITS = {
     'seconds since accepted pose': 's',
     'position std': 'm',
@@ -113,12 +113,12 @@ _UNITS = {
     'accelerometer scale error': '1',
     'map tilt': 'rad',
 }
-#: Of all poses of the run, these stand in the table of the innovations; the nodes' own are of the latest ones.
+#: Figures left out: the table of innovations has them for the whole run, the nodes only for the latest poses.
 _ELSEWHERE = ('received ', 'published ', 'poses accepted', 'poses refused', 'NIS per d.o.f.', INNOVATIONS)
 
 
 def tables(evaluation: Evaluation, numbers: dict[str, Any]) -> dict[str, Table]:
-    """All tables that the run has something for, by what they are about."""
+    """All tables that are not empty, by topic."""
     made = {
         'pilot': _pilot(numbers),
         'accuracy': _accuracy(numbers),
@@ -142,7 +142,7 @@ def _pick(values: dict[str, Any], rows: tuple[tuple[str, str, str], ...]) -> lis
 
 
 def map_error_table(values: dict[str, Any]) -> Table:
-    """Errors of a map, as :func:`map_accuracy` gives them."""
+    """Errors of a map from :func:`map_accuracy`."""
     return Table('Error of the map', ('', 'unit', ''), _pick(values, _MAP))
 
 
@@ -156,7 +156,7 @@ def _accuracy(numbers: dict[str, Any]) -> Table:
 
 
 def _pilot(numbers: dict[str, Any]) -> Table:
-    """Errors as a controller has them beside those at the instants of frames, which flatter the markers."""
+    """Errors as seen by a controller, beside those at the stamps of frames, which flatter the markers."""
     held = numbers.get('as_available', {})
     cases = {
         'markers in view': held.get('in_view', {}),
@@ -273,7 +273,7 @@ def _load(evaluation: Evaluation) -> Table:
 
 
 def _figures(evaluation: Evaluation) -> Table:
-    """What the nodes counted, but for the traffic on their topics and what stands in other tables."""
+    """Figures of the nodes, without message counts and those of other tables."""
     said = evaluation.run.summary.get('diagnostics', {})
     rows = [
         (node, *_split(name, str(value)))
@@ -286,7 +286,7 @@ def _figures(evaluation: Evaluation) -> Table:
 
 
 def _split(name: str, value: str) -> tuple[str, str, str]:
-    """Name without unit, value, unit of what a node counted."""
+    """Name without unit, value and unit of a figure."""
     if name.startswith('vibration '):
         return 'vibration', value, name.removeprefix('vibration ')
     if name.endswith(']'):

@@ -1,4 +1,4 @@
-"""One row a marker: how often it was seen, how well it fits, where it stands and why."""
+"""One row per marker: number of views, fit, state in the map and its reason."""
 
 from dataclasses import dataclass
 
@@ -12,10 +12,10 @@ _ON_TRIAL, _QUARANTINED = 'candidates', 'quarantine'
 
 @dataclass(frozen=True)
 class Tag:
-    """What a run knows of a marker; None: nothing."""
+    """Figures of a marker in a run; None: unknown."""
 
     id: int
-    #: frames in which it was detected
+    #: number of frames in which it was detected
     views: int
     first_view_ns: int | None
     corner_sigma_px: float | None
@@ -28,7 +28,7 @@ class Tag:
 
     @property
     def is_doubtful(self) -> bool:
-        """Whether it was measured and is not used."""
+        """Whether it was measured but is not used."""
         return self.status in ('quarantined', 'on trial', 'not in the map')
 
 
@@ -78,7 +78,7 @@ def _standing(run: Run, key: int, views: int, reasons: dict[str, dict[int, str]]
 
 
 def _reasons(run: Run, name: str) -> dict[int, str]:
-    """What the mapper said last of markers, from its figures ``ID: reason; ID: reason``."""
+    """The mapper's last reason per marker, from its figures ``ID: reason; ID: reason``."""
     found: dict[int, str] = {}
     for node, figures in run.summary.get('diagnostics', {}).items():
         if node.rpartition('/')[2] == 'marker_mapper':

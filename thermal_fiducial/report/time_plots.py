@@ -1,4 +1,4 @@
-"""Plots over each other with one time axis (Plotly): markers alone red, fused blue, truth grey, on any ground."""
+"""Stacked plots with a common time axis (Plotly): markers alone red, fused blue, truth grey."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,17 +21,17 @@ CAUSES = {
     Cause.NO_MARKERS: 'rgba(245, 158, 11, 0.20)',
     Cause.UNUSED: 'rgba(239, 68, 68, 0.18)',
 }
-#: Points of a line and of a cloud of dots: half a minute at 400 Hz is shown whole, more than that slows a phone down.
+#: Most points of a line and of a scatter plot: half a minute at 400 Hz; more slow a phone down.
 MOST_POINTS, MOST_DOTS = 12_000, 3_000
-#: Height of one of the plots that lie over each other [px], and of what stands round them.
+#: Height of one of the stacked plots, and of the margins around all [px].
 ROW_PX, AROUND_PX = 128, 92
-# Decades of a logarithmic axis, and what is written in each of them.
+# Tick digits of a logarithmic axis, by its number of decades.
 _LOG_TICKS = ((2, (1, 2, 5)), (4, (1, 3)), (np.inf, (1,)))
 
 
 @dataclass(frozen=True)
 class Chart:
-    """A plot of the page; ``timed`` ones share their time axis. ``wide``: as wide as the page."""
+    """A plot of the page. ``timed``: shares its time axis; ``wide``: as wide as the page."""
 
     name: str
     title: str
@@ -49,12 +49,12 @@ def thinned(length: int, most: int = MOST_POINTS) -> IntArray:
 
 
 class TimePlots:
-    """Plots over each other with one time axis, a trace at a time.
+    """Stacked plots with a common time axis; traces are added one by one.
 
     Parameters
     ----------
-    labels : what stands at each vertical axis, from the top
-    heights : relative; default: alike
+    labels : titles of the vertical axes, from the top
+    heights : relative; default: equal
     """
 
     def __init__(self, labels: Sequence[str], heights: Sequence[float] | None = None) -> None:
@@ -73,7 +73,7 @@ class TimePlots:
         self._named: set[str] = set()
 
     def add(self, row: int, x: FloatArray, y: FloatArray, name: str, **look: Any) -> None:
-        """A trace; of several of one name the first stands in the legend and switches them all."""
+        """Add a trace; traces of the same name share one entry of the legend, which switches them all."""
         first = name not in self._named
         self._named.add(name)
         values = {'x': np.asarray(x, np.float32), 'y': np.asarray(y, np.float32)}
@@ -81,25 +81,25 @@ class TimePlots:
         self.figure.add_trace(trace, row=row, col=1)
 
     def line(self, row: int, x: FloatArray, y: FloatArray, name: str, colour: str, width: float = 1.3) -> None:
-        """A line of at most :data:`MOST_POINTS`."""
+        """Add a line of at most :data:`MOST_POINTS`."""
         shown = thinned(len(x))
         self.add(row, x[shown], y[shown], name, mode='lines', line={'color': colour, 'width': width})
 
     def dots(self, row: int, x: FloatArray, y: FloatArray, name: str, colour: str, symbol: str = 'circle') -> None:
-        """Dots, at most :data:`MOST_DOTS` of them."""
+        """Add at most :data:`MOST_DOTS` dots."""
         shown = thinned(len(x), MOST_DOTS)
         marker = {'color': colour, 'size': 3.5 if symbol == 'circle' else 7, 'symbol': symbol}
         self.add(row, x[shown], y[shown], name, mode='markers', marker=marker)
 
     def band(self, row: int, x: FloatArray, half: FloatArray, name: str) -> None:
-        """An area from ``-half`` to ``half``."""
+        """Add a band from ``-half`` to ``half``."""
         shown = thinned(len(x), MOST_DOTS)
         both = np.concatenate([half[shown], -half[shown][::-1]])
         look = {'fill': 'toself', 'fillcolor': BAND, 'line': {'width': 0}, 'mode': 'lines', 'hoverinfo': 'skip'}
         self.add(row, np.concatenate([x[shown], x[shown][::-1]]), both, name, **look)
 
     def make_logarithmic(self) -> None:
-        """Vertical axes by powers of ten, a whole number at each tick: of Plotly, one digit stands at most of them."""
+        """Make the vertical axes logarithmic, with full numbers at the ticks: Plotly writes single digits."""
         for number, row in enumerate(self.figure.select_yaxes(), 1):
             drawn = np.concatenate([trace.y for trace in self.figure.select_traces(row=number, col=1)] or [[]])
             values = drawn[np.isfinite(drawn)]
@@ -111,7 +111,7 @@ class TimePlots:
             row.update(type='log', tickvals=ticks, ticktext=[f'{tick:g}' for tick in ticks])
 
     def shade(self, evaluation: Evaluation) -> None:
-        """Mark the times without a pose from markers, a colour for each cause."""
+        """Shade the interruptions, with a colour per cause."""
         for entry in evaluation.interruptions:
             start, end = evaluation.seconds_at(entry.start_ns), evaluation.seconds_at(entry.end_ns)
             place = {'x0': start, 'x1': end, 'y0': 0, 'y1': 1, 'xref': 'x', 'yref': 'paper'}

@@ -1,4 +1,4 @@
-"""Trajectories as the report holds them."""
+"""Trajectories of the report."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +43,7 @@ class Trajectory:
 
 
 def ordered(stamps_ns: IntArray, positions: FloatArray, quaternions: FloatArray) -> Trajectory:
-    """Trajectory of poses whose stamps do not go back; of several poses at one stamp, the first."""
+    """Trajectory of poses with non-decreasing stamps; of several poses at one stamp, the first is kept."""
     first = np.ones(len(stamps_ns), np.bool_)
     first[1:] = np.diff(stamps_ns) > 0
     return Trajectory(stamps_ns[first], transform_from_quaternion(positions[first], quaternions[first]))

@@ -1,4 +1,4 @@
-"""What a run comes to, in words: remarks, each with a weight, and one headline of them all."""
+"""The verdict on a run: weighted remarks and a headline."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -6,24 +6,24 @@ from typing import Any
 
 from thermal_fiducial.report.evaluation import Evaluation
 
-#: NEES per degree of freedom up to which covariances are consistent, and beyond which they claim far too little error.
+#: NEES per degree of freedom up to which covariances are consistent, and above which they are far too small.
 CONSISTENT_NEES, INCONSISTENT_NEES = 2.0, 4.0
-#: Below this, covariances claim much more error than there is.
+#: NEES per degree of freedom below which covariances are far too large.
 CAUTIOUS_NEES = 0.2
-#: Shares of refused poses that are worth a look, and that say something is wrong.
+#: Shares of refused poses that are worth a look, and that indicate a fault.
 FEW_REFUSED, MANY_REFUSED = 0.01, 0.1
-#: Without a pose for longer than this, a controller notices [ms]; and than this, a drone drifts off.
+#: Gaps of the poses [ms] above which a controller is disturbed, and above which a drone drifts away.
 SHORT_PAUSE_MS, LONG_PAUSE_MS = 100.0, 500.0
-#: Coasting for longer than this is worth a look [s].
+#: Duration of coasting that is worth a look [s].
 LONG_COAST_S = 2.0
-#: A step of the pose that a position controller answers with a jerk [mm].
+#: Step of the pose that causes a jerk of a position controller [mm].
 LARGE_STEP_MM = 50.0
-#: A pose that comes later than this is of little use to an autopilot [ms].
+#: Latency above which a pose is of little use to an autopilot [ms].
 LATE_MS = 20.0
 
 
 class Weight(IntEnum):
-    """How much a remark weighs."""
+    """Weight of a remark."""
 
     GOOD = 0
     NOTE = 1
@@ -55,7 +55,7 @@ class RunVerdict:
 
     @property
     def weight(self) -> Weight:
-        """That of the weightiest remark."""
+        """Largest weight of the remarks."""
         return max((remark.weight for remark in self.remarks), default=Weight.GOOD)
 
     @property

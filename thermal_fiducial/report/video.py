@@ -1,4 +1,4 @@
-"""A video of a run: thermal frames with their markers, time, state and place, by ffmpeg or PyAV."""
+"""A video of a run: thermal frames with markers, time, state and position, by ffmpeg or PyAV."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,9 +18,9 @@ from thermal_fiducial.report.frames import annotated, bag_of, views, write
 from thermal_fiducial.report.interruptions import Cause, interruptions
 from thermal_fiducial.report.run_folder import Run
 
-#: Frames a second of the video where the bag has fewer than three.
+#: Frame rate of the video if the bag has fewer than three frames [Hz].
 _FALLBACK_RATE = 30.0
-#: A fused pose within this [ns] of a frame stands in its caption.
+#: Largest stamp difference of a frame and the fused pose in its caption [ns].
 _NEAR_NS = 20_000_000
 _LINE_PX = 26
 
@@ -33,7 +33,7 @@ def require_encoder() -> str:
     Raises
     ------
     InputError
-        Neither is.
+        Neither is installed.
     """
     if shutil.which('ffmpeg'):
         return 'ffmpeg'
@@ -50,8 +50,8 @@ def write_video(
     Parameters
     ----------
     run : the run
-    path : an ``.mp4`` file, H.264, that browsers play
-    bag : what the run was replayed from; default: where it was
+    path : an ``.mp4`` file (H.264)
+    bag : the replayed bag; default: its recorded path
     progress : called with the share done, 0 to 1
 
     Raises
@@ -77,7 +77,7 @@ def write_video(
                     take(frame)
                     progress(min(1.0, index / count))
         except BaseException:
-            # Half a video plays no longer than to its middle.
+            # An incomplete video is useless.
             path.unlink(missing_ok=True)
             raise
 
@@ -88,7 +88,7 @@ def _rate(reader: BagReader, count: int) -> float:
 
 
 def _captioned(run: Run, reader: BagReader) -> Iterator[Frame]:
-    """The frames with markers and captions; a withheld one stays as it was, with the reason on it."""
+    """The frames with markers and captions; a dropped frame repeats the last one, with the reason."""
     last: Frame | None = None
     start_ns: int | None = None
     closed = [(entry.start_ns, entry.end_ns) for entry in interruptions(run, None) if entry.is_shutter]
@@ -99,18 +99,18 @@ def _captioned(run: Run, reader: BagReader) -> Iterator[Frame]:
         if last is None:
             continue
         picture = annotated(last, run.detections, view.stamp_ns) if view.pixels is not None else last.copy()
-        # The first frames behind a closed shutter only look frozen.
+        # The first frames with a closed shutter are reported as frozen.
         in_shutter = any(start < view.stamp_ns + run.offset_ns < end for start, end in closed)
         reason = Cause.SHUTTER.value if view.reason and in_shutter else view.reason
         lines = [f'{(view.stamp_ns - start_ns) / SECOND_NS:6.2f} s  {reason}', _place(run, view.stamp_ns)]
         for row, line in enumerate(lines):
             write(picture, line, (8, picture.shape[0] - 10 - _LINE_PX * (len(lines) - 1 - row)))
-        # H.264 with halved colours wants even sizes.
+        # H.264 with chroma subsampling needs even sizes.
         yield picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
 
 
 def _place(run: Run, stamp_ns: int) -> str:
-    """Where the filter had the robot at a frame."""
+    """The filter's position at a frame."""
     fused = run.fused
     if not len(fused):
         return 'no pose'
