@@ -14,27 +14,27 @@ from thermal_fiducial.calibration.preintegration import ImuTrack
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
-#: Below this [s] nothing can be said.
+#: Shortest usable recording [s].
 SHORTEST_S = 20.0
-# Averages over a second may wander by this much at rest: rate [rad/s] and force [m/s^2] of a table that is leant upon.
+# Largest deviation of one-second averages at rest [rad/s, m/s^2]: a table that somebody leans on.
 _STILL = np.repeat((0.02, 0.2), 3)
-# The longest averaging time is this share of the recording: of longer ones there are too few.
+# Longest averaging time as a share of the recording; longer ones leave too few averages.
 _LONGEST_SHARE = 0.1
-# Time without samples that changes nothing, as a share, and from when on it is that [s].
+# Largest tolerated share of time in gaps, and shortest interval that counts as a gap [s].
 _MISSING, _GAP_S = 0.02, 0.2
 _FLICKER = 2.0 * np.log(2.0) / np.pi
 
 
 @dataclass(frozen=True)
 class AllanFit:
-    """Of one sensor, three axes.
+    """Allan deviation of one sensor, three axes, with its fit.
 
     Parameters
     ----------
     tau : (K,) averaging times [s]
     deviation : (K, 3) overlapping Allan deviation
     white : (3,) density N, per sqrt(Hz)
-    instability : (3,) B
+    instability : (3,) bias instability B
     walk : (3,) density K, per second and sqrt(Hz)
     """
 
@@ -61,7 +61,7 @@ def fit_noise(track: ImuTrack) -> ImuNoiseFit:
     Raises
     ------
     InputError
-        Too short, not at rest, or with too many samples missing.
+        A recording that is too short, not at rest, or has too many missing samples.
     """
     seconds = float(track.seconds[-1] - track.seconds[0])
     if seconds < SHORTEST_S:
@@ -89,7 +89,7 @@ def _check_rest(values: FloatArray, rate: float) -> None:
 
 
 def _fit(values: FloatArray, rate: float, seconds: float) -> AllanFit:
-    """N, B and K of values (N, 3)."""
+    """Fit N, B and K to samples (N, 3)."""
     longest = max(1, int(np.log2(_LONGEST_SHARE * seconds * rate)))
     wanted = 2.0 ** np.arange(longest + 1) / rate
     columns = [allantools.oadev(axis, rate=rate, data_type='freq', taus=wanted)[:2] for axis in values.T]
@@ -100,7 +100,7 @@ def _fit(values: FloatArray, rate: float, seconds: float) -> AllanFit:
     for variance in (deviation**2).T:
         if np.max(variance) <= 0.0:
             raise InputError('an axis of the IMU says the same all the time')
-        # An Allan variance is as uncertain as the square root of the number of averages says, relative to itself.
+        # The relative standard deviation of an Allan variance is about one over the root of the number of averages.
         weight = np.sqrt(seconds / tau) / np.maximum(variance, 1e-6 * np.max(variance))
         fitted.append(np.sqrt(nnls(design * weight[:, None], variance * weight)[0]))
     white, instability, walk = np.array(fitted).T

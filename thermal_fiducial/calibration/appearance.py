@@ -1,4 +1,4 @@
-"""What boards look like around their points, in steps of their grid."""
+"""Image models of board points, in units of the grid spacing (steps)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,14 +9,14 @@ from scipy.special import ndtr
 
 from thermal_fiducial.core.types import FloatArray, IntArray
 
-# Least reach of a window [px].
+# Smallest half width of a window [px].
 _LEAST_REACH = 2.7
-# Ground beside a disc that its window shows [px].
+# Margin of background around a disc in its window [px].
 _GROUND = 4.0
 _MOST_INSET = 0.3
-# A blurred edge is over after so many standard deviations, for a window's size, and as good as nothing is left of it.
+# Extent of a blurred edge in standard deviations: for the size of a window, and where it has vanished.
 _TAIL, _NOTHING_LEFT = 3.0, 5.0
-# Where a disc has fewer neighbours than another: none is seen from so far [steps].
+# Placeholder position of missing neighbours, out of reach [steps].
 _NOWHERE = 1e3
 
 
@@ -25,57 +25,57 @@ class Appearance(Protocol):
 
     @property
     def bent(self) -> bool:
-        """Whether perspective bends it within a window; discs are taken for ellipses, as the least squares do."""
+        """Whether perspective within a window is modelled; discs are treated as ellipses, as in the least squares."""
 
     @property
     def width(self) -> float:
-        """How far squares draw back, or radius of a disc, to start from [steps of the grid]."""
+        """Initial inset of squares, or radius of a disc [steps]."""
 
     @property
     def width_free(self) -> bool:
-        """Whether ``width`` is to be found."""
+        """Whether ``width`` is estimated."""
 
     @property
     def least_visible(self) -> float:
         """Share of its window that must lie in the image."""
 
     def at(self, nodes: FloatArray, board: FloatArray) -> Self:
-        """What it looks like at ``nodes`` (P, 2) among the nodes (N, 2) of a board."""
+        """The model at ``nodes`` (P, 2) among the nodes (N, 2) of a board."""
 
     def rows(self, index: IntArray) -> Self:
-        """What it looks like at some of the points."""
+        """The model at a subset of the points."""
 
     def reach(self, spacing: FloatArray, blur: FloatArray | None) -> FloatArray:
-        """How far (P,) [steps] windows reach where points are ``spacing`` (P,) [px] apart; blur (P,) [px] if known."""
+        """Half widths (P,) [steps] of windows for a point ``spacing`` (P,) [px]; blur (P,) [px] if known."""
 
     def shape(
         self, places: FloatArray, blur: FloatArray, width: FloatArray, free: int
     ) -> tuple[FloatArray, FloatArray]:
         """Pattern (P, N) at places (P, N, 2) relative to the points, and its derivatives (free, P, N).
 
-        Where the place alone is free, without what is :meth:`beside` the point.
+        If only the place is free, without the contribution of :meth:`beside`.
 
         Parameters
         ----------
         blur : (P, 2) along the axes [steps]
         width : (P,)
-        free : derivatives are by the place (2), the logarithm of the blur and the width: the first so many of them
+        free : number of derivatives, in the order place (2), logarithm of the blur, width
         """
 
     def beside(self, places: FloatArray, blur: FloatArray, width: FloatArray) -> FloatArray:
-        """What neighbours of the points add to :meth:`shape` (P, N) when they stay where the grid has them."""
+        """Contribution of the neighbours to :meth:`shape` (P, N), with neighbours fixed at their grid positions."""
 
 
 @dataclass(frozen=True)
 class SquaresMeet:
-    """Corner of a chessboard, whose squares of one colour may be smaller than those of the other.
+    """Corner of a chessboard whose squares of one colour may be inset.
 
-    Paint bleeds, foil is cut short, and heat spreads: where squares of one colour draw back from the lines of the
-    grid, those of the other touch along more than a point.
+    Paint bleeds, foil is cut short, and heat spreads: the squares of one colour shrink from the grid lines, and
+    those of the other colour join at the corners.
 
     Parameters
     ----------
-    parity : (P,) -1 where the squares are the other way round
+    parity : (P,) sign, -1 where the colours are swapped
     """
 
     parity: FloatArray = field(default_factory=lambda: np.ones(1))
@@ -99,7 +99,7 @@ class SquaresMeet:
     def shape(
         self, places: FloatArray, blur: FloatArray, width: FloatArray, free: int
     ) -> tuple[FloatArray, FloatArray]:
-        """See :class:`Appearance`; where ``width`` is negative, the squares of the other colour draw back."""
+        """See :class:`Appearance`; a negative ``width`` insets the squares of the other colour."""
         sign = np.where(width >= 0.0, 1.0, -1.0)
         inset = np.minimum(np.abs(width), _MOST_INSET)
         turned = sign * self.parity
@@ -107,7 +107,7 @@ class SquaresMeet:
         across = _bands(places[..., 1] * turned[:, None], inset, blur[:, 1], free)
         scale = (2.0 * sign)[:, None]
         values = scale * (along[0] * across[0]).sum(axis=0) - sign[:, None]
-        # By place, each along its own axis; by blur and width, which both axes have in common.
+        # Derivatives by the place, per axis; then by blur and width, which are common to both axes.
         slopes = [scale * (along[1] * across[0]).sum(axis=0)]
         slopes.append((scale * turned[:, None]) * (along[0] * across[1]).sum(axis=0))
         for number in range(2, free):
@@ -155,14 +155,14 @@ class Disc:
     Parameters
     ----------
     width : radius [steps]
-    others : (P, K, 2) where its neighbours are, relative to it [steps]: blurred they reach into its window
+    others : (P, K, 2) positions of its neighbours relative to it [steps], whose blur reaches into the window
     """
 
     width: float
     others: FloatArray = field(default_factory=lambda: np.zeros((1, 0, 2)))
     bent = False
     width_free = False
-    #: the whole disc: a part of it does not show its middle
+    #: nearly the whole disc, since a part of it does not determine its centre
     least_visible = 0.9
 
     def at(self, nodes: FloatArray, board: FloatArray) -> 'Disc':
@@ -178,7 +178,7 @@ class Disc:
         return Disc(self.width, self.others[index])
 
     def reach(self, spacing: FloatArray, blur: FloatArray | None) -> FloatArray:
-        """See :class:`Appearance`; the next disc stays outside, but for its blur."""
+        """See :class:`Appearance`; excludes the next disc except its blur."""
         most = 1.0 - self.width - 1.0 / spacing
         if blur is None:
             enough = 2.0 * self.width + 1.0 / spacing
@@ -204,9 +204,9 @@ class Disc:
     def _add_neighbours(
         self, totals: Sequence[FloatArray], places: FloatArray, blur: FloatArray, width: FloatArray
     ) -> None:
-        """Add what the neighbours show to the values, and to as many derivatives as there are."""
+        """Add the contribution of the neighbours to the values and derivatives."""
         visible = width + _NOTHING_LEFT * blur.max(axis=1)
-        # Neighbours are a step away or more: pixels near the middle see nothing of them.
+        # Neighbours are at least a step away and do not contribute near the centre.
         from_middle = np.hypot(places[..., 0], places[..., 1])
         point, pixel = np.nonzero(from_middle > (1.0 - visible)[:, None])
         away = places[point, pixel][:, None] - self.others[point]
@@ -218,7 +218,7 @@ class Disc:
 
 
 def _disc(places: FloatArray, blur: FloatArray, width: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
-    """Disc (...) at places (..., 2) relative to its middle, and its derivatives as of :class:`Appearance`.
+    """Disc (...) at places (..., 2) relative to its centre, and its derivatives as in :class:`Appearance`.
 
     Parameters
     ----------
@@ -228,7 +228,7 @@ def _disc(places: FloatArray, blur: FloatArray, width: FloatArray, free: int) ->
     x, y = places[..., 0], places[..., 1]
     x_blur, y_blur = x / blur[..., 0] ** 2, y / blur[..., 1] ** 2
     radius = np.sqrt(x * x + y * y) + 1e-9
-    # Distance from the middle in blurs of the direction, and distance from the edge in the same.
+    # Distances from centre and edge in units of the blur along that direction.
     steps = np.sqrt(x * x_blur + y * y_blur) + 1e-9
     outwards = width / radius - 1.0
     inside = outwards * steps

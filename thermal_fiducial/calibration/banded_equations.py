@@ -1,4 +1,4 @@
-"""Normal equations of states in a band, each held to the next one, and of the unknowns that all of them share."""
+"""Normal equations of a chain of states (block tridiagonal) with unknowns shared by all of them."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -11,13 +11,13 @@ from thermal_fiducial.core.types import FloatArray
 
 @dataclass(frozen=True)
 class BandedEquations:
-    """Those of a Gauss-Newton step, to which each measurement adds.
+    """Accumulated normal equations of a Gauss-Newton step.
 
     Parameters
     ----------
-    H : (N, 2, S, S) of each of N states with itself, and with the next one
-    B : (N, S, K) of the states with the K shared unknowns
-    C : (K, K) of the shared unknowns
+    H : (N, 2, S, S) blocks of each state with itself and with the next one
+    B : (N, S, K) blocks of the states with the K shared unknowns
+    C : (K, K) block of the shared unknowns
     g, c : (N, S) and (K,) gradients by the states and by the shared unknowns
     """
 
@@ -29,12 +29,12 @@ class BandedEquations:
 
     @classmethod
     def empty(cls, states: int, size: int, shared: int) -> Self:
-        """Those of so many states of ``size`` unknowns each, of which nothing is known."""
+        """Zero equations for ``states`` states of ``size`` unknowns each."""
         H, B = np.zeros((states, 2, size, size)), np.zeros((states, size, shared))
         return cls(H, B, np.zeros((shared, shared)), np.zeros((states, size)), np.zeros(shared))
 
     def copy(self) -> Self:
-        """The same, to which more can be added."""
+        """An independent copy."""
         return type(self)(*(values.copy() for values in vars(self).values()))
 
     def add_states(self, index: slice, J: FloatArray, by_shared: FloatArray, error: FloatArray) -> None:
@@ -45,7 +45,7 @@ class BandedEquations:
         self.g[index] += (transposed @ error[:, :, None])[:, :, 0]
 
     def add_shared(self, by_shared: FloatArray, error: FloatArray) -> None:
-        """Add what the same errors say of the shared unknowns alone."""
+        """Add the blocks of the shared unknowns for the same errors."""
         flat = by_shared.reshape(-1, len(self.c))
         self.C[...] += flat.T @ flat
         self.c[...] += flat.T @ error.ravel()

@@ -1,7 +1,7 @@
-"""The adjustment of a whole recording: body states at the camera's frames, and what all of them share.
+"""Batch adjustment of a recording: body states at the camera's frames, and shared unknowns.
 
-Gauss-Newton on states in a band (consecutive ones are held together by the preintegrated IMU samples between them) and
-the shared unknowns beside it.
+Gauss-Newton on a chain of states (consecutive ones are linked by the preintegrated IMU samples between them) and on the
+shared unknowns.
 """
 
 from copy import copy
@@ -22,19 +22,19 @@ _STATE = 15
 #: Shared unknowns: rotation and position of the camera in the body, time offset, direction of gravity, read-out time,
 #: scale errors and misalignments of the IMU.
 _SHARED = 10 + AXES
-#: Largest time offset that is looked for [s].
+#: Largest time offset that is searched [s].
 LARGEST_OFFSET = 0.15
 _COARSE_STEP = 0.002
 _MAX_STEPS = 15
-# Change of the shared unknowns [rad, m, s] that no digit of the answer shows.
+# Convergence threshold of the shared unknowns [rad, m, s], below the printed digits.
 _CONVERGED = 1e-7
-# Parts of a recording that are left out one by one.
+# Number of groups of the jackknife.
 _GROUPS = 8
 # Mahalanobis distance of a pose (six degrees of freedom, 99 %) beyond which it loses weight.
 _INLIER = 4.1
-# What biases may be at most, as a prior on the first state [rad/s, m/s^2].
+# Prior standard deviations of the biases at the first state [rad/s, m/s^2].
 _BIAS_PRIOR = np.array([0.1] * 3 + [1.0] * 3)
-# Scale errors (places of the diagonals) and misalignments [rad], by the data sheets of small IMUs.
+# Prior standard deviations of scale errors (diagonal entries) and misalignments [rad], by data sheets of small IMUs.
 _AXES_PRIOR = np.where(np.isin(np.arange(AXES), (0, 4, 8, 9, 11, 14)), 0.01, 0.005)
 # Standard deviation of the read-out time about zero: while it is estimated, and while it is held there [s].
 _READOUT_PRIOR, _READOUT_HELD = 0.05, 1e-12
@@ -42,7 +42,7 @@ _READOUT_PRIOR, _READOUT_HELD = 0.05, 1e-12
 
 @dataclass(frozen=True)
 class State:
-    """All unknowns; leading dimension (N,) where there is one a frame."""
+    """All unknowns; those of each frame have a leading dimension (N,)."""
 
     R: FloatArray
     p: FloatArray
@@ -58,15 +58,15 @@ class State:
 
 @dataclass(frozen=True)
 class Solution:
-    """The best states.
+    """The least-squares solution.
 
     Parameters
     ----------
     state : all unknowns
     covariance : (25, 25) of the shared ones, scaled by ``scale`` squared
     residuals : (N, 6) of the camera poses, position and rotation, in the map [m, rad]
-    scale : factor on the given covariances at which the residuals are what they should be
-    jitter : standard deviation of the frames' stamps [s], as the residuals show it
+    scale : factor on the given covariances that makes them consistent with the residuals
+    jitter : standard deviation of the frames' stamps [s], estimated from the residuals
     """
 
     state: State
@@ -83,7 +83,7 @@ def root_information(covariance: FloatArray) -> FloatArray:
 
 
 def first_state(stamps: FloatArray, measured: FloatArray, imu: ImuTrack, gravity: float) -> State:
-    """Offset and rotation from the angular velocities, everything else from these."""
+    """Initial state: clock offset and rotation by matching angular velocities, everything else from these."""
     R, p = measured[:, :3, :3], measured[:, :3, 3]
     dt = np.diff(stamps)
     turned = se3.so3_log(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / dt[:, None]
@@ -115,15 +115,15 @@ def _aligned(camera: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 class Problem:
-    """All that was measured.
+    """The measurements.
 
     Parameters
     ----------
     stamps : (N,) of the frames, by the camera's clock [s]
     measured : (N, 4, 4) T_map_camera
-    root : (N, 6, 6) of their information, as :func:`root_information` has it
-    imu, noise : samples, and what their noise is
-    rows, readout : of the frames, and the read-out time that their poses allow for [s]; without rows it is held at zero
+    root : (N, 6, 6) root information of the poses, see :func:`root_information`
+    imu, noise : samples and their noise densities
+    rows, readout : row moments of the frames, and the read-out time assumed in their poses [s]; without rows it is zero
     jitter : standard deviation of the stamps [s]
     """
 
@@ -139,18 +139,17 @@ class Problem:
         jitter: float = 0.0,
     ) -> None:
         self._stamps, self._measured, self._root, self._imu, self._noise = stamps, measured, root, imu, noise
-        # What shakes the gyroscope shakes what is predicted from it too: in a derivative it would find itself.
+        # Averaged, since vibration in the twist would be correlated with that in the prediction.
         self._steady = imu.averaged(float(np.median(np.diff(stamps))))
         self._rows, self._about, self._jitter = rows, readout, jitter
         if rows is not None:
             covariance = np.linalg.inv(np.swapaxes(root, 1, 2) @ root)
-            # By how much the true pose is off the measured one for a twist and a read-out time of one, and what the
-            # corners know beyond that.
+            # Error of the measured pose per twist and read-out time, and the remaining information of the corners.
             self._drift = -covariance @ rows.cross
             self._beyond = rows.square + rows.cross @ self._drift
 
     def solved(self, state: State) -> Solution:
-        """The best states, from first ones."""
+        """The least-squares solution, iterated from ``state``."""
         for _ in range(_MAX_STEPS):
             state, change, covariance = self.improved(state)
             if change < _CONVERGED:
@@ -162,10 +161,10 @@ class Problem:
         return Solution(state, covariance * scale**2, error, scale, jitter)
 
     def repeated(self, solution: Solution) -> Solution:
-        """``solution`` with a covariance as wide as its answers scatter when an eighth of the frames is left out.
+        """``solution`` with the covariance from its scatter when an eighth of the frames is left out.
 
-        What errs for seconds on end (a lens that is off in a part of the image, an IMU whose errors the model does not
-        have) is no white noise, and no covariance of white noise knows of it. Delete-a-group jackknife, B. Efron, "The
+        Errors that are correlated over seconds (a lens error in a part of the image, unmodelled IMU errors) are not in
+        a covariance that assumes white noise. Delete-a-group jackknife, B. Efron, "The
         jackknife, the bootstrap and other resampling plans", 1982; never narrower than the covariance of white noise.
         An answer is a step from the whole's solution: further ones change a deviation by less than a hundredth.
         """
@@ -173,7 +172,7 @@ class Problem:
         edges = np.linspace(0, len(self._stamps), _GROUPS + 1).astype(int).tolist()
         answers = np.array([self._step_without(solution.state, of_samples, *pair) for pair in pairwise(edges)])
         variance = (_GROUPS - 1) * np.var(answers, axis=0)
-        # The direction of gravity is not asked for.
+        # The direction of gravity is a nuisance parameter.
         variance[7:9] = 0.0
         wider = np.sqrt(np.maximum(1.0, variance / np.diag(solution.covariance)))
         return replace(solution, covariance=solution.covariance * np.outer(wider, wider))
@@ -208,7 +207,7 @@ class Problem:
         return self.moved(state, own, shared), float(np.abs(shared).max()), covariance
 
     def _of_samples(self, state: State) -> BandedEquations:
-        """What the IMU's samples and prior knowledge say."""
+        """Normal equations of IMU samples and priors."""
         normal = BandedEquations.empty(len(self._stamps), _STATE, _SHARED)
         self._add_imu(state, normal)
         normal.H[0, 0, 9:, 9:] += np.diag(1.0 / _BIAS_PRIOR**2)
@@ -239,7 +238,7 @@ class Problem:
         shared[:, :3, 6] = state.v + (state.R @ np.cross(rate, arm)[:, :, None])[:, :, 0]
         shared[:, 3:, 6] = (state.R @ rate[:, :, None])[:, :, 0]
         if self._rows is not None:
-            # What the twist's own errors add is of second order: they are centimetres a second, for milliseconds.
+            # Errors of the twist are of second order: centimetres a second, for milliseconds.
             shared[:, :, 9] = -(self._drift @ shared[:, :, 6, None])[:, :, 0]
             error += (state.readout - self._about) * shared[:, :, 9]
         return error, own, shared
@@ -255,7 +254,7 @@ class Problem:
         return np.asarray(self._root - a[:, None, None] * u[:, :, None] * (u[:, None, :] @ self._root))
 
     def _scatter(self, error: FloatArray, twist: FloatArray) -> float:
-        """Deviation of the stamps [s]: of the delays that explain errors (N, 6) best, less what poses' noise makes."""
+        """Jitter of the stamps [s]: scatter of the delays that explain errors (N, 6) best, less that by pose noise."""
         u = (self._root @ twist[:, :, None])[:, :, 0]
         square = np.maximum(np.sum(u**2, axis=1), 1e-12)
         fast = square >= np.median(square)

@@ -1,12 +1,12 @@
 """Camera against IMU: rotation, lever arm, time offset and read-out time, from one recording before known markers.
 
-A batch over the whole recording. Every camera pose has a body state (pose, velocity, biases); consecutive states are
-held together by the preintegrated IMU samples between them, and the camera poses hold them to the map through the
-extrinsics. States stand at the camera's stamps plus the offset; a change of the offset moves them along their own
-velocity, and the samples are then preintegrated anew. J. Rehder et al., "Extending kalibr", ICRA 2016, estimates the
-same quantities with splines, scale errors and misalignments of the IMU among them: left out, half a per cent of them
-turns up in the lever arm as millimetres. How long the rows take to be read out shows in the corners of each frame, and
-in poses that come early or late with the rows that they rest on.
+A batch adjustment of the whole recording. Every camera pose has a body state (pose, velocity, biases); consecutive
+states are linked by the preintegrated IMU samples between them, and to the map by the camera poses and the extrinsics.
+The times of the states are the camera's stamps plus the offset; a change of the offset moves them along their velocity,
+and the samples are preintegrated again. J. Rehder et al., "Extending kalibr", ICRA 2016, estimates the same quantities
+with splines, including scale errors and misalignments of the IMU: neglected, half a per cent of these biases the lever
+arm by millimetres. The read-out time is observable in the corners of each frame, and in the delay of poses with the
+rows that they are computed from.
 """
 
 from collections.abc import Sequence
@@ -32,9 +32,9 @@ from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
 
 _LEAST_POSES = 100
-# Standard deviations from zero beyond which there is a read-out time.
+# Significance (standard deviations from zero) above which a read-out time is reported.
 _SIGNIFICANT = 3.0
-# The corners are brought to the middle row's time, and the poses solved anew, until read-out time and jitter stay [s].
+# Corners are moved to the middle row's time and poses solved again until read-out time and jitter converge [s].
 _ROUNDS, _SETTLED = 8, 2e-5
 
 
@@ -142,7 +142,7 @@ def _rolling(
     jitter: float = 0.0,
     state: State | None = None,
 ) -> tuple[list[SolvedFrame], Problem, Solution]:
-    """Frames as they are with all rows read out at once, the last adjustment, and its solution."""
+    """Frames corrected to a global shutter, the last adjustment, and its solution."""
     readout = 0.0 if state is None else state.readout
     for _ in range(_ROUNDS):
         poses, rows = [frame.pose for frame in solved], [frame.rows for frame in solved]
@@ -175,7 +175,7 @@ def _solved(
 
 
 def _row_shifts(frames: Sequence[FrameCorners], camera: Camera, problem: Problem, state: State) -> list[FloatArray]:
-    """By how much (markers, 4, 2) [px] corners would have been elsewhere at the time of the middle row."""
+    """Rolling-shutter displacement (markers, 4, 2) [px] of the corners to the time of the middle row."""
     points = np.concatenate([frame.points.reshape(-1, 3) for frame in frames])
     delays = state.readout * np.concatenate([frame.shares(camera.height).ravel() for frame in frames])
     counts = [4 * len(frame.sizes) for frame in frames]
@@ -191,7 +191,7 @@ def _row_shifts(frames: Sequence[FrameCorners], camera: Camera, problem: Problem
 
 @dataclass(frozen=True)
 class _RigRecording:
-    """What of a recording doesn't change from round to round."""
+    """The data of a recording that are the same in every iteration."""
 
     imu: ImuTrack
     start_ns: int

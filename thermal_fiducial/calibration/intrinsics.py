@@ -1,7 +1,6 @@
-"""Intrinsics from sightings of a board: one lens model, the views that belong to it, and what is known of its errors.
+"""Intrinsics from sightings of a board: fit of one lens model, outlier views, covariance.
 
-Z. Zhang, "A flexible new technique for camera calibration", 2000, is where the problem's shape comes from; OpenCV only
-starts it.
+Formulation of Z. Zhang, "A flexible new technique for camera calibration", 2000; OpenCV only gives the initial values.
 """
 
 from collections.abc import Sequence
@@ -17,7 +16,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 
-#: With all but one of them a camera can still be fitted.
+#: Fewest views: a camera can still be fitted without one of them.
 LEAST_VIEWS = 6
 # A view whose rms is this many times the median view's was moving, half hidden or wrongly numbered.
 _OUTLIER_RATIO = 2.5
@@ -41,8 +40,8 @@ class Calibration:
     T_camera_board : (V, 4, 4)
     residuals : V arrays (N, 2) measured minus predicted [px]
     views : (V,) indices of the sightings that were used
-    dropped : indices of those that were left out as outliers
-    held_out_px : rms error of views that the fit had not seen, and its standard error
+    dropped : indices of the sightings rejected as outliers
+    held_out_px : rms error of held-out views, and its standard error
     """
 
     camera: Camera

@@ -1,4 +1,4 @@
-"""Pose of a camera from markers of known pose and nothing else: no errors of the map, no history, any start."""
+"""Camera pose from markers of known pose alone: without map errors, history or initial value."""
 
 from dataclasses import dataclass
 
@@ -78,7 +78,7 @@ def solve_camera_pose(
 
 
 def _likeliest(chi2: FloatArray, freedom: int, predicted: bool) -> int:
-    """Of poses of chi-squares (B,): the best, but the first, if that is ``predicted`` and not clearly worse."""
+    """Index of the smallest of chi-squares (B,), or 0 if that is ``predicted`` and not clearly worse."""
     best = int(np.argmin(chi2))
     return 0 if predicted and chi2[0] <= _AMBIGUOUS_RATIO * max(chi2[best], freedom) else best
 

@@ -1,8 +1,7 @@
-"""Points that a board may be made of: saddles where squares meet, blobs where holes or spots are.
+"""Detection of candidate board points: saddles where squares meet, blobs at holes or spots.
 
-Both are where the determinant of the Hessian has an extremum, measured against the noise of the frame's own second
-derivatives, and neither asks for a level: a frame is searched as it comes, whatever hot or cold thing is in it, and a
-board may be warm on cold or cold on warm.
+Both are extrema of the determinant of the Hessian, compared with the noise of the frame's second derivatives. No
+threshold on counts is needed, so hot or cold objects in the frame do not matter, and either polarity is found.
 """
 
 from collections.abc import Iterator
@@ -14,19 +13,18 @@ from scipy.spatial import cKDTree
 
 from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, IntArray
 
-# Blurs [px] to look with, coarse ones first: they are quick, and a fifth to a third of the points' spacing is good.
+# Search scales [px], the fast coarse ones first; a fifth to a third of the point spacing is best.
 _SCALES = (17.0, 10.0, 5.8, 3.4, 2.0, 1.2)
-# The finer of the two scales that blobs are looked for with at a time.
+# Ratio of the finer to the coarser of the two scales of a blob search.
 _FINER = 0.6
-# What is wider than the scale by this is no part of the pattern.
+# Structures wider than the scale by this factor are suppressed as background.
 _WIDE = 4.0
 _LEAST_SIDE = 8
 _MOST_POINTS = 800
-# A response below this many times the noise's is noise. Second derivatives of rounded counts, blurred by s, are no
-# better than the second number over s^3.
+# Least ratio of response to noise; and noise of second derivatives by the rounding of counts at blur s, times s^3.
 _NOISE_RATIO, _ROUNDING = 4.5, 0.02
-# A saddle lies within this many blurs of where the slope vanishes. At the outer corner of a board's last square, or
-# where three surfaces meet, that is 1.2 blurs away or more.
+# Largest distance of a saddle from the stationary point, in blurs. At the outer corner of a board's last square, or
+# where three surfaces meet, it is 1.2 or more.
 _STATIONARY = 0.8
 # A pixel this share of the frame's range away from the median of its neighbours is dead or stuck: optics blur over
 # more than a pixel, so nothing in the scene looks like that.
@@ -42,8 +40,8 @@ class Keypoints:
     pixels : (N, 2)
     hessians : (N, 3) unit vectors of Iuu, Ivv, sqrt(2) Iuv: which way a saddle lies
     response : (N,) determinant of the Hessian, free of scale
-    alternate : whether neighbours on a board have opposite Hessians (corners of a chessboard) or like ones (discs)
-    look : number of the blur, and for blobs of the sign, with which they were looked for
+    alternate : whether neighbours on a board have opposite Hessians (chessboard corners) or similar ones (discs)
+    look : index of the search scale, and for blobs of the sign
     """
 
     pixels: FloatArray
@@ -66,7 +64,7 @@ def without_speckles(counts: Counts | Gray) -> Float32Array:
 
 
 def saddles(image: Float32Array, first: int = 0) -> Iterator[Keypoints]:
-    """Saddle points of ``image``, one scale after the other; look number ``first`` before the others."""
+    """Saddle points of ``image``, one scale after the other, beginning with index ``first``."""
     for look in _beginning_with(first, len(_SCALES)):
         yield replace(_extrema(image, _SCALES[look], None), look=look)
 

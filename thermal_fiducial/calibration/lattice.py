@@ -1,7 +1,7 @@
-"""Regular grids among the points of an image, grown point by point, and the board in them.
+"""Regular grids among keypoints, grown point by point, and the board within a grid.
 
-Everything is local: a grid is continued from its own nearest points, so neither lens distortion nor perspective nor
-contrast that fades, or reverses, over a board stops it.
+Each point is predicted from its nearest grid points only, so lens distortion, perspective, and contrast that fades or
+reverses over a board do not matter.
 """
 
 from collections import Counter
@@ -42,9 +42,9 @@ class BoardPoints:
     ----------
     points : (N,) their index on the board
     pixels : (N, 2) where they are, to a pixel or a tenth of their spacing
-    beyond_nodes, beyond_pixels : (B, 2) points that continue the grid where the board has none
-    larger_nodes, larger_pixels : (L, 2) a grid that has more of the board's points than these, and goes on beyond it
-    look : of the keypoints
+    beyond_nodes, beyond_pixels : (B, 2) grid points outside the board
+    larger_nodes, larger_pixels : (L, 2) a grid that covers more of the board but extends beyond it
+    look : search index of the keypoints, see :class:`Keypoints`
     """
 
     points: IntArray
@@ -148,13 +148,13 @@ class Grower:
     def _add(
         self, grid: dict[Node, int], reach: int, support: Counter[Node], asked: dict[Node, int], off: list[float]
     ) -> bool:
-        """Add the points ``reach`` steps from the grid, all expected from what it is before; whether there were any.
+        """Add points ``reach`` steps from the grid, all predicted from the present grid; returns whether any was added.
 
         Parameters
         ----------
-        support : how many points of the grid show where that of each place should be
-        asked : support of each place that was looked at before: with the same the answer is the same
-        off : how far each point that was added lay from where it was expected [steps]
+        support : number of grid points that predict each place
+        asked : support of each place at its last test, which is repeated only with another support
+        off : deviations of the added points from their predictions [steps]
         """
         places = [node for node in _beside(grid, reach) if asked.get(node) != support[node]]
         if not places:

@@ -1,4 +1,4 @@
-"""Whether a lens model holds out to the corners of the image, and how far off it may be over the image."""
+"""Validity of a lens model up to the image corners, and its error over the image."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class ImageError:
     Parameters
     ----------
     u, v : (A,), (B,) places [px]
-    sigma_px : (B, A) standard deviation of a pixel's place there (length of the 2-vector), turned the best way
+    sigma_px : (B, A) standard deviation of a pixel (length of the 2-vector), after the best-fitting rotation
     covered : (B, A) whether views reach there
     covered_share : of the image's area
     """
@@ -75,7 +75,7 @@ class ImageError:
 def image_error(camera: Camera, covariance: FloatArray, sightings: Sequence[Sighting]) -> ImageError:
     """Error of a pixel's place, over the image, from the covariance (4 + D, 4 + D) of the intrinsics.
 
-    A turn of the camera as a whole is no error of the lens: the one that fits best where the views are is taken out.
+    A rotation of the whole camera is not a lens error: the one that fits best where the views are is removed.
     """
     mask = _covered(sightings, camera.width, camera.height)
     u, v = np.linspace(0, camera.width - 1, _PLACES[0]), np.linspace(0, camera.height - 1, _PLACES[1])

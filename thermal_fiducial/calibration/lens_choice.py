@@ -1,4 +1,4 @@
-"""Which lens model, with which coefficients: as few as predict views that were not fitted no worse.
+"""Choice of lens model and coefficients: the fewest whose error on held-out views is not clearly larger.
 
 Stepwise: a coefficient enters when it lowers the error of held-out views by more than the standard error of the
 difference, view by view; what does not enter stays at zero. A model that folds back before the image's corners is none.
@@ -34,9 +34,9 @@ _GROUPS: dict[str, tuple[tuple[tuple[int, ...], ...], ...]] = {
 
 @dataclass(frozen=True)
 class _FittedLens:
-    """A fit to all views, and the mean squared error of each when it is held out (V,) [px^2].
+    """A fit to all views, and the mean squared error (V,) [px^2] of each view when it is held out.
 
-    One that is not ``usable`` folds back within the image; what enters next may mend that.
+    If not ``usable``, the model folds back within the image; further coefficients may cure that.
     """
 
     fit: Calibration
@@ -80,7 +80,7 @@ def choose_model(
         As :func:`calibrate`; or no model reaches the corners.
     """
     starts = [_start(sightings, width, height, model, radius, focal_px) for model in models]
-    # Compared on equal terms: what is an outlier to the model that fits best is one to all.
+    # For a fair comparison all models drop the outliers of the best-fitting one.
     reference = min(starts, key=lambda fit: (len(fit.dropped), fit.rms_px))
     used = [sightings[index] for index in reference.views.tolist()]
     chosen: dict[str, _FittedLens] = {}
@@ -141,9 +141,9 @@ def _candidate(sightings: Sequence[Sighting], near: Calibration, free: tuple[int
 def _step(
     sightings: Sequence[Sighting], current: Calibration, free: tuple[int, ...], radius: float
 ) -> _FittedLens | None:
-    """Fit with more coefficients than the ``current`` one; None where they gain next to nothing with fitted views.
+    """Fit with more coefficients than the ``current`` one; None if the gain on fitted views is negligible.
 
-    With views that were not fitted they gain less still.
+    The gain on held-out views would be smaller still.
     """
     fit = _fit(sightings, current, free, radius)
     gains = current.rms_px**2 > (1.0 + _NEAR_TIE) * fit.rms_px**2

@@ -1,8 +1,8 @@
 """Least squares over the intrinsics of a camera and the pose of a board in every view.
 
-The residuals come from the package's own camera model, so what is estimated is what is used. Distortion coefficients
-have a prior: none moves a point at the image's corner by more than a part of its distance from the centre. It is far
-too wide to matter where views reach the corner, and holds what they do not determine.
+The residuals use the package's own camera model, so the estimate is consistent with its use. Distortion coefficients
+have a prior that limits the displacement of the image's corner relative to its distance from the centre. It is too weak
+to matter where views reach the corner, and constrains what they do not determine.
 """
 
 from collections.abc import Sequence
@@ -14,18 +14,18 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, MODELS
 from thermal_fiducial.core.types import FloatArray, IntArray
 
-# Errors beyond this many standard deviations [px after scaling] lose weight (Huber).
+# Huber threshold [standard deviations].
 _HUBER = 3.0
 # Step of the numerical derivative by the distortion coefficients, which are of order 0.01 to 1.
 _STEP = 1e-6
 _MAX_STEPS = 60
-# A step that lowers the cost by less than this share is the last; damping at which no step lowers it any more.
+# Relative decrease of the cost at convergence; damping at which the fit gives up.
 _CONVERGED, _HOPELESS = 1e-7, 1e9
-#: Enough for errors of views that are compared, to some per cent, with each other.
+#: Convergence for fits whose errors are only compared to some per cent.
 NEARLY = 1e-4
-# Centroids of circles are brought up to date until they change by less than this [px].
+# Most updates of the circles' centroids, and largest change at convergence [px].
 _ROUNDS, _SETTLED_PX = 4, 1e-4
-# A polygon whose second moments are those of the circle: perspective displaces the centroid of both alike.
+# A polygon with the second moments of the circle, so that perspective displaces both centroids equally.
 _ANGLE = np.pi / 6.0
 _TURNS = np.arange(12) * _ANGLE
 _CIRCLE = np.sqrt(3.0 / (2.0 + np.cos(_ANGLE))) * np.stack([np.cos(_TURNS), np.sin(_TURNS), 0.0 * _TURNS], axis=1)
@@ -53,13 +53,13 @@ class LensFit:
 
     Parameters
     ----------
-    camera : to start from; coefficients that are not ``free`` stay as they are there
+    camera : initial values; coefficients that are not ``free`` are held
     radius : of the board's circles [m]; 0 for corners
     free : indices of the coefficients to estimate; None: all
-    poses_only : whether the camera is known
-    centroids : of each view, how far (N, 2) its circles' centroids lie from their centres [px], to be held there; None:
-        worked out from the radius
-    converged : share of the cost that the last step may gain
+    poses_only : whether the camera is held
+    centroids : for each view the offsets (N, 2) of its circles' centroids from their centres [px], held fixed; None:
+        computed from the radius
+    converged : relative decrease of the cost at convergence
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class LensFit:
         self._pixels = np.concatenate([sighting.pixels for sighting in sightings])
         self._lengths = [len(sighting.points) for sighting in sightings]
         self._view = np.repeat(np.arange(len(sightings)), self._lengths)
-        # Rows of each view's points, of views with fewer some twice: those have no weight.
+        # Rows of each view's points, padded by repeated rows of zero weight.
         place, ends = np.arange(max(self._lengths)), np.cumsum(self._lengths)[:, None]
         self._there = place < np.array(self._lengths)[:, None]
         self._rows = np.minimum(ends - np.array(self._lengths)[:, None] + place, ends - 1)
@@ -91,7 +91,7 @@ class LensFit:
         self._prior[MATRIX:] = prior_sigmas(camera) ** -2
 
     def solve(self, T: FloatArray) -> tuple[Camera, FloatArray]:
-        """Camera and poses T_camera_board (V, 4, 4), from poses to start with."""
+        """Camera and poses T_camera_board (V, 4, 4), from initial poses."""
         camera = self._camera
         for _ in range(_ROUNDS):
             change = self._update_centroids(camera, T)
@@ -101,7 +101,7 @@ class LensFit:
         return camera, T
 
     def covariance(self, camera: Camera, T: FloatArray) -> FloatArray:
-        """Of fx fy cx cy and all coefficients, those held included, with the noise that the residuals show."""
+        """Covariance of fx fy cx cy and all coefficients, held ones included, for the noise of the residuals."""
         free, self._free = self._free, np.arange(len(self._prior))
         error = self.error(camera, T)
         information, _ = self._normal_equations(camera, T, error, np.inf, 0.0)
@@ -118,12 +118,12 @@ class LensFit:
         return self._by_view(-self.error(camera, T))
 
     def centroids(self, camera: Camera, T: FloatArray) -> list[FloatArray]:
-        """How far circles' centroids lie from their centres (N, 2) [px] in each view."""
+        """Offsets (N, 2) [px] of the circles' centroids from their centres, per view."""
         self._update_centroids(camera, T)
         return self._by_view(self._centroid)
 
     def error(self, camera: Camera, T: FloatArray) -> FloatArray:
-        """Predicted minus measured (N, 2) [px]; large where the model cannot show a point."""
+        """Predicted minus measured (N, 2) [px]; large where the model cannot project a point."""
         predicted = camera.project(_in_camera(T[self._view], self._points)) + self._centroid
         return np.asarray(np.nan_to_num(predicted - self._pixels, nan=1e3))
 
@@ -199,7 +199,7 @@ class LensFit:
         return information, gradient
 
     def _update_centroids(self, camera: Camera, T: FloatArray) -> float:
-        """How far the circles' centroids lie from their centres now; by how much that changed at most [px]."""
+        """Update the centroids' offsets; returns the largest change [px]."""
         if self._radius == 0.0:
             return 0.0
         outline = camera.project(se3.apply(T[self._view], self._points[:, None] + self._radius * _CIRCLE))
@@ -237,7 +237,7 @@ def by_parameters(camera: Camera, points: FloatArray, chosen: IntArray | None = 
             continue
         step = np.zeros(len(parameters))
         step[index] = _STEP
-        # Without the check for points that the lens cannot show, which costs more than the points.
+        # Without the check for points outside the lens's field, which costs more than the projection.
         ahead, behind = (_with_parameters(camera, parameters + sign * step).distort(x) for sign in (1.0, -1.0))
         J[:, :, place] = (ahead - behind) / (2.0 * _STEP)
     return J

@@ -1,4 +1,4 @@
-"""Where a board lies in a grid of points; refused where it could as well lie elsewhere, or goes on."""
+"""Placement of a board in a grid of points; refused if it is ambiguous, or if the grid extends beyond the board."""
 
 from dataclasses import dataclass
 
@@ -7,22 +7,22 @@ import numpy as np
 
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
-# A board is where it is when at least this share of it is seen, and when every other place would lose at least this
-# share of the points that it would lose of a whole board: a board that a row is missing of may be shifted by a row.
+# A placement is accepted if at least this share of the board is seen, and if every other placement loses at least this
+# share of the points that it would lose of a complete board: a board with a missing row may be shifted by a row.
 _LEAST_SHARE, _CLEAR = 0.5, 0.5
-# Points beyond the board, as a share of it: more, and it is another board.
+# Largest number of points beyond the board, relative to its own; with more it is another board.
 _BEYOND = 0.1
 _OFF_DIAGONAL = np.array([[0, 1], [0, 0]]), np.array([[0, 0], [1, 0]])
-# Seen steeply, the nearest points in a grid need not be its neighbours on the board: the grid's axes are sheared.
+# At oblique views the nearest points are not always neighbours on the board: the grid's axes may be sheared.
 _SHEARS = tuple(np.array([[1, 0], [0, 1]]) + shear * axis for axis in _OFF_DIAGONAL for shear in (0, 1, -1, 2, -2))
 _QUARTER = np.array([[0, -1], [1, 0]])
 
 
 @dataclass(frozen=True)
 class GridRefusal:
-    """Why a grid is not the board, in words.
+    """Why a grid is not the board.
 
-    Where it has more points than the board, ``covered`` is how many of the board's it has.
+    If the grid has more points than the board, ``covered`` is the number of board points in it.
     """
 
     reason: str
@@ -31,12 +31,12 @@ class GridRefusal:
 
 @dataclass(frozen=True)
 class GridPlacement:
-    """Where a board lies in a grid.
+    """Placement of a board in a grid.
 
     Parameters
     ----------
-    points, rows : (K,) points of the board, and the rows of the grid that show them
-    beyond, beyond_nodes : (B,) rows of the grid that the board has no point for, and (B, 2) their nodes on the board
+    points, rows : (K,) points of the board, and their rows of the grid
+    beyond, beyond_nodes : (B,) rows of the grid outside the board, and (B, 2) their nodes on the board
     """
 
     points: IntArray
@@ -46,7 +46,7 @@ class GridPlacement:
 
 
 class BoardNodes:
-    """Nodes of a board's points, and the ways in which they may appear in a grid.
+    """Nodes of a board's points, and their patterns in a grid.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class BoardNodes:
     def __init__(self, nodes: IntArray, missing: IntArray | None = None) -> None:
         self.nodes = nodes
         missing = np.zeros((0, 2), np.int64) if missing is None else missing
-        # A board with a hole looks the same after half a turn but for the hole: its outline says where it lies.
+        # A board with a hole is symmetric except for the hole, so its outline is placed.
         self._outline = np.concatenate([nodes, missing])
         self._views = _views(self._outline)
         self._margin = len(self._outline) - _largest_two(self._overlaps(self._outline))[1]
@@ -67,7 +67,7 @@ class BoardNodes:
 
         Parameters
         ----------
-        grid : (M, 2) nodes of a grid whose axes turn like those of the board: it is seen from the front
+        grid : (M, 2) nodes of a grid whose axes have the orientation of the board's, as seen from the front
         """
         count = len(self._outline)
         if len(grid) < _LEAST_SHARE * count:
@@ -78,7 +78,7 @@ class BoardNodes:
         if most < _LEAST_SHARE * count:
             return GridRefusal(f'a grid of {len(grid)} points that is not like the board')
         unclear = most - second < _CLEAR * self._margin
-        # A few points more are another board's where all of this one is seen, and clutter where its border is not.
+        # A few extra points belong to another board if all of this one is seen, and are clutter if its border is not.
         if beyond > _BEYOND * count + 1.0 or (unclear and beyond > 0 and most >= (1.0 - _BEYOND) * count):
             return GridRefusal(goes_on(beyond), int(most))
         if unclear:
@@ -102,7 +102,7 @@ class BoardNodes:
         return GridPlacement(point[shown], shown, outside, on_board[outside])
 
     def _overlaps(self, grid: IntArray) -> list[FloatArray]:
-        """Points that each view of the board has in common with a grid, for each shift."""
+        """Number of points that each view of the board shares with a grid, for each shift."""
         occupied = _occupancy(grid)
         return [_correlation(occupied, _occupancy(view.nodes(self._outline))) for view in self._views]
 
@@ -149,9 +149,9 @@ def _occupancy(nodes: IntArray) -> FloatArray:
 
 
 def _correlation(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Points that two occupancies have in common for each shift of ``b``, from where but their last corners meet."""
+    """Number of points shared by two occupancies for each shift of ``b`` with any overlap."""
     around = np.pad(a, [(n - 1, n - 1) for n in b.shape]).astype(np.float32)
-    # Of numbers as small as these the products of single precision are whole ones, but for a rounding.
+    # Sums of these small numbers are integers up to rounding in single precision.
     return np.rint(cv2.matchTemplate(around, b.astype(np.float32), cv2.TM_CCORR)).astype(np.float64)
 
 

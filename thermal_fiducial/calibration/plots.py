@@ -1,7 +1,7 @@
-"""Drawings of a calibration: residuals, coverage and error over the image, each an SVG in a page's own colours.
+"""Drawings of a calibration: residuals, coverage and error over the image, as SVG.
 
-Drawings stand beside each other on a wide screen and below each other on a narrow one. Their lines and letters have the
-colour of the page's text, so they are readable on a dark page too.
+They are side by side on a wide screen and stacked on a narrow one. Lines and letters have the page's text colour, so
+they are readable on a dark page too.
 """
 
 from collections.abc import Sequence
@@ -20,17 +20,17 @@ from thermal_fiducial.core.types import FloatArray, IntArray
 
 #: Cells of the coverage drawing, columns and rows.
 GRID = (16, 12)
-# What matplotlib draws in this colour takes that of the page's text.
+# Placeholder colour in matplotlib's output, replaced by the page's text colour.
 _INK = '#010203'
 _INKED = ('text.color', 'axes.labelcolor', 'axes.edgecolor', 'xtick.color', 'ytick.color')
 _STYLE: dict[Any, Any] = {'svg.fonttype': 'none', 'svg.hashsalt': 'calibration', 'font.size': 9}
 _STYLE.update(dict.fromkeys(_INKED, _INK))
 _SIZE, _WIDE = (5.2, 4.0), (10.6, 3.6)
-# Names of more views than this would touch each other: the drawing of all views grows and is scrolled.
+# Most views whose names fit the width; with more the drawing grows and is scrolled.
 _NAMES_IN_WIDTH, _INCHES_A_NAME = 50, 0.2
-# Least points of a cell whose mean residual is shown.
+# Fewest points of a cell whose mean residual is drawn.
 _LEAST_POINTS = 3
-# The standard deviation is drawn in so many steps, and not below this [px].
+# Number of contour levels of the standard deviation, and its lower limit [px].
 _LEVELS, _LEAST_PX = 13, 1e-3
 
 
@@ -89,7 +89,7 @@ def _frame(axes: Any, size: tuple[int, int]) -> None:
 
 
 def _field(size: tuple[int, int], pixels: FloatArray, residuals: FloatArray) -> str:
-    """Mean residual of each cell as an arrow: what the model does not explain."""
+    """Mean residual of each cell as an arrow: the systematic error of the model."""
     figure, axes = _figure('mean residual of each cell')
     column = np.clip(pixels[:, 0] * GRID[0] / size[0], 0, GRID[0] - 1).astype(np.int64)
     row = np.clip(pixels[:, 1] * GRID[1] / size[1], 0, GRID[1] - 1).astype(np.int64)
@@ -100,7 +100,7 @@ def _field(size: tuple[int, int], pixels: FloatArray, residuals: FloatArray) -> 
         np.bincount(cell, weights=values, minlength=GRID[0] * GRID[1])[filled] / count[filled]
         for values in (*pixels.T, *residuals.T)
     )
-    # But for one in twenty, of few points, no arrow is longer than a cell is wide.
+    # Scaled so that 95 % of the arrows are shorter than a cell; longer ones are of few points.
     long = max(float(np.percentile(np.hypot(du, dv), 95.0)) if len(filled) else 0.0, 1e-6)
     scale = long * GRID[0] / size[0]
     arrows = axes.quiver(u, v, du, dv, angles='xy', scale_units='xy', scale=scale, color=_INK, width=0.004)

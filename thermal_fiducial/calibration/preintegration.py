@@ -1,4 +1,4 @@
-"""IMU samples between camera frames, summed up once: rotation, velocity and position increments with covariances.
+"""Preintegrated IMU samples between camera frames: rotation, velocity and position increments with covariances.
 
 C. Forster, L. Carlone, F. Dellaert, D. Scaramuzza, "On-manifold preintegration for real-time visual-inertial
 odometry", 2017, section VI, for all intervals at once.
@@ -46,7 +46,7 @@ class ImuTrack:
         return rate.reshape(*t.shape, 3), force.reshape(*t.shape, 3)
 
     def averaged(self, seconds: float) -> 'ImuTrack':
-        """Samples averaged over so long about each: how the body moves, without how it shakes."""
+        """Samples averaged over a window of ``seconds`` about each: the motion without vibration."""
         width = 2 * round(0.5 * seconds / float(np.median(np.diff(self.seconds)))) + 1
         rate, force = (np.asarray(cv2.blur(signal, (1, width)), np.float64) for signal in (self.rate, self.force))
         return ImuTrack(self.seconds, rate, force)
@@ -57,7 +57,7 @@ class ImuTrack:
         return ImuTrack(self.seconds, self.rate - by_axes[:, :3], self.force - by_axes[:, 3:])
 
     def noise(self, known: ImuNoise) -> ImuNoise:
-        """``known`` with the white noise that the samples show, where vibration makes it more."""
+        """``known`` with the white noise estimated from the samples, where vibration increases it."""
         root = float(np.median(np.diff(self.seconds))) ** 0.5
         rate, force = (
             root * float(np.sqrt(np.mean(np.diff(signal, 2, axis=0) ** 2) / _SECOND_DIFFERENCE))
@@ -73,8 +73,8 @@ class ImuTrack:
 def axis_errors(rate: FloatArray, force: FloatArray) -> FloatArray:
     """Derivative (N, 6, 15) of samples (N, 3), (N, 3) by the IMU's scale errors and misalignments.
 
-    Those of the gyroscope are a whole matrix (nine, row by row). The accelerometer's first axis and its plane with the
-    second are the body's, which leaves a lower triangle (six, row by row). J. Rehder et al., "Extending kalibr".
+    Those of the gyroscope are a full matrix (nine, row by row). The accelerometer's first axis and its plane with the
+    second define the body frame, which leaves a lower triangle (six, row by row). J. Rehder et al., "Extending kalibr".
     """
     J = np.zeros((len(rate), 6, AXES))
     for row in range(3):
@@ -86,7 +86,7 @@ def axis_errors(rate: FloatArray, force: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Increments:
-    """Between consecutive frames; leading dimension (K,).
+    """Increments between consecutive frames; leading dimension (K,).
 
     Parameters
     ----------
@@ -127,7 +127,7 @@ def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: ImuN
         half = se3.so3_exp(0.5 * rate * h)
         middle = R @ half
         transition, inputs = _linearised(middle, force, half, h[:, :, None])
-        # Noise and bias enter in the same way; a bias takes away from the sample.
+        # Bias enters like noise, with the opposite sign, as it is subtracted from the sample.
         by_bias = transition @ by_bias - inputs
         by_axes = transition @ by_axes - inputs @ axes
         covariance = transition @ covariance @ np.swapaxes(transition, 1, 2)
@@ -142,9 +142,9 @@ def preintegrate(imu: ImuTrack, times: FloatArray, bias: FloatArray, noise: ImuN
 def _linearised(
     middle: FloatArray, force: FloatArray, half: FloatArray, h: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Transition (K, 9, 9) of the errors (rotation, velocity, position), and how samples enter (K, 9, 6).
+    """Transition (K, 9, 9) of the errors (rotation, velocity, position), and input matrix (K, 9, 6) of the samples.
 
-    All is taken at the ``middle`` of the step, ``half`` a step's turn after its start.
+    Both are linearised at the ``middle`` of the step, after ``half`` of its rotation.
     """
     count = len(middle)
     back = np.swapaxes(half, 1, 2)

@@ -16,7 +16,7 @@ from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.core.types import Counts, FloatArray, Gray
 from thermal_fiducial.files.writing import write_text
 
-# Longest residual of a view as drawn, as a share of the picture's width; width of the pictures [px].
+# Drawn length of a view's largest residual, relative to the picture's width; width of the pictures [px].
 _ARROW, _WIDTH = 0.06, 480
 _STYLE = """
 :root{color-scheme:light dark;--line:#8888}
@@ -41,7 +41,7 @@ class BoardView:
     ----------
     name : of its file, or its number in the bag
     sighting : the points
-    counts : the frame; None where points were measured elsewhere
+    counts : the frame; None for points from a file
     """
 
     name: str
@@ -61,9 +61,9 @@ def write_report(
 
     Parameters
     ----------
-    views : all that the calibration was given
+    views : all input views
     fits : the best of each model
-    unusable : name and reason of the frames that gave nothing
+    unusable : name and reason of the frames without a sighting
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""What the corners of a frame say of when their rows were sampled.
+"""Information of a frame's corners on the read-out time.
 
 Row v is sampled at ``stamp + readout_time (v / (height - 1) - 1/2)``. While the camera moves with the twist tau (map
 frame, as pose errors are), a corner at the share s of the read-out appears at ``u + J s tau readout_time``. With the
-pose of the frame eliminated, all that the corners know of the read-out time are the moments below, whatever the twist.
+frame's pose eliminated, the moments below are sufficient statistics of the read-out time, for any twist.
 """
 
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ class RowMoments:
     ----------
     cross : (6, 6) J' S J, with S the shares of the read-out, -1/2 in the first row and 1/2 in the last
     square : (6, 6) J' S S J
-    residual : (6,) J' S rho, of what the frame's pose leaves of the corners
+    residual : (6,) J' S rho, with rho the residuals of the corners
     """
 
     cross: FloatArray
@@ -37,19 +37,19 @@ class RowMoments:
 
     @staticmethod
     def stacked(moments: Sequence['RowMoments']) -> 'RowMoments':
-        """Those of N frames."""
+        """The moments of N frames, stacked."""
         parts = zip(*((m.cross, m.square, m.residual) for m in moments), strict=True)
         return RowMoments(*(np.stack(part) for part in parts))
 
 
 @dataclass(frozen=True)
 class FrameCorners:
-    """Mapped markers that a frame shows.
+    """Detections of mapped markers in a frame.
 
     Parameters
     ----------
     stamp_ns : by the camera's clock
-    corners_px, covariances : (N, 4, 2), (N, 4, 2, 2) in the raw image, where they were when their rows were sampled
+    corners_px, covariances : (N, 4, 2), (N, 4, 2, 2) in the raw image, with rolling-shutter displacement
     T_map_marker, sizes : (N, 4, 4), (N,)
     """
 
@@ -76,7 +76,7 @@ class FrameCorners:
         Raises
         ------
         InputError
-            No pose sees them.
+            No camera pose fits the corners.
         """
         corners = self.corners_px if shift is None else self.corners_px + shift
         pose = solve_camera_pose(corners, self.covariances, self.points, camera, initial)

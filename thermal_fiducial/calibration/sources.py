@@ -33,7 +33,7 @@ class RawFrame:
     Parameters
     ----------
     name : of its file, or its number in the bag
-    stamp_ns : of the bag's frames; of pictures their number, ten seconds apart
+    stamp_ns : of the bag's frames; pictures get artificial stamps ten seconds apart
     counts : (height, width)
     """
 
@@ -62,7 +62,7 @@ def pictures(folder: Path) -> list[Path]:
 
 
 def read_picture(path: Path) -> Counts | Gray:
-    """Pixels (height, width) of 8 or 16 bit; colours become grey.
+    """Pixels (height, width) of 8 or 16 bit; colours are converted to grey.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def measured_points(path: Path, width: int, height: int) -> list[tuple[str, Sigh
     Raises
     ------
     InputError
-        No such file or columns, numbers that are none, points outside the image or twice in a view.
+        No such file or columns, invalid numbers, points outside the image or twice in a view.
     """
     views: dict[str, dict[str, list[float]]] = {}
     for number, (view, point, *cells) in named_rows(path, POINT_COLUMNS):
@@ -110,7 +110,7 @@ def _flat_sighting(values: FloatArray) -> Sighting:
 
 
 def clean_frames(bag: BagReader) -> Iterator[RawFrame]:
-    """Frames of a bag as the detector gets them: without those that the shutter or the driver froze."""
+    """Frames of a bag as the detector receives them, without frozen ones."""
     bag.require({bag.image_topic: _COMPRESSED_TYPE if bag.image_topic == COMPRESSED_TOPIC else _IMAGE_TYPE})
     cleaner = FrameCleaner(Tau2CameraConfig())
     for index, entry in enumerate(bag.messages([bag.image_topic])):
@@ -121,12 +121,12 @@ def clean_frames(bag: BagReader) -> Iterator[RawFrame]:
 
 
 def recorded_camera(bag: BagReader) -> Camera:
-    """Intrinsics that the bag recorded.
+    """Recorded intrinsics of a bag.
 
     Raises
     ------
     InputError
-        There are none, or none that a camera can have.
+        There are none, or they are impossible.
     """
     bag.require({CAMERA_INFO_TOPIC: _INFO_TYPE})
     info = next(bag.messages([CAMERA_INFO_TOPIC])).message
@@ -134,12 +134,12 @@ def recorded_camera(bag: BagReader) -> Camera:
 
 
 def imu_track(bag: BagReader) -> tuple[ImuTrack, int]:
-    """IMU samples in order, in seconds since the stamp that is returned with them.
+    """IMU samples in order, in seconds since the returned stamp [ns].
 
     Raises
     ------
     InputError
-        No topic of IMU samples, or samples that are no numbers.
+        No topic of IMU samples, or invalid samples.
     """
     bag.require({IMU_TOPIC: _IMU_TYPE})
     stamps, values = [], []

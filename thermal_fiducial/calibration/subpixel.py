@@ -1,13 +1,12 @@
-"""Points of a board to a few hundredths of a pixel, on raw counts.
+"""Refinement of board points to a few hundredths of a pixel, on raw counts.
 
-What the board looks like around a point (:mod:`appearance`) is fitted to the counts in a window, on ground that may
-slope. The grid shows how the board is seen there, so perspective and lens bend the pattern as they bend the image.
-Three rounds: some of the points, each alone; all, with the blur and the width that the board has in common; and with
-the contrast that the neighbours lead one to expect. So neither a lamp's spot of heat nor contrast that fades over the
-board, or reverses in a reflection, moves a point, and what covers a point is noticed.
+The model of the board around a point (:mod:`appearance`) is fitted to the counts in a window, on a sloping background.
+The local grid maps the model to the image, with perspective and lens distortion. There are three rounds:
+a sample of the points, each alone; all points, with common blur and width; and with the contrast predicted from the
+neighbours. So neither hot spots nor contrast that fades or reverses (in a reflection) displace a point, and covered
+points are rejected.
 
-Points are fitted many at a time: their windows hold few pixels, and Python takes longer to call numpy than numpy to
-fit one of them.
+Points are fitted in batches: their windows are small, and a numpy call takes longer than the fit of one point.
 """
 
 from collections.abc import Iterator
@@ -21,20 +20,20 @@ from thermal_fiducial.calibration.surface import CLOSELY, local_surfaces, ROUGHL
 from thermal_fiducial.calibration.windows import PointWindows, windows_around, with_expected_contrast
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# Blur to start from, in steps of the grid and at least in pixels.
+# Initial blur in steps of the grid, and its lower limit in pixels.
 _BLUR, _LEAST_BLUR = 0.06, 0.8
-# Steps of a fit, tried ones too; it has converged when a step is shorter than this, in the last round and before; and
-# damping that leaves no step.
+# Most steps of a fit, rejected ones included; length of a step at convergence, in the last round and before; initial
+# damping, and damping at which the fit gives up.
 _MOST_STEPS, _CONVERGED_PX, _NEARLY_PX, _DAMPING, _HOPELESS = 40, 1e-3, 1e-2, 1e-3, 1e3
-# A point is lost when its standard deviation is larger than this [px], when the fit goes further from the start, in
-# steps of the grid, or when its contrast is not, within these shares, what the neighbours lead one to expect.
+# A point is lost when its standard deviation exceeds this [px], when the fit moves further than this from the start
+# [steps], or when its contrast relative to that predicted from the neighbours is outside these limits.
 _MOST_SIGMA_PX, _MOST_MOVE, _CONTRAST = 0.5, 0.25, (0.6, 1.6)
 _LEAST_POINTS = 6
-# Points, spread over the board, from which its blur and width are found; each has them to a few per cent.
+# Number of points, spread over the board, for blur and width; each determines them to a few per cent.
 _SAMPLE = 48
-# What the linear part of a fit determines: ground (level and slope) and contrast.
+# Number of linear parameters of a fit: background (level and slope) and contrast.
 _LINEAR = 4
-# Points looked at, and pixels fitted, at a time: enough for long rows, few enough for a processor's cache.
+# Points and pixels per batch: enough for long rows, few enough for a processor's cache.
 _POINTS_AT_A_TIME, _PIXELS_AT_A_TIME = 48, 8000
 
 
@@ -47,14 +46,14 @@ def refine(
     *,
     grid: BoolArray | None = None,
 ) -> FloatArray:
-    """Points (N, 2) of a board, NaN where they are lost.
+    """Refined points (N, 2) of a board, NaN where lost.
 
     Parameters
     ----------
-    nodes : (N, 2) place of each in the grid
-    pixels : (N, 2) within a few pixels, or a tenth of their distance
+    nodes : (N, 2) nodes in the grid
+    pixels : (N, 2) initial pixels, to within a few pixels or a tenth of their spacing
     board : (M, 2) places of all points of the board
-    grid : (N,) which of them show how the grid is seen: of the others it is not known whether they belong; None: all
+    grid : (N,) mask of the points that define the grid; the others may not belong to it. None: all
     """
     appearance = appearance.at(nodes, board)
     every = np.arange(len(nodes))
@@ -79,7 +78,7 @@ def refine(
 def _next_starts(
     nodes: FloatArray, starts: FloatArray, refined: FloatArray, fitted: IntArray, grid: BoolArray
 ) -> FloatArray:
-    """Where the next round starts (N, 2): those of the ``fitted`` that were lost where the others say."""
+    """Starts (N, 2) of the next round; ``fitted`` points that were lost start at the grid's prediction."""
     starts = np.where(np.isfinite(refined), refined, starts)
     lost = fitted[np.isnan(refined[fitted, 0])]
     others = np.setdiff1d(np.flatnonzero(grid), lost)
@@ -89,7 +88,7 @@ def _next_starts(
 
 
 class _Shared(NamedTuple):
-    """What a board's points have in common: blur at each point (N,) [log px], width (N,) [steps]."""
+    """Common parameters of a board's points: blur at each point (N,) [log px], width (N,) [steps]."""
 
     log_blur: FloatArray
     width: FloatArray
@@ -114,7 +113,7 @@ def _round(
     shared: _Shared | None,
     contrast: FloatArray | None,
 ) -> _Fits:
-    """Fit points ``index`` once; with ``contrast``, points without one are lost and say nothing of the ``grid``."""
+    """Fit points ``index`` once; with ``contrast``, points without one are lost and not used for the ``grid``."""
     known = grid if contrast is None else grid & np.isfinite(contrast)
     ridge = ROUGHLY if shared is None else CLOSELY
     fits = _Fits(np.full_like(pixels, np.nan), *np.full((3, len(nodes)), np.nan))
@@ -135,7 +134,7 @@ def _round(
 
 
 def _few_pixels(windows: PointWindows) -> Iterator[PointWindows]:
-    """Windows, some at a time."""
+    """Split windows into batches."""
     count, size = windows.weight.shape
     at_a_time = max(1, _PIXELS_AT_A_TIME // max(1, size))
     for first in range(0, count, at_a_time):
@@ -143,7 +142,7 @@ def _few_pixels(windows: PointWindows) -> Iterator[PointWindows]:
 
 
 def _plane(nodes: FloatArray, values: FloatArray, places: FloatArray) -> FloatArray:
-    """Values at ``places`` of the plane through those at ``nodes``, without those that stick out."""
+    """Values at ``places`` of the plane fitted to ``values`` at ``nodes`` without outliers."""
     off = np.abs(values - np.median(values))
     kept = off <= 4.0 * np.median(off) + 0.05
     design = np.column_stack([np.ones(len(nodes)), nodes])
@@ -152,7 +151,7 @@ def _plane(nodes: FloatArray, values: FloatArray, places: FloatArray) -> FloatAr
 
 
 def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) -> _Fits:
-    """Fit points by Levenberg's and Marquardt's method: all of each, or the points alone with what is shared given."""
+    """Levenberg-Marquardt fit of all parameters of each point, or of places alone with ``shared`` ones given."""
     parameters = np.zeros((len(windows.index), 4))
     if shared is None:
         parameters[:, 2] = np.log(np.maximum(_LEAST_BLUR, _BLUR / windows.scale.max(axis=1)))
@@ -169,7 +168,7 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
     for _ in range(_MOST_STEPS):
         step = np.pad(state.rows(moving).step(damping[moving]), ((0, 0), (0, 4 - free)))
         short = np.abs(step[:, :2]).max(axis=1) < enough
-        # The last step changes nothing that would have to be looked at.
+        # Too short a step for the cost to be evaluated again.
         state.parameters[moving[short]] += step[short]
         moving, step = moving[~short], step[~short]
         if len(moving) == 0:
@@ -190,7 +189,7 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
 
 
 def _well_determined(windows: PointWindows, state: '_CornerState') -> BoolArray:
-    """Which fits (P,) are of small standard deviation, and near to where they started."""
+    """Mask (P,) of the fits with a small standard deviation that end near their start."""
     freedom = np.maximum(1.0, (windows.weight**2).sum(axis=1) - state.free - _LINEAR)
     covariance = np.linalg.pinv(state.normal, hermitian=True)[:, :2, :2]
     variance = state.cost / freedom * np.trace(covariance, axis1=1, axis2=2)
@@ -200,13 +199,13 @@ def _well_determined(windows: PointWindows, state: '_CornerState') -> BoolArray:
 
 @dataclass(frozen=True)
 class _CornerState:
-    """Parameters (P, 4) of fits, of which ``free`` are estimated, and what the counts say there.
+    """Parameters (P, 4) of fits, of which ``free`` are estimated, with the normal equations there.
 
     Parameters
     ----------
-    contrast : (P,) the best one
-    cost : (P,) sum of squares of what is left of the counts
-    normal : (P, free + 1, free + 1) of the free parameters and the contrast
+    contrast : (P,) least-squares contrast
+    cost : (P,) sum of squared residuals of the counts
+    normal : (P, free + 1, free + 1) normal matrix of the free parameters and the contrast
     gradient : (P, free + 1)
     """
 
@@ -236,11 +235,11 @@ class _CornerState:
         return np.asarray(np.linalg.solve(damped, self.gradient[..., None])[:, : self.free, 0])
 
     def rows(self, index: IntArray) -> '_CornerState':
-        """That of some of the points."""
+        """The state of a subset of the points."""
         return _CornerState(self.free, *(values[index] for values in self._arrays()))
 
     def put(self, index: IntArray, other: '_CornerState') -> None:
-        """Take over the state of points from ``other``, which has these alone."""
+        """Replace the state of points ``index`` by ``other``."""
         for values, new in zip(self._arrays(), other._arrays(), strict=True):
             values[index] = new
 

@@ -1,4 +1,4 @@
-"""Where the points of a grid should be, from those around them."""
+"""Prediction of grid points from their neighbours."""
 
 from dataclasses import dataclass
 
@@ -6,16 +6,16 @@ import numpy as np
 
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
-# How far the points that predict another one lie away from it, in steps of the grid.
+# Largest distance of the points that predict another one, in steps of the grid.
 REACH = 3
-#: How firmly curvature is held down where points are known to a pixel and lie on one side only; and where they are
-#: known so well that perspective and lens show: held down then, it would cost 0.02 % of the focal length.
+#: Ridge on the curvature: for points known to a pixel and on one side only; and for points accurate enough to show
+#: perspective and lens, where a strong ridge would bias the focal length by 0.02 %.
 ROUGHLY, CLOSELY = 0.03, 0.00001
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """A grid around each of P places in it: pixel = centre + steps n + bend t(n), t its second and third powers.
+    """Local maps of a grid to pixels at P places: pixel = centre + steps n + bends t(n), t the terms of order 2 and 3.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class Surfaces:
 
 
 def _terms(away: FloatArray) -> FloatArray:
-    """Terms (..., 10) of orders zero to three of places (..., 2)."""
+    """Monomials (..., 10) of orders zero to three at places (..., 2)."""
     a, b = away[..., 0], away[..., 1]
     aa, bb = a * a, b * b
     terms = np.empty((*a.shape, 10))
@@ -55,11 +55,11 @@ def _terms(away: FloatArray) -> FloatArray:
 
 
 def local_surfaces(nodes: FloatArray, pixels: FloatArray, places: FloatArray, ridge: float = ROUGHLY) -> Surfaces:
-    """Surfaces around ``places`` (P, 2) through points near them, the nearer the closer.
+    """Surfaces around ``places`` (P, 2), fitted to the points near them with weights that fall with distance.
 
     Parameters
     ----------
-    nodes, pixels : (N, 2) of the grid; those farther than :data:`REACH` from a place do not count there
+    nodes, pixels : (N, 2) of the grid; a place uses those within :data:`REACH`
     ridge : :data:`ROUGHLY` or :data:`CLOSELY`
     """
     away = nodes - places[:, None]

@@ -1,4 +1,4 @@
-"""Calibration boards and how their points are found in raw frames: chessboard, circle grid, marker board."""
+"""Calibration boards and their detection in raw frames: chessboard, circle grid, marker board."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, 
 from thermal_fiducial.errors import InputError
 
 _APART_NS = 10_000_000_000
-# Discs that continue the grid, as sharp and as warm as the board's own, of which one or two may be clutter.
+# Number of similar discs beyond the board that prove a larger grid; one or two may be clutter.
 _ANOTHER_GRID = 3
-# With less of a grid's points like those described it is not said to be incomplete: they are of another kind.
+# Smallest share of matching points of a grid that is reported as incomplete; below, it is another pattern.
 _ALIKE = 0.5
 
 
@@ -40,7 +40,7 @@ class Sighting:
 
 
 class BoardNotFound(InputError):  # noqa: N818  (nothing went wrong)
-    """A frame does not show the board; why not."""
+    """The board is not found in a frame; the message says why."""
 
 
 class Target(Protocol):
@@ -50,24 +50,24 @@ class Target(Protocol):
     radius: float
 
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
-        """The board in a raw frame; ``camera`` is the best guess so far.
+        """Find the board in a raw frame; ``camera`` is the present estimate.
 
         Raises
         ------
         BoardNotFound
-            It is not in view, or it is another one: the reason in words.
+            It is not in view, or it is another board.
         """
 
 
 class Detector(Protocol):
-    """What a marker board needs of a detector of markers."""
+    """Interface of the marker detector for a marker board."""
 
     def detect(self, stamp_ns: int, counts: Counts | Gray, camera: Camera) -> Markers:
         """Rows of the markers of a frame."""
 
 
 class Chessboard:
-    """A chessboard of warm and cold squares; looked for first as it was found in the frame before.
+    """A chessboard of warm and cold squares; the search starts with the scale of the previous frame.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ class Chessboard:
         nodes = _rectangle(columns, rows)
         self.points = _on_board(square * nodes.astype(np.float64))
         self._board = BoardNodes(nodes)
-        # Outer corners of the outermost squares may look like points: one of every other square.
+        # Outer corners of the outermost squares may look like points, one for every other square.
         self._line = min(columns, rows)
         self._look = 0
 
@@ -96,7 +96,7 @@ class Chessboard:
 
 
 class CircleGrid:
-    """A grid of round holes or spots; looked for first as it was found in the frame before.
+    """A grid of round holes or spots; the search starts with the scale of the previous frame.
 
     Parameters
     ----------
@@ -104,9 +104,8 @@ class CircleGrid:
     spacing : between two rows [m]
     diameter : of a circle [m]
     asymmetric : whether every other row is shifted by ``spacing``, circles in a row two of them apart
-    longer : circles that every other row, from the second on, has more than ``columns``; shifted rows are then centred
-        on each other
-    missing : column and row, from 0, of circles that the grid does not have
+    longer : number of additional circles in every other row, from the second on; the rows are then centred
+    missing : column and row, from 0, of missing circles
     """
 
     def __init__(
@@ -174,14 +173,14 @@ def _sighting(
     appearance: Appearance,
     another: int,
 ) -> tuple[Sighting, int]:
-    """Find a board roughly, then its points to a few hundredths of a pixel; and with which look it was found.
+    """Find a board, refine its points to a few hundredths of a pixel; also returns the search index that found it.
 
-    With ``another`` points of its kind beyond it, it is another board.
+    With at least ``another`` similar points beyond it, it is another board.
     """
     found = find_board(keypoints, board)
     if isinstance(found, GridRefusal):
         raise BoardNotFound(found.reason)
-    # What continues the grid is looked at as closely as the board: clutter is no point of it, another board's is.
+    # Points beyond the board are refined too, which rejects clutter but not the points of another board.
     count, beside = len(found.points), len(found.beyond_nodes)
     beside = beside if beside >= another else 0
     nodes = np.concatenate([board.nodes[found.points], found.beyond_nodes[:beside]]).astype(np.float64)
@@ -190,7 +189,7 @@ def _sighting(
         image, nodes, starts, board.nodes.astype(np.float64), appearance, grid=np.arange(len(nodes)) < count
     )
     good = np.isfinite(pixels[:, 0])
-    # So is a grid that shows more of the board, among keypoints of another scale, but goes on.
+    # The same for a larger grid of another scale that extends beyond the board.
     larger = found.larger_nodes.astype(np.float64)
     of_larger = refine(image, larger, found.larger_pixels, larger, appearance) if len(larger) else found.larger_pixels
     beyond = max(int(np.sum(good[count:])), int(np.sum(np.isfinite(of_larger[:, 0]))) - len(points))
@@ -199,7 +198,7 @@ def _sighting(
     kept = found.points[good[:count]]
     if len(kept) < _ALIKE * count:
         raise BoardNotFound(f'{len(kept)} of {count} points look as described: out of focus, or of other sizes')
-    # What turns out to be no point of the board may have been all that showed where in the grid it lies.
+    # Placed again, since rejected points may have been the only ones that determined the placement.
     placed = board.place(board.nodes[kept])
     if isinstance(placed, GridRefusal):
         raise BoardNotFound(placed.reason)
@@ -207,7 +206,7 @@ def _sighting(
 
 
 class MarkerBoard:
-    """Markers of known poses, e.g. stencils on a base plate; a part of them may be in view.
+    """Markers of known poses, e.g. stencils on a base plate; a subset in view suffices.
 
     Parameters
     ----------
@@ -223,7 +222,7 @@ class MarkerBoard:
 
     def find(self, counts: Counts | Gray, camera: Camera) -> Sighting:
         """See :class:`Target`."""
-        # Views have nothing to do with each other: far apart in time none hints at motion to the next.
+        # Views are independent: stamps far apart keep the detector from predicting motion between them.
         self._stamp_ns += _APART_NS
         rows = self._detector.detect(self._stamp_ns, counts, camera)
         rows = rows[np.isin(rows['id'], list(self._board.markers))]

@@ -1,4 +1,4 @@
-"""Pixels around the points of a board, with the ground they lie on taken out."""
+"""Pixel windows around the points of a board, with the background removed."""
 
 from dataclasses import dataclass, replace
 
@@ -8,34 +8,34 @@ from thermal_fiducial.calibration.appearance import Appearance
 from thermal_fiducial.calibration.surface import Surfaces
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
-# Points closer than this [px] are too close to give sub-pixel points.
+# Smallest spacing of points for a sub-pixel fit [px].
 _LEAST_SPACING = 5.0
 _LEAST_PIXELS = 12
 # Bounds of the blur [px].
 _BLUR_BOUNDS = (0.2, 60.0)
-# Where contrast reverses, at this share of the neighbours' or less, nothing shows where the point is.
+# Smallest contrast relative to the neighbours'; where contrast reverses, a point is not observable.
 _LEAST_CONTRAST = 0.25
-# Nodes whose contrast shows that of another, in steps, how many of them, and how firmly the slope is held down.
+# Prediction of contrast from neighbours: reach [steps], fewest neighbours, ridge on the slope.
 _NEAR, _LEAST_NEIGHBOURS, _SLOPE_RIDGE = 2, 4, 0.1
 
 
 @dataclass(frozen=True)
 class PointWindows:
-    """Pixels around P points, in rows of N; rows with fewer are filled up with pixels of no weight.
+    """Pixels around P points, in rows of N, padded by pixels of zero weight.
 
     Parameters
     ----------
     appearance : of each point
-    index : (P,) which points they are
+    index : (P,) indices of the points
     starts : (P, 2) [px]
     places : (P, N, 2) on the board, relative to ``starts`` [steps]
-    counts : (P, N) times their weight, what the ground explains taken out
+    counts : (P, N) weighted, projected off the background
     weight : (P, N)
-    ground : (P, N, 3) orthonormal: what level and slope explain
-    inverse : (P, 2, 2) steps of the grid by pixels
-    scale : (P, 2) steps along the axes in a pixel
-    expected : (P, N) contrast that the neighbours lead one to expect, or 1 everywhere
-    beside : (P, N) what neighbours show where they are held
+    ground : (P, N, 3) orthonormal basis of the background (level and slope)
+    inverse : (P, 2, 2) derivative of steps by pixels
+    scale : (P, 2) steps along the axes per pixel
+    expected : (P, N) contrast predicted from the neighbours, or 1 everywhere
+    beside : (P, N) contribution of fixed neighbours
     """
 
     appearance: Appearance
@@ -51,12 +51,12 @@ class PointWindows:
     beside: FloatArray
 
     def rows(self, index: IntArray) -> 'PointWindows':
-        """Those of some of the points."""
+        """The windows of a subset of the points."""
         parts = {name: values[index] for name, values in vars(self).items() if name != 'appearance'}
         return PointWindows(self.appearance.rows(index), **parts)
 
     def pattern(self, parameters: FloatArray, free: int) -> tuple[FloatArray, FloatArray]:
-        """Pattern (P, N) above ground, weighted, and its derivatives (P, N, free) by the first parameters.
+        """Pattern (P, N), weighted and without background, and its derivatives (P, N, free) by the first parameters.
 
         Parameters
         ----------
@@ -78,7 +78,7 @@ class PointWindows:
         return columns[..., 0], columns[..., 1:]
 
     def with_neighbours_held(self, parameters: FloatArray) -> 'PointWindows':
-        """For fits of the places alone: the neighbours stay where the grid has them."""
+        """Windows for fits of places alone, with the neighbours fixed at their grid positions."""
         return replace(self, beside=self.appearance.beside(self.places, self._blur(parameters), parameters[:, 3]))
 
     def _blur(self, parameters: FloatArray) -> FloatArray:
@@ -89,12 +89,12 @@ class PointWindows:
 def windows_around(
     image: Float32Array, starts: FloatArray, surfaces: Surfaces, appearance: Appearance, blur: FloatArray | None
 ) -> PointWindows:
-    """Pixels within the reach of the pattern, with weights that fall towards the border; of points that have enough.
+    """Windows of the size of the pattern, with weights that fall towards the border, of points with enough pixels.
 
     Parameters
     ----------
     starts : (P, 2) [px]
-    blur : (P,) [px] where it is known
+    blur : (P,) [px], if known
     """
     spacing = np.linalg.norm(surfaces.steps, axis=1).min(axis=1)
     index = np.flatnonzero(surfaces.determined & (spacing >= _LEAST_SPACING))
@@ -109,7 +109,7 @@ def windows_around(
     whole = np.pi * reach**2 * np.abs(np.linalg.det(surfaces.steps))
     count = inside.sum(axis=1)
     enough = np.flatnonzero(count >= np.maximum(_LEAST_PIXELS, appearance.least_visible * whole))
-    # Pixels of the window first, in their order.
+    # Sort the pixels of the window to the front, in their order.
     order = np.argsort(~inside[enough], axis=1, kind='stable')[:, : count[enough].max(initial=0)]
     weight = np.sqrt(np.where(inside, 1.0 - away, 0.0))[enough[:, None], order]
     offsets, places, pixels = (values[enough[:, None], order] for values in (offsets, places, pixels))
@@ -133,7 +133,7 @@ def windows_around(
 
 
 def _box(image: Float32Array, starts: FloatArray, extent: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Pixels (P, N, 2) around each start in a box as large as the largest, and which lie in its own and the image."""
+    """Pixels (P, N, 2) in a box of the largest extent around each start; mask of those in its window and the image."""
     half = np.ceil(extent.max(axis=0, initial=0.0)).astype(np.int64) + 1
     v, u = np.mgrid[-half[1] : half[1] + 1, -half[0] : half[0] + 1]
     pixels = np.rint(starts)[:, None] + np.stack([u.reshape(-1), v.reshape(-1)], axis=1)
@@ -146,12 +146,12 @@ def _box(image: Float32Array, starts: FloatArray, extent: FloatArray) -> tuple[F
 def with_expected_contrast(
     windows: PointWindows, nodes: FloatArray, known: FloatArray, contrast: FloatArray
 ) -> PointWindows:
-    """Windows with the contrast, linear over each, that is expected by neighbours; of points that have enough.
+    """Windows with the contrast predicted from the neighbours, linear over each, of points with enough neighbours.
 
     Parameters
     ----------
     nodes : (P, 2) of all points
-    known, contrast : (K, 2) nodes of points with a contrast (K,)
+    known, contrast : (K, 2) nodes of points with known contrast (K,)
     """
     away = known - nodes[windows.index][:, None]
     near = np.abs(away).max(axis=-1) <= _NEAR
