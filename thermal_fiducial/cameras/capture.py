@@ -1,4 +1,4 @@
-"""A thread that reads a camera, and connects to it again whenever it is gone."""
+"""A thread that reads a camera and reconnects after a loss."""
 
 from collections.abc import Callable
 import threading
@@ -7,12 +7,12 @@ import time
 from thermal_fiducial.cameras.source import CapturedFrame, EndOfFramesError, FrameSource
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 
-#: A camera that is gone is looked for again after this time; one that sends nothing for so long is opened anew [s].
+#: Interval of reconnection attempts; and timeout without frames after which a camera is reopened [s].
 _RETRY_S, _STALLED_S = 1.0, 3.0
 
 
 class Capture:
-    """Hands on the frames of a camera until it is closed.
+    """Passes on the frames of a camera until it is closed.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class Capture:
         self._on_frame = on_frame
         self._on_change = on_change
         self._retry, self._stalled = retry, stalled
-        #: why there are no frames, in words; empty while there are
+        #: why there are no frames; empty while there are
         self.trouble = 'connecting'
         self._opened = 0
         self._stop = threading.Event()
@@ -45,11 +45,11 @@ class Capture:
 
     @property
     def reconnections(self) -> int:
-        """How often the camera was connected again."""
+        """Number of reconnections."""
         return max(0, self._opened - 1)
 
     def close(self) -> None:
-        """Stop reading and let go of the camera."""
+        """Stop reading and release the camera."""
         self._stop.set()
         # Each read returns within a fraction of a second; a driver that hangs in the kernel must not hold the node.
         self._thread.join(timeout=3.0)

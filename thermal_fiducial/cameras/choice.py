@@ -1,4 +1,4 @@
-"""Which driver a camera's name asks for."""
+"""Choice of the driver by a camera's name."""
 
 from thermal_fiducial.cameras.pictures import Pictures
 from thermal_fiducial.cameras.source import FrameSource
@@ -8,7 +8,7 @@ from thermal_fiducial.config import ThermalSourceConfig
 from thermal_fiducial.errors import InputError
 
 _TEAX = 'teax'
-#: Of recorded pictures, where none is asked for [Hz]: a Tau 2's.
+#: Default rate of recorded pictures [Hz], that of a Tau 2.
 _PICTURE_RATE = 30.0
 
 

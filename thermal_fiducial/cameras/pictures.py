@@ -1,4 +1,4 @@
-"""Recorded 16-bit pictures in the place of a camera: a folder of them (flirpy's, for instance), or a video."""
+"""Recorded 16-bit pictures in place of a camera: a folder (flirpy's, for instance) or a video."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -51,12 +51,12 @@ class Pictures:
         self.events.clear()
 
     def open(self) -> None:
-        """Begin with the first picture."""
+        """Start with the first picture."""
         self._pictures = self._all()
         self._due = time.monotonic()
 
     def read(self) -> list[CapturedFrame]:
-        """The next picture, when it is its turn; see the protocol."""
+        """The next picture when it is due; see the protocol."""
         wait = self._due - time.monotonic()
         time.sleep(min(max(wait, 0.0), _PATIENCE_S))
         if wait > _PATIENCE_S:
@@ -64,12 +64,12 @@ class Pictures:
         counts = next(self._pictures, None)
         if counts is None:
             raise EndOfFramesError
-        # In step, unless a picture took longer to read than it may be shown.
+        # At an even rate, unless reading a picture took longer than its period.
         self._due = max(self._due + self._period, time.monotonic() - self._period)
         return [CapturedFrame(now_ns(), counts)]
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to release."""
 
     def _all(self) -> Iterator[Counts]:
         yield from self._one_pass()
@@ -116,7 +116,7 @@ class Pictures:
 
 
 def _picture(path: Path) -> Any:
-    """The pixels of a file, None where it has none that a camera may have taken."""
+    """The pixels of a file; None if they are not those of a thermal frame."""
     try:
         return read_picture(path, cv2.IMREAD_UNCHANGED)
     except InputError:

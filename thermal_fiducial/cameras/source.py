@@ -1,4 +1,4 @@
-"""What every camera driver offers."""
+"""Interface of the camera drivers."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -23,11 +23,11 @@ class CapturedFrame:
 
 
 class FrameSource(Protocol):
-    """A camera, or what stands for one. All calls come from one thread."""
+    """A camera or a substitute. All calls come from one thread."""
 
-    #: events of the driver in words, e.g. ``short frames``, to how often they happened
+    #: events of the driver, e.g. ``short frames``, to their counts
     events: Counter[str]
-    #: what it is, in words
+    #: description of the camera
     name: str
 
     def open(self) -> None:
@@ -42,7 +42,7 @@ class FrameSource(Protocol):
         """
 
     def read(self) -> list[CapturedFrame]:
-        """Frames that have come, oldest first; none if there were none for a fraction of a second.
+        """Received frames, oldest first; none if none arrived within a fraction of a second.
 
         Raises
         ------
@@ -53,13 +53,13 @@ class FrameSource(Protocol):
         """
 
     def close(self) -> None:
-        """Stop the stream and let go of the device; also of one that is gone, or was never opened."""
+        """Stop the stream and release the device; valid also if it is gone or was never opened."""
 
 
 class EndOfFramesError(Exception):
-    """Recorded pictures have all been shown."""
+    """The recorded pictures have ended."""
 
 
 def now_ns() -> int:
-    """The system's real-time clock, which ROS takes for its own [ns]."""
+    """The system's real-time clock, which is ROS's clock [ns]."""
     return time.time_ns()

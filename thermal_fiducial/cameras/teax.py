@@ -18,11 +18,11 @@ _VENDOR_REQUEST, _RESET, _SET_LATENCY, _SET_BITMODE = 0x40, 0x00, 0x09, 0x0B
 _PURGE_INPUT = 1
 _RESET_MODE, _SYNCHRONOUS_FIFO = 0x00FF, 0x40FF
 _INTERFACE_A, _ENDPOINT_A = 1, 0x81
-#: The chip puts two bytes of modem status before the data of each packet.
+#: Bytes of modem status that the chip puts before the data of each packet.
 _PACKET, _STATUS = 512, 2
-#: A part of a packet is sent after this time [ms]; the shortest that the chip can.
+#: Timeout after which the chip sends an incomplete packet [ms]; the shortest possible.
 _LATENCY_MS = 1
-#: Bytes a read: 3 ms of a 640 x 512 camera at 30 Hz, which is how finely its frames are timed.
+#: Bytes per read: 3 ms of a 640 x 512 camera at 30 Hz, which is the resolution of the stamps.
 _READ = 128 * _PACKET
 _TIMEOUT_MS = 200
 #: The grabber names itself so; other FT2232H are serial adapters.
@@ -70,7 +70,7 @@ class ThermalGrabber:
         self._stream.events = self.events
 
     def read(self) -> list[CapturedFrame]:
-        """Frames that have come; see the protocol."""
+        """Received frames; see the protocol."""
         try:
             data = bytes(self._device.read(_ENDPOINT_A, _READ, _TIMEOUT_MS))
         except self._usb.core.USBTimeoutError:
@@ -78,7 +78,7 @@ class ThermalGrabber:
         return self._stream.feed(without_status(data), now_ns())
 
     def close(self) -> None:
-        """Let go of the grabber."""
+        """Release the grabber."""
         device, self._device = self._device, None
         if device is not None:
             self._usb.util.dispose_resources(device)
@@ -98,7 +98,7 @@ class ThermalGrabber:
         return wanted[0]
 
     def _is_wanted(self, device: Any) -> bool:
-        """By serial number, or by its name where USB lets it be read."""
+        """Whether a device matches by serial number, or by its name if USB permits reading it."""
         try:
             if self._serial_number:
                 return bool(device.serial_number == self._serial_number)

@@ -18,14 +18,14 @@ from thermal_fiducial.core.types import Counts
 MAGIC = b'TEAX'
 _HEADER_BYTES = 8
 _PIXEL_FLAGS, _COUNTS = 0xC000, 0x3FFF
-#: Words a frame may have: the smallest core is 160 x 120, none is larger than 1024 x 1024.
+#: Range of a frame's words: the smallest core is 160 x 120, none is larger than 1024 x 1024.
 _SMALLEST, _LARGEST = 160 * 120, 1 << 20
 #: Sizes of Tau 2 and Quark cores (width, height), for streams without blanking between the rows.
 _KNOWN_SIZES = ((640, 512), (640, 480), (336, 256), (324, 256), (160, 128), (160, 120))
 
 
 class TeaxStream:
-    """Takes bytes as they come and gives whole frames; all else is left out and counted.
+    """Assembles complete frames from received bytes; everything else is dropped and counted.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class TeaxStream:
         self._arrivals: deque[tuple[int, int]] = deque()
 
     def feed(self, data: bytes, stamp_ns: int) -> list[CapturedFrame]:
-        """Frames that ``data`` completes; their stamps are the times when their headers came.
+        """Frames that ``data`` completes; their stamps are the arrival times of their headers.
 
         Parameters
         ----------
@@ -76,7 +76,7 @@ class TeaxStream:
         return len(self._buffer) >= _HEADER_BYTES
 
     def _frame_length(self) -> int:
-        """Bytes of the frame at the beginning of the buffer; 0 while it is not whole.
+        """Bytes of the frame at the beginning of the buffer; 0 while it is incomplete.
 
         A frame that the next magic cuts short is dropped, and the next one looked at.
         """
@@ -100,7 +100,7 @@ class TeaxStream:
         return at
 
     def _accepted(self, counts: Counts | None) -> Counts | None:
-        """``counts`` if they are a frame of the size that is expected."""
+        """``counts`` if they have the expected size, else None."""
         if counts is None:
             self.events['scrambled frames'] += 1
             return None
@@ -116,7 +116,7 @@ class TeaxStream:
         return None
 
     def _stamp_of(self, position: int) -> int:
-        """When the byte at ``position`` of the stream came: between two arrivals bytes come evenly."""
+        """Arrival time of the byte at ``position`` of the stream, interpolated between two reads."""
         before = self._arrivals[0]
         for after in self._arrivals:
             if after[0] > position:

@@ -13,7 +13,7 @@ from thermal_fiducial.cameras.source import CapturedFrame
 from thermal_fiducial.core.types import Counts, SECOND_NS
 from thermal_fiducial.errors import InputError
 
-#: Pixel formats of one 16-bit word a pixel; Y16 is asked for, a driver may answer with another one.
+#: Pixel formats of one 16-bit word per pixel; Y16 is requested, a driver may choose another one.
 _Y16 = api.fourcc('Y16 ')
 FORMATS = {
     _Y16: '<u2',
@@ -25,7 +25,7 @@ FORMATS = {
 #: Buffers that the driver fills while one is read: an eighth of a second at 30 Hz.
 _BUFFERS = 4
 _PATIENCE_S = 0.2
-#: A rate is what was asked for when it is off by no more than this, as 29.97 is 30.
+#: Tolerance of the requested rate: 29.97 counts as 30.
 _RATE_TOLERANCE = 0.02
 
 
@@ -60,7 +60,7 @@ class V4l2Camera:
         self._call(api.STREAMON, ctypes.c_int32(api.CAPTURE))
 
     def read(self) -> list[CapturedFrame]:
-        """Frames that have come; see the protocol."""
+        """Received frames; see the protocol."""
         frames: list[CapturedFrame] = []
         if not self._kernel.wait(self._fd, _PATIENCE_S):
             return frames
@@ -72,13 +72,13 @@ class V4l2Camera:
         return frames
 
     def close(self) -> None:
-        """Stop the stream and let go of the device."""
+        """Stop the stream and release the device."""
         fd, self._fd = self._fd, -1
         for buffer in self._maps:
             buffer.close()
         self._maps = []
         if fd >= 0:
-            # Closing ends the stream too, also that of a camera that is gone.
+            # Closing ends the stream too, even if the camera is gone.
             self._kernel.close(fd)
 
     def _call(self, request: int, argument: Any) -> Any:
@@ -114,7 +114,7 @@ class V4l2Camera:
         self._needed = self._step * (pix.height - 1) + 2 * pix.width
 
     def _choose_rate(self) -> None:
-        """Set the rate where one is asked for; remember the period [ns], 0 where the driver does not know it."""
+        """Set the requested rate, if any; store the period [ns], 0 if the driver does not know it."""
         self._period_ns = 0
         try:
             parameters = self._call(api.G_PARM, api.StreamParameters(type=api.CAPTURE))
