@@ -586,10 +586,18 @@ class PoseEkfConfig(SelfChecked):
         minimum=0.0,
         maximum=0.05,
     )
-    estimate_extrinsics: bool = param(False, 'Estimate the errors of camera_position and camera_orientation.')
-    extrinsics_position_std: float = param(0.02, 'Standard deviation of camera_position.', unit='m', minimum=0.0)
+    estimate_extrinsics: bool = param(
+        False,
+        'Estimate the errors of camera_position and camera_orientation; otherwise they are counted in the covariance.',
+    )
+    extrinsics_position_std: float = param(
+        0.002, 'Standard deviation of camera_position: what its calibration leaves. 0: exact.', unit='m', minimum=0.0
+    )
     extrinsics_orientation_std: float = param(
-        0.02, 'Standard deviation of camera_orientation.', unit='rad', minimum=0.0
+        0.002,
+        'Standard deviation of camera_orientation: what its calibration leaves. 0: exact.',
+        unit='rad',
+        minimum=0.0,
     )
     imu: ImuNoise = group(ImuNoise)  # noqa: RUF009
     gravity: float = param(9.80665, 'Local gravity.', unit='m/s^2', minimum=9.7, maximum=9.9)

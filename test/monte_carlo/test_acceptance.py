@@ -438,7 +438,14 @@ def test_extrinsics_are_refined_on_request():
     wrong = np.add(config().camera_position, (0.01, -0.01, 0.01))
     # What turns show of the lever arm they show of an unknown scale of the gyroscope too: this one is calibrated.
     imu = ImuNoise(gyroscope_scale_std=0.0)
-    _, _, ekf, _ = flown(data, config(camera_position=tuple(wrong), estimate_extrinsics=True, imu=imu))
+    measured_by_hand = config(
+        camera_position=tuple(wrong),
+        estimate_extrinsics=True,
+        extrinsics_position_std=0.02,
+        extrinsics_orientation_std=0.02,
+        imu=imu,
+    )
+    _, _, ekf, _ = flown(data, measured_by_hand)
     before = np.linalg.norm(wrong - config().camera_position)
     after = np.linalg.norm(ekf.state.T_body_camera[:3, 3] - config().camera_position)
     assert after < 0.6 * before

@@ -128,9 +128,10 @@ class Flight:
 
 
 def config(**changes) -> PoseEkfConfig:
-    """The shipped parameters with the camera of these flights."""
+    """The shipped parameters with the camera of these flights, whose place on the robot is exactly known."""
     camera = {'camera_position': CAMERA_POSITION, 'camera_orientation': CAMERA_ORIENTATION}
-    return PoseEkfConfig(**(camera | changes))
+    exact = {'extrinsics_position_std': 0.0, 'extrinsics_orientation_std': 0.0}
+    return PoseEkfConfig(**(camera | exact | changes))
 
 
 def matched(**changes) -> PoseEkfConfig:

@@ -251,6 +251,9 @@ def _parameters(scenario: Scenario) -> dict[str, Any]:
         **({'marker_size_overrides': overrides} if overrides else {}),
         'camera_position': [float(value) for value in scenario.camera_position],
         'camera_orientation': [float(value) for value in scenario.camera_orientation],
+        # Nothing is calibrated here: the camera is exactly where the parameters say.
+        'extrinsics_position_std': 0.0,
+        'extrinsics_orientation_std': 0.0,
         'camera_time_offset': float(scenario.camera_time_offset),
         **({} if scenario.sensor.lag else {'bolometer_lag': 0.0}),
         **({'readout_time': scenario.sensor.readout} if scenario.sensor.readout else {}),

@@ -87,6 +87,11 @@ def start(
     # The systematic error of the pose is an error of the estimate, with the opposite sign.
     P[POSE, SYSTEMATIC] -= systematic * np.linalg.cholesky(pose.shape)
     P[SYSTEMATIC, POSE] = P[POSE, SYSTEMATIC].T
+    # So is the error of the extrinsics.
+    of_extrinsics = P[EXTRINSICS, EXTRINSICS]
+    P[np.ix_(POSE, POSE)] += of_extrinsics
+    P[POSE, EXTRINSICS] -= of_extrinsics
+    P[EXTRINSICS, POSE] -= of_extrinsics
     state = replace(
         prior,
         R_map_body=pose.T_map_body[:3, :3],
@@ -131,7 +136,6 @@ def _initial_variances(config: PoseEkfConfig) -> FloatArray:
     stds[GYROSCOPE_MATRIX] = config.imu.gyroscope_scale_std
     stds[ACCELEROMETER_MATRIX] = config.imu.accelerometer_scale_std
     stds[GRAVITY] = config.gravity * config.map_tilt_std
-    if config.estimate_extrinsics:
-        stds[EXTRINSICS] = np.repeat((config.extrinsics_orientation_std, config.extrinsics_position_std), 3)
+    stds[EXTRINSICS] = np.repeat((config.extrinsics_orientation_std, config.extrinsics_position_std), 3)
     stds[SYSTEMATIC] = 1.0
     return np.square(stds)

@@ -28,7 +28,7 @@ GYROSCOPE_MATRIX, ACCELEROMETER_MATRIX = slice(15, 24), slice(24, 33)
 GRAVITY = slice(33, 35)
 #: clock offset [s],
 TIME_OFFSET = 35
-#: T_body_camera, perturbed from the left [rad, m],
+#: T_body_camera, perturbed from the left [rad, m]; a consider parameter unless ``estimate_extrinsics``,
 EXTRINSICS = slice(36, 42)
 #: systematic error of the camera poses, in units of its standard deviation.
 SYSTEMATIC = slice(42, 48)

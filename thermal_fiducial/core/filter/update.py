@@ -185,6 +185,10 @@ class PoseUpdater:
         algebra = self._algebra
         algebra.x, algebra.P = np.zeros(SIZE), P
         algebra.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R=R)
+        if not self.config.estimate_extrinsics:
+            # A consider parameter (S. Schmidt, 1966): its cross-covariances change, itself it does not.
+            algebra.x[EXTRINSICS] = 0.0
+            algebra.P[EXTRINSICS, EXTRINSICS] = P[EXTRINSICS, EXTRINSICS]
         return algebra.x, 0.5 * (algebra.P + algebra.P.T)
 
     def with_unknown_clock(self, estimate: Estimate) -> Estimate:
