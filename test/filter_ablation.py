@@ -114,6 +114,10 @@ MECHANISMS = {
     'steps of the clock of the camera': Mechanism(
         ('stepping clock',), ('camera_clock',), {'camera_clock:CameraClock.proposed': _first(0)}
     ),
+    'error of the extrinsics': Mechanism(
+        ('carpet_mountain', 'carpet_slow_circle'),
+        changes={'extrinsics_position_std': 0.0, 'extrinsics_orientation_std': 0.0},
+    ),
     'tilt of the map': Mechanism(('tilted map',), changes={'map_tilt_std': 0.0}),
     'far poses need evidence': Mechanism(('twin marker', 'wrong poses'), off={'hypotheses:_ENOUGH_POSES': 0}),
     'contradiction in what is published': Mechanism(
