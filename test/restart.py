@@ -89,7 +89,8 @@ def measured(rounds: int) -> dict[str, list[float]]:
         initialise(None, context, domain)
         with Laps(Path(folder), lap(small=True), 3600.0) as laps:
             arguments = ['--params-file', f'{laps.folder}/params.yaml', '-p', 'mode:=localization']
-            with NodeProcesses(domain, NODES, [*arguments, '-p', f'map_file:={laps.folder}/map_true.yaml']) as nodes:
+            arguments += ['-p', f'map_file:={laps.folder}/map_true.yaml']
+            with NodeProcesses(domain, NODES, arguments, Path(folder)) as nodes:
                 flight = Flight(context, laps)
                 for _ in range(rounds):
                     for name in NODES:

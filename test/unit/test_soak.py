@@ -68,9 +68,9 @@ def test_growth_a_trend_and_what_is_missing_are_named(flown, expected):
 
 
 @pytest.mark.ros
-def test_a_node_that_does_not_end_well_is_named():
+def test_a_node_that_does_not_end_well_is_named(tmp_path):
     refused = pytest.raises(InputError, match='image_rate')
-    with NodeProcesses(77, ['tau2_camera'], ['-p', 'image_rate:=-1.0']) as nodes, refused:
+    with NodeProcesses(77, ['tau2_camera'], ['-p', 'image_rate:=-1.0'], tmp_path) as nodes, refused:
         while True:
             nodes.check()
             time.sleep(0.02)

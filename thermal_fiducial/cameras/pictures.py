@@ -44,6 +44,9 @@ class Pictures:
         self._path = Path(path)
         self._period = 1.0 / rate
         self._repeat = repeat
+        self._pictures: Iterator[Counts] = iter(())
+        #: when the next picture is due, by the monotonic clock [s]
+        self._due = 0.0
         if not self._path.exists():
             raise InputError(f'camera {path}: neither a device in /dev, nor "teax", nor a folder or video')
         if not any(True for _ in self._one_pass()):

@@ -53,6 +53,7 @@ class ThermalGrabber:
         self._size = size
         self._usb = usb
         self._device: Any = None
+        self._stream = TeaxStream(size, self.events)
 
     def open(self) -> None:
         """Find the grabber, take it from the kernel's serial driver, and start the stream; see the protocol."""
@@ -66,8 +67,7 @@ class ThermalGrabber:
         self._request(_SET_BITMODE, _SYNCHRONOUS_FIFO)
         self._request(_SET_LATENCY, _LATENCY_MS)
         self._request(_RESET, _PURGE_INPUT)
-        self._stream = TeaxStream(self._size)
-        self._stream.events = self.events
+        self._stream = TeaxStream(self._size, self.events)
 
     def read(self) -> list[CapturedFrame]:
         """Received frames; see the protocol."""

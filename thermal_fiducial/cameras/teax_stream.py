@@ -30,10 +30,11 @@ class TeaxStream:
     Parameters
     ----------
     size : (width, height) that frames must have; None: that of the first frame, until two in a row have another one
+    events : where what is dropped is counted; None: a counter of its own
     """
 
-    def __init__(self, size: tuple[int, int] | None = None) -> None:
-        self.events: Counter[str] = Counter()
+    def __init__(self, size: tuple[int, int] | None = None, events: Counter[str] | None = None) -> None:
+        self.events: Counter[str] = Counter() if events is None else events
         self._fixed = size is not None
         self._size = size
         self._other_size: tuple[int, int] | None = None

@@ -2,6 +2,7 @@
 
 from collections import Counter
 import ctypes
+from dataclasses import dataclass
 import errno
 from fractions import Fraction
 from typing import Any
@@ -29,6 +30,24 @@ _PATIENCE_S = 0.2
 _RATE_TOLERANCE = 0.02
 
 
+@dataclass(frozen=True)
+class _Layout:
+    """Where the pixels are in a buffer."""
+
+    #: height, width [px]
+    shape: tuple[int, int]
+    #: numpy's name of the type of a pixel
+    kind: str
+    #: from one row to the next [bytes]
+    step: int
+
+    @property
+    def needed(self) -> int:
+        """Size of a whole frame [bytes]; the last row may end with its last pixel."""
+        height, width = self.shape
+        return self.step * (height - 1) + 2 * width
+
+
 class V4l2Camera:
     """A :class:`~thermal_fiducial.cameras.source.FrameSource`.
 
@@ -48,15 +67,20 @@ class V4l2Camera:
         self._kernel: Any = kernel or api.Kernel()
         self._fd = -1
         self._maps: list[Any] = []
+        self._layout = _Layout((0, 0), '<u2', 0)
+        #: time from frame to frame [ns]; 0 where the driver does not know it
+        self._period_ns = 0
+        #: the driver's number of the next frame; None before the first
+        self._next_sequence: int | None = None
 
     def open(self) -> None:
         """Choose format and rate, map buffers, start the stream; see the protocol."""
         self._fd = self._kernel.open(self.name)
         self._check_capability()
-        self._choose_format()
-        self._choose_rate()
+        self._layout = self._choose_format()
+        self._period_ns = self._choose_rate()
         self._map_buffers()
-        self._next_sequence: int | None = None
+        self._next_sequence = None
         self._call(api.STREAMON, ctypes.c_int32(api.CAPTURE))
 
     def read(self) -> list[CapturedFrame]:
@@ -97,7 +121,7 @@ class V4l2Camera:
         if not (able & api.CAP_VIDEO_CAPTURE and able & api.CAP_STREAMING):
             raise InputError(f'{self.name} streams no video (a UVC camera has a second device for its metadata)')
 
-    def _choose_format(self) -> None:
+    def _choose_format(self) -> _Layout:
         wanted = self._call(api.G_FMT, api.Format(type=api.CAPTURE))
         wanted.pix.pixelformat, wanted.pix.field = _Y16, api.FIELD_NONE
         if self._size is not None:
@@ -109,13 +133,10 @@ class V4l2Camera:
         if self._size is not None and (pix.width, pix.height) != self._size:
             asked = 'x'.join(map(str, self._size))
             raise InputError(f'{self.name} offers {pix.width}x{pix.height}, not {asked}')
-        self._shape, self._kind = (pix.height, pix.width), FORMATS[pix.pixelformat]
-        self._step = pix.bytesperline or 2 * pix.width
-        self._needed = self._step * (pix.height - 1) + 2 * pix.width
+        return _Layout((pix.height, pix.width), FORMATS[pix.pixelformat], pix.bytesperline or 2 * pix.width)
 
-    def _choose_rate(self) -> None:
-        """Set the requested rate, if any; store the period [ns], 0 if the driver does not know it."""
-        self._period_ns = 0
+    def _choose_rate(self) -> int:
+        """Set the requested rate, if any; the period [ns], 0 if the driver does not know it."""
         try:
             parameters = self._call(api.G_PARM, api.StreamParameters(type=api.CAPTURE))
         except OSError as error:
@@ -130,11 +151,13 @@ class V4l2Camera:
             capture.timeperframe.numerator, capture.timeperframe.denominator = period.numerator, period.denominator
             capture = self._call(api.S_PARM, parameters).capture
         period = capture.timeperframe
-        if period.numerator and period.denominator:
-            self._period_ns = round(SECOND_NS * period.numerator / period.denominator)
-            offered = period.denominator / period.numerator
-            if self._rate > 0.0 and abs(offered / self._rate - 1.0) > _RATE_TOLERANCE:
-                raise InputError(f'{self.name} offers {offered:.4g} Hz, not {self._rate:.4g}')
+        if not (period.numerator and period.denominator):
+            return 0
+        offered = period.denominator / period.numerator
+        if self._rate > 0.0 and abs(offered / self._rate - 1.0) > _RATE_TOLERANCE:
+            raise InputError(f'{self.name} offers {offered:.4g} Hz, not {self._rate:.4g}')
+        period_ns: int = round(SECOND_NS * period.numerator / period.denominator)
+        return period_ns
 
     def _map_buffers(self) -> None:
         request = api.RequestBuffers(count=_BUFFERS, type=api.CAPTURE, memory=api.MMAP)
@@ -157,11 +180,11 @@ class V4l2Camera:
         if buffer.flags & api.FLAG_ERROR:
             self.events['scrambled frames'] += 1
             return None
-        if buffer.bytesused < self._needed:
+        layout = self._layout
+        if buffer.bytesused < layout.needed:
             self.events['short frames'] += 1
             return None
-        strides = (self._step, 2)
-        pixels = np.ndarray(self._shape, self._kind, self._maps[buffer.index], strides=strides)
+        pixels = np.ndarray(layout.shape, layout.kind, self._maps[buffer.index], strides=(layout.step, 2))
         return np.array(pixels, dtype=np.uint16)
 
     def _stamp_ns(self, buffer: api.Buffer) -> int:

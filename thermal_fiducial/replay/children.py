@@ -6,7 +6,6 @@ from pathlib import Path
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from typing import Self
 
@@ -26,19 +25,19 @@ class NodeProcesses:
     domain_id : DDS domain
     nodes : names of the nodes
     ros_arguments : for the nodes, after ``--ros-args``
+    folder : for what the nodes print, and for the log files of ROS unless the user has set another place for them
     """
 
-    def __init__(self, domain_id: int, nodes: Sequence[str], ros_arguments: Sequence[str]) -> None:
+    def __init__(self, domain_id: int, nodes: Sequence[str], ros_arguments: Sequence[str], folder: Path) -> None:
         self._nodes = tuple(nodes)
-        self._environment = {**os.environ, 'ROS_DOMAIN_ID': str(domain_id)}
+        self._folder = folder
+        self._environment = {'ROS_LOG_DIR': str(folder), **os.environ, 'ROS_DOMAIN_ID': str(domain_id)}
         self._arguments = ['--ros-args', *ros_arguments]
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         #: after the end: messages on nodes that did not end properly
         self.unclean: list[str] = []
 
     def __enter__(self) -> Self:
-        self._folder = tempfile.TemporaryDirectory(prefix='thermal_fiducial_')
-        self._environment.setdefault('ROS_LOG_DIR', self._folder.name)
         for node in self._nodes:
             self._start(node)
         return self
@@ -56,7 +55,6 @@ class NodeProcesses:
         for node, process in self._processes.items():
             if fault := _await_end(process):
                 self.unclean.append(f'{node}: {fault}')
-        self._folder.cleanup()
 
     def check(self) -> None:
         """Raise if a node has ended.
@@ -94,7 +92,7 @@ class NodeProcesses:
         return {node: _cpu_seconds(process.pid) for node, process in self._processes.items()}
 
     def _log(self, node: str) -> Path:
-        return Path(self._folder.name) / f'{node}.txt'
+        return self._folder / f'{node}.txt'
 
 
 def _await_end(process: subprocess.Popen[bytes]) -> str:

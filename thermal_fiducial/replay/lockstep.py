@@ -75,8 +75,8 @@ def replay_lockstep(
         initialise(['--ros-args', *ros_arguments], context, domain)
         graph = None
         try:
-            graph = _Graph(context, nodes, recorded, warn)
-            graph.play(bag, played, files, progress)
+            graph = _Graph(context, nodes, played, recorded, warn)
+            graph.play(bag, files, progress)
         finally:
             if graph is not None:
                 graph.close()
@@ -87,7 +87,14 @@ def replay_lockstep(
 class _Graph:
     """The nodes, a player and a recorder in one executor."""
 
-    def __init__(self, context: Context, nodes: Sequence[str], recorded: Topics, warn: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        context: Context,
+        nodes: Sequence[str],
+        played: Sequence[str],
+        recorded: Topics,
+        warn: Callable[[str], None],
+    ) -> None:
         self._warn = warn
         self._arrived: list[tuple[str, bytes]] = []
         self._order = {topic: index for index, topic in enumerate(recorded)}
@@ -96,30 +103,35 @@ class _Graph:
         for name in nodes:
             make: Callable[..., StageNode[Any]] = _KINDS[name]
             self._stages.append(make(live=False, **quiet))
-        self._player = CountingNode('player', use_global_arguments=False, **quiet)
+        player = CountingNode('player', use_global_arguments=False, **quiet)
+        self._played = {topic: player.advertise(PLAYED[topic][0], topic, PLAYED[topic][1]) for topic in played}
         recorder = Recorder(self._take, recorded, use_global_arguments=False, **quiet)
-        self._nodes: list[CountingNode] = [*self._stages, self._player, recorder]
+        self._nodes: list[CountingNode] = [*self._stages, player, recorder]
+        self._inputs = [source for node in self._nodes for source in node.inputs]
+        self._outputs = [output for node in self._nodes for output in node.outputs]
+        topics = Counter(source.topic for source in self._inputs)
+        #: outputs that somebody receives, and how many do
+        self._received = [(output, topics[output.topic]) for output in self._outputs if output.topic in topics]
         self._executor = make_executor(context)
         for node in self._nodes:
             self._executor.add_node(node)
 
-    def play(self, bag: Playable, played: Sequence[str], files: Sink, progress: Callable[[int], None]) -> None:
+    def play(self, bag: Playable, files: Sink, progress: Callable[[int], None]) -> None:
         """Play the bag, with diagnostics once a second of the bag's time."""
         faults = [fault for stage in self._stages for fault in stage.faults]
         if faults:
             raise InputError('; '.join(faults))
-        outputs = {topic: self._player.advertise(PLAYED[topic][0], topic, PLAYED[topic][1]) for topic in played}
         self._connect()
         self._settle(bag.start_ns, files)
         next_diagnosis = bag.start_ns + SECOND_NS
         last_ns = bag.start_ns
-        for message in bag.messages(played):
+        for message in bag.messages(self._played):
             while message.stamp_ns >= next_diagnosis:
                 self._diagnose(next_diagnosis, files)
                 progress(next_diagnosis - bag.start_ns)
                 next_diagnosis += SECOND_NS
             _check(message)
-            outputs[message.topic].send(message.cdr)
+            self._played[message.topic].send(message.cdr)
             self._settle(message.stamp_ns, files)
             last_ns = message.stamp_ns
         # At the last message, not a full second later: rates would include the time after the end.
@@ -134,14 +146,10 @@ class _Graph:
         self._arrived.append((topic, data))
 
     def _connect(self) -> None:
-        """Pair publishers and subscriptions, and wait until DDS has matched them at both ends."""
-        self._inputs = [source for node in self._nodes for source in node.inputs]
-        outputs = [output for node in self._nodes for output in node.outputs]
-        readers = [(output, sum(source.topic == output.topic for source in self._inputs)) for output in outputs]
-        writers = [(source, sum(output.topic == source.topic for output in outputs)) for source in self._inputs]
-        self._wait(lambda: [output.topic for output, count in readers if output.listeners != count])
-        self._wait(lambda: [source.topic for source, count in writers if source.publishers != count])
-        self._heard = [(output, count) for output, count in readers if count]
+        """Wait until DDS has matched publishers and subscriptions at both ends."""
+        readers, writers = (Counter(end.topic for end in ends) for ends in (self._inputs, self._outputs))
+        self._wait(lambda: [output.topic for output in self._outputs if output.listeners != readers[output.topic]])
+        self._wait(lambda: [source.topic for source in self._inputs if source.publishers != writers[source.topic]])
 
     def _settle(self, time_ns: int, files: Sink) -> None:
         """Run callbacks until no message is in transit; pass recorded ones to ``files`` in a fixed order of topics."""
@@ -153,11 +161,11 @@ class _Graph:
 
     def _under_way(self) -> list[str]:
         """Topics with messages in transit; none if the sums are equal, as no topic receives more than was sent."""
-        sent = sum([output.count * readers for output, readers in self._heard])
+        sent = sum([output.count * readers for output, readers in self._received])
         if sent == sum([source.count for source in self._inputs]):
             return []
         left: Counter[str] = Counter()
-        for output, readers in self._heard:
+        for output, readers in self._received:
             left[output.topic] += output.count * readers
         for source in self._inputs:
             left[source.topic] -= source.count

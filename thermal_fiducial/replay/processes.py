@@ -3,6 +3,9 @@
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+import tempfile
 import time
 from typing import Any
 
@@ -72,7 +75,10 @@ def replay_processes(
         initialise(None, context, domain)
         say(f'the nodes run in DDS domain {domain} of this computer: listen with ROS_DOMAIN_ID={domain}')
         try:
-            with NodeProcesses(domain, nodes, ros_arguments) as processes:
+            with (
+                tempfile.TemporaryDirectory(prefix='thermal_fiducial_') as folder,
+                NodeProcesses(domain, nodes, ros_arguments, Path(folder)) as processes,
+            ):
                 player = _Player(context, played, files, recorded)
                 try:
                     player.connect(processes, nodes, warn)
@@ -85,6 +91,29 @@ def replay_processes(
             return timing
         finally:
             context.try_shutdown()
+
+
+@dataclass(frozen=True)
+class _Clock:
+    """Relates the time of a bag to the monotonic clock of this machine, from the moment at which it is made."""
+
+    bag_start_ns: int
+    #: seconds of the bag in a second
+    rate: float
+    start_ns: int = field(default_factory=time.monotonic_ns)
+
+    def due_ns(self, stamp_ns: int) -> int:
+        """When a message of the bag is due, by the monotonic clock."""
+        return self.start_ns + round((stamp_ns - self.bag_start_ns) / self.rate)
+
+    def bag_ns(self, now_ns: int) -> int:
+        """The bag's time, not before its start."""
+        return self.bag_start_ns + max(0, round((now_ns - self.start_ns) * self.rate))
+
+    @property
+    def seconds(self) -> float:
+        """Seconds since the start."""
+        return (time.monotonic_ns() - self.start_ns) / SECOND_NS
 
 
 class _Player:
@@ -125,25 +154,24 @@ class _Player:
 
     def play(self, bag: Playable, nodes: NodeProcesses, rate: float, progress: Callable[[int], None]) -> dict[str, Any]:
         """Publish the bag; then wait for the last results."""
-        self._bag_start_ns, self._rate = bag.start_ns, rate
         cpu = nodes.cpu_seconds()
-        self._start_ns, late_ns, next_check = time.monotonic_ns(), 0, 0
+        clock, late_ns, next_check = _Clock(bag.start_ns, rate), 0, 0
         for message in _read_ahead(bag.messages(self._outputs)):
-            elapsed = message.stamp_ns - bag.start_ns
-            due_ns = self._start_ns + round(elapsed / rate)
-            self._spin_until(due_ns)
+            due_ns = clock.due_ns(message.stamp_ns)
+            self._spin_until(due_ns, clock)
             now = time.monotonic_ns()
             late_ns = max(late_ns, now - due_ns)
             if message.topic in _KINDS:
                 self._latency.sent(_KINDS[message.topic], header_stamp_ns(message.cdr), now)
             self._outputs[message.topic].send(message.cdr)
+            elapsed = message.stamp_ns - bag.start_ns
             if elapsed >= next_check:
                 nodes.check()
                 progress(elapsed)
                 next_check = elapsed + SECOND_NS
-        seconds = (time.monotonic_ns() - self._start_ns) / SECOND_NS
+        seconds = clock.seconds
         used = {node: total - cpu[node] for node, total in nodes.cpu_seconds().items()}
-        self._drain(nodes)
+        self._drain(nodes, clock)
         self._latency.write(self._files.folder / 'latency.csv')
         return {
             'rate': rate,
@@ -152,17 +180,17 @@ class _Player:
             'player_late_ms': late_ns * 1e-6,
         }
 
-    def _drain(self, nodes: NodeProcesses) -> None:
+    def _drain(self, nodes: NodeProcesses, clock: _Clock) -> None:
         """Receive the remaining outputs until all topics are silent and all nodes idle; slow machines may take long."""
         heard, idle = -1, 0
         while idle * _GLANCE_S < _SILENCE_S:
             nodes.check()
-            self._spin_until(time.monotonic_ns() + round(_GLANCE_S * SECOND_NS))
+            self._spin_until(time.monotonic_ns() + round(_GLANCE_S * SECOND_NS), clock)
             if heard != (heard := sum(source.count for source in self._results())):
                 idle = 0
             idle += not nodes.working
         while self._arrived:
-            self._file_one()
+            self._file_one(clock)
 
     def _results(self) -> list[Any]:
         """Recorded topics that fall silent after the bag's end, so without diagnostics."""
@@ -176,18 +204,17 @@ class _Player:
         elif topic == 'camera_pose':
             self._latency.camera_pose(header_stamp_ns(data), now)
 
-    def _spin_until(self, due_ns: int) -> None:
+    def _spin_until(self, due_ns: int, clock: _Clock) -> None:
         while (left := due_ns - time.monotonic_ns()) > 0:
             if self._arrived and left > _SPARE_NS:
                 self._executor.spin_once(timeout_sec=0.0)
-                self._file_one()
+                self._file_one(clock)
             else:
                 self._executor.spin_once(timeout_sec=left / SECOND_NS)
 
-    def _file_one(self) -> None:
+    def _file_one(self, clock: _Clock) -> None:
         topic, data, now = self._arrived.popleft()
-        elapsed = max(0, round((now - self._start_ns) * self._rate))
-        self._files.add(topic, self._bag_start_ns + elapsed, data)
+        self._files.add(topic, clock.bag_ns(now), data)
 
     def close(self) -> None:
         """Destroy the player's nodes."""

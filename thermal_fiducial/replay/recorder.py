@@ -25,7 +25,7 @@ from thermal_fiducial.replay.topics import Topics, type_name
 from thermal_fiducial.ros import clouds, convert
 from thermal_fiducial.ros.counting import CountingNode
 
-_TABLES = ('fused.tum', 'fiducial.tum', 'detections.csv')
+_FUSED, _FIDUCIAL, _DETECTIONS = _TABLES = ('fused.tum', 'fiducial.tum', 'detections.csv')
 
 
 class Sink(Protocol):
@@ -69,6 +69,8 @@ class RunFiles:
             (folder / name).unlink(missing_ok=True)
         self._bag = BagWriter(folder / 'output')
         self._ending = ExitStack()
+        #: name to the open file
+        self._tables: dict[str, TextIO] = {}
         self._types = {topic: type_name(kind) for topic, (kind, _) in topics.items()}
         self._readers: dict[str, tuple[type, Callable[[Any], None]]] = {
             'pose': (PoseWithCovarianceStamped, self._on_pose),
@@ -84,11 +86,10 @@ class RunFiles:
             for topic, msgtype in self._types.items():
                 self._bag.add_topic(topic, msgtype)
             ending.push(self._sort_late_frames)
-            self._fused, self._fiducial, self._detections = [
-                ending.enter_context(unfinished(self.folder / name).open('w', encoding='utf-8')) for name in _TABLES
-            ]
-            claim(self._fused)
-            self._detections.write(','.join(['stamp_ns', 'id', *CORNER_FIELDS, 'sigma_px']) + '\n')
+            for name in _TABLES:
+                self._tables[name] = ending.enter_context(unfinished(self.folder / name).open('w', encoding='utf-8'))
+            claim(self._tables[_FUSED])
+            self._tables[_DETECTIONS].write(','.join(['stamp_ns', 'id', *CORNER_FIELDS, 'sigma_px']) + '\n')
             self._ending = ending.pop_all()
         return self
 
@@ -97,7 +98,7 @@ class RunFiles:
 
     def _sort_late_frames(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
-            _sort_by_stamp(unfinished(self.folder / 'fiducial.tum'))
+            _sort_by_stamp(unfinished(self.folder / _FIDUCIAL))
 
     def _put_in_place(self, kind: type[BaseException] | None, *_: object) -> None:
         """Give the tables their final names; after an exception remove them, as half a run looks like a whole one."""
@@ -123,11 +124,11 @@ class RunFiles:
         return dict(sorted(self._last_figures.items()))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
-        _write_pose(self._fused, message, message.pose.pose)
+        _write_pose(self._tables[_FUSED], message, message.pose.pose)
 
     def _on_camera_pose(self, message: PoseWithCovarianceStamped) -> None:
         T_map_body = convert.transform_of(message.pose.pose) @ self._T_camera_body
-        _write_pose(self._fiducial, message, convert.pose(T_map_body))
+        _write_pose(self._tables[_FIDUCIAL], message, convert.pose(T_map_body))
 
     def _on_markers(self, message: PointCloud2) -> None:
         stamp = convert.stamp_ns(message.header.stamp)
@@ -135,7 +136,7 @@ class RunFiles:
         self.frames_with_markers += len(rows) > 0
         for row in rows:
             values = [f'{row[name]:.5f}' for name in (*CORNER_FIELDS, 'sigma_px')]
-            self._detections.write(f'{stamp},{row["id"]},{",".join(values)}\n')
+            self._tables[_DETECTIONS].write(f'{stamp},{row["id"]},{",".join(values)}\n')
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

@@ -28,6 +28,28 @@ _NEAR_PAIRS = 4
 _FAR_PENALTY_COUNTS = 1 << 16
 
 
+class _Window:
+    """What pixels and their surroundings did over some frames."""
+
+    def __init__(self, counts: Counts, surroundings: Counts) -> None:
+        self._first, self._lowest, self._highest = counts.copy(), surroundings.copy(), surroundings.copy()
+        # At the ends of the scale a sound pixel keeps its value too: the corner of a clipped marker, say.
+        #: pixels that have kept one value
+        self.constant = (counts > counts.min()) & (counts < counts.max())
+        self.frames = 0
+
+    def add(self, counts: Counts, surroundings: Counts) -> None:
+        """Take one frame, and the median of the surroundings of each of its pixels."""
+        self.constant &= counts == self._first
+        np.minimum(self._lowest, surroundings, out=self._lowest)
+        np.maximum(self._highest, surroundings, out=self._highest)
+        self.frames += 1
+
+    def moved(self, margin_counts: float) -> BoolArray:
+        """Pixels whose surroundings changed by more than a margin."""
+        return np.asarray(cv2.subtract(self._highest, self._lowest) > margin_counts, np.bool_)
+
+
 class BadPixelFinder:
     """Finds pixels that do not follow the scene, from one frame in ``interval``.
 
@@ -47,7 +69,7 @@ class BadPixelFinder:
         self._interval = interval
         self._sigmas = sigmas
         self._frames = 0
-        self._watched = 0
+        self._window: _Window | None = None
 
     def add(self, counts: Counts) -> IntArray | None:
         """Take a live frame; the bad pixels (N, 2) as column, row where this frame may have changed them."""
@@ -69,19 +91,12 @@ class BadPixelFinder:
 
     def _watch(self, counts: Counts, surroundings: Counts, moved_counts: float) -> None:
         """Mark pixels that kept one value over a window in which the median of their surroundings moved."""
-        if self._watched == 0:
-            self._first, self._lowest, self._highest = counts.copy(), surroundings.copy(), surroundings.copy()
-            # At the ends of the scale a sound pixel keeps its value too: the corner of a clipped marker, say.
-            self._constant = (counts > counts.min()) & (counts < counts.max())
-        self._constant &= counts == self._first
-        np.minimum(self._lowest, surroundings, out=self._lowest)
-        np.maximum(self._highest, surroundings, out=self._highest)
-        self._watched += 1
-        if self._watched == self.WINDOW:
-            moved = cv2.subtract(self._highest, self._lowest) > moved_counts
+        window = self._window = self._window or _Window(counts, surroundings)
+        window.add(counts, surroundings)
+        if window.frames == self.WINDOW:
             # A scene that stands still says nothing: what was known of its pixels stays.
-            self._stuck = np.where(moved, self._constant, self._stuck & self._constant)
-            self._watched = 0
+            self._stuck = np.where(window.moved(moved_counts), window.constant, self._stuck & window.constant)
+            self._window = None
 
 
 def _stands_out(counts: Counts, surroundings: Counts, margin_counts: float) -> IntArray:
