@@ -69,7 +69,7 @@ def test_stress_of_necks_is_that_of_a_beam():
     [
         ({'size': 600.0}, 'too heavy for its necks'),
         ({'size': 80.0}, 'too small for its ears'),
-        ({'tie_width': 2.0}, 'its narrowest web has 2.0 mm'),
+        ({'tie_width': 2.0}, 'its narrowest web is 2.0 mm wide'),
     ],
 )
 def test_what_speaks_against_a_plate(options, said, tmp_path, capsys):

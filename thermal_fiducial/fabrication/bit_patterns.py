@@ -53,7 +53,7 @@ def weight(words: Words) -> IntArray:
 
 
 def cuttable(words: Words, n: int) -> BoolArray:
-    """Which of ``words`` (N,) are one piece of acrylic with no two holes touching at a point only."""
+    """Whether each of ``words`` (N,) is one piece of acrylic without holes that touch only at a point."""
     sound = ~_has_point_contact(words, n)
     sound[sound] = _in_one_piece(words[sound], n)
     return sound

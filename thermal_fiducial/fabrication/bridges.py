@@ -1,6 +1,6 @@
-"""Webs that hold what would fall out of a marker from a standard dictionary.
+"""Webs of acrylic that hold the loose parts of a marker from a standard dictionary.
 
-A reader of bits looks at the middle of each cell (OpenCV leaves out 13 % on each side), so webs run along the lines
+Detectors read the bit in the middle of each cell (OpenCV ignores 13 % on each side), so webs run along the lines
 between cells: a square patch where two acrylic cells meet at a point, and along the lines between white cells from
 an island to the nearest acrylic.
 """
@@ -15,10 +15,10 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, Gray, IntArray
 from thermal_fiducial.fabrication.cuttability import acrylic_cells, pieces, point_contacts
 from thermal_fiducial.fabrication.shape import paint, Rectangle
 
-#: Line between cells, as (row, column) of a corner of the cells' lattice, rows from the top.
+#: Point where cells meet, as (row, column) of a corner of the cells' lattice, rows from the top.
 Vertex = tuple[int, int]
 
-# What OpenCV's bit reading leaves out on each side of a cell, in cells.
+# Margin on each side of a cell that OpenCV ignores when it reads the bit, in cells.
 _READING_MARGIN = 0.13
 
 
@@ -28,7 +28,7 @@ class Bridges:
 
     #: corners where two acrylic cells meet at a point
     patches: tuple[Vertex, ...]
-    #: ways along the lattice, each from an island to other acrylic
+    #: paths along the lattice, each from an island to other acrylic
     webs: tuple[tuple[Vertex, ...], ...]
 
     def rectangles(self, cells: int, cell: float, width: float) -> list[Rectangle]:
@@ -42,7 +42,7 @@ class Bridges:
             points = _scaled(web, cells, cell)
             last = len(points) - 2
             for index, (start, end) in enumerate(pairwise(points)):
-                # At its ends a web reaches its own width along the acrylic, else its neck would be thinner than it.
+                # At its ends a web extends its own width along the acrylic, else its joints would be thinner.
                 before = width if index == 0 else half
                 after = width if index == last else half
                 along = (end - start) / np.linalg.norm(end - start)
@@ -61,7 +61,7 @@ def _box(start: FloatArray, end: FloatArray, dx: float, dy: float) -> Rectangle:
 
 
 def find_bridges(bits: Gray) -> Bridges:
-    """Bridges that make one piece of the marker with ``bits`` (n, n), 1 for white; none where it is one already."""
+    """Bridges that join the acrylic of a marker with ``bits`` (n, n), 1 for white; none if it is one piece."""
     acrylic = acrylic_cells(bits)
     contacts = [(int(row) + 1, int(column) + 1) for row, column in np.argwhere(point_contacts(acrylic))]
     _, piece = pieces(acrylic)
@@ -124,7 +124,7 @@ def _beside(acrylic: BoolArray, start: Vertex, end: Vertex) -> BoolArray:
 
 
 def darkest_white(bits: Gray, bridges: Bridges, cell: float, width: float) -> float:
-    """Largest share of a white cell's read part that webs ``width`` wide cover (0 to 1; below 0.5 it reads white)."""
+    """Largest covered share of the part of a white cell that is read, with webs of ``width``; below 0.5: white."""
     cells = len(bits) + 2
     covered = np.zeros((cells, cells))
     margin = _READING_MARGIN * cell

@@ -1,4 +1,4 @@
-"""How the contrast of a stencil fades: the acrylic warms up.
+"""Decay of the contrast of a stencil while its acrylic warms up.
 
 One-dimensional heat conduction through the sheet. Its back faces the warm surface across an air gap (conduction
 through the air and radiation) or touches it; its front loses heat to the room by convection and radiation. What the
@@ -19,7 +19,7 @@ _HEAT_CAPACITY = 1190.0 * 1470.0  # J/m^3/K
 _AIR_CONDUCTIVITY = 0.026  # W/m/K
 # 4 sigma T^3 at 310 K between two surfaces of emissivity 0.95 and 0.95.
 _RADIATION = 4.0 * 5.67e-8 * 310.0**3 / (2.0 / 0.95 - 1.0)  # W/m^2/K
-# Layers of the sheet: doubling them changes no answer by 0.002 of the contrast.
+# Layers of the sheet in the computation: twice as many change the contrast by less than 0.002 of it.
 _LAYERS = 40
 
 
@@ -30,8 +30,8 @@ class Mounting:
     Parameters
     ----------
     thickness : of the acrylic [m]
-    gap : stand-off between warm surface and sheet [m]; 0: in contact
-    loss : of the front to the room [W/m^2/K]: 10 in still air, 25 in a rotor's wash
+    gap : distance between warm surface and sheet [m]; 0: in contact
+    loss : heat transfer from the front to the room [W/m^2/K]: 10 in still air, 25 in a rotor's wash
     """
 
     thickness: float = 0.003
@@ -47,12 +47,12 @@ class Mounting:
 
     @property
     def gap_conductance(self) -> float:
-        """Of the gap [W/m^2/K]; infinite in contact."""
+        """Heat transfer across the gap [W/m^2/K]; infinite in contact."""
         return _AIR_CONDUCTIVITY / self.gap + _RADIATION if self.gap > 0.0 else np.inf
 
 
 def remaining_contrast(mounting: Mounting, seconds: npt.ArrayLike) -> FloatArray:
-    """Share (...) of the difference between warm surface and room that is left after ``seconds`` (...).
+    """Remaining contrast after ``seconds`` (...), as a share (...) of the difference between warm surface and room.
 
     The sheet starts at room temperature. Solved exactly in time (eigenvalues of the conduction matrix), in layers
     across the thickness.

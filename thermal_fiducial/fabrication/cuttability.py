@@ -14,13 +14,13 @@ from thermal_fiducial.core.types import BoolArray, Gray, IntArray
 
 @dataclass(frozen=True)
 class Cuttability:
-    """What keeps a marker from being cut.
+    """Properties of a marker that decide whether it can be cut.
 
     Parameters
     ----------
     islands : pieces of acrylic that no edge joins to the border
-    point_contacts : corners of cells where two holes meet and the acrylic between them has no width
-    longest_arm : largest number of cells that one has to cross to get from an acrylic cell to the border
+    point_contacts : corners of cells where two holes touch, so that the acrylic between them has no width
+    longest_arm : largest distance of an acrylic cell from the border, through acrylic [cells]
     """
 
     islands: int
@@ -29,12 +29,12 @@ class Cuttability:
 
     @property
     def cuttable(self) -> bool:
-        """Whether the marker is one piece without bridges."""
+        """Whether the marker is one piece of acrylic, so that it needs no bridges."""
         return self.islands == 0 and self.point_contacts == 0
 
     @property
     def narrowest_web_cells(self) -> float:
-        """Width of the thinnest acrylic in cells: a cell, or nothing where holes touch at a point."""
+        """Width of the thinnest acrylic [cells]: 1, or 0 where holes touch at a point."""
         return 0.0 if self.point_contacts else 1.0
 
 
@@ -44,13 +44,13 @@ def acrylic_cells(bits: Gray) -> BoolArray:
 
 
 def pieces(acrylic: BoolArray) -> tuple[int, IntArray]:
-    """Number of pieces that hang together by edges, and the piece (0 none, 1 the border, 2 ...) of each cell."""
+    """Number of pieces joined by edges, and the label of each cell: 0 hole, 1 the piece with the border, 2 ..."""
     count, labels = cv2.connectedComponents(acrylic.astype(np.uint8), connectivity=4)
     return count - 1, np.asarray(labels, dtype=np.int64)
 
 
 def point_contacts(acrylic: BoolArray) -> BoolArray:
-    """Inner corners of the cells, shape one less than ``acrylic`` in both directions, where holes meet at a point."""
+    """Whether holes touch at each inner corner of the cells; one row and column fewer than ``acrylic``."""
     a, b, c, d = acrylic[:-1, :-1], acrylic[:-1, 1:], acrylic[1:, :-1], acrylic[1:, 1:]
     return np.asarray((a == d) & (b == c) & (a != b))
 

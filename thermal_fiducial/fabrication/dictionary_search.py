@@ -1,13 +1,13 @@
 """Search for dictionaries of markers that can be cut.
 
-A greedy search keeps whatever pattern is far enough from those kept before. Far more markers fit into a coset of a
-linear code: let C be a linear code of n x n bits with minimum distance d that turning the grid by 90 degrees maps
-onto itself, and v a pattern with v + R v in C. All words of v + C and all their rotations lie in v + C, so any two
-of them differ in at least d bits. What remains to be done is to keep the cuttable ones, one of each four rotations.
+A greedy search accepts each pattern that is far enough from those accepted before. Far more markers fit into a coset
+of a linear code: let C be a linear code of n x n bits with minimum distance d that turning the grid by 90 degrees
+maps onto itself, and v a pattern with v + R v in C. All words of v + C and all their rotations lie in v + C, so any two
+of them differ in at least d bits. Of these the search keeps the cuttable ones, one of each four rotations.
 
 Such codes are grown a dimension at a time: R acts unipotently on the patterns (R^4 = 1 in characteristic 2), so
 every invariant code can be reached by adding, each time, a g with g + R g already in the code. The g of one step
-form a space of at most a few hundred cosets, which are tried all; the choice among the fit ones is random.
+form a space of at most a few hundred cosets. All are tried, and one of the suitable ones is chosen at random.
 Background: F. MacWilliams, N. Sloane, "The Theory of Error-Correcting Codes", 1977.
 """
 
@@ -27,12 +27,12 @@ class LinearCode:
     """A linear code of n x n bits, invariant under turning the grid."""
 
     n: int
-    #: rows in reduced echelon form: highest bit to row
+    #: rows in reduced echelon form, by their highest bit
     basis: dict[int, int] = field(default_factory=dict)
     words: Words = field(default_factory=lambda: np.zeros(1, np.uint64))
 
     def add(self, generator: int) -> None:
-        """Grow by one dimension."""
+        """Extend the code by one dimension."""
         row = self.reduce(generator)
         lead = row.bit_length() - 1
         for other in self.basis:
@@ -75,7 +75,7 @@ def span(generators: Iterable[int]) -> Words:
 
 
 def random_code(n: int, distance: int, rng: np.random.Generator) -> LinearCode:
-    """A code that no further dimension fits into, grown at random.
+    """A random code that cannot be extended by a further dimension.
 
     Every other one prefers generators that keep all weights divisible by 4: such codes (Golay's is one) are dense
     at distances divisible by 4.
@@ -95,7 +95,7 @@ def random_code(n: int, distance: int, rng: np.random.Generator) -> LinearCode:
 
 
 def best_coset(code: LinearCode, distance: int) -> Words:
-    """The most markers, one word of each four rotations, that a coset of ``code`` holds."""
+    """The markers of the coset of ``code`` that has most, one word of each four rotations."""
     cosets = code.invariant_cosets()
     words = code.words ^ cosets[:, None]
     fit = cuttable(words.reshape(-1), code.n).reshape(words.shape)
@@ -106,9 +106,9 @@ def best_coset(code: LinearCode, distance: int) -> Words:
 
 
 def apart_from_negatives(markers: Words, n: int, distance: int) -> Words:
-    """The ``markers`` that are left when none may differ in less than ``distance`` bits from the negative of another.
+    """A subset of ``markers`` in which each differs in ``distance`` bits or more from the negative of any other.
 
-    Those with the fewest such partners are kept first.
+    Markers with the fewest negatives too close to them are taken first.
     """
     full = np.uint64((1 << n * n) - 1)
     turned = rotations(markers, n)
@@ -130,14 +130,14 @@ def search(
     signed: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Gray:
-    """Markers of n x n bits that can be cut, any two (and any marker and itself turned) ``distance`` bits apart.
+    """Cuttable markers of n x n bits; any two, and any marker and its rotations, differ in ``distance`` bits or more.
 
     Parameters
     ----------
     n : bits along a side, 3 to 8
     distance : least Hamming distance
     seed, restarts : the same numbers give the same markers
-    signed : any marker is as far from the negatives of all, so that the bits distinguish warm from cold
+    signed : also keep this distance from the negatives of all markers, so that the bits distinguish warm from cold
     progress : called with the number of restarts done and the most markers found so far
 
     Returns
@@ -184,7 +184,7 @@ def distances(bits: Gray) -> tuple[int, int]:
 
 
 def negatives(bits: Gray, closer_than: int) -> list[tuple[int, int, int]]:
-    """Pairs of markers, and in how many bits one differs from the negative of the other, in any rotation.
+    """Pairs of markers, and the distance of one from the negative of the other: the least over the rotations.
 
     Parameters
     ----------

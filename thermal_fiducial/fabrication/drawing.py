@@ -1,4 +1,4 @@
-"""What a laser cutter gets: closed contours of straight lines and arcs, circles, and engraved outlines.
+"""Drawings for a laser cutter: closed contours of straight lines and arcs, circles, and engraved outlines.
 
 Millimetres, x to the right, y up, the origin at the lower left of the acrylic. The paths reach half a kerf beyond it.
 """
@@ -36,7 +36,7 @@ class Contour:
         return polygon + float(np.sum(_segment_area(chord, self.bulges)))
 
     def moved(self, dx: float, dy: float) -> 'Contour':
-        """The same contour elsewhere."""
+        """The contour, shifted."""
         return Contour(self.points + np.array([dx, dy]), self.bulges)
 
     def flattened(self, points_per_arc: int = 8) -> FloatArray:
@@ -79,7 +79,7 @@ class Circle:
     radius: float
 
     def moved(self, dx: float, dy: float) -> 'Circle':
-        """The same hole elsewhere."""
+        """The hole, shifted."""
         return Circle(self.x + dx, self.y + dy, self.radius)
 
 
@@ -88,7 +88,7 @@ Shape: TypeAlias = Contour | Circle
 
 @dataclass(frozen=True)
 class Drawing:
-    """One drawing: what to cut, drill and engrave on a sheet of ``width`` times ``height`` [mm]."""
+    """One drawing: paths to cut, drill and engrave on a sheet of ``width`` times ``height`` [mm]."""
 
     name: str
     width: float
@@ -100,13 +100,13 @@ class Drawing:
     engraving: tuple[Contour, ...] = ()
     #: round holes of a pattern: the dots of a calibration board
     dots: tuple[Circle, ...] = ()
-    #: number of separate pieces of acrylic that must come out
+    #: expected number of separate pieces of acrylic
     parts: int = 1
-    #: what to cut and how to mount it, one line a part
+    #: instructions for cutting and mounting, one line a part
     notes: tuple[str, ...] = field(default=())
 
     def moved(self, dx: float, dy: float) -> 'Drawing':
-        """The same drawing with everything on it shifted."""
+        """The drawing, shifted."""
         return replace(
             self,
             cuts=tuple(contour.moved(dx, dy) for contour in self.cuts),
@@ -117,9 +117,9 @@ class Drawing:
 
     @property
     def layers(self) -> dict[str, tuple[Shape, ...]]:
-        """What to do, in this order: a piece that has come loose is neither engraved nor cut into.
+        """Layers in the order of the work: a piece that has come loose can be neither engraved nor cut.
 
-        ``ENGRAVE``, ``HOLES`` (mounting), ``PATTERN`` (what the camera sees through), ``OUTLINE``.
+        ``ENGRAVE``, ``HOLES`` (mounting), ``PATTERN`` (openings for the camera), ``OUTLINE``.
         """
         return {
             'ENGRAVE': self.engraving,
@@ -137,7 +137,7 @@ class Drawing:
 
 
 def combined(name: str, width: float, height: float, drawings: Sequence[Drawing]) -> Drawing:
-    """All ``drawings``, where they are, as one on a sheet of ``width`` times ``height`` [mm]."""
+    """One drawing of all ``drawings``, in place, on a sheet of ``width`` times ``height`` [mm]."""
     return Drawing(
         name,
         width,

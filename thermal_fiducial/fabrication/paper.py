@@ -19,20 +19,20 @@ PAPERS = ('A4', 'A3', 'A2', 'A1', 'A0', 'Letter', 'Legal', 'Tabloid')
 
 _POINTS_PER_MM = 72.0 / 25.4
 _LINE_MM = 0.1
-# What no printer reaches, and what neighbouring tiles both show, in its middle the marks [mm].
+# Unprintable margin of the paper, and overlap of neighbouring tiles, with the marks in its middle [mm].
 _MARGIN_MM, _OVERLAP_MM = 12.0, 10.0
-# Half a mark's length, and the ruler that says whether the page was printed at true size [mm].
+# Half the length of a mark, and the length of the ruler that shows whether the page has its true size [mm].
 _MARK_MM, _RULER_MM = 4.0, 100.0
 _POINTS_PER_ARC = 32
 
 
 @dataclass(frozen=True)
 class Tiling:
-    """How a drawing is spread over sheets of paper.
+    """Division of a drawing over sheets of paper.
 
     Parameters
     ----------
-    sheet : width and height (2,) of the paper as it lies [mm]
+    sheet : width and height (2,) of the paper, upright or turned [mm]
     origin : lower left corner (2,) of the first tile, in the drawing [mm]
     columns, rows : number of tiles
     """
@@ -53,7 +53,7 @@ class Tiling:
 
 
 def tiling(drawing: Drawing, paper: str) -> Tiling:
-    """Tiles for ``drawing``, the paper upright or lying, whichever takes fewer; the drawing in their middle.
+    """Tiles with ``drawing`` in their middle, on upright or turned paper, whichever takes fewer sheets.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def _paper(name: str) -> FloatArray:
 
 
 def write_pdf(drawing: Drawing, path: Path, colours: Mapping[str, str], paper: str | None) -> None:
-    """PDF that is printed at 100 %: one page as large as the paths, or tiles on sheets of ``paper``.
+    """PDF to be printed at 100 %: one page as large as the paths, or tiles on sheets of ``paper``.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def write_pdf(drawing: Drawing, path: Path, colours: Mapping[str, str], paper: s
     from reportlab.pdfgen.canvas import Canvas
 
     low, high = drawing.page
-    # The same drawing gives the same bytes.
+    # Without date and random number, so that the same drawing gives the same bytes.
     canvas = Canvas(str(path), pagesize=tuple((high - low) * _POINTS_PER_MM), invariant=1)
     title = f'marker {drawing.name}' if drawing.name.isdigit() else drawing.name
     canvas.setTitle(title)
@@ -144,7 +144,7 @@ def _write_tiles(canvas: Any, name: str, tiles: Tiling) -> None:
 
 
 def _mark(canvas: Any, tiles: Tiling) -> None:
-    """Crosses in the corners, where neighbouring tiles have theirs; and a ruler above the tile."""
+    """Draw crosses in the corners, which lie on those of the neighbouring tiles, and a ruler above the tile."""
     canvas.setStrokeColor('black')
     canvas.setLineWidth(_LINE_MM)
     for x in _MARGIN_MM + np.array([0.5 * _OVERLAP_MM, tiles.tile[0] - 0.5 * _OVERLAP_MM]):

@@ -1,11 +1,11 @@
-"""What a camera will make of a marker: whether it is found, and how good its pose is.
+"""Predicted detection rate and pose error of a marker, seen by a given camera.
 
-Nothing is guessed: ``measured.yaml`` holds what the detector of this package did with rendered frames over marker
-side in pixels, contrast and tilt (``thermal-fiducial markers measure`` makes it anew). The share of markers found, the
-noise of the corners and the error of the distance are read from it; the other errors of the pose follow by running the
-pose solver on corners with that noise, both planar branches included, because near front-parallel views no linear
-propagation holds. The distance is another matter: corners of small markers are not only noisy but displaced alike,
-which no solver makes good.
+The predictions rest on measurements: ``measured.yaml`` holds results of this package's detector in rendered frames,
+over marker side in pixels, contrast and tilt (``thermal-fiducial markers measure`` measures them again). The share of
+markers found, the noise of the corners and the error of the distance are read from it. The other errors of the pose
+come from the pose solver, run on corners with that noise, with both planar branches, since linear propagation fails
+near front-parallel views. The distance is measured because the corners of small markers have, besides their noise, a
+common displacement, which scales the distance.
 """
 
 from dataclasses import dataclass
@@ -28,31 +28,31 @@ from thermal_fiducial.files.reading import one_line
 from thermal_fiducial.files.writing import write_text
 
 FORMAT = 'thermal_fiducial/marker_measurements'
-#: What the package ships.
+#: The measurements in the package.
 PACKAGED = Path(__file__).resolve().parent / 'measured.yaml'
-#: A marker is planned as detected when so many of the measured ones were: four frames of five, 24 times a second.
+#: Share of measured markers found from which a marker counts as detected: four frames of five, 24 a second.
 DETECTED = 0.8
 
 _TABLES = ('side_px', 'contrast', 'tilt_deg', 'found', 'sigma_px', 'distance_error', 'pose_factor')
 _SAMPLES = 200
-# Bits along a side of the markers that were measured: what counts for reading them is the size of a cell.
+# Bits along a side of the measured markers; other markers are compared by the size of their cells.
 _MEASURED_BITS = 4
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """What the detector did.
+    """Results of the detector.
 
     Parameters
     ----------
-    side_px : (S,) side of the black square as a front view would show it
+    side_px : (S,) side of the black square in a view from the front
     contrast : (C,) in standard deviations of the camera's temporal noise (NETD)
     tilt_deg : (T,) between the marker's normal and the line of sight
     found : (S, C, T) share of the markers that were found
     sigma_px : (S, C, T) noise of a corner coordinate; NaN where nothing was found
-    distance_error : (S, C, T) median error of the distance in its share of the distance; NaN where nothing was found
-    pose_factor : (C, T) median error of the poses in that of poses from four corners with independent noise: the
-        corners of a marker lie on common lines, so their errors have much in common, the more the fainter it is
+    distance_error : (S, C, T) median relative error of the distance; NaN where nothing was found
+    pose_factor : (C, T) ratio of the median error of the poses to that of poses from corners with independent noise:
+        the corners of a marker lie on common sides, so their errors are correlated, most in faint markers
     """
 
     side_px: FloatArray
@@ -64,13 +64,13 @@ class Measurements:
     pose_factor: FloatArray
 
     def look_up(self, side_px: float, contrast: float, tilt_deg: float, bits: int = 4) -> tuple[float, float]:
-        """Share found and corner noise [px], between the measured points.
+        """Share found and corner noise [px], interpolated.
 
         The share is linear over the logarithms of side and contrast. The noise is a power of the side in pixels as the
-        camera sees it, so its logarithm is linear over those of side and of the tilt's cosine; and its square is a
-        floor, from optics and from the fixed pattern, plus a part that falls with the square of the contrast. Beyond
-        the measured range the nearest end counts, except that nothing smaller or fainter than measured is found, and
-        nothing of which a side is shorter than the detector's ``min_side_px`` however it is turned.
+        camera sees it, so its logarithm is linear over those of side and of the tilt's cosine. Its square is a floor,
+        from optics and from the fixed pattern, plus a part that falls with the square of the contrast. Beyond the
+        measured range the values of its ends hold, but markers that are smaller or fainter than measured, or have a
+        side below the detector's ``min_side_px`` in some rotation, count as not found.
         """
         shortest = side_px * np.sqrt(0.5 + 0.5 * np.cos(np.radians(tilt_deg)) ** 2)
         if contrast < self.contrast[0] or shortest < ArucoDetectorConfig().min_side_px:
@@ -91,13 +91,13 @@ class Measurements:
         return found, float(np.sqrt((1.0 - share) * variances[0] + share * variances[1]))
 
     def distance_share(self, side_px: float, contrast: float, tilt_deg: float) -> float:
-        """``distance_error`` between the measured points; its logarithm is linear over those of the axes."""
+        """``distance_error``, interpolated: its logarithm is linear over those of the axes."""
         large = _position(np.log(self.side_px), np.log(side_px))
         faint = _position(np.log(self.contrast), np.log(contrast))
         return float(np.exp(_interpolate(np.log(self.distance_error), (large, faint, self._tilted(tilt_deg)))))
 
     def factor(self, contrast: float, tilt_deg: float) -> float:
-        """``pose_factor`` between the measured points."""
+        """``pose_factor``, interpolated."""
         faint = _position(np.log(self.contrast), np.log(contrast))
         return _interpolate(self.pose_factor[None].repeat(2, axis=0), ((0, 0.0), faint, self._tilted(tilt_deg)))
 
@@ -112,7 +112,7 @@ def _position(axis: FloatArray, value: float) -> tuple[int, float]:
 
 
 def _interpolate(table: FloatArray, positions: tuple[tuple[int, float], ...]) -> float:
-    """Linear between the corners of a cell; corners without a value are left out."""
+    """Interpolate linearly between the corners of a cell; corners without a value are left out."""
     total, weights = 0.0, 0.0
     for corner in np.ndindex(2, 2, 2):
         weight = float(
@@ -157,17 +157,17 @@ def save_measurements(path: str | os.PathLike[str], measurements: Measurements, 
 
 @dataclass(frozen=True)
 class Expectation:
-    """What to expect of one marker in one view.
+    """Prediction for one marker in one view.
 
     Parameters
     ----------
-    side_px : of the black square as a front view would show it
-    found : share of such markers that is found
+    side_px : side of the black square in a view from the front
+    found : share of frames in which it is found
     sigma_px : noise of a corner coordinate
     position : median error of the camera's position in the marker's frame [m]
     distance : median error of the distance [m]
     rotation_deg : median error of the rotation
-    wrong_branch : share of poses on the wrong branch of the planar ambiguity; the errors are those of the others
+    wrong_branch : share of poses on the wrong branch of the planar ambiguity; the errors leave these out
     """
 
     side_px: float
@@ -180,7 +180,7 @@ class Expectation:
 
     @property
     def detected(self) -> bool:
-        """Whether one may count on it."""
+        """Whether the marker counts as detected."""
         return self.found >= DETECTED
 
 
@@ -195,7 +195,7 @@ def expect(
     bits: int = 4,
     seed: int = 1,
 ) -> Expectation:
-    """What ``camera`` makes of a marker in the middle of its image.
+    """Prediction for a marker in the middle of the image of ``camera``.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def expect(
 def expected_errors(
     camera: Camera, size: float, distance: float, tilt_deg: float, sigma_px: float, seed: int
 ) -> tuple[float, float, float, float]:
-    """See :func:`pose_errors`, of poses from corners with independent noise of ``sigma_px``."""
+    """Errors as of :func:`pose_errors`, for corners with independent noise of ``sigma_px``."""
     rng = np.random.default_rng(seed)
     turned = rng.uniform(0.0, 2.0 * np.pi, _SAMPLES)
     T = viewed_at(distance, np.radians(tilt_deg), turned, camera)
@@ -259,7 +259,7 @@ def pose_errors(best: FloatArray, other: FloatArray, T_true: FloatArray) -> tupl
     """
     R_true = np.swapaxes(T_true[:, :3, :3], 1, 2)
     angle, other_angle = (se3.rotation_angle(T[:, :3, :3] @ R_true) for T in (best, other))
-    # Where both branches meet, they are the same pose but for rounding.
+    # Where the branches meet they differ only by rounding, and neither is wrong.
     right = angle <= 1.01 * other_angle
     if not np.any(right):
         return np.nan, np.nan, np.nan, 1.0

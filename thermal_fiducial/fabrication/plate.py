@@ -1,9 +1,9 @@
-"""Drawings of one marker plate: the pattern and what holds it.
+"""Drawings of one marker plate: the pattern and its mount.
 
-Three mounts. ``ears``: the black square with a tab at the middle of each side, on a narrow neck, so that the edges
-which the camera measures stay free; the warm surface behind must reach a cell beyond the square. ``frame``: a ring of
-hot background one cell wide, then a frame of acrylic, held together by ties; the ties break the outline of the black
-square where the camera resolves them. ``none``: the black square alone.
+There are three mounts. ``ears``: the black square has a tab on a narrow neck at the middle of each side, so that the
+edges which the camera measures are free; the warm surface must extend a cell beyond the square. ``frame``: a ring of
+warm background, one cell wide, and a frame of acrylic surround the square; ties join the two, and interrupt the outline
+of the black square if the camera resolves them. ``none``: the black square alone.
 """
 
 from dataclasses import dataclass
@@ -19,19 +19,19 @@ from thermal_fiducial.fabrication.shape import contour, Rectangle, trace
 
 MOUNTS = ('ears', 'frame', 'none')
 
-# Acrylic left around a mounting hole [mm]: the thickness of usual sheets, the least that a bolt may clamp.
-#: Nobody cuts a smaller one; most likely its size is in metres.
+# Width of acrylic around a mounting hole [mm]: the thickness of usual sheets, the least that a bolt may clamp.
+#: Smallest side [mm]: a smaller number is probably in metres.
 _SMALLEST_MM = 5.0
 _WALL_MM = 3.0
-# Width of a tab and length of its neck in sides of the marker: room for the engraving, and warm background between
-# tab and edge that the camera resolves. Together they stay below the 12 % of a side that OpenCV smooths away when it
-# looks for squares.
+# Width of a tab and length of its neck, in sides of the marker: the tab has room for the engraving, and the camera
+# resolves the warm background between tab and edge. Together they are below 12 % of a side, which OpenCV smooths away
+# in its search for squares.
 _TAB_WIDTH, _NECK = 0.15, 0.04
 
 
 @dataclass(frozen=True)
 class PlateOptions:
-    """How markers are cut; all lengths in millimetres."""
+    """Dimensions of a marker plate [mm] and its mount."""
 
     #: side of the black square
     size: float = 300.0
@@ -48,7 +48,7 @@ class PlateOptions:
     corner_radius: float = 1.0
     #: width of the webs that hold islands
     bridge_width: float = 4.0
-    #: hot ring between pattern and frame, in cells
+    #: width of the warm ring between pattern and frame, in cells
     quiet_cells: float = 1.0
     #: width of the frame
     frame_width: float = 15.0
@@ -106,7 +106,7 @@ def marker_drawing(bits: Gray, label: str, options: PlateOptions) -> Drawing:
     Raises
     ------
     InputError
-        Options that leave no room, e.g. a kerf that closes a gap.
+        Impossible dimensions, e.g. a kerf that closes a gap.
     """
     mounted = {'ears': _ears, 'frame': _frame, 'none': _bare}[options.mount]
     cells = len(bits) + 2
@@ -156,7 +156,7 @@ Mounted = tuple[list[Rectangle], list[Contour]]
 
 
 def neck_arm(options: PlateOptions, cells: int) -> float:
-    """Over what length a neck or tie is bent [mm]: from the black square to the mounting hole, or across the ring."""
+    """Length over which a neck or tie is bent [mm]: from the black square to the mounting hole, or across the ring."""
     if options.mount == 'frame':
         return options.quiet_cells * options.size / cells
     return _NECK * options.size + 0.5 * _tab_length(options)
@@ -195,7 +195,7 @@ def _ears(label: str, options: PlateOptions, length: float) -> Mounted:
 
 
 def _frame(label: str, options: PlateOptions, origin: float) -> Mounted:
-    """A ring of hot background, a tie across it at the middle of each side, and the frame."""
+    """A ring of warm background, a tie across it at the middle of each side, and the frame."""
     width, total = options.frame_width, 2.0 * origin + options.size
     middle, half = 0.5 * total, 0.5 * options.tie_width
     outline = [

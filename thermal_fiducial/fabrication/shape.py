@@ -1,7 +1,7 @@
-"""Shapes with axis-parallel edges: painted from rectangles, traced to closed contours.
+"""Shapes with axis-parallel edges: composed of rectangles, traced to closed contours.
 
-All that is cut here is made of rectangles (cells, bridges, frames, ears), so kerf compensation and the rounding of
-corners are exact: an edge moves sideways, a corner becomes an arc.
+All parts are made of rectangles (cells, bridges, frames, ears), so kerf compensation and the rounding of corners are
+exact: an edge moves sideways, a corner becomes an arc.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.drawing import Contour
 
-# Coordinates closer than this [mm] are the same edge: far below what a cutter can do, far above rounding.
+# Coordinates closer than this [mm] are the same edge: far below the precision of a cutter, far above rounding.
 _SAME_EDGE_MM = 1e-7
 
 
@@ -29,7 +29,7 @@ class Rectangle:
 
 
 def paint(rectangles: Sequence[Rectangle]) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Grid lines x (C + 1,) and y (R + 1,) [mm] and which cells (R, C) are acrylic; later rectangles win."""
+    """Grid lines x (C + 1,) and y (R + 1,) [mm], and whether each cell (R, C) is acrylic; later rectangles win."""
     xs = _grid_lines([value for r in rectangles for value in (r.x0, r.x1)])
     ys = _grid_lines([value for r in rectangles for value in (r.y0, r.y1)])
     acrylic = np.zeros((len(ys) - 1, len(xs) - 1), dtype=np.bool_)
@@ -46,12 +46,12 @@ def _grid_lines(values: list[float]) -> FloatArray:
 
 
 def trace(rectangles: Sequence[Rectangle]) -> list[FloatArray]:
-    """Corners (N, 2) [mm] of each closed contour, acrylic to the left of the way along it.
+    """Corners (N, 2) [mm] of each closed contour, in the direction that has acrylic on its left.
 
     Raises
     ------
     InputError
-        Two pieces, or two holes, touch at a point only: nobody can cut that.
+        Two pieces or two holes touch only at a point, which cannot be cut.
     """
     xs, ys, acrylic = paint(rectangles)
     following = _boundary_edges(np.pad(acrylic, 1))
@@ -94,14 +94,14 @@ def _without_collinear(loop: FloatArray) -> FloatArray:
 
 
 def contour(corners: FloatArray, kerf: float, radius: float) -> Contour:
-    """What the laser follows so that the acrylic left has ``corners``.
+    """Path of the laser that leaves acrylic with ``corners``.
 
     Parameters
     ----------
     corners : (N, 2) [mm] of a rectilinear contour with acrylic to its left
     kerf : width of the cut [mm]: half of it lies outside the acrylic
-    radius : of the re-entrant corners [mm], where cracks start; corners that stick out stay sharp, for they make
-        the edges that the camera measures. Where edges are short the radius shrinks to fit.
+    radius : of the re-entrant corners [mm], where cracks start; convex corners stay sharp, since the camera measures
+        the edges that end there. The radius is reduced where edges are short.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def contour(corners: FloatArray, kerf: float, radius: float) -> Contour:
 
 def _rounded(corners: FloatArray, forward: FloatArray, length: FloatArray, radii: FloatArray) -> Contour:
     """Replace corners by quarter arcs that turn right."""
-    # Two arcs share an edge at most half and half, so that no vertex doubles even where both need all of it.
+    # Each of two arcs takes at most half of the edge between them, so that no vertex occurs twice.
     radii = np.minimum(radii, 0.499 * np.minimum(length, np.roll(length, 1)))
     points, bulges = [], []
     for corner, came, goes, radius in zip(corners, np.roll(forward, 1, axis=0), forward, radii, strict=True):

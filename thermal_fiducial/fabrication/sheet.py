@@ -9,7 +9,7 @@ from thermal_fiducial.fabrication.drawing import combined, Drawing
 
 @dataclass
 class _Shelf:
-    """A row of drawings, the tallest first; ``x`` is where the next one goes."""
+    """A row of drawings, the tallest first; the next one begins at ``x``."""
 
     y: float
     height: float
@@ -28,7 +28,7 @@ class _Sheet:
     placed: list[Drawing] = field(default_factory=list)
 
     def put(self, drawing: Drawing) -> bool:
-        """Place ``drawing`` on the first shelf that it fits on, if need be a new one; False where it doesn't fit."""
+        """Place ``drawing`` on the first shelf with room for it, or on a new one; False if it does not fit."""
         right = self.width - self.margin
         for shelf in (*self.shelves, self._next_shelf(drawing.height)):
             fits = drawing.height <= shelf.height and shelf.y + shelf.height <= self.height - self.margin
@@ -48,7 +48,7 @@ class _Sheet:
 def nest(drawings: Sequence[Drawing], width: float, height: float, *, spacing: float, margin: float) -> list[Drawing]:
     """Sheets of ``width`` times ``height`` [mm] that hold all ``drawings``.
 
-    Rows from the bottom, tallest drawings first, each put where it fits first (first fit by decreasing height;
+    Shelves are filled from the bottom, tallest drawings first (first fit by decreasing height;
     E. Coffman et al., "Performance bounds for level-oriented two-dimensional packing algorithms", 1980).
 
     Parameters

@@ -1,7 +1,7 @@
-"""Whether a plate holds: the narrowest web of acrylic, and how hard its necks are bent.
+"""Strength of a plate: the width of its narrowest web of acrylic, and the bending stress of its necks.
 
-Half the width of a web is how far one can come in from both its edges until they meet: the shape is shrunk by more and
-more until a part falls off, a ring around a hole opens, or something does not come back when it is grown again.
+The narrowest web is found by shrinking the shape: at half the width of the web, a part comes off, a ring around a hole
+opens, or a part is not restored when the shape is grown again.
 """
 
 from dataclasses import dataclass
@@ -15,16 +15,16 @@ from thermal_fiducial.fabrication.drawing import Drawing
 from thermal_fiducial.fabrication.plate import ear_length, neck_arm, pattern_origin, PlateOptions
 from thermal_fiducial.fabrication.verification import sheet_of
 
-#: Widths are found to this [mm].
+#: Resolution of widths [mm].
 RESOLUTION_MM = 0.02
-#: Bending stress of a neck beyond which a marker is too heavy for it [MPa]: a third of what breaks cast acrylic.
+#: Allowed bending stress of a neck [MPa]: a third of the strength of cast acrylic.
 STRESS_LIMIT_MPA = 23.0
-#: Ears up to this share of a side leave the outline a square to those who look for one. Rendered, 24 and 60 px a side:
-#: with 12 % all of 16 views are found, with 14 % 12, with 21 % none.
+#: Largest size of an ear, as a share of a side, with which detectors still find a square outline. Rendered with 24 and
+#: 60 px a side: with 12 % all of 16 views are found, with 14 % 12, with 21 % none.
 LARGEST_EAR = 0.12
 
 _DENSITY, _GRAVITY = 1.19e-6, 9.81  # kg/mm^3, m/s^2
-# A plate that two hands carry by its ears is shaken with this many times its weight.
+# Acceleration of a plate that is carried by two ears, in multiples of gravity.
 _HANDLING = 3.0
 
 
@@ -38,7 +38,7 @@ class Web:
 
 @dataclass(frozen=True)
 class Strength:
-    """What a marker's plate bears: width [mm] and kind of its narrowest web, and what speaks against the plate."""
+    """Width [mm] and kind of the narrowest web of a plate, and warnings in words."""
 
     web_mm: float
     kind: str
@@ -60,7 +60,7 @@ def strength_of(drawing: Drawing, options: PlateOptions, cells: int, least: floa
 
 
 def acrylic_of(drawing: Drawing, kerf: float) -> Polygon | MultiPolygon:
-    """What is left after the laser has taken half its ``kerf`` [mm] from both sides of the paths."""
+    """Shape of the acrylic after the laser has removed half its ``kerf`` [mm] on both sides of the paths."""
     shape = shapely.buffer(sheet_of(drawing), -0.5 * kerf, join_style='mitre')
     circles = (*drawing.holes, *drawing.dots)
     return shapely.difference(
@@ -78,14 +78,14 @@ def narrowest_web(shape: Polygon | MultiPolygon) -> Web:
 
 
 def _place(shape: Polygon | MultiPolygon, width: float) -> FloatArray:
-    """Middle (2,) of what is hardly wider than ``width``."""
+    """Middle (2,) of a part that is hardly wider than ``width``."""
     pieces = sorted(shapely.get_parts(_shrunk(shape, 1.02 * width)), key=lambda piece: piece.area)
     if len(pieces) > len(shapely.get_parts(shape)):
         gap = shapely.shortest_line(pieces[0], shapely.union_all(pieces[1:]))
         return np.array(gap.centroid.coords[0])
     for wider in width * np.array([1.05, 1.1, 1.15, 1.2, 1.3]):
         lost = shapely.get_parts(shapely.difference(shape, shapely.buffer(_shrunk(shape, wider), 0.5 * wider)))
-        # Corners that stick out are lost as well: they have one stretch of the shape's boundary, a web has two.
+        # Convex corners are lost as well, but touch the shape's boundary in one stretch; a web does in two.
         edge = shapely.buffer(shape.boundary, 1e-3 * wider)
         stretches = shapely.get_num_geometries(shapely.intersection(lost, edge))
         best = np.lexsort([shapely.area(lost), stretches])[-1]
@@ -99,7 +99,7 @@ def _shrunk(shape: Polygon | MultiPolygon, width: float) -> Polygon | MultiPolyg
 
 
 def _opened(shape: Polygon | MultiPolygon, width: float) -> Polygon | MultiPolygon:
-    # Corners that stick out come back only where they are mitred.
+    # With mitred joins convex corners are restored.
     return shapely.buffer(_shrunk(shape, width), 0.5 * width, join_style='mitre')
 
 
@@ -107,7 +107,7 @@ def _holds(shape: Polygon | MultiPolygon, width: float) -> bool:
     """Whether all of a shape is wider than ``width``."""
     if _pieces_and_holes(_shrunk(shape, width)) != _pieces_and_holes(shape):
         return False
-    # Corners between rounded ones do not come back either; an arm that is lost is as long as it is wide, or longer.
+    # Corners between rounded ones are not restored either, but are small: a lost arm is at least as long as wide.
     return bool(shapely.difference(shape, _opened(shape, width)).area < 0.5 * width**2)
 
 
@@ -117,7 +117,7 @@ def _pieces_and_holes(shape: Polygon | MultiPolygon) -> tuple[int, int]:
 
 
 def _web_kind(web: Web, drawing: Drawing, options: PlateOptions, cells: int) -> str:
-    """In words, what the narrowest web of a marker's plate is."""
+    """The kind of a plate's narrowest web, in words."""
     reach = 0.5 * options.hole_diameter + web.width + 1.0
     if any(np.hypot(hole.x - web.place[0], hole.y - web.place[1]) < reach for hole in drawing.holes):
         return 'hole wall'
@@ -145,13 +145,13 @@ def neck_stress(shape: Polygon | MultiPolygon, options: PlateOptions, cells: int
 
 
 def _complaints(web: Web, stress: float, options: PlateOptions, least: float) -> list[str]:
-    """In words, what speaks against a plate; empty when nothing does."""
+    """Warning about a plate, in words; empty for a sound one."""
     found = []
     if web.width < least - 2.0 * RESOLUTION_MM:
-        found.append(f'its narrowest web has {web.width:.1f} mm')
+        found.append(f'its narrowest web is {web.width:.1f} mm wide')
     if stress > STRESS_LIMIT_MPA:
         width = options.tie_width * stress / STRESS_LIMIT_MPA
-        bears = f'--tie-width {np.ceil(width):g} bears it'
+        bears = f'--tie-width {np.ceil(width):g} is enough'
         found.append(f'too heavy for its necks: {stress:.0f} MPa when it is carried flat; {bears}')
     ear = ear_length(options) if options.mount == 'ears' else 0.0
     if ear > LARGEST_EAR * options.size:

@@ -1,4 +1,4 @@
-"""Checks of drawings as they stand in the file: read back, not trusted."""
+"""Checks of drawings, read back from their files."""
 
 from itertools import combinations
 import os
@@ -11,7 +11,7 @@ from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.drawing import Circle, Contour, Drawing
 
-#: A drawing read back must agree with the one written to this [mm].
+#: Largest difference between a drawing and its file, read back [mm].
 TOLERANCE_MM = 1e-6
 
 
@@ -21,7 +21,7 @@ def read_dxf(path: str | os.PathLike[str]) -> Drawing:
     Raises
     ------
     InputError
-        Not a DXF file, not in millimetres, an open polyline, or an entity that nobody cuts.
+        Not a DXF file, not in millimetres, an open polyline, or an entity that cannot be cut.
     """
     from ezdxf import units
     from ezdxf.entities.circle import Circle as DxfCircle
@@ -62,7 +62,7 @@ def read_dxf(path: str | os.PathLike[str]) -> Drawing:
 
 
 def problems(drawing: Drawing, parts: int) -> list[str]:
-    """What is wrong with a drawing from which ``parts`` pieces of acrylic shall come out; empty when nothing is."""
+    """Faults of a drawing that should give ``parts`` pieces of acrylic; empty for a sound one."""
     found = []
     polygons = [contour.flattened() for contour in drawing.cuts]
     rings = [LinearRing(polygon) for polygon in polygons]
@@ -84,7 +84,7 @@ def problems(drawing: Drawing, parts: int) -> list[str]:
 
 
 def agree(drawing: Drawing, other: Drawing) -> bool:
-    """Whether two drawings are the same to :data:`TOLERANCE_MM`, layer by layer."""
+    """Whether two drawings agree within :data:`TOLERANCE_MM`, layer by layer."""
     return all(
         len(shapes) == len(theirs) and all(_same(a, b) for a, b in zip(shapes, theirs, strict=True))
         for shapes, theirs in zip(drawing.layers.values(), other.layers.values(), strict=True)
@@ -103,12 +103,12 @@ def _numbers(shape: Contour | Circle) -> FloatArray:
 
 
 def acrylic_at(drawing: Drawing, points: FloatArray) -> BoolArray:
-    """Whether points (N, 2) [mm] lie on acrylic; round holes are left out."""
+    """Whether points (N, 2) [mm] lie on acrylic; round holes are ignored."""
     return np.asarray(shapely.contains(sheet_of(drawing), shapely.points(points)), dtype=np.bool_)
 
 
 def sheet_of(drawing: Drawing) -> Polygon:
-    """What lies between the contours, round holes not taken out; arcs are chords."""
+    """Area between the contours, without regard to round holes; arcs are replaced by chords."""
     outlines = [Polygon(cut.flattened()) for cut in drawing.cuts if cut.area > 0]
     openings = [Polygon(cut.flattened()) for cut in drawing.cuts if cut.area < 0]
     return shapely.difference(shapely.union_all(outlines), shapely.union_all(openings))

@@ -1,4 +1,4 @@
-"""Drawings as files: SVG and DXF for the cutter, PDF for checking on paper at true size, PNG to look at.
+"""Drawings as files: SVG and DXF for the cutter, PDF for checking on paper at true size, PNG as a preview.
 
 svgwrite, ezdxf, reportlab and matplotlib (extra ``tools``) are imported when they are needed.
 """
@@ -28,7 +28,7 @@ FORMATS = {'svg': 'svgwrite', 'dxf': 'ezdxf', 'pdf': 'reportlab', 'png': 'matplo
 
 _MM_PER_INCH = 25.4
 _ACRYLIC, _WARM = '#26465a', '#ffb347'
-# Width of the lines [mm]: wide enough for a screen, where a millimetre is four pixels or so.
+# Width of the lines [mm]: visible on a screen, where a millimetre is about four pixels.
 _LINE_MM = 0.2
 
 
@@ -38,7 +38,7 @@ def write(drawing: Drawing, path: str | os.PathLike[str], paper: str | None = No
     Raises
     ------
     InputError
-        Another ending than those of :data:`FORMATS`, or a folder that can't be written to.
+        An unknown format, or a folder that cannot be written to.
     """
     path = Path(path)
     kind = path.suffix.lower().lstrip('.')
@@ -145,7 +145,7 @@ def _half_arcs(circle: Circle) -> Contour:
 
 
 def _path(contours: Iterable[Contour]) -> Any:
-    """Compound path; contours round acrylic and round holes turn opposite ways, so that holes stay open."""
+    """Compound path; contours around acrylic and around holes run in opposite directions, so that holes stay open."""
     from matplotlib.path import Path as Outline
 
     outlines = []
