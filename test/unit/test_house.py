@@ -42,6 +42,12 @@ def late_attributes(kind):
     return set().union(*map(self_attributes, methods.values())) - known
 
 
+def test_a_node_fits_on_a_screen():
+    """It converts, makes one call of the core, and publishes."""
+    lengths = {path.name: len(path.read_text().splitlines()) for path in sources(PACKAGE / 'nodes')}
+    assert {name: length for name, length in lengths.items() if length > 100} == {}
+
+
 def test_no_attribute_begins_outside_the_constructor():
     """Else it exists only after some other method has run, which a caller must know."""
     late = [

@@ -171,16 +171,19 @@ class Robot(SimpleNamespace):
     """A node as RobotFrames needs it, its callbacks by topic."""
 
     def __init__(self, **values):
-        said, events, taken = [], {}, {}
+        said, adopted, events, taken = [], [], {}, {}
         super().__init__(
-            config=PoseEkfConfig(**values), live=False, frame_prefix='', said=said, events=events, taken=taken,
-            subscribe=lambda kind, topic, callback, profile: taken.update({topic: callback}),
+            config=PoseEkfConfig(**values), live=False, frame_prefix='', said=said, adopted=adopted, events=events,
+            taken=taken,            subscribe=lambda kind, topic, callback, profile: taken.update({topic: callback}),
             get_logger=lambda: SimpleNamespace(info=said.append),
             console=SimpleNamespace(event=events.__setitem__),
         )  # fmt: skip
 
     def derive(self, **values):
         self.config = PoseEkfConfig(**values)
+
+    def configure(self, config):
+        self.adopted.append(config.camera_position)
 
 
 @pytest.fixture
@@ -197,34 +200,34 @@ def static(parent, child, T):
 
 @pytest.mark.usefixtures('tf2_msgs')
 def test_tf_stands_before_a_urdf_and_does_not_move_the_camera_in_flight():
-    robot, adopted = Robot(), []
-    frames = RobotFrames(robot, lambda: adopted.append(robot.config.camera_position))
+    robot, moved = Robot(), []
+    frames = RobotFrames(robot, lambda: moved.append(len(robot.adopted)))
     robot.taken['/tf_static'](static('base_link', 'somewhere', np.eye(4)))
-    assert adopted == []
+    assert robot.adopted == []
     robot.taken['robot_description'](String(data=URDF))
     robot.taken['/tf_static'](static('base_link', CAMERA, transform(np.eye(3), [0.5, 0.0, 0.0])))
-    assert [position[0] for position in adopted] == pytest.approx([0.1, 0.5])
+    assert [position[0] for position in robot.adopted] == pytest.approx([0.1, 0.5])
     assert frames.source == '/tf_static'
     robot.taken['robot_description'](String(data=URDF))
     robot.taken['/tf_static'](static('base_link', CAMERA, transform(np.eye(3), [0.7, 0.0, 0.0])))
-    assert len(adopted) == 2
+    assert moved == [1, 2]
     assert 'not taken over' in robot.events['camera']
     assert len(robot.said) == 2
 
 
 @pytest.mark.usefixtures('tf2_msgs')
 def test_tf_that_says_what_the_parameters_say_changes_nothing():
-    robot, adopted = Robot(camera_position=(0.1, 0.0, 0.02)), []
-    RobotFrames(robot, lambda: adopted.append(1))
+    robot = Robot(camera_position=(0.1, 0.0, 0.02))
+    RobotFrames(robot)
     robot.taken['/tf_static'](static('base_link', CAMERA, FORWARD))
-    assert adopted == []
+    assert robot.adopted == []
     assert robot.said == [f'camera on the robot ({CAMERA} in base_link): from /tf_static']
 
 
 @pytest.mark.usefixtures('tf2_msgs')
 def test_the_frame_of_the_imu_is_that_of_its_messages_where_tf_has_it():
     robot = Robot()
-    frames = RobotFrames(robot, lambda: None)
+    frames = RobotFrames(robot)
     robot.taken['/tf_static'](static('base_link', CAMERA, FORWARD))
     T_base_imu = transform(so3_exp([0.0, 0.0, 0.5]), [0.0, 0.1, 0.0])
     robot.taken['/tf_static'](static('base_link', 'imu_link', T_base_imu))

@@ -36,7 +36,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
         self.subscribe(PointCloud2, 'markers', self._on_markers, qos.RESULT, raw=True)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT, raw=True)
         self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
-        RobotFrames(self, lambda: None)
+        RobotFrames(self)
 
     @property
     def _T_body_camera(self) -> FloatArray:

@@ -5,17 +5,16 @@ import sys
 from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CompressedImage, Image
 
 from thermal_fiducial.config import Tau2CameraConfig
-from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
-from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.ros import convert, message_bytes, qos
+from thermal_fiducial.ros.calibration_output import CalibrationOutput
 from thermal_fiducial.ros.node import OK, StageNode, WARN
 from thermal_fiducial.ros.run import run
 
@@ -26,15 +25,11 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('tau2_camera', Tau2CameraConfig, **kwargs)
         config = self.config
-        bad_pixels = (
-            self.attempt(lambda: load_bad_pixels(config.bad_pixel_file), None) if config.bad_pixel_file else None
-        )
+        file = config.bad_pixel_file
+        bad_pixels = self.attempt(lambda: load_bad_pixels(file), None) if file else None
         self.cleaner = FrameCleaner(config, bad_pixels)
         self.view = EightBitView(config)
-        self._calibration: Camera | None = None
-        if config.calibration_file:
-            self._calibration = self.attempt(lambda: load_camera(config.calibration_file), None)
-            self._camera_info = self.advertise(CameraInfo, 'thermal/camera_info', qos.IMAGE_OUTPUT)
+        self._calibration = CalibrationOutput(self)
         self._image = self.advertise(Image, 'thermal/image', qos.IMAGE_OUTPUT)
         self._image_mono8 = self.advertise(Image, 'thermal/image_mono8', qos.IMAGE_OUTPUT)
         self._withheld: Counter[str] = Counter()
@@ -69,8 +64,7 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
             self._withheld[frame.reason] += 1
             return
         head = convert.header(stamp, self.config.frame_id)
-        if self._calibration is not None:
-            self._camera_info.send(convert.camera_info(self._calibration, head))
+        self._calibration.send(head)
         self._image.send(convert.image(frame.counts, head))
         if self._image_mono8.listeners:
             self._image_mono8.send(convert.image(self.view(frame.counts), head))

@@ -3,15 +3,14 @@
 import sys
 from typing import Any
 
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import Image
 
 from thermal_fiducial.cameras.capture import Capture
 from thermal_fiducial.cameras.choice import make_source
 from thermal_fiducial.cameras.source import CapturedFrame
 from thermal_fiducial.config import ThermalSourceConfig
-from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.ros import convert, qos
+from thermal_fiducial.ros.calibration_output import CalibrationOutput
 from thermal_fiducial.ros.node import ERROR, OK, StageNode
 from thermal_fiducial.ros.run import run
 
@@ -22,10 +21,7 @@ class ThermalSource(StageNode[ThermalSourceConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('thermal_source', ThermalSourceConfig, **kwargs)
         config = self.config
-        self._calibration: Camera | None = None
-        if config.calibration_file:
-            self._calibration = self.attempt(lambda: load_camera(config.calibration_file), None)
-            self._camera_info = self.advertise(CameraInfo, 'thermal/camera_info', qos.IMAGE_OUTPUT)
+        self._calibration = CalibrationOutput(self)
         self._image = self.advertise(Image, 'thermal/image_raw', qos.IMAGE_OUTPUT)
         self._source = self.attempt(lambda: make_source(config), None)
         self._capture: Capture | None = None
@@ -38,8 +34,7 @@ class ThermalSource(StageNode[ThermalSourceConfig]):
 
     def _publish(self, frame: CapturedFrame) -> None:
         head = convert.header(frame.stamp_ns, self.config.frame_id)
-        if self._calibration is not None:
-            self._camera_info.send(convert.camera_info(self._calibration, head))
+        self._calibration.send(head)
         self._image.send(convert.image(frame.counts, head))
 
     def _on_change(self, trouble: str) -> None:

@@ -34,7 +34,7 @@ class CameraStageNode(StageNode[Config]):
         """Subscribe to calibration and odometry; call it after subscribing to the node's main input."""
         self.subscribe_lazily(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
         self.subscribe_lazily(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT)
-        RobotFrames(self, lambda: self.configure(self.config))
+        RobotFrames(self)
         self.subscribe_lazily(TimeReference, 'camera_clock', self._on_camera_clock, qos.RESULT)
 
     def camera(self) -> Camera:

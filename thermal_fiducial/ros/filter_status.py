@@ -6,6 +6,7 @@ from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_text, PoseUpdate
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.ros.console import Console
+from thermal_fiducial.ros.imu_queue import ImuQueue
 from thermal_fiducial.ros.node import ERROR, OK, WARN
 
 _WAITING = 'waiting for markers'
@@ -14,10 +15,10 @@ _APART_S = 2.5
 
 
 class FilterStatus:
-    """Monitors ``filter_``; resets are printed on ``console``."""
+    """Monitors ``filter_`` and the delay of its input ``imu``; resets are printed on ``console``."""
 
-    def __init__(self, filter_: PoseEkf, console: Console) -> None:
-        self._filter, self._console = filter_, console
+    def __init__(self, filter_: PoseEkf, imu: ImuQueue, console: Console) -> None:
+        self._filter, self._imu, self._console = filter_, imu, console
         #: number of jumps of the pose: initialisations, resets, corrections of the map
         self.jumps = 0
         self._resets: int | None = None
@@ -47,7 +48,11 @@ class FilterStatus:
         self._last_refusal = '' if update.accepted or update.pending else update.reason
 
     def state(self) -> tuple[bytes, str]:
-        """Diagnostic level and message: state of the filter, reason of the last refusal."""
+        """Diagnostic level and message: state of the filter, reason of the last refusal, delay."""
+        level, words = self._state_of_filter()
+        return max(level, self._imu.level()), _joined(words, self._imu.complaint())
+
+    def _state_of_filter(self) -> tuple[bytes, str]:
         status, lost = self._status(), self._filter.lost
         if self._last_refusal and (not lost or status == _WAITING):
             return ERROR if lost else WARN, f'{status}; pose {self._last_refusal}'
@@ -61,7 +66,7 @@ class FilterStatus:
             self._headline = f'{again}: {words}' if self._was_lost and not lost else words
             self._words, self._was_lost = words, lost
             self._initialised |= not lost
-        return self._headline
+        return _joined(self._headline, self._imu.headline())
 
     def _status(self) -> str:
         """Status of the filter, or that poses and IMU have different clocks, which must not read as lack of markers."""
@@ -77,7 +82,8 @@ class FilterStatus:
     def figures(self) -> dict[str, object]:
         """Key-value pairs of the diagnostics."""
         numbers: dict[str, object] = {name: f'{value:.6g}' for name, value in self._filter.diagnostics().items()}
-        return numbers | {'lost': self._filter.lost, 'jumps': self.jumps, INNOVATIONS: self._innovations()}
+        own = {'lost': self._filter.lost, 'jumps': self.jumps, INNOVATIONS: self._innovations()}
+        return numbers | own | {'IMU messages without a pose': self._imu.without_pose}
 
     def _innovations(self) -> str:
         """Innovations of the poses since the last call."""
@@ -85,3 +91,7 @@ class FilterStatus:
         text = innovations_text(update for stamp, update in decided.items() if stamp not in self._published)
         self._published = set(decided)
         return text
+
+
+def _joined(words: str, more: str) -> str:
+    return f'{words}; {more}' if more else words

@@ -1,14 +1,18 @@
 """Map corrections during the delay of poses, at the publisher and at the subscriber of ``camera_pose``."""
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
 
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 import numpy as np
 
 from thermal_fiducial.core.error_model import positive
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
+from thermal_fiducial.ros import convert, message_bytes, qos
+from thermal_fiducial.ros.counting import CountingNode
 
 #: Number of corrections and of map covariances kept.
 _REMEMBERED = 10
@@ -50,6 +54,20 @@ class MapCorrections:
         self._errors: deque[CameraPose] = deque(maxlen=_REMEMBERED)
         #: the last map error received with a pose
         self._error: CameraPose | None = None
+
+    def follow(self, node: CountingNode, on_moved: Callable[[FloatArray], None]) -> None:
+        """Subscribe to errors and corrections of the map; ``on_moved`` is called with T_new_old (4, 4) of each."""
+
+        def on_error(message: bytes) -> None:
+            self.note_error(message_bytes.map_error(message))
+
+        def on_correction(message: TransformStamped) -> None:
+            stamp_ns, T_new_old = convert.correction_of(message)
+            self.add(stamp_ns, T_new_old)
+            on_moved(T_new_old)
+
+        node.subscribe_lazily(PoseWithCovarianceStamped, 'camera_pose/map_error', on_error, qos.RESULT)
+        node.subscribe(TransformStamped, 'map_correction', on_correction, qos.RESULT)
 
     def add(self, stamp_ns: int, T_new_old: FloatArray) -> None:
         """Log that the map moved by ``T_new_old`` (4, 4) after the frame of ``stamp_ns``."""

@@ -34,11 +34,11 @@ class RobotFrames:
     Parameters
     ----------
     node : its config has ``extrinsics``, ``base_frame``, ``camera_frame`` and the camera's pose
-    adopt : called after the camera's pose has changed in the node's config
+    on_moved : called after the node was configured with another pose of the camera
     """
 
-    def __init__(self, node: StageNode[Any], adopt: Callable[[], None]) -> None:
-        self._node, self._adopt = node, adopt
+    def __init__(self, node: StageNode[Any], on_moved: Callable[[], None] | None = None) -> None:
+        self._node, self._on_moved = node, on_moved
         self._trees = {_URDF: FrameTree(), _TF: FrameTree()}
         self._imu_frame = ''
         #: source of the camera's pose
@@ -117,7 +117,9 @@ class RobotFrames:
         self.source, self.T_imu_base = source, T_imu_base
         if moved:
             self._say(f', {np.linalg.norm(apart[:3, 3]):.3f} m and {_angle_deg(apart):.2f} deg from what held before')
-            self._adopt()
+            self._node.configure(self._node.config)
+            if self._on_moved is not None:
+                self._on_moved()
         elif new:
             self._say()
 
