@@ -4,7 +4,7 @@ The threshold is a share of the local standard deviation, so that markers of any
 the order of the noise it rises again: a marker of twice the noise is still segmented, a bare wall hardly at all.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
@@ -22,9 +22,13 @@ _COLUMNS = 9
 _PICTURE_WINDOW_PX, _PICTURE_STEP, _PICTURE_NOISE = 5, 3.0, 2.0
 # Mean of Gaussian noise clipped at one standard deviation moves by 0.68 of a small offset.
 _CLIPPED = 1.0 / 0.68
+# Floor of the local standard deviation where all markers have a high contrast [standard deviations of the noise].
+_FLOOR_OF_CLEAR = 4.0
 # Tolerance of polygon approximation as a share of an outline's length: above the effect of noise, below a side.
 _STRAIGHT = 0.05
 _CORNERS, _NEXT = 4, np.array([1, 2, 3, 0])
+# Of OpenCV.
+_Image: TypeAlias = np.ndarray[Any, Any]
 
 
 def halved(counts: Float32Array) -> Float32Array:
@@ -44,7 +48,8 @@ def without_columns(counts: Float32Array, noise: float) -> Float32Array:
     An offset is the mean difference of a column's pixels from neighbouring columns, clipped at the noise so that the
     scene has little influence.
     """
-    deviation = counts - cv2.blur(counts, (_COLUMNS, 1))
+    deviation = np.asarray(cv2.blur(counts, (_COLUMNS, 1)))
+    np.subtract(counts, deviation, out=deviation)
     np.clip(deviation, -noise, noise, out=deviation)
     offsets = np.float32(_CLIPPED) * cv2.reduce(deviation, 0, cv2.REDUCE_AVG)
     return np.asarray(np.subtract(counts, offsets, out=deviation))
@@ -64,29 +69,44 @@ class Scale(NamedTuple):
     floor: float
 
 
-def dark(counts: Float32Array, noise: float, scale: Scale) -> Gray:
-    """Mask (height, width) of what is darker than its surroundings, 255 where it is.
+class DarkRegions:
+    """Masks of what is darker than its surroundings, at one resolution.
 
-    Parameters
-    ----------
-    counts : (height, width) counts or gray levels
-    noise : standard deviation of the noise of a pixel [counts]
+    The images of a frame are kept for the next one: fresh memory takes as long as what is computed in it.
     """
-    shape = counts.shape
-    reach = 2 * round(2.5 * scale.smoothing_px) + 1
-    smooth = cv2.GaussianBlur(counts, (reach, reach), scale.smoothing_px)
-    coarse = counts if scale.window_shrink == 1 else halved(counts)
-    limit = cv2.blur(smooth if scale.window_shrink == 1 else coarse, (scale.window_px, scale.window_px))
-    small = halved(coarse)
-    deviation = small - cv2.blur(small, (_LOCAL, _LOCAL))
-    variance = np.maximum(cv2.blur(deviation * deviation, (_LOCAL, _LOCAL)), 1e-6)
-    asked = (scale.depth / np.sqrt(variance)) * (variance + (scale.floor * noise) ** 2)
-    cv2.subtract(limit, cv2.resize(asked, limit.shape[::-1], interpolation=cv2.INTER_LINEAR), dst=limit)
-    if limit.shape != shape:
-        limit = cv2.resize(limit, shape[::-1], interpolation=cv2.INTER_LINEAR)
-    mask = cv2.compare(smooth, limit, cv2.CMP_LT)
-    # Specks of noise are many, and each is an outline to follow.
-    return np.asarray(cv2.medianBlur(mask, _SPECKS))
+
+    def __init__(self, scale: Scale) -> None:
+        self._scale = scale
+        self._smooth: _Image | None = None
+        self._limit: _Image | None = None
+        self._mask: _Image | None = None
+
+    def mask(self, counts: Float32Array, noise: float, *, clear: bool) -> Gray:
+        """Mask (height, width), 255 where ``counts`` are darker than their surroundings; the next one overwrites it.
+
+        Parameters
+        ----------
+        counts : (height, width) counts or gray levels
+        noise : standard deviation of the noise of a pixel [counts]
+        clear : whether all markers have a high contrast: less noise is followed then, and faint markers are missed
+        """
+        scale, size = self._scale, counts.shape[::-1]
+        reach = 2 * round(2.5 * scale.smoothing_px) + 1
+        self._smooth = cv2.GaussianBlur(counts, (reach, reach), scale.smoothing_px, dst=self._smooth)
+        coarse = counts if scale.window_shrink == 1 else halved(counts)
+        window = scale.window_px, scale.window_px
+        limit = cv2.blur(self._smooth if scale.window_shrink == 1 else coarse, window)
+        small = halved(coarse)
+        deviation = small - cv2.blur(small, (_LOCAL, _LOCAL))
+        variance = np.maximum(cv2.blur(deviation * deviation, (_LOCAL, _LOCAL)), 1e-6)
+        floor = (_FLOOR_OF_CLEAR if clear else scale.floor) * noise
+        asked = (scale.depth / np.sqrt(variance)) * (variance + floor * floor)
+        cv2.subtract(limit, cv2.resize(asked, limit.shape[::-1], interpolation=cv2.INTER_LINEAR), dst=limit)
+        if limit.shape != counts.shape:
+            limit = self._limit = cv2.resize(limit, size, dst=self._limit, interpolation=cv2.INTER_LINEAR)
+        self._mask = cv2.compare(self._smooth, limit, cv2.CMP_LT, dst=self._mask)
+        # Specks of noise are many, and each is an outline to follow.
+        return np.asarray(cv2.medianBlur(self._mask, _SPECKS, dst=self._mask))
 
 
 def dark_in_picture(picture: Float32Array, noise: float) -> Gray:
@@ -101,14 +121,12 @@ def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray) -> FloatArray
 
     Parameters
     ----------
-    mask : (height, width)
+    mask : (height, width), in which what is hidden is cleared
     min_side_px : shortest side
     hidden : (N, 4, 2) where not to look [px]
     """
-    if len(hidden):
-        mask = mask.copy()
-        for quad in np.rint(hidden).astype(np.int32):
-            cv2.fillConvexPoly(mask, quad, 0)
+    for quad in np.rint(hidden).astype(np.int32):
+        cv2.fillConvexPoly(mask, quad, 0)
     outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
     shortest, longest = 3.2 * min_side_px, 2.0 * sum(mask.shape)
     quads = []

@@ -11,8 +11,8 @@ from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import among, CUT_OFF_PX, FoundMarkers, TOGETHER
 from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
 from thermal_fiducial.core.detection.quads import (
-    dark,
     dark_in_picture,
+    DarkRegions,
     find_quads,
     halfway,
     halved,
@@ -24,9 +24,6 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 # Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.
 _FINE = Scale(smoothing_px=1.0, window_px=7, window_shrink=2, depth=0.2, floor=1.5)
 _FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0)
-# Where all markers have a high contrast, higher floors: less noise is followed, and the faintest markers are missed.
-_FINE_OF_CLEAR = _FINE._replace(floor=4.0)
-_FAINT_OF_CLEAR = _FAINT._replace(floor=4.0)
 # Correlation from which an outline needs no alignment; least correlation, and its margin, for alignment to be tried.
 _CLEAR = 0.95
 _HINT, _HINT_MARGIN = 0.5, 0.06
@@ -69,6 +66,7 @@ class BlindSearch:
 
     def __init__(self, decoder: Decoder) -> None:
         self._decoder = decoder
+        self._fine, self._faint = DarkRegions(_FINE), DarkRegions(_FAINT)
 
     def search(
         self,
@@ -90,12 +88,14 @@ class BlindSearch:
         hidden = _grown(seen.places.at.px, 1.0 + 2.0 * _PLATE_CELLS / self._decoder.cells)
         min_side_px = _PICTURE_SIDE * config.min_side_px if frame.displayed else config.min_side_px
         fine = faint = np.zeros((0, 4, 2))
-        half = frame.image
+        half, clear = frame.image, scales != SearchScales.ALL
         if SearchScales.FINE in scales:
-            fine = find_quads(_fine_mask(frame, scales), min_side_px, hidden)
+            fine = find_quads(self._fine_mask(frame, clear=clear), min_side_px, hidden)
         if SearchScales.FAINT in scales:
             half = without_columns(halved(frame.image), 0.5 * frame.noise)
-            faint = _faint_quads(half, frame.noise, scales, kinds, config.min_side_px, hidden)
+            masks = (self._faint.mask(half if kind > 0.0 else -half, 0.5 * frame.noise, clear=clear) for kind in kinds)
+            found = [find_quads(mask, 0.5 * config.min_side_px + 2.0, halfway(hidden)) for mask in masks]
+            faint = 2.0 * np.concatenate(found) + 0.5
         if len(fine) + len(faint) == 0:
             return Outlines.none()
         # A search at full resolution alone is for clear markers, which need no alignment.
@@ -107,6 +107,11 @@ class BlindSearch:
             return Outlines.none()
         good &= ~inside_out(reading, quads, good, distinct(reading, frame.noise, config))
         return _chosen(reading, quads, _once(reading, quads, good, config.duplicates == 'drop'), frame.noise)
+
+    def _fine_mask(self, frame: Frame, *, clear: bool) -> Gray:
+        if frame.displayed:
+            return dark_in_picture(frame.image, frame.noise)
+        return self._fine.mask(frame.image, frame.noise, clear=clear)
 
     def _read(
         self,
@@ -137,28 +142,6 @@ class BlindSearch:
             in_half = aligned(half, halfway(quads[rough]), ids, turns, decoder)
             pulled, again = 2.0 * in_half + 0.5, decoder.read(half, in_half, allowed)
         return reading.joined(again), np.concatenate([quads, pulled])
-
-
-def _fine_mask(frame: Frame, scales: SearchScales) -> Gray:
-    """Mask of dark pixels at full resolution."""
-    if frame.displayed:
-        return dark_in_picture(frame.image, frame.noise)
-    return dark(frame.image, frame.noise, _FINE if scales == SearchScales.ALL else _FINE_OF_CLEAR)
-
-
-def _faint_quads(
-    half: Float32Array,
-    noise: float,
-    scales: SearchScales,
-    kinds: tuple[float, ...],
-    min_side_px: float,
-    hidden: FloatArray,
-) -> FloatArray:
-    """Quadrilaterals of faint markers (Q, 4, 2) at half the resolution, in pixels of the full one."""
-    scale = _FAINT if scales == SearchScales.ALL else _FAINT_OF_CLEAR
-    masks = [dark(half if kind > 0.0 else -half, 0.5 * noise, scale) for kind in kinds]
-    found = [find_quads(mask, 0.5 * min_side_px + 2.0, halfway(hidden)) for mask in masks]
-    return np.asarray(2.0 * np.concatenate(found) + 0.5)
 
 
 def _with_shrunk(outlines: FloatArray, cells: int) -> FloatArray:
