@@ -97,7 +97,7 @@ def test_follows_recorded_poses(tmp_path):
 
 def test_refuses_too_few_poses(tmp_path):
     save_tum(tmp_path / 'a.tum', [0, 10**9], np.zeros((2, 3)), np.tile([0, 0, 0, 1.0], (2, 1)))
-    with pytest.raises(InputError, match='too few'):
+    with pytest.raises(InputError, match='too short for a flight'):
         RecordedFlight.load(tmp_path / 'a.tum')
     with pytest.raises(InputError, match='more than'):
         SplineTrajectory(np.arange(3.0), np.zeros((3, 3)), Rotation.identity(3))

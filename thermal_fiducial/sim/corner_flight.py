@@ -1,4 +1,4 @@
-"""A flight from the corners on: what a detector would answer."""
+"""Simulated detections: corners of markers with errors, without pictures."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ class CornerFrame:
 
 
 def corner_frames(flight: FlightPlan, noise: CornerNoise) -> list[CornerFrame]:
-    """The frames of a flight, those without a marker left out."""
+    """Frames of a flight in which at least one marker is visible."""
     scenario = flight.scenario
     lens = noise.true_lens or scenario.lens
     path = scenario.trajectory(flight.seconds, flight.seed)

@@ -1,4 +1,4 @@
-"""Errors of the corners of a flight that is simulated from the corners on, without a picture being rendered."""
+"""Errors of the corners in flights that are simulated without pictures."""
 
 from dataclasses import dataclass
 
@@ -11,10 +11,9 @@ class CornerNoise:
 
     Parameters
     ----------
-    sigma_px : white, of each coordinate
-    claimed_px : what the detector says of it
-    true_lens : through which the corners are seen, where the calibration is not exact: errors that last as long as
-        the view
+    sigma_px : standard deviation of white noise of each coordinate
+    claimed_px : standard deviation that the detector claims
+    true_lens : lens that projects the corners, if the calibration is not exact; gives systematic errors
     """
 
     sigma_px: float = 0.25

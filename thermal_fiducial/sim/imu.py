@@ -1,4 +1,4 @@
-"""An IMU on the simulated body: exact rates and specific force, errors of its axes, noise, and how its stamps come."""
+"""An IMU on the simulated body: exact rates and specific force, errors of its axes, noise, errors of its stamps."""
 
 from dataclasses import dataclass
 
@@ -46,13 +46,13 @@ class SimulatedNoise:
 
 @dataclass(frozen=True)
 class Delivery:
-    """How samples reach the recorder through a driver that stamps them when it reads them.
+    """A driver that reads several samples at once, and stamps them when it reads them.
 
     Parameters
     ----------
-    period : the driver reads what has gathered every so often [s]; its stamps are then ``spacing`` apart [s]
-    gaps : begin and length [s] of times without samples, again after ``every`` [s]
-    steps_back : times at which one stamp goes back by a millisecond [s]
+    period : time from one reading to the next [s]; the stamps of samples read together are ``spacing`` apart [s]
+    gaps : start and length [s] of gaps without samples, repeated after ``every`` [s]
+    steps_back : times at which one stamp is a millisecond too early [s]
     """
 
     period: float = 0.033
@@ -62,7 +62,7 @@ class Delivery:
     steps_back: tuple[float, ...] = ()
 
     def stamps(self, times: FloatArray) -> tuple[IntArray, IntArray]:
-        """Of samples taken at ``times`` (N,) [s]: which arrive (M,), and their stamps since the start (M,) [ns]."""
+        """Of samples taken at ``times`` (N,) [s], the indices (M,) of those that arrive, and their stamps (M,) [ns]."""
         within = times[:, None] % self.every
         lost = np.any(
             [(within[:, 0] >= begin) & (within[:, 0] < begin + length) for begin, length in self.gaps], axis=0
@@ -88,15 +88,15 @@ class ImuModel:
     noise : densities and random walks (Kalibr's)
     rate : [Hz]
     gyroscope_bias_sigma, accelerometer_bias_sigma : of the biases at switch-on [rad/s], [m/s^2]
-    gyroscope_rattle, accelerometer_rattle : broadband noise of a sample by vibration, which no data sheet counts
+    gyroscope_rattle, accelerometer_rattle : broadband noise of a sample by vibration, beyond the data sheet's
         [rad/s], [m/s^2]
-    stamp_jitter : standard deviation of the stamps about the sampling; they stay in order [s]
+    stamp_jitter : standard deviation of the errors of the stamps, which stay in order [s]
     gyroscope_axes, accelerometer_axes : standard deviation of each entry of the matrices of scale and misalignment
-    g_sensitivity : the same of the matrix from specific force to rate [rad/s per m/s^2]
-    gyroscope_instability, accelerometer_instability : standard deviation of a first-order Gauss-Markov process beside
-        the biases [rad/s], [m/s^2]
+    g_sensitivity : standard deviation of each entry of the matrix from specific force to rate [rad/s per m/s^2]
+    gyroscope_instability, accelerometer_instability : standard deviation of a first-order Gauss-Markov process added
+        to the biases [rad/s], [m/s^2]
     instability_time : its time constant [s]
-    delivery : how stamps come; None: each with its own
+    delivery : the driver; None: samples have stamps of their own
     """
 
     noise: SimulatedNoise = SimulatedNoise()
@@ -115,7 +115,7 @@ class ImuModel:
     delivery: Delivery | None = None
 
     def sample(self, trajectory: Path, times: FloatArray, stamps_ns: IntArray, seed: int) -> ImuRecord:
-        """What the IMU answers at ``times`` (N,) [s] of a flight, true stamps ``stamps_ns`` (N,).
+        """Measurements of the IMU at ``times`` (N,) [s] of a flight, with true stamps ``stamps_ns`` (N,).
 
         A discrete sample of white noise of density n at rate f has deviation n sqrt(f), a bias of random walk
         w moves by w / sqrt(f) a sample (Kalibr's IMU noise model).
@@ -147,14 +147,14 @@ class ImuModel:
         return record if self.delivery is None else record.delivered(self.delivery, times, int(stamps_ns[0]))
 
     def _seen_by_its_axes(self, rates: FloatArray, forces: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
-        """Rates and forces (N, 3) in axes of wrong scale that are not square, and rates that forces act upon."""
+        """Rates and forces (N, 3) with errors of scale, misalignment and g-sensitivity."""
         rng = np.random.default_rng([seed, 12])
         deviations = self.gyroscope_axes, self.accelerometer_axes, self.g_sensitivity
         gyroscope, accelerometer, sensitivity = (rng.normal(0.0, deviation, (3, 3)) for deviation in deviations)
         return rates + rates @ gyroscope.T + forces @ sensitivity.T, forces + forces @ accelerometer.T
 
     def _instabilities(self, count: int, seed: int) -> tuple[FloatArray, FloatArray]:
-        """Two Gauss-Markov processes (count, 3), of the gyroscope and of the accelerometer."""
+        """Gauss-Markov processes (count, 3) of gyroscope and accelerometer."""
         rng = np.random.default_rng([seed, 13])
         kept = np.exp(-1.0 / (self.rate * self.instability_time))
         driven = rng.normal(size=(count, 6))

@@ -15,7 +15,7 @@ from thermal_fiducial.errors import InputError
 
 COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 
-# Newton with a numerical Jacobian: four steps leave 1e-11 px at the border of the worst lens, two more are spare.
+# Steps of Newton's method with a numerical Jacobian: four leave 1e-11 px at the border of the worst lens.
 _STEPS = 6
 _DIFFERENCE = 1e-6
 
@@ -70,7 +70,7 @@ class Lens:
         return x
 
     def slopes_jacobian(self, slopes: npt.ArrayLike) -> FloatArray:
-        """Derivative (..., 2, 2) of the rays by the pixel they belong to [1/px]."""
+        """Derivative (..., 2, 2) of the rays by their pixels [1/px]."""
         return _inverse(_derivative(self.project_slopes, np.asarray(slopes, dtype=np.float64)))
 
     def _start(self, target: FloatArray) -> FloatArray:
@@ -90,7 +90,7 @@ def _derivative(function: Callable[[FloatArray], FloatArray], x: FloatArray) -> 
 
 
 def _inverse(J: FloatArray) -> FloatArray:
-    """Of matrices (..., 2, 2)."""
+    """Inverse of matrices (..., 2, 2)."""
     a, b, c, d = J[..., 0, 0], J[..., 0, 1], J[..., 1, 0], J[..., 1, 1]
     adjugate = np.stack([np.stack([d, -b], axis=-1), np.stack([-c, a], axis=-1)], axis=-2)
     return np.asarray(adjugate / (a * d - b * c)[..., None, None])

@@ -1,4 +1,4 @@
-"""The simulated messages, as objects of rosbags."""
+"""Simulated messages, as objects of rosbags."""
 
 from typing import Any
 

@@ -11,14 +11,14 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.trajectory_file import load_tum
 from thermal_fiducial.sim.spline_trajectory import SplineTrajectory
 
-# Ten poses a second carry what a drone or a hand does, and little of the noise of the poses' source: at a millimetre
-# it becomes 0.1 m/s^2 in the simulated accelerometer.
+# Ten poses a second resolve the motion of a drone or a hand, but little of the poses' noise: a millimetre of noise
+# becomes 0.1 m/s^2 in the simulated accelerometer.
 _KNOTS_PER_SECOND = 10
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedFlight:
-    """Poses of the body in ``map``, flown through at ten a second by a smooth curve.
+    """A smooth path through recorded poses of the body in ``map``, of which it takes ten a second.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ class RecordedFlight:
         stamps, first = np.unique(stamps, return_index=True)
         times = (stamps - stamps[0]) * 1e-9
         if times[-1] < 2.0:
-            raise InputError(f'{path}: {times[-1]:g} s of poses are too few to fly')
+            raise InputError(f'{path}: poses of {times[-1]:g} s are too short for a flight')
         return cls(times, positions[first], quaternions[first])
 
     @property
@@ -53,7 +53,7 @@ class RecordedFlight:
         return float(self.times[-1])
 
     def trajectory(self, seconds: float, seed: int) -> SplineTrajectory:
-        """The flight; afterwards it stands still, the seed changes nothing.
+        """The flight, the same for each ``seed``; after its end the body stands still.
 
         Raises
         ------

@@ -1,13 +1,13 @@
-"""The scene as the focal plane sees it: sampled from the plates' own planes, in space and in time.
+"""Rendering of the scene on the focal plane, by samples in space and time that are looked up in planar plates.
 
-A pixel wholly inside one cell of a plate at all times of a sub-frame needs one sample. Every other pixel gets the
-points of a rank-1 lattice over its area and the sub-frame: each point is back-projected through the lens with the
-camera pose of its own time and looked up in the plate. Its time is drawn from the exponential by which the bolometer
-forgets within the sub-frame, so that the sum over sub-frames y <- e y + (1 - e) x is the lag's true response,
+A pixel that lies inside one cell of a plate during a whole sub-frame needs one sample. All others get the points of a
+rank-1 lattice over their area and the sub-frame: each point is back-projected through the lens with the camera pose of
+its own time, and looked up in the plate. The ages of the points follow the exponential decay of the bolometer within
+the sub-frame, so that the sum over sub-frames y <- e y + (1 - e) x is the true response of the lag,
 y(t) = integral of x(t - a) exp(-a / tau) / tau da, and a moving edge is blurred without steps.
 
-In a rolling read-out t is another one for each row, and so are the times of its points: a plate's homographies, exact
-at the borders of strips of rows that take a millisecond, are linear in the row between them.
+With a rolling shutter each row has its own t. The homographies of a plate are computed at the borders of strips of
+rows, a millisecond of read-out each, and interpolated linearly over the rows between.
 """
 
 from collections.abc import Sequence
@@ -24,11 +24,11 @@ from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.scene import Acrylic, Fog, Plate, Room
 from thermal_fiducial.sim.spline_trajectory import Path
 
-#: Points of a pixel and sub-frame -> generators of the lattice (column, row, time), found by exhaustive search for
-#: the largest distance between points in each projection.
+#: Number of points of a pixel and sub-frame to generators of the lattice (column, row, time), found by exhaustive
+#: search for the largest distance between points in each projection.
 LATTICES = {23: (1, 19, 10), 97: (1, 84, 79), 251: (1, 234, 148)}
 
-#: Longest strip of a rolling read-out [s]: a vibration of 0.1 px at 180 Hz leaves 0.016 px of itself between its ends.
+#: Longest read-out of a strip [s]: interpolation over it misses 0.016 px of a vibration of 0.1 px at 180 Hz.
 STRIP_TIME = 1e-3
 
 _NEAR = 0.05
@@ -38,15 +38,15 @@ _KERNEL = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True)
 class Quality:
-    """How finely the renderer samples.
+    """Sampling of the renderer.
 
     Parameters
     ----------
-    samples : points of a pixel in a sub-frame, a key of :data:`LATTICES`
+    samples : points of a pixel in a sub-frame, one of :data:`LATTICES`
     sub_frames : of a frame interval
-    warm_up : frames before the first one that fill the bolometers' memory
-    stepwise : whether the lag is integrated in steps, the scene taken at the end of each sub-frame, as simpler
-        renderers do: an edge leaves a staircase, and less lag than the time constant says
+    warm_up : frames before the first one, until the bolometers have settled
+    stepwise : integrate the lag in steps from the scene at the end of each sub-frame, as simpler renderers do: a moving
+        edge becomes a staircase, with less lag than that of the time constant
     """
 
     samples: int = 23
@@ -61,7 +61,7 @@ class Renderer:
     Parameters
     ----------
     lens : with the image size
-    plates : everything flat
+    plates : all flat objects
     room, fog, acrylic : the rest of the scene
     trajectory : of the body
     T_body_camera : (4, 4)
@@ -109,14 +109,13 @@ class Renderer:
         return np.asarray(self._trajectory(t).T_map_body @ self._T_body_camera)
 
     def forget(self) -> None:
-        """Let the next frame be the first one."""
+        """Forget the state of the bolometers: the next frame begins with a warm-up."""
         self._previous = None
 
     def frame(self, t: float) -> Float32Array:
         """Excess temperature (height, width) [K] of the bolometers when the middle row is read out at ``t`` [s].
 
-        The state of the previous call is the start if that was one interval ago, else the frames before ``t``
-        are rendered for it.
+        It starts from the state of the previous call if that was one interval ago, else from a warm-up before ``t``.
         """
         if self._previous is None or abs(self._previous + self._interval - t) > 1e-6:
             self._state = self._sub_frame(t - (self._warm_up + 1) * self._interval).copy()
@@ -132,7 +131,7 @@ class Renderer:
             cv2.accumulateWeighted(scene, self._state, 1.0 - self._forget)
 
     def _sub_frame(self, t: float) -> Float32Array:
-        """The scene averaged over the sub-frame that ends at ``t`` in the middle row, with the lag's weights."""
+        """The scene averaged with the lag's weights over the sub-frame that ends at ``t`` in the middle row."""
         times = t + self._nodes[:, None] - self._ages
         poses = self.camera_poses(times.ravel()).reshape(*times.shape, 4, 4)
         t_middle = t - float(self._ages[len(self._ages) // 2])
@@ -202,7 +201,7 @@ class Renderer:
         image += np.where(visible, seen - cover * image, 0.0)
 
     def _in_view(self, poses: FloatArray) -> list[tuple[Plate, tuple[slice, slice]]]:
-        """Plates that may be seen from ``poses`` (N, 4, 4), the farthest first, each with its rows and columns."""
+        """Plates that may be visible from ``poses`` (N, 4, 4), the farthest first, each with its rows and columns."""
         centre = poses[:, :3, 3].mean(axis=0)
         heights = np.sum((poses[:, None, :3, 3] - self._centres) * self._normals, axis=-1)
         lows, highs, in_front = self._boxes(poses)
@@ -212,7 +211,7 @@ class Renderer:
         return [(self._plates[n], (slice(lows[n, 1], highs[n, 1]), slice(lows[n, 0], highs[n, 0]))) for n in order]
 
     def _boxes(self, poses: FloatArray) -> tuple[IntArray, IntArray, BoolArray]:
-        """Low and high corner (P, 2) [px] of what each plate may cover, and whether any of it is in front (P,)."""
+        """Low and high corner (P, 2) [px] of the area that each plate may cover; whether any of it is in front (P,)."""
         points = (self._outlines - poses[:, None, None, :3, 3]) @ poses[:, None, :3, :3]
         front = points[..., 2] > _NEAR
         pixels = self._outline_pixels(points[..., :2] / np.where(front, points[..., 2], 1.0)[..., None])
@@ -230,13 +229,13 @@ class Renderer:
         )
 
     def _outline_pixels(self, slopes: FloatArray) -> FloatArray:
-        """Pixels of rays; those that miss the image by far are drawn to a circle round it, where the lens is true."""
+        """Pixels of rays; rays far outside the image are moved to a circle around it, where the lens model is valid."""
         radius = np.linalg.norm(slopes, axis=-1, keepdims=True)
         return self._lens.project_slopes(slopes * np.minimum(1.0, self._max_slope / np.maximum(radius, 1e-9)))
 
 
 def _lattice(quality: Quality, duration: float, lag: float) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Offsets in the pixel [px], ages before the end of the sub-frame [s] in rising order, and the share forgotten."""
+    """Offsets in the pixel [px], ages before the end of the sub-frame [s] in rising order, share that decays."""
     n = quality.samples
     columns, rows, times = (((np.arange(n) * g) % n + 0.5) / n for g in LATTICES[n])
     forget = float(np.exp(-duration / lag)) if lag > 0 else 0.0
@@ -259,7 +258,7 @@ def _pixel_rays(lens: Lens) -> Float32Array:
 
 @lru_cache(maxsize=2)
 def _coarse_rays(lens: Lens) -> FloatArray:
-    """Rays (rows, columns, 3) through the centres of blocks of pixels, as ``cv2.resize`` takes them."""
+    """Rays (rows, columns, 3) through the centres of the blocks of pixels of ``cv2.resize``."""
     rows, columns = -(-lens.height // _COARSE), -(-lens.width // _COARSE)
     v, u = (np.mgrid[0:rows, 0:columns] + 0.5) * _COARSE - 0.5
     slopes = lens.slopes(np.stack([u, v], axis=-1))
@@ -268,7 +267,7 @@ def _coarse_rays(lens: Lens) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Strip:
-    """Rows ``start`` to ``stop`` of the image, sampled between two nodes of the read-out, or all at the only one."""
+    """Rows ``start`` to ``stop`` of the image, read out between two nodes, or all rows at a single one."""
 
     start: int
     stop: int
@@ -276,28 +275,28 @@ class _Strip:
     rolling: bool
 
     def within(self, rows: slice) -> slice:
-        """Those of ``rows`` that are the strip's."""
+        """The part of ``rows`` that lies in the strip."""
         return slice(max(rows.start, self.start), min(rows.stop, self.stop))
 
     def rows_of(self, rows: slice) -> tuple[slice, slice]:
-        """The strip's part of ``rows`` with a neighbour at either end where there is one, and where it lies in that."""
+        """The strip's part of ``rows``, extended by a row at each end if possible, and the part's place in it."""
         own = self.within(rows)
         padded = slice(max(own.start - 1, rows.start), min(own.stop + 1, rows.stop))
         return padded, slice(own.start - padded.start, own.stop - padded.start)
 
     def share(self, rows: slice) -> Float32Array:
-        """How far each of ``rows`` is on its way from the first node to the second (rows, 1)."""
+        """Position (rows, 1) of each of ``rows`` between the nodes: 0 at the first, 1 at the second."""
         done = (np.arange(rows.start, rows.stop) - self.start) / (self.stop - self.start)
         return np.asarray(done[:, None], dtype=np.float32)
 
     def motion(self, H: FloatArray) -> FloatArray:
-        """Of H (nodes, N, 3, 3) at the first node, and by how much they change until the second (1 or 2, N, 3, 3)."""
+        """H (nodes, N, 3, 3) at the first node, and its change until the second (1 or 2, N, 3, 3)."""
         first = H[self.node]
         return np.stack([first, H[self.node + 1] - first]) if self.rolling else first[None]
 
 
 def _strips(height: int, readout: float) -> tuple[list[_Strip], FloatArray]:
-    """Strips of an image, and the nodes between them: times [s] after the middle row's."""
+    """Strips of an image, and the times [s] of the nodes between them, after that of the middle row."""
     if readout <= 0:
         return [_Strip(0, height, 0, rolling=False)], np.zeros(1)
     count = min(int(np.ceil(readout / STRIP_TIME)), height)
@@ -307,7 +306,7 @@ def _strips(height: int, readout: float) -> tuple[list[_Strip], FloatArray]:
 
 
 def _coarse_delays(height: int, readout: float) -> FloatArray:
-    """When rows of :func:`_coarse_rays` are read out after the middle [s]: (rows,), or one for all."""
+    """Times [s] at which rows of :func:`_coarse_rays` are read out, after the middle row: (rows,), or one for all."""
     if readout <= 0:
         return np.zeros(1)
     rows = (np.arange(-(-height // _COARSE)) + 0.5) * _COARSE - 0.5
@@ -315,7 +314,7 @@ def _coarse_delays(height: int, readout: float) -> FloatArray:
 
 
 def _moved(rays: Float32Array, share: Float32Array, H: FloatArray) -> Float32Array:
-    """Factors (K or 2 K, rows * columns) of H's start and of its change for ``rays`` (K, rows, columns)."""
+    """Factors (K or 2 K, rows * columns), for ``rays`` (K, rows, columns), of H at the first node and of its change."""
     return np.concatenate([rays, share * rays] if len(H) > 1 else [rays]).reshape(len(H) * len(rays), -1)
 
 
@@ -346,7 +345,7 @@ def _look_up(
 
 
 def _ray_terms(H: FloatArray, offsets: FloatArray | None) -> Float32Array:
-    """What multiplies a ray (3 or 7,) under ``H`` (N, 3, 3): (3 N, 3 or 7)."""
+    """Matrix (3 N, 3 or 7) that multiplies a ray (3 or 7,) for ``H`` (N, 3, 3)."""
     terms = [H[..., 0], H[..., 1], H[..., 2]]
     if offsets is not None:
         dx, dy = offsets[:, :1], offsets[:, 1:]
@@ -355,7 +354,7 @@ def _ray_terms(H: FloatArray, offsets: FloatArray | None) -> Float32Array:
 
 
 def _cells(u: Float32Array, v: Float32Array, plate: Plate) -> IntArray:
-    """Index into the plate's flat grids; what is off the plate falls on their border."""
+    """Index into the plate's flat grids; points off the plate get their border."""
     rows, columns = plate.levels.shape
     row = np.clip(v, 0, rows - 0.5).astype(np.intp)
     row *= columns
@@ -364,7 +363,7 @@ def _cells(u: Float32Array, v: Float32Array, plate: Plate) -> IntArray:
 
 
 def _cut_pixels(regions: Gray) -> BoolArray:
-    """Pixels (h, w) whose surroundings (3 x 3, at the three moments of ``regions`` (3, h, w)) aren't all one region."""
+    """Pixels (h, w) with several regions in their 3 x 3 neighbourhood at the times of ``regions`` (3, h, w)."""
     highest = cv2.dilate(np.maximum(np.maximum(regions[0], regions[1]), regions[2]), _KERNEL)
     lowest = cv2.erode(np.minimum(np.minimum(regions[0], regions[1]), regions[2]), _KERNEL)
     return np.asarray(highest != lowest)
@@ -378,7 +377,7 @@ def _outline(plate: Plate) -> FloatArray:
 
 
 def _clip(outline: FloatArray) -> FloatArray:
-    """The points of a closed outline (N, 3) before the near plane, and those where it crosses that."""
+    """Points of a closed outline (N, 3) beyond the near plane, and its intersections with that plane."""
     a, b = outline, np.roll(outline, -1, axis=0)
     front = outline[:, 2] > _NEAR
     crossing = front != np.roll(front, -1)

@@ -30,17 +30,17 @@ LENSES = {
 
 @dataclass(frozen=True)
 class Scenario:
-    """Everything that a simulated flight depends on besides its seed.
+    """Everything that determines a simulated flight, except its seed.
 
     Parameters
     ----------
     name, description : for the command line
     markers : the first one is the fixed one of the map that mapping starts with
     camera_position, camera_orientation : of the camera in the body (IMU) frame [m], quaternion x y z w
-    camera_time_offset : clock of the camera, t_imu = t_camera + offset [s]
-    stamp_jitter : of the camera's stamps, exponential: most a little early, few late; the offset is their mean [s]
+    camera_time_offset : t_imu = t_camera + offset [s]
+    stamp_jitter : of the camera's stamps, exponential: most slightly early, few late; the offset is the mean [s]
     vibration : of the body, or none
-    corner_noise : errors of the corners of a flight that has no pictures; None: it has pictures
+    corner_noise : errors of the corners of a flight without pictures; None: it has pictures
     dictionary : name of an OpenCV dictionary
     seconds : default length
     """
@@ -86,7 +86,7 @@ class Scenario:
 
     @property
     def plates(self) -> list[Plate]:
-        """Everything flat in the room."""
+        """All flat objects in the room."""
         markers = [marker_plate(marker, self.aruco_dictionary, self.acrylic) for marker in self.markers]
         return markers + [clutter_plate(item) for item in self.clutter]
 
@@ -97,7 +97,7 @@ class Scenario:
 
 
 def _wall() -> tuple[Marker, ...]:
-    """Eight markers between 2.5 and 4.5 m in front of home, at various depths and angles; the first is seen from it."""
+    """Eight markers 2.5 to 4.5 m in front of home, at various angles; the first is visible from home."""
     depth = (3.2, 2.9, 3.5, 4.4, 3.0, 3.8, 2.8, 4.1)
     yaw = (180, 165, 190, 172, 200, 183, 160, 195)
     tilt = (0, 8, -6, 4, -10, 5, 12, -3)
@@ -149,11 +149,11 @@ def _carpet() -> tuple[Marker, ...]:
     return tuple(Marker(key, (x, y, 0.0), 0.0, -90.0, size=0.193) for key, x, y in cells)
 
 
-#: A global-shutter camera of visible light, and the same as it truly is when its calibration is off by a little.
+#: A global-shutter camera of visible light: its calibration, and its true lens, which differs a little.
 _WIDE = Lens((460.0, 459.0), (370.0, 245.0), 'plumb_bob', (-0.28, 0.07, 2e-4, 0.0, 0.0), 752, 480)
 _WIDE_TRUE = Lens((460.2, 459.2), (370.1, 244.9), 'plumb_bob', (-0.2805, 0.0708, 2.3e-4, -3e-5, 0.0), 752, 480)
 _DOWNWARD = Lens((364.0, 364.0), (288.0, 290.0), width=576, height=576)
-#: Published densities of a tactical-grade MEMS IMU, and what readings against a reference show beside them.
+#: Published densities of a tactical-grade MEMS IMU, and its other errors as measured against a reference.
 _MEMS = ImuModel(
     SimulatedNoise(1.7e-4, 2.0e-3, 2.0e-5, 3.0e-3),
     gyroscope_bias_sigma=0.04,
@@ -198,7 +198,7 @@ _SCENARIOS = (
     ),
     Scenario(
         'rough',
-        'a flight in the room as it really is: rolling read-out, vibration, jitter of all stamps, a late camera',
+        'a flight with real sensors: rolling shutter, vibration, jitter of all stamps, a late camera',
         _room(),
         lens=LENSES['9mm'],
         flight=Flight(amplitude=(1.6, 1.6, 0.4), period=(9.0, 8.0, 4.5), turns=_TURNS),
@@ -211,7 +211,7 @@ _SCENARIOS = (
     ),
     Scenario(
         'april',
-        'corners of a board of 36 tags before a hand-held rig: an IMU whose axes are off, a lens not quite known',
+        'corners of a board of 36 tags before a hand-held rig: misaligned axes of the IMU, a slightly wrong lens',
         _board(),
         lens=_WIDE,
         corner_noise=CornerNoise(true_lens=_WIDE_TRUE),
@@ -253,7 +253,7 @@ _SCENARIOS = (
     ),
     Scenario(
         'cheap_imu',
-        'corners of the wall, a gentle flight, the IMU of a toy: ten times the noise, axes off by a per cent',
+        'corners of the wall, a gentle flight, the IMU of a toy: ten times the noise, axes wrong by a per cent',
         _wall(),
         corner_noise=CornerNoise(0.05, 0.05),
         sensor=Sensor(lag=0.0),

@@ -1,4 +1,4 @@
-"""What hangs in the room: markers, warm clutter, walls, fog. Temperatures in kelvin above ambient."""
+"""Contents of the room: markers, warm clutter, walls, fog. Temperatures are in kelvin above ambient."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,7 +29,7 @@ class Marker:
     ----------
     id : in the scenario's dictionary
     position : of its centre in ``map`` [m]
-    yaw_deg, tilt_deg, roll_deg : where its face looks, see :func:`facing`
+    yaw_deg, tilt_deg, roll_deg : orientation, see :func:`facing`
     size : side of the black square [m]
     """
 
@@ -67,7 +67,7 @@ class Marker:
 
 @dataclass(frozen=True)
 class Clutter:
-    """Something warm without a code: ``kind`` is person, heater, pipe or plate.
+    """A warm object without a code: ``kind`` is person, heater, pipe or plate.
 
     Parameters
     ----------
@@ -89,10 +89,10 @@ class Acrylic:
 
     Parameters
     ----------
-    contrast : of plate over sheet when the sheet is still cold [K]
-    gradient : share of the contrast by which a plate's two sides differ
-    steady : share of the contrast that the sheet warms up by in the end
-    warm_up_time : time constant of that [s]
+    contrast : of plate over sheet while the sheet is cold [K]
+    gradient : difference between the two sides of a plate, as a share of the contrast
+    steady : final warming of the sheet, as a share of the contrast
+    warm_up_time : time constant of the warming [s]
     age : time since the plates were switched on, at the start [s]
     inverted : warm code on a cold ground instead of warm holes in a cold sheet
     """
@@ -117,7 +117,7 @@ class Fog:
     ----------
     extinction : in the long-wave infrared [1/m]
     excess : temperature of the fog above ambient [K]
-    swing, period : share by which the extinction comes and goes [1], and how fast [s]
+    swing, period : relative amplitude [1] and period [s] of the variation of the extinction
     """
 
     extinction: float = 0.0
@@ -161,16 +161,16 @@ class Room:
 
 
 class Plate:
-    """A rectangle of cells, the thing that the renderer draws.
+    """A rectangle of cells: the only object that the renderer draws.
 
     Parameters
     ----------
     T_map_plate : (4, 4)
     width, height : [m]
     levels : (rows, columns) in 0..1, row 0 at the top (+y): 0 is the sheet, 1 the plate behind
-    opaque : (rows, columns), False where one sees through
-    hot : excess of level 1 [K]; of level 0 for things without a sheet it is ``cold``
-    cold : excess of level 0 [K], or None: that of the acrylic
+    opaque : (rows, columns), False where the plate is transparent
+    hot : excess of level 1 [K]
+    cold : excess of level 0 [K]; None: that of the acrylic
     gradient : relative change of ``hot`` across the width and the height
     """
 
@@ -194,7 +194,7 @@ class Plate:
 
     @cached_property
     def regions(self) -> Gray:
-        """(rows + 2, columns + 2) uint8: cells of one number look alike."""
+        """Region of each cell, (rows + 2, columns + 2) uint8: cells with equal numbers have equal appearance."""
         _, region = np.unique(self.levels + 2 * self.cover, return_inverse=True)
         return np.asarray(region.reshape(self.levels.shape), dtype=np.uint8)
 
@@ -227,7 +227,7 @@ class Plate:
 
 
 def marker_plate(marker: Marker, dictionary: cv2.aruco.Dictionary, acrylic: Acrylic) -> Plate:
-    """The stencil of a marker: one cell of warm plate round the black square."""
+    """The stencil of a marker, with one cell of warm plate around the black square."""
     cells = dictionary.markerSize + 2
     packed = dictionary.bytesList[marker.id : marker.id + 1]
     bits = np.pad(cv2.aruco.Dictionary.getBitsFromByteList(packed, dictionary.markerSize) > 0, 1)

@@ -1,7 +1,7 @@
 """A Tau 2's electronics: noise, fixed pattern, bad pixels, shutter, drift, 14 bits.
 
-Numbers: NETD below 50 mK (FLIR), fixed pattern that grows after the shutter's correction to about 0.1 K within
-minutes, large-scale non-uniformity up to 0.6 K, a shutter event of less than half a second.
+Its values: NETD below 50 mK (FLIR), fixed-pattern noise that grows to about 0.1 K within minutes of a correction by the
+shutter, large-scale non-uniformity up to 0.6 K, shutter events of less than half a second.
 """
 
 from dataclasses import dataclass
@@ -27,21 +27,21 @@ class Sensor:
     ----------
     lag : thermal time constant of the bolometers [s]
     readout : from the sampling of the first row to that of the last [s]; the stamp is that of the middle row
-    psf_sigma_px : of optics and pixel together [px]
+    psf_sigma_px : standard deviation of the point spread of optics and pixel together [px]
     netd : temporal noise [K]
-    counts_per_kelvin, offset_counts : scale, and counts of something at ambient temperature
-    drift_counts, drift_period : of the offset with the housing's temperature [counts], [s]
-    pixel_pattern, pixel_growth : fixed pattern just after the shutter, and what it grows by in three minutes [K]
-    column_pattern, column_growth : the same of whole columns [K]
+    counts_per_kelvin, offset_counts : scale, and counts at ambient temperature
+    drift_counts, drift_period : of the drift of the offset with the housing's temperature [counts], [s]
+    pixel_pattern, pixel_growth : fixed-pattern noise just after a shutter event, and its growth in three minutes [K]
+    column_pattern, column_growth : the same for whole columns [K]
     shading : low-order non-uniformity [K]
-    bad_pixel_share : half of them dead, half stuck at random counts
-    ffc_period, ffc_first, ffc_duration : of the shutter [s]; period 0: never
-    ffc_behaviour : what the driver does then: ``frozen`` repeats the last frame under new stamps, ``dropped`` sends
+    bad_pixel_share : share of bad pixels: half of them dead, half stuck at random counts
+    ffc_period, ffc_first, ffc_duration : period, first start and duration of shutter events [s]; period 0: none
+    ffc_behaviour : output of the driver in them: ``frozen`` repeats the last frame with new stamps, ``dropped`` sends
         nothing, ``shutter`` sends the view of the closed shutter
     shutter_excess : temperature of the shutter above ambient [K]
     frame_rate : [Hz]
-    full_scale : counts at which a pixel is saturated; below 256 the pictures have 8 bits. What is brighter than that
-        bleeds over its edges by as much as the blur reaches above half of the scale
+    full_scale : counts of saturated pixels; below 256 the pictures have 8 bits. Brighter objects grow at their
+        edges, by the width over which the blur exceeds half of the scale
     """
 
     lag: float = 0.010
@@ -71,13 +71,13 @@ class Sensor:
             raise InputError(f'driver behaviour {self.ffc_behaviour!r} is not one of {", ".join(FFC_BEHAVIOURS)}')
 
     def ffc_index(self, t: float) -> int:
-        """Number of shutter events that have begun until ``t`` [s]."""
+        """Number of shutter events that have begun by ``t`` [s]."""
         if self.ffc_period <= 0:
             return 0
         return max(0, int(np.floor((t - self.ffc_first) / self.ffc_period)) + 1)
 
     def ffc_start(self, index: int) -> float:
-        """When shutter event ``index`` (from 1) begins [s]; for 0 a correction long before the flight."""
+        """Start of shutter event ``index`` (from 1) [s]; index 0 is a correction long before the flight."""
         return self.ffc_first + (index - 1) * self.ffc_period if index > 0 else -60.0
 
     def in_ffc(self, t: float) -> bool:
@@ -86,7 +86,7 @@ class Sensor:
         return index > 0 and t - self.ffc_start(index) < self.ffc_duration
 
     def counts(self, temperature: Float32Array, t: float, frame: int, seed: int) -> Counts:
-        """14-bit counts (height, width) of the temperatures [K] that the bolometers reached at ``t`` [s]."""
+        """14-bit counts (height, width) of the temperatures [K] of the bolometers at ``t`` [s]."""
         kelvin = cv2.GaussianBlur(temperature, (0, 0), self.psf_sigma_px) if self.psf_sigma_px > 0 else temperature
         rng = np.random.default_rng([seed, 4, frame])
         kelvin = kelvin + self._pattern(t, kelvin.shape, seed)
@@ -123,7 +123,7 @@ def _patterns(sensor: Sensor, shape: tuple[int, int], seed: int, index: int) -> 
 
 @lru_cache(maxsize=2)
 def _bad_pixels(shape: tuple[int, int], share: float, seed: int, full_scale: int) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices of bad pixels and what they always say: 0 or full scale (dead), or anything (stuck)."""
+    """Flat indices of bad pixels and their constant counts: 0 or full scale (dead), or any (stuck)."""
     rng = np.random.default_rng([seed, 6])
     count = round(share * shape[0] * shape[1])
     where = rng.choice(shape[0] * shape[1], count, replace=False)

@@ -1,4 +1,4 @@
-"""Smooth flights with analytic derivatives, so that the IMU's samples are exact."""
+"""Smooth flights with analytic derivatives, for exact samples of the IMU."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -18,7 +18,7 @@ _KNOTS_PER_SECOND = 20
 
 @dataclass(frozen=True)
 class Motion:
-    """The body at times t, in ``map`` unless the name says otherwise; leading dimension (N,)."""
+    """Motion of the body at times t, in ``map`` unless the name says otherwise; leading dimension (N,)."""
 
     position: FloatArray
     rotation: Rotation
@@ -41,7 +41,7 @@ def pose_matrix(rotation: Rotation, position: npt.ArrayLike) -> FloatArray:
 
 
 class Path(Protocol):
-    """Where a body is and how it moves."""
+    """A path of a body."""
 
     def __call__(self, t: npt.ArrayLike, /) -> Motion:
         """The motion at times ``t`` (N,) [s]."""
@@ -89,7 +89,7 @@ class SplineTrajectory:
 
 
 def _angular_velocity(s: FloatArray, s_dot: FloatArray) -> FloatArray:
-    """Body rate of q = s/|s|: the vector part of 2 conj(q) q_dot; what s_dot has along s drops out of it."""
+    """Body rate of q = s/|s|: vector part of 2 conj(q) q_dot, independent of the component of s_dot along s."""
     s, s_dot = s.T, s_dot.T
     vector, w = s[:3], s[3]
     vector_dot, w_dot = s_dot[:3], s_dot[3]
@@ -98,7 +98,7 @@ def _angular_velocity(s: FloatArray, s_dot: FloatArray) -> FloatArray:
 
 
 def smooth_step(t: FloatArray, start: float, duration: float) -> FloatArray:
-    """From 0 to 1 over ``duration``, with three continuous derivatives (7th-degree polynomial)."""
+    """Step from 0 to 1 over ``duration`` with three continuous derivatives (7th-degree polynomial)."""
     x = np.clip((t - start) / duration, 0.0, 1.0)
     return np.asarray(x**4 * (35.0 - 84.0 * x + 70.0 * x**2 - 20.0 * x**3))
 
@@ -111,8 +111,8 @@ class Flight:
     ----------
     home : take-off point [m]
     height : hover above home [m]
-    amplitude : of the survey about the hover point, x y z [m]
-    period : of each axis' oscillation [s]
+    amplitude : of the oscillation about the hover point, x y z [m]
+    period : of the oscillation of each axis [s]
     sway_deg, sway_period : amplitude [deg] and period [s] of the yaw oscillation during the survey
     turns : (start [s], duration [s], angle [deg]) of the yaw turns; a turn peaks at 2.19 angle / duration
     yaw_deg : heading at home
@@ -132,7 +132,7 @@ class Flight:
     hover_time: float = 1.0
 
     def trajectory(self, seconds: float, seed: int) -> SplineTrajectory:
-        """The flight of this seed, squeezed into ``seconds``.
+        """The flight of ``seed``, compressed into ``seconds``.
 
         Raises
         ------
@@ -167,7 +167,7 @@ class Flight:
 
 
 def _hover_attitude(t: FloatArray, positions: FloatArray, yaw: FloatArray) -> Rotation:
-    """A multirotor's attitude: its thrust along acceleration minus gravity, its nose at ``yaw``."""
+    """Attitude of a multirotor: thrust along acceleration minus gravity, heading ``yaw``."""
     acceleration = make_interp_spline(t, positions, k=_DEGREE)(t, 2)
     up = acceleration + np.array([0.0, 0.0, GRAVITY])
     up /= np.linalg.norm(up, axis=1, keepdims=True)

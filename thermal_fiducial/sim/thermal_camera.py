@@ -15,8 +15,7 @@ from thermal_fiducial.sim.sensor import IDEAL
 
 #: Stamp of the start of every flight.
 START_NS = 1_700_000_000_000_000_000
-#: Frames that are rendered in one go: a chunk begins with a warm-up, whoever renders it, so that bytes don't depend
-#: on the number of workers.
+#: Number of frames in a chunk. Each chunk begins with a warm-up, so that the bytes do not depend on the workers.
 CHUNK = 30
 
 _DEFAULT_QUALITY = Quality()
@@ -24,17 +23,17 @@ _DEFAULT_QUALITY = Quality()
 
 @dataclass(frozen=True)
 class SimFrame:
-    """One frame and the truth about it.
+    """One frame with its ground truth.
 
     Parameters
     ----------
-    stamp_ns : when it was read out (its middle row), by the camera's clock
-    seconds : the same since the start, by the IMU's clock
+    stamp_ns : when its middle row was read out, in the camera's clock
+    seconds : the same since the start, in the IMU's clock
     counts : (height, width) uint16
-    shutter : whether the counts are no live view
-    T_map_camera : (4, 4) then
-    corners_px : ID to true corners (4, 2) then, for each marker that lies wholly in the image, shows
-        its face and isn't hidden, also when the shutter is closed
+    shutter : whether the shutter is closed
+    T_map_camera : (4, 4) at that time
+    corners_px : ID to true corners (4, 2), for each marker that lies wholly in the image, faces the camera and is not
+        hidden, also while the shutter is closed
     """
 
     stamp_ns: int
@@ -63,7 +62,7 @@ class FlightPlan:
 
     @property
     def sensor_scenario(self) -> Scenario:
-        """The scenario, its sensor without noise when that is wanted."""
+        """The scenario; its sensor has no noise if ``noise`` is False."""
         if self.noise:
             return self.scenario
         sensor = self.scenario.sensor
@@ -76,11 +75,11 @@ class FlightPlan:
         return int(self.seconds * self.scenario.sensor.frame_rate)
 
     def frame_time(self, index: int) -> float:
-        """Read-out of frame ``index`` since the start, by the IMU's clock [s]."""
+        """Read-out of frame ``index`` since the start, in the IMU's clock [s]."""
         return (index + 1) / self.scenario.sensor.frame_rate
 
     def stamp_ns(self, index: int) -> int:
-        """The camera's stamp of it."""
+        """Stamp of frame ``index`` in the camera's clock."""
         late = self.scenario.stamp_jitter * (np.random.default_rng([self.seed, 9, index]).exponential() - 1.0)
         return START_NS + round((self.frame_time(index) - self.scenario.camera_time_offset + late) * SECOND_NS)
 
@@ -100,7 +99,7 @@ def plan(
     noise: bool = True,
     quality: Quality = _DEFAULT_QUALITY,
 ) -> FlightPlan:
-    """A flight of ``scenario`` (an object or a name), by default of its own length."""
+    """A flight of ``scenario`` (an object or a name), by default of the scenario's length."""
     chosen = named(scenario) if isinstance(scenario, str) else scenario
     return FlightPlan(chosen, seconds or chosen.seconds, seed, noise, quality)
 
@@ -117,7 +116,7 @@ def render_frames(
 ) -> Iterator[SimFrame]:
     """Frames ``start`` to ``stop`` of a flight, in order.
 
-    With ``ffc_behaviour`` ``dropped`` those of the closed shutter are missing.
+    With ``ffc_behaviour`` ``dropped`` the frames of the closed shutter are missing.
     """
     flight = plan(scenario, seconds, seed, noise=noise, quality=quality)
     camera = ThermalCamera(flight)
@@ -135,7 +134,7 @@ def simulate_imu(scenario: Scenario | str, seconds: float | None = None, seed: i
 def true_corners(
     lens: Lens, markers: Sequence[Marker], plates: Sequence[Plate], T_map_camera: FloatArray, margin_px: float = 1.0
 ) -> dict[int, FloatArray]:
-    """ID to corners (4, 2) [px] of the markers that are wholly in the image, show their face and aren't hidden."""
+    """ID to corners (4, 2) [px] of the markers that lie wholly in the image, face the camera and are not hidden."""
     R, origin = T_map_camera[:3, :3], T_map_camera[:3, 3]
     high = np.array([lens.width, lens.height]) - 1 - margin_px
     poses = np.array([marker.T_map_marker for marker in markers])
@@ -157,7 +156,7 @@ def true_corners(
 
 
 def _unfolded(lens: Lens, points: FloatArray, pixels: FloatArray) -> BoolArray:
-    """Whether the lens maps the pixels back to the points: beyond its field the distortion folds them into it."""
+    """Whether the lens maps the pixels back to the points: distortion folds points beyond its field into the image."""
     slopes = points[..., :2] / points[..., 2:]
     off = np.linalg.norm(lens.slopes(pixels) - slopes, axis=-1)
     return np.asarray(off < 1e-6 * (1.0 + np.linalg.norm(slopes, axis=-1)))
@@ -224,7 +223,7 @@ class ThermalCamera:
             last -= 1
         if self._last is not None and self._last[0] == last:
             return self._last[1]
-        # It was in another chunk: the same steps as there give the same counts to the last bit.
+        # The frame belongs to another chunk: the same steps as there give the same counts to the last bit.
         self._renderer.forget()
         for earlier in range(last - last % CHUNK, last):
             if not self._closed(earlier):

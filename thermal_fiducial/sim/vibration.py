@@ -1,4 +1,4 @@
-"""Propellers out of balance: what shakes body, camera and IMU alike, and what only the IMU feels."""
+"""Vibration by propellers out of balance: of the whole body, and noise of the IMU alone."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +13,7 @@ from thermal_fiducial.sim.spline_trajectory import Motion, Path
 
 @dataclass(frozen=True)
 class Vibration:
-    """Oscillations of the body about its path, three axes each in their own phase.
+    """Oscillations of the body about its path, with a phase for each of three axes.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class Vibration:
 
 @dataclass(frozen=True)
 class Shaken:
-    """A path with a vibration: p + d in ``map``, and R Exp(theta)."""
+    """A path with vibration: p + d in ``map``, and R Exp(theta)."""
 
     path: Path
     vibration: Vibration

@@ -1,4 +1,4 @@
-"""A rig that is waved before its markers, by hand or by a drone: sums of sines, always roughly looking at them."""
+"""A rig moved about in front of its markers, by hand or by a drone: sums of sines, roughly aimed at the markers."""
 
 from dataclasses import dataclass
 
@@ -9,20 +9,20 @@ from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.sim.spline_trajectory import smooth_step, SplineTrajectory
 
 _KNOTS_PER_SECOND = 20
-#: Time to come into motion and out of it [s].
+#: Duration of the transitions between rest and motion [s].
 _START = 1.5
 
 
 @dataclass(frozen=True)
 class Waving:
-    """Position and attitude about a place and a view, each axis a sum of sines with phases of the seed.
+    """Motion about a position and a direction of view; each axis is a sum of sines with random phases.
 
     Parameters
     ----------
-    centre : about which it moves [m]
-    target : what the view goes to from there [m]; None: straight ahead along x, as over a floor
+    centre : mean position [m]
+    target : point in the middle of the view [m]; None: straight ahead along x, as over a floor
     speed : rms of each axis [m/s]
-    turn : rms rate about each axis besides what looking at the target takes [rad/s]
+    turn : rms rate about each axis, beyond the rotation towards the target [rad/s]
     frequencies : slowest and fastest sine [Hz]
     rest : time at rest before and after [s]
     """
@@ -35,7 +35,7 @@ class Waving:
     rest: float = 0.5
 
     def trajectory(self, seconds: float, seed: int) -> SplineTrajectory:
-        """The flight of this seed.
+        """The flight of ``seed``.
 
         Raises
         ------
@@ -52,10 +52,10 @@ class Waving:
         return SplineTrajectory(t, positions, self._looking(positions) * turned)
 
     def _sines(self, t: FloatArray, rng: np.random.Generator, rate: float) -> FloatArray:
-        """(N, 3) of rms derivative ``rate`` in each axis."""
+        """Sums of sines (N, 3) with an rms derivative of ``rate`` in each axis."""
         count = 5
         low, high = self.frequencies
-        # One sine in each part of the band, so that no seed is all slow.
+        # One sine in each part of the band, so that no seed has slow ones only.
         edges = np.geomspace(low, high, count + 1)
         frequency = rng.uniform(edges[:-1, None], edges[1:, None], (count, 3))
         phase = rng.uniform(0.0, 2.0 * np.pi, (count, 3))

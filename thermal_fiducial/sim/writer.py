@@ -1,4 +1,4 @@
-"""A simulated flight as a rosbag2 with everything that a replay of it needs beside it."""
+"""A simulated flight as a rosbag2, with all files that its replay needs."""
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, ProcessPoolExecutor
@@ -32,14 +32,14 @@ from thermal_fiducial.sim.scenario import Scenario
 from thermal_fiducial.sim.scene import Marker
 from thermal_fiducial.sim.thermal_camera import CHUNK, FlightPlan, plan, SimFrame, START_NS, ThermalCamera
 
-#: A frame reaches the recorder this long after its read-out, an IMU sample and the truth sooner [ns].
+#: Delay of a frame from its read-out to the recorder [ns]; IMU samples and ground truth have less.
 IMAGE_DELAY_NS = 25_000_000
 IMU_DELAY_NS = 1_000_000
 
 
 @dataclass(frozen=True)
 class _Event:
-    """A message on its way into the bag."""
+    """A message for the bag."""
 
     arrival_ns: int
     topic: str
@@ -52,7 +52,7 @@ def simulate(out: str | Path, scenario: Scenario | str = 'fog', seconds: float |
     Parameters
     ----------
     out : becomes a rosbag2 with the truth, the true map and the parameters in it, see :func:`write_flight`
-    scenario : its name (``thermal-fiducial simulate --help`` lists them) or an object
+    scenario : name (``thermal-fiducial simulate --help`` lists them) or object
     seconds : length of the flight, at least 11; None: the scenario's own
     seed : of path and noise; the same seed gives the same bytes
 
@@ -77,14 +77,14 @@ def write_flight(
     workers: int = 1,
     progress: Callable[[int], None] | None = None,
 ) -> None:
-    """Simulate ``flight`` into the new folder ``out``: it is there whole, or not at all.
+    """Simulate ``flight`` into the new folder ``out``, which exists only once it is complete.
 
     Parameters
     ----------
     out : a rosbag2 with ``ground_truth.tum``, ``ground_truth_corners.csv``, ``map_true.yaml``, ``map_one.yaml`` (one
         fixed marker, the start of a map) and ``params.yaml`` (the rig) in it
     storage : mcap or sqlite3
-    workers : processes that render; the bytes don't depend on it
+    workers : number of rendering processes; the bytes do not depend on it
     progress : called with the number of frames written since the last call
 
     Raises
@@ -106,7 +106,7 @@ def write_flight(
     except OSError as error:
         raise InputError(f'{out}: {error.strerror}') from None
     except BrokenExecutor:
-        raise InputError(f'{out}: a rendering process died, for want of memory perhaps') from None
+        raise InputError(f'{out}: a rendering process died, perhaps for lack of memory') from None
     finally:
         shutil.rmtree(folder)
 
@@ -139,7 +139,7 @@ def _camera_events(frames: Iterable[SimFrame], flight: FlightPlan) -> Iterator[_
 
 
 def _body_events(flight: FlightPlan) -> Iterator[_Event]:
-    """IMU samples and the truth at their stamps."""
+    """IMU samples, and the ground truth at their stamps."""
     scenario = flight.scenario
     times, stamps = flight.imu_stamps()
     trajectory = scenario.trajectory(flight.seconds, flight.seed)
@@ -161,7 +161,7 @@ def _body_events(flight: FlightPlan) -> Iterator[_Event]:
 
 
 def _arrivals(record: ImuRecord, stamps: IntArray, scenario: Scenario) -> list[int]:
-    """When samples come: as they are taken, or as a driver has stamped them that reads them now and then."""
+    """Samples that arrive and their stamps, through the driver of the scenario if it has one."""
     if scenario.imu.delivery is None:
         return stamps.tolist()  # type: ignore[no-any-return]
     return np.maximum.accumulate(record.stamps_ns).tolist()  # type: ignore[no-any-return]
@@ -169,7 +169,7 @@ def _arrivals(record: ImuRecord, stamps: IntArray, scenario: Scenario) -> list[i
 
 # --- rendering in chunks ------------------------------------------------------------------------------
 
-#: The camera of a worker process, made once: its tables of rays take a second.
+#: The camera of a worker process, created once, since its tables of rays take a second.
 _worker_camera: list[ThermalCamera] = []
 
 
@@ -193,7 +193,7 @@ def _frames(flight: FlightPlan, workers: int) -> Iterator[SimFrame]:
     context = multiprocessing.get_context('spawn')  # a fork of a process that runs ROS deadlocks
     with ProcessPoolExecutor(min(workers, len(starts)), context, _start_worker, (flight,)) as pool:
         with _interrupts_ignored():
-            # Which the processes that it starts inherit: an interrupt meets them before their own first line.
+            # Its children inherit this: an interrupt may reach them before their first line.
             chunks = pool.map(_render_chunk, starts, stops)
         for chunk in chunks:
             yield from chunk
@@ -215,7 +215,7 @@ def _interrupts_ignored() -> Iterator[None]:
 
 
 def write_side_files(folder: Path, flight: FlightPlan) -> None:
-    """Truth, maps and parameters of a flight into the folder of its bag."""
+    """Write ground truth, maps and parameters of a flight into the folder of its bag."""
     scenario = flight.scenario
     times, stamps = flight.imu_stamps()
     motion = scenario.trajectory(flight.seconds, flight.seed)(times)
@@ -240,7 +240,7 @@ def _marker_map(scenario: Scenario, markers: tuple[Marker, ...]) -> str:
 
 
 def _parameters(scenario: Scenario) -> dict[str, Any]:
-    """The rig under the names that the nodes use."""
+    """The rig as parameters of the nodes."""
     sizes = [marker.size for marker in scenario.markers]
     common = max(set(sizes), key=sizes.count)
     overrides = [f'{marker.id}:{marker.size}' for marker in scenario.markers if marker.size != common]
@@ -251,7 +251,7 @@ def _parameters(scenario: Scenario) -> dict[str, Any]:
         **({'marker_size_overrides': overrides} if overrides else {}),
         'camera_position': [float(value) for value in scenario.camera_position],
         'camera_orientation': [float(value) for value in scenario.camera_orientation],
-        # Nothing is calibrated here: the camera is exactly where the parameters say.
+        # The extrinsics are exact, not calibrated.
         'extrinsics_position_std': 0.0,
         'extrinsics_orientation_std': 0.0,
         'camera_time_offset': float(scenario.camera_time_offset),
