@@ -13,7 +13,7 @@ def work(task):
         os._exit(3)
     if isinstance(task, Path):
         _wait_for(task)
-    else:
+    elif isinstance(task, float):
         time.sleep(task)
     return os.getpid(), task
 

@@ -60,6 +60,20 @@ def test_a_flight_ends_with_a_map_of_a_millimetre():
     assert 2 < resets < 12
 
 
+def test_after_the_clock_is_set_back_the_map_is_still_refined():
+    rng = np.random.default_rng(0)
+    poses = wall(rng)
+    m = from_one_marker(poses)
+    refined = []
+    for k in range(0, 600, 3):
+        # As a computer without a battery for its clock: time comes over the network, in the middle of the flight.
+        now = stamp(k) + (3600 * 10**9 if k < 300 else 0)
+        m.process(now, see(flight(k / 30), poses, 0.02, rng), CAMERA)
+        if m.refinement_due(now) and m.apply(refine(m.snapshot())):
+            refined.append(k)
+    assert min(refined) < 300 <= max(refined)
+
+
 def test_a_refinement_moves_poses_by_no_more_than_they_claimed():
     """Whoever stands on the old map can follow by itself, and weighs what it knows against the poses that come."""
     rng = np.random.default_rng(1)

@@ -1,6 +1,8 @@
 """Long work beside the callbacks: done elsewhere, reported once, survived when it fails."""
 
+import multiprocessing
 import os
+import signal
 import time
 
 import pytest
@@ -65,11 +67,65 @@ def test_work_that_fails_is_reported_and_the_next_is_done(worker):
     assert result_of(worker)[1] == 0.0
 
 
-def test_a_process_that_dies_is_reported_once_and_never_used_again(worker):
+def test_a_process_that_dies_is_reported_once_and_replaced(worker):
     worker.start('die')
     assert 'ended' in failure(worker)
     assert worker.take() is None
-    until(lambda: worker.busy)
+    worker.start(0.0)
+    assert result_of(worker)[1] == 0.0
+
+
+def signalled(number):
+    """The process of the worker, after a signal."""
+    (process,) = multiprocessing.active_children()
+    os.kill(process.pid, number)
+    return process
+
+
+def test_a_process_that_is_killed_while_it_waits_is_replaced(worker):
+    process = signalled(signal.SIGKILL)
+    until(lambda: not process.is_alive())
+    worker.start(0.0)
+    assert result_of(worker)[1] == 0.0
+
+
+def test_neither_a_task_nor_an_answer_that_a_stopped_process_leaves_in_the_pipe_is_waited_for(worker):
+    """A pipe takes 200 kB; a task of a large map has two megabytes."""
+    process = signalled(signal.SIGSTOP)
+    began = time.monotonic()
+    worker.start(b'x' * 10_000_000)
+    assert worker.take() is None
+    # Milliseconds, to pickle it; a busy machine may make ten times as much of that.
+    assert time.monotonic() - began < 1.0
+    os.kill(process.pid, signal.SIGCONT)
+    assert len(result_of(worker)[1]) == 10_000_000
+
+
+def test_a_process_that_hangs_is_killed_reported_and_replaced(worker):
+    process = signalled(signal.SIGSTOP)
+    patience_s, worker.patience_s = worker.patience_s, 0.1
+    worker.start(0.0)
+    assert 'no answer' in failure(worker)
+    assert not process.is_alive()
+    worker.patience_s = patience_s
+    worker.start(0.0)
+    assert result_of(worker)[1] == 0.0
+
+
+def test_the_process_has_no_real_time_priority():
+    """Of a node that has; it may be started in flight, when the map is set free or after a crash."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+    except PermissionError:
+        pytest.skip('this user may not')
+    try:
+        worker = Background(work)
+    finally:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    until(lambda: worker.take() is None and not worker.busy)
+    (process,) = multiprocessing.active_children()
+    assert os.sched_getscheduler(process.pid) == os.SCHED_OTHER
+    worker.close()
 
 
 def test_closing_does_not_wait_for_the_work(worker):

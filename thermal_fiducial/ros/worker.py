@@ -5,6 +5,8 @@ import multiprocessing
 from multiprocessing.connection import Connection
 import os
 import signal
+from threading import Thread
+import time
 from typing import Generic, TypeVar
 
 from thermal_fiducial.errors import InputError
@@ -12,7 +14,8 @@ from thermal_fiducial.errors import InputError
 Task = TypeVar('Task')
 Result = TypeVar('Result')
 
-_ENDED = 'the background process ended'
+#: Time that work may take [s]: two seconds of a slow core become a minute beside thirty busy programs.
+PATIENCE_S = 60.0
 
 
 class Foreground(Generic[Task, Result]):
@@ -40,39 +43,67 @@ class Foreground(Generic[Task, Result]):
 class Background(Generic[Task, Result]):
     """Runs ``function`` on one task at a time in a spawned process of low priority.
 
+    A process that has ended is replaced with the next task, and so is one that hangs. Whatever waits for it is a thread:
+    a pipe blocks while the process at its other end is stopped.
+
     Parameters
     ----------
     function : of a module, as the process imports it by name; tasks and results are pickled
     """
 
     def __init__(self, function: Callable[[Task], Result]) -> None:
+        self._function = function
+        #: time after which a process that has not answered is killed [s]
+        self.patience_s = PATIENCE_S
+        self._outcome: Result | Exception | None = None
+        self._spawn()
+        self._begin(self._await_imports)
+
+    def _spawn(self) -> None:
         # Spawned, since a forked child would wait for locks held by DDS threads.
         context = multiprocessing.get_context('spawn')
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(function, theirs), daemon=True)
+        self._process = context.Process(target=_serve, args=(self._function, theirs), daemon=True)
         self._process.start()
         theirs.close()
-        #: whether the process is starting or working
-        self._waiting = True
+
+    def _begin(self, wait: Callable[[], Result | None]) -> None:
+        """Let a thread ``wait`` for the process."""
+
+        def answer() -> None:
+            try:
+                self._outcome = wait()
+            except (EOFError, OSError):
+                self._outcome = InputError(f'its process ended, or gave no answer for {self.patience_s:g} s')
+            except Exception as error:  # reported by the node, whatever it is
+                self._outcome = error
+
+        self._until = time.monotonic() + self.patience_s
+        self._thread: Thread | None = Thread(target=answer, daemon=True)
+        self._thread.start()
+
+    def _await_imports(self) -> None:
+        self._connection.recv()
 
     @property
     def busy(self) -> bool:
-        """Whether no task can be started: the process is starting, working, or has ended."""
-        return self._waiting or not self._process.is_alive()
+        """Whether no task can be started: the process is starting or working, or its result has not been taken."""
+        return self._thread is not None
 
     def start(self, task: Task) -> None:
-        """Send ``task`` to the process; only when not busy.
+        """Process ``task``; only when not busy."""
+        fresh = not self._process.is_alive()
+        if fresh:
+            self._connection.close()
+            self._spawn()
 
-        Raises
-        ------
-        InputError
-            The process has ended.
-        """
-        try:
+        def work() -> Result:
+            if fresh:
+                self._await_imports()
             self._connection.send(task)
-        except OSError:
-            raise InputError(_ENDED) from None
-        self._waiting = True
+            return self._connection.recv()  # type: ignore[no-any-return]
+
+        self._begin(work)
 
     def take(self) -> Result | None:
         """The result, once; None as long as there is none.
@@ -80,20 +111,19 @@ class Background(Generic[Task, Result]):
         Raises
         ------
         InputError
-            The computation failed, or the process has ended.
+            The computation failed, or the process has ended or was killed for taking too long.
         """
-        if not self._waiting or not self._connection.poll():
+        if self._thread is None:
             return None
-        try:
-            outcome = self._connection.recv()
-        except (EOFError, OSError):
-            self._connection.close()
-            self._waiting = False
-            raise InputError(_ENDED) from None
-        self._waiting = False
+        if self._thread.is_alive():
+            if time.monotonic() > self._until:
+                self._process.kill()
+            return None
+        self._thread.join()
+        self._thread, outcome, self._outcome = None, self._outcome, None
         if isinstance(outcome, Exception):
-            raise InputError(f'background work failed: {outcome}')
-        return outcome  # type: ignore[no-any-return]
+            raise InputError(f'{self._function.__name__} failed: {outcome}')
+        return outcome
 
     def close(self) -> None:
         """Terminate the process, even during a task."""
@@ -104,6 +134,8 @@ class Background(Generic[Task, Result]):
 def _serve(function: Callable[[Task], Result], connection: Connection) -> None:
     """Process tasks until the connection closes; the first answer, None, signals that all imports are done."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # The node that starts it may have real-time priority.
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.nice(10)
     connection.send(None)
     while True:

@@ -233,7 +233,9 @@ class FrameMemory:
         """Whether an adjustment of ``markers`` markers is due, at least ``period`` [s] after the last one."""
         if not self._keyframes.frames or period == 0.0:
             return False
-        if stamp_ns - self._refined_ns < max(period, _PERIOD_A_VIEW * self._refined_views) * SECOND_NS:
+        wait_ns = max(period, _PERIOD_A_VIEW * self._refined_views) * SECOND_NS
+        # A clock that was set back leaves the last one in the future.
+        if 0 <= stamp_ns - self._refined_ns < wait_ns:
             return False
         enough = self._keyframes.added - self._added_then >= _GROWTH * self._refined_frames + _FEW
         return enough or markers > self._refined_markers
