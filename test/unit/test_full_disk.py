@@ -8,14 +8,20 @@ import os
 import resource
 import shutil
 import tempfile
+import time
 
 import numpy as np
 import pytest
+from std_srvs.srv import Trigger
 from support import small_bag
+from support.messages import info
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.mapping.map_data import MapperResult
+from thermal_fiducial.core.measurements import MARKER_DTYPE
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.atomic import locked
 from thermal_fiducial.files.bag_writer import BagWriter, STORAGES
 from thermal_fiducial.files.bags import BagReader, IMU_TOPIC
 from thermal_fiducial.files.map_keeper import MapKeeper
@@ -23,6 +29,8 @@ from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.trajectory_file import save_tum
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.replay.session import Options, replay
+from thermal_fiducial.ros import clouds, convert
+from thermal_fiducial.ros.node import WARN
 
 
 @contextmanager
@@ -237,6 +245,54 @@ def test_a_map_whose_folder_takes_nothing_is_saved_where_something_can_be(tmp_pa
     assert load_map(saved).markers.keys() == {0, 1}
     assert keeper.save(grown) == keeper.path
     assert keeper.obstacle == ''
+
+
+@pytest.mark.ros
+def test_a_disk_that_is_full_in_flight_is_reported_until_it_takes_the_map_again(tmp_path, homes, monkeypatch, capfd):
+    keeper, grown = learned(tmp_path / 'maps')
+    with ros_graph() as graph:
+        node = graph.add(MarkerMapperNode, live=True, map_file=str(keeper.path), mode='mapping', autosave_period=0.05)
+        node.mapper.map.markers |= grown.markers
+        node.mapper.learn = lambda frame: MapperResult(1, None, '', learned=True)
+        graph.send('thermal/camera_info', info())
+        frame = clouds.cloud(np.zeros(0, MARKER_DTYPE), convert.header(1, 'camera'))
+        failed = f'no autosave: {keeper.path}.autosave: No space left on device'
+        with refused(monkeypatch, tmp_path / 'maps', errno.ENOSPC):
+            graph.send('markers', frame)
+            graph.spin_until(lambda: node.headline() == failed)
+            # Also in seconds in which none is tried.
+            assert graph.diagnose(node)[:2] == (WARN, failed)
+            graph.diagnose(node)
+            saved = graph.call(Trigger, 'marker_mapper/save', Trigger.Request())
+            assert (saved.success, 'No space left on device' in saved.message) == (True, True)
+            assert load_map(homes[0] / 'thermal_fiducial' / 'hall.new.yaml').markers.keys() == {0, 1}
+        graph.send('markers', frame)
+        graph.spin_until(lambda: node.headline() == '')
+        assert load_map(f'{keeper.path}.autosave').markers.keys() == {0, 1}
+        assert graph.call(Trigger, 'marker_mapper/save', Trigger.Request()).message.endswith(f'saved to {keeper.path}')
+        assert sorted(path.name for path in keeper.path.parent.iterdir()) == ['hall.yaml', 'hall.yaml.history']
+        node.close()
+    assert capfd.readouterr().err.count('no autosave') == 1
+
+
+@pytest.mark.ros
+def test_frames_do_not_wait_for_a_disk_that_does_not_answer(tmp_path, homes):
+    """Here it is another program that keeps the lock of the folder for longer than anybody waits."""
+    keeper, grown = learned(tmp_path / 'maps')
+    before = keeper.path.read_bytes()
+    with ros_graph() as graph:
+        node = graph.add(MarkerMapperNode, live=True, map_file=str(keeper.path), mode='mapping')
+        node.mapper.map.markers |= grown.markers
+        with locked(keeper.path):
+            began = time.monotonic()
+            response = graph.call(Trigger, 'marker_mapper/save', Trigger.Request())
+            # Two folders, five seconds each, until the map is saved elsewhere.
+            assert time.monotonic() - began < 5.0
+            assert (response.success, 'the disk is busy' in response.message) == (False, True)
+            assert keeper.path.read_bytes() == before
+        graph.spin_until(lambda: keeper.path.read_bytes() != before)
+        node.close()
+    assert load_map(keeper.path).markers.keys() == {0, 1}
 
 
 @pytest.mark.ros

@@ -124,6 +124,8 @@ def test_a_marker_that_hangs_twice_is_found_by_the_joint_refinement():
     assert result.quarantined == (5,)
     assert 5 not in result.pose.marker_ids
     assert 5 not in m.snapshot().markers
+    alone = m.process(stamp(301) + 1, see(flight(10.0), {5: poses[5]}, 0.05, rng), CAMERA)
+    assert (alone.pose, alone.reason) == (None, 'all known markers in view are in quarantine')
     # It is taken back when it has agreed for a while, and not before.
     for k in range(302, 302 + 30):
         result = m.process(stamp(k), see(flight(10.0), poses, 0.05, rng), CAMERA)

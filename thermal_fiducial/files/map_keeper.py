@@ -13,6 +13,7 @@ from thermal_fiducial.files import map_history
 from thermal_fiducial.files.atomic import locked, write_atomically
 from thermal_fiducial.files.marker_map import dump_map, load_map
 from thermal_fiducial.files.robot_folder import robot_folder
+from thermal_fiducial.files.writing import into
 
 #: A mapper that starts within so many autosave periods of the last autosave resumes it as after a crash.
 RESTART_PERIODS = 2.0
@@ -39,7 +40,8 @@ class MapKeeper:
         self._read = 'nothing'
         self._own_autosave = False
         self._writer: Thread | None = None
-        self._fault = ''
+        #: why the last autosave could not be written; empty if it was
+        self.fault = ''
         #: whether the map has changed since it was loaded or saved
         self.unsaved = False
         #: why the last save could not replace the file; empty if it did
@@ -109,14 +111,14 @@ class MapKeeper:
         """
         self.finish()
         self.obstacle = ''
+        # Set again by what is learned meanwhile.
+        self.unsaved = False
         try:
             self._read = map_history.save_with_history(self.path, marker_map, 'save', self._read)
         except InputError as error:
             self.obstacle = str(error)
-            elsewhere = self._save_elsewhere(marker_map)
-            self.unsaved = False
-            return elsewhere
-        self.unsaved = False
+            return self._save_elsewhere(marker_map)
+        self.fault = ''
         self._retire_autosave()
         return self.path
 
@@ -128,6 +130,7 @@ class MapKeeper:
                 path = folder() / name
                 map_history.save_with_history(path, marker_map, 'save')
                 return path
+        self.unsaved = True
         raise InputError(f'the map is not saved: {self.obstacle}')
 
     def undo(self) -> str:
@@ -141,30 +144,23 @@ class MapKeeper:
         return map_history.undo(self.path).action
 
     def autosave(self, marker_map: MarkerMap) -> None:
-        """Write a copy of a changed map beside its file, in a thread, since disks are slow.
-
-        Raises
-        ------
-        InputError
-            The previous autosave failed.
-        """
-        fault, self._fault = self._fault, ''
+        """Write a copy of a changed map beside its file, in a thread, since disks are slow; see :attr:`fault`."""
         if self._path is not None and self.unsaved and (self._writer is None or not self._writer.is_alive()):
             self._writer = Thread(target=self._autosave, args=(marker_map.copy(),), daemon=True)
             self._writer.start()
-        if fault:
-            raise InputError(fault)
 
     def _autosave(self, marker_map: MarkerMap) -> None:
+        file = map_history.autosave_file(self.path)
         try:
             text = dump_map(marker_map)
-            with locked(self.path):
+            with locked(self.path), into(file):
                 if not self._own_autosave:
                     map_history.put_autosave_aside(self.path)
-                write_atomically(map_history.autosave_file(self.path), text)
-            self._own_autosave = True
-        except (OSError, InputError) as error:
-            self._fault = f'autosave failed: {error}'
+                write_atomically(file, text)
+        except InputError as error:
+            self.fault = f'no autosave: {error}'
+            return
+        self._own_autosave, self.fault = True, ''
 
     def _retire_autosave(self) -> None:
         """After a save delete the own autosave; move one of an earlier mapper into the history."""

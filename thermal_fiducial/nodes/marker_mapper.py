@@ -72,9 +72,13 @@ class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):
         self._map.close()
 
     def state(self) -> tuple[bytes, str]:
-        """Why the last frame gave no pose, another dictionary, quarantined markers, skipped frames."""
+        """Why the last frame gave no pose, doubts about map and file, quarantined markers, skipped frames."""
         left = self._frames.left_since()
-        return map_status.state(self._result, self._map.other_dictionary, frozen=self.mapper.frozen, left=left)
+        return map_status.state(self._result, self._map.doubts, frozen=self.mapper.frozen, left=left)
+
+    def headline(self) -> str:
+        """Doubts about map and file."""
+        return self._map.doubts
 
     def figures(self) -> dict[str, object]:
         """Key-value pairs: size of the map, candidates."""

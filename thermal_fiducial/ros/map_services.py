@@ -1,8 +1,9 @@
 """The map of a mapper and its file: loaded at the start, saved, edited by services, saved at the end."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -20,6 +21,10 @@ from thermal_fiducial.ros.map_refinement import MapRefinement
 from thermal_fiducial.ros.node import StageNode
 
 Answer = Callable[[Trigger.Request, Trigger.Response], Trigger.Response]
+Made = TypeVar('Made')
+
+#: Time for which a service waits for a disk [s]; no frame is processed meanwhile.
+_PATIENCE_S = 1.0
 
 
 class MapServices:
@@ -38,8 +43,8 @@ class MapServices:
         file = Path(config.map_file) if config.map_file else None
         sizes = size_overrides(config.marker_size_overrides)
         self._keeper = MapKeeper(file, config.marker_size, sizes, flown=node.live)
-        #: warning if the map's dictionary differs from the detector's; else empty
-        self.other_dictionary = ''
+        self._disk = ThreadPoolExecutor(1)
+        self._other_dictionary = ''
         self.mapper = MarkerMapper(config, self._first_map())
         self.refinement = MapRefinement(self.mapper, live=node.live)
         for name in ('save', 'load', 'undo', 'reset', 'refine'):
@@ -68,11 +73,30 @@ class MapServices:
             self._node.get_logger().warning(doubt)
         wanted = self._node.config.dictionary
         folder = self._keeper.path.parent
-        self.other_dictionary = other_patterns(loaded.markers, loaded.dictionary, wanted, folder)
+        self._other_dictionary = other_patterns(loaded.markers, loaded.dictionary, wanted, folder)
         return loaded
+
+    @property
+    def doubts(self) -> str:
+        """Warnings: the map's dictionary differs from the detector's, autosaves fail; empty without any."""
+        return '; '.join(filter(None, (self._other_dictionary, self._keeper.fault)))
 
     def _autosave(self) -> None:
         self._node.guard(self._keeper.autosave, self.mapper.map)
+
+    def _in_time(self, act: Callable[[], Made]) -> Made:
+        """Result of what is done to files, which a disk that hangs or another program's lock may delay.
+
+        Raises
+        ------
+        InputError
+            It takes too long; it goes on, and so do the frames.
+        """
+        task = self._disk.submit(act)
+        try:
+            return task.result(_PATIENCE_S)
+        except TimeoutError:
+            raise InputError(f'{self._keeper.path}: the disk is busy; this goes on without an answer') from None
 
     def note_learned(self) -> None:
         """Mark the map as changed since the last save."""
@@ -80,21 +104,25 @@ class MapServices:
 
     def save(self) -> str:
         """Write the map file, or another one if it cannot be replaced; returns a message with path and reason."""
-        path = self._keeper.save(self.mapper.map)
+        marker_map = self.mapper.map.copy()
+        return self._in_time(lambda: self._save(marker_map))
+
+    def _save(self, marker_map: MarkerMap) -> str:
+        path = self._keeper.save(marker_map)
         why = f', as {self._keeper.obstacle}' if self._keeper.obstacle else ''
-        return f'{self.mapper.map.size_in_words} saved to {path}{why}'
+        return f'{marker_map.size_in_words} saved to {path}{why}'
 
     def load(self) -> str:
         """Reload the map file, for example after edits with ``thermal-fiducial map``."""
         self._refuse_frozen()
-        loaded = self._read()
+        loaded = self._in_time(self._read)
         self._publish_jump(self.mapper.load(loaded))
         return f'{loaded.size_in_words} loaded from {self._keeper.path}'
 
     def undo(self) -> str:
         """Restore the previous version of the map file and load it."""
         self._refuse_frozen()
-        return f'undone: {self._keeper.undo()}; {self.load()}'
+        return f'undone: {self._in_time(self._keeper.undo)}; {self.load()}'
 
     def reset(self) -> str:
         """Reset to the map loaded last."""
@@ -136,7 +164,7 @@ class MapServices:
         file = self._node.config.map_file
         lost = not self.mapper.frozen and not Path(file).exists()
         if file and (self._keeper.unsaved or lost) and self.mapper.map.markers:
-            line, logger = self.save(), self._node.get_logger()
+            line, logger = self._save(self.mapper.map), self._node.get_logger()
             if self._keeper.obstacle:
                 logger.warning(line)
             else:

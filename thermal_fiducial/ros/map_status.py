@@ -6,13 +6,13 @@ from thermal_fiducial.core.mapping.map_data import MapperResult, MarkerMap
 from thermal_fiducial.ros.node import OK, WARN
 
 
-def state(result: MapperResult, other_dictionary: str, *, frozen: bool, left: int = 0) -> tuple[bytes, str]:
-    """Diagnostic level and message: why the last frame gave no pose, another dictionary, quarantined markers.
+def state(result: MapperResult, doubts: str, *, frozen: bool, left: int = 0) -> tuple[bytes, str]:
+    """Diagnostic level and message: why the last frame gave no pose, doubts about the map, quarantined markers.
 
     ``left``: frames skipped for newer ones since the last call.
     """
-    if result.reason or other_dictionary:
-        return WARN, '; '.join(filter(None, (result.reason, other_dictionary)))
+    if result.reason or doubts:
+        return WARN, '; '.join(filter(None, (result.reason, doubts)))
     if result.quarantined:
         return WARN, f'quarantined: {_listed(result.quarantined)}'
     if left:

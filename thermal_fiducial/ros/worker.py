@@ -43,8 +43,8 @@ class Foreground(Generic[Task, Result]):
 class Background(Generic[Task, Result]):
     """Runs ``function`` on one task at a time in a spawned process of low priority.
 
-    A process that has ended is replaced with the next task, and so is one that hangs. Whatever waits for it is a thread:
-    a pipe blocks while the process at its other end is stopped.
+    A process that has ended is replaced with the next task, and so is one that hangs. A thread does all that waits for
+    it, since a pipe blocks while the process at its other end is stopped.
 
     Parameters
     ----------

@@ -119,6 +119,8 @@ class MarkerMapper:
             T_expected = None if expected is None else expected.T_map_camera
             running_errors = self._trust.running_errors(sight.markers)
             outcome = locate(stamp_ns, sight, running_errors, camera, T_expected, self._errors)
+        elif len(known.markers):
+            outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
         pose = None if isinstance(outcome, Refusal) or outcome.reason else outcome.pose
