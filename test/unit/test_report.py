@@ -5,11 +5,13 @@ import json
 
 import numpy as np
 import pytest
-from support.run_folders import FIDUCIAL_SIGMA, FUSED_SIGMA, make_run, write_truth_bag
+from support.run_folders import FIDUCIAL_SIGMA, FUSED_SIGMA, make_run, wall, write_truth_bag
 import yaml
 
 from thermal_fiducial.cli.main import main
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.report.evaluation import evaluate
 from thermal_fiducial.report.overview import cards
 from thermal_fiducial.report.page import evaluate_run, write_report
@@ -119,6 +121,19 @@ def test_a_run_in_which_nothing_came_out_has_a_report(tmp_path):
     assert numbers['fused'] == {'poses': 0}
     assert [card.name for card in cards(evaluation, numbers)] == ['Output', 'Markers', 'Drop-outs']
     assert write_report(tmp_path).is_file()
+
+
+def test_a_run_whose_map_stayed_empty_has_a_report(small_run):
+    save_map(small_run / 'map_true.yaml', wall())
+    save_map(small_run / 'marker_map.yaml', MarkerMap())
+    assert 'map' not in evaluate_run(small_run)[1]
+    assert write_report(small_run).is_file()
+
+
+def test_one_shutter_event_is_one_event(run_folder):
+    evaluation, numbers = evaluate_run(run_folder)
+    shutter = next(card for card in cards(evaluation, numbers) if card.name == 'Shutter (FFC)')
+    assert (shutter.value, shutter.unit) == ('1', 'event')
 
 
 def test_a_fused_path_without_any_fiducial_pose(small_run):

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.report import metrics
 from thermal_fiducial.report.availability import at_frames, Available, available
@@ -93,13 +94,20 @@ class Evaluation:
             result['at_frames'] = frames
         if self.available is not None:
             result['as_available'] = self.available.numbers()
-        if self.run.marker_map is not None and self.run.true_map is not None:
-            result['map'] = map_accuracy(self.run.marker_map, self.run.true_map)
+        if (maps := self._comparable_maps()) is not None:
+            result['map'] = map_accuracy(*maps)
         if (known := self.covariances) is not None:
             result['fused']['consistency'] = _consistency(*known)
         if len(self.run.output.innovations.nis):
             result['innovations'] = metrics.innovation_consistency(self.run.output.innovations)
         return result
+
+    def _comparable_maps(self) -> tuple[MarkerMap, MarkerMap] | None:
+        """Map of the run and the true one; None without either, or without a common marker (no pose ever went out)."""
+        estimate, truth = self.run.marker_map, self.run.true_map
+        if estimate is None or truth is None or not estimate.markers.keys() & truth.markers.keys():
+            return None
+        return estimate, truth
 
     def _markers(self) -> dict[str, Any]:
         detections, marker_map = self.run.detections, self.run.marker_map

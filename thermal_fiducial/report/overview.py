@@ -92,7 +92,8 @@ def _shutter(evaluation: Evaluation) -> Card | None:
     if not events:
         return None
     longest = max(entry.seconds for entry in events)
-    return Card('Shutter (FFC)', str(len(events)), 'events', f'the longest {longest:.2f} s')
+    unit = 'event' if len(events) == 1 else 'events'
+    return Card('Shutter (FFC)', str(len(events)), unit, f'the longest {longest:.2f} s')
 
 
 def _drop_outs(evaluation: Evaluation) -> Card:
