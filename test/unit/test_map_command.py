@@ -193,7 +193,7 @@ def test_refine_takes_the_calibration_of_the_run(path, poses, photographed, caps
     photographed[0].rename(folder / 'detections.csv')
     save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0])}))
     assert run('--marker-size', SIZE, 'refine', path, folder) == 2
-    assert 'is to be found: name a --calibration' in capsys.readouterr().err
+    assert 'is found: give --calibration' in capsys.readouterr().err
     # From its bag.
     recording = small_bag.recording(seconds=0.1)
     recording.write(folder / 'bag')
@@ -224,7 +224,7 @@ def test_refine_never_guesses_the_side_of_a_marker(path, poses, tmp_path, capsys
     status = run('refine', path, folder, '--calibration', folder / 'camera.yaml')
     if said == 'by nobody':
         assert status == 2
-        assert 'have no known side: say --marker-size' in capsys.readouterr().err
+        assert 'have no known side: give --marker-size' in capsys.readouterr().err
         return
     assert status == 0
     refined = load_map(path)

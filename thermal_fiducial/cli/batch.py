@@ -12,28 +12,32 @@ from thermal_fiducial.files.bags import parse_remaps
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument('bags', type=Path, nargs='+', metavar='BAG', help='as for replay')
-    parser.add_argument('--out', type=Path, required=True, metavar='FOLDER', help='for a run folder a bag and the map')
+    parser.add_argument(
+        '--out', type=Path, required=True, metavar='FOLDER', help='gets a run folder for each bag, and the map'
+    )
     parser.add_argument('--map', type=Path, required=True, metavar='FILE', help='marker map to start from')
     parser.add_argument(
         '--params', type=Path, metavar='FILE', help="ROS parameter file (default: the nodes' own values)"
     )
     parser.add_argument(
-        '--mode', choices=('mapping', 'localization'), help='of each replay (default: mode of --params)'
+        '--mode', choices=('mapping', 'localization'), help='mode of each replay (default: mode of --params)'
     )
     where = parser.add_mutually_exclusive_group()
-    where.add_argument('--workers', type=int, default=1, metavar='N', help='processes of this machine')
+    where.add_argument('--workers', type=int, default=1, metavar='N', help='number of processes on this machine')
     where.add_argument(
         '--scheduler',
         default='',
         metavar='ADDRESS',
-        help='of a Dask cluster that sees the same files, tcp://HOST:8786 (default: this machine)',
+        help='Dask cluster with access to the same files, tcp://HOST:8786 (default: this machine)',
     )
-    parser.add_argument('--max-frames', type=int, default=1000, metavar='N', help='frames of all bags in the joint map')
-    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bags')
+    parser.add_argument(
+        '--max-frames', type=int, default=1000, metavar='N', help='largest number of frames for the joint map'
+    )
+    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='rename a topic of the bags')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay, adjust, say what came of it."""
+    """Replay the bags, adjust the joint map, print a summary."""
     if not (1 <= args.workers <= 256 and args.max_frames >= 1):
         raise InputError('--workers is between 1 and 256, --max-frames at least 1')
     try:

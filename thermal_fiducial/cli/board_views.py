@@ -1,4 +1,4 @@
-"""Views of a calibration board, from pictures or a bag: those that are kept, and why others are not."""
+"""Views of a calibration board in pictures or a bag: the usable ones, and the reasons against the others."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -18,18 +18,19 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 
-# A view of a bag must have moved by this much since the last one kept, and by less than that to the next frame [px].
+# Least motion of the board since the last view kept of a bag, and largest motion until the next frame [px].
 _NEW_VIEW_PX, _STILL_PX = 12.0, 0.7
 
 
 @dataclass
 class BoardViews:
-    """Views of the board as they come in.
+    """Views of the board, collected frame by frame.
 
     Parameters
     ----------
     target : the board; None where its points were measured elsewhere
-    kept, unusable : views, and name and reason of frames that are none
+    kept : usable views
+    unusable : name of each other frame, and why it is unusable
     size : width and height of the image [px]
     """
 
@@ -39,7 +40,7 @@ class BoardViews:
     size: tuple[int, int] = (0, 0)
 
     def find(self, frame: RawFrame, camera: Camera) -> Sighting | None:
-        """The board in a frame; None, with the reason noted, where there is none."""
+        """The board in a frame; None if it is not found, and the reason is kept in ``unusable``."""
         height, width = frame.counts.shape
         if self.kept and self.size != (width, height):
             reason = f'{width}x{height} pixels, the views before it have {self.size[0]}x{self.size[1]}'
@@ -54,22 +55,22 @@ class BoardViews:
             return None
 
     def keep(self, frame: RawFrame, sighting: Sighting) -> None:
-        """Use a view, and say how much of the image is covered by now."""
+        """Keep a view, and print how much of the image the views cover."""
         self.kept.append(BoardView(frame.name, sighting, frame.counts))
         cells = self.covered()
         print(f'{frame.name}: {len(sighting.pixels)} points; {np.sum(cells > 0)} of {cells.size} cells covered')
 
     def covered(self) -> np.ndarray:
-        """Points in each cell of the image."""
+        """Number of points in each cell of the image."""
         return coverage(np.concatenate([view.sighting.pixels for view in self.kept]), *self.size)
 
     def require(self, source: Path) -> None:
-        """Refuse too few views, with the reasons of those that are none.
+        """Require enough views; the error lists the reasons against the unusable frames.
 
         Raises
         ------
         InputError
-            Fewer than a calibration needs.
+            There are fewer views than a calibration needs.
         """
         if len(self.kept) >= LEAST_VIEWS:
             return
@@ -83,7 +84,7 @@ class BoardViews:
         raise InputError('; '.join([text, *named]))
 
     def look_again(self, camera: Camera) -> None:
-        """Find the board once more in all frames, now that the camera is known."""
+        """Find the board again in all views, with the calibrated camera."""
         assert self.target is not None
         for index, view in enumerate(self.kept):
             if view.counts is None:
@@ -94,14 +95,14 @@ class BoardViews:
                 continue
 
     def solve(self, models: Sequence[str], focal_px: float) -> tuple[Calibration, dict[str, Calibration]]:
-        """The best lens, and the best of every model."""
+        """The best calibration, and the best of each lens model."""
         radius = 0.0 if self.target is None else self.target.radius
         sightings = [view.sighting for view in self.kept]
         return choose_model(sightings, *self.size, models, radius=radius, focal_px=focal_px)
 
 
 def look_at_pictures(source: Path, views: BoardViews, focal_px: float, most: int) -> None:
-    """Each picture of a folder, until there are ``most`` views."""
+    """Look for the board in the pictures of a folder until there are ``most`` views."""
     for index, path in enumerate(pictures(source)):
         if len(views.kept) == most:
             return
@@ -120,7 +121,7 @@ def look_at_pictures(source: Path, views: BoardViews, focal_px: float, most: int
 
 
 def look_at_bag(bag: BagReader, views: BoardViews, focal_px: float, most: int, every: int) -> None:
-    """Every n-th frame of a bag where the board stands still and elsewhere than before."""
+    """Look in every n-th frame of a bag for the board, at rest and in a new place."""
     pending: tuple[RawFrame, Sighting] | None = None
     frames = tracked(clean_frames(bag), 'looking for the board', bag.message_count([bag.image_topic]))
     for index, frame in enumerate(frames):
@@ -150,7 +151,7 @@ def _is_new(sighting: Sighting, kept: Sequence[BoardView]) -> bool:
 
 
 def _distance(a: Sighting, b: Sighting) -> float:
-    """Mean distance of the points that both show [px]; infinite when they share none."""
+    """Mean distance of the common points [px]; infinite without common points."""
     there = {tuple(point): pixel for point, pixel in zip(a.points.tolist(), a.pixels, strict=True)}
     both = [
         (there[tuple(point)], pixel)

@@ -64,7 +64,7 @@ def _add_camera_imu(parser: argparse.ArgumentParser) -> None:
 
 
 def _camera_imu(args: argparse.Namespace) -> int:
-    # Half a second of loading that the other calibrations need not wait for.
+    # Takes half a second to import, which the other calibrations do not need.
     from thermal_fiducial.calibration.camera_imu import calibrate_rolling_camera_imu
 
     noise = ImuNoise(
@@ -86,7 +86,7 @@ def _camera_imu(args: argparse.Namespace) -> int:
 
 
 def _mapped_corners(frames: Iterable[RawFrame], marker_map: MarkerMap, camera: Camera) -> Iterator['FrameCorners']:
-    """Markers of the map in each frame that shows any."""
+    """Detections of mapped markers, frames without any left out."""
     from thermal_fiducial.calibration.rolling import FrameCorners
 
     detector = mapped_detector(marker_map)
@@ -106,7 +106,7 @@ def _percent(result: 'CameraImuCalibration', places: tuple[int, ...]) -> str:
 
 
 def _extrinsics_text(result: 'CameraImuCalibration') -> str:
-    """Parameter file of the nodes, with what is known of the errors as comments."""
+    """Parameter file of the nodes, with the errors of the values as comments."""
     q = se3.quaternion_from_rotation(result.T_body_camera[:3, :3])
     p = result.T_body_camera[:3, 3]
     sigma = np.sqrt(np.diag(result.covariance))

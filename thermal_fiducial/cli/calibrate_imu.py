@@ -14,7 +14,7 @@ from thermal_fiducial.files.writing import write_text
 if TYPE_CHECKING:
     from thermal_fiducial.calibration.allan_deviation import AllanFit, ImuNoiseFit
 
-#: With less than this [s] at rest a random walk is hardly seen beside the white noise.
+#: Shortest recording at rest [s] in which a random walk exceeds the white noise.
 _LONG_S = 600.0
 #: Averaging times whose deviation is printed [s].
 _SHOWN = (0.01, 0.1, 1.0, 10.0, 100.0, 1000.0)
@@ -29,8 +29,8 @@ def add_imu(parser: argparse.ArgumentParser) -> None:
 
 
 def calibrate_imu(args: argparse.Namespace) -> int:
-    """Read, fit, write, show."""
-    # allantools takes a second to load, which the other calibrations need not wait for.
+    """Fit noise densities to a recording, write and print them."""
+    # allantools takes a second to import, which the other calibrations do not need.
     from thermal_fiducial.calibration.allan_deviation import fit_noise
 
     with BagReader(args.bag, parse_remaps(args.remap)) as bag:

@@ -1,4 +1,4 @@
-"""``calibrate intrinsics``: camera_info from thermal views of a board, or from points that were measured elsewhere."""
+"""``calibrate intrinsics``: camera_info from thermal views of a board, or from measured points."""
 
 import argparse
 from pathlib import Path
@@ -81,7 +81,7 @@ def _intrinsics(args: argparse.Namespace) -> int:
     views.require(args.source)
     result, fits = views.solve(models, args.focal_px)
     if isinstance(views.target, MarkerBoard):
-        # The first search refined its corners without the lens.
+        # The first search refined the corners without knowledge of the distortion.
         views.look_again(result.camera)
         result, fits = views.solve(models, args.focal_px)
     error = image_error(result.camera, result.covariance, [views.kept[k].sighting for k in result.views.tolist()])
@@ -110,7 +110,7 @@ def _views(args: argparse.Namespace) -> BoardViews:
 
 
 def _target(args: argparse.Namespace) -> Target:
-    # As markers board has it where nothing is said.
+    # The default of ``markers board``.
     millimetres = args.spacing or (25.0 if args.target == 'circles' else 50.0)
     spacing, diameter = 1e-3 * millimetres, 1e-3 * args.diameter
     if args.target == 'chessboard':
@@ -137,14 +137,14 @@ def _place(text: str) -> tuple[int, int]:
 
 
 def mapped_detector(board: MarkerMap) -> MarkerDetector:
-    """Detector of the markers of a map."""
+    """Detector with the markers of ``board`` as its map."""
     detector = MarkerDetector(ArucoDetectorConfig(dictionary=board.dictionary), load_dictionary(board.dictionary))
     detector.set_map(board.geometry())
     return detector
 
 
 def _save_covariance(out: Path, result: Calibration, error: ImageError) -> None:
-    """Next to the calibration, which has no place for it."""
+    """Write the covariance beside the calibration, whose format has no field for it."""
     path = out.with_name(f'{out.stem}_covariance.yaml')
     rows = result.parameter_rows()
     document = {

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Check and print. 0: no fault; 1: an autopilot would not fly on it."""
+    """Check and print the findings; returns 1 if an autopilot would reject the odometry, else 0."""
     findings: list[Finding] = []
     if args.recording is not None:
         record = read_bridge(args.recording, args.topic, args.imu)

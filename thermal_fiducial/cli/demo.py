@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 SCENARIO = 'fog'
 BAG = 'flight_through_fog'
 LONGEST_S = 3600.0
-#: Stands in the folder of a demo: only such a folder is ever replaced.
+#: Marker file in the folder of a demo: no other folder is replaced.
 MARK = '.thermal_fiducial_demo'
-#: What the replay imports of ROS.
+#: ROS packages that the replay imports.
 ROS_PACKAGES = ('rclpy', 'sensor_msgs', 'geometry_msgs', 'diagnostic_msgs')
 
 
@@ -31,13 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     parser.add_argument('--out', type=Path, default=Path('runs/demo'), metavar='RUN', help='folder')
     parser.add_argument('--seconds', type=float, default=30.0, help='length of the flight [s], 11 or more')
-    parser.add_argument('--seed', type=int, default=0, help='of path and noise')
+    parser.add_argument('--seed', type=int, default=0, help='seed of path and noise')
     parser.add_argument('--picture', type=Path, metavar='PNG', help='also draw frame, map and error into one picture')
     parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate, replay, score, report."""
+    """Simulate a flight, replay it, evaluate it, write the report."""
     if not 0.0 < args.seconds <= LONGEST_S:
         raise InputError(f'--seconds {args.seconds:g} is not between 0 and {LONGEST_S:g}')
     _check_packages(args)
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_packages(args: argparse.Namespace) -> None:
-    """Say what is missing before minutes of work."""
+    """Report missing packages before minutes of work."""
     require_packages(tables=True)
     missing = [name for name in ROS_PACKAGES if not is_installed(name)]
     if missing:
@@ -77,7 +77,7 @@ def _check_packages(args: argparse.Namespace) -> None:
 
 
 def _make_room(out: Path) -> None:
-    """An empty folder ``out``, in the place of an earlier demo if there is one."""
+    """Create the empty folder ``out``; an earlier demo in its place is removed."""
     if out.exists() and not (out / MARK).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f'{out} exists and is no earlier demo: choose another folder with --out')
     try:

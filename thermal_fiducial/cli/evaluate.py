@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--truth-map', type=Path, metavar='FILE', help='the map as it really is (default: map_true.yaml beside it)'
     )
-    parser.add_argument('--bag', type=Path, help='the bag with the frames (default: where it was when it was replayed)')
+    parser.add_argument('--bag', type=Path, help='the bag with the frames (default: where it was during the replay)')
     parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
     parser.add_argument('--json', action='store_true', help='print the measures as JSON instead of tables')
     parser.add_argument('--no-report', action='store_true', help='write no report.html')
@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Measure, print, write ``summary.json`` and ``report.html``."""
+    """Evaluate a run, print the tables, write ``summary.json`` and ``report.html``."""
     if args.compare:
         return _compare(args)
     if len(args.folders) > 1:
@@ -90,7 +90,7 @@ def _compare(args: argparse.Namespace) -> int:
 
 
 def print_tables(shown: Iterable[Table]) -> None:
-    """Print tables to the terminal, one that is wider below one another in parts.
+    """Print tables to the terminal; tables that are too wide are split into parts.
 
     Raises
     ------
@@ -107,7 +107,7 @@ def print_tables(shown: Iterable[Table]) -> None:
 
 
 def _parts(entry: Table) -> Iterator[Table]:
-    """Tables of as many columns as fit, each with what its rows are about."""
+    """Tables with as many columns as fit, each with the columns that name its rows."""
     from thermal_fiducial.cli.terminal_tables import fits
 
     about = [column for column, head in enumerate(entry.heads[:2]) if column == 0 or head == 'unit']
@@ -128,7 +128,7 @@ def _for_terminal(entry: Table) -> Any:
 
     table = table_of(entry.title, ())
     for index, head in enumerate(entry.heads):
-        # What a row is about stays whole; heads of numbers wrap.
+        # Names of rows do not wrap; headers of numbers do.
         whole = index == 0 and max((len(row[0]) for row in entry.rows), default=0) <= _WHOLE
         style = 'blue' if head.startswith('fused') else 'red' if head.startswith('markers alone') else ''
         justify: Literal['left', 'right'] = 'left' if entry.is_text(index) else 'right'

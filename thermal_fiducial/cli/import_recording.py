@@ -4,7 +4,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.progress import counted, progress_bar
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_writer import STORAGES
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -26,22 +26,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('folder', type=Path, metavar='FOLDER', help='the recording')
     parser.add_argument('--out', type=Path, required=True, metavar='BAG', help='folder to create')
-    parser.add_argument('--camera', default='cam0', help='which of the cameras (default: cam0)')
+    parser.add_argument('--camera', default='cam0', help='name of the camera (default: cam0)')
     parser.add_argument('--camchain', type=Path, metavar='YAML', help="Kalibr's camchain (default: in the folder)")
     parser.add_argument('--imu', type=Path, metavar='YAML', help="Kalibr's IMU file (default: in the folder)")
     parser.add_argument(
         '--marker-size', type=float, metavar='M', help='side of the markers, for corners [m] (default: of rig.yaml)'
     )
-    parser.add_argument('--dictionary', metavar='NAME', help='of the markers (default: of rig.yaml)')
+    parser.add_argument('--dictionary', metavar='NAME', help='dictionary of the markers (default: of rig.yaml)')
     parser.add_argument(
-        '--sigma-px', type=float, default=0.3, help='standard deviation of corners that come without (default: 0.3)'
+        '--sigma-px',
+        type=float,
+        default=0.3,
+        help='standard deviation of corners without one of their own [px] (default: 0.3)',
     )
-    parser.add_argument('--late', type=float, default=0.0, metavar='S', help='frames arrive so late (default: 0)')
-    parser.add_argument('--storage', choices=sorted(STORAGES), default='mcap', help='of the bag (default: mcap)')
+    parser.add_argument('--late', type=float, default=0.0, metavar='S', help='delay of the frames (default: 0)')
+    parser.add_argument(
+        '--storage', choices=sorted(STORAGES), default='mcap', help='storage of the bag (default: mcap)'
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, write, say how to replay."""
+    """Read the recording, write the bag, print how to replay it."""
     if args.marker_size is not None and not 0.0 < args.marker_size <= LARGEST_MARKER_M:
         raise InputError(f'--marker-size {args.marker_size:g} is not between 0 and {LARGEST_MARKER_M:g} m')
     if not (0.0 < args.sigma_px < 100.0 and 0.0 <= args.late < 10.0):
@@ -55,17 +60,12 @@ def run(args: argparse.Namespace) -> int:
     if rig.dictionary:
         load_dictionary(rig.dictionary)
     recording = replace(recording, rig=rig)
-    total, done = max(frame_count(recording), 1), 0
+    frames = frame_count(recording)
     with progress_bar(f'import {args.folder.name}') as share:
-
-        def advance(frames: int) -> None:
-            nonlocal done
-            done += frames
-            share(done / total)
-
+        advance = counted(share, max(frames, 1))
         write_recording(args.out, recording, args.sigma_px, args.late, args.storage, advance)
     print(
-        f'{args.out}: {len(recording.samples)} IMU samples, {done} frames\n'
+        f'{args.out}: {len(recording.samples)} IMU samples, {frames} frames\n'
         f'replay it with: thermal-fiducial replay {args.out} --params {args.out}/params.yaml --map MAP --out RUN'
     )
     return 0

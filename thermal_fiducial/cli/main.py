@@ -1,4 +1,4 @@
-"""Entry point: chooses the command, turns unusable input into one line and exit status 2."""
+"""Entry point: runs a command, and reports unusable input in one line with exit status 2."""
 
 import argparse
 from collections.abc import Sequence
@@ -15,31 +15,31 @@ from thermal_fiducial.errors import InputError, RunError
 PROGRAM = 'thermal-fiducial'
 INSTALL_HINT = "pip install '.[tools,ros]' in the package's folder, or apt on the robot"
 
-#: Command to what it does. Module ``cli/<command>.py`` has ``add_arguments(parser)`` and ``run(args) -> int``; it is
-#: imported only when its command is called, so that each starts fast and needs only its own extras.
+#: Commands and their descriptions. Module ``cli/<command>.py`` has ``add_arguments(parser)`` and ``run(args) -> int``;
+#: it is imported only when its command is called, so that each starts fast and needs only its own packages.
 COMMANDS = {
     'demo': 'simulate a flight through fog, replay it through the four nodes, score it, write the report',
     'simulate': 'write a synthetic thermal bag with ground truth',
     'replay': 'play a recorded bag through the four nodes',
-    'batch': 'replay many bags on many workers, and one map of all',
-    'import': "a bag from a recording of CSV files: ours, EuRoC's or Kalibr's",
-    'evaluate': 'errors against ground truth, jitter, consistency, latency; tables and plots',
+    'batch': 'replay many bags on many workers, and make one map of them',
+    'import': "convert a recording of CSV files (ours, EuRoC's or Kalibr's) to a bag",
+    'evaluate': 'evaluate a run: errors against ground truth, jitter, consistency, latency; tables and plots',
     'map': 'show, check, edit, merge, refine and align marker maps',
     'markers': 'make markers that can be cut: dictionaries, drawings, planning',
     'calibrate': 'calibrate the thermal camera, camera against IMU, and noise of the IMU',
-    'watch': 'whether the pose may be flown on, live in a terminal',
+    'watch': 'show live in a terminal whether the pose may be flown on',
     'check-bridge': 'verify what a flight controller would receive',
 }
 
-#: What a file system refuses: full, read-only, not allowed, broken. Nobody can do anything about it here.
+#: Errors of a file system that is full, read-only, not permitted or broken.
 _REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
 
-#: Commands whose module cannot have their name.
+#: Modules of commands with a name that no module can have.
 MODULES = {'import': 'import_recording'}
 
 
 class _Help(argparse.HelpFormatter):
-    """Says what every option is when it is left out, unless its text does; a text of several lines keeps them."""
+    """Adds the default to the help of each option that does not mention it; keeps the lines of long texts."""
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         default = action.default
@@ -58,7 +58,7 @@ class _Help(argparse.HelpFormatter):
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser of the program, and of each of its commands, since argparse makes those of the same class."""
+    """Parser of the program; argparse uses the same class for its commands."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{'formatter_class': _Help, **options})
@@ -76,53 +76,61 @@ def main(argv: Sequence[str] | None = None) -> int:
     Exit status: 0 done, 1 something failed on the way, 2 wrong usage or unusable input, 130 interrupted.
     """
     argv = sys.argv[1:] if argv is None else list(argv)
-    _print_any_name()
-    command = argv[0] if argv else ''
+    _allow_any_letter()
+    try:
+        status = _run(argv)
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        _discard_output()
+        return 0
+    except (InputError, RunError, ImportError, OSError, KeyboardInterrupt) as error:
+        found = _reported(error)
+        if found is None:
+            raise
+        status, words = found
+        print(f'{PROGRAM} {argv[0] if argv else ""}: {words}', file=sys.stderr)
+        return status
+
+
+def _run(argv: Sequence[str]) -> int:
+    """Parse the arguments and run their command."""
     parser = _Parser(
         prog=PROGRAM, description='Thermal-inertial localization from acrylic markers, for drones in smoke and fog.'
     )
     parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')
     subparsers = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
     choices = {name: subparsers.add_parser(name, help=text, description=text) for name, text in COMMANDS.items()}
-    try:
-        if command in choices:
-            module = import_module(f'thermal_fiducial.cli.{MODULES.get(command, command.replace("-", "_"))}')
-            module.add_arguments(choices[command])
-        args = parser.parse_args(argv)
-        status = int(module.run(args))
-        sys.stdout.flush()
-        return status
-    except InputError as error:
-        print(f'{PROGRAM} {command}: {error}', file=sys.stderr)
-        return 2
-    except RunError as error:
-        print(f'{PROGRAM} {command}: {error}', file=sys.stderr)
-        return 1
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition('.')[0] == 'thermal_fiducial':
-            raise
-        print(f'{PROGRAM} {command}: needs the Python package {error.name}: {INSTALL_HINT}', file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        print(f'{PROGRAM} {command}: interrupted', file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        _let_go_of_output()
-        return 0
-    except OSError as error:
-        if error.errno not in _REFUSED:
-            raise
-        _let_go_of_output()
-        print(f'{PROGRAM} {command}: {error.filename or "output"}: {error.strerror}', file=sys.stderr)
-        return 2
+    command = argv[0] if argv else ''
+    if command not in choices:
+        # Prints the help, the version or an error, and ends the process.
+        parser.parse_args(argv)
+        parser.error('the command comes first')
+    module = import_module(f'thermal_fiducial.cli.{MODULES.get(command, command.replace("-", "_"))}')
+    module.add_arguments(choices[command])
+    return int(module.run(parser.parse_args(argv)))
 
 
-def _print_any_name() -> None:
-    """A terminal that has no letter for a name shows another one in its place."""
+def _reported(error: BaseException) -> tuple[int, str] | None:
+    """Exit status and message for an error that a user can act upon; None for others, which need their traceback."""
+    if isinstance(error, InputError | RunError):
+        return 2 if isinstance(error, InputError) else 1, str(error)
+    if isinstance(error, KeyboardInterrupt):
+        return 130, 'interrupted'
+    if isinstance(error, ModuleNotFoundError) and error.name and error.name.partition('.')[0] != 'thermal_fiducial':
+        return 2, f'needs the Python package {error.name}: {INSTALL_HINT}'
+    if isinstance(error, OSError) and error.errno in _REFUSED:
+        _discard_output()
+        return 2, f'{error.filename or "output"}: {error.strerror}'
+    return None
+
+
+def _allow_any_letter() -> None:
+    """Let names with letters that the terminal does not have be printed with substitutes."""
     if isinstance(sys.stdout, TextIOWrapper) and sys.stdout.errors == 'strict':
         sys.stdout.reconfigure(errors='replace')
 
 
-def _let_go_of_output() -> None:
-    """What is still to be written would fail again when the process ends."""
+def _discard_output() -> None:
+    """Discard unwritten output, which would fail again when the process ends."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -41,19 +41,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='PNG',
         help='picture of the map from above, from the side and from the front, with uncertainties',
     )
-    _command(commands, 'check', 'what is doubtful about a map; exit status 1 if anything is', _check)
+    _command(commands, 'check', 'check a map for implausible entries; exit status 1 if there are any', _check)
     for name, fixed in (('fix', True), ('unfix', False)):
-        action = _command(commands, name, f'declare markers {"fixed: they never move" if fixed else "free"}', _fix)
+        action = _command(
+            commands, name, f'declare markers {"fixed, so that they never move" if fixed else "free to move"}', _fix
+        )
         action.add_argument('ids', type=int, nargs='+', metavar='ID', help='markers of the map')
         action.set_defaults(fixed=fixed)
     _add_editing(commands)
     _command(commands, 'history', 'earlier versions of a map', _history)
-    _command(commands, 'undo', 'put the latest earlier version back, or take up a map that was never saved', _undo)
-    _command(commands, 'upgrade', 'rewrite a map from before 0.2, whose version counted its changes', _upgrade)
-    map_sources.add_build(commands.add_parser('build', help='a map from a folder of photos in any order'))
+    _command(commands, 'undo', 'restore the previous version, or an autosaved map', _undo)
+    _command(commands, 'upgrade', 'convert a map from before 0.2 to the present format', _upgrade)
+    map_sources.add_build(commands.add_parser('build', help='make a map from a folder of photos in any order'))
     map_sources.add_refine(commands.add_parser('refine', help='adjust a map to the detections of a run'))
-    map_comparison.add_error(commands.add_parser('error', help='how far a map lies from the true one'))
-    map_cloud.add_align(commands.add_parser('align', help='hold a map against a point cloud of the place'))
+    map_comparison.add_error(commands.add_parser('error', help='compare a map with the true one'))
+    map_cloud.add_align(commands.add_parser('align', help='align a map to a point cloud of the place'))
     for action in commands.choices.values():
         add_sizes(action, behind=True)
 
@@ -76,27 +78,29 @@ def _command(
 
 
 def _add_editing(commands: Commands) -> None:
-    move = _command(commands, 'move', 'put a marker somewhere else', _move)
+    move = _command(commands, 'move', 'set the pose of a marker', _move)
     move.add_argument('id', type=int, metavar='ID', help='marker of the map')
     move.add_argument(
-        '--position', type=float, nargs=3, required=True, metavar=('X', 'Y', 'Z'), help='of its centre [m]'
+        '--position', type=float, nargs=3, required=True, metavar=('X', 'Y', 'Z'), help='position of its centre [m]'
     )
     move.add_argument('--orientation', type=float, nargs=4, metavar=('QX', 'QY', 'QZ', 'QW'), help='default: as it is')
-    move.add_argument('--sigma', type=float, default=0.005, metavar='M', help='how well that is known')
-    move.add_argument('--sigma-deg', type=float, default=1.0, metavar='DEG', help='and its orientation')
+    move.add_argument('--sigma', type=float, default=0.005, metavar='M', help='standard deviation of the position')
+    move.add_argument(
+        '--sigma-deg', type=float, default=1.0, metavar='DEG', help='standard deviation of the orientation'
+    )
     rename = _command(commands, 'rename', 'give a marker another ID', _rename)
     rename.add_argument('old', type=int, metavar='OLD', help='ID that it has')
     rename.add_argument('new', type=int, metavar='NEW', help='ID that no other marker has')
-    delete = _command(commands, 'delete', 'take markers out', _delete)
+    delete = _command(commands, 'delete', 'remove markers', _delete)
     delete.add_argument('ids', type=int, nargs='+', metavar='ID', help='markers of the map')
-    merge = _command(commands, 'merge', 'take over the markers of another map, by the ones in common', _merge)
+    merge = _command(commands, 'merge', 'add the markers of another map, aligned by the markers in common', _merge)
     merge.add_argument('other', type=Path, metavar='OTHER', help='map file with markers in common')
     merge.add_argument('--out', type=Path, metavar='FILE', help='default: MAP itself')
     anchor = _command(commands, 'anchor', 'move the whole map onto surveyed markers', _anchor)
     anchor.add_argument(
         'survey', type=Path, metavar='CSV', help='lines "id,x,y,z": centres of three markers or more [m]'
     )
-    anchor.add_argument('--fix', action='store_true', help='and declare those markers fixed')
+    anchor.add_argument('--fix', action='store_true', help='also declare those markers fixed')
 
 
 def _load(args: argparse.Namespace, path: Path | None = None) -> MarkerMap:
@@ -104,20 +108,20 @@ def _load(args: argparse.Namespace, path: Path | None = None) -> MarkerMap:
 
 
 def _edit(args: argparse.Namespace, action: str, change: Callable[[MarkerMap], MarkerMap]) -> int:
-    """Change the map where nobody else can do so meanwhile."""
+    """Change the map file; if it changes meanwhile, apply the change to its new contents."""
     while True:
         read = map_history.digest(args.map)
         before = _load(args)
         edited = change(before)
         if dump_map(edited) == dump_map(replace(before, revision=edited.revision)):
-            # A version for each time that somebody says the same would push those that differ out of the history.
-            print(f'{args.map}: {action}: it is so already')
+            # An unchanged version would push a different one out of the history.
+            print(f'{args.map}: {action}: nothing to change')
             return 0
         try:
             map_history.save_with_history(args.map, edited, action, read)
             break
         except map_history.ChangedMeanwhileError:
-            # An edit says what to do, not what comes out: on top of what another one has made it is as good.
+            # The edit is applied to the new contents.
             continue
     print(f'{args.map}: {action}; revision {edited.revision}, {edited.size_in_words}')
     return 0
@@ -149,7 +153,7 @@ def _show(args: argparse.Namespace) -> int:
 
 
 def _facing(normal: FloatArray) -> str:
-    """Where a marker looks, in words: the nearest axis, and how far off it is."""
+    """Direction of a marker's normal: the nearest axis, and the angle to it."""
     axis = int(np.argmax(np.abs(normal)))
     off = np.rad2deg(np.arccos(np.clip(abs(normal[axis]), -1.0, 1.0)))
     return f'{"-" if normal[axis] < 0 else "+"}{"xyz"[axis]}' + (f' {off:.0f}°' if off >= 0.5 else '')

@@ -14,7 +14,7 @@ from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.point_cloud import load_cloud, save_alignment, thinned
 from thermal_fiducial.map_tools.cloud_alignment import align_to_cloud, CloudAlignment
 
-# Points of the cloud in the picture: more make it no clearer.
+# Largest number of points in the picture; more would not be visible.
 _DRAWN = 200_000
 
 
@@ -31,8 +31,8 @@ def add_align(parser: argparse.ArgumentParser) -> None:
         help='rough pose of the map in the cloud (default: the same frame)',
     )
     parser.add_argument('--reach', type=float, default=0.5, metavar='M', help='how rough that may be')
-    parser.add_argument('--out', type=Path, metavar='YAML', help='write the transform here')
-    parser.add_argument('--plot', type=Path, metavar='PNG', help='draw map and cloud together')
+    parser.add_argument('--out', type=Path, metavar='YAML', help='file for the transform')
+    parser.add_argument('--plot', type=Path, metavar='PNG', help='draw map and cloud into a picture')
     parser.set_defaults(do=_align)
 
 
@@ -71,6 +71,6 @@ def _print_result(alignment: CloudAlignment) -> None:
     if alignment.without_surface:
         print(f'no surface near markers {", ".join(map(str, alignment.without_surface))}')
     if alignment.open_directions:
-        print(f'the surfaces leave {alignment.open_directions} of 6 directions open: there the initial pose stands')
+        print(f'the surfaces leave {alignment.open_directions} of 6 directions open: in these the initial pose is kept')
     position, q = alignment.T[:3, 3], quaternion_from_rotation(alignment.T[:3, :3])
     print('map in cloud: position', *(f'{v:.4f}' for v in position), 'orientation', *(f'{v:.6f}' for v in q))

@@ -1,4 +1,4 @@
-"""A marker map drawn from above and from the side."""
+"""Drawings of a marker map from above, from the side and from the front."""
 
 from pathlib import Path
 
@@ -15,14 +15,14 @@ from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.writing import new_file
 
-# Axes that point right and up, as seen from above and along y.
+# Axes that point right and up in the views from above and along y.
 _VIEWS = (('from above', 0, 1), ('from the side, along y', 0, 2))
 _STATUSES = {'fixed': 'black', 'free': 'tab:blue', 'in quarantine': 'tab:red'}
-#: Millimetres would not be seen in a drawing of metres.
+#: Enlargement of the ellipses: millimetres would be invisible beside metres.
 _ENLARGED = 20.0
-#: Along the whole width of a view, of labels of four digits.
+#: Number of labels of four digits that fit into the width of a view.
 _MOST_TICKS = 7
-#: After three, nothing moves by a pixel any more in drawings of walls, rooms and halls.
+#: Passes of the layout: after three nothing moves by a pixel in drawings of walls, rooms and halls.
 _LAYOUT_STEPS = 3
 
 
@@ -32,7 +32,7 @@ def plot_map(marker_map: MarkerMap, path: Path, cloud: FloatArray | None = None)
     Raises
     ------
     InputError
-        The file can't be written.
+        The file cannot be written.
     """
     figure = draw_map(marker_map, cloud)
     with new_file(path) as new:
@@ -53,28 +53,28 @@ def draw_map(marker_map: MarkerMap, cloud: FloatArray | None = None) -> Figure:
             _draw(axis, marker, i, j)
         axis.set(title=title, xlabel=f'{"xyz"[i]} [m]', ylabel=f'{"xyz"[j]} [m]', aspect='equal')
         axis.grid(alpha=0.3)
-        axis.margins(0.12)  # numbers stand at the tips of the normals
+        axis.margins(0.12)  # labels are at the tips of the normals
         _space_ticks(axis)
         if title.endswith('along x'):
-            axis.invert_xaxis()  # y points to the left of whoever looks along x
+            axis.invert_xaxis()  # in a view along x, y points to the left
     handles = [Line2D([], [], color=colour, label=status) for status, colour in _STATUSES.items()]
     title = f'{marker_map.size_in_words}, normals, ellipses of three sigma enlarged {_ENLARGED:g} times'
     figure.legend(handles=handles, title=title, loc='outside lower center', ncols=len(handles))
-    # Views of equal scale come to their places step by step; after the first, a title is cut off.
+    # The layout of views of equal scale converges in passes; after the first, a title is cut off.
     for _ in range(_LAYOUT_STEPS):
         figure.draw_without_rendering()
     return figure
 
 
 def _space_ticks(axis: Axes) -> None:
-    """Have labels stand apart along an axis that is short, as the one across a wall is."""
+    """Thin out the labels of a short axis, such as that across a wall."""
     low, high = axis.get_xlim()
     share = (high - low) / max(np.ptp(axis.get_ylim()), high - low)
     axis.xaxis.set_major_locator(MaxNLocator(nbins=max(1, int(_MOST_TICKS * share)), min_n_ticks=1))
 
 
 def _front(marker_map: MarkerMap) -> str:
-    """From where the faces of the markers are seen, as the camera sees them: along x, or against it."""
+    """The view along x or against it that shows the faces of the markers."""
     facing = sum(float(marker.T_map_marker[0, 2]) for marker in marker_map.markers.values())
     return 'from the front, against x' if facing > 0.0 else 'from the front, along x'
 

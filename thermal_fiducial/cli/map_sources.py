@@ -29,11 +29,11 @@ from thermal_fiducial.map_tools.map_doubts import Doubt, doubts
 _IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
 #: Noise of OpenCV's sub-pixel corners in photos [px]; the mapper takes the actual noise from the pictures.
 PHOTO_SIGMA_PX = 0.2
-# Beyond any stamp [ns] and any corner [px]; and any ID of a dictionary.
+# Bounds above all stamps [ns] and corners [px], and above all IDs.
 _LARGEST_VALUE, _LARGEST_ID = 9.2e18, 100_000
-# How far entries may be off that somebody has written by hand, without a covariance.
+# Standard deviations of entries without a covariance, which were written by hand.
 _HAND_STD_M, _HAND_STD_DEG = 0.1, 5.0
-# Between unordered pictures the detector shall see no motion.
+# Time between unordered pictures, so long that the detector assumes no continuous motion.
 _APART_NS = 100_000_000_000
 
 
@@ -65,7 +65,7 @@ def add_refine(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class _MapInProgress:
-    """The file that a new map goes to: nobody's change since the command began is overwritten."""
+    """The file of a new map; changes to it since the command began are not overwritten."""
 
     path: Path
     action: str
@@ -77,7 +77,7 @@ class _MapInProgress:
         return cls(path, action, digest(path))
 
     def save(self, marker_map: MarkerMap) -> None:
-        """Write the map. Raises InputError, also where the file has changed."""
+        """Write the map. Raises InputError if the file has changed or cannot be written."""
         save_with_history(self.path, marker_map, self.action, self.read)
 
 
@@ -87,7 +87,7 @@ def _build(args: argparse.Namespace) -> int:
     start = _start(args)
     args.marker_size = args.marker_size or _only_size(start)
     if args.marker_size is None:
-        raise InputError(f'{args.map}: its markers have several sizes: say --marker-size for new ones')
+        raise InputError(f'{args.map}: its markers have several sizes: give --marker-size for new ones')
     frames = _detect(_photos(args.images), camera, args)
     if args.origin is not None and not any(args.origin in rows['id'] for rows in frames):
         raise InputError(f'{args.images}: marker {args.origin}, the origin, is in none of the {len(frames)} photos')
@@ -110,7 +110,7 @@ def _refine(args: argparse.Namespace) -> int:
 
 
 def _only_size(marker_map: MarkerMap) -> float | None:
-    """Side of all markers of a map [m]; None where they differ."""
+    """Side of all markers of a map [m]; None if they differ."""
     sizes = {marker.size for marker in marker_map.markers.values()}
     return sizes.pop() if len(sizes) == 1 else None
 
@@ -129,7 +129,7 @@ def _grow(
 
 
 def say_doubts(marker_map: MarkerMap, path: Path) -> list[Doubt]:
-    """Print what is doubtful about the map in the file ``path``; returns it."""
+    """Print and return the doubts about the map in the file ``path``."""
     found = doubts(marker_map)
     for key in not_in_dictionary(marker_map.markers, marker_map.dictionary, path.parent):
         found.append(Doubt(f'marker {key}: not in {marker_map.dictionary}', True))
@@ -143,7 +143,7 @@ def _print_what_was_used(built: Built, frames: int) -> None:
     print(f'{built.frames_used} of {frames} frames used')
     if all(marker.fixed for marker in built.map.markers.values()):
         print('all markers are fixed: none was moved (map unfix)')
-    # Medians of each marker's views: the root mean square of all is that of a few bad ones, twenty times as much.
+    # Medians over each marker's views: the root mean square is dominated by a few outliers, and twenty times as large.
     errors = {marker.id: marker.reprojection_error_px for marker in built.map.markers.values() if marker.observations}
     if errors:
         worst = max(errors, key=lambda key: errors[key])
@@ -221,8 +221,8 @@ def _detect_in_photo(
 ) -> Markers:
     """Markers of an 8-bit photo.
 
-    Cameras for visible light sharpen their pictures and bend the grey scale, which shifts the edges that our own
-    detector finds on counts that are linear in radiance; OpenCV's corners follow the gradient alone.
+    Cameras for visible light sharpen their pictures and have a nonlinear grey scale. This displaces the edges of our
+    detector, which expects counts linear in radiance; OpenCV's corners depend on the gradient alone.
     """
     corners, ids, _ = photo_detector.detectMarkers(gray)
     if not len(corners):
@@ -235,7 +235,7 @@ def _detect_in_photo(
 
 
 def _photo_detector(args: argparse.Namespace) -> 'cv2.aruco.ArucoDetector':
-    """OpenCV's own detector. Raises InputError where OpenCV has none of this kind."""
+    """OpenCV's detector. Raises InputError if this version of OpenCV does not have it."""
     if not hasattr(cv2.aruco, 'ArucoDetector'):
         raise InputError(f"OpenCV {cv2.__version__}: photos need 4.7 or newer, as pip's opencv-python-headless is")
     parameters = cv2.aruco.DetectorParameters()
@@ -252,7 +252,7 @@ def _read_detections(path: Path, start: MarkerMap, args: argparse.Namespace, cam
     Raises
     ------
     InputError
-        Also for markers whose side nobody has said: a guess would put them somewhere else.
+        Also if the side of a marker is unknown: a guess would displace it.
     """
     table = _detection_table(path)
     if not len(table):
@@ -262,7 +262,7 @@ def _read_detections(path: Path, start: MarkerMap, args: argparse.Namespace, cam
     sizes |= {key: marker.size for key, marker in start.markers.items()}
     unknown = sorted({int(key) for key in table[:, 1]} - sizes.keys())
     if unknown and args.marker_size is None:
-        raise InputError(f'{path}: markers {", ".join(map(str, unknown))} have no known side: say --marker-size')
+        raise InputError(f'{path}: markers {", ".join(map(str, unknown))} have no known side: give --marker-size')
     frames = []
     for first, last in zip(firsts, [*firsts[1:], len(table)], strict=True):
         rows = table[first:last]

@@ -1,4 +1,4 @@
-"""Which markers of which dictionary a command is about."""
+"""Options that choose markers of a dictionary."""
 
 import argparse
 
@@ -8,13 +8,15 @@ from thermal_fiducial.files.dictionary import load_dictionary
 
 
 def add_choice(parser: argparse.ArgumentParser) -> None:
-    """Arguments that choose markers."""
-    parser.add_argument('--dictionary', default='STENCIL_4X4_100', help="name of OpenCV's or ours, or a file")
+    """Add the options."""
+    parser.add_argument(
+        '--dictionary', default='STENCIL_4X4_100', help='dictionary of OpenCV or of this package, or a file'
+    )
     parser.add_argument('--ids', metavar='LIST', help='markers, e.g. 0-7,12 (default: all)')
 
 
 def chosen(args: argparse.Namespace) -> tuple[Gray, list[int]]:
-    """Bits (M, n, n) of the whole dictionary, and the IDs that are meant.
+    """Bits (M, n, n) of the whole dictionary, and the chosen IDs.
 
     Raises
     ------

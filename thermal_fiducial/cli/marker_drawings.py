@@ -1,4 +1,4 @@
-"""``markers make``, ``sheet`` and ``board``: files for the cutter and for the printer."""
+"""``markers make``, ``sheet`` and ``board``: drawings for laser cutters and printers."""
 
 import argparse
 from collections.abc import Iterable, Sequence
@@ -28,14 +28,14 @@ from thermal_fiducial.files.packages import is_installed
 
 _OPTION_HELP = {
     'size': 'side of the black square',
-    'thickness': 'of the acrylic',
-    'hole_diameter': 'mounting holes (4.3: M4)',
-    'stand_off': 'spacers between warm surface and plate',
+    'thickness': 'thickness of the acrylic',
+    'hole_diameter': 'diameter of the mounting holes (4.3: M4)',
+    'stand_off': 'length of the spacers between warm surface and plate',
     'kerf': 'width of the cut',
     'corner_radius': 'radius of re-entrant corners',
-    'bridge_width': 'webs that hold islands of standard dictionaries',
+    'bridge_width': 'width of the webs that hold islands of standard dictionaries',
     'frame_width': 'width of the frame (--mount frame)',
-    'tie_width': 'necks of the ears, or ties to the frame',
+    'tie_width': 'width of the necks of the ears, or of the ties to the frame',
 }
 
 
@@ -117,7 +117,7 @@ def _say_how_to_use(target: str) -> None:
 
 
 def _board_map(centres: FloatArray, options: PlateOptions, dictionary: str) -> MarkerMap:
-    """Map of a board's markers, the origin in its middle; what ``calibrate intrinsics --board`` takes."""
+    """Map of a board's markers, with its origin in the middle, for ``calibrate intrinsics --board``."""
     metres = 1e-3 * np.column_stack([centres, np.zeros(len(centres))])
     markers = {
         index: MapMarker(index, 1e-3 * options.size, True, se3.transform(np.eye(3), centre))
@@ -127,24 +127,26 @@ def _board_map(centres: FloatArray, options: PlateOptions, dictionary: str) -> M
 
 
 def add_plate_options(parser: argparse.ArgumentParser, size: float = PlateOptions.size) -> None:
-    """Arguments that say how a plate is cut; ``size`` is the default side of the black square [mm]."""
+    """Options for the dimensions of a plate; ``size`` is the default side of the black square [mm]."""
     group = parser.add_argument_group('plate', 'all lengths in millimetres')
-    group.add_argument('--mount', choices=MOUNTS, default='ears', help='what holds the pattern')
+    group.add_argument('--mount', choices=MOUNTS, default='ears', help='mount of the pattern')
     for name, description in _OPTION_HELP.items():
         default = size if name == 'size' else getattr(PlateOptions, name)
         group.add_argument('--' + name.replace('_', '-'), type=float, default=default, metavar='MM', help=description)
-    group.add_argument('--quiet-cells', type=float, default=1.0, metavar='CELLS', help='warm ring around the pattern')
+    group.add_argument(
+        '--quiet-cells', type=float, default=1.0, metavar='CELLS', help='width of the warm ring around the pattern'
+    )
     group.add_argument('--min-web', type=float, default=3.0, metavar='MM', help='least width of acrylic between holes')
 
 
 def plate_options(args: argparse.Namespace) -> PlateOptions:
-    """What :func:`add_plate_options` has read."""
+    """Values of the options of :func:`add_plate_options`."""
     return PlateOptions(**{item.name: getattr(args, item.name) for item in fields(PlateOptions)})
 
 
 def _add_output(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument('--out', type=Path, default=Path('markers'), metavar='FOLDER', help='where the files go')
-    parser.add_argument('--formats', default='svg,dxf,pdf,png', help='of these, separated by commas')
+    parser.add_argument('--out', type=Path, default=Path('markers'), metavar='FOLDER', help='folder of the files')
+    parser.add_argument('--formats', default='svg,dxf,pdf,png', help='formats, separated by commas')
     parser.add_argument(
         '--paper', metavar='PAPER', help=f'PDF in tiles for a printer: {", ".join(PAPERS)} (default: one page)'
     )
@@ -152,7 +154,7 @@ def _add_output(parser: argparse.ArgumentParser) -> None:
 
 
 def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cells: int | None = None) -> None:
-    """Width of the narrowest web of each marker, and what speaks against cutting it so."""
+    """Print the narrowest web of each marker, and warnings about its strength."""
     options = plate_options(args)
     cells = cells or chosen(args)[0].shape[1] + 2
     with progress_bar('measuring webs') as progress:
@@ -165,17 +167,17 @@ def _say_what_is_weak(drawings: Sequence[Drawing], args: argparse.Namespace, cel
 
 
 def add_force(parser: argparse.ArgumentParser) -> None:
-    """Argument that allows to overwrite files."""
+    """Add the option that allows overwriting files."""
     parser.add_argument('--force', action='store_true', help='overwrite files that exist')
 
 
 def refuse_to_overwrite(paths: Iterable[Path], force: bool) -> None:
-    """Stop before anything is written.
+    """Refuse to overwrite files, before any is written.
 
     Raises
     ------
     InputError
-        One of ``paths`` exists, and nobody has said ``force``.
+        One of ``paths`` exists, without ``force``.
     """
     existing = [] if force else [path for path in paths if path.exists()]
     if existing:
@@ -191,8 +193,20 @@ def _markers(args: argparse.Namespace) -> Iterable[Drawing]:
 
 
 def _write_all(drawings: Sequence[Drawing], args: argparse.Namespace, others: Sequence[Path] = ()) -> None:
-    """Write drawings in all formats, read each DXF back and compare; ``others`` will be written besides."""
-    formats = args.formats.split(',')
+    """Write drawings in all formats; ``others`` will be written besides."""
+    formats = _formats(args)
+    stems = [f'marker-{drawing.name}' if drawing.name.isdigit() else drawing.name for drawing in drawings]
+    refuse_to_overwrite([*(args.out / f'{stem}.{kind}' for stem in stems for kind in formats), *others], args.force)
+    for stem, drawing in zip(stems, drawings, strict=True):
+        _write_checked(drawing, [args.out / f'{stem}.{kind}' for kind in formats], args.paper)
+        notes = '\n  '.join(('', *drawing.notes))
+        parts = '1 part' if drawing.parts == 1 else f'{drawing.parts} parts'
+        print(f'{args.out / stem}: {drawing.width:.1f} x {drawing.height:.1f} mm, {parts}{notes}')
+
+
+def _formats(args: argparse.Namespace) -> list[str]:
+    """The formats of ``--formats``, each of which must be known and have its library installed."""
+    formats: list[str] = args.formats.split(',')
     unknown = set(formats) - set(FORMATS)
     if unknown:
         raise InputError(f'--formats: {", ".join(sorted(unknown))} is not among {", ".join(FORMATS)}')
@@ -202,17 +216,14 @@ def _write_all(drawings: Sequence[Drawing], args: argparse.Namespace, others: Se
         raise InputError(
             f'{libraries} missing: install the extra "tools", or leave {", ".join(missing)} out of --formats'
         )
-    stems = [f'marker-{drawing.name}' if drawing.name.isdigit() else drawing.name for drawing in drawings]
-    refuse_to_overwrite([*(args.out / f'{stem}.{kind}' for stem in stems for kind in formats), *others], args.force)
-    for stem, drawing in zip(stems, drawings, strict=True):
-        wrong = problems(drawing, drawing.parts)
-        if wrong:
-            raise InputError(f'{drawing.name}: {"; ".join(wrong)}')
-        for kind in formats:
-            path = args.out / f'{stem}.{kind}'
-            write(drawing, path, args.paper)
-            if kind == 'dxf' and not agree(read_dxf(path), drawing):
-                raise InputError(f'{path}: what was read back is not what was written')
-        notes = '\n  '.join(('', *drawing.notes))
-        parts = '1 part' if drawing.parts == 1 else f'{drawing.parts} parts'
-        print(f'{args.out / stem}: {drawing.width:.1f} x {drawing.height:.1f} mm, {parts}{notes}')
+    return formats
+
+
+def _write_checked(drawing: Drawing, paths: Iterable[Path], paper: str | None) -> None:
+    """Check a drawing, write it to ``paths``, and compare each DXF file, read back, with the drawing."""
+    if wrong := problems(drawing, drawing.parts):
+        raise InputError(f'{drawing.name}: {"; ".join(wrong)}')
+    for path in paths:
+        write(drawing, path, paper)
+        if path.suffix == '.dxf' and not agree(read_dxf(path), drawing):
+            raise InputError(f'{path}: the file differs from the drawing')

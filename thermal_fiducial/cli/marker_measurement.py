@@ -1,4 +1,4 @@
-"""Rendered views of markers, shown to the detector: where the tables of ``markers plan`` come from."""
+"""Measurements of the detector in rendered views of markers, for the tables of ``markers plan``."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import columns, corners_px, Markers
-from thermal_fiducial.core.types import Counts, FloatArray
+from thermal_fiducial.core.types import Counts, FloatArray, SIGMA_OF_MEDIAN
 from thermal_fiducial.fabrication.planning import expected_errors, Measurements, pose_errors
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.lens import Lens
@@ -24,14 +24,14 @@ from thermal_fiducial.sim.spline_trajectory import SplineTrajectory
 DICTIONARY = 'STENCIL_4X4_100'
 LENS = '13mm'
 _SIZE = 0.30
-# Six seconds after the shutter of the simulated sensor closed: half the time until it does again.
+# Time of the frames [s]: six seconds after a shutter event, half the time until the next.
 _TIME = 13.0
-# Bad pixels and column pattern are the cleaning's business, not the detector's.
+# Bad pixels are removed before the detector.
 _SENSOR = replace(Sensor(), bad_pixel_share=0.0, lag=0.0)
 _MOST_MARKERS = 12
-# Views of one kind at most: large markers come one or two a view.
+# Largest number of views of one kind; a view has one or two large markers.
 _MOST_VIEWS = 4
-# Poses whose median says something about the scale of their errors.
+# Least number of poses for the scale of their errors.
 _ENOUGH_POSES = 8
 
 
@@ -41,11 +41,11 @@ class View:
 
     Parameters
     ----------
-    stamp_ns : random, so that no view hints at motion to the next
+    stamp_ns : random, so that the detector assumes no motion between views
     counts : (height, width)
     ids : (N,)
     T_camera_marker : (N, 4, 4)
-    corners_px : (N, 4, 2) true ones
+    corners_px : (N, 4, 2) true corners
     """
 
     stamp_ns: int
@@ -56,11 +56,11 @@ class View:
 
 
 def render_view(side_px: float, contrast: float, tilt_deg: float, rng: np.random.Generator) -> View:
-    """Markers at random places of the image, turned at random, all ``tilt_deg`` from their line of sight.
+    """Markers at random places of the image with random rotations, tilted by ``tilt_deg`` from the line of sight.
 
     Parameters
     ----------
-    side_px : side of the black square if it were seen from the front
+    side_px : side of the black square in a view from the front
     contrast : [K]
     """
     lens = LENSES[LENS]
@@ -81,7 +81,7 @@ def render_view(side_px: float, contrast: float, tilt_deg: float, rng: np.random
 
 
 def _places(lens: Lens, side_px: float, rng: np.random.Generator) -> Iterator[FloatArray]:
-    """Pixels (2,) far enough apart for markers with their warm border in any direction."""
+    """Pixels (2,) far enough apart for markers and their warm borders in any rotation."""
     pitch = 1.95 * side_px + 6.0
     columns_, rows = max(1, int(lens.width / pitch)), max(1, int(lens.height / pitch))
     cells = rng.permutation(columns_ * rows)[:_MOST_MARKERS]
@@ -123,7 +123,7 @@ def detect(view: View, detector: MarkerDetector, camera: Camera) -> tuple[Marker
 
 
 def camera_and_detector() -> tuple[Camera, MarkerDetector]:
-    """Those that the measurements use."""
+    """Camera and detector of the measurements."""
     lens = LENSES[LENS]
     camera = Camera(lens.width, lens.height, lens.matrix, lens.model, np.array(lens.distortion))
     config = ArucoDetectorConfig(dictionary=DICTIONARY, marker_size=_SIZE)
@@ -139,7 +139,7 @@ def both_poses(rows: Markers) -> tuple[FloatArray, FloatArray]:
 
 @dataclass
 class Tally:
-    """What the detector made of all views of one kind."""
+    """Results of the detector in all views of one kind."""
 
     shown: int
     corner_errors: FloatArray
@@ -149,17 +149,17 @@ class Tally:
 
     @property
     def found(self) -> float:
-        """Share of the markers."""
+        """Share of the markers that was found."""
         return len(self.best) / self.shown
 
     @property
     def sigma_px(self) -> float:
-        """Noise of a corner coordinate, from the median: poses do not suffer from one corner that is far off."""
-        return 1.4826 * float(np.median(np.abs(self.corner_errors))) if len(self.best) >= 3 else np.nan
+        """Standard deviation of a corner coordinate, robust against single outliers."""
+        return SIGMA_OF_MEDIAN * float(np.median(np.abs(self.corner_errors))) if len(self.best) >= 3 else np.nan
 
     @property
     def distance_error(self) -> float:
-        """Median error of the distance in its share of the distance."""
+        """Median relative error of the distance."""
         if len(self.best) < 3:
             return np.nan
         measured, true = (np.linalg.norm(T[:, :3, 3], axis=1) for T in (self.best, self.T_true))
@@ -175,7 +175,7 @@ def show(
     markers: int,
     seed: list[int],
 ) -> Tally:
-    """Show about ``markers`` markers of one kind to the detector."""
+    """Run the detector on about ``markers`` markers of one kind."""
     rng = np.random.default_rng(seed)
     shown, parts = 0, []
     for _ in range(_MOST_VIEWS):
@@ -189,7 +189,7 @@ def show(
 
 
 def _pose_factor(tally: Tally, camera: Camera, side_px: float, tilt_deg: float) -> float:
-    """Error of the poses in that of poses from independent corners; NaN where too few were found to say."""
+    """Ratio of the poses' error to that of poses from independent corners; NaN for too few poses."""
     if len(tally.best) < _ENOUGH_POSES:
         return np.nan
     measured = pose_errors(tally.best, tally.other, tally.T_true)[0]
@@ -206,7 +206,7 @@ def measure(
     seed: int,
     progress: Callable[[float], None] | None = None,
 ) -> Measurements:
-    """Show about ``markers`` markers of every side, contrast (in NETD) and tilt to the detector."""
+    """Run the detector on about ``markers`` markers of each side, contrast (in NETD) and tilt."""
     camera, detector = camera_and_detector()
     shape = (len(side_px), len(contrast), len(tilt_deg))
     found, (sigma, off, factor) = np.zeros(shape), np.full((3, *shape), np.nan)
@@ -221,7 +221,7 @@ def measure(
 
 
 def _over_sides(factor: FloatArray) -> FloatArray:
-    """Median (C, T) of factors (S, C, T); where nothing was found, that of the next higher contrast."""
+    """Median (C, T) of factors (S, C, T); if nothing was found, that of the next higher contrast."""
     medians = np.full(factor.shape[1:], np.nan)
     for node in np.ndindex(*medians.shape):
         values = factor[:, node[0], node[1]]

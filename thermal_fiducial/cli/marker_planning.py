@@ -46,20 +46,32 @@ def add_plan(parser: argparse.ArgumentParser) -> None:
     marker = parser.add_argument_group('marker')
     marker.add_argument('--size', type=float, default=300.0, metavar='MM', help='side of the black square')
     marker.add_argument('--bits', type=int, default=4, help='bits along a side of the dictionary')
-    marker.add_argument('--thickness', type=float, default=3.0, metavar='MM', help='of the acrylic')
+    marker.add_argument('--thickness', type=float, default=3.0, metavar='MM', help='thickness of the acrylic')
     marker.add_argument(
-        '--stand-off', type=float, default=10.0, metavar='MM', help='air between warm surface and sheet'
+        '--stand-off', type=float, default=10.0, metavar='MM', help='air gap between warm surface and sheet'
     )
     scene = parser.add_argument_group('scene')
-    scene.add_argument('--contrast', type=float, default=15.0, metavar='K', help='warm surface above the room')
-    scene.add_argument('--after', type=float, default=300.0, metavar='S', help='time since the surface is warm')
-    scene.add_argument('--loss', type=float, default=10.0, metavar='W/m2/K', help='10 in still air, 25 under rotors')
+    scene.add_argument(
+        '--contrast',
+        type=float,
+        default=15.0,
+        metavar='K',
+        help='temperature of the warm surface above that of the room',
+    )
+    scene.add_argument('--after', type=float, default=300.0, metavar='S', help='time since the surface was switched on')
+    scene.add_argument(
+        '--loss',
+        type=float,
+        default=10.0,
+        metavar='W/m2/K',
+        help='heat transfer to the room: 10 in still air, 25 under rotors',
+    )
     scene.add_argument('--fog', type=float, default=0.0, metavar='1/M', help='extinction in the long-wave infrared')
-    scene.add_argument('--tilt', type=float, default=30.0, metavar='DEG', help='between normal and line of sight')
-    scene.add_argument('--distances', default='1,1.5,2,3,4,6,8,12', metavar='LIST', help='metres')
+    scene.add_argument('--tilt', type=float, default=30.0, metavar='DEG', help='angle between normal and line of sight')
+    scene.add_argument('--distances', default='1,1.5,2,3,4,6,8,12', metavar='LIST', help='distances [m]')
     parser.add_argument('--plot', type=Path, metavar='FILE', help='picture of both tables (PNG, PDF, SVG)')
     parser.add_argument(
-        '--tables', type=Path, default=PACKAGED, help='of measured views (default: those of the package)'
+        '--tables', type=Path, default=PACKAGED, help='file of ``markers measure`` (default: that of the package)'
     )
 
 
@@ -121,8 +133,8 @@ def _expectation(args: argparse.Namespace, measurements: Measurements, distance:
 def _view_table(distances: list[float], views: list[Expectation]) -> Table:
     headers = 'at m', 'side px', 'found', 'corner px', 'position mm', 'distance mm', 'rotation deg', 'flips'
     title = (
-        'One view of one marker: median errors, position of the camera as seen from the marker; flips: how often the '
-        'wrong one of its two mirrored poses fits better'
+        'One view of one marker: median errors, position of the camera in the frame of the marker; flips: how often '
+        'the wrong one of the two planar poses fits better'
     )
     table = table_of(title, headers)
     for distance, view in zip(distances, views, strict=True):
@@ -186,8 +198,8 @@ def add_measure(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``markers measure``."""
     parser.set_defaults(do=_measure)
     parser.add_argument('out', type=Path, help='file to write (YAML)')
-    parser.add_argument('--markers', type=int, default=16, help='markers to show for every side, contrast and tilt')
-    parser.add_argument('--seed', type=int, default=1, help='of the rendering')
+    parser.add_argument('--markers', type=int, default=16, help='number of markers for each side, contrast and tilt')
+    parser.add_argument('--seed', type=int, default=1, help='seed of the rendering')
     add_force(parser)
 
 

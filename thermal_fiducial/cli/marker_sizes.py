@@ -1,4 +1,4 @@
-"""Sides of markers whose entry in a map has none: options that stand before an action or behind it."""
+"""Options for the sides of markers whose entries in a map have none, given before or after an action."""
 
 import argparse
 
@@ -7,11 +7,11 @@ from thermal_fiducial.errors import InputError
 
 
 def add_sizes(parser: argparse.ArgumentParser, *, behind: bool = False) -> None:
-    """Options of a command, or of one of its actions, ``behind`` which they may stand too."""
+    """Add the options to a command, or to one of its actions (``behind``)."""
     size = argparse.SUPPRESS if behind else None
     text = 'side of markers whose entry has none [m]'
     parser.add_argument('--marker-size', type=_side, default=size, metavar='M', help=text)
-    # An action's parser starts its lists empty: under one name, it would lose those before the action.
+    # The parser of an action begins with empty lists, and would overwrite those of the command under the same name.
     parser.add_argument(
         '--marker-size-override',
         type=_override,
@@ -24,7 +24,7 @@ def add_sizes(parser: argparse.ArgumentParser, *, behind: bool = False) -> None:
 
 
 def join_sizes(args: argparse.Namespace) -> None:
-    """Put the overrides of both places into ``args.marker_size_override``; for one marker the last counts."""
+    """Join the overrides of both places in ``args.marker_size_override``; for a marker the last one holds."""
     args.marker_size_override = [*args.sizes_before, *args.sizes_behind]
 
 

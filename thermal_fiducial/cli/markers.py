@@ -22,20 +22,16 @@ from thermal_fiducial.files.writing import write_text
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Sub-commands of ``markers``."""
     commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
-    _add_check(commands.add_parser('check', help='which markers of a dictionary can be cut in one piece'))
-    marker_drawings.add_make(
-        commands.add_parser('make', help='drawings of markers (SVG, DXF, PDF, PNG), one file a marker')
-    )
-    marker_drawings.add_sheet(commands.add_parser('sheet', help='many markers nested on sheets of a given size'))
-    _add_bridge(commands.add_parser('bridge', help='where bridges go in markers of a standard dictionary'))
-    marker_drawings.add_board(commands.add_parser('board', help='drawings of thermal calibration boards'))
-    _add_dictionary(commands.add_parser('dictionary', help='search a dictionary of markers that can be cut'))
+    _add_check(commands.add_parser('check', help='check which markers of a dictionary can be cut in one piece'))
+    marker_drawings.add_make(commands.add_parser('make', help='draw markers (SVG, DXF, PDF, PNG), one file a marker'))
+    marker_drawings.add_sheet(commands.add_parser('sheet', help='draw many markers nested on sheets of a given size'))
+    _add_bridge(commands.add_parser('bridge', help='list the bridges of markers of a standard dictionary'))
+    marker_drawings.add_board(commands.add_parser('board', help='draw thermal calibration boards'))
+    _add_dictionary(commands.add_parser('dictionary', help='search for a dictionary of markers that can be cut'))
     marker_planning.add_plan(
-        commands.add_parser('plan', help='will it be seen, how good is the pose, how long is it warm')
+        commands.add_parser('plan', help='predict detection, error of the pose and contrast over time')
     )
-    marker_planning.add_measure(
-        commands.add_parser('measure', help='measure the tables that plan reads, in simulation')
-    )
+    marker_planning.add_measure(commands.add_parser('measure', help='measure the tables of plan in simulation'))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -76,7 +72,7 @@ def _check(args: argparse.Namespace) -> int:
         print(f'marker {ids[a]} and the negative of {ids[b]} differ in {apart} bit{"" if apart == 1 else "s"}')
     if pairs:
         signed = ' and '.join(sorted(path.stem for path in PACKAGED.glob('*_SIGNED.yaml')))
-        print(f'of these the border alone shows whether warm is cold: set polarity, or take {signed}, which have none')
+        print(f'only the border shows the polarity of these: set polarity, or use {signed}, which have none')
     print(f'{good} of {len(ids)} markers can be cut; distance between markers {between}, to own rotations {own}')
     return 0
 
@@ -107,10 +103,12 @@ def _add_dictionary(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('out', type=Path, help="dictionary file to write (YAML); its name becomes the dictionary's")
     parser.add_argument('--bits', type=int, default=4, help='bits along a side')
     parser.add_argument('--distance', type=int, default=4, help='least Hamming distance')
-    parser.add_argument('--count', type=int, help='keep this many, the stiffest (default: all)')
+    parser.add_argument('--count', type=int, help='number of markers to keep, the stiffest first (default: all)')
     parser.add_argument('--seed', type=int, default=1, help='the same seed and restarts give the same file')
     parser.add_argument('--restarts', type=int, default=1000, help='codes to try')
-    parser.add_argument('--signed', action='store_true', help='no marker is like the negative of another')
+    parser.add_argument(
+        '--signed', action='store_true', help='keep the distance also from the negatives of all markers'
+    )
     marker_drawings.add_force(parser)
 
 

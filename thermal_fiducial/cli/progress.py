@@ -1,4 +1,4 @@
-"""How far long work has come: a bar on a terminal, a line every few seconds anywhere else."""
+"""Progress of long work: a bar on a terminal, elsewhere a line every few seconds."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -8,20 +8,20 @@ from typing import Protocol, TypeVar
 
 _Item = TypeVar('_Item')
 
-#: Between two lines where there is no terminal [s]: work that is done by then says nothing.
+#: Interval of lines without a terminal [s]; shorter work prints none.
 LINE_EVERY_S = 5.0
 
 
 class ShowProgress(Protocol):
-    """Takes the share that is done, None where nobody knows, and what else there is to say."""
+    """Display of the share that is done, None if unknown, and of a note."""
 
     def __call__(self, share: float | None, note: str = '') -> None:
-        """Show that so much is done by now."""
+        """Update the display."""
 
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[ShowProgress]:
-    """Show on stderr how far the work called ``title`` has come; yields what takes the share done (0 to 1)."""
+    """Show the progress of the work ``title`` on stderr; yields the function that updates it (0 to 1)."""
     if not sys.stderr.isatty():
         yield _lines(title)
         return
@@ -42,7 +42,7 @@ def progress_bar(title: str) -> Iterator[ShowProgress]:
 
 
 def counted(show: ShowProgress, total: int) -> Callable[[int], None]:
-    """What takes how many of ``total`` pieces are done since it was called last."""
+    """Function to call with the number of pieces, of ``total``, that were done since its last call."""
     done = 0
 
     def advance(count: int) -> None:
@@ -54,7 +54,7 @@ def counted(show: ShowProgress, total: int) -> Callable[[int], None]:
 
 
 def tracked(items: Iterable[_Item], title: str, total: int) -> Iterator[_Item]:
-    """``items``, of which there are ``total``, with the progress of the work on them called ``title``."""
+    """Iterate over ``total`` ``items`` and show the progress of the work ``title`` on them."""
     with progress_bar(title) as show:
         advance = counted(show, max(1, total))
         for item in items:

@@ -13,7 +13,7 @@ from thermal_fiducial.files.bags import parse_remaps
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of the command."""
+    """Options of the command."""
     parser.add_argument('bag', type=Path, metavar='BAG', help='rosbag2 folder, .mcap or .db3 file, or ROS 1 .bag')
     parser.add_argument('--out', type=Path, required=True, metavar='RUN', help='folder for the results')
     parser.add_argument(
@@ -33,23 +33,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default='lockstep',
         help='one process, deterministic, as fast as it goes; or one process a node, in real time',
     )
-    parser.add_argument('--rate', type=float, default=1.0, metavar='X', help='processes: times real time')
-    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='another name in the bag')
+    parser.add_argument(
+        '--rate', type=float, default=1.0, metavar='X', help='speed of --transport processes, in multiples of real time'
+    )
+    parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='rename a topic of the bag')
     parser.add_argument('--images', action='store_true', help='record the cleaned images too (as large as the bag)')
     parser.add_argument(
         '--from',
         dest='entry',
         default='',
         choices=('images', 'compressed', 'markers', 'poses'),
-        help='what the bag has beside the IMU: images, compressed images, markers with camera_info, or camera poses '
-        '(default: the earliest of these that it has)',
+        help='input besides the IMU: images, compressed images, markers with camera_info, or camera poses '
+        '(default: the first of these in the bag)',
     )
     parser.add_argument('--no-report', action='store_true', help='write no report.html')
     parser.add_argument('--video', action='store_true', help='write flight.mp4: frames with their markers')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay, write the run folder, say how fast it went."""
+    """Replay the bag, write the run folder, print a summary."""
     if not 0.0 < args.rate <= 100.0:
         raise InputError(f'--rate {args.rate:g} is not between 0 and 100')
     _refuse_other_folder(args.out)
@@ -89,9 +91,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _refuse_other_folder(out: Path) -> None:
-    """Only an empty folder, or what an earlier replay has left, is written to."""
+    """Refuse a folder that is neither empty nor that of an earlier replay."""
     names = {path.name for path in out.iterdir()} if out.is_dir() else set()
-    # One that failed has left parameters and map.
+    # A failed replay leaves parameters and map.
     failed = all(name.startswith(('parameters.yaml', 'marker_map.', 'truth.tum', 'map_true.yaml')) for name in names)
     earlier = 'parameters.yaml' in names and ('output' in names or failed)
     if out.exists() and not earlier and (not out.is_dir() or names):
@@ -99,7 +101,7 @@ def _refuse_other_folder(out: Path) -> None:
 
 
 def _check_packages(*, report: bool, video: bool) -> None:
-    """Say what is missing before the replay, not after minutes of it."""
+    """Report missing packages before the replay, not after minutes of it."""
     if report:
         try:
             importlib.import_module('thermal_fiducial.report.page').require_packages()
@@ -110,7 +112,7 @@ def _check_packages(*, report: bool, video: bool) -> None:
 
 
 def _internal_errors(diagnostics: Mapping[str, Mapping[str, str]]) -> list[str]:
-    """Errors of the nodes themselves, which they live on through: no replay with one is as it should be."""
+    """Internal errors of the nodes: a node goes on after one, but its results are incomplete."""
     last = {node: figures.get('last refusal', '') for node, figures in diagnostics.items()}
     return [f'{node}: {reason}' for node, reason in last.items() if reason.startswith(INTERNAL_ERROR)]
 

@@ -1,4 +1,4 @@
-"""What a run was made with: its camera and the sides of its markers, where nobody names them."""
+"""Camera and marker sizes of a run, as defaults for commands on it."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from thermal_fiducial.report.run_folder import bag_of_run, read_summary
 
 
 def camera_of_run(run: Path) -> Camera:
-    """The calibration that a run was made with: the file among its parameters, else what its bag recorded.
+    """The calibration of a run: the file among its parameters, else the recorded one of its bag.
 
     Parameters
     ----------
@@ -22,7 +22,7 @@ def camera_of_run(run: Path) -> Camera:
     Raises
     ------
     InputError
-        Neither is to be found; the line says which option names a calibration.
+        There is neither; the message names the option for a calibration.
     """
     file = _parameter(run, 'tau2_camera', 'calibration_file')
     if file:
@@ -30,23 +30,23 @@ def camera_of_run(run: Path) -> Camera:
     summary = read_summary(run / 'summary.json')
     bag_path = bag_of_run(run, summary)
     if bag_path is None:
-        raise InputError(f'{run}: neither a calibration nor the bag of a replay is to be found: name a --calibration')
+        raise InputError(f'{run}: neither a calibration nor the replayed bag is found: give --calibration')
     try:
         with BagReader(bag_path, summary.get('remaps', {})) as bag:
             return recorded_camera(bag)
     except InputError as error:
-        raise InputError(f'{error}: name a --calibration') from None
+        raise InputError(f'{error}: give --calibration') from None
 
 
 def sizes_of_run(run: Path) -> tuple[float | None, tuple[str, ...]]:
-    """Side of the markers [m], and those of single ones as "ID:SIZE"; None and nothing where no replay wrote them."""
+    """Side of the markers [m] and overrides "ID:SIZE" of a run; None and none if they are unknown."""
     size, overrides = (_parameter(run, 'marker_mapper', name) for name in ('marker_size', 'marker_size_overrides'))
     known = isinstance(size, float | int) and isinstance(overrides, list)
     return (float(size), tuple(map(str, overrides))) if known else (None, ())
 
 
 def _parameter(run: Path, node: str, name: str) -> Any:
-    """A parameter that the nodes of a replay had; None where none is known."""
+    """A parameter of a node in the replay; None if it is unknown."""
     path = run / 'parameters.yaml'
     if not path.is_file():
         return None

@@ -17,7 +17,7 @@ from thermal_fiducial.sim.thermal_camera import FlightPlan, plan
 from thermal_fiducial.sim.writer import write_flight
 
 _OWN = "the scenario's"
-#: Inclusive ranges of the numbers.
+#: Inclusive ranges of the options.
 _RANGES = {
     'seconds': (1.0, 3600.0),
     'seed': (0, 2**32 - 1),
@@ -39,13 +39,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('out', type=Path, metavar='OUT', help='folder to create')
     parser.add_argument('--scenario', default='fog', metavar='NAME', help='see below')
     parser.add_argument('--seconds', type=float, help=f'length of the flight [s] (default: {_OWN})')
-    parser.add_argument('--seed', type=int, default=0, help='of path and noise')
-    parser.add_argument('--storage', choices=sorted(STORAGES), default='mcap', help='of the bag')
-    parser.add_argument('--lens', help=f'one of {", ".join(LENSES)} (default: {_OWN})')
+    parser.add_argument('--seed', type=int, default=0, help='seed of path and noise')
+    parser.add_argument('--storage', choices=sorted(STORAGES), default='mcap', help='storage of the bag')
+    parser.add_argument('--lens', help=f'lens: one of {", ".join(LENSES)} (default: {_OWN})')
     parser.add_argument(
-        '--contrast', type=float, metavar='K', help=f'warm plates over cold acrylic [K] (default: {_OWN})'
+        '--contrast',
+        type=float,
+        metavar='K',
+        help=f'temperature of warm plates above cold acrylic [K] (default: {_OWN})',
     )
-    parser.add_argument('--inverted', action='store_true', help='warm code on a cold ground')
+    parser.add_argument('--inverted', action='store_true', help='warm code on a cold background')
     parser.add_argument(
         '--fog', type=float, metavar='E', help=f'extinction in the long-wave infrared [1/m] (default: {_OWN})'
     )
@@ -53,22 +56,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--lag', type=float, metavar='S', help=f'thermal time constant of the bolometers [s] (default: {_OWN})'
     )
     parser.add_argument(
-        '--readout', type=float, metavar='S', help=f"from the first row's sampling to the last's [s] (default: {_OWN})"
+        '--readout',
+        type=float,
+        metavar='S',
+        help=f'rolling shutter: time from the first row to the last [s] (default: {_OWN})',
     )
     parser.add_argument(
-        '--ffc', choices=(*FFC_BEHAVIOURS, 'never'), help=f'what a shutter event sends (default: {_OWN})'
+        '--ffc', choices=(*FFC_BEHAVIOURS, 'never'), help=f'output during shutter events (default: {_OWN})'
     )
     parser.add_argument(
-        '--time-offset', type=float, metavar='S', help=f"camera's clock: t_imu = t_camera + S [s] (default: {_OWN})"
+        '--time-offset',
+        type=float,
+        metavar='S',
+        help=f'clock offset of the camera: t_imu = t_camera + S [s] (default: {_OWN})',
     )
     parser.add_argument(
         '--trajectory', type=Path, metavar='TUM', help=f'fly these poses of base_link in map (default: {_OWN})'
     )
-    parser.add_argument('--workers', type=int, default=_cores(), help='processes (default: one a core)')
+    parser.add_argument('--workers', type=int, default=_cores(), help='number of processes (default: one a core)')
 
 
 def _scenarios() -> str:
-    """Name and description of each, on lines of at most 80 characters."""
+    """Name and description of each scenario, on lines of at most 80 characters."""
     return '\n'.join(
         textwrap.fill(
             f'{item.description} ({item.seconds:g} s)', 80, initial_indent=f'  {name:14}', subsequent_indent=16 * ' '
@@ -78,7 +87,7 @@ def _scenarios() -> str:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate and say how to replay."""
+    """Simulate the flight, print how to replay it."""
     for name, (low, high) in _RANGES.items():
         value = getattr(args, name)
         if value is not None and not low <= value <= high:
@@ -132,7 +141,7 @@ def _summary(out: Path, flight: FlightPlan) -> str:
 
 
 def _start_map(flight: FlightPlan) -> str:
-    """A board is known, a room is to be mapped."""
+    """Map for the replay: of a board all markers are known, a room is to be mapped."""
     return 'map_one.yaml' if flight.scenario.corner_noise is None else 'map_true.yaml --mode localization'
 
 

@@ -1,4 +1,4 @@
-"""A simulated flight that begins with the corners, as a bag of ``markers``."""
+"""A bag of ``markers`` from a simulated flight without pictures."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -19,7 +19,7 @@ from thermal_fiducial.sim.writer import IMAGE_DELAY_NS, write_side_files
 
 
 def simulated_recording(flight: FlightPlan, noise: CornerNoise) -> Recording:
-    """What a recording of the flight holds: IMU samples as they arrive, corners, truth at the IMU's instants."""
+    """Recording of the flight: IMU samples as they arrive, corners, ground truth at the stamps of the IMU."""
     scenario = flight.scenario
     times, stamps = flight.imu_stamps()
     path = scenario.trajectory(flight.seconds, flight.seed)
@@ -44,7 +44,7 @@ def simulated_recording(flight: FlightPlan, noise: CornerNoise) -> Recording:
 def write_corner_flight(
     out: Path, flight: FlightPlan, noise: CornerNoise, storage: str, progress: Callable[[int], None]
 ) -> None:
-    """Write the bag ``out`` with truth, maps and parameters beside it, as of a flight with pictures.
+    """Write the bag ``out`` with ground truth, maps and parameters, as for a flight with pictures.
 
     Raises
     ------
@@ -56,6 +56,6 @@ def write_corner_flight(
     try:
         write_side_files(out, flight)
     except BaseException:
-        # Without its parameters and maps a flight cannot be replayed.
+        # A flight without its parameters and maps cannot be replayed.
         shutil.rmtree(out, ignore_errors=True)
         raise

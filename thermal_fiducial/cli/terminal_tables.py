@@ -1,4 +1,4 @@
-"""Tables on the console: no word of a header and no number is cut, however narrow the window."""
+"""Tables on the console, whose words and numbers are never truncated."""
 
 from collections.abc import Sequence
 
@@ -10,7 +10,7 @@ _WIDEST = 1000
 
 
 def table_of(title: str, headers: Sequence[str], left: Sequence[str] = ()) -> Table:
-    """An empty table; numbers to the right, the columns named in ``left`` to the left."""
+    """An empty table, aligned to the right except for the columns named in ``left``."""
     table = Table(title=title or None, title_justify='left', box=box.SIMPLE_HEAD, pad_edge=False)
     for header in headers:
         table.add_column(header, justify='left' if header in left else 'right', overflow='fold')
@@ -18,11 +18,11 @@ def table_of(title: str, headers: Sequence[str], left: Sequence[str] = ()) -> Ta
 
 
 def show(table: Table) -> None:
-    """Print a table; where the window is narrower than its words, closer, and at last lines run over."""
+    """Print a table; in a narrow window with less padding, and if need be with lines longer than the window."""
     console = Console()
     if _least_width(console, table) > console.width:
         table.collapse_padding = True
-        # Else rich takes from the widest column, and cuts its words.
+        # Otherwise rich narrows the widest column and truncates its words.
         for column in table.columns:
             column.width = column.min_width
     console.width = max(console.width, _least_width(console, table))
@@ -30,7 +30,7 @@ def show(table: Table) -> None:
 
 
 def fits(table: Table) -> bool:
-    """Whether the window is wide enough for all its words."""
+    """Whether the window is wide enough for all words."""
     console = Console()
     return _least_width(console, table) <= console.width
 
@@ -40,5 +40,5 @@ def _least_width(console: Console, table: Table) -> int:
         texts = [str(text) for text in (column.header, *column.cells)]
         words = texts[1:] + texts[0].split() if column.no_wrap else ' '.join(texts).split()
         column.min_width = max(map(len, words), default=0)
-    # Measured as if there was room for all.
+    # Measured in a window with room for all.
     return console.measure(table, options=console.options.update(width=_WIDEST)).minimum

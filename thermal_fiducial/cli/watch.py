@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _COLOURS = {Advice.FLY: 'green', Advice.CARE: 'yellow', Advice.STOP: 'red'}
 _LEVELS = ('green', 'yellow', 'red')
-#: A plain terminal gets a line this often [s], a screen is drawn anew this often.
+#: Intervals of lines on a plain terminal and of updates of a screen [s].
 _LINE_S, _SCREEN_S = 1.0, 0.25
 
 
@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--once', action='store_true', help='show the state once and end; exit status 1 unless the pose may be flown on'
     )
-    parser.add_argument('--wait', type=float, default=3.0, help='with --once: listen for so long first [s]')
+    parser.add_argument('--wait', type=float, default=3.0, help='with --once: time to listen before [s]')
     parser.add_argument('--plain', action='store_true', help='lines of plain text, no screen')
     parser.add_argument(
         '--ros-args', nargs=argparse.REMAINDER, default=[], help='remaps and the like, as for any node; last'
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Listen and show until asked to stop."""
+    """Show the state until interrupted."""
     if not 0.0 < args.wait < 3600.0:
         raise InputError(f'--wait {args.wait:g}: between 0 and 3600')
     try:
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         watch(keep, args.wait, args.ros_args)
         _show_once(last[0], plain=args.plain)
         return int(last[0].advice is Advice.STOP)
-    # The ordinary end.
+    # Interrupting is the usual end.
     with suppress(KeyboardInterrupt):
         _follow(watch, args)
     return 0
@@ -91,7 +91,7 @@ def _show_once(snapshot: LiveState, *, plain: bool) -> None:
 
 
 def _live_screen() -> Any:
-    """A screen that is drawn anew; None without rich."""
+    """A screen that can be updated; None without rich."""
     try:
         from rich.live import Live
     except ImportError:
