@@ -81,8 +81,9 @@ def actions(parser):
 def test_help_says_what_every_option_does_and_is_when_left_out(command, monkeypatch):
     for parser in parsers_of(command, monkeypatch):
         text = ' '.join(parser.format_help().split())
+        assert parser.description, parser.prog
         for action in actions(parser):
-            if not action.option_strings or action.default is argparse.SUPPRESS:
+            if not action.option_strings:
                 continue
             assert action.help, f'{parser.prog} {action.option_strings}'
             # As argparse itself expands it; it offers no other way.

@@ -12,6 +12,7 @@ from thermal_fiducial.cli import calibrate_intrinsics
 from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
 from thermal_fiducial.cli.progress import tracked
+from thermal_fiducial.cli.subcommands import add_command
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -30,11 +31,9 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Sub-commands of ``calibrate``."""
     commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
-    calibrate_intrinsics.add_arguments(
-        commands.add_parser('intrinsics', help='camera_info from thermal views of a board')
-    )
-    _add_camera_imu(commands.add_parser('camera-imu', help='pose and clock of the camera relative to the IMU'))
-    add_imu(commands.add_parser('imu', help='noise densities of an IMU at rest'))
+    calibrate_intrinsics.add_arguments(add_command(commands, 'intrinsics', 'camera_info from thermal views of a board'))
+    _add_camera_imu(add_command(commands, 'camera-imu', 'pose and clock of the camera relative to the IMU'))
+    add_imu(add_command(commands, 'imu', 'noise densities of an IMU at rest'))
 
 
 def run(args: argparse.Namespace) -> int:

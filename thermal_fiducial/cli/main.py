@@ -10,6 +10,7 @@ import sys
 from typing import Any
 
 from thermal_fiducial import __version__
+from thermal_fiducial.cli.subcommands import add_command
 from thermal_fiducial.errors import InputError, RunError
 
 PROGRAM = 'thermal-fiducial'
@@ -43,7 +44,7 @@ class _Help(argparse.HelpFormatter):
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         default = action.default
-        needs_none = action.nargs == 0 or action.required or default is argparse.SUPPRESS
+        needs_none = action.nargs == 0 or action.required
         if needs_none or not action.option_strings or 'default' in (action.help or ''):
             return action.help
         values = list(default) if isinstance(default, (list, tuple)) else [default]
@@ -95,12 +96,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str]) -> int:
     """Parse the arguments and run their command."""
-    parser = _Parser(
+    parser: argparse.ArgumentParser = _Parser(
         prog=PROGRAM, description='Thermal-inertial localization from acrylic markers, for drones in smoke and fog.'
     )
     parser.add_argument('--version', action='version', version=f'{PROGRAM} {__version__}')
     subparsers = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
-    choices = {name: subparsers.add_parser(name, help=text, description=text) for name, text in COMMANDS.items()}
+    choices = {name: add_command(subparsers, name, text) for name, text in COMMANDS.items()}
     command = argv[0] if argv else ''
     if command not in choices:
         # Prints the help, the version or an error, and ends the process.

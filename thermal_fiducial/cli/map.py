@@ -5,12 +5,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 import re
-from typing import TypeAlias
 
 import numpy as np
 
 from thermal_fiducial.cli import map_cloud, map_comparison, map_sources
 from thermal_fiducial.cli.marker_sizes import add_sizes, join_sizes
+from thermal_fiducial.cli.subcommands import add_command, Commands
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
@@ -27,7 +27,11 @@ from thermal_fiducial.files.marker_map import dump_map, load_map
 from thermal_fiducial.files.packages import require_plots
 from thermal_fiducial.map_tools import map_editing
 
-Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
+#: What the actions that add markers take for the side of one where nothing is said.
+_SIZE_WITHOUT = {
+    'build': 'the common one of --map',
+    'refine': 'that of the run, or the common one of the map',
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,12 +56,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _command(commands, 'history', 'earlier versions of a map', _history)
     _command(commands, 'undo', 'restore the previous version, or an autosaved map', _undo)
     _command(commands, 'upgrade', 'convert a map from before 0.2 to the present format', _upgrade)
-    map_sources.add_build(commands.add_parser('build', help='make a map from a folder of photos in any order'))
-    map_sources.add_refine(commands.add_parser('refine', help='adjust a map to the detections of a run'))
-    map_comparison.add_error(commands.add_parser('error', help='compare a map with the true one'))
-    map_cloud.add_align(commands.add_parser('align', help='align a map to a point cloud of the place'))
-    for action in commands.choices.values():
-        add_sizes(action, behind=True)
+    map_sources.add_build(add_command(commands, 'build', 'make a map from a folder of photos in any order'))
+    map_sources.add_refine(add_command(commands, 'refine', 'adjust a map to the detections of a run'))
+    map_comparison.add_error(add_command(commands, 'error', 'compare a map with the true one'))
+    map_cloud.add_align(add_command(commands, 'align', 'align a map to a point cloud of the place'))
+    for name, action in commands.choices.items():
+        add_sizes(action, behind=True, without=_SIZE_WITHOUT.get(name, 'none'))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -71,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 def _command(
     commands: Commands, name: str, text: str, do: Callable[[argparse.Namespace], int]
 ) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=text, description=text[0].upper() + text[1:])
+    parser = add_command(commands, name, text)
     parser.add_argument('map', type=Path, metavar='MAP', help='map file (YAML)')
     parser.set_defaults(do=do)
     return parser

@@ -6,10 +6,10 @@ from thermal_fiducial.config import size_overrides
 from thermal_fiducial.errors import InputError
 
 
-def add_sizes(parser: argparse.ArgumentParser, *, behind: bool = False) -> None:
-    """Add the options to a command, or to one of its actions (``behind``)."""
+def add_sizes(parser: argparse.ArgumentParser, *, behind: bool = False, without: str = 'none') -> None:
+    """Add the options to a command, or to one of its actions (``behind``); ``without``: the side if none is given."""
     size = argparse.SUPPRESS if behind else None
-    text = 'side of markers whose entry has none [m]'
+    text = f'side of markers whose entry has none [m] (default: {without})'
     parser.add_argument('--marker-size', type=_side, default=size, metavar='M', help=text)
     # The parser of an action begins with empty lists, and would overwrite those of the command under the same name.
     parser.add_argument(

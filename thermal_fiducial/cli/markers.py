@@ -7,6 +7,7 @@ from pathlib import Path
 from thermal_fiducial.cli import marker_drawings, marker_planning
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.subcommands import add_command
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.detection.patterns import Dictionary
 from thermal_fiducial.errors import InputError
@@ -22,16 +23,16 @@ from thermal_fiducial.files.writing import write_text
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Sub-commands of ``markers``."""
     commands = parser.add_subparsers(dest='action', metavar='ACTION', required=True)
-    _add_check(commands.add_parser('check', help='check which markers of a dictionary can be cut in one piece'))
-    marker_drawings.add_make(commands.add_parser('make', help='draw markers (SVG, DXF, PDF, PNG), one file a marker'))
-    marker_drawings.add_sheet(commands.add_parser('sheet', help='draw many markers nested on sheets of a given size'))
-    _add_bridge(commands.add_parser('bridge', help='list the bridges of markers of a standard dictionary'))
-    marker_drawings.add_board(commands.add_parser('board', help='draw thermal calibration boards'))
-    _add_dictionary(commands.add_parser('dictionary', help='search for a dictionary of markers that can be cut'))
+    _add_check(add_command(commands, 'check', 'check which markers of a dictionary can be cut in one piece'))
+    marker_drawings.add_make(add_command(commands, 'make', 'draw markers (SVG, DXF, PDF, PNG), one file a marker'))
+    marker_drawings.add_sheet(add_command(commands, 'sheet', 'draw many markers nested on sheets of a given size'))
+    _add_bridge(add_command(commands, 'bridge', 'list the bridges of markers of a standard dictionary'))
+    marker_drawings.add_board(add_command(commands, 'board', 'draw thermal calibration boards'))
+    _add_dictionary(add_command(commands, 'dictionary', 'search for a dictionary of markers that can be cut'))
     marker_planning.add_plan(
-        commands.add_parser('plan', help='predict detection, error of the pose and contrast over time')
+        add_command(commands, 'plan', 'predict detection, error of the pose and contrast over time')
     )
-    marker_planning.add_measure(commands.add_parser('measure', help='measure the tables of plan in simulation'))
+    marker_planning.add_measure(add_command(commands, 'measure', 'measure the tables of plan in simulation'))
 
 
 def run(args: argparse.Namespace) -> int:
