@@ -91,7 +91,7 @@ def test_frames_of_8_bits_are_taken_and_what_they_cost_is_said(graph):
     assert graph.heard['thermal/image'][0].encoding == 'mono16'
     level, reason, _ = graph.diagnose(node)
     assert level == OK
-    assert '8 bits' in reason
+    assert '8-bit images' in reason
 
 
 def test_a_late_frame_goes_out_and_is_counted(graph):
@@ -227,7 +227,7 @@ def test_a_detector_that_cannot_keep_up_takes_the_newest_image_and_counts_the_ot
     assert stamps == [convert.stamp_ns(images[-1].header.stamp)]
     _, reason, figures = graph.diagnose(node)
     assert figures['left /thermal/image'] == '5'
-    assert '5 older images left' in reason
+    assert '5 older images skipped' in reason
 
 
 def test_an_opencv_that_nobody_has_tried_is_refused_in_words(graph, monkeypatch):
@@ -319,7 +319,7 @@ def test_a_mapper_that_cannot_keep_up_takes_the_newest_frame_and_counts_the_othe
     assert convert.stamp_ns(graph.heard['camera_pose'][0].header.stamp) == START + 5 * 33_333_333
     _, reason, figures = graph.diagnose(node)
     assert (len(graph.heard['camera_pose']), figures['left /markers']) == (1, '5')
-    assert reason == '5 older frames left'
+    assert reason == '5 older frames skipped'
 
 
 def test_services_save_freeze_and_reset(graph, map_file):
@@ -449,18 +449,18 @@ def test_a_filter_that_has_no_time_for_its_imu_says_by_how_much_its_pose_is_late
     driver = graph.tester.advertise(Imu, 'imu/data')
     graph.spin_until(lambda: driver.listeners and graph.input(node, 'imu/data').publishers)
     node.diagnose(0)
-    assert 'no time' not in node.state()[1]
+    assert 'overloaded' not in node.state()[1]
     for k in range(3):
         driver.send(imu(k))
         time.sleep(0.1)
     node.diagnose(0)
     level, words = node.state()
     assert level == ERROR
-    assert float(words.partition('no time: IMU messages wait for ')[2].removesuffix(' s')) >= 0.3
-    assert 'the pose comes late' in node.headline()
+    assert float(words.partition('overloaded: IMU messages wait for ')[2].removesuffix(' s')) >= 0.3
+    assert 'poses are late' in node.headline()
     graph.spin_until(lambda: graph.input(node, 'imu/data').count == 3)
     node.diagnose(0)
-    assert 'no time' not in node.state()[1]
+    assert 'overloaded' not in node.state()[1]
 
 
 def test_a_queue_of_imu_messages_is_taken_in_at_once_with_one_pose_at_the_newest(graph):
@@ -564,7 +564,7 @@ def test_a_reset_is_said_with_its_reason_and_then_that_the_pose_is_back(graph, c
     assert lines == [
         'initialised: tracking',
         'reset: the poses contradict the estimate and agree with each other',
-        'reset: it was asked for',
+        'reset: on request',
         'waiting for markers',
         'recovered: tracking',
     ]

@@ -100,7 +100,7 @@ def test_a_robot_description_decides_where_the_camera_is(graph, kind, capfd):
     np.testing.assert_allclose(in_force(node), FORWARD, atol=1e-12)
     lines = [line for line in capfd.readouterr().err.splitlines() if 'camera on the robot' in line]
     assert len(lines) == 1
-    assert 'from robot_description, 0.201 m and 0.00 deg from what held before' in lines[0]
+    assert 'from robot_description, 0.201 m and 0.00 deg from the previous pose' in lines[0]
     # A parameter that is set while it runs brings nothing of the others back.
     live = [
         parameter
@@ -211,7 +211,7 @@ def test_tf_stands_before_a_urdf_and_does_not_move_the_camera_in_flight():
     robot.taken['robot_description'](String(data=URDF))
     robot.taken['/tf_static'](static('base_link', CAMERA, transform(np.eye(3), [0.7, 0.0, 0.0])))
     assert moved == [1, 2]
-    assert 'not taken over' in robot.events['camera']
+    assert 'ignored until' in robot.events['camera']
     assert len(robot.said) == 2
 
 

@@ -99,7 +99,7 @@ def test_stamps_of_another_clock_give_no_latency():
 def test_the_last_refusals_come_first_and_grow_old():
     status = flying()
     for second, words in ((4.0, '7.1 sigma'), (5.0, '9.3 sigma')):
-        status.diagnostic(second, 'pose_ekf', 1, f'tracking; pose refused: {words}', FIGURES)
+        status.diagnostic(second, 'pose_ekf', 1, 'tracking', FIGURES | {'last refused pose': f'refused: {words}'})
     for count in ('1', '2'):
         figures = {'refused messages': count, 'last refusal': 'encoding rgb8'}
         status.diagnostic(6.0, 'tau2_camera', 1, 'encoding rgb8', figures)
@@ -190,7 +190,8 @@ def test_once_says_in_a_line_that_there_is_nothing(capfd, monkeypatch):
         monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
         assert main(['watch', '--once', '--wait', '0.3']) == 1
     printed = capfd.readouterr().out
-    assert printed.startswith('The pose must not be flown on: nothing is heard of pose_ekf')
+    # Fast DDS prints lines of its own before it, where it finds leftovers of other processes.
+    assert printed.splitlines()[-1].startswith('The pose must not be flown on: nothing is heard of pose_ekf')
     assert printed.count('\n') == 1
 
 

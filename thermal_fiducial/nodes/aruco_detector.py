@@ -78,7 +78,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
     def state(self) -> tuple[bytes, str]:
         """Number of markers in the last frame, and of images skipped since the last diagnostics."""
         if left := self._images.left_since():
-            return WARN, f'{self._seen} markers; {left} older images left'
+            return WARN, f'{self._seen} markers; {left} older images skipped'
         return OK, '1 marker' if self._seen == 1 else f'{self._seen} markers'
 
 

@@ -34,7 +34,7 @@ class PoseEkfNode(StageNode[PoseEkfConfig]):
         self._corrections = MapCorrections(self.config.max_delay)
         self.subscribe(PoseWithCovarianceStamped, 'camera_pose', self._on_camera_pose, qos.RESULT, raw=True)
         self._corrections.follow(self, self._on_map_moved)
-        self._frames = RobotFrames(self, lambda: self.filter.reset('the camera is elsewhere on the robot'))
+        self._frames = RobotFrames(self, lambda: self.filter.reset('the pose of the camera on the robot has changed'))
         self._outputs = FilterOutputs(self, self.config, self.fault, self._frames)
         self.serve(Trigger, '~/reset', self._on_reset)
 

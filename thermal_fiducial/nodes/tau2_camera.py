@@ -73,7 +73,7 @@ class Tau2Camera(StageNode[Tau2CameraConfig]):
         """Why the last frame was dropped, and faults of the published frames."""
         if self._reason:
             return WARN, self._reason
-        return OK, 'ok, but of 8 bits: raw counts show corners ten times as well' if self._displayed else 'ok'
+        return OK, 'ok, but 8-bit images: raw counts give corners ten times as accurate' if self._displayed else 'ok'
 
     def headline(self) -> str:
         """Message if the image has been frozen for longer than a shutter event, which is over within a second."""

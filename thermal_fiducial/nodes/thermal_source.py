@@ -41,7 +41,7 @@ class ThermalSource(StageNode[ThermalSourceConfig]):
         if trouble:
             self.get_logger().warning(trouble)
         elif self._source is not None:
-            self.get_logger().info(f'{self._source.name}: frames are coming')
+            self.get_logger().info(f'{self._source.name}: receiving frames')
 
     def state(self) -> tuple[bytes, str]:
         """Why there are no frames."""

@@ -7,6 +7,7 @@ from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_te
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.ros.console import Console
 from thermal_fiducial.ros.imu_queue import ImuQueue
+from thermal_fiducial.ros.live_status import LAST_REFUSED
 from thermal_fiducial.ros.node import ERROR, OK, WARN
 
 _WAITING = 'waiting for markers'
@@ -69,7 +70,7 @@ class FilterStatus:
         return _joined(self._headline, self._imu.headline())
 
     def _status(self) -> str:
-        """Status of the filter, or that poses and IMU have different clocks, which must not read as lack of markers."""
+        """Status of the filter; where it lacks poses because their clock is not the IMU's, that."""
         status = self._filter.status
         if status != _WAITING or self._imu_ns is None or self._pose_ns is None:
             return status
@@ -83,7 +84,7 @@ class FilterStatus:
         """Key-value pairs of the diagnostics."""
         numbers: dict[str, object] = {name: f'{value:.6g}' for name, value in self._filter.diagnostics().items()}
         own = {'lost': self._filter.lost, 'jumps': self.jumps, INNOVATIONS: self._innovations()}
-        return numbers | own | {'IMU messages without a pose': self._imu.without_pose}
+        return numbers | own | {LAST_REFUSED: self._last_refusal, 'IMU messages without a pose': self._imu.without_pose}
 
     def _innovations(self) -> str:
         """Innovations of the poses since the last call."""

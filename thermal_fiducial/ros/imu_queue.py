@@ -68,8 +68,8 @@ class ImuQueue:
 
     def complaint(self) -> str:
         """The delay in words; empty while poses come in time."""
-        return '' if self.level() == OK else f'no time: IMU messages wait for {self._reported:.2g} s'
+        return '' if self.level() == OK else f'overloaded: IMU messages wait for {self._reported:.2g} s'
 
     def headline(self) -> str:
         """The same without numbers."""
-        return '' if self.level() == OK else 'no time: the pose comes late'
+        return '' if self.level() == OK else 'overloaded: poses are late'

@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-import re
 
 from thermal_fiducial.core.imaging.frame_cleaner import SHUTTER
 
@@ -21,7 +20,8 @@ REFUSAL_S, MOST_REFUSALS = 60.0, 5
 _ONE_CLOCK_S = 5.0
 _FILTER, _CAMERA, _DETECTOR, _MAPPER = 'pose_ekf', 'tau2_camera', 'aruco_detector', 'marker_mapper'
 STAGES = (_CAMERA, _DETECTOR, _MAPPER, _FILTER)
-_REFUSED = re.compile(r'; pose (refused: .*)')
+#: Key of the filter's diagnostics: why the last pose was refused, empty once a later one is accepted.
+LAST_REFUSED = 'last refused pose'
 _OK, _WARNING = 0, 1
 
 
@@ -148,9 +148,8 @@ class LiveStatus:
             return
         before = self._nodes.get(node)
         self._nodes[node] = _Node(now, level, message, figures)
-        refusal = _REFUSED.search(message)
-        if refusal:
-            self._refuse(now, f'pose {refusal[1]}')
+        if refusal := figures.get(LAST_REFUSED):
+            self._refuse(now, f'pose {refusal}')
         counted = figures.get('refused messages', '0')
         if before is not None and counted != before.figures.get('refused messages', '0'):
             self._refuse(now, f'{node}: {figures.get("last refusal", "")}')

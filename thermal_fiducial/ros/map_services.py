@@ -129,7 +129,7 @@ class MapServices:
         self._refuse_frozen()
         self._publish_jump(self.mapper.reset())
         left = f'{self.mapper.map.size_in_words} left'
-        self._node.console.event('map', f'map reset, as it was asked for: {left}')
+        self._node.console.event('map', f'map reset on request: {left}')
         return left
 
     def refine(self) -> str:

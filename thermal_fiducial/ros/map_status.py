@@ -16,7 +16,7 @@ def state(result: MapperResult, doubts: str, *, frozen: bool, left: int = 0) -> 
     if result.quarantined:
         return WARN, f'quarantined: {_listed(result.quarantined)}'
     if left:
-        return WARN, f'{left} older frames left'
+        return WARN, f'{left} older frames skipped'
     return OK, 'map frozen' if frozen else 'ok'
 
 

@@ -98,7 +98,7 @@ class RobotFrames:
                 continue
             moved = not _same(T_body_camera, _in_force(config))
             if source == self.source and moved and (T_imu_base is None) == (self.T_imu_base is None):
-                text = f'{source} has moved the camera on the robot: not taken over before the node starts again'
+                text = f'{source} has moved the camera on the robot: ignored until the node is restarted'
                 self._node.console.event('camera', text)
                 return
             self._take(source, T_body_camera, T_imu_base, moved=moved)
@@ -116,7 +116,7 @@ class RobotFrames:
         new = source != self.source
         self.source, self.T_imu_base = source, T_imu_base
         if moved:
-            self._say(f', {np.linalg.norm(apart[:3, 3]):.3f} m and {_angle_deg(apart):.2f} deg from what held before')
+            self._say(f', {np.linalg.norm(apart[:3, 3]):.3f} m and {_angle_deg(apart):.2f} deg from the previous pose')
             self._node.configure(self._node.config)
             if self._on_moved is not None:
                 self._on_moved()

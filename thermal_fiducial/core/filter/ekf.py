@@ -43,7 +43,7 @@ class PoseEkf:
         self._config = config
         self._hypotheses.configure(config)
 
-    def reset(self, reason: str = 'it was asked for') -> None:
+    def reset(self, reason: str = 'on request') -> None:
         """Discard the estimate and all samples and poses; the diagnostics give the ``reason``."""
         config, self._restart_reason = self._config, reason
         self._hypotheses = Hypotheses(config)
