@@ -1,0 +1,71 @@
+"""Records that cross from stage to stage: nobody changes them, neither who received nor who made them."""
+
+from dataclasses import fields, is_dataclass
+
+import numpy as np
+from support import small_bag
+
+from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.core.pipeline import Pipeline, PipelineConfig
+from thermal_fiducial.files.dictionary import load_dictionary
+
+
+def arrays(value):
+    """All arrays in a record, however deep."""
+    if isinstance(value, np.ndarray):
+        yield value
+    elif is_dataclass(value):
+        yield from arrays([getattr(value, item.name) for item in fields(value)])
+    elif isinstance(value, list | tuple):
+        for item in value:
+            yield from arrays(item)
+
+
+class Sealed:
+    """Makes arrays read-only, and remembers what they held."""
+
+    def __init__(self):
+        self.copies = []
+
+    def __call__(self, value):
+        for array in arrays(value):
+            array.setflags(write=False)
+            if array.dtype != object:
+                self.copies.append((array, array.copy()))
+        return value
+
+
+def sealing(method, sealed):
+    """The ``method``, of which arguments and result are sealed."""
+
+    def sealed_method(*arguments):
+        return sealed(method(*sealed(arguments)))
+
+    return sealed_method
+
+
+def test_no_stage_changes_what_it_received_or_has_handed_on():
+    config = PipelineConfig.from_mapping(small_bag.PARAMETERS)
+    start = small_bag.map_of(dict(list(small_bag.CENTRES.items())[:2]))
+    pipeline = Pipeline(config, load_dictionary('DICT_4X4_50'), start, small_bag.CAMERA)
+    sealed = Sealed()
+    for stage, names in (
+        (pipeline.cleaner, ['process']),
+        (pipeline.detector, ['detect']),
+        (pipeline.mapper, ['locate', 'learn', 'snapshot', 'apply']),
+        (pipeline.filter, ['add_imu', 'add_pose']),
+    ):
+        for name in names:
+            setattr(stage, name, sealing(getattr(stage, name), sealed))
+    rng = np.random.default_rng(0)
+    for k in range(400):
+        stamp = small_bag.START_NS + k * 5_000_000
+        values = small_bag.true_imu(k * 0.005)
+        pipeline.add_imu(ImuSample(stamp, values[:3], values[3:]))
+        if k % 7 == 0:
+            pipeline.add_image(stamp, small_bag.frame(small_bag.true_pose(k * 0.005), rng))
+    assert pipeline.filter.status == 'tracking'
+    assert len(pipeline.mapper.map.markers) == len(small_bag.CENTRES)
+    assert len(sealed.copies) > 1000
+    for array, copy in sealed.copies:
+        np.testing.assert_array_equal(array, copy)
