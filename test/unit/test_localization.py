@@ -1,0 +1,68 @@
+"""The camera in a map of known markers: the joint fit, its weights, and the planar ambiguity."""
+
+import numpy as np
+import pytest
+from support.walls import CAMERA, flight, look, see, SIZE, wall
+
+from thermal_fiducial.core.error_model import SystematicErrors
+from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.geometry.se3 import transform
+from thermal_fiducial.core.mapping.localization import locate, marker_weights
+from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.measurements import Observations
+
+MODEL = SystematicErrors()
+
+
+def located(T, poses, rows, prior=None):
+    """``locate`` with the markers of ``rows`` in a map of ``poses``."""
+    marker_map = MarkerMap({key: MapMarker(key, SIZE, True, pose) for key, pose in poses.items()})
+    sight = Sight.of(Observations.of(rows), marker_map)
+    return locate(0, sight, np.zeros(len(rows)), CAMERA, prior, MODEL)
+
+
+def test_a_marker_that_was_moved_loses_its_weight_and_hardly_moves_the_pose():
+    rng = np.random.default_rng(1)
+    poses, T = wall(rng), flight(0.0)
+    moved = poses | {2: transform(np.eye(3), [0.0, 0.2, 0.0]) @ poses[2]}
+    rows = see(T, poses, 0.02, rng)
+    found, other = located(T, poses, rows), located(T, moved, rows)
+    place = rows['id'].tolist().index(2)
+    assert found.weights.min() == 1.0
+    assert other.weights[place] < 1e-3
+    assert np.delete(other.weights, place).min() == 1.0
+    # Corners of 0.02 px at 3 m: a tenth of a millimetre.
+    for outcome in (found, other):
+        assert np.abs(difference(outcome.pose.T_map_camera, T)).max() < 1e-3
+
+
+def test_the_pose_that_is_nearer_to_the_prior_settles_the_ambiguity_of_a_far_marker():
+    rng = np.random.default_rng(2)
+    poses = {0: wall(rng, tilt=0.0)[0]}
+    centre = poses[0][:3, 3]
+    T = look(centre + np.array([-9.0, 0.2, 0.0]), centre)
+    rows = see(T, poses, 0.3, rng)
+    unsettled = located(T, poses, rows)
+    assert isinstance(unsettled, Refusal)
+    assert unsettled.reason == 'planar ambiguity of marker 0 unsettled'
+    for prior in unsettled.viewpoint.T_map_camera:
+        outcome = located(T, poses, rows, prior)
+        assert isinstance(outcome, Location)
+        d = difference(outcome.pose.T_map_camera, prior)
+        # The fits end where a step would lower the chi square by less than a hundredth.
+        assert d @ np.linalg.solve(outcome.pose.covariance, d) < 1e-2
+
+
+@pytest.mark.parametrize(
+    ('errors', 'running', 'expected'),
+    [
+        # No worse than the median, or than what a decision allows, counts in full.
+        ([0.1, 0.2, 0.3], [0.0, 0.0, 0.0], [1.0, 1.0, 0.2**2 / 0.3**2]),
+        ([1e-3, 2e-3, 3e-3], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]),
+        # The running error counts as much as the present one.
+        ([0.2, 0.2, 0.2], [0.2, 0.2, 0.6], [1.0, 1.0, 0.2**2 / (0.5 * (0.2**2 + 0.6**2))]),
+    ],
+)
+def test_weights_are_ratios_of_squared_errors(errors, running, expected):
+    np.testing.assert_allclose(marker_weights(np.array(errors), np.array(running), MODEL), expected)

@@ -1,0 +1,67 @@
+"""Quarantine of markers that contradict the others, from made-up errors."""
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.core.mapping.map_data import MapMarker
+from thermal_fiducial.core.mapping.trust import inconsistent, Trust
+
+
+def markers(count=4, **values):
+    return {key: MapMarker(key, 0.3, False, np.eye(4), **values) for key in range(count)}
+
+
+def frame(trust, known, errors_px):
+    """A frame in which each of the first markers has its error, of 0.1 px that are explained."""
+    seen = np.array([known[key] for key in range(len(errors_px))], dtype=np.object_)
+    return trust.update(known, seen, np.array(errors_px), np.full(len(errors_px), 0.1))
+
+
+def test_a_marker_off_in_most_frames_of_a_second_is_quarantined_and_one_that_fits_again_released():
+    known = markers()
+    trust = Trust(known)
+    changes = [frame(trust, known, [0.1, 0.1, 0.1, 2.0]) for _ in range(40)]
+    # 1 - 0.95^n exceeds 0.7 with the 24th frame.
+    assert changes.index(True) == 23
+    assert sum(changes) == 1
+    assert not known[3].trusted
+    assert trust.quarantined == {3: '2.0 px off, 20.0 sigma, in most of the last 20 frames'}
+    changes = [frame(trust, known, [0.1, 0.1, 0.1, 0.1]) for _ in range(60)]
+    assert sum(changes) == 1
+    assert known[3].trusted
+    assert trust.quarantined == {}
+
+
+@pytest.mark.parametrize('errors', [[2.0], [0.1, 0.1, 0.3]])
+def test_one_marker_alone_and_errors_within_four_sigma_are_no_evidence(errors):
+    known = markers()
+    trust = Trust(known)
+    assert not any(frame(trust, known, errors) for _ in range(100))
+    assert all(marker.trusted for marker in known.values())
+
+
+def test_the_running_error_is_the_mean_at_first_and_then_forgets():
+    known = markers()
+    trust = Trust(known)
+    for error in (0.1, 0.3):
+        frame(trust, known, [error, 0.1])
+    of_both = np.sqrt((0.1**2 + 0.3**2) / 2.0)
+    np.testing.assert_allclose(trust.running_errors([known[0], known[1]]), [of_both, 0.1])
+    for _ in range(200):
+        frame(trust, known, [0.2, 0.1])
+    # 0.95^180 of the start is left.
+    np.testing.assert_allclose(trust.running_errors([known[0]]), [0.2], rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ('a', 'b', 'expected'),
+    [
+        ({'fixed': True}, {}, [False, True]),
+        ({}, {'fixed': True}, [True, False]),
+        ({'observations': 100}, {'observations': 20}, [False, True]),
+        ({'observations': 50}, {'observations': 20}, [False, False]),
+    ],
+)
+def test_of_two_that_contradict_each_other_the_better_known_one_holds(a, b, expected):
+    pair = [MapMarker(key, 0.3, T_map_marker=np.eye(4), **({'fixed': False} | own)) for key, own in enumerate((a, b))]
+    assert inconsistent(np.array([True, True]), pair).tolist() == expected
