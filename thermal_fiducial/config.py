@@ -171,7 +171,11 @@ def _number(name: str, value: Any) -> float:
 
 
 def _dictionary() -> Any:
-    return param('DICT_4X4_50', 'ArUco dictionary: a name of OpenCV, or the path of a dictionary file of ours.')
+    text = (
+        'Dictionary of the markers: a name of OpenCV or of this package (STENCIL_4X4_100 is the default of '
+        '"markers make"), or the path of a dictionary file.'
+    )
+    return param('DICT_4X4_50', text)
 
 
 def _marker_size() -> Any:

@@ -98,7 +98,7 @@ def test_a_map_names_a_dictionary_or_a_file_beside_it_and_opens_no_other(tmp_pat
     for folder in (tmp_path, tmp_path / 'maps'):
         save_dictionary(folder / 'own.yaml', 'OWN', load_dictionary('DICT_5X5_50'))
     beside = tmp_path / 'maps'
-    assert 'marker 3 is another one' in other_patterns([3], 'own.yaml', 'DICT_4X4_50', beside)
+    assert 'marker 3 looks different' in other_patterns([3], 'own.yaml', 'DICT_4X4_50', beside)
     for path in (str(tmp_path / 'own.yaml'), '../own.yaml', '/dev/zero', '/etc/passwd'):
         assert 'not opened' in other_patterns([3], path, 'DICT_4X4_50', beside)
     # The parameter is the user's own: it may be any path, and the map that is written says so.

@@ -62,13 +62,15 @@ def test_a_map_that_is_loaded_is_said_on_the_console(graph, map_file, capfd):
     assert f'map of 1 marker from {map_file}' in capfd.readouterr().err
 
 
-def test_a_map_of_another_dictionary_is_used_and_warned_of(graph, map_file):
+def test_a_map_of_another_dictionary_is_used_and_warned_of(graph, map_file, capfd):
     """Most likely the file's label is wrong: a drone that flies is not left without its map for that."""
     map_file.write_text(map_file.read_text().replace('DICT_4X4_50', 'DICT_5X5_50'))
     node = graph.add(MarkerMapperNode, map_file=str(map_file))
     level, reason = node.state()
     assert (len(node.mapper.map.markers), level) == (1, WARN)
     assert 'DICT_5X5_50' in reason
+    # The console says it at the start, where one looks who wonders why nothing is seen.
+    assert 'has markers of DICT_5X5_50, but dictionary is DICT_4X4_50' in capfd.readouterr().err
 
 
 def test_saving_keeps_what_was_in_the_file(graph, map_file):

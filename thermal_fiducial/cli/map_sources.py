@@ -4,37 +4,37 @@ import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from thermal_fiducial.cli.map_photos import detect_in_photos, isotropic, photos_in
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.run_parameters import camera_of_run, sizes_of_run
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, size_overrides
-from thermal_fiducial.core.detection.detector import MarkerDetector, rows_from_corners
+from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
-from thermal_fiducial.core.measurements import CORNER_FIELDS, MARKER_DTYPE, Markers
-from thermal_fiducial.core.types import FloatArray, Gray
+from thermal_fiducial.core.measurements import CORNER_FIELDS, Markers
+from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.csv_rows import named_rows
-from thermal_fiducial.files.dictionary import load_dictionary, not_in_dictionary
-from thermal_fiducial.files.images import read_picture
+from thermal_fiducial.files.dictionary import (
+    dictionary_of_map,
+    not_in_dictionary,
+    other_patterns,
+)
 from thermal_fiducial.files.map_history import digest, save_with_history
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.map_tools import map_editing
 from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.map_tools.map_doubts import Doubt, doubts
 
-_IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
-#: Noise of OpenCV's sub-pixel corners in photos [px]; the mapper takes the actual noise from the pictures.
-PHOTO_SIGMA_PX = 0.2
 # Bounds above all stamps [ns] and corners [px], and above all IDs.
 _LARGEST_VALUE, _LARGEST_ID = 9.2e18, 100_000
 # Standard deviations of entries without a covariance, which were written by hand.
 _HAND_STD_M, _HAND_STD_DEG = 0.1, 5.0
-# Time between unordered pictures, so long that the detector assumes no continuous motion.
-_APART_NS = 100_000_000_000
+# Dictionary of a new map, as the nodes take it.
+_DICTIONARY = ArucoDetectorConfig().dictionary
 
 
 def add_build(parser: argparse.ArgumentParser) -> None:
@@ -43,7 +43,9 @@ def add_build(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--calibration', type=Path, required=True, metavar='FILE', help='camera_info YAML of the camera'
     )
-    parser.add_argument('--dictionary', default='DICT_4X4_50', help='dictionary or dictionary file')
+    parser.add_argument(
+        '--dictionary', help=f'dictionary or dictionary file (default: that of --map, with --origin {_DICTIONARY})'
+    )
     start = parser.add_mutually_exclusive_group(required=True)
     start.add_argument('--origin', type=int, metavar='ID', help='marker that becomes the origin of the map')
     start.add_argument('--map', type=Path, metavar='MAP', help='map with known markers to start from')
@@ -88,9 +90,10 @@ def _build(args: argparse.Namespace) -> int:
     args.marker_size = args.marker_size or _only_size(start)
     if args.marker_size is None:
         raise InputError(f'{args.map}: its markers have several sizes: give --marker-size for new ones')
-    frames = _detect(_photos(args.images), camera, args)
+    frames = detect_in_photos(photos_in(args.images), camera, args)
     if args.origin is not None and not any(args.origin in rows['id'] for rows in frames):
-        raise InputError(f'{args.images}: marker {args.origin}, the origin, is in none of the {len(frames)} photos')
+        origin = f'marker {args.origin} of {args.dictionary}'
+        raise InputError(f'{args.images}: {origin}, the origin, is in none of the {len(frames)} photos')
     return _grow(args, frames, camera, start, work)
 
 
@@ -168,82 +171,20 @@ def _mapper_config(args: argparse.Namespace, dictionary: str) -> MarkerMapperCon
 
 
 def _start(args: argparse.Namespace) -> MarkerMap:
+    """Map to start from; sets ``args.dictionary`` to its dictionary."""
     sizes = size_overrides(tuple(args.marker_size_override))
     if args.map is not None:
-        return load_map(args.map, args.marker_size, sizes)
+        known = load_map(args.map, args.marker_size, sizes)
+        args.dictionary = args.dictionary or dictionary_of_map(known.dictionary, args.map.parent)
+        if other := other_patterns(known.markers, known.dictionary, args.dictionary, args.map.parent):
+            raise InputError(f'{args.map}: {other}')
+        return known
+    args.dictionary = args.dictionary or _DICTIONARY
     size = sizes.get(args.origin, args.marker_size)
     if size is None:
         raise InputError('map build --origin needs --marker-size')
     origin = MapMarker(args.origin, size, True, np.eye(4))
     return MarkerMap({args.origin: origin}, dictionary=args.dictionary)
-
-
-def _detector(args: argparse.Namespace) -> MarkerDetector:
-    defaults = ArucoDetectorConfig()
-    config = ArucoDetectorConfig(
-        dictionary=args.dictionary,
-        marker_size=args.marker_size or defaults.marker_size,
-        marker_size_overrides=tuple(args.marker_size_override),
-    )
-    return MarkerDetector(config, load_dictionary(args.dictionary))
-
-
-def _photos(folder: Path) -> list[Path]:
-    if not folder.is_dir():
-        raise InputError(f'{folder}: no such folder')
-    photos = sorted(file for file in folder.iterdir() if file.suffix.lower() in _IMAGES)
-    if not photos:
-        raise InputError(f'{folder}: no photos ({", ".join(sorted(_IMAGES))})')
-    return photos
-
-
-def _detect(photos: list[Path], camera: Camera, args: argparse.Namespace) -> list[Markers]:
-    detector, photo_detector = _detector(args), _photo_detector(args)
-    frames = []
-    with progress_bar('detecting') as progress:
-        for k, photo in enumerate(photos):
-            progress(k / len(photos))
-            counts = read_picture(photo, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-            if counts.shape != (camera.height, camera.width):
-                raise InputError(
-                    f'{photo}: {counts.shape[1]}x{counts.shape[0]}, '
-                    f'but the calibration is for {camera.width}x{camera.height}'
-                )
-            if counts.dtype == np.uint16:
-                frames.append(detector.detect(k * _APART_NS, counts.astype(np.uint16), camera))
-            else:
-                frames.append(_detect_in_photo(photo_detector, counts.astype(np.uint8), camera, detector))
-    return frames
-
-
-def _detect_in_photo(
-    photo_detector: 'cv2.aruco.ArucoDetector', gray: Gray, camera: Camera, sizes: MarkerDetector
-) -> Markers:
-    """Markers of an 8-bit photo.
-
-    Cameras for visible light sharpen their pictures and have a nonlinear grey scale. This displaces the edges of our
-    detector, which expects counts linear in radiance; OpenCV's corners depend on the gradient alone.
-    """
-    corners, ids, _ = photo_detector.detectMarkers(gray)
-    if not len(corners):
-        return np.zeros(0, MARKER_DTYPE)
-    ids = ids.ravel()
-    once = np.array([np.count_nonzero(ids == key) == 1 for key in ids])
-    ids, uv = ids[once].astype(np.int64), np.array(corners, dtype=np.float64).reshape(-1, 4, 2)[once]
-    side = np.array([sizes.size(int(key)) for key in ids])
-    return rows_from_corners(ids, uv, _isotropic(np.full(len(ids), PHOTO_SIGMA_PX)), side, camera)
-
-
-def _photo_detector(args: argparse.Namespace) -> 'cv2.aruco.ArucoDetector':
-    """OpenCV's detector. Raises InputError if this version of OpenCV does not have it."""
-    if not hasattr(cv2.aruco, 'ArucoDetector'):
-        raise InputError(f"OpenCV {cv2.__version__}: photos need 4.7 or newer, as pip's opencv-python-headless is")
-    parameters = cv2.aruco.DetectorParameters()
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    ours = load_dictionary(args.dictionary)
-    packed = np.concatenate([cv2.aruco.Dictionary.getByteListFromBits(bits) for bits in ours.bits])
-    theirs = cv2.aruco.Dictionary(packed, ours.bits.shape[1], ours.correctable)
-    return cv2.aruco.ArucoDetector(theirs, parameters)
 
 
 def _read_detections(path: Path, start: MarkerMap, args: argparse.Namespace, camera: Camera) -> list[Markers]:
@@ -268,7 +209,7 @@ def _read_detections(path: Path, start: MarkerMap, args: argparse.Namespace, cam
         rows = table[first:last]
         ids = rows[:, 1].astype(np.int64)
         size = np.array([sizes.get(int(key), args.marker_size) for key in ids])
-        frames.append(rows_from_corners(ids, rows[:, 3:].reshape(-1, 4, 2), _isotropic(rows[:, 2]), size, camera))
+        frames.append(rows_from_corners(ids, rows[:, 3:].reshape(-1, 4, 2), isotropic(rows[:, 2]), size, camera))
     assert len(frames) == len(stamps)
     return frames
 
@@ -286,7 +227,3 @@ def _detection_table(path: Path) -> FloatArray:
             raise InputError(f'{path}: line {number}: not a detection')
         rows.append(values)
     return np.array(rows).reshape(-1, len(names))
-
-
-def _isotropic(sigma_px: FloatArray) -> FloatArray:
-    return np.asarray(np.maximum(sigma_px, 1e-3)[:, None, None, None] ** 2 * np.tile(np.eye(2), (4, 1, 1)))

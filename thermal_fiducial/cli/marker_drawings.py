@@ -51,6 +51,7 @@ def _make(args: argparse.Namespace) -> int:
     drawings = list(_markers(args))
     _write_all(drawings, args)
     _say_what_is_weak(drawings, args)
+    _say_parameters(args)
     return 0
 
 
@@ -70,7 +71,12 @@ def _sheet(args: argparse.Namespace) -> int:
     drawings = list(_markers(args))
     _write_all(nest(drawings, width, height, spacing=args.spacing, margin=args.margin), args)
     _say_what_is_weak(drawings, args)
+    _say_parameters(args)
     return 0
+
+
+def _say_parameters(args: argparse.Namespace) -> None:
+    print(f'parameters of the nodes for these markers: dictionary: {args.dictionary}, marker_size: {args.size / 1e3:g}')
 
 
 def add_board(parser: argparse.ArgumentParser) -> None:

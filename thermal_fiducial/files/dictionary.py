@@ -75,26 +75,26 @@ def other_patterns(markers: Iterable[int], of: str, read_as: str, folder: Path =
     """
     if Path(of).name == Path(read_as).name:
         return ''
-    differ = f'the map is of {of}, looked for is {read_as}'
+    differ = f'the map has markers of {of}, but dictionary is {read_as}'
     try:
-        theirs, ours = load_dictionary(_of_map(of, folder)).bits, load_dictionary(read_as).bits
+        theirs, ours = load_dictionary(dictionary_of_map(of, folder)).bits, load_dictionary(read_as).bits
     except InputError as error:
         return f'{differ}: {error}'
     both = min(len(theirs), len(ours))
     other = [m for m in sorted(markers) if m >= both or not np.array_equal(theirs[m], ours[m])]
-    return f'{differ}: marker {other[0]} is another one there' if other else ''
+    return f'{differ}, whose marker {other[0]} looks different' if other else ''
 
 
 def not_in_dictionary(markers: Iterable[int], name: str, folder: Path) -> list[int]:
     """IDs ``markers`` that the dictionary of a map in ``folder`` lacks; none if it cannot be opened."""
     try:
-        known = len(load_dictionary(_of_map(name, folder)).bits)
+        known = len(load_dictionary(dictionary_of_map(name, folder)).bits)
     except InputError:
         return []
     return [marker for marker in sorted(markers) if marker >= known]
 
 
-def _of_map(name: str, folder: Path) -> str:
+def dictionary_of_map(name: str, folder: Path) -> str:
     """The dictionary of a map in ``folder``: a name, or a file beside the map; other paths are refused.
 
     Raises

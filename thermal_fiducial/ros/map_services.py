@@ -69,11 +69,11 @@ class MapServices:
     def _read(self) -> MarkerMap:
         loaded = self._keeper.load()
         self._node.get_logger().info(f'map of {loaded.size_in_words} from {self._keeper.path}')
-        if doubt := other_frame(loaded.frame_id, self._node.config.map_frame):
-            self._node.get_logger().warning(doubt)
-        wanted = self._node.config.dictionary
-        folder = self._keeper.path.parent
-        self._other_dictionary = other_patterns(loaded.markers, loaded.dictionary, wanted, folder)
+        config, folder = self._node.config, self._keeper.path.parent
+        self._other_dictionary = other_patterns(loaded.markers, loaded.dictionary, config.dictionary, folder)
+        for doubt in (other_frame(loaded.frame_id, config.map_frame), self._other_dictionary):
+            if doubt:
+                self._node.get_logger().warning(doubt)
         return loaded
 
     @property
