@@ -187,7 +187,7 @@ MECHANISMS = {
     ),
     'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
-    'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'refining:_OF_CLEAR': (6, np.inf)}),
+    'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'refining:_HARDLY_PX': np.inf}),
     'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(
         'fast, 8 K, blind', (), {'corner_errors:OF_LAG': 0.0, 'corner_errors:OF_LAG_FORM': 0.0}

@@ -40,9 +40,11 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 _BLUR_THAT_MATTERS_PX = 0.4
 #: Contrast-to-noise ratio above which a marker is clear: it is found at full and at half resolution.
 CLEAR_CNR = 20.0
-# Columns of pixels per cell, and blur [px] up to which the lag tail is modelled as symmetric blur instead of removed:
-# for clear markers, and for faint ones, where the noise of removing it would cost more.
-_OF_CLEAR, _OF_FAINT = (6, 0.2), (12, 1.0)
+# Columns of pixels per cell for clear markers, and for faint ones.
+_OF_CLEAR, _OF_FAINT = 6, 12
+# Displacement of a corner by lag, about the blur of the optics, up to which it is modelled as symmetric blur [px].
+# Beyond it, the lag tail is removed.
+_HARDLY_PX = 0.6
 _ROUNDS = 2
 _NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
 # Indices of the corners, clockwise, among the ends of the sides.
@@ -115,7 +117,7 @@ class RefinedMarkers(Stacked):
     def none(frame: Frame) -> 'RefinedMarkers':
         """No markers."""
         found, corners = FoundMarkers.none(), RefinedCorners.none()
-        blur = _motion_blur(frame, found.places, None, 0.0)
+        blur = _motion_blur(frame, found.places, None)
         return RefinedMarkers(found.ids, corners, blur, corners, found.places, frame.twist)
 
 
@@ -131,10 +133,10 @@ def refine(
     """
     if len(found.ids) == 0:
         return RefinedMarkers.none(frame)
-    columns, hardly = _OF_CLEAR if np.abs(found.cnr).min() > CLEAR_CNR else _OF_FAINT
+    columns = _OF_CLEAR if np.abs(found.cnr).min() > CLEAR_CNR else _OF_FAINT
     twist, places = frame.twist, found.places
     for _ in range(_ROUNDS):
-        blur = _motion_blur(frame, places, twist, hardly)
+        blur = _motion_blur(frame, places, twist)
         start = places.at.at_pixels(places.at.px + blur.shift)
         widths = config.blur_px, blur.spread
         seen = refine_corners(frame.image, start, frame.camera, behind, *widths, columns, blur.to_tails)
@@ -188,11 +190,11 @@ def _never_seen(frame: Frame, places: Places, seen: RefinedCorners, twist: Twist
     return unknown_motion(since[..., None, None] * places.flow, twist.covariance_ago(frame.lag), unsharpness, cell)
 
 
-def _motion_blur(frame: Frame, places: Places, twist: Twist | None, hardly_px: float) -> MotionBlur:
-    """Motion blur of all markers; lag tails are removed if the largest displacement by lag exceeds ``hardly_px``."""
+def _motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlur:
+    """Motion blur of all markers; lag tails are removed if the largest displacement by lag is not small."""
     lag_blur = np.zeros_like(places.at.px) if twist is None else places.lag_blur(twist, frame.lag)
     mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
-    if twist is None or (mean * mean).sum(axis=1).max() <= hardly_px**2:
+    if twist is None or (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
         return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean)
     # So far the velocity has carried the image since its lag tail was seen, as the read-out shows it.
     tail = -frame.lag * (places.flow @ twist.ago(LAG_TAIL_AGE * frame.lag))
