@@ -8,7 +8,7 @@ import numpy as np
 from thermal_fiducial.core.geometry.rigid_fit import SINGULAR
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
-# Columns of the inverse that are computed at a time.
+# Columns of a sparse matrix's inverse that are computed at a time.
 _CHUNK = 96
 # Unknowns up to which a dense factorisation is faster than a sparse one.
 _DENSE = 1500
@@ -43,23 +43,35 @@ class NormalEquations:
 
     def reduced(self, blocks: Blocks, damping: float = 0.0) -> 'ReducedSystem | None':
         """The system of the markers alone, factorised; None where it is singular."""
-        from scipy.sparse import bsr_array
-
-        markers = len(self._held)
         try:
             root = np.linalg.inv(np.linalg.cholesky(_damped(blocks.frame, damping)))
-        except np.linalg.LinAlgError:
+            coupling, matrix = self._schur(root[self._frame] @ blocks.cross, _damped(blocks.marker, damping))
+            free = np.flatnonzero(np.repeat(~self._held, 6))
+            factor = _factorised(matrix[free][:, free])
+        except (RuntimeError, ValueError, np.linalg.LinAlgError):
             return None
-        shape = (6 * self._frames, 6 * markers)
-        coupling: Any = bsr_array((root[self._frame] @ blocks.cross, self._marker, self._starts), shape=shape)
-        if len(self._frame) > _FULL * self._frames * markers:
-            coupling = coupling.toarray()
-        each = np.arange(markers + 1)
-        own = bsr_array((_damped(blocks.marker, damping), each[:-1], each))
-        matrix = own.tocsr() - coupling.T @ coupling
-        free = np.flatnonzero(np.repeat(~self._held, 6))
-        factor = _factorise(matrix[free][:, free])
-        return None if factor is None else ReducedSystem(root, coupling, matrix, factor, self._held)
+        return ReducedSystem(root, coupling, matrix, factor, self._held)
+
+    def _schur(self, cross: FloatArray, own: FloatArray) -> tuple[Any, Any]:
+        """Coupling (6 F, 6 M) of keyframes and markers, and Schur complement (6 M, 6 M); sparse in large maps.
+
+        Parameters
+        ----------
+        cross, own : (n, 6, 6), (M, 6, 6) blocks of the views and of the markers
+        """
+        frames, each = self._frames, np.arange(len(own))
+        if len(cross) > _FULL * frames * len(own):
+            cells, blocks = np.zeros((frames, 6, len(own), 6)), np.zeros((len(own), 6, len(own), 6))
+            cells[self._frame, :, self._marker] = cross
+            blocks[each, :, each] = own
+            coupling = cells.reshape(6 * frames, -1)
+            return coupling, blocks.reshape(6 * len(own), -1) - coupling.T @ coupling
+        # Only here, as its import takes 30 MB.
+        from scipy.sparse import bsr_array
+
+        sparse: Any = bsr_array((cross, self._marker, self._starts), shape=(6 * frames, 6 * len(own)))
+        reduced = bsr_array((own, each, np.arange(len(own) + 1))).tocsr() - sparse.T @ sparse
+        return sparse, reduced.toarray() if reduced.shape[0] <= _DENSE else reduced
 
 
 @dataclass(frozen=True)
@@ -72,7 +84,7 @@ class ReducedSystem:
     coupling: Any
     #: (6 M, 6 M) Schur complement, and the factorisation of its part of free markers
     matrix: Any
-    factor: Any
+    factor: '_Dense | _Sparse'
     #: (M,)
     held: BoolArray
 
@@ -91,11 +103,11 @@ class ReducedSystem:
         free = np.flatnonzero(~self.held)
         unknowns = (6 * free[:, None] + np.arange(6)).ravel()
         result = held_covariances.copy()
-        result[free] = factor * _diagonal_blocks(self.factor, len(free))
+        result[free] = factor * self.factor.covariances()
         for held in np.flatnonzero(self.held):
             if np.any(held_covariances[held]):
                 columns = self.matrix[unknowns][:, 6 * held : 6 * held + 6]
-                gains = -self.factor.solve(_dense(columns)).reshape(-1, 6, 6)
+                gains = -self.factor.solve(_as_array(columns)).reshape(-1, 6, 6)
                 result[free] += gains @ held_covariances[held] @ np.swapaxes(gains, -1, -2)
         return np.asarray(0.5 * (result + np.swapaxes(result, -1, -2)))
 
@@ -107,44 +119,61 @@ def _damped(H: FloatArray, damping: float) -> FloatArray:
     return np.asarray(H + (damping * diagonal + floor)[..., None] * np.eye(6))
 
 
-@dataclass(frozen=True)
-class _Cholesky:
-    """A dense factor with the interface of scipy's sparse one."""
-
-    factor: tuple[FloatArray, bool]
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        from scipy.linalg import cho_solve
-
-        return np.asarray(cho_solve(self.factor, right, check_finite=False))
-
-
-def _dense(matrix: Any) -> FloatArray:
+def _as_array(matrix: Any) -> FloatArray:
     return np.asarray(matrix if isinstance(matrix, np.ndarray) else matrix.toarray())
 
 
-def _factorise(S: Any) -> Any:
-    """Factors of a matrix; None when it is singular."""
-    from scipy.linalg import cho_factor
+def _diagonal_blocks(matrix: FloatArray) -> FloatArray:
+    """The 6 x 6 blocks (m, 6, 6) on the diagonal of a matrix (6 m, 6 m)."""
+    each = np.arange(len(matrix) // 6)
+    return np.asarray(matrix.reshape(len(each), 6, len(each), 6)[each, :, each])
+
+
+@dataclass(frozen=True)
+class _Dense:
+    """A small positive definite matrix (6 m, 6 m)."""
+
+    matrix: FloatArray
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solutions of right sides (6 m, K)."""
+        return np.asarray(np.linalg.solve(self.matrix, right))
+
+    def covariances(self) -> FloatArray:
+        """The 6 x 6 blocks (m, 6, 6) on the diagonal of the inverse."""
+        return _diagonal_blocks(np.asarray(np.linalg.inv(self.matrix), dtype=np.float64))
+
+
+@dataclass(frozen=True)
+class _Sparse:
+    """Factors of a large matrix (6 m, 6 m)."""
+
+    lu: Any
+    unknowns: int
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Solutions of right sides (6 m, K)."""
+        return np.asarray(self.lu.solve(right))
+
+    def covariances(self) -> FloatArray:
+        """The 6 x 6 blocks (m, 6, 6) on the diagonal of the inverse."""
+        blocks = []
+        for low in range(0, self.unknowns, _CHUNK):
+            width = min(_CHUNK, self.unknowns - low)
+            unit = np.zeros((self.unknowns, width))
+            unit[low + np.arange(width), np.arange(width)] = 1.0
+            blocks.append(_diagonal_blocks(self.lu.solve(unit)[low : low + width]))
+        return np.concatenate(blocks)
+
+
+def _factorised(S: Any) -> _Dense | _Sparse:
+    """What solves with a positive definite matrix; LinAlgError or RuntimeError if it is not one."""
+    if isinstance(S, np.ndarray):
+        np.linalg.cholesky(S)
+        return _Dense(S)
     from scipy.sparse import csc_array
     from scipy.sparse.linalg import splu
 
-    try:
-        if S.shape[0] <= _DENSE:
-            return _Cholesky(cho_factor(_dense(S), lower=True, overwrite_a=True))
-        return splu(csc_array(S), permc_spec='MMD_AT_PLUS_A', options={'SymmetricMode': True}, diag_pivot_thresh=0.0)
-    except (RuntimeError, ValueError, np.linalg.LinAlgError):
-        return None
-
-
-def _diagonal_blocks(lu: Any, count: int) -> FloatArray:
-    """The 6 x 6 blocks (count, 6, 6) on the diagonal of the inverse."""
-    blocks = np.empty((count, 6, 6))
-    for low in range(0, 6 * count, _CHUNK):
-        width = min(_CHUNK, 6 * count - low)
-        unit = np.zeros((6 * count, width))
-        unit[low + np.arange(width), np.arange(width)] = 1.0
-        columns = lu.solve(unit)[low : low + width].reshape(width // 6, 6, width // 6, 6)
-        k = np.arange(width // 6)
-        blocks[low // 6 : low // 6 + width // 6] = columns[k, :, k]
-    return blocks
+    options = {'SymmetricMode': True}
+    lu = splu(csc_array(S), permc_spec='MMD_AT_PLUS_A', options=options, diag_pivot_thresh=0.0)
+    return _Sparse(lu, S.shape[0])
