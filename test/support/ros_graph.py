@@ -19,19 +19,20 @@ class Graph:
         self.context = context
         self.executor = make_executor(context)
         self.nodes = []
-        self.tester = self._added(CountingNode('tester', context=context))
+        self.tester = self.added(CountingNode('tester', context=context))
         self._outputs = {}
         self.heard = {}
         self.listen(DiagnosticArray, '/diagnostics')
 
-    def _added(self, node):
+    def added(self, node):
+        """A node, run with the others."""
         self.executor.add_node(node)
         self.nodes.append(node)
         return node
 
     def add(self, kind, live=False, **parameters):
         overrides = [Parameter(name.replace('__', '.'), value=value) for name, value in parameters.items()]
-        return self._added(kind(live=live, context=self.context, parameter_overrides=overrides))
+        return self.added(kind(live=live, context=self.context, parameter_overrides=overrides))
 
     def listen(self, kind, topic, profile=qos.RESULT):
         """Collect the messages of a topic in ``heard``."""

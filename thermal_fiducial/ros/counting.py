@@ -42,7 +42,8 @@ class Input:
         self.count = 0
         #: messages skipped because a newer one had arrived
         self.left = self._left_before = 0
-        self._subscription: Any = None
+        #: of rclpy
+        self.subscription: Any = None
 
     def left_since(self) -> int:
         """Number of messages skipped since the last call."""
@@ -51,11 +52,11 @@ class Input:
 
     def attach(self, subscription: Any) -> None:
         """Set the subscription that is counted."""
-        self._subscription = subscription
+        self.subscription = subscription
 
     def take(self) -> tuple[Any, float] | None:
         """Take and count the oldest queued message; returns it and its time in the queue [s], None if there is none."""
-        subscription = self._subscription
+        subscription = self.subscription
         with subscription.handle:
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
         if taken is None:
@@ -75,7 +76,7 @@ class Input:
     @property
     def publishers(self) -> int:
         """Number of matched publishers."""
-        return int(self._subscription.get_publisher_count())
+        return int(self.subscription.get_publisher_count())
 
 
 class CountingNode(Node):
@@ -84,6 +85,8 @@ class CountingNode(Node):
     def __init__(self, name: str, **kwargs: Any) -> None:
         #: subscriptions that the executor ignores: their messages stay queued until :meth:`take_waiting`
         self.lazy: dict[Any, Input] = {}
+        #: others that it ignores, see :meth:`observe`
+        self._observed: set[Any] = set()
         super().__init__(name, **kwargs)
         self.inputs: list[Input] = []
         self.outputs: list[Output] = []
@@ -141,10 +144,22 @@ class CountingNode(Node):
         self.lazy[subscription] = source
         return source
 
+    def observe(self, kind: type, topic: str, profile: QoSProfile) -> Input:
+        """A subscription whose messages stay in its queue until somebody takes them; no input of the node."""
+        source = Input(self.resolve_topic_name(topic))
+        source.attach(self.create_subscription(kind, topic, lambda _: None, profile))
+        self._observed.add(source.subscription)
+        return source
+
+    def ignore(self, source: Input) -> None:
+        """End a subscription of :meth:`observe`."""
+        self._observed.discard(source.subscription)
+        self.destroy_subscription(source.subscription)
+
     @property
     def subscriptions(self) -> Iterator[Any]:
         """Subscriptions that the executor serves."""
-        return (subscription for subscription in super().subscriptions if subscription not in self.lazy)
+        return (item for item in super().subscriptions if item not in self.lazy and item not in self._observed)
 
     def take_waiting(self) -> None:
         """Take all queued messages of the lazy subscriptions, in the order of subscription."""

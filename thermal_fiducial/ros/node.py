@@ -19,6 +19,7 @@ from thermal_fiducial.files.reading import one_line
 from thermal_fiducial.ros import convert, params
 from thermal_fiducial.ros.console import Console
 from thermal_fiducial.ros.counting import CountingNode
+from thermal_fiducial.ros.hearing import Hearing
 from thermal_fiducial.ros.input_rates import InputRates
 
 Config = TypeVar('Config')
@@ -82,6 +83,9 @@ class StageNode(CountingNode, Generic[Config]):
         self.last_refusal = ''
         self._diagnosed_refused = 0
         self._rates = InputRates(self.inputs, _expected_rate(self.config))
+        self._hearing = Hearing(self)
+        #: why the node cannot go on in this process; see ``run``
+        self.deaf = ''
         #: console lines for a pilot
         self.console = Console(self.get_logger())
         self._diagnostics = self.advertise(DiagnosticArray, '/diagnostics')
@@ -179,6 +183,8 @@ class StageNode(CountingNode, Generic[Config]):
         """Publish the diagnostics of the time since the last call, and print changes of the headline."""
         self.take_waiting()
         self._rates.look(time.monotonic_ns() if self.live else stamp_ns)
+        if self.live and not self.deaf:
+            self._listen()
         level, reason = self._level()
         self.console.say(self._rates.trouble() or self.headline(), calm=level == OK)
         counts: dict[str, object] = {f'received {source.topic}': source.count for source in self.inputs}
@@ -192,10 +198,15 @@ class StageNode(CountingNode, Generic[Config]):
         self._diagnostics.send(convert.diagnostics(name, level, reason, values, stamp_ns))
         self._diagnosed_refused = self.refused
 
+    def _listen(self) -> None:
+        self.deaf = self._hearing.look()
+        if self.deaf:
+            self.get_logger().error(f'{self.deaf}; the node starts again')
+
     def _level(self) -> tuple[bytes, str]:
-        """Level and message by precedence: faults, refused messages, missing main input, stage and rates."""
-        if self.faults:
-            return ERROR, '; '.join(self.faults)
+        """Level and message by precedence: deafness, faults, refused messages, missing main input, stage and rates."""
+        if self.deaf or self.faults:
+            return ERROR, '; '.join(filter(None, (self.deaf, *self.faults)))
         if self.refused > self._diagnosed_refused:
             return WARN, self.last_refusal
         if self._rates.silent:

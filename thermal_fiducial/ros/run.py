@@ -16,7 +16,7 @@ from rclpy.utilities import ok, remove_ros_args, try_shutdown
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.node import StageNode
 from thermal_fiducial.ros.promptness import keep_for_good, take_priority
-from thermal_fiducial.ros.stopping import limit_the_end, StopSignals
+from thermal_fiducial.ros.stopping import limit_the_end, release_the_end, StopSignals
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
 #: Environment variables of Fast DDS 2 (Jazzy) and Fast DDS 3.
@@ -78,7 +78,7 @@ def _first_line(error: RuntimeError) -> str:
 
 
 def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = None) -> int:
-    """Run a node until it is asked to stop.
+    """Run a node until it is asked to stop; one that DDS has left deaf is started again in place of this process.
 
     Parameters
     ----------
@@ -91,7 +91,8 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     """
     stop = StopSignals(try_shutdown)
     try:
-        _make_and_spin(make_node, args, stop)
+        if _make_and_spin(make_node, args, stop):
+            _start_again()
     except InputError as error:
         print(f'{Path(sys.argv[0]).name}: {error}', file=sys.stderr)
         return 2
@@ -100,7 +101,15 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     return 0
 
 
-def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None, stop: StopSignals) -> None:
+def _start_again() -> None:
+    """Replace this process: nobody else would do it for ``ros2 run``, and launch would wait for a second."""
+    release_the_end()
+    sys.stdout.flush()
+    os.execv(sys.executable, sys.orig_argv)
+
+
+def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None, stop: StopSignals) -> bool:
+    """Run a node to its orderly end; whether it is to be started again."""
     # Saving comes first in the shutdown, before steps that may fail or hang.
     with ExitStack() as ending:
         ending.callback(try_shutdown)
@@ -115,6 +124,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             ending.callback(node.close)
             executor.add_node(node)
             _spin(node, executor, stop)
+            return bool(node.deaf) and not stop.asked
         except InputError:
             raise
         except ExternalShutdownException:
@@ -124,6 +134,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
             if ok() and not stop.asked:
                 raise
             limit_the_end()
+    return False
 
 
 def _made(make_node: Callable[[], StageNode[Any]]) -> StageNode[Any]:
@@ -148,5 +159,5 @@ def _spin(node: StageNode[Any], executor: Any, stop: StopSignals) -> None:
     if node.realtime_priority and not take_priority(node.realtime_priority):
         node.get_logger().info('no real-time priority: this user may not')
     # EventsExecutor.spin() and spin_once(None) run no callbacks on some builds.
-    while ok() and not stop.asked:
+    while ok() and not (stop.asked or node.deaf):
         executor.spin_once(timeout_sec=1.0)

@@ -70,3 +70,9 @@ def limit_the_end(crashed: type[BaseException] | None = None, *_: object) -> Non
     signal.setitimer(signal.ITIMER_REAL, LEAVING_S)
     signal.signal(signal.SIGPROF, signal.SIG_DFL)
     signal.setitimer(signal.ITIMER_PROF, LEAVING_CPU_S)
+
+
+def release_the_end() -> None:
+    """Disarm :func:`limit_the_end`, whose timers a program that replaces this one would inherit."""
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    signal.setitimer(signal.ITIMER_PROF, 0.0)
