@@ -49,6 +49,7 @@ BORDER_PX = 1.0
 
 def confirmed(
     image: Float32Array,
+    to_tails: FloatArray | None,
     found: FoundMarkers,
     there: FloatArray,
     refined: RefinedCorners,
@@ -64,12 +65,16 @@ def confirmed(
 
     Parameters
     ----------
+    to_tails : (N, 2, 3) maps from pixels to lag tails, which are removed; None: none are
     there : (N, 4, 2) predicted corners in the image [px]
     standing_picture : (N,) which are in a picture for a display, without motion blur
     """
     if len(found.ids) == 0:
         return np.zeros(0, dtype=bool)
-    reading = _read(image, refined.corners_px, decoder)
+    tails = None
+    if to_tails is not None:
+        tails = refined.corners_px @ to_tails[:, :, :2].swapaxes(1, 2) + to_tails[:, None, :, 2]
+    reading = _read(image, refined.corners_px, tails, decoder)
     similarity = np.abs(reading.correlation)
     contrast = np.abs(refined.contrast) / np.maximum(refined.noise, TINY)
     same = reading.ids == found.ids
@@ -84,12 +89,13 @@ def confirmed(
     return np.asarray(same & ((found.expected & known & near) | (alike & (softness <= _SHARP))))
 
 
-def _read(image: Float32Array, quads: FloatArray, decoder: Decoder) -> Reading:
+def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:
     """Readings of quadrilaterals (Q, 4, 2), at half resolution if all are large enough."""
     sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
     if sides.min() < _WIDE_CELL_PX * decoder.cells:
-        return decoder.read(image, quads)
-    return decoder.read(halved(image), halfway(quads))
+        return decoder.read(image, quads, lag_tails=lag_tails)
+    half_tails = None if lag_tails is None else halfway(lag_tails)
+    return decoder.read(halved(image), halfway(quads), lag_tails=half_tails)
 
 
 def speaks_for_itself(reading: Reading, decoder: Decoder) -> BoolArray:

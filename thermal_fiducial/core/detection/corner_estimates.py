@@ -21,7 +21,7 @@ from thermal_fiducial.core.detection.corner_errors import (
 )
 from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind_border, model, sides_of
-from thermal_fiducial.core.detection.frame import counts_of, Frame, markers_deblurred
+from thermal_fiducial.core.detection.frame import counts_of, Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.refining import RefinedCorners, RefinedMarkers, sides_px
@@ -148,12 +148,10 @@ class CornerEstimator:
         keep = read & found.certain
         others = np.flatnonzero(~keep)
         if len(others):
-            there, image = there[others], frame.image
-            if blur.to_tails is not None:
-                image = markers_deblurred(image, there, blur.to_tails[others])
+            there, to_tails = there[others], None if blur.to_tails is None else blur.to_tails[others]
             standing = np.sqrt(np.sum(blur.spread[others] ** 2, axis=1)) < _STANDING * sides_px(there) / cells
             keep[others] = confirmed(
-                image, found.only(others), there, observed.only(others), self._decoder, config,
+                frame.image, to_tails, found.only(others), there, observed.only(others), self._decoder, config,
                 standing_picture=frame.displayed & standing,
             )  # fmt: skip
         return np.asarray(keep & frame.camera.contains(observed.corners_px, BORDER_PX).all(axis=1))

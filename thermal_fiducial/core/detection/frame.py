@@ -38,9 +38,6 @@ _LEVELS = 256
 # Interpolation of lag tails where edges are measured: a linear one blurs them more than the image that they are taken
 # from, a cubic one displaces them by up to 0.04 px.
 _EXACT = cv2.INTER_LANCZOS4
-# Margin around a marker from which the lag tail is removed [px]: windows across the sides of 10, and two for errors of
-# the prediction.
-_MARGIN_PX = 12
 # Age m from which on the response counts as lag tail, in time constants, and the weight b of the tail.
 _TAIL = 0.75
 _FORGOTTEN = math.exp(-_TAIL)
@@ -164,30 +161,13 @@ def counts_of(pixel: IntArray, image: Float32Array, to_tails: FloatArray | None 
     to_u, to_v = (
         (maps[:, row, 0] * u + maps[:, row, 1] * v + maps[:, row, 2]).reshape(len(by_marker), -1) for row in (0, 1)
     )
-    lag_tail = cv2.remap(image, to_u, to_v, _EXACT, borderMode=cv2.BORDER_REPLICATE).reshape(counts.shape)
-    return np.asarray(counts + np.float32(_GAIN - 1.0) * (counts - lag_tail))
+    lag_tails = np.asarray(cv2.remap(image, to_u, to_v, _EXACT, borderMode=cv2.BORDER_REPLICATE), dtype=np.float32)
+    return without_tails(counts, lag_tails.reshape(counts.shape))
 
 
-def markers_deblurred(image: Float32Array, corners_px: FloatArray, maps: FloatArray) -> Float32Array:
-    """``image`` with the lag tails removed in windows around N markers with corners (N, 4, 2).
-
-    ``maps`` (N, 2, 3): as ``to_tails`` of :func:`counts_of`. Cubic interpolation suffices to read cells, in a fifth of
-    the time of an exact one.
-    """
-    result, flags = image.copy(), cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-    height, width = image.shape
-    finite = np.isfinite(corners_px).all(axis=(1, 2)) & np.isfinite(maps).all(axis=(1, 2))
-    corners_px, maps = corners_px[finite], maps[finite]
-    low = np.floor(corners_px.min(axis=1)).astype(int) - _MARGIN_PX
-    high = np.ceil(corners_px.max(axis=1)).astype(int) + _MARGIN_PX + 1
-    low, high = np.maximum(low, 0), np.minimum(high, (width, height))
-    seen = (low < high).all(axis=1)
-    low, high, to_tail = low[seen], high[seen], maps[seen].astype(np.float32)
-    to_tail[:, :, 2:] += to_tail[:, :, :2] @ low[..., None].astype(np.float32)
-    for (u0, v0), (u1, v1), inverse in zip(low.tolist(), high.tolist(), to_tail, strict=True):
-        lag_tail = cv2.warpAffine(image, inverse, (u1 - u0, v1 - v0), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        cv2.addWeighted(image[v0:v1, u0:u1], _GAIN, lag_tail, 1.0 - _GAIN, 0.0, dst=result[v0:v1, u0:u1])
-    return result
+def without_tails(counts: Float32Array, lag_tails: Float32Array) -> Float32Array:
+    """``counts`` (...) at some places without the lag tails there, where ``lag_tails`` (...) are the image's."""
+    return np.asarray(counts + np.float32(_GAIN - 1.0) * (counts - lag_tails))
 
 
 def lag_tail_maps(corners_px: FloatArray, lag_blur_px: FloatArray) -> FloatArray:

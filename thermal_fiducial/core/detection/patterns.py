@@ -11,8 +11,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from thermal_fiducial.core.detection.frame import without_tails
 from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
-from thermal_fiducial.core.types import BoolArray, Counts, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
 
 # Distance from a side at which black and white are compared: in cells, and at most in pixels.
 _OUTSIDE = 0.4
@@ -135,24 +136,37 @@ class Decoder:
         mean = np.kron(np.eye(self.cells), np.full((len(CELL_SAMPLES), 1), 1.0 / len(CELL_SAMPLES)))
         self._cells_of_samples = (np.kron(mean, mean) @ self._detrend).astype(np.float32)
 
-    def read(self, image: Float32Array, quads: FloatArray, allowed: BoolArray | None = None) -> Reading:
-        """Most similar pattern of each quadrilateral (Q, 4, 2) among those ``allowed`` (M,), or all."""
+    def read(
+        self,
+        image: Float32Array,
+        quads: FloatArray,
+        allowed: BoolArray | None = None,
+        lag_tails: FloatArray | None = None,
+    ) -> Reading:
+        """Most similar pattern of each quadrilateral (Q, 4, 2) among those ``allowed`` (M,), or all.
+
+        ``lag_tails`` (Q, 4, 2): where their corners are in the lag tails, which are removed.
+        """
         if len(quads) == 0:
             nothing = np.zeros(0)
             none = nothing.astype(np.int64)
             return Reading(none, none, nothing, nothing, nothing, none, none, nothing)
-        values, best, correlation, runner_up = self.likeness(image, quads, allowed)
+        values, best, correlation, runner_up = self.likeness(image, quads, allowed, lag_tails)
         steps = np.zeros((len(quads), 4))
         alike = np.flatnonzero(np.abs(correlation) >= _SIMILAR)
         if len(alike):
-            steps[alike] = self._steps(image, quads[alike])
+            steps[alike] = self._steps(image, quads[alike], None if lag_tails is None else lag_tails[alike])
         return self._judged(values, best, correlation, runner_up, steps)
 
     def likeness(
-        self, image: Counts | Float32Array, quads: FloatArray, allowed: BoolArray | None = None
+        self,
+        image: Float32Array,
+        quads: FloatArray,
+        allowed: BoolArray | None = None,
+        lag_tails: FloatArray | None = None,
     ) -> PatternMatch:
-        """Most similar patterns of quadrilaterals (Q, 4, 2) among those ``allowed`` (M,), or all."""
-        values = self._contrasts(image, quads)
+        """Most similar patterns of quadrilaterals (Q, 4, 2), as :meth:`read`."""
+        values = self._contrasts(image, quads, lag_tails)
         spread = np.sqrt((values * values).sum(axis=1, keepdims=True))
         similar = (values / np.maximum(spread, np.float32(TINY))) @ self._patterns.T
         if allowed is not None and not allowed.all():
@@ -194,17 +208,17 @@ class Decoder:
             np.sort(steps / safe, axis=1)[:, 1],
         )
 
-    def _steps(self, image: Float32Array, quads: FloatArray) -> FloatArray:
+    def _steps(self, image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None) -> FloatArray:
         """Mean counts just outside the sides minus those just inside (Q, 4)."""
         side = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1) / np.sqrt(2.0)
         near = np.minimum(_OUTSIDE / self.cells, _OUTSIDE_PX / np.maximum(side, 1.0))[:, None, None]
         weights = self._along_sides + near.astype(np.float32) * self._away
-        means = sampled(image, seen_between(quads, weights)).reshape(len(quads), 2, 4, -1).mean(axis=-1)
+        means = _between(image, quads, weights, lag_tails).reshape(len(quads), 2, 4, -1).mean(axis=-1)
         return np.asarray(means[:, 0] - means[:, 1], dtype=np.float64)
 
-    def _contrasts(self, image: Counts | Float32Array, quads: FloatArray) -> Float32Array:
+    def _contrasts(self, image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None = None) -> Float32Array:
         """Mean counts (Q, m * m) of the cells without the background."""
-        values = sampled(image, seen_between(quads, self._samples))
+        values = _between(image, quads, self._samples, lag_tails)
         values -= values[:, :1].copy()
         return np.asarray(values @ self._cells_of_samples)
 
@@ -230,7 +244,17 @@ def _in_plate(cells: int) -> FloatArray:
     return bilinear(np.array([low, high, high, low]), np.array([low, low, high, high]))
 
 
-def sampled(image: Counts | Float32Array, places: Float32Array) -> Float32Array:
+def _between(
+    image: Float32Array, quads: FloatArray, weights: Float32Array, lag_tails: FloatArray | None
+) -> Float32Array:
+    """Values (Q, P) of the image at points with ``weights`` (4, P) or (Q, 4, P) between corners, without lag tails."""
+    values = sampled(image, seen_between(quads, weights))
+    if lag_tails is None:
+        return values
+    return without_tails(values, sampled(image, seen_between(lag_tails, weights)))
+
+
+def sampled(image: Float32Array, places: Float32Array) -> Float32Array:
     """Values (Q, P) of the image at columns and rows (2, Q, P)."""
     values = cv2.remap(image, places[0], places[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float32)
