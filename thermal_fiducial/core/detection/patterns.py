@@ -166,7 +166,10 @@ class Decoder:
         lag_tails: FloatArray | None = None,
     ) -> PatternMatch:
         """Most similar patterns of quadrilaterals (Q, 4, 2), as :meth:`read`."""
-        values = self._contrasts(image, quads, lag_tails)
+        counts = sampled(image, seen_between(quads, self._samples))
+        if lag_tails is not None:
+            counts = without_tails(counts, sampled(image, seen_between(lag_tails, self._samples)))
+        values = self._contrasts(counts)
         spread = np.sqrt((values * values).sum(axis=1, keepdims=True))
         similar = (values / np.maximum(spread, np.float32(TINY))) @ self._patterns.T
         if allowed is not None and not allowed.all():
@@ -179,7 +182,7 @@ class Decoder:
 
     def match(self, image: Float32Array, quads: FloatArray, ids: IntArray) -> FloatArray:
         """Correlation (Q,) of quadrilaterals (Q, 4, 2) with the upright patterns of ``ids`` (Q,)."""
-        values = self._contrasts(image, quads)
+        values = self._contrasts(sampled(image, seen_between(quads, self._samples)))
         spread = np.maximum(np.sqrt(np.sum(values * values, axis=1)), np.float32(TINY))
         return np.asarray(np.sum(values * self._patterns[4 * ids], axis=1) / spread, dtype=np.float64)
 
@@ -213,14 +216,16 @@ class Decoder:
         side = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1) / np.sqrt(2.0)
         near = np.minimum(_OUTSIDE / self.cells, _OUTSIDE_PX / np.maximum(side, 1.0))[:, None, None]
         weights = self._along_sides + near.astype(np.float32) * self._away
-        means = _between(image, quads, weights, lag_tails).reshape(len(quads), 2, 4, -1).mean(axis=-1)
+        counts = sampled(image, seen_between(quads, weights))
+        if lag_tails is not None:
+            counts = without_tails(counts, sampled(image, seen_between(lag_tails, weights)))
+        means = counts.reshape(len(quads), 2, 4, -1).mean(axis=-1)
         return np.asarray(means[:, 0] - means[:, 1], dtype=np.float64)
 
-    def _contrasts(self, image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None = None) -> Float32Array:
-        """Mean counts (Q, m * m) of the cells without the background."""
-        values = _between(image, quads, self._samples, lag_tails)
-        values -= values[:, :1].copy()
-        return np.asarray(values @ self._cells_of_samples)
+    def _contrasts(self, counts: Float32Array) -> Float32Array:
+        """Mean counts (Q, m * m) of the cells without the background, by those of their samples (Q, P)."""
+        # Small numbers for sums in single precision.
+        return np.asarray((counts - counts[:, :1]) @ self._cells_of_samples)
 
 
 def shrunk(quads: FloatArray, cells: int) -> FloatArray:
@@ -242,16 +247,6 @@ def _in_plate(cells: int) -> FloatArray:
     """Of :func:`bilinear`, (4, 4), for the corners of such a marker."""
     low, high = 1.0 / (cells + 2), (cells + 1.0) / (cells + 2)
     return bilinear(np.array([low, high, high, low]), np.array([low, low, high, high]))
-
-
-def _between(
-    image: Float32Array, quads: FloatArray, weights: Float32Array, lag_tails: FloatArray | None
-) -> Float32Array:
-    """Values (Q, P) of the image at points with ``weights`` (4, P) or (Q, 4, P) between corners, without lag tails."""
-    values = sampled(image, seen_between(quads, weights))
-    if lag_tails is None:
-        return values
-    return without_tails(values, sampled(image, seen_between(lag_tails, weights)))
 
 
 def sampled(image: Float32Array, places: Float32Array) -> Float32Array:

@@ -15,9 +15,9 @@ import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, of_motion_blur, unknown_motion
-from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED
-from thermal_fiducial.core.detection.corners.sides import blurs, model, sides_of
-from thermal_fiducial.core.detection.corners.squares import as_squares
+from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED, Segments
+from thermal_fiducial.core.detection.corners.sides import blurs, model, Sides, sides_of
+from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.frame import (
     counts_of,
     delays,
@@ -96,6 +96,12 @@ class MotionBlur(Stacked):
     #: (N, 2) standard deviation of the remaining motion blur, along the motion [px]
     spread: FloatArray
 
+    @staticmethod
+    def none(count: int) -> 'MotionBlur':
+        """Of ``count`` markers at rest."""
+        still = np.zeros((count, 4, 2))
+        return MotionBlur(None, still, still, still[:, 0])
+
 
 @dataclass(frozen=True, slots=True)
 class RefinedMarkers(Stacked):
@@ -117,8 +123,7 @@ class RefinedMarkers(Stacked):
     def none(frame: Frame) -> 'RefinedMarkers':
         """No markers."""
         found, corners = FoundMarkers.none(), RefinedCorners.none()
-        blur = _motion_blur(frame, found.places, None)
-        return RefinedMarkers(found.ids, corners, blur, corners, found.places, frame.twist)
+        return RefinedMarkers(found.ids, corners, MotionBlur.none(0), corners, found.places, frame.twist)
 
 
 def refine(
@@ -138,8 +143,7 @@ def refine(
     for _ in range(_ROUNDS):
         blur = _motion_blur(frame, places, twist)
         start = places.at.at_pixels(places.at.px + blur.shift)
-        widths = config.blur_px, blur.spread
-        seen = refine_corners(frame.image, start, frame.camera, behind, *widths, columns, blur.to_tails)
+        seen = refine_corners(frame.image, start, frame.camera, behind, config.blur_px, columns, blur)
         markers = _at_stamp(frame, found.ids, places, blur, seen, twist, track, behind.shape[2])
         change = np.abs(markers.corners.corners_px - seen.corners_px + blur.shift)
         if markers.twist is None or change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX:
@@ -217,11 +221,10 @@ def refine_corners(
     camera: Camera,
     behind: Float32Array,
     blur_px: float,
-    lag_blur_px: FloatArray | None = None,
-    columns: int = 6,
-    to_tails: FloatArray | None = None,
+    columns: int = _OF_CLEAR,
+    motion: MotionBlur | None = None,
 ) -> RefinedCorners:
-    """Corners of N markers, refined.
+    """Corners of N markers, refined in passes until they converge.
 
     Parameters
     ----------
@@ -229,41 +232,29 @@ def refine_corners(
     corners : (N, 4) initial values, accurate to two pixels or a third of a cell
     behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
     blur_px : standard deviation of optics and pixel
-    lag_blur_px : (N, 2) standard deviation of what motion adds to the blur, along its direction; none when left out
     columns : of pixels, in a segment
-    to_tails : (N, 2, 3) maps from pixels to lag tails, which are removed; nothing is removed when left out
+    motion : blur by motion; none when left out
     """
-    lag_blur = np.zeros((len(corners.px), 2)) if lag_blur_px is None else lag_blur_px
-    found, moving = _pass(image, corners, camera, behind, blur_px, lag_blur, columns, to_tails)
-    which = np.arange(len(moving))
-    for _ in range(_PASSES - 1):
+    start, motion = corners, motion or MotionBlur.none(len(corners.px))
+    found, cells, which = RefinedCorners.none(), behind.shape[2], np.arange(len(corners.px))
+    for index in range(_PASSES):
+        widest = math.hypot(blur_px, math.sqrt(float((motion.spread * motion.spread).sum(axis=1).max())))
+        sides = sides_of(start.x, camera, image.shape, cells, columns, widest)
+        blur = blurs(sides.normal[:, cells // 2], blur_px, motion.spread)
+        counts = counts_of(sides.pixel, image, motion.to_tails)
+        segments = measure(counts, model(sides, behind, blur), REACHED * blur[0])
+        refined, moving = _moved(sides, segments, as_squares(start, *adjust(sides, segments, _PRIOR_PX)))
+        found = found.with_others(which, refined) if index else refined
         which = which[moving]
         if len(which) == 0:
             break
-        tails = None if to_tails is None else to_tails[which]
-        start = corners.only(which).at_pixels(found.corners_px[which])
-        again, moving = _pass(image, start, camera, behind[which], blur_px, lag_blur[which], columns, tails)
-        found = found.with_others(which, again)
+        start = start.only(moving).at_pixels(found.corners_px[which])
+        motion, behind = motion.only(moving), behind[moving]
     return found
 
 
-def _pass(
-    image: Float32Array,
-    start: ImagePoints,
-    camera: Camera,
-    behind: Float32Array,
-    blur_px: float,
-    lag_blur: FloatArray,
-    columns: int,
-    to_tails: FloatArray | None,
-) -> tuple[RefinedCorners, BoolArray]:
+def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCorners, BoolArray]:
     """Corners after one linearised adjustment, and which markers (N,) have not converged."""
-    cells = behind.shape[2]
-    widest = math.hypot(blur_px, math.sqrt(float((lag_blur * lag_blur).sum(axis=1).max())))
-    sides = sides_of(start.x, camera, image.shape, cells, columns, widest)
-    blur = blurs(sides.normal[:, cells // 2], blur_px, lag_blur)
-    segments = measure(counts_of(sides.pixel, image, to_tails), model(sides, behind, blur), REACHED * blur[0])
-    known = as_squares(start, *adjust(sides, segments, _PRIOR_PX))
     # Corners that constrain one another have correlated errors: as independent ones they would claim too much.
     together = (8 / (8 - known.constrained))[:, None, None, None]
     blocks = known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
