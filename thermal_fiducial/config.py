@@ -261,7 +261,7 @@ def _image_rate() -> Any:
 
 def _realtime_priority() -> Any:
     text = (
-        'SCHED_FIFO priority of tau2_camera, if the user may set one (rtprio in limits.conf); detector, mapper and '
+        'SCHED_RR priority of tau2_camera, if the user may set one (rtprio in limits.conf); detector, mapper and '
         'filter get 1, 2 and 3 more. 0: ordinary scheduling.'
     )
     return param(1, text, minimum=0, maximum=96)

@@ -36,7 +36,7 @@ _MATCHING_S = 0.7
 _SILENCE_S, _GLANCE_S = 1.5, 0.05
 #: Least time to the next message in which recorded messages are written to disk [ns].
 _SPARE_NS = 2_000_000
-#: SCHED_FIFO priority of the player, if the user may set one: the nodes must not delay its measurements.
+#: SCHED_RR priority of the player, if the user may set one: the nodes must not delay its measurements.
 _PRIORITY = 5
 #: Number of messages read ahead; reading a chunk of a bag takes 25 ms.
 _AHEAD = 60

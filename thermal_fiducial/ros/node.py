@@ -75,7 +75,7 @@ class StageNode(CountingNode, Generic[Config]):
             frames = {name: getattr(self.config, name, '') for name in _ROBOT_FRAMES}
             self.derive(**{name: self.frame_prefix + frame for name, frame in frames.items() if frame})
         asked = int(getattr(self.config, 'realtime_priority', 0))
-        #: SCHED_FIFO priority of the process; 0: ordinary scheduling
+        #: SCHED_RR priority of the process; 0: ordinary scheduling
         self.realtime_priority = asked + self.stage if asked else 0
         #: messages on faults of the configuration; the node runs without the parts concerned
         self.faults: list[str] = []

@@ -14,11 +14,14 @@ def keep_for_good() -> None:
 
 
 def take_priority(priority: int) -> bool:
-    """Set SCHED_FIFO for all threads of this process, unless the user has already chosen a policy.
+    """Set SCHED_RR for all threads of this process, unless the user has already chosen a policy.
+
+    Not SCHED_FIFO: the asynchronous writer of Fast DDS spins until another thread of its process has removed a sample,
+    and must not keep the core from it.
 
     Parameters
     ----------
-    priority : SCHED_FIFO priority, 1 to 99
+    priority : SCHED_RR priority, 1 to 99
 
     Returns
     -------
@@ -27,7 +30,7 @@ def take_priority(priority: int) -> bool:
     if os.sched_getscheduler(0) != os.SCHED_OTHER:
         return True
     try:
-        _schedule(os.SCHED_FIFO, priority)
+        _schedule(os.SCHED_RR, priority)
     except PermissionError:
         return False
     return True
