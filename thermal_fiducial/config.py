@@ -494,8 +494,15 @@ class MarkerMapperConfig(SelfChecked):
     time_offset_std: float = _time_offset_std()
     marker_size_std: float = param(
         0.003,
-        'Scale error common to all marker sizes and the focal length (relative standard deviation); enters the '
-        'covariances of map and poses.',
+        'Scale error common to all marker sizes (relative standard deviation); enters the covariances of map and '
+        'poses.',
+        minimum=0.0,
+        maximum=0.1,
+        live=True,
+    )
+    focal_length_std: float = param(
+        0.002,
+        'Error of the calibrated focal length (relative standard deviation); enters the covariances of poses.',
         minimum=0.0,
         maximum=0.1,
         live=True,

@@ -31,11 +31,11 @@ def root_of_field(corners, errors):
     return errors.corner_px * np.linalg.cholesky(correlations + 1e-7 * np.eye(len(corners)))
 
 
-def located(poses, rows, size_std=0.0, size=SIZE):
-    """The camera's pose in an exact map, or one of markers of another ``size``."""
-    marker_map = MarkerMap({i: MapMarker(i, size, True, T) for i, T in poses.items()})
-    config = MarkerMapperConfig(mode='localization', marker_size_std=size_std)
-    return MarkerMapper(config, marker_map).locate(stamp(0), rows, CAMERA).outcome
+def located(poses, rows, size_std=0.0, focal_std=0.0, camera=CAMERA):
+    """The camera's pose in an exact map."""
+    marker_map = MarkerMap({i: MapMarker(i, SIZE, True, T) for i, T in poses.items()})
+    config = MarkerMapperConfig(mode='localization', marker_size_std=size_std, focal_length_std=focal_std)
+    return MarkerMapper(config, marker_map).locate(stamp(0), rows, camera).outcome
 
 
 @pytest.mark.parametrize('count', [1, 4, 8])
@@ -80,6 +80,23 @@ def test_markers_larger_than_the_map_says_move_the_camera_by_what_the_scale_allo
     np.testing.assert_allclose(np.sqrt(np.diag(scale))[:3], np.abs(d[:3]), rtol=0.02, atol=2e-4)
 
 
+@pytest.mark.parametrize('count', [1, 8])
+def test_a_wrong_focal_length_moves_the_camera_by_what_is_allowed_for(count):
+    """In an exact map too: markers of known size at known places are nearer or farther all the same."""
+    poses = wall(np.random.default_rng(0), count)
+    rows = see(flight(0.0), poses, 1e-3, np.random.default_rng(1))
+    K = CAMERA.K.copy()
+    K[:2, :2] *= 1.002
+    exact, uncertain = (located(poses, rows, focal_std=std, camera=replace(CAMERA, K=K)).pose for std in (0.0, 0.002))
+    d = difference(flight(0.0), exact.T_map_camera)
+    # 0.2 % of 3.7 m, mostly along the line of sight.
+    assert 0.005 < np.linalg.norm(d[:3]) < 0.01
+    focal = uncertain.map_covariance - exact.map_covariance
+    # One sigma to first order, of one scalar: within 2 % of its own size.
+    np.testing.assert_allclose(np.sqrt(np.diag(focal))[:3], np.abs(d[:3]), rtol=0.02, atol=2e-4)
+    assert np.linalg.matrix_rank(focal, tol=1e-6 * np.trace(focal)) == 1
+
+
 def test_the_scale_of_a_map_grows_from_the_nearest_marker_that_is_held():
     positions, held = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [9.0, 0.0, 0.0]]), np.array([[0.0] * 3, [10.0, 0, 0]])
     stds = np.sqrt(scale_of_map(arms_of_scale(positions, held), ERRORS)[:, 0, 0])
@@ -122,7 +139,8 @@ def test_the_scale_of_a_map_moves_the_camera_as_one():
     claimed = dict(zip(poses, scale_of_map(arms, ERRORS), strict=True))
     uncertain = MarkerMap({i: MapMarker(i, SIZE, i == min(poses), T, claimed[i]) for i, T in poses.items()})
     rows = see(flight(0.0), poses, 1e-3, rng)
-    pose = MarkerMapper(MarkerMapperConfig(mode='localization'), uncertain).process(stamp(0), rows, CAMERA).pose
+    config = MarkerMapperConfig(mode='localization', focal_length_std=0.0)
+    pose = MarkerMapper(config, uncertain).process(stamp(0), rows, CAMERA).pose
     arm = pose.T_map_camera[:3, 3] - fixed
     expected = ERRORS.marker_size_std**2 * np.outer(arm, arm)
     # To a hundredth of the largest variance: weights and inverses in between.

@@ -30,10 +30,14 @@ class SystematicErrors:
     #: Corners [px] where one hypothesis is weighed against another, and the limit below which no marker is worth more
     #: than its neighbours. Enters the fit of new markers, the choice between two poses, and weights.
     decision_px: float = 0.1
-    #: Common relative error of the markers' sides and of the focal length: ways of measuring tags on one carpet differ
-    #: by 1.2 %, a laser cutter's kerf of 0.3 mm is 0.1 %, and a calibration with a board is good to 0.1 to 0.3 %.
-    #: Enters poses from markers (:func:`of_single_error`) and the map (:func:`scale_of_map`).
+    #: Common relative error of the markers' sides: ways of measuring tags on one carpet differ by 1.2 %, a laser
+    #: cutter's kerf of 0.3 mm is 0.1 %. Enters poses from markers (:func:`of_single_error`) and the map
+    #: (:func:`scale_of_map`).
     marker_size_std: float = 0.003
+    #: Relative error of the focal length: a calibration with a board is good to 0.1 to 0.3 %. It moves the camera along
+    #: its axis by as much of the distance to the markers, in maps with exact sizes too. Enters poses from markers
+    #: (:func:`of_single_error`).
+    focal_length_std: float = 0.002
     #: Corners of one marker in all of its views [share of the corners' noise]: its shape and the model of its edges.
     #: As measured on rendered flights with three lenses and 0.5 to 9 K. Enters the covariance of a joint adjustment.
     marker_shape: float = 0.7
@@ -42,7 +46,7 @@ class SystematicErrors:
 #: 99.9 % limits of chi square with six and eight degrees of freedom, of a pose and of a view of a marker.
 CHI2_OF_POSE, CHI2_OF_VIEW = 22.5, 26.1
 #: For data without systematic errors: simulated corners.
-NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0)
+NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0, 0.0)
 #: Share of the variance of the best-known marker in view that is common to all markers of the rigid map: the error of
 #: the gauge. In maps from flights past eight markers nearly all is; the rest covers markers surveyed one by one.
 MAP_COMMON = 0.75
@@ -148,8 +152,8 @@ def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
 
     Parameters
     ----------
-    std : standard deviation of the error: ``marker_size_std`` for the scale, that of the clock offset [s] for a
-        velocity, 1 for the difference of two possible poses
+    std : standard deviation of the error: ``marker_size_std`` for the scale, ``focal_length_std`` for the lens, that of
+        the clock offset [s] for a velocity, 1 for the difference of two possible poses
     """
     return np.asarray(std**2 * np.outer(moved, moved))
 

@@ -251,7 +251,9 @@ def _parameters(scenario: Scenario) -> dict[str, Any]:
         **({'marker_size_overrides': overrides} if overrides else {}),
         'camera_position': [float(value) for value in scenario.camera_position],
         'camera_orientation': [float(value) for value in scenario.camera_orientation],
-        # The extrinsics are exact, not calibrated.
+        # Nothing is measured or calibrated here: all is exactly as the parameters say.
+        'marker_size_std': 0.0,
+        'focal_length_std': 0.0,
         'extrinsics_position_std': 0.0,
         'extrinsics_orientation_std': 0.0,
         'camera_time_offset': float(scenario.camera_time_offset),

@@ -74,6 +74,11 @@ class Camera:
         """Geometric mean of the two focal lengths [px]."""
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
 
+    @property
+    def principal_point(self) -> FloatArray:
+        """(2,) [px]."""
+        return self.K[:2, 2]
+
     def matches(self, other: 'Camera') -> bool:
         """Whether ``other`` is the same calibration."""
         return (

@@ -159,7 +159,9 @@ class _JointFit:
         map_gains = -np.swapaxes(gains.reshape(6, n, 8), 0, 1) @ seen.J_marker
         # Sides of the markers and distances in the map have the same scale error.
         of_scale = np.einsum('nij,nj->i', map_gains[:, :, :3], sight.scale_arms) - grown
-        of_map = of_single_error(of_scale, model.marker_size_std)
+        # A longer focal length moves all corners away from the principal point.
+        of_focal = gains @ (sight.observed.corners - self.camera.principal_point).ravel()
+        of_map = of_single_error(of_scale, model.marker_size_std) + of_single_error(of_focal, model.focal_length_std)
         if np.any(sight.map_covariances):
             rest = positive(sight.map_covariances - scale_of_map(sight.scale_arms, model))
             of_map += map_of_pose(map_gains, rest, sight.T_map_marker[:, :3, 3], T_map_camera[:3, 3])

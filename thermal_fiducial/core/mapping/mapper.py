@@ -128,7 +128,10 @@ class MarkerMapper:
 
     @property
     def _errors(self) -> SystematicErrors:
-        return SystematicErrors(self._bias.px, marker_size_std=self.config.marker_size_std)
+        config = self.config
+        return SystematicErrors(
+            self._bias.px, marker_size_std=config.marker_size_std, focal_length_std=config.focal_length_std
+        )
 
     def learn(self, frame: LocatedFrame) -> MapperResult:
         """Second half of :meth:`process`: updates errors, quarantine and new markers with the frame located last."""
