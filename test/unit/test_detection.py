@@ -7,7 +7,7 @@ import pytest
 from support.scenes import camera_of
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corner_estimates import DisplayedSides
+from thermal_fiducial.core.detection.confirmation import DisplayedSides
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, MARKER_DTYPE
 from thermal_fiducial.files.dictionary import load_dictionary

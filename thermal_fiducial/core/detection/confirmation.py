@@ -1,32 +1,45 @@
-"""Confirms markers at their refined corners, by the correlation of their pattern and the sharpness of their sides.
+"""Confirms markers at their refined corners, and corrects corners in pictures for a display.
 
-In pictures for a display, markers whose cells are hardly wider than the blur are refined by fitting the whole pattern,
-as single sides cannot be measured. That is only safe with dictionaries whose markers differ in many bits.
+A marker is confirmed by the correlation of its pattern. A gain control for displays is a nonlinear function of the
+counts. The middle between the gray levels of black and white is then not the middle of the blurred step between them:
+all dark regions grow, or all shrink. The sides of a marker and the inner edges of its border move in opposite
+directions, so the width of the border measures the displacement. Markers whose cells are hardly wider than the blur are
+refined by fitting the whole pattern, as single sides cannot be measured; that is only safe with dictionaries whose
+markers differ in many bits.
 """
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.alignment import aligned
-from thermal_fiducial.core.detection.corner_errors import OF_PATTERN_CELLS
-from thermal_fiducial.core.detection.frame import Frame
+from thermal_fiducial.core.detection.corner_errors import (
+    OF_BENT_BLUR_PX,
+    OF_BENT_SCALE_PX,
+    OF_BORDER_PX,
+    OF_BORDERS_TOGETHER,
+    OF_LOCAL_PX,
+    OF_PATTERN_CELLS,
+)
+from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
+from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind_border, model, sides_of
+from thermal_fiducial.core.detection.frame import counts_of, Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
 from thermal_fiducial.core.detection.quads import halfway, halved
 from thermal_fiducial.core.detection.refining import RefinedCorners, RefinedMarkers, sides_px
 from thermal_fiducial.core.detection.search import accepted
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, TINY
+from thermal_fiducial.core.geometry import se3
+from thermal_fiducial.core.geometry.camera import ImagePoints
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
 
 # Cells at least this wide are decoded at half resolution, with half the noise and less blur [px].
 _WIDE_CELL_PX = 8.0
-# Least correlation at the refined corners.
-_SIMILAR = 0.82
-# Least correlation in a picture for a display, and for faint markers there a smaller one that grows with the contrast.
-# Everyday textures resemble patterns of few bits: of 19 false positives of four such dictionaries in 100 pictures the
-# best had 0.90.
-_SIMILAR_IN_PICTURE, _FAINT, _PER_CNR = 0.92, 0.7, 0.07
+# Least correlation at the refined corners, and in a picture for a display. Everyday textures resemble patterns of few
+# bits: of 19 false positives of four such dictionaries in 100 pictures the best had 0.90.
+_SIMILAR, _SIMILAR_IN_PICTURE = 0.82, 0.92
 # Least margin over the runner-up, as a share of the marker's isolation. It suffices for dictionaries that correct at
 # least _MANY_BITS wrong bits; noise and clutter often resemble one of the patterns of a 4 x 4 dictionary a little.
 _CLEAR_MARGIN = 0.5
@@ -34,17 +47,136 @@ _MANY_BITS = 3
 # Range of the step from border to surroundings over the contrast: white surroundings are about as white as white bits,
 # the background behind a plate's edge is not.
 _WHITE = (0.4, 1.75)
-# Largest corner standard deviation [px] times contrast-to-noise ratio times root of the side [px]: 4 to 7 for four
-# sharp sides.
-_SHARP = 7.5
-# Contrast-to-noise ratio above which model errors dominate the noise of corners.
-_NOISY = 8.0
-# Length of a side up to which the refinement uses all of its pixels [px].
-_SEEN_PX = 60.0
+# Largest distance of a known marker from its prediction [cells].
+_NEAR_CELLS = 0.7
 # Widest cells of markers too small for their sides to be measured [px].
 _WIDEST_CELL_PX = 2.5
-#: Distance from the image's border below which a marker, by its refined corners, counts as possibly cut off [px].
-BORDER_PX = 1.0
+# Distance from the image's border below which a marker, by its refined corners, counts as possibly cut off [px].
+_BORDER_PX = 1.0
+# Displacement or standard deviation of blur that cells are read in spite of [cells].
+_LITTLE = 0.1
+# Half the window of ``cornerSubPix``: in cells, and at most in pixels.
+_WINDOW_IN_CELLS, _LARGEST_WINDOW = 0.3, 5
+_STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 0.001)
+# Largest step of ``cornerSubPix`` that is accepted [cells].
+_LOST_CELLS = 0.4
+# Factor on the covariances of four corners with a common error: taken as independent, their mean has a quarter of it.
+_CORNERS = 4.0
+# Columns of pixels in a segment of a border, and the blur for which they are long enough [px].
+_COLUMNS, _WIDEST_PX = 6, 2.0
+
+
+def local_corners(image: Float32Array, refined: RefinedCorners, cells: int) -> RefinedCorners:
+    """Corners (N, 4, 2) by ``cv2.cornerSubPix``; those that move too far keep their refined place.
+
+    These lie a few tenths of a pixel inside the intersections of the sides, because blur rounds corners.
+    """
+    corners = refined.corners_px.copy()
+    for index, start in enumerate(refined.corners_px):
+        cell = np.linalg.norm(start[2] - start[0]) / (np.sqrt(2.0) * cells)
+        window = int(np.clip(round(_WINDOW_IN_CELLS * cell), 1, _LARGEST_WINDOW))
+        points = start.astype(np.float32).reshape(-1, 1, 2)
+        found = cv2.cornerSubPix(image, points, (window, window), (-1, -1), _STOP).reshape(4, 2).astype(np.float64)
+        near = np.abs(found - start).max(axis=1) < max(1.0, _LOST_CELLS * cell)
+        corners[index, near] = found[near]
+    return replace(refined, corners_px=corners, covariances=refined.covariances + OF_LOCAL_PX**2 * np.eye(2))
+
+
+class DisplayedSides:
+    """Corrects corners for the displacement of sides in pictures for a display; markers with ``bits`` (M, n, n)."""
+
+    def __init__(self, bits: Gray) -> None:
+        self._behind, self._white = edges_behind_border(bits)
+        self._bits = bits.shape[1]
+
+    def corrected(self, frame: Frame, refined: RefinedMarkers, blur_px: float) -> RefinedCorners:
+        """Corrected corners of N markers at the stamp; covariances with the remaining error of the correction."""
+        if len(refined.ids) == 0:
+            return refined.corners
+        segments = self._across_border(frame, refined, blur_px)
+        known = segments.variance < HOPELESS
+        weight = np.where(known, 1.0 / (OF_BORDERS_TOGETHER * (segments.variance + OF_BORDER_PX**2)), 0.0)
+        # Sides displaced outward by 1 scale the pattern, so that the inner edges appear displaced inward by ``gain``.
+        gain = 2.0 - 2.0 / (self._bits + 2.0)
+        information = gain * gain * weight.sum(axis=1)
+        variance = 1.0 / (information + OF_BENT_SCALE_PX**-2)
+        displacement = variance * gain * np.sum(weight * segments.shift, axis=1)
+        outward = _outward(refined.corners.corners_px)
+        corners = refined.corners.corners_px - displacement[:, None, None] * outward
+        unknown = _CORNERS * variance[:, None, None, None] * outward[..., :, None] * outward[..., None, :]
+        unknown = unknown + OF_BENT_BLUR_PX**2 * np.eye(2)
+        return replace(refined.corners, corners_px=corners, covariances=refined.corners.covariances + unknown)
+
+    def _across_border(self, frame: Frame, refined: RefinedMarkers, blur_px: float) -> Segments:
+        """Inward displacements of the inner edges of the borders, where the cells behind are white."""
+        seen = ImagePoints.at(refined.observed.corners_px, frame.camera)
+        inset = 1.0 / (self._bits + 2.0)
+        a, b = inset + (1.0 - 2.0 * inset) * np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
+        inner = np.moveaxis(se3.seen_between(seen.x, se3.bilinear(a, b)), 0, -1)
+        sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _WIDEST_PX)
+        blur = blurs(sides.normal[:, self._bits // 2], blur_px, refined.blur.spread)
+        value, slope, weight = model(sides, self._behind[refined.ids], blur)
+        weight *= self._white[refined.ids].reshape(-1, self._bits)
+        counts = counts_of(sides.pixel, frame.image, refined.blur.to_tails)
+        return measure(counts, (value, slope, weight), REACHED * blur[0])
+
+
+def _outward(corners: FloatArray) -> FloatArray:
+    """Displacement (N, 4, 2) of the corners (N, 4, 2) of quadrilaterals whose sides all move outward by 1."""
+    side = np.roll(corners, -1, axis=1) - corners
+    side = side / np.linalg.norm(side, axis=-1, keepdims=True)
+    normal = np.stack([side[..., 1], -side[..., 0]], axis=-1)
+    before = np.roll(normal, 1, axis=1)
+    return np.asarray((normal + before) / (1.0 + np.sum(normal * before, axis=-1, keepdims=True)))
+
+
+class CornerEstimator:
+    """Corners of the markers of a dictionary.
+
+    Parameters
+    ----------
+    decoder, bits : of the dictionary, (M, n, n)
+    """
+
+    def __init__(self, decoder: Decoder, bits: Gray) -> None:
+        self._decoder = decoder
+        self._displayed = DisplayedSides(bits)
+
+    def published(
+        self, frame: Frame, found: FoundMarkers, markers: RefinedMarkers, config: ArucoDetectorConfig
+    ) -> RefinedMarkers:
+        """The markers ``found`` that are confirmed at their refined corners, with the corners to publish."""
+        if len(found.ids) == 0:
+            return markers
+        keep = self._confirmed(frame, found, markers, config)
+        if frame.displayed and not keep.all():
+            markers, small = with_corners_by_pattern(frame, found, markers, ~keep, self._decoder, config)
+            keep = keep | small
+        markers = markers if keep.all() else markers.only(keep)
+        if config.refinement == 'subpix':
+            return replace(markers, corners=local_corners(frame.image, markers.corners, self._decoder.cells))
+        if frame.displayed:
+            return replace(markers, corners=self._displayed.corrected(frame, markers, config.blur_px))
+        return markers
+
+    def _confirmed(
+        self, frame: Frame, found: FoundMarkers, markers: RefinedMarkers, config: ArucoDetectorConfig
+    ) -> BoolArray:
+        """Which markers show their pattern at the refined corners."""
+        blur, observed, cells = markers.blur, markers.observed, self._decoder.cells
+        there = found.places.at.px + blur.shift
+        off = np.abs(observed.corners_px - there).max(axis=(1, 2))
+        read = off < _LITTLE / cells * sides_px(found.places.at.px)
+        keep = read & found.certain
+        others = np.flatnonzero(~keep)
+        if len(others):
+            there, to_tails = there[others], None if blur.to_tails is None else blur.to_tails[others]
+            standing = np.sqrt(np.sum(blur.spread[others] ** 2, axis=1)) < _LITTLE * sides_px(there) / cells
+            keep[others] = confirmed(
+                frame.image, to_tails, found.only(others), there, observed.only(others), self._decoder, config,
+                standing_picture=frame.displayed & standing,
+            )  # fmt: skip
+        return np.asarray(keep & frame.camera.contains(observed.corners_px, _BORDER_PX).all(axis=1))
 
 
 def confirmed(
@@ -58,10 +190,7 @@ def confirmed(
     *,
     standing_picture: BoolArray,
 ) -> BoolArray:
-    """Which markers (N,) show their pattern at the refined corners, with sides as sharp as their contrast allows.
-
-    Noise and clutter that happen to correlate with a pattern have no four straight sharp sides: the standard deviations
-    of their corners are far larger than contrast, noise and size of a marker explain.
+    """Which markers (N,) show their pattern at the refined corners.
 
     Parameters
     ----------
@@ -75,18 +204,11 @@ def confirmed(
     if to_tails is not None:
         tails = refined.corners_px @ to_tails[:, :, :2].swapaxes(1, 2) + to_tails[:, None, :, 2]
     reading = _read(image, refined.corners_px, tails, decoder)
-    similarity = np.abs(reading.correlation)
-    contrast = np.abs(refined.contrast) / np.maximum(refined.noise, TINY)
-    same = reading.ids == found.ids
-    asked = np.clip(_FAINT + _PER_CNR * np.abs(found.cnr), _SIMILAR, _SIMILAR_IN_PICTURE)
-    distinct = (similarity >= np.where(standing_picture, asked, _SIMILAR)) | (decoder.correctable >= _MANY_BITS)
-    alike = distinct & _stands_out(reading, decoder)
-    side = np.linalg.norm(refined.corners_px[:, 2] - refined.corners_px[:, 0], axis=-1) / np.sqrt(2.0)
-    deviation = np.sort(np.sqrt(0.5 * np.trace(refined.covariances, axis1=-2, axis2=-1)), axis=1)[:, 2]
-    softness = deviation * np.minimum(contrast, _NOISY) * np.sqrt(np.minimum(side, _SEEN_PX))
-    known = reading.clear(config.guided_min_correlation, config.guided_min_margin)
-    near = np.abs(refined.corners_px - there).max(axis=(1, 2)) < 0.7 * side / decoder.cells
-    return np.asarray(same & ((found.expected & known & near) | (alike & (softness <= _SHARP))))
+    near = np.abs(refined.corners_px - there).max(axis=(1, 2)) < _NEAR_CELLS / decoder.cells * sides_px(there)
+    known = found.expected & near & reading.clear(config.guided_min_correlation, config.guided_min_margin)
+    similar = np.abs(reading.correlation) >= np.where(standing_picture, _SIMILAR_IN_PICTURE, _SIMILAR)
+    distinct = (similar | (decoder.correctable >= _MANY_BITS)) & _stands_out(reading, decoder)
+    return np.asarray((reading.ids == found.ids) & (known | distinct))
 
 
 def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:
@@ -129,7 +251,7 @@ def with_corners_by_pattern(
     reading = decoder.read(frame.image, corners)
     good = (reading.ids == found.ids[small]) & (reading.turns == 0) & speaks_for_itself(reading, decoder)
     good &= accepted(reading, frame.noise, decoder.correctable, config)
-    good &= frame.camera.contains(corners, BORDER_PX).all(axis=1)
+    good &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)
     which, corners, shift = small[good], corners[good], shift[good]
     by_pattern[which] = True
     covariances = (OF_PATTERN_CELLS * cell[which, None, None, None]) ** 2 * np.broadcast_to(np.eye(2), (4, 2, 2))

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
-from thermal_fiducial.core.detection.corner_estimates import CornerEstimator
+from thermal_fiducial.core.detection.confirmation import CornerEstimator
 from thermal_fiducial.core.detection.corners.sides import edges_behind
 from thermal_fiducial.core.detection.finding import Findings, FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.frame import Frame
