@@ -58,7 +58,7 @@ def test_all_is_well():
 
 STATES = [
     ({'tau2_camera': (1, 'FFC')}, Advice.FLY, ''),
-    ({'pose_ekf': (1, 'coasting for 1.2 s')}, Advice.CARE, 'coasting for 1.2 s'),
+    ({'pose_ekf': (1, 'coasting: 1.2 s without a pose')}, Advice.CARE, 'coasting: 1.2 s without a pose'),
     ({'marker_mapper': (1, 'quarantined: 7')}, Advice.CARE, 'marker_mapper: quarantined: 7'),
     ({'tau2_camera': (2, 'no thermal/image_raw')}, Advice.CARE, 'tau2_camera: no thermal/image_raw'),
     ({'pose_ekf': (2, 'lost: position known to 0.41 m')}, Advice.STOP, 'lost: position known to 0.41 m'),
@@ -120,14 +120,21 @@ def test_other_robots_do_not_count():
     assert status.snapshot(0.1).reasons == ('waiting for IMU',)
 
 
-def test_the_screen_says_what_the_line_says():
+def test_the_screen_shows_all_that_the_line_shows():
     from rich.console import Console
 
-    status = flying(pose_ekf=(1, 'coasting for 1.2 s; pose refused: 7.1 sigma'))
+    status = flying(pose_ekf=(1, 'coasting: 1.2 s without a pose; pose refused: 7.1 sigma'))
     console = Console(width=100, file=io.StringIO())
     console.print(command.screen(status.snapshot(4.0)))
     text = console.file.getvalue()
-    for words in ('with care', 'coasting for 1.2 s', '2 (3 7)', '18.2 +- 0.4', 'marker_mapper', 'pose refused: 7.1'):
+    for words in (
+        'with care',
+        'coasting: 1.2 s without a pose',
+        '2 (3 7)',
+        '18.2 +- 0.4',
+        'marker_mapper',
+        'pose refused: 7.1',
+    ):
         assert words in text
 
 
@@ -185,7 +192,7 @@ def speak(node, ending):
 
 
 @pytest.mark.ros
-def test_once_says_in_a_line_that_there_is_nothing(capfd, monkeypatch):
+def test_once_prints_one_line_if_no_node_runs(capfd, monkeypatch):
     with own_domain() as domain:
         monkeypatch.setenv('ROS_DOMAIN_ID', str(domain))
         assert main(['watch', '--once', '--wait', '0.3']) == 1

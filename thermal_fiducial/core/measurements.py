@@ -161,3 +161,14 @@ class Odometry:
     pose_covariance: FloatArray
     #: (6, 6), linear then angular, in ``base_link`` [m/s, rad/s]
     twist_covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """Condition of a stage in words: what it does or lacks, and details, which may change with every message."""
+
+    words: str
+    details: str = ''
+
+    def __str__(self) -> str:
+        return f'{self.words}: {self.details}' if self.details else self.words

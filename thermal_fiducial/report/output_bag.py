@@ -18,7 +18,7 @@ from thermal_fiducial.files.images import header_stamp_ns, stamp_to_ns
 MOST_COVARIANCES = 6000
 _POSE, _DIAGNOSTICS = 'pose', 'diagnostics'
 _WITHHELD = 'withheld: '
-# "coasting for 0.6 s" and "coasting for 0.8 s" are counted as the same message.
+# "coasting: 0.6 s without a pose" and "coasting: 0.8 s without a pose" are counted as the same message.
 _NUMBER = re.compile(r'\d+(\.\d+)?')
 _LEVELS = ('ok', 'warning', 'error', 'stale')
 

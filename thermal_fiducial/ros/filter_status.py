@@ -1,16 +1,15 @@
 """Status of the filter: diagnostics, console lines, count of jumps of the pose."""
 
-import re
-
+from thermal_fiducial.core.filter.condition import TRACKING, WAITING
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_text, PoseUpdate
+from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.ros.console import Console
 from thermal_fiducial.ros.imu_queue import ImuQueue
 from thermal_fiducial.ros.live_status import LAST_REFUSED
 from thermal_fiducial.ros.node import ERROR, OK, WARN
 
-_WAITING = 'waiting for markers'
 #: Difference of IMU and pose stamps beyond any delay [s]: their clocks are not synchronised.
 _APART_S = 2.5
 
@@ -54,14 +53,14 @@ class FilterStatus:
         return max(level, self._imu.level()), _joined(words, self._imu.complaint())
 
     def _state_of_filter(self) -> tuple[bytes, str]:
-        status, lost = self._status(), self._filter.lost
-        if self._last_refusal and (not lost or status == _WAITING):
-            return ERROR if lost else WARN, f'{status}; pose {self._last_refusal}'
-        return ERROR if lost else OK if status == 'tracking' else WARN, status
+        condition, lost = self._condition(), self._filter.lost
+        if self._last_refusal and (not lost or condition == WAITING):
+            return ERROR if lost else WARN, f'{condition}; pose {self._last_refusal}'
+        return ERROR if lost else OK if condition == TRACKING else WARN, str(condition)
 
     def headline(self) -> str:
         """State of the filter without numbers, with the reason of a reset when it has a pose again."""
-        words, lost = re.split(r'[:\d]', self._status())[0].removesuffix(' for '), self._filter.lost
+        words, lost = self._condition().words, self._filter.lost
         if words != self._words:
             again = 'recovered' if self._initialised else 'initialised'
             self._headline = f'{again}: {words}' if self._was_lost and not lost else words
@@ -69,16 +68,16 @@ class FilterStatus:
             self._initialised |= not lost
         return _joined(self._headline, self._imu.headline())
 
-    def _status(self) -> str:
-        """Status of the filter; where it lacks poses because their clock is not the IMU's, that."""
-        status = self._filter.status
-        if status != _WAITING or self._imu_ns is None or self._pose_ns is None:
-            return status
+    def _condition(self) -> Condition:
+        """Condition of the filter; where it lacks poses because their clock is not the IMU's, that."""
+        condition = self._filter.condition
+        if condition != WAITING or self._imu_ns is None or self._pose_ns is None:
+            return condition
         apart = (self._pose_ns - self._imu_ns) / SECOND_NS
         if abs(apart) < _APART_S:
-            return status
+            return condition
         side = 'ahead of' if apart > 0.0 else 'behind'
-        return f'camera and IMU have two clocks: poses are {abs(apart):.4g} s {side} the IMU'
+        return Condition('camera and IMU have two clocks', f'poses are {abs(apart):.4g} s {side} the IMU')
 
     def figures(self) -> dict[str, object]:
         """Key-value pairs of the diagnostics."""

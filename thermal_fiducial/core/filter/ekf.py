@@ -9,17 +9,18 @@ import numpy as np
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.camera_clock import CameraClock
 from thermal_fiducial.core.filter.coasting import usable_seconds
+from thermal_fiducial.core.filter.condition import coasting_seconds, condition_of
 from thermal_fiducial.core.filter.history import History
-from thermal_fiducial.core.filter.hypotheses import Hypotheses, KNOWN_OFFSET_STD, NO_GRAVITY
+from thermal_fiducial.core.filter.hypotheses import Hypotheses, KNOWN_OFFSET_STD
 from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
-from thermal_fiducial.core.filter.initialization import FEWEST_SAMPLES, WINDOW_SECONDS
+from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseLog, PoseUpdate
 from thermal_fiducial.core.filter.output import odometry, SmoothOutput
 from thermal_fiducial.core.filter.recovery import Hypothesis
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
-from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
+from thermal_fiducial.core.measurements import CameraPose, Condition, ImuSample, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 from thermal_fiducial.errors import InputError
 
@@ -30,7 +31,7 @@ CLOCK_JUMPED = "the IMU's clock has jumped"
 class PoseEkf:
     """Left-invariant error-state Kalman filter with delayed, gated corrections.
 
-    ``status`` gives its condition in words, ``diagnostics()`` in numbers; ``decided`` has the latest verdicts on poses.
+    ``condition`` is its condition in words, ``diagnostics()`` in numbers; ``decided`` has the latest verdicts on poses.
     """
 
     def __init__(self, config: PoseEkfConfig) -> None:
@@ -59,7 +60,8 @@ class PoseEkf:
         self._noise = ImuNoiseMonitor(config.imu)
         self._history = History(self._hypotheses, config.max_delay + WINDOW_SECONDS, camera_time_offset)
         self._log = PoseLog()
-        self._imu_fault = ''
+        #: on the last IMU sample
+        self._verdict = Verdict.USE
         self._smoother = SmoothOutput(config.smoothing_time) if config.smoothing_time > 0.0 else None
         #: the latest odometry without steps; None unless ``smoothing_time`` asks for it
         self.smooth: Odometry | None = None
@@ -78,8 +80,8 @@ class PoseEkf:
 
         Returns
         -------
-        State at the sample's stamp; None before the filter is initialised and for a refused sample (``status`` says
-        why).
+        State at the sample's stamp; None before the filter is initialised and for a refused sample (``condition``
+        says why).
         """
         if not self.keep_imu(sample):
             return None
@@ -93,12 +95,12 @@ class PoseEkf:
 
         Returns
         -------
-        Whether the sample was taken (``status`` says why not).
+        Whether the sample was taken (``condition`` says why not).
         """
         verdict = self._input.judge(sample)
         if verdict is Verdict.RESTART:
             self._begin_after_jump()
-        self._imu_fault = verdict.value
+        self._verdict = verdict
         if verdict not in (Verdict.USE, Verdict.RESTART):
             self._imu_refused += 1
             return False
@@ -243,43 +245,23 @@ class PoseEkf:
         return self._history.belief.reset_reason or self._restart_reason
 
     @property
+    def condition(self) -> Condition:
+        """What the filter does, or what it lacks."""
+        if self._verdict is not Verdict.USE:
+            of_sample: Condition = self._verdict.value
+            return of_sample
+        return condition_of(self._history, next(reversed(self._log.latest.values()), None), self._config)
+
+    @property
     def status(self) -> str:
-        """Condition of the filter in words."""
-        if self._imu_fault:
-            return self._imu_fault
-        if not self._history.imu:
-            return 'waiting for IMU'
-        main, other = self._history.main, self._history.belief.alternative
-        if main is None:
-            return self._why_no_estimate(other)
-        if main.position_std > self._config.lost_position_std:
-            return f'lost: position known to {main.position_std:.2f} m'
-        if main.in_doubt:
-            return f'in doubt: {main.refused_in_row} poses in a row contradict the estimate'
-        coasting = self._coasting(main)
-        return f'coasting for {coasting:.1f} s' if coasting > 0.5 else 'tracking'
-
-    def _why_no_estimate(self, begun: Hypothesis | None) -> str:
-        if contradiction := self._history.belief.contradiction:
-            return contradiction
-        return f'initialising: {begun.hits} of {self._config.initial_poses} poses' if begun else self._why_waiting()
-
-    def _why_waiting(self) -> str:
-        latest = next(reversed(self._log.latest.values()), None)
-        if latest is None or latest.reason != NO_GRAVITY:
-            return 'waiting for markers'
-        force = self._history.imu.imu[-FEWEST_SAMPLES:, 3:].mean(axis=0)
-        words = ' '.join(f'{value:.1f}' for value in force)
-        return f'poses contradict gravity: the IMU says {words} m/s^2; its axes, sign, units? camera_orientation?'
-
-    def _coasting(self, main: Hypothesis) -> float:
-        return (self._history.imu.newest_ns - main.accepted_ns) / SECOND_NS
+        """The condition as text."""
+        return str(self.condition)
 
     @property
     def lost(self) -> bool:
         """Whether not to fly on the pose: worse than ``lost_position_std``, contradicted by poses, or IMU frozen."""
         main = self._history.main
-        if main is None or self._imu_fault == Verdict.FROZEN.value or main.in_doubt:
+        if main is None or self._verdict is Verdict.FROZEN or main.in_doubt:
             return True
         return main.position_std > self._config.lost_position_std
 
@@ -308,7 +290,7 @@ class PoseEkf:
     def _figures_of(self, main: Hypothesis) -> dict[str, float]:
         state, noise = main.estimate.state, main.estimate.pose_noise
         return {
-            'seconds since accepted pose': self._coasting(main),
+            'seconds since accepted pose': coasting_seconds(self._history, main),
             'resets': float(self.resets),
             'position std': main.position_std,
             'usable for': self.usable_for,

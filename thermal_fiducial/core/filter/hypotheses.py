@@ -21,7 +21,7 @@ from thermal_fiducial.core.filter.state import (
     TIME_OFFSET,
 )
 from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, PoseUpdater
-from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.core.measurements import CameraPose, Condition
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: reason of refusal of a first pose whose vertical contradicts the measured specific force
@@ -70,8 +70,8 @@ class Hypotheses:
             pose.stamp_ns, False, f'refused: {math.sqrt(innovation.nis):.1f} sigma', innovation.nis
         )
 
-    def contradiction(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> str:
-        """Which sensor of the IMU a refused pose contradicts, in words; ``hypothesis`` is at the pose's instant."""
+    def contradiction(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> Condition:
+        """Which sensor of the IMU a refused pose contradicts; ``hypothesis`` is at the pose's instant."""
         estimate = hypothesis.estimate
         measured = self._measured(pose, estimate.state)
         innovation = self._updater.innovation(estimate, measured, motion)
@@ -79,9 +79,10 @@ class Hypotheses:
         seconds = (hypothesis.estimate.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
         if turn @ np.linalg.solve(np.linalg.inv(innovation.S_inverse)[:3, :3], turn) > self._config.gate:
             apart = f'{math.degrees(np.linalg.norm(turn)):.0f} deg apart after {seconds:.2f} s'
-            return f'poses contradict the gyroscope: {apart}; its units, axes, sign? camera_orientation?'
+            return Condition('poses contradict the gyroscope', f'{apart}; its units, axes, sign? camera_orientation?')
         apart = f'{np.linalg.norm(shift):.2f} m apart after {seconds:.2f} s'
-        return f'poses contradict the accelerometer, or each other: {apart}; its units, axes, sign? marker_size?'
+        details = f'{apart}; its units, axes, sign? marker_size?'
+        return Condition('poses contradict the accelerometer, or each other', details)
 
     def explains(self, hypothesis: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> bool:
         """Whether a pose at a hypothesis's instant passes the gate once the clock offset is taken for unknown."""

@@ -3,7 +3,7 @@
 from enum import Enum
 import math
 
-from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.core.measurements import Condition, ImuSample
 from thermal_fiducial.core.types import SECOND_NS
 
 #: Samples in a row that must follow each other after a jump: for a stepped clock, and for the end of a gap.
@@ -25,14 +25,14 @@ SATURATED_SECONDS = 0.1
 class Verdict(Enum):
     """What to do with a sample."""
 
-    USE = ''
-    NOT_FINITE = 'IMU sample is not finite'
-    IMPOSSIBLE = 'IMU sample far beyond the range of its sensors'
-    FROZEN = 'IMU is frozen: the same value again and again'
-    REPEATED = 'IMU stamp repeated'
-    BACKWARD = 'IMU stamp went back'
-    AHEAD = 'IMU stamp jumped ahead'
-    RESTART = 'IMU clock jumped: reset'
+    USE = Condition('')
+    NOT_FINITE = Condition('IMU sample is not finite')
+    IMPOSSIBLE = Condition('IMU sample far beyond the range of its sensors')
+    FROZEN = Condition('IMU is frozen', 'the same value again and again')
+    REPEATED = Condition('IMU stamp repeated')
+    BACKWARD = Condition('IMU stamp went back')
+    AHEAD = Condition('IMU stamp jumped ahead')
+    RESTART = Condition('IMU clock jumped', 'reset')
 
 
 class Axis:

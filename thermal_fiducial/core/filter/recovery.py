@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.state import Estimate, POSITION
+from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Poses that the alternative must accept for each one that the estimate accepts: an estimate with a wrong clock offset
@@ -98,8 +99,8 @@ class Belief(NamedTuple):
     drifted: bool = False
     #: reason of the latest reset, in words
     reset_reason: str = ''
-    #: while initialising: which sensor of the IMU the poses contradict, in words
-    contradiction: str = ''
+    #: while initialising: which sensor of the IMU the poses contradict, if any
+    contradiction: Condition | None = None
 
     @property
     def hypotheses(self) -> list[Hypothesis]:
@@ -152,5 +153,5 @@ class Belief(NamedTuple):
             alternative=None,
             resets=resets,
             reset_reason=reason,
-            contradiction='',
+            contradiction=None,
         )
