@@ -13,6 +13,8 @@ import cv2
 import hypothesis
 import pytest
 from rclpy.logging import LoggingSeverity, set_logger_level
+from support import small_bag
+from support.ros_graph import ros_graph
 
 from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.ros.run import use_transport_profile
@@ -76,6 +78,19 @@ def real_data():
     if not folder:
         pytest.skip('THERMAL_FIDUCIAL_DATA is not set: no real data')
     return Path(folder)
+
+
+@pytest.fixture
+def graph():
+    """The nodes of a test, in a graph of their own."""
+    with ros_graph() as graph:
+        yield graph
+
+
+@pytest.fixture
+def map_file(tmp_path):
+    """A map of the four markers of the small bag."""
+    return small_bag.side_files(tmp_path)[0]
 
 
 @pytest.fixture

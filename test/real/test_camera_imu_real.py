@@ -53,7 +53,7 @@ PART = (20.0, 3, (0.2, 0.005))
     ('camera', 'seconds', 'every', 'off'),
     [('cam1', *PART), *(pytest.param(camera, *WHOLE, marks=pytest.mark.nightly) for camera in ('cam0', 'cam1'))],
 )
-def test_extrinsics_are_as_good_as_they_say(camera, seconds, every, off):
+def test_extrinsics_are_consistent_with_their_covariance(camera, seconds, every, off):
     found, published = calibrated(camera, seconds, every)
     error, sigma = difference(found.T_body_camera, published), np.sqrt(np.diag(found.covariance))[:6]
     assert np.all(np.abs(error) < 3.0 * sigma)

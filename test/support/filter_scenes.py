@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from support import real_flights
 from support.corner_runs import fly, published, rms
-from support.flights import errors, Flight, Motion, START_NS, timeline, white_poses
+from support.flights import errors, Flight, in_order, Motion, run_watched, START_NS, timeline, white_poses
 from support.sim_flights import simulated
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
@@ -60,12 +60,7 @@ def of_recording(name: str, changes: Changes) -> Figures:
     arrivals: list[tuple[int, int, Any]] = [(sample.stamp_ns, 0, sample) for sample in flight.samples]
     late_ns = round((flight.time_offset + run.late) * 1e9)
     arrivals += [(pose.stamp_ns + late_ns, 1, pose) for pose in run.poses]
-    states = []
-    for _, kind, item in sorted(arrivals, key=lambda entry: entry[:2]):
-        if kind == 1:
-            ekf.add_pose(item)
-        elif (state := ekf.add_imu(item)) is not None:
-            states.append(state)
+    states, _ = run_watched(ekf, in_order(arrivals))
     score = published(flight, states).score(flight)
     return {
         'mm': score.rms_mm,
@@ -85,14 +80,7 @@ def of_flights(scene: Callable[[int], Arrivals], changes: Changes, seeds: range 
 
 def _flown(arrivals: Arrivals, changes: Changes) -> Figures:
     flight, ekf = arrivals.flight, PoseEkf(altered(arrivals.config, changes))
-    states, lost = [], []
-    for item in arrivals.items:
-        if isinstance(item, ImuSample):
-            state = ekf.add_imu(item)
-            states += [state] if state else []
-            lost += [ekf.lost] if state else []
-        else:
-            ekf.add_pose(item)
+    states, lost = run_watched(ekf, arrivals.items)
     position, attitude = errors(flight, states, SETTLED)
     counted = np.array([state.stamp_ns >= START_NS + round(SETTLED * 1e9) for state in states])
     covariances = np.array([state.pose_covariance[:3, :3] for state in states])[counted]

@@ -170,7 +170,24 @@ def timeline(samples: Iterable[ImuSample], poses: Iterable[CameraPose], delay=0.
     delays = np.broadcast_to(delay, len(poses))
     arrivals = [(sample.stamp_ns, 0, sample) for sample in samples]
     arrivals += [(pose.stamp_ns + round(late * 1e9), 1, pose) for pose, late in zip(poses, delays, strict=True)]
+    return in_order(arrivals)
+
+
+def in_order(arrivals):
+    """The items of (time of arrival [ns], rank at equal times, item), the earliest first."""
     return [item for _, _, item in sorted(arrivals, key=lambda entry: entry[:2])]
+
+
+def run_watched(ekf: PoseEkf, arrivals):
+    """Odometry of every IMU sample that has one, and whether it was lost then (N,)."""
+    states, lost = [], []
+    for item in arrivals:
+        if not isinstance(item, ImuSample):
+            ekf.add_pose(item)
+        elif state := ekf.add_imu(item):
+            states.append(state)
+            lost.append(ekf.lost)
+    return states, np.array(lost)
 
 
 def run(ekf: PoseEkf, arrivals):

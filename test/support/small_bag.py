@@ -19,6 +19,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.planar_pose import marker_corners
 from thermal_fiducial.core.geometry.se3 import apply, inverse, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.files import bag_messages
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import save_map
@@ -208,20 +209,7 @@ def compressed(message):
 
 
 def camera_info(stamp_ns, camera=CAMERA):
-    region = _TYPES['sensor_msgs/msg/RegionOfInterest'](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
-    return _TYPES['sensor_msgs/msg/CameraInfo'](
-        header=header(stamp_ns, 'thermal_camera_optical'),
-        height=camera.height,
-        width=camera.width,
-        distortion_model=camera.model,
-        d=camera.D,
-        k=camera.K.ravel(),
-        r=np.eye(3).ravel(),
-        p=np.hstack([camera.K, np.zeros((3, 1))]).ravel(),
-        binning_x=0,
-        binning_y=0,
-        roi=region,
-    )
+    return bag_messages.camera_info(stamp_ns, camera)
 
 
 def imu(stamp_ns, values):

@@ -33,7 +33,7 @@ def storage(request):
     return request.param
 
 
-def test_reads_in_recorded_order_what_was_written(tmp_path, storage):
+def test_messages_are_read_in_recorded_order(tmp_path, storage):
     with BagReader(write(tmp_path / 'bag', storage=storage)) as bag:
         assert bag.topics == {'imu/data': STRING, 'other': STRING}
         assert bag.message_count() == 20
@@ -131,7 +131,7 @@ def test_parses_remaps():
             parse_remaps([wrong])
 
 
-def test_missing_topics_are_named_with_what_is_there(tmp_path):
+def test_missing_topics_are_named_beside_the_recorded_ones(tmp_path):
     with BagReader(write(tmp_path / 'bag')) as bag:
         bag.require({'imu/data': STRING})
         with pytest.raises(InputError, match=rf'no topic thermal/image_raw .*imu/data \({STRING}\), other'):
@@ -223,7 +223,7 @@ def test_truncated_ros_1_bag(tmp_path):
             read_all(tmp_path / 'old.bag')
 
 
-def test_a_message_that_is_none(tmp_path):
+def test_an_undecodable_message_is_refused(tmp_path):
     with BagWriter(tmp_path / 'bag') as bag:
         bag.write('imu/data', 12, b'\x00\x01\x00\x00\x01\x02', IMU)
     with BagReader(tmp_path / 'bag') as bag:
@@ -304,7 +304,7 @@ def test_chunks_of_ros_1_expand_as_little(tmp_path, kind):
         ('type', '[]'),
     ],
 )
-def test_metadata_that_is_none_is_refused(tmp_path, field, value):
+def test_invalid_metadata_is_refused(tmp_path, field, value):
     path = write(tmp_path / 'bag', count=2)
     file = path / 'metadata.yaml'
     file.write_text(re.sub(rf'\b{field}: .*', f'{field}: {value}', file.read_text()))

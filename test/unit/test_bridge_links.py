@@ -45,7 +45,7 @@ def test_one_sender_and_a_listener_are_in_order():
         assert topics[0].odometry == '/mavros/odometry/out'
 
 
-def test_two_senders_and_nobody_who_listens_are_said():
+def test_two_publishers_and_a_missing_subscriber_are_reported():
     with ros_graph(*MAVROS) as graph:
         node = graph.add(PoseEkfNode, bridge_rate=30.0)
         graph.tester.advertise(Odometry, 'mavros/odometry/out')

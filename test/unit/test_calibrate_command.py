@@ -70,7 +70,7 @@ def test_intrinsics_from_a_bag(tmp_path, capsys):
     assert load_camera(out).K[0, 0] == pytest.approx(lens.focal[0], rel=3e-3)
 
 
-def test_pictures_that_are_none_or_of_another_size_are_named(tmp_path, capsys):
+def test_unreadable_pictures_and_those_of_another_size_are_named(tmp_path, capsys):
     board = Chessboard(8, 6, 0.05)
     plate = plate_pose(random_view(SMALL, board.points, np.random.default_rng(6)), np.array([0.175, 0.125]))
     counts = render(SMALL, plate, chessboard_levels(8, 6), 0.55, 0.45, 8.0, 1, samples=23)

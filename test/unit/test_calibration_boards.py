@@ -165,14 +165,14 @@ def test_rows_that_alternate_are_centred_on_each_other():
         (SYMMETRIC, CircleGrid(6, 5, 1.0, 0.54, asymmetric=False), 0.27),
     ],
 )
-def test_a_grid_that_goes_on_is_refused(target, described, radius, views):
+def test_a_larger_grid_than_described_is_refused(target, described, radius, views):
     for seed in range(1, 1 + views):
         counts, _ = picture(target.points[:, :2], Heat(), np.random.default_rng(seed), radius=radius, fill=0.75)
         with pytest.raises(BoardNotFound, match='goes on beyond the one described'):
             described.find(counts, GUESS)
 
 
-def test_a_board_partly_out_of_view_is_not_said_to_go_on():
+def test_a_board_partly_out_of_view_is_not_taken_for_a_larger_one():
     """Among the edges of its dots a chance grid of 181 of 753 points is larger than the 110 of 111 that are dots."""
     target = CircleGrid(16, 10, 1.0, 0.8, longer=1)
     size = {'radius': 0.4, 'width': 384, 'height': 288, 'fill': 1.1}
@@ -223,7 +223,7 @@ def test_a_board_is_looked_for_first_as_it_was_found_before(monkeypatch):
     assert looks[-1] == looks[-2]
 
 
-def test_the_grid_of_another_scale_shows_that_the_board_goes_on():
+def test_the_grid_at_another_scale_reveals_a_larger_board():
     """Seen steeply, 29 of 30 points are a grid at one scale; at another all 35 of the larger board are."""
     counts, _ = picture(SYMMETRIC.points[:, :2], Heat(), np.random.default_rng(4), radius=0.27, fill=0.75)
     with pytest.raises(BoardNotFound, match='5 more points'):
@@ -258,7 +258,7 @@ def test_circles_of_another_diameter_are_named_as_such():
         described.find(counts, GUESS)
 
 
-def test_reasons_in_words():
+def test_a_picture_without_a_board_is_refused_with_a_reason():
     noise = np.random.default_rng(1).normal(7000.0, 3.0, (512, 640)).astype(np.uint16)
     with pytest.raises(BoardNotFound, match='grid'):
         SYMMETRIC.find(noise, GUESS)

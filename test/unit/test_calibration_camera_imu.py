@@ -104,36 +104,25 @@ def test_increments_are_those_of_the_flight():
     assert np.abs(found.p - dp).max() < 5e-6
 
 
-def test_bias_derivatives_against_differences():
+@pytest.mark.parametrize(
+    ('derivative', 'count', 'atol'),
+    # Second order in h and in the turn of a step, 0.01 rad at most; by the axes times rates and forces of up to 20.
+    [('by_bias', 6, 2e-6), ('by_axes', AXES, 4e-5)],
+)
+def test_derivatives_of_a_preintegration_against_differences(derivative, count, atol):
     _, imu = recording(SCENARIO, 20.0, 1)
     times = np.arange(5.0, 6.0, 1 / 30)
     zero = np.zeros((len(times) - 1, 6))
     base = preintegrate(imu, times, zero, ImuNoise())
     h = 1e-5
-    for column in range(6):
-        step = np.zeros(6)
-        step[column] = h
-        moved = preintegrate(imu, times, zero + step, ImuNoise())
+    for column, step in enumerate(h * np.eye(count)):
+        if derivative == 'by_bias':
+            moved = preintegrate(imu, times, zero + step, ImuNoise())
+        else:
+            moved = preintegrate(imu.corrected(step), times, zero, ImuNoise())
         turn = se3.so3_log(np.swapaxes(base.R, 1, 2) @ moved.R)
         difference = np.concatenate([turn, moved.v - base.v, moved.p - base.p], axis=1) / h
-        # Second order in the turn of a step, 0.01 rad at most, and in h.
-        assert base.by_bias[:, :, column] == pytest.approx(difference, rel=2e-3, abs=2e-6)
-
-
-def test_derivatives_by_scale_and_misalignment_against_differences():
-    _, imu = recording(SCENARIO, 20.0, 1)
-    times = np.arange(5.0, 6.0, 1 / 30)
-    zero = np.zeros((len(times) - 1, 6))
-    base = preintegrate(imu, times, zero, ImuNoise())
-    h = 1e-5
-    for column in range(AXES):
-        step = np.zeros(AXES)
-        step[column] = h
-        moved = preintegrate(imu.corrected(step), times, zero, ImuNoise())
-        turn = se3.so3_log(np.swapaxes(base.R, 1, 2) @ moved.R)
-        difference = np.concatenate([turn, moved.v - base.v, moved.p - base.p], axis=1) / h
-        # Second order in the turn of a step and in h, as for the biases, times rates and forces of up to 20.
-        assert base.by_axes[:, :, column] == pytest.approx(difference, rel=2e-3, abs=4e-5)
+        assert getattr(base, derivative)[:, :, column] == pytest.approx(difference, rel=2e-3, abs=atol)
 
 
 def test_scale_errors_and_misalignments_are_found():
@@ -245,7 +234,7 @@ def test_wrong_poses_hardly_matter():
     assert np.linalg.norm(error[3:6]) < 0.004
 
 
-def test_refuses_what_it_cannot_answer():
+def test_unusable_recordings_are_refused():
     poses, imu = recording(SCENARIO, 20.0, 1)
     with pytest.raises(InputError, match='camera poses'):
         calibrate_camera_imu(poses[:50], imu, START_NS, ImuNoise())
@@ -301,7 +290,7 @@ def test_stamps_that_jitter_and_an_imu_that_shakes_are_allowed_for():
     assert 0.9 < result.scale < 1.5
 
 
-def test_white_noise_is_what_the_samples_show():
+def test_white_noise_is_estimated_from_the_samples():
     shaking = replace(SCENARIO.imu, gyroscope_rattle=0.015, accelerometer_rattle=0.3)
     _, imu = recording(replace(SCENARIO, imu=shaking), 20.0, 1)
     noise = imu.noise(ImuNoise(gyroscope_random_walk=1e-4))

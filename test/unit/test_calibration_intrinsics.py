@@ -45,7 +45,7 @@ def test_noiseless_points_give_the_lens_back(name):
 
 
 @pytest.mark.parametrize('name', ['7.5mm', '13mm'])
-def test_covariance_is_what_the_errors_are(name):
+def test_covariance_is_that_of_the_errors(name):
     lens = LENSES[name]
     squared = []
     for seed in range(8):

@@ -85,7 +85,7 @@ def test_a_camera_that_falls_silent_is_opened_anew():
         (KeyError('x'), "a camera: internal error: KeyError: 'x'"),
     ],
 )
-def test_whatever_happens_is_said_and_tried_again(error, state):
+def test_every_failure_is_reported_and_the_camera_reopened(error, state):
     _, frames, states = captured(Script(error, error, None, [FRAME]), lambda frames, _: frames)
     assert frames == [FRAME]
     assert states == [state, '']
@@ -100,7 +100,7 @@ def test_the_end_of_recorded_pictures_is_no_fault_to_mend():
 @pytest.mark.parametrize(
     ('camera', 'kind'), [('/dev/video3', V4l2Camera), ('teax', ThermalGrabber), ('teax:T42', ThermalGrabber)]
 )
-def test_the_name_of_a_camera_says_which_driver(camera, kind):
+def test_the_name_of_a_camera_chooses_the_driver(camera, kind):
     source = make_source(ThermalSourceConfig(camera=camera, image_width=640, image_height=512))
     assert isinstance(source, kind)
     assert camera.partition(':')[2] in source.name

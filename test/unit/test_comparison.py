@@ -85,7 +85,7 @@ def test_what_cannot_be_compared(runs, capsys, arguments, words):
     assert error.count('\n') == 1
 
 
-def test_a_run_without_truth_says_so(runs, tmp_path, capsys):
+def test_a_run_without_truth_is_marked_so(runs, tmp_path, capsys):
     blind = make_run(tmp_path / 'blind', 2.0, 0, (1.0, 1.4), with_output=False)
     (blind / 'truth.tum').unlink()
     page = tmp_path / 'comparison.html'

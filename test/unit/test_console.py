@@ -45,7 +45,7 @@ def test_pieces_are_counted(capsys, monkeypatch):
     assert capsys.readouterr().err == 'wall, 20 s: 50 %\n'
 
 
-def test_short_work_says_nothing_without_a_terminal(capsys):
+def test_short_work_prints_no_progress_without_a_terminal(capsys):
     with progress_bar('quick') as show:
         show(0.5)
     assert capsys.readouterr().err == ''
@@ -82,7 +82,7 @@ def test_a_table_wider_than_the_window_keeps_its_words(monkeypatch):
         (['calibrate', 'intrinsics', 'nope'], 'nope: no such folder of pictures, bag or CSV file'),
     ],
 )
-def test_what_is_missing_is_called_what_it_is(command, said, tmp_path, capsys, monkeypatch):
+def test_missing_inputs_are_named(command, said, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main(command) == 2
     assert said in capsys.readouterr().err

@@ -195,7 +195,7 @@ def test_fields_are_looked_up_by_name(order):
 
 @pytest.mark.parametrize('order', ['<', '>', 'own'])
 @pytest.mark.parametrize('frame', ['', 'a', 'camera'])
-def test_bytes_of_markers_are_what_their_message_says(order, frame):
+def test_markers_from_bytes_are_those_of_the_message(order, frame):
     rows = rows_of(MARKER_DTYPE, 4)
     message = clouds.cloud(rows, HEAD) if order == 'own' else other_layout(rows, order)
     message.header = convert.header(STAMP, frame)
@@ -316,7 +316,7 @@ def test_poses_and_odometry_come_back():
         Pose(orientation=Quaternion(w=2.0)),
     ],
 )
-def test_a_pose_that_is_none_is_refused(pose):
+def test_an_invalid_pose_is_refused(pose):
     message = PoseWithCovarianceStamped()
     message.pose.pose = pose
     with pytest.raises(InputError, match='unit quaternion'):

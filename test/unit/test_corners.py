@@ -193,7 +193,7 @@ def test_covariance_is_consistent(contrast):
     assert np.mean(squared) == pytest.approx(2.0, abs=0.2 + 2 * 2 * 2 / np.sqrt(count))
 
 
-def test_poses_of_faint_markers_are_as_good_as_their_corners_claim():
+def test_poses_of_faint_markers_are_consistent_with_their_corners():
     """Corners err together: what the sides and the square show all of them must not count for each of them anew."""
     rng, camera, squared = np.random.default_rng(10), CAMERAS['plumb_bob'], []
     for turn in rng.uniform(-3.0, 3.0, 8):

@@ -14,7 +14,7 @@ NAMES = ['DICT_4X4_50', 'DICT_5X5_1000', 'DICT_6X6_250', 'DICT_7X7_50', 'DICT_AP
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_bits_are_what_opencv_draws(name):
+def test_bits_are_those_that_opencv_draws(name):
     theirs = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
     bits = load_dictionary(name).bits
     cells = bits.shape[1] + 2
@@ -57,7 +57,7 @@ GOOD = {'format': 'thermal_fiducial/dictionary', 'version': 1, 'marker_size': 2,
         ({'markers': [['01', '11'], 7]}, r'markers\[1\]'),
     ],
 )
-def test_wrong_file_says_what_is_wrong(change, words, tmp_path):
+def test_errors_of_a_dictionary_file_name_the_fault(change, words, tmp_path):
     path = tmp_path / 'own.yaml'
     path.write_text(yaml.safe_dump(GOOD | change))
     with pytest.raises(InputError, match=words):

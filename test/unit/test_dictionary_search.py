@@ -99,7 +99,7 @@ def test_check_names_markers_that_are_negatives_of_one_another(capsys):
 
 
 @pytest.mark.parametrize('name', ['STENCIL_4X4_16', 'STENCIL_4X4_100'])
-def test_packaged_dictionary_is_what_its_command_writes(name, tmp_path):
+def test_packaged_dictionaries_are_reproduced_by_their_commands(name, tmp_path):
     dictionary = load_dictionary(name)
     packaged = (FOLDER / f'{name}.yaml').read_text()
     arguments = packaged.splitlines()[0].split()[5:]
@@ -149,7 +149,7 @@ def test_search_depends_on_its_seed_only():
 
 
 @pytest.mark.parametrize(('bits', 'distance'), [(2, 4), (9, 4), (4, 0), (4, 17), (3, 9)])
-def test_search_refuses_what_cannot_be(bits, distance):
+def test_search_refuses_impossible_sizes_and_distances(bits, distance):
     with pytest.raises(InputError):
         search(bits, distance, seed=1, restarts=2)
 

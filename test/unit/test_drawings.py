@@ -404,7 +404,7 @@ def test_nothing_is_written_where_one_file_exists(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ['marker-3.dxf']
 
 
-def test_commands_write_what_they_say(tmp_path, capsys):
+def test_commands_write_the_files_that_they_print(tmp_path, capsys):
     assert main(['markers', 'make', '--ids', '2-3', '--size', '120', '--out', str(tmp_path)]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
         f'marker-{marker}.{kind}' for marker in (2, 3) for kind in ('svg', 'dxf', 'pdf', 'png')

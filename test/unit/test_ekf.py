@@ -191,7 +191,7 @@ def filter_in_flight(flight):
         ({'stamp_ns': 3_000_000_000}, 'ahead'),
     ],
 )
-def test_a_bad_sample_is_refused_and_the_next_one_goes_on(flight, filter_in_flight, change, word):
+def test_a_bad_sample_is_refused_and_the_next_one_used(flight, filter_in_flight, change, word):
     ekf, samples = deepcopy(filter_in_flight), flight.samples()
     bad = samples[400]
     change = {key: bad.stamp_ns + value if key == 'stamp_ns' else value for key, value in change.items()}
@@ -236,7 +236,7 @@ def test_after_long_enough_without_markers_it_resets(flight, patience, resets):
     assert errors(flight, states, 5.0)[0].max() < 0.1
 
 
-def test_unusable_poses_are_refused_in_words(short_flight, flown):
+def test_unusable_poses_are_refused_with_a_reason(short_flight, flown):
     ekf, flight = flown, short_flight
     pose = flight.poses[0]
     assert 'no IMU' in PoseEkf(config()).add_pose(pose).reason

@@ -68,7 +68,7 @@ def test_corners_that_are_wrong_over_the_whole_image_are_in_the_systematic_covar
     assert 4.0 < np.mean(nees) < 8.0
 
 
-def test_markers_larger_than_the_map_says_move_the_camera_by_what_the_scale_allows_for():
+def test_a_scale_error_of_the_markers_is_within_the_covariance_of_the_camera():
     poses = wall(np.random.default_rng(0), 1)
     rows = see(flight(0.0), poses, 1e-3, np.random.default_rng(1), size=1.003 * SIZE)
     exact, uncertain = (located(poses, rows, size_std=std).pose for std in (0.0, 0.003))
@@ -158,7 +158,7 @@ def test_a_model_without_errors_adds_nothing():
 # Without a field the estimate falls from its start at 0.1 px, and is within the bound of none after 450 frames; after
 # 300 it is too low for a field of 0.08 px, so that one that learned nothing of the field would fail with it too.
 @pytest.mark.parametrize(('true_px', 'frames'), [(0.0, 600), (0.08, 300)])
-def test_the_bias_of_the_corners_is_learned_from_residuals_that_last(true_px, frames):
+def test_the_bias_of_the_corners_is_learned_from_correlated_residuals(true_px, frames):
     """Corners with noise of 0.1 px, and with a smooth field over the image or without."""
     rng = np.random.default_rng(4)
     poses, model = wall(rng), replace(ERRORS, corner_px=max(true_px, 1e-6))
@@ -179,7 +179,7 @@ def test_the_bias_of_the_corners_is_learned_from_residuals_that_last(true_px, fr
     assert abs(m.corner_bias_px - true_px) < 0.035
 
 
-def test_a_marker_that_is_hardly_in_view_says_nothing_of_the_bias():
+def test_a_partially_visible_marker_does_not_change_the_bias():
     """One of eight is off by 40 px in each frame, and says so: the pose leaves it out, and so must what is learned."""
     rng = np.random.default_rng(5)
     poses = wall(rng)

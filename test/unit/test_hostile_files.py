@@ -290,7 +290,7 @@ def _untouched(path):
 
 
 @pytest.mark.parametrize('kind', ['a pipe', 'a device', 'a link to itself', 'nothing but holes'])
-def test_a_map_is_not_written_over_what_no_map_is(tmp_path, kind):
+def test_a_map_does_not_overwrite_another_kind_of_file(tmp_path, kind):
     good, out = tmp_path / 'map.yaml', tmp_path / 'out.yaml'
     good.write_text(MAP)
     NO_TABLES[kind](out)

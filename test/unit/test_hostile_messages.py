@@ -13,7 +13,6 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 from support import small_bag
 from support.messages import FRAME_NS, frames, imu, IMU_NS, info, odometry, pose, pose_with_covariance, START
-from support.ros_graph import ros_graph
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
@@ -33,12 +32,6 @@ from thermal_fiducial.ros.node import OK
 pytestmark = pytest.mark.ros
 EYE = np.eye(4)
 GOOD = np.diag([1e-6] * 3 + [1e-7] * 3)
-
-
-@pytest.fixture
-def graph():
-    with ros_graph() as graph:
-        yield graph
 
 
 def at(stamp_ns, frame_id='map'):

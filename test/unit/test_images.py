@@ -42,7 +42,7 @@ def test_eight_bits_and_a_last_row_without_padding():
         message(np.zeros(36, np.uint8), encoding='rgb8'),
     ],
 )
-def test_refuses_what_does_not_fit(broken):
+def test_inconsistent_images_are_refused(broken):
     with pytest.raises(InputError, match='image'):
         image_to_array(broken)
 

@@ -203,7 +203,7 @@ def test_what_is_broken_is_named(ours, capsys, name, change, words):
         assert word in line
 
 
-def test_a_picture_that_is_none_leaves_no_half_bag(tmp_path, capsys):
+def test_an_unreadable_picture_leaves_no_incomplete_bag(tmp_path, capsys):
     folder = tmp_path / 'flight'
     imu_csv(folder / 'imu0.csv')
     (folder / 'cam1').mkdir()
@@ -222,7 +222,7 @@ def test_a_folder_of_no_known_layout(tmp_path, capsys):
     assert run(tmp_path / 'nothing') == 2
 
 
-def test_a_transform_that_is_none(ours, capsys):
+def test_an_invalid_transform_is_refused(ours, capsys):
     (ours / 'rig.yaml').write_text(yaml.safe_dump(rig(T_body_camera=[1.0] * 16)))
     assert run(ours) == 2
     assert 'no rigid transform' in capsys.readouterr().err

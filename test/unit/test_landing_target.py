@@ -4,7 +4,6 @@ from geometry_msgs.msg import PoseStamped
 import numpy as np
 import pytest
 from support.messages import pose_with_covariance
-from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, so3_exp, transform
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
@@ -32,10 +31,9 @@ PAD = np.array([3.4, -1.6, 0.05])
 
 
 @pytest.fixture
-def graph():
-    with ros_graph() as graph:
-        graph.listen(PoseStamped, 'landing_target')
-        yield graph
+def graph(graph):
+    graph.listen(PoseStamped, 'landing_target')
+    return graph
 
 
 def marker_map(ids=(7, 8)):
@@ -140,7 +138,7 @@ def test_a_marker_whose_detector_has_no_pose_of_it_is_no_target(graph, quaternio
 
 
 @pytest.mark.parametrize('parameters', [{'landing_pad': [7, 8]}, {'landing_pad': [7], 'landing_target_frame': 'map'}])
-def test_what_cannot_be_known_without_the_map_is_said(graph, parameters):
+def test_a_pad_that_needs_the_map_is_reported_as_missing_without_one(graph, parameters):
     node = graph.add(LandingTarget, **parameters, **EXTRINSICS)
     graph.send('marker_map', marker_map([8]), profile=qos.LATCHED)
     graph.send('markers', markers(7, 8))

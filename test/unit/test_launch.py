@@ -154,9 +154,7 @@ def test_arguments_reach_the_nodes(launched, tmp_path):
     ('asked', 'environment', 'expected'),
     [('', '', 'LOCALHOST'), ('', 'SUBNET', 'SUBNET'), ('subnet', 'LOCALHOST', 'SUBNET'), ('OFF', '', 'OFF')],
 )
-def test_only_this_computer_finds_the_nodes_unless_somebody_says_so(
-    launched, monkeypatch, asked, environment, expected
-):
+def test_nodes_are_visible_only_on_this_computer_by_default(launched, monkeypatch, asked, environment, expected):
     monkeypatch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', environment)
     _, nodes = launched('mapping.launch.py', discovery_range=asked, enclave='/drone')
     assert [node.additional_env for node in nodes] == [{'ROS_AUTOMATIC_DISCOVERY_RANGE': expected}] * 4
@@ -206,7 +204,7 @@ def test_a_landing_pad_is_reported_where_one_is_named(launched):
         ({'rviz': 'maybe'}, 'rviz maybe: true or false'),
     ],
 )
-def test_what_cannot_be_meant_is_refused_in_words(launched, arguments, words):
+def test_impossible_launch_arguments_are_refused_with_a_reason(launched, arguments, words):
     with pytest.raises(InputError, match=words):
         launched('localization.launch.py', **arguments)
 
@@ -228,7 +226,7 @@ def test_launches_in_the_documents_name_files_and_arguments_that_exist(launched)
         assert [action.msg for action in actions if action.kind == 'log'] == []
 
 
-def test_without_rviz_the_nodes_start_and_it_is_said(launched, monkeypatch):
+def test_without_rviz_the_nodes_start_with_a_warning(launched, monkeypatch):
     monkeypatch.setattr(sys.modules['ament_index_python.packages'], 'get_package_prefix', prefix)
     _, actions = launched('localization.launch.py', rviz='true')
     assert [action.executable for action in actions[:4]] == NODES

@@ -78,7 +78,7 @@ def actions(parser):
 
 
 @pytest.mark.parametrize('command', COMMANDS)
-def test_help_says_what_every_option_does_and_is_when_left_out(command, monkeypatch):
+def test_help_describes_every_option_with_its_default(command, monkeypatch):
     for parser in parsers_of(command, monkeypatch):
         text = ' '.join(parser.format_help().split())
         assert parser.description, parser.prog

@@ -115,7 +115,7 @@ def test_edits_make_versions_that_can_be_undone(path, poses, capsys):
         ('anchor', 'MAP', 'missing.csv'),
     ],
 )
-def test_what_cannot_be_done_is_said_in_one_line(path, capsys, arguments):
+def test_impossible_edits_are_refused_in_one_line(path, capsys, arguments):
     before = path.read_bytes()
     assert run(*(str(a).replace('MAP', str(path)) for a in arguments)) == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
@@ -284,13 +284,13 @@ def test_a_few_bad_views_do_not_make_the_error_that_is_printed(path, poses, phot
     assert 0.005 < float(printed[1]) <= float(printed[2]) < 0.04
 
 
-def test_refine_says_when_nothing_may_move(path, poses, photographed, capsys):
+def test_refine_reports_a_map_of_fixed_markers(path, poses, photographed, capsys):
     save_map(path, MarkerMap({key: MapMarker(key, SIZE, True, poses[key]) for key in range(8)}))
     assert run('refine', path, *photographed) == 0
     assert 'all markers are fixed: none was moved (map unfix)' in capsys.readouterr().out
 
 
-def test_refine_ends_with_what_check_says_and_with_2_where_that_spoils_the_map(path, poses, photographed, capsys):
+def test_refine_prints_the_doubts_and_returns_2_if_one_spoils_the_map(path, poses, photographed, capsys):
     save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, poses[0]), 40: MapMarker(40, SIZE, True, poses[0])}))
     assert run('--marker-size', SIZE, 'refine', path, *photographed) == 2
     said = capsys.readouterr().out
@@ -368,7 +368,7 @@ def test_align_finds_the_map_in_a_cloud(tmp_path, capsys):
     assert (tmp_path / 'T.yaml').read_text().startswith('parent: room.ply')
 
 
-def test_align_along_a_lone_wall_says_what_stays_open(tmp_path, poses, capsys):
+def test_align_along_a_lone_wall_reports_the_unobservable_directions(tmp_path, poses, capsys):
     pytest.importorskip('small_gicp')
     pytest.importorskip('plyfile')
     rng = np.random.default_rng(7)

@@ -45,7 +45,7 @@ def test_one_that_is_missing_is_that_of_the_frame_before_and_no_older(frames, ex
     np.testing.assert_allclose(of_map(corrections, replace(POSE, stamp_ns=frames * FRAME_NS)), expected, atol=1e-15)
 
 
-def test_errors_of_poses_of_another_mapper_do_not_count():
+def test_map_errors_with_stamps_of_another_clock_are_ignored():
     corrections = MapCorrections(1.0)
     corrections.note_error(error_of(FRAME_NS // 2))
     assert not np.any(of_map(corrections, POSE))

@@ -234,7 +234,7 @@ def test_what_has_lost_its_connection_stays_and_the_rest_is_adjusted():
         assert np.trace(marker.covariance[:3, :3]) < 1e-4
 
 
-def test_known_markers_hold_on_to_what_was_known_of_them():
+def test_known_markers_keep_their_prior():
     rng = np.random.default_rng(10)
     poses = wall(rng, 3)
     s = snapshot(rng, poses, sigma=2.0, count=3)

@@ -6,9 +6,7 @@ import pytest
 from scipy.spatial import cKDTree
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
-from support import small_bag
 from support.messages import info
-from support.ros_graph import ros_graph
 from visualization_msgs.msg import Marker, MarkerArray
 
 from thermal_fiducial.cli.main import main
@@ -23,17 +21,6 @@ from thermal_fiducial.ros import clouds, convert, qos
 from thermal_fiducial.ros.node import ERROR, WARN
 
 pytestmark = pytest.mark.ros
-
-
-@pytest.fixture
-def graph():
-    with ros_graph() as graph:
-        yield graph
-
-
-@pytest.fixture
-def map_file(tmp_path):
-    return small_bag.side_files(tmp_path)[0]
 
 
 def test_edits_of_the_file_are_loaded_and_undone_in_flight(graph, map_file):
@@ -57,7 +44,7 @@ def test_edits_of_the_file_are_loaded_and_undone_in_flight(graph, map_file):
     assert graph.call(Trigger, 'marker_mapper/load', Trigger.Request()).message == 'the map is frozen'
 
 
-def test_a_map_that_is_loaded_is_said_on_the_console(graph, map_file, capfd):
+def test_loading_a_map_is_logged(graph, map_file, capfd):
     graph.add(MarkerMapperNode, map_file=str(map_file))
     assert f'map of 1 marker from {map_file}' in capfd.readouterr().err
 
@@ -73,7 +60,7 @@ def test_a_map_of_another_dictionary_is_used_and_warned_of(graph, map_file, capf
     assert 'has markers of DICT_5X5_50, but dictionary is DICT_4X4_50' in capfd.readouterr().err
 
 
-def test_saving_keeps_what_was_in_the_file(graph, map_file):
+def test_saving_keeps_the_previous_file_in_the_history(graph, map_file):
     graph.add(MarkerMapperNode, map_file=str(map_file))
     before = map_file.read_text()
     # As long as nothing has changed there is nothing to keep.

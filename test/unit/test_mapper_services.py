@@ -8,8 +8,6 @@ import os
 import pytest
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool, Trigger
-from support import small_bag
-from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.mapping.map_data import MapMarker, MapperResult, MarkerMap
 from thermal_fiducial.files.map_history import entries
@@ -20,17 +18,6 @@ from thermal_fiducial.ros import map_status, qos
 pytestmark = pytest.mark.ros
 MODES = ('mapping', 'localization')
 FROZEN = 'the map is frozen'
-
-
-@pytest.fixture
-def graph():
-    with ros_graph() as graph:
-        yield graph
-
-
-@pytest.fixture
-def map_file(tmp_path):
-    return small_bag.side_files(tmp_path)[0]
 
 
 def ask(graph, name):

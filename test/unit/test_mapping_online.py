@@ -107,7 +107,7 @@ def test_a_frozen_map_takes_no_refinement():
     assert m.map == before
 
 
-def test_a_marker_that_hangs_twice_is_found_by_the_joint_refinement():
+def test_a_duplicated_marker_is_found_by_the_joint_refinement():
     """Its two sheets take turns, so no run of frames is long enough to condemn it online; all frames together are."""
     rng = np.random.default_rng(8)
     poses = wall(rng)
@@ -158,7 +158,7 @@ def test_another_map_is_taken_over_and_the_jump_returned():
     assert sorted(m.map.markers) == [90]
 
 
-def test_refinement_goes_on_when_the_budget_is_used_up():
+def test_refinement_continues_when_the_keyframe_budget_is_used_up():
     """Loops that close after hours must settle too."""
     rng = np.random.default_rng(10)
     poses = wall(rng)
@@ -223,7 +223,7 @@ def test_drift_that_grows_with_the_way_does_not_set_neighbouring_frames_apart():
     assert np.all(np.sqrt(np.diag(apart.covariances[0])) < [0.005] * 3 + [0.001] * 3)
 
 
-def test_a_marker_that_hangs_in_two_places_teaches_nothing():
+def test_a_duplicated_marker_does_not_change_the_map():
     """Markers 0 and 1 are seen again 6 m away, with new ones round them: odometry, right so far, knows better."""
     rng = np.random.default_rng(12)
     poses = wall(rng)

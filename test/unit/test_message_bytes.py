@@ -26,7 +26,7 @@ def state(**other):
 
 
 @pytest.mark.parametrize('length', range(9))
-def test_is_what_the_message_says(length):
+def test_bytes_are_decoded_as_rclpy_does(length):
     """Names of any length, as what follows them is aligned."""
     for names in (('m' * length, 'base_link'), ('map', 'b' * length)):
         said, message = state(), serialize_message(odometry(state(), *names))
@@ -38,7 +38,7 @@ def test_is_what_the_message_says(length):
             np.testing.assert_array_equal(getattr(read, name), getattr(said, name))
 
 
-def test_many_at_once_are_what_each_is():
+def test_a_batch_is_decoded_like_single_messages():
     messages = [serialize_message(odometry(state(velocity_body=np.full(3, 0.1 * k)), 'm' * k)) for k in range(5)]
     for one, message in zip(message_bytes.odometry(messages), messages, strict=True):
         (alone,) = message_bytes.odometry([message])
@@ -121,7 +121,7 @@ def imu_message(frame, **changes):
 
 
 @pytest.mark.parametrize('frame', ['', 'imu', 'imu_link', 'robot_1/imu'])
-def test_an_imu_message_is_what_it_says(frame):
+def test_an_imu_message_is_decoded(frame):
     message = imu_message(frame)
     read, said = message_bytes.imu_sample(serialize_message(message)), convert.imu_sample(message)
     assert read.stamp_ns == said.stamp_ns
@@ -131,7 +131,7 @@ def test_an_imu_message_is_what_it_says(frame):
 
 
 @pytest.mark.parametrize('name', ['angular_velocity_covariance', 'linear_acceleration_covariance'])
-def test_an_imu_message_that_says_it_measures_nothing_is_refused(name):
+def test_an_imu_message_without_measurements_is_refused(name):
     with pytest.raises(InputError, match='without angular velocity'):
         message_bytes.imu_sample(serialize_message(imu_message('imu', **{name: -1.0})))
 
@@ -146,7 +146,7 @@ def test_an_imu_message_that_is_cut_short_is_refused():
 
 
 @pytest.mark.parametrize('length', range(9))
-def test_a_camera_pose_is_what_it_says(length):
+def test_a_camera_pose_is_decoded(length):
     """Written as the mapper does, read as the filter does."""
     said, frame = state(), 'm' * length
     written = message_bytes.PoseBytes(frame)
@@ -174,7 +174,7 @@ def test_errors_of_the_map_may_have_no_variance_in_some_directions():
 
 @pytest.mark.parametrize('frame', ['', 'a', 'ab', 'abc', 'camera'])
 @pytest.mark.parametrize('kind', [np.uint8, np.uint16])
-def test_an_image_is_what_it_says(frame, kind):
+def test_an_image_is_decoded(frame, kind):
     pixels = np.arange(15, dtype=kind).reshape(3, 5)
     message = convert.image(pixels, convert.header(1_700_000_000_123_456_789, frame))
     whole = bytes(serialize_message(message))
@@ -189,7 +189,7 @@ def test_an_image_is_what_it_says(frame, kind):
 
 
 @pytest.mark.parametrize('frame', ['', 'a', 'ab', 'abc', 'abcd'])
-def test_a_clock_reference_is_what_it_says(frame):
+def test_a_clock_reference_is_decoded(frame):
     message = convert.clock_reference(1_700_000_000_999_999_000, 0.0123456)
     message.header.frame_id = frame
     whole = serialize_message(message)

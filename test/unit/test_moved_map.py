@@ -44,7 +44,7 @@ def unmoved(seconds, jump_ns):
 
 
 @pytest.mark.parametrize('T_new_old', CORRECTIONS.values(), ids=CORRECTIONS)
-def test_the_estimate_goes_on_in_the_new_map(T_new_old):
+def test_the_estimate_continues_in_the_corrected_map(T_new_old):
     flight = Flight(seconds=2.6)
     jump_ns = flight.samples()[400].stamp_ns
     reference = unmoved(flight.seconds, jump_ns)
@@ -64,7 +64,7 @@ def test_the_estimate_goes_on_in_the_new_map(T_new_old):
         )
 
 
-def test_without_the_word_the_jump_is_refused_at_first():
+def test_without_a_correction_the_jump_is_refused_at_first():
     # The negative control: poses in a map that moved by 1.4 m contradict the estimate.
     flight = Flight(seconds=2.8)
     jump_ns = flight.samples()[500].stamp_ns

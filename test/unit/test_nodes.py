@@ -37,12 +37,6 @@ pytestmark = pytest.mark.ros
 START = small_bag.START_NS
 
 
-@pytest.fixture
-def graph():
-    with ros_graph() as graph:
-        yield graph
-
-
 # --- tau2_camera --------------------------------------------------------------------------------------
 
 
@@ -81,7 +75,7 @@ def test_compressed_frames_are_those_that_were_compressed(graph):
     assert 'only PNG' in reason
 
 
-def test_frames_of_8_bits_are_taken_and_what_they_cost_is_said(graph):
+def test_frames_of_8_bits_are_used_with_a_note_on_accuracy(graph):
     node = graph.add(Tau2Camera)
     graph.listen(Image, 'thermal/image')
     (raw,) = frames(1)
@@ -133,7 +127,7 @@ def test_a_truncated_image_is_refused_and_the_next_one_taken(graph):
     assert (level, figures['published /thermal/image']) == (OK, '1')
 
 
-def test_what_nobody_foresaw_is_said_and_the_next_image_taken(graph, monkeypatch):
+def test_an_unexpected_exception_is_reported_and_the_next_image_used(graph, monkeypatch):
     node = graph.add(Tau2Camera)
     first, second = frames(2)
     with monkeypatch.context() as fault:
@@ -185,7 +179,7 @@ def test_markers_come_as_rows_of_the_contract(graph):
     assert (none.width, len(none.data)) == (0, 0)
 
 
-def test_no_camera_info_is_said_and_then_forgotten(graph):
+def test_a_missing_camera_info_is_reported_until_it_comes(graph):
     node = graph.add(ArucoDetector)
     first, second = frames(2)
     graph.send('thermal/image', first)
@@ -230,7 +224,7 @@ def test_a_detector_that_cannot_keep_up_takes_the_newest_image_and_counts_the_ot
     assert '5 older images skipped' in reason
 
 
-def test_an_opencv_that_nobody_has_tried_is_refused_in_words(graph, monkeypatch):
+def test_an_opencv_that_is_too_old_is_refused_with_the_version_needed(graph, monkeypatch):
     monkeypatch.setattr('cv2.__version__', '4.5.4')
     with pytest.raises(InputError, match=r'OpenCV 4\.5\.4: 4\.6 or newer is needed'):
         graph.add(ArucoDetector)
@@ -382,7 +376,7 @@ def fly(graph, messages):
         graph.send('imu/data' if isinstance(message, Imu) else 'camera_pose', message)
 
 
-def test_the_error_of_the_map_widens_what_is_claimed_and_moves_no_pose(graph):
+def test_the_error_of_the_map_widens_the_covariance_and_moves_no_pose(graph):
     node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
     error = pose(0)
     error.pose.covariance = (0.04 * np.eye(6)).ravel()
@@ -443,7 +437,7 @@ def test_nan_in_the_imu_is_refused_and_the_next_sample_taken(graph):
     assert graph.diagnose(node)[2]['refused messages'] == '1'
 
 
-def test_a_filter_that_has_no_time_for_its_imu_says_by_how_much_its_pose_is_late(graph):
+def test_an_overloaded_filter_reports_the_delay_of_its_poses(graph):
     """Nobody spins it for a third of a second."""
     node = graph.add(PoseEkfNode, live=True)
     driver = graph.tester.advertise(Imu, 'imu/data')
@@ -479,7 +473,7 @@ def test_a_queue_of_imu_messages_is_taken_in_at_once_with_one_pose_at_the_newest
     assert node.figures()['IMU messages without a pose'] == 39
 
 
-def test_stamps_that_go_back_are_said_and_survived(graph):
+def test_stamps_that_go_back_are_reported_and_the_next_ones_used(graph):
     node = graph.add(PoseEkfNode)
     fly(graph, [imu(10), imu(11), imu(9)])
     level, reason, _ = graph.diagnose(node)
@@ -489,7 +483,7 @@ def test_stamps_that_go_back_are_said_and_survived(graph):
     assert graph.diagnose(node)[1] == 'waiting for markers'
 
 
-def test_a_camera_pose_that_is_none_is_refused(graph):
+def test_an_invalid_camera_pose_is_refused(graph):
     node = graph.add(PoseEkfNode)
     broken = pose(0)
     broken.pose.pose.orientation.w = broken.pose.pose.orientation.x = 0.0
@@ -514,7 +508,7 @@ def test_reset_starts_anew(graph):
 # --- parameters ---------------------------------------------------------------------------------------
 
 
-def test_silence_is_said(graph):
+def test_an_input_without_messages_is_reported(graph):
     node = graph.add(PoseEkfNode)
     assert graph.diagnose(node)[:2] == (WARN, 'no imu/data')
 
@@ -548,7 +542,7 @@ def test_the_console_has_a_line_for_each_change_that_a_pilot_must_know(graph, ca
     ]  # fmt: skip
 
 
-def test_a_reset_is_said_with_its_reason_and_then_that_the_pose_is_back(graph, capfd):
+def test_a_reset_is_logged_with_its_reason_and_then_the_recovery(graph, capfd):
     node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], reset_after=0.1)
     moved = transform(np.eye(3), [0.5, 0.0, 0.0]) @ small_bag.T_BODY_CAMERA
     for begin, T in ((0, None), (60, moved)):
@@ -570,7 +564,7 @@ def test_a_reset_is_said_with_its_reason_and_then_that_the_pose_is_back(graph, c
     ]
 
 
-def test_a_camera_that_sends_the_same_frame_again_and_again_is_said_to_be_stalled(graph, capfd):
+def test_a_camera_that_repeats_one_frame_is_reported_as_stalled(graph, capfd):
     node = graph.add(Tau2Camera)
     (first,) = frames(1)
     same = [convert.image(image_to_array(first), convert.header(START + k * 33_333_333, 'camera')) for k in range(1, 7)]

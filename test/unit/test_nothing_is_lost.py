@@ -74,7 +74,7 @@ def test_an_autosave_is_named_offered_and_taken_up(path, capsys):
     assert whole(path) == 1
 
 
-def test_a_mapper_that_crashed_goes_on_where_it_was(path):
+def test_a_crashed_mapper_recovers_its_map(path):
     autosaved(keeper_of(path), grown(2))
     restarted = MapKeeper(path, 0.3, {})
     restarted.load()
@@ -85,7 +85,7 @@ def test_a_mapper_that_crashed_goes_on_where_it_was(path):
     assert not map_history.autosave_file(path).exists()
 
 
-def test_an_autosave_that_nobody_took_up_is_kept_when_the_next_mapper_leaves_its_own(path):
+def test_an_unused_autosave_is_kept_beside_a_newer_one(path):
     autosaved(keeper_of(path), grown(2))
     autosaved(keeper_of(path), grown(3))
     assert whole(map_history.autosave_file(path)) == 3
@@ -93,7 +93,7 @@ def test_an_autosave_that_nobody_took_up_is_kept_when_the_next_mapper_leaves_its
     assert (entry.action, entry.revision) == (map_history.PUT_ASIDE, 2)
 
 
-def test_nothing_is_autosaved_when_nothing_was_learned(path):
+def test_an_unchanged_map_is_not_autosaved(path):
     keeper = keeper_of(path)
     keeper.unsaved = False
     keeper.autosave(grown(2))

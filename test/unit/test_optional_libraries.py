@@ -70,7 +70,7 @@ def test_a_missing_tool_is_named_in_one_line(run_folder, options):
         (('--no-report', '--video'), ('av',), '--video needs ffmpeg (apt install ffmpeg) or PyAV'),
     ],
 )
-def test_a_replay_says_what_is_missing_before_it_begins(tmp_path, monkeypatch, options, hidden, words):
+def test_a_replay_names_missing_packages_before_it_begins(tmp_path, monkeypatch, options, hidden, words):
     monkeypatch.setenv('PATH', '')
     arguments = ('replay', str(tmp_path / 'no_bag'), '--out', str(tmp_path / 'run'), *options)
     result = python(COMMAND, hidden, *arguments)
@@ -88,7 +88,7 @@ def test_a_replay_says_what_is_missing_before_it_begins(tmp_path, monkeypatch, o
         (('plotly',), (), 'the report needs plotly: install the extra "tools"'),
     ],
 )
-def test_the_demo_says_what_is_missing_before_it_begins(tmp_path, hidden, options, words):
+def test_the_demo_names_missing_packages_before_it_begins(tmp_path, hidden, options, words):
     result = python(COMMAND, hidden, 'demo', '--out', str(tmp_path / 'demo'), *options)
     assert result.returncode == 2
     assert result.stderr == f'thermal-fiducial demo: {words}\n'
@@ -124,7 +124,7 @@ OF_SOME = {'pose_ekf': ('cv2', 'scipy', 'xml')}
 
 @pytest.mark.ros
 @pytest.mark.parametrize('node', ['tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf'])
-def test_a_node_that_is_back_in_flight_does_not_wait_for_what_it_does_not_use(node):
+def test_a_restarting_node_imports_no_library_that_it_does_not_use(node):
     code = f'import sys, thermal_fiducial.nodes.{node}\nprint(*[name for name in sys.argv[1:] if name in sys.modules])'
     result = python(code, (), *SLOW, *OF_SOME.get(node, ()))
     assert (result.stdout, result.stderr) == ('\n', '')

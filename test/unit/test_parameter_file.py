@@ -47,7 +47,7 @@ def test_an_unknown_name_is_refused_in_a_section_of_ours(tmp_path, section):
         read_settings(file, {})
 
 
-def test_a_section_of_another_node_is_its_own_matter(tmp_path):
+def test_sections_of_other_nodes_are_not_checked(tmp_path):
     file = tmp_path / 'rig.yaml'
     theirs = {'/mavros': {'ros__parameters': {'fcu_url': 'udp://'}}}
     file.write_text(yaml.safe_dump(theirs | {'/**': {'ros__parameters': {'marker_size': 0.3}}}))

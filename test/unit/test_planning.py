@@ -31,7 +31,7 @@ def table(found, sigma, distance=0.001):
     )
 
 
-def test_looks_up_what_was_measured():
+def test_predictions_at_measured_points_are_the_measurements():
     found = np.arange(8.0).reshape(2, 2, 2) / 8.0
     sigma = 0.01 * (1.0 + np.arange(8.0).reshape(2, 2, 2))
     measurements = table(found, sigma)
@@ -65,7 +65,7 @@ def test_nothing_is_promised_below_the_shortest_side_that_the_detector_takes():
     assert packaged.look_up(1.3 * smallest, 200.0, 0.0)[0] > 0.8
 
 
-def test_error_of_the_distance_is_what_was_measured():
+def test_error_of_the_distance_is_that_of_the_measurements():
     measured = np.full((2, 2, 2), 0.001)
     measured[0] = 0.01
     plan = expect(table(1.0, 0.02, measured), CAMERA, size=0.3, distance=8.0, tilt_deg=30.0, contrast=50.0)
@@ -75,7 +75,7 @@ def test_error_of_the_distance_is_what_was_measured():
 
 
 @pytest.mark.parametrize('side', [15.3, 19.1])
-def test_promised_distance_is_what_markers_show(side):
+def test_predicted_error_of_the_distance_is_that_of_rendered_markers(side):
     """Rendered markers of 0.3 m at 15 and 12 m, other ones than those of the tables."""
     camera, detector = camera_and_detector()
     shown = show(detector, camera, side, 11.0, 30.0, 24, [99, int(side)])

@@ -39,7 +39,7 @@ def test_odometry_is_read_at_the_frame_s_stamp_in_its_own_clock(offset_s):
     np.testing.assert_allclose(found.twist.value[:3], VELOCITY, atol=0.02)
 
 
-def test_an_unknown_clock_widens_what_is_said_of_motion_and_place():
+def test_an_unknown_clock_offset_widens_the_predicted_motion_and_pose():
     known, unknown = (predicted(motion_prior(*states(), clock_offset=offset)) for offset in (0.0, None))
     # 30 ms of the offset at 2 m/s, and at 3 m/s^2; the acceleration itself is known to a few m/s^2.
     assert unknown.position_std_m == pytest.approx(np.hypot(known.position_std_m, 0.06), rel=1e-6)

@@ -16,7 +16,6 @@ IMU = np.array([0.8, -1.5, 2.0, 3.0, -1.0, 9.0])
 DENSITIES = np.repeat((1.7e-4, 2.0e-3), 3)
 SECONDS, STEP_NS = 0.005, 5_000_000
 NO_WALKS = np.zeros(SIZE)
-rng = np.random.default_rng(3)
 
 
 @pytest.fixture
@@ -76,7 +75,7 @@ def test_the_pose_error_propagates_exactly_linearly(estimate):
     error = np.zeros(SIZE)
     error[CORE] = np.random.default_rng(2).normal(size=9)
     other = replace(estimate, state=estimate.state.plus(error))
-    samples = IMU + 0.3 * rng.normal(size=(4, 6))
+    samples = IMU + 0.3 * np.random.default_rng(3).normal(size=(4, 6))
     matrices = step_matrices(estimate.state.corrected(samples), np.full(4, SECONDS))
     expected = np.linalg.multi_dot(matrices.transition[::-1]) @ error[CORE]
     found = difference(after(estimate, samples).state, after(other, samples).state)[CORE]
@@ -86,7 +85,7 @@ def test_the_pose_error_propagates_exactly_linearly(estimate):
 
 @pytest.mark.parametrize('count', [1, 6])
 def test_the_covariance_follows_the_derivative_of_the_propagation(estimate, count):
-    samples = IMU + 0.3 * rng.normal(size=(count, 6))
+    samples = IMU + 0.3 * np.random.default_rng(3).normal(size=(count, 6))
     ahead = after(estimate, samples, 0.0 * DENSITIES)
     columns = []
     for error in 1e-6 * np.eye(SIZE):
@@ -100,7 +99,7 @@ def test_the_covariance_follows_the_derivative_of_the_propagation(estimate, coun
 
 
 def test_many_steps_at_once_are_one_after_another(estimate):
-    samples, walks = IMU + 0.3 * rng.normal(size=(7, 6)), np.full(SIZE, 1e-6)
+    samples, walks = IMU + 0.3 * np.random.default_rng(3).normal(size=(7, 6)), np.full(SIZE, 1e-6)
     at_once = after(estimate, samples, walks=walks)
     one_by_one = estimate
     for sample in samples:

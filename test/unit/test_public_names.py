@@ -22,7 +22,7 @@ def test_each_name_is_there_and_documented(name):
     assert f'thermal_fiducial.{name}\n' in (ROOT / 'doc' / 'api.md').read_text()
 
 
-def test_what_type_checkers_see_is_what_is_imported():
+def test_type_checkers_see_the_names_that_are_imported():
     tree = ast.parse(Path(thermal_fiducial.__file__).read_text())
     (block,) = [node for node in tree.body if isinstance(node, ast.If)]
     declared = {alias.name: node.module for node in block.body for alias in node.names}

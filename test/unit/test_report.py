@@ -65,7 +65,7 @@ def test_the_measures_are_those_of_the_noise_that_was_put_in(run_folder):
     assert shutter['seconds'] == pytest.approx(0.5, abs=0.07)
 
 
-def test_the_summary_keeps_what_it_had_and_gains_the_measures(run_folder):
+def test_the_measures_are_added_to_the_summary(run_folder):
     evaluate_run(run_folder)
     evaluate_run(run_folder)
     summary = json.loads((run_folder / 'summary.json').read_text())
@@ -276,14 +276,14 @@ def test_visible_spans_break_at_gaps():
     assert visible_spans(stamps[:0]) == []
 
 
-def test_tables_leave_out_what_is_not_known(small_run):
+def test_tables_omit_unknown_values(small_run):
     evaluation = evaluate(read_run(small_run))
     made = tables(evaluation, evaluation.numbers())
     assert {'accuracy', 'pilot', 'tags'} <= made.keys()
     assert not {'consistency', 'innovations', 'map', 'diagnostics', 'figures'} & made.keys()
 
 
-def test_what_the_nodes_said_is_counted_whatever_its_numbers(run_folder):
+def test_messages_of_nodes_are_counted_regardless_of_their_numbers(run_folder):
     said = {(entry.node, entry.level, entry.message): entry.count for entry in read_run(run_folder).output.diagnostics}
     assert said == {
         ('pose_ekf', 'ok', 'running for N s'): 20,

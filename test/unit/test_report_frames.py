@@ -88,7 +88,7 @@ def test_the_page_holds_the_strip(flight):
 
 
 @needs_encoder
-def test_a_bag_that_is_gone_is_said_and_may_be_named(flight, tmp_path, capsys):
+def test_a_missing_bag_is_reported_and_another_path_can_be_given(flight, tmp_path, capsys):
     shutil.copytree(flight / 'run', tmp_path / 'run')
     run = read_run(tmp_path / 'run')
     assert bag_of(run)[0] == flight / 'bag'
@@ -166,7 +166,7 @@ def test_the_video_calls_the_shutter_by_its_name(flight, monkeypatch):
     assert reasons == [''] * 4 + ['shutter (FFC)'] * 3 + [''] * 2 + ['frozen'] + [''] * (len(stamps) - 10)
 
 
-def test_without_an_encoder_it_says_what_to_install(monkeypatch):
+def test_without_an_encoder_the_error_names_the_package(monkeypatch):
     monkeypatch.setattr(video.shutil, 'which', lambda name: None)
     monkeypatch.setattr(video, 'is_installed', lambda name: False)
     with pytest.raises(InputError, match=r'apt install ffmpeg.*extra "video"'):

@@ -118,7 +118,7 @@ def test_space_holds_path_markers_and_ellipsoids(page):
     assert values(path, 'x').min() < x.mean() < values(path, 'x').max()
 
 
-def test_the_words_of_the_overview(page):
+def test_the_overview_states_its_verdicts_in_sentences(page):
     overview = page[page.index('class="verdict') : page.index('<section id="errors"')]
     for words in (
         'can be flown on, with reservations',
@@ -141,7 +141,7 @@ def test_units_stand_in_every_table(page):
         assert units, title
 
 
-def test_nothing_is_said_twice_in_two_ways(run_folder):
+def test_figures_of_the_diagnostics_are_not_shown_beside_those_of_all_poses(run_folder):
     """What the nodes say of their latest poses must not stand beside the figures of all, under the same names."""
     summary = json.loads((run_folder / 'summary.json').read_text())
     said = {'pose_ekf': {'poses refused': '7', 'NIS per d.o.f.': '0.81', 'position std': '0.004'}}

@@ -112,7 +112,7 @@ def straight(rate_hz, speed=1.5):
     return Trajectory(stamps, transform(np.tile(np.eye(3), (len(t), 1, 1)), np.outer(t, [speed, 0.0, 0.0])))
 
 
-def test_a_held_pose_is_wrong_by_what_was_flown_since(tmp_path):
+def test_the_error_of_a_held_pose_is_the_distance_flown_since(tmp_path):
     """Perfect poses in straight flight: the error as available is the speed times the age, of both."""
     fused, markers = straight(200.0), straight(30.0)
     output = RecordedOutput(
@@ -145,7 +145,7 @@ def test_arrivals_by_another_clock_count_from_the_soonest(tmp_path):
     assert results[0].numbers() == results[1].numbers()
 
 
-def test_nothing_is_said_of_availability_without_truth_or_arrivals(tmp_path):
+def test_without_truth_or_arrivals_there_is_no_table_of_availability(tmp_path):
     fused, markers = straight(200.0), straight(30.0)
     assert available(run_of(tmp_path, fused, markers)) is None
     output = RecordedOutput(fused_arrivals=Arrivals(fused.stamps_ns, fused.stamps_ns))

@@ -36,7 +36,7 @@ def test_a_pose_that_no_flight_could_have_reached_is_kept_out_for_a_second():
 
 
 @pytest.mark.parametrize('seconds', [-1.0, 11.0])
-def test_of_other_times_it_says_nothing(seconds):
+def test_poses_at_other_times_are_not_compared(seconds):
     assert RestartHint(LAST, np.eye(4)).contradiction(camera_pose(seconds, 900.0)) == 0.0
 
 
@@ -57,7 +57,7 @@ def test_the_file_holds_it_for_ten_seconds(tmp_path):
         '{"stamp_ns": 1, "T_map_body": [[1.0]], "camera_time_offset": null}',
     ],
 )  # fmt: skip
-def test_a_file_that_is_none_is_no_hint(tmp_path, text):
+def test_an_unusable_file_of_the_last_pose_is_ignored(tmp_path, text):
     (tmp_path / 'pose.json').write_text(text, encoding='latin-1')
     assert recent_pose(tmp_path / 'pose.json') is None
 
@@ -108,7 +108,7 @@ def fly(graph, first, last, T=None):
 
 
 @pytest.mark.ros
-def test_a_filter_that_is_started_again_says_so_and_refuses_what_cannot_be(tmp_path, monkeypatch, capfd):
+def test_a_restarted_filter_logs_it_and_refuses_impossible_poses(tmp_path, monkeypatch, capfd):
     monkeypatch.setenv('ROS_HOME', str(tmp_path))
     far = transform(np.eye(3), [20.0, 0.0, 0.0]) @ small_bag.T_BODY_CAMERA
     with ros_graph() as graph:

@@ -41,12 +41,6 @@ URDF = """<robot name="drone">
 FORWARD = transform_from_quaternion([0.1, 0.0, 0.02], [-0.5, 0.5, -0.5, 0.5])
 
 
-@pytest.fixture
-def graph():
-    with ros_graph() as graph:
-        yield graph
-
-
 def in_force(node):
     return transform_from_quaternion(node.config.camera_position, node.config.camera_orientation)
 
@@ -70,7 +64,7 @@ def test_fixed_joints_of_a_urdf_make_a_tree():
         (f'<robot>{"<link/>" * 300_000}</robot>', 'of 2100015 characters'),
     ],
 )
-def test_a_description_that_is_none_is_refused_in_words(urdf, words):
+def test_an_invalid_robot_description_is_refused_with_a_reason(urdf, words):
     with pytest.raises(InputError, match=words):
         list(fixed_joints(urdf))
 
@@ -216,7 +210,7 @@ def test_tf_stands_before_a_urdf_and_does_not_move_the_camera_in_flight():
 
 
 @pytest.mark.usefixtures('tf2_msgs')
-def test_tf_that_says_what_the_parameters_say_changes_nothing():
+def test_tf_that_agrees_with_the_parameters_changes_nothing():
     robot = Robot(camera_position=(0.1, 0.0, 0.02))
     RobotFrames(robot)
     robot.taken['/tf_static'](static('base_link', CAMERA, FORWARD))

@@ -155,7 +155,7 @@ def test_arguments_that_ros_cannot_read_are_an_input_error(arguments):
         ('keys', '/empty', 'error creating node'),
     ],
 )
-def test_a_node_that_security_keeps_out_says_why_and_is_not_tried_again(tmp_path, keystore, enclave, words):
+def test_a_node_refused_by_security_reports_it_and_is_not_restarted(tmp_path, keystore, enclave, words):
     """Without a keystore, without its enclave, and with one that has no keys (or a middleware without security)."""
     (tmp_path / 'keys' / 'enclaves' / 'empty').mkdir(parents=True)
     secured = {
@@ -181,7 +181,7 @@ def test_arguments_that_ros_leaves_are_named():
 
 
 @pytest.mark.parametrize('ending', ['os.kill(os.getpid(), signal.SIGINT)', 'rclpy.shutdown()'])
-def test_a_node_that_is_to_stop_while_it_is_made_stops_without_a_word(ending):
+def test_a_node_interrupted_in_its_constructor_stops_silently(ending):
     program = f"""
 import os, signal, sys
 import rclpy
@@ -203,7 +203,7 @@ sys.exit(run(Stopped))
     ('executable', 'quiet'),
     [('-m', True), ('/opt/rig/lib/thermal_fiducial/pose_ekf', True), ('thermal-fiducial', False), ('', False)],
 )
-def test_a_node_stopped_while_it_imports_says_nothing_and_commands_are_left_alone(executable, quiet):
+def test_a_node_interrupted_in_its_imports_stops_silently_and_commands_are_unaffected(executable, quiet):
     # Where the tests run in the background of a shell, SIGINT is ignored from the start.
     program = (
         'import os, signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n'
@@ -274,7 +274,7 @@ HOLDS_THE_INTERPRETER = "re.match('(a+)+$', 64 * 'a' + 'b')"
         ('pass', 'time.sleep(60)', 'pass', 'LEAVING_S = 0.1', -signal.SIGALRM),
     ],
 )
-def test_a_node_ends_without_a_word(at_work, while_destroyed, while_python_ends, limit, status):
+def test_a_node_stops_silently(at_work, while_destroyed, while_python_ends, limit, status):
     """Stopped in a callback that publishes, again while the interpreter ends, and with a library that never returns."""
     program = ENDED % (at_work, while_destroyed, while_python_ends, limit)
     done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from support import small_bag
 from support.messages import frames, info
-from support.ros_graph import ros_graph
 
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
@@ -63,7 +62,7 @@ def test_the_covariance_follows_the_lever_arm():
     np.testing.assert_allclose(found, J @ A @ A.T @ J.T, rtol=0, atol=1e-4)
 
 
-def test_both_at_an_instant_weigh_by_what_they_know_and_claim_no_more_than_the_better():
+def test_simultaneous_poses_are_weighted_by_covariance_and_claim_no_less_than_the_better():
     vague_in_x, vague_in_y = (1e-2, *(1e-4,) * 5), (1e-4, 1e-2, *(1e-4,) * 4)
     first, second = pose(0, np.eye(4), vague_in_x), pose(0, transform(np.eye(3), [0.02, 0.02, 0.0]), vague_in_y)
     joint = intersection(first, second)
@@ -115,14 +114,8 @@ def test_parameters_in_the_second_cameras_namespace_are_its_own(tmp_path):
     assert read_settings(path, {}).aruco_detector.camera_position == (0.1, 0.0, 0.0)
 
 
-@pytest.fixture
-def graph():
-    with ros_graph() as graph:
-        yield graph
-
-
 @pytest.mark.ros
-def test_the_mapper_reads_both_and_goes_on_with_the_second_alone(graph, tmp_path):
+def test_the_mapper_uses_both_cameras_and_continues_with_the_second_alone(graph, tmp_path):
     """Twice the same camera: frames 0 and 1 of both, frames 4 and 8 of the second alone."""
     detector = MarkerDetector(ArucoDetectorConfig(marker_size=small_bag.SIZE), load_dictionary('DICT_4X4_50'))
     seen = [

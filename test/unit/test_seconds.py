@@ -9,7 +9,7 @@ _BY_HAND = re.compile(r'1_000_000_000|\* ?1e9\b|\b1e9 ?[*/]|10 ?\*\* ?9')
 PACKAGE = Path(thermal_fiducial.__file__).parent
 
 
-def test_nobody_writes_the_constant_again():
+def test_nanoseconds_of_a_second_are_one_constant():
     again = [
         f'{path.relative_to(PACKAGE)}: {line.strip()}'
         for path in PACKAGE.rglob('*.py')

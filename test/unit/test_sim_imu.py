@@ -92,7 +92,7 @@ def recorded(model, seed=3):
     return t, model.sample(path, t, stamps, seed), replace(SILENT, rate=model.rate).sample(path, t, stamps, seed)
 
 
-def test_axes_and_g_sensitivity_are_matrices_on_what_is_true():
+def test_axes_and_g_sensitivity_multiply_the_true_values():
     faulty = replace(SILENT, gyroscope_axes=0.01, accelerometer_axes=0.02, g_sensitivity=1e-3)
     _, readings, truth = recorded(faulty)
     inputs = np.hstack([truth.angular_velocity, truth.linear_acceleration])

@@ -38,7 +38,7 @@ def test_jacobian_is_the_derivative_of_the_rays(name):
     np.testing.assert_allclose(lens.slopes_jacobian(lens.slopes(pixels)), np.stack(numeric, axis=-1), atol=1e-9)
 
 
-def test_refuses_what_is_no_lens():
+def test_impossible_lenses_are_refused():
     with pytest.raises(InputError, match='one of'):
         Lens((400.0, 400.0), (320.0, 256.0), 'brown')
     with pytest.raises(InputError, match='takes 4'):

@@ -12,16 +12,20 @@ from thermal_fiducial.sim.thermal_camera import plan, true_corners
 STEP = 1e-4
 
 
+def check_derivatives(path, step, rate_atol):
+    """The derivatives that a path gives against central differences over ``step`` [s] to either side."""
+    t = np.linspace(1.0, 23.0, 57)
+    before, here, after = path(t - step), path(t), path(t + step)
+    turn = (before.rotation.inv() * after.rotation).as_rotvec() / (2 * step)
+    np.testing.assert_allclose(here.velocity, (after.position - before.position) / (2 * step), atol=1e-6)
+    np.testing.assert_allclose(here.acceleration, (after.velocity - before.velocity) / (2 * step), atol=1e-5)
+    np.testing.assert_allclose(here.angular_velocity_body, turn, atol=rate_atol)
+
+
 @pytest.mark.parametrize('name', SCENARIOS)
 def test_derivatives_are_those_of_the_motion(name):
-    trajectory = SCENARIOS[name].flight.trajectory(24.0, seed=4)
-    t = np.linspace(1.0, 23.0, 57)
-    before, here, after = trajectory(t - STEP), trajectory(t), trajectory(t + STEP)
-    turn = (before.rotation.inv() * after.rotation).as_rotvec() / (2 * STEP)
     # Central differences over 0.1 ms: the error is step^2/6 times a third derivative of at most 100.
-    np.testing.assert_allclose(here.velocity, (after.position - before.position) / (2 * STEP), atol=1e-6)
-    np.testing.assert_allclose(here.acceleration, (after.velocity - before.velocity) / (2 * STEP), atol=1e-5)
-    np.testing.assert_allclose(here.angular_velocity_body, turn, atol=1e-5)
+    check_derivatives(SCENARIOS[name].flight.trajectory(24.0, seed=4), STEP, 1e-5)
 
 
 @pytest.mark.parametrize('name', [name for name, item in SCENARIOS.items() if isinstance(item.flight, Flight)])
@@ -39,13 +43,9 @@ def test_derivatives_of_a_vibration_are_those_of_its_motion():
     scenario, step = SCENARIOS['rough'], 1e-6
     shaken, smooth = scenario.trajectory(24.0, seed=4), scenario.flight.trajectory(24.0, seed=4)
     t = np.linspace(1.0, 23.0, 57)
-    before, here, after = shaken(t - step), shaken(t), shaken(t + step)
-    turn = (before.rotation.inv() * after.rotation).as_rotvec() / (2 * step)
     # Central differences: step^2/6 times a third derivative of 1e5, five lines of 0.4 m/s^2 at up to 179 Hz.
-    np.testing.assert_allclose(here.velocity, (after.position - before.position) / (2 * step), atol=1e-6)
-    np.testing.assert_allclose(here.acceleration, (after.velocity - before.velocity) / (2 * step), atol=1e-5)
-    np.testing.assert_allclose(here.angular_velocity_body, turn, atol=1e-6)
-    quiet = smooth(t)
+    check_derivatives(shaken, step, 1e-6)
+    here, quiet = shaken(t), smooth(t)
     assert 0.3 < np.std(here.acceleration - quiet.acceleration) / (0.4 * np.sqrt(5 / 2)) < 2.0
     assert np.abs(here.position - quiet.position).max() < 1e-5
     assert 1e-5 < (quiet.rotation.inv() * here.rotation).magnitude().max() < 2e-4

@@ -175,7 +175,7 @@ def tiny_scenario(monkeypatch):
     monkeypatch.setitem(SCENARIOS, 'tiny', replace(TINY, sensor=replace(TINY.sensor, frame_rate=10.0)))
 
 
-def test_command_writes_a_bag_and_says_how_to_replay_it(tiny_scenario, tmp_path, capsys):
+def test_command_writes_a_bag_and_prints_how_to_replay_it(tiny_scenario, tmp_path, capsys):
     out = tmp_path / 'new' / 'bag'
     options = [
         '--scenario',
@@ -229,7 +229,7 @@ def test_command_refuses_in_one_line(tmp_path, capsys, options, says):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_command_keeps_what_exists(tmp_path, capsys):
+def test_command_does_not_overwrite_a_folder(tmp_path, capsys):
     assert main(['simulate', str(tmp_path)]) == 2
     assert 'exists already' in capsys.readouterr().err
 

@@ -63,7 +63,7 @@ def minutes(memory, errors, poses=12_000):
         (minutes([100, 100], [1.0, 0.0], 6_000), ['12000 poses of 24000 samples of the IMU']),
     ],
 )
-def test_growth_a_trend_and_what_is_missing_are_named(flown, expected):
+def test_growth_trends_and_missing_poses_are_named(flown, expected):
     assert faults(flown, 12_000 * len(flown), []) == expected
 
 

@@ -42,7 +42,7 @@ def test_derivative_by_the_corners_in_pixels():
     np.testing.assert_allclose((derivative @ step.reshape(20, 8, 1))[..., 0], difference, rtol=1e-4, atol=1e-7)
 
 
-def test_corners_are_those_of_squares_and_as_good_as_they_claim():
+def test_corners_are_those_of_squares_with_consistent_covariance():
     truth, sigma = views(400, marker_corners(0.3)), 0.03
     noise = np.random.default_rng(5).normal(0.0, sigma, (400, 8, 1))
     known = as_squares(truth, noise, np.tile(sigma**2 * np.eye(8), (400, 1, 1)))
@@ -54,7 +54,7 @@ def test_corners_are_those_of_squares_and_as_good_as_they_claim():
     assert np.count_nonzero(known.doubt) <= 4
 
 
-def test_the_square_constrains_what_the_image_does_not():
+def test_the_square_constrains_corners_that_the_image_does_not():
     truth = views(50, marker_corners(0.3))
     faint, clear = (
         as_squares(truth, np.zeros((50, 8, 1)), np.tile(sigma**2 * np.eye(8), (50, 1, 1))).constrained

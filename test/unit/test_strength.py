@@ -91,7 +91,7 @@ def test_the_plate_of_the_defaults_is_fine(tmp_path, capsys):
     assert 'marker 5: narrowest web 3.0 mm (hole wall)' in output.out
 
 
-def test_a_neck_as_wide_as_the_warning_says_bears_the_marker():
+def test_a_neck_of_the_width_in_the_warning_is_strong_enough():
     heavy = PlateOptions(size=600.0)
     complaint = strength_of(marker_drawing(BITS[5], '5', heavy), heavy, 6, 3.0).complaints[0]
     width = float(complaint.split('--tie-width ')[1].split()[0])

@@ -174,7 +174,7 @@ def test_the_right_grabber_is_found():
     assert other.calls
 
 
-def test_a_grabber_that_this_user_may_not_open_is_said_to_be_so():
+def test_a_grabber_without_permission_is_reported():
     class Locked(Device):
         @property
         def manufacturer(self):

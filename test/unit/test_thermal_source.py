@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo, Image
-from support.ros_graph import ros_graph
 from support.small_bag import CAMERA
 
 from thermal_fiducial.files.camera_info import save_camera
@@ -19,12 +18,11 @@ PICTURES = [np.random.default_rng(k).integers(6000, 9000, (48, 64), dtype=np.uin
 
 
 @pytest.fixture
-def graph():
-    with ros_graph() as graph:
-        yield graph
-        for node in graph.nodes:
-            if isinstance(node, ThermalSource):
-                node.close()
+def graph(graph):
+    yield graph
+    for node in graph.nodes:
+        if isinstance(node, ThermalSource):
+            node.close()
 
 
 @pytest.fixture
@@ -63,7 +61,7 @@ def test_tau2_camera_takes_its_frames(graph, folder):
     assert any(np.mean(clean == counts) > 0.99 for counts in PICTURES)
 
 
-def test_without_a_camera_it_waits_and_says_so(graph):
+def test_without_a_camera_the_node_waits_and_reports_it(graph):
     node = graph.add(ThermalSource, camera='/dev/video_that_is_not_there')
     graph.spin_until(lambda: 'No such file' in node.state()[1])
     level, reason, _ = graph.diagnose(node)
@@ -71,14 +69,14 @@ def test_without_a_camera_it_waits_and_says_so(graph):
 
 
 @pytest.mark.parametrize(('camera', 'words'), [('', 'parameter camera'), ('/nowhere/pictures', 'neither a device')])
-def test_a_camera_that_is_none_is_a_fault(graph, camera, words):
+def test_an_impossible_camera_is_a_fault(graph, camera, words):
     node = graph.add(ThermalSource, camera=camera)
     level, reason, _ = graph.diagnose(node)
     assert level == ERROR
     assert words in reason
 
 
-def test_a_frame_that_nobody_foresaw_does_not_end_it(graph, folder):
+def test_an_unexpected_frame_does_not_end_the_node(graph, folder):
     node = graph.add(ThermalSource, camera=folder, frame_rate=100.0)
     graph.spin_until(lambda: node.state()[0] == OK)
     # What the camera's thread calls with a frame, called with none.

@@ -70,7 +70,7 @@ def test_the_second_frame_knows_the_motion_and_sharpens_by_it():
     assert np.abs(corners[:, [0, 3], 0] - left).max() < 0.6
 
 
-def test_the_first_frames_say_what_they_know_of_the_motion():
+def test_errors_by_unknown_motion_are_within_their_covariance():
     detector = MarkerDetector(ArucoDetectorConfig(bolometer_lag=0.010), DICTIONARY)
     rng, speed = np.random.default_rng(4), 450.0
     for k in range(4):

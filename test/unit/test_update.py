@@ -114,7 +114,7 @@ def at_camera_stamp(estimate, motion):
     return P[CORE, CORE], P[CORE, TIME_OFFSET]
 
 
-def test_a_corrected_velocity_says_nothing_of_the_clock(estimate, motion):
+def test_an_error_of_the_velocity_does_not_change_the_clock_offset(estimate, motion):
     """A pose is of the state at the camera's stamp: what is not correlated with the offset there, stays so."""
     updater, std = PoseUpdater(FULL), 0.02
     unknown = replace(estimate, covariance=np.zeros((SIZE, SIZE)))
@@ -151,7 +151,7 @@ def test_noise_of_the_motion_is_no_information(estimate, motion):
 
 
 @pytest.mark.parametrize(('turning', 'push'), [(0.0, 0.0), (3.0, 0.0), (0.0, 2.0)])
-def test_an_uncertain_time_offset_costs_what_the_acceleration_makes_of_it(estimate, turning, push):
+def test_an_uncertain_time_offset_adds_noise_by_the_acceleration(estimate, turning, push):
     """Nothing at rest; in a turn half of the acceleration times the square of the offset, of variance 3/4 a^2 s^4."""
     updater, std = PoseUpdater(FULL), 0.02
     P = np.zeros((SIZE, SIZE))
@@ -178,14 +178,14 @@ def weighed(estimate, still, errors):
     return now.pose_noise.white
 
 
-def test_what_poses_scatter_is_learned(estimate, still):
+def test_white_noise_of_poses_is_learned(estimate, still):
     """White errors of three times what the covariance claims, about a state that is known."""
     errors = 3.0 * np.random.default_rng(8).normal(size=(600, 6))
     # the memory of 15 poses of 6 degrees of freedom: a fifth of the variance, a tenth of the deviation; three of that
     assert np.sqrt(weighed(estimate, still, errors)) == pytest.approx(3.0, rel=0.3)
 
 
-def test_poses_that_scatter_less_than_they_claim_are_worth_what_they_claim(estimate, still):
+def test_poses_with_less_noise_than_claimed_keep_their_covariance(estimate, still):
     errors = 0.1 * np.random.default_rng(8).normal(size=(100, 6))
     assert weighed(estimate, still, errors) == WHITE
 
@@ -241,7 +241,7 @@ def test_what_another_error_of_the_map_makes_of_a_pose_is_not_taken_for_motion(e
     np.testing.assert_allclose(shown, 1e-2, rtol=1e-2)
 
 
-def test_the_jitter_of_the_stamps_is_learned(estimate, motion):
+def test_jitter_of_the_stamps_is_learned(estimate, motion):
     """Stamps that scatter by 3 ms, about a state that is known and moves."""
     white = config(systematic_pose_std=0.01, estimate_time_offset=False, time_offset_std=0.0)
     rng, updater = np.random.default_rng(9), PoseUpdater(white)

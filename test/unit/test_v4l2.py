@@ -255,7 +255,7 @@ def test_size_and_rate_are_those_that_were_asked_for():
     np.testing.assert_array_equal(frame.counts, picture(3, (320, 256)))
 
 
-def test_big_endian_words_are_turned():
+def test_big_endian_words_are_swapped():
     kernel = FakeKernel()
     kernel.set_format = lambda argument, original=kernel.set_format: (
         original(argument), setattr(argument.pix, 'pixelformat', api.fourcc('Y16 ') | 1 << 31)
@@ -276,7 +276,7 @@ def test_big_endian_words_are_turned():
         ({'rates': [9]}, None, 30.0, 'one rate only'),
     ],
 )
-def test_what_the_camera_cannot_do_is_said(changes, size, rate, reason):
+def test_unsupported_settings_of_the_camera_are_refused(changes, size, rate, reason):
     with pytest.raises(InputError, match=reason):
         opened(FakeKernel(**changes), size, rate)
 
@@ -315,7 +315,7 @@ def test_a_camera_that_is_unplugged_and_comes_back():
     assert camera.events == {}
 
 
-def test_the_real_calls_refuse_what_is_no_camera():
+def test_the_real_system_calls_refuse_a_file_that_is_no_camera():
     camera = V4l2Camera('/dev/null')
     with pytest.raises(InputError, match='/dev/null is no camera'):
         camera.open()

@@ -3,7 +3,7 @@
 from thermal_fiducial.replay.waiting import PATIENCE_S, Wait
 
 
-def test_a_wait_without_progress_is_said_ever_more_seldom():
+def test_a_wait_without_progress_is_reported_at_growing_intervals():
     now, said = [0.0], []
     wait = Wait(lambda: 'messages on pose', said.append, now=lambda: now[0])
     for _ in range(20):
