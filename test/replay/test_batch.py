@@ -93,6 +93,28 @@ def test_missing_bags_are_named_before_anything_is_begun(folder, capfd):
     assert not (folder / 'never').exists()
 
 
+def test_a_bag_in_the_folder_of_the_runs_is_not_replaced(folder, capfd):
+    before = contents(folder / 'flight0')
+    assert batch(folder, '.', bags=('flight0',)) == 2
+    assert 'flight0 exists and is no earlier run' in capfd.readouterr().err
+    assert contents(folder / 'flight0') == before
+
+
+def test_a_map_of_something_else_is_not_overwritten(folder, capfd):
+    (folder / 'mine').mkdir()
+    (folder / 'mine' / 'marker_map.yaml').write_text('mine')
+    assert batch(folder, 'mine', bags=('flight0',)) == 2
+    assert 'marker_map.yaml is not of an earlier batch' in capfd.readouterr().err
+    assert contents(folder / 'mine') == {Path('marker_map.yaml'): b'mine'}
+
+
+def test_no_folder_is_left_where_no_bag_could_be_replayed(folder, capfd):
+    (folder / 'empty').mkdir()
+    assert batch(folder, 'nothing', bags=('empty',)) == 2
+    assert 'empty: no bag' in capfd.readouterr().err
+    assert not (folder / 'nothing').exists()
+
+
 def test_a_scheduler_that_is_not_there(folder, capfd):
     assert batch(folder, 'nowhere', '--scheduler', 'nonsense://1', bags=('flight0',)) == 2
     assert 'no scheduler at nonsense://1' in capfd.readouterr().err

@@ -383,6 +383,7 @@ def test_open_polyline_is_refused(tmp_path):
 def test_unusable_input_is_one_line(wrong, tmp_path, capsys):
     assert main(['markers', *wrong, '--out', str(tmp_path)]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize('command', [['make', '--ids', '2'], ['sheet', '--ids', '2'], ['board', 'circles']])

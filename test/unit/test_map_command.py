@@ -248,6 +248,14 @@ def test_refine_overwrites_no_edit_that_was_made_meanwhile(path, poses, photogra
     assert load_map(out).markers.keys() == poses.keys()
 
 
+def test_refine_of_a_map_without_markers_says_so(path, photographed, capsys):
+    save_map(path, MarkerMap())
+    assert run('refine', path, *photographed, '--marker-size', SIZE) == 2
+    printed = capsys.readouterr().out
+    assert 'the map has no marker' in printed
+    assert 'fixed' not in printed
+
+
 def test_refine_moves_entries_that_somebody_wrote_by_hand(path, poses, photographed, capsys):
     rng = np.random.default_rng(5)
     entries = {}

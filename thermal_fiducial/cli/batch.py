@@ -59,8 +59,9 @@ def run(args: argparse.Namespace) -> int:
     batch.check()
     with workers(min(args.workers, len(args.bags)), args.scheduler) as client, progress_bar('batch') as progress:
         summary = run_batch(batch, client, progress, lambda line: print(f'warning: {line}', file=sys.stderr))
+    runs = '1 run' if len(summary['runs']) == 1 else f'{len(summary["runs"])} runs'
     print(
-        f'{args.out}: {len(summary["runs"])} runs; {len(summary["markers"])} markers in the joint map, '
+        f'{args.out}: {runs}; {len(summary["markers"])} markers in the joint map, '
         f'{summary["frames_used"]} of {summary["frames"]} frames used'
     )
     return 0

@@ -144,7 +144,7 @@ def say_doubts(marker_map: MarkerMap, path: Path) -> list[Doubt]:
 
 def _print_what_was_used(built: Built, frames: int) -> None:
     print(f'{built.frames_used} of {frames} frames used')
-    if all(marker.fixed for marker in built.map.markers.values()):
+    if built.map.markers and all(marker.fixed for marker in built.map.markers.values()):
         print('all markers are fixed: none was moved (map unfix)')
     # Medians over each marker's views: the root mean square is dominated by a few outliers, and twenty times as large.
     errors = {marker.id: marker.reprojection_error_px for marker in built.map.markers.values() if marker.observations}

@@ -16,7 +16,7 @@ from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.fabrication.boards import base_plate, circle_board, marker_grid
 from thermal_fiducial.fabrication.drawing import Drawing
-from thermal_fiducial.fabrication.paper import PAPERS
+from thermal_fiducial.fabrication.paper import check_paper, PAPERS
 from thermal_fiducial.fabrication.plate import marker_drawing, MOUNTS, PlateOptions
 from thermal_fiducial.fabrication.sheet import nest
 from thermal_fiducial.fabrication.strength import strength_of
@@ -216,6 +216,8 @@ def _formats(args: argparse.Namespace) -> list[str]:
     unknown = set(formats) - set(FORMATS)
     if unknown:
         raise InputError(f'--formats: {", ".join(sorted(unknown))} is not among {", ".join(FORMATS)}')
+    if args.paper is not None:
+        check_paper(args.paper)
     missing = [kind for kind in formats if not is_installed(FORMATS[kind])]
     if missing:
         libraries = ', '.join(FORMATS[kind] for kind in missing)

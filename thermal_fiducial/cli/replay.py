@@ -10,6 +10,7 @@ import time
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import parse_remaps
+from thermal_fiducial.replay.earlier_runs import refuse_other_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Replay the bag, write the run folder, print a summary."""
     if not 0.0 < args.rate <= 100.0:
         raise InputError(f'--rate {args.rate:g} is not between 0 and 100')
-    _refuse_other_folder(args.out)
+    refuse_other_folder(args.out)
     _check_packages(report=not args.no_report, video=args.video)
     replay = importlib.import_module('thermal_fiducial.replay.session')
     options = replay.Options(
@@ -88,16 +89,6 @@ def run(args: argparse.Namespace) -> int:
     for error in errors:
         print(error, file=sys.stderr)
     return 1 if errors else 0
-
-
-def _refuse_other_folder(out: Path) -> None:
-    """Refuse a folder that is neither empty nor that of an earlier replay."""
-    names = {path.name for path in out.iterdir()} if out.is_dir() else set()
-    # A failed replay leaves parameters and map.
-    failed = all(name.startswith(('parameters.yaml', 'marker_map.', 'truth.tum', 'map_true.yaml')) for name in names)
-    earlier = 'parameters.yaml' in names and ('output' in names or failed)
-    if out.exists() and not earlier and (not out.is_dir() or names):
-        raise InputError(f'{out} exists and is no earlier run: choose another folder with --out')
 
 
 def _check_packages(*, report: bool, video: bool) -> None:

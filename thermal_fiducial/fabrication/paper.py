@@ -70,11 +70,16 @@ def tiling(drawing: Drawing, paper: str) -> Tiling:
     return min(choices, key=lambda choice: choice.columns * choice.rows)
 
 
+def check_paper(name: str) -> None:
+    """Raise InputError for a paper that is not among :data:`PAPERS`."""
+    if name.upper() not in {known.upper() for known in PAPERS}:
+        raise InputError(f'--paper {name}: choose one of {", ".join(PAPERS)}')
+
+
 def _paper(name: str) -> FloatArray:
     from reportlab.lib import pagesizes
 
-    if name.upper() not in {known.upper() for known in PAPERS}:
-        raise InputError(f'--paper {name}: choose one of {", ".join(PAPERS)}')
+    check_paper(name)
     return np.array(getattr(pagesizes, name.upper())) / _POINTS_PER_MM
 
 

@@ -5,7 +5,7 @@ of its bag. Run folders appear atomically.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 import json
 import logging
@@ -26,11 +26,12 @@ from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.writing import into, write_text
 from thermal_fiducial.map_tools.map_building import build_map, Built
+from thermal_fiducial.replay.earlier_runs import refuse_other_folder
 from thermal_fiducial.replay.session import MAP_FILE, Options, replay
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.ros import clouds, convert
 
-#: Written last; that of an earlier batch is deleted before the first replay.
+#: Written last; it and the map of an earlier batch are deleted before the first replay.
 SUMMARY_FILE = 'batch.json'
 #: Settings of a local cluster: how many workers may die with a bag before the bag is to blame; and no timeout of a
 #: starved worker, since a dead one shows by its connection.
@@ -77,10 +78,15 @@ class Batch:
 
     def check(self) -> None:
         """Raise InputError for unusable input before any workers are started."""
-        self.runs()
+        runs = self.runs()
         missing = [str(bag) for bag in self.bags if not bag.exists()]
         if missing:
             raise InputError(f'{", ".join(missing)}: no such bag')
+        for run in runs:
+            # A bag in the folder of the runs would be replaced by its own run.
+            refuse_other_folder(run.run)
+        if (self.out / MAP_FILE).exists() and not (self.out / SUMMARY_FILE).exists():
+            raise InputError(f'{self.out / MAP_FILE} is not of an earlier batch: choose another folder with --out')
         mode = {} if self.options.mode is None else {'mode': self.options.mode}
         read_settings(self.options.params, mode | {'map_file': str(self.options.map_file)})
 
@@ -142,8 +148,15 @@ def run_batch(
         raise InputError('a joint map needs --map with at least one marker of known pose')
     with into(batch.out):
         batch.out.mkdir(parents=True, exist_ok=True)
-        (batch.out / SUMMARY_FILE).unlink(missing_ok=True)
-    _replay_all(runs, client, progress, warn)
+        for earlier in (MAP_FILE, SUMMARY_FILE):
+            (batch.out / earlier).unlink(missing_ok=True)
+    try:
+        _replay_all(runs, client, progress, warn)
+    except (InputError, RunError):
+        # Empty if no bag was replayed.
+        with suppress(OSError):
+            batch.out.rmdir()
+        raise
     built, frames = _joint_map(batch, runs, settings)
     save_map(batch.out / MAP_FILE, built.map)
     summary = {
