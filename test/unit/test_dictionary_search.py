@@ -93,7 +93,7 @@ def test_check_names_markers_that_are_negatives_of_one_another(capsys):
     assert main(['markers', 'check', '--mount', 'none', '--ids', ','.join(map(str, first))]) == 0
     printed = capsys.readouterr().out
     assert f'marker {first[0]} and the negative of {first[1]} differ in 0 bits' in printed
-    assert 'take STENCIL_4X4_80_SIGNED and STENCIL_5X5_100_SIGNED, which have none' in printed
+    assert 'use STENCIL_4X4_80_SIGNED and STENCIL_5X5_100_SIGNED, which have none' in printed
     assert main(['markers', 'check', '--mount', 'none', '--dictionary', 'STENCIL_4X4_80_SIGNED', '--ids', '0-5']) == 0
     assert 'negative' not in capsys.readouterr().out
 

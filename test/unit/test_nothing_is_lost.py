@@ -191,7 +191,7 @@ def test_an_edit_that_changes_nothing_makes_no_history(path, capsys):
     before, history = path.read_bytes(), map_history.entries(path)
     capsys.readouterr()
     assert main(['map', 'fix', str(path), '0']) == 0
-    assert 'so already' in capsys.readouterr().out
+    assert 'nothing to change' in capsys.readouterr().out
     assert path.read_bytes() == before
     assert map_history.entries(path) == history
 

@@ -2,12 +2,11 @@
 
 from thermal_fiducial.core.filter.condition import TRACKING, WAITING
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_text, PoseUpdate
+from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_text, LAST_REFUSED, PoseUpdate
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.ros.console import Console
 from thermal_fiducial.ros.imu_queue import ImuQueue
-from thermal_fiducial.ros.live_status import LAST_REFUSED
 from thermal_fiducial.ros.node import ERROR, OK, WARN
 
 #: Difference of IMU and pose stamps beyond any delay [s]: their clocks are not synchronised.

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
+from thermal_fiducial.core.filter.innovations import LAST_REFUSED
 from thermal_fiducial.core.imaging.frame_cleaner import SHUTTER
 
 #: Timeouts of odometry, after which there is no pose to fly on, and of a node's diagnostics [s].
@@ -20,8 +21,6 @@ REFUSAL_S, MOST_REFUSALS = 60.0, 5
 _ONE_CLOCK_S = 5.0
 _FILTER, _CAMERA, _DETECTOR, _MAPPER = 'pose_ekf', 'tau2_camera', 'aruco_detector', 'marker_mapper'
 STAGES = (_CAMERA, _DETECTOR, _MAPPER, _FILTER)
-#: Key of the filter's diagnostics: why the last pose was refused, empty once a later one is accepted.
-LAST_REFUSED = 'last refused pose'
 _OK, _WARNING = 0, 1
 
 

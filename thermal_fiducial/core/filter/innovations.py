@@ -10,8 +10,8 @@ import numpy as np
 
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
-#: Name of the line of normalised innovations in the filter's diagnostics.
-INNOVATIONS = 'innovations'
+#: Keys of the filter's diagnostics: normalised innovations; why the last pose was refused, until one is accepted.
+INNOVATIONS, LAST_REFUSED = 'innovations', 'last refused pose'
 #: Verdicts kept, and poses over which the diagnostics average the normalised innovation squared (NIS).
 _KEPT, _NIS_POSES = 300, 30
 _REFUSED = '!'
