@@ -179,7 +179,7 @@ _BORDER_WIDTH = {'confirmation:DisplayedSides.corrected': lambda _, __, refined,
 
 MECHANISMS = {
     'corners of squares': Mechanism('slow, 0.5 K, blind', ('corners.squares',), {'refining:as_squares': _as_seen}),
-    'other tilt of a square': Mechanism('slow, 0.1 K, blind', (), {'corners.squares:_OTHER_TILT': np.inf}),
+    'other tilt of a square': Mechanism('slow, 0.1 K, blind', (), {'corners.squares:_INCONSISTENT': np.inf}),
     'passes until settled': Mechanism('fast, 8 K, blind', (), {'refining:_PASSES': 1}),
     'second round': Mechanism('fast, 8 K, blind', (), {'refining:_ROUNDS': 1}),
     'edges behind the sides': Mechanism(

@@ -7,13 +7,11 @@ import numpy as np
 
 from thermal_fiducial.core.types import FloatArray, TINY
 
-#: A corner by its four sides, and a corner of a partially visible marker by the edges of its cells [px]: the blur of
-#: the optics is not quite a Gaussian. Rendered frames without noise.
+#: A corner by its four sides, an edge between two cells, and a corner of a partially visible marker by such edges
+#: [px]: the blur of the optics is not quite a Gaussian. Rendered frames without noise.
 OF_SIDES_PX = 0.010
 #: Part of that error that the four sides of a marker have in common [px].
 OF_ALL_SIDES_PX = 0.005
-#: An edge between two cells [px]: optics and cut. Drawn views of partially visible markers.
-OF_CELL_EDGE_PX = 0.015
 #: A corner by ``cornerSubPix`` on thermal frames [px]: blur rounds it.
 OF_LOCAL_PX = 0.18
 #: A corner by the whole pattern of a marker too small for its sides [cells].

@@ -36,14 +36,14 @@ _NARROWEST_PX, _COARSE_PX = 5.0, 8.0
 # Largest number of markers, the largest ones, that are looked for in a frame.
 _MOST = 2
 # Grid of offsets from the prediction that are tried [cells]: spacing; extent in standard deviations of the prediction;
-# least and largest extent.
-_APART, _UNSURE, _LEAST_REACH, _REACH = 0.7, 2.5, 1.4, 4.9
+# largest extent.
+_APART, _UNSURE, _REACH = 0.7, 2.5, 4.9
 # Least number of visible cells, and of visible cells in which any other marker differs: a stain may change one.
 _CELLS, _DIFFERENT = 16, 2
 # Least correlation; least margin over the runner-up as a share of a perfect view's; least evidence (chi square).
 _SIMILAR, _MARGIN, _EVIDENCE = 0.8, 0.5, 25.0
-# Correlation above which no other offsets are tried, and below which the marker is given up.
-_THERE, _HINT = 0.95, 0.55
+# Correlation below which the marker is given up.
+_HINT = 0.55
 # Least shares of the visible edges that show a step of the common contrast, and that agree with the pose.
 _SHOWN, _AGREEING = 0.7, 0.6
 # Largest number of adjustments on the fine layer, and the step below which a pose has converged [px].
@@ -164,8 +164,6 @@ class PartialMarkerSearch:
         def similar(places: FloatArray) -> FloatArray:
             return np.abs(self._visible.match(layer.image, px + places[:, None], marker.id))
 
-        if similar(np.zeros((1, 2)))[0] > _THERE:
-            return marker.T_camera_marker
         at, near = np.zeros(2), cell_px * NEAR_CELLS
         similarity = similar(near)
         if similarity.max() < _SIMILAR:
@@ -210,7 +208,7 @@ def _agrees(fit: PoseFit) -> bool:
 
 def _around(unsure_cells: float) -> FloatArray:
     """Places (P, 2) round one that is known so well, in cells."""
-    steps = round(np.clip(_UNSURE * unsure_cells, _LEAST_REACH, _REACH) / _APART)
+    steps = round(min(_UNSURE * unsure_cells, _REACH) / _APART)
     along = _APART * np.arange(-steps, steps + 1)
     return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
 

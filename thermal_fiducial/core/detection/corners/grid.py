@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.detection.corner_errors import OF_CELL_EDGE_PX
+from thermal_fiducial.core.detection.corner_errors import OF_SIDES_PX
 from thermal_fiducial.core.detection.corners.segments import (
     HOPELESS,
     measure,
@@ -25,12 +25,10 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, Stacked, TINY
 
-# Columns of pixels across an edge: every so many pixels, but no fewer and no more than this.
-_EVERY_PX, _FEWEST, _MOST = 3.0, 6, 24
+# Columns of pixels across an edge.
+_COLUMNS = 6
 # Distance from its ends and from other edges, in blurs, at which an edge is a straight step.
 _QUIET = 2.0
-# Standard deviation of the prior of a pose, as a displacement of each edge [px].
-_PRIOR_PX = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,10 +113,8 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     pattern, nodes = pattern.only(inside), nodes[inside]
     middle = pattern.nodes[:, 2]
     onward = layer.project(se3.apply(T, on_marker(middle + pattern.onward, size))) - nodes[:, 2]
-    length = float(np.linalg.norm(nodes[:, 4] - nodes[:, 0], axis=1).max())
-    columns = int(np.clip(length / _EVERY_PX, _FEWEST, _MOST))
     widest = math.hypot(layer.blur, float(np.linalg.norm(layer.lag_blur)))
-    sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, columns, widest)
+    sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, _COLUMNS, widest)
     blur = blurs(sides.normal[:, 0], layer.blur, layer.lag_blur[None])
     modelled = _model(sides, pattern.step, blur)
     measured = measure(counts_of(sides.pixel, layer.image), modelled, REACHED * blur[0], len(nodes))
@@ -126,9 +122,9 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     if used.sum() < 6:
         return None
     J = _design(T, size, pattern, sides, modelled[2], layer.camera)
-    sharpness = np.where(used, 1.0 / np.sqrt(measured.variance[0] + OF_CELL_EDGE_PX**2), 0.0)
-    prior = J[used].T @ J[used] / (used.sum() * _PRIOR_PX**2)
-    prior += TINY * np.diag(np.diag(prior))
+    sharpness = np.where(used, 1.0 / np.sqrt(measured.variance[0] + OF_SIDES_PX**2), 0.0)
+    # So weak that it only keeps the system solvable.
+    prior = TINY * np.diag((J[used] ** 2).sum(axis=0))
     fit = robust_fit((J * sharpness[:, None])[None], measured.shift * sharpness, used[None], prior)
     step = fit.moved[0]
     return PoseFit(

@@ -31,9 +31,8 @@ _NARROW = 5.0
 # Approximation of the normal distribution by a hyperbolic tangent, good to 2e-4 (E. Page, "Approximations to the
 # cumulative normal function and its inverse for use on a pocket calculator", 1977).
 _LINEAR, _CUBIC = 0.7988, 0.7988 * 0.04417
-# The plate ends one cell outside, at an edge that is not in the model: distance from it that is left out [blurs], and
-# least part of the plate that is used nevertheless [px].
-_PLATE_EDGE_SHOWS, _LEAST_QUIET_PX = 1.5, 0.8
+# The plate ends one cell outside, at an edge that is not in the model: distance from it that is left out [blurs].
+_PLATE_EDGE_SHOWS = 1.5
 # Least share of the side's step in a column: it falls off at the ends of the side.
 _MOSTLY = 0.7
 
@@ -228,7 +227,7 @@ def model(
         which, edges = np.flatnonzero(narrow), behind.reshape(-1, cells, len(NEIGHBOURS))
         _add_neighbours(value, slope, sides, which, edges, blur)
     reach = np.where(narrow, cell, cell - 2.0 * blur[0])
-    quiet = np.minimum(reach, np.maximum(cell - _PLATE_EDGE_SHOWS * blur[0], _LEAST_QUIET_PX))
+    quiet = np.minimum(reach, np.maximum(cell - _PLATE_EDGE_SHOWS * blur[0], 0.0))
     weight = (sides.distance >= -quiet.astype(np.float32)) & (sides.distance <= reach.astype(np.float32))
     weight &= sides.fresh & (own > _MOSTLY)
     if sides.inside is not None:

@@ -20,9 +20,9 @@ _SQUARE_STD = 0.003
 _BENT = 0.1
 # The constraints are nonlinear: largest number of linearisations, and the step below which they are not repeated [px].
 _STEPS, _BENDS_PX = 3, 0.05
-# Squared Mahalanobis distances (2 d.o.f.): beyond which a square of the second planar pose is tried, and beyond which
-# an outline is inconsistent with any square.
-_OTHER_TILT, _TOO_FAR = 9.0, 12.0
+# Squared Mahalanobis distance (99 % of two degrees of freedom) beyond which an outline is inconsistent with a square: a
+# square of the second planar pose is tried then.
+_INCONSISTENT = 9.0
 # Step of the differences from which the derivatives are taken [px]: a millionth of a side, far above rounding.
 _STEP_PX = 1e-4
 _EYE, _OF_EACH = np.eye(2), np.eye(4)[:, None, :, None]
@@ -56,7 +56,7 @@ def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squ
     together = np.empty((len(seen), 4, 2))
     together[:] = seen.reshape(-1, 4, 2).mean(axis=1, keepdims=True)
     nearest = _corrected(at, together.reshape(-1, 8, 1), seen, covariance)
-    refuted = np.flatnonzero(nearest.chi2 > _OTHER_TILT)
+    refuted = np.flatnonzero(nearest.chi2 > _INCONSISTENT)
     if len(refuted):
         other = _corrected(at.only(refuted), seen[refuted], seen[refuted], covariance[refuted])
         better = other.chi2 < nearest.chi2[refuted]
@@ -79,7 +79,7 @@ def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance:
             break
     chi2, left = (error * weighted).sum(axis=(1, 2)), ((variance * weighted) ** 2).sum(axis=(1, 2))
     constrained = 2.0 - (variance * information * _EYE).sum(axis=(1, 2))
-    doubt = np.where(chi2 > _TOO_FAR, left, 0.0)
+    doubt = np.where(chi2 > _INCONSISTENT, left, 0.0)
     return Squared(moved, covariance - spread @ information @ spread.swapaxes(1, 2), chi2, doubt, constrained)
 
 
