@@ -29,7 +29,7 @@ _BLUR = 0.25
 # Damping: share of the information's diagonal that is added to it.
 _DAMPING = 0.1
 # Factor from a Sobel filter's sum to a gradient per pixel.
-_SOBEL = 0.125
+_SOBEL = 1 / 8
 # Longest step of a corner [cells].
 _LONGEST = 0.6
 

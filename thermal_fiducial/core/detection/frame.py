@@ -31,8 +31,6 @@ from thermal_fiducial.core.types import Counts, Float32Array, FloatArray, Gray, 
 
 #: Least depth of points, used for those behind the camera [m].
 LEAST_DEPTH = 1e-3
-# Least noise of a pixel: rounding to whole counts [counts].
-_LEAST_NOISE = 0.3
 # Number of gray levels up to which a frame counts as a picture for a display.
 _LEVELS = 256
 # Interpolation of lag tails where edges are measured: a linear one blurs them more than the image that they are taken
@@ -78,7 +76,7 @@ class Frame:
         keep_columns: bool,
     ) -> 'Frame':
         """A frame; the fixed pattern of its columns is removed unless ``keep_columns`` or the pixels have 8 bits."""
-        noise, displayed = pixel_noise(counts, _LEAST_NOISE), bool(counts[::64].max() < _LEVELS)
+        noise, displayed = pixel_noise(counts), bool(counts[::64].max() < _LEVELS)
         lag, readout = config.bolometer_lag, config.readout_time
         image = counts.astype(np.float32)
         if counts.dtype != np.uint8 and not keep_columns:

@@ -35,17 +35,17 @@ from thermal_fiducial.core.types import BoolArray, FloatArray, Gray, IntArray
 _NARROWEST_PX, _COARSE_PX = 5.0, 8.0
 # Largest number of markers, the largest ones, that are looked for in a frame.
 _MOST = 2
-# Grid of offsets from the prediction that are tried [cells]: spacing; extent in standard deviations of the prediction;
-# largest extent.
-_APART, _UNSURE, _REACH = 0.7, 2.5, 4.9
+# Grid of offsets from the prediction that are tried: spacing [cells]; extent in standard deviations of the prediction;
+# most steps to either side.
+_APART, _UNSURE, _MOST_STEPS = 0.7, 2.5, 7
 # Least number of visible cells, and of visible cells in which any other marker differs: a stain may change one.
 _CELLS, _DIFFERENT = 16, 2
 # Least correlation; least margin over the runner-up as a share of a perfect view's; least evidence (chi square).
 _SIMILAR, _MARGIN, _EVIDENCE = 0.8, 0.5, 25.0
 # Correlation below which the marker is given up.
 _HINT = 0.55
-# Least shares of the visible edges that show a step of the common contrast, and that agree with the pose.
-_SHOWN, _AGREEING = 0.7, 0.6
+# Least share of the visible edges that show a step of the common contrast and agree with the pose.
+_AGREEING = 0.6
 # Largest number of adjustments on the fine layer, and the step below which a pose has converged [px].
 _STEPS, _SETTLED_PX = 9, 0.1
 # Standard deviation [px] and distance outside the image [image widths] beyond which a corner is not published.
@@ -134,7 +134,7 @@ class PartialMarkerSearch:
             fit = step
             if fit.moved_px < _SETTLED_PX:
                 break
-        if fit.moved_px > _SETTLED_PX or not _agrees(fit):
+        if fit.moved_px > _SETTLED_PX or fit.agreeing < _AGREEING * fit.visible:
             return None
         return _corners(frame, marker, fit)
 
@@ -201,14 +201,9 @@ class PartialMarkerSearch:
         )
 
 
-def _agrees(fit: PoseFit) -> bool:
-    """Whether most visible edges show a step and agree with the pose."""
-    return fit.shown >= _SHOWN * fit.visible and fit.agreeing >= _AGREEING * fit.visible
-
-
 def _around(unsure_cells: float) -> FloatArray:
     """Places (P, 2) round one that is known so well, in cells."""
-    steps = round(min(_UNSURE * unsure_cells, _REACH) / _APART)
+    steps = min(round(_UNSURE * unsure_cells / _APART), _MOST_STEPS)
     along = _APART * np.arange(-steps, steps + 1)
     return np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
 

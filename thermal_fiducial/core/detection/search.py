@@ -27,8 +27,6 @@ _FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor
 # Correlation from which an outline needs no alignment; least correlation, and its margin, for alignment to be tried.
 _CLEAR = 0.95
 _HINT, _HINT_MARGIN = 0.5, 0.06
-# Width of the white plate around a marker, with an allowance for motion blur [cells].
-_PLATE_CELLS = 1.6
 # Factor on the shortest side of a marker in a picture for a display, which has little noise: in oblique views the other
 # sides are longer.
 _PICTURE_SIDE = 0.25
@@ -85,7 +83,8 @@ class BlindSearch:
         scales : resolutions of the search
         kinds : polarities searched at half resolution, 1 for markers darker than their surroundings, -1 for brighter
         """
-        hidden = _grown(seen.places.at.px, 1.0 + 2.0 * _PLATE_CELLS / self._decoder.cells)
+        # The plate, and as much again for its blurred edge.
+        hidden = _grown(seen.places.at.px, (self._decoder.cells + 4) / self._decoder.cells)
         min_side_px = _PICTURE_SIDE * config.min_side_px if frame.displayed else config.min_side_px
         fine = faint = np.zeros((0, 4, 2))
         half, clear = frame.image, scales != SearchScales.ALL

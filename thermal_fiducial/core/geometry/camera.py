@@ -26,7 +26,7 @@ _STEPS, _SHORT = 10, 1e-6
 # A last coefficient below this has no root at any angle that a lens can have, but makes the others' overflow.
 _NO_COEFFICIENT = 1e-15
 # Coefficients of the derivative of angle + k1 angle^3 + k2 angle^5 ... with respect to the angle.
-_RISE = np.array([1.0, 3.0, 5.0, 7.0, 9.0])
+_RISE = np.arange(1, 10, 2)
 _EYE = np.eye(3)
 
 

@@ -20,10 +20,11 @@ _MAX_STEPS = 20
 # it misses is of the second order, a hundredth of that. Of a pose that the image refutes anyway a share of the cost
 # is enough, lest it creep along its valley; of one that is worse than an alternative, a share of what it is worse by.
 # One that costs so many times more even after a step is given up.
-_LAST_GAIN, _REFUTED, _LAST_SHARE, _TIMES_THE_BEST = 1e-2, 50.0, 1e-2, 10.0
+_LITTLE, _REFUTED, _TIMES_THE_BEST = 1e-2, 50.0, 10.0
 #: Damping of Levenberg-Marquardt: factors on it after a step that was better, and one that was not; and that at which
 #: no better one is found at all.
-EASED, STIFFENED, MOST_DAMPED = 0.1, 10.0, 1e6
+EASED, MOST_DAMPED = 0.1, 1e6
+STIFFENED = 1.0 / EASED
 # Least depth [m] of a point in front of the camera.
 _NEAR = 1e-6
 # Replaces an initial pose that is not finite.
@@ -86,7 +87,7 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
         if alternatives > 1:
             best = np.repeat(cost.reshape(-1, alternatives).min(axis=1), alternatives)
         gain = (step * gradient).sum(axis=1)
-        last = gain < np.maximum(_LAST_GAIN, _LAST_SHARE * (cost - np.minimum(best, _REFUTED)))
+        last = gain < _LITTLE * np.maximum(cost - np.minimum(best, _REFUTED), 1.0)
         if steps > 0:
             active = active & (damping <= MOST_DAMPED) & (cost <= _REFUTED + _TIMES_THE_BEST * best)
         trial, done = retract(T, -step), active & last

@@ -12,8 +12,6 @@ from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.core.types import BoolArray, Counts, IntArray
 from thermal_fiducial.errors import InputError
 
-#: Least noise of a pixel: half a count.
-LEAST_NOISE = 0.5
 # How many times the spread of its neighbours a pixel must stand out by. A hot point of the scene, centred on a pixel
 # behind a lens with a point spread of 0.6 px, does so 4 times, but such points are few and carry no marker. The end of
 # a fine line (roofs, masts in real frames) stands out from seven of its neighbours up to 5 times, so where one is
@@ -77,7 +75,7 @@ class BadPixelFinder:
         # The first frames are all looked at: a bad pixel should disturb no more than a moment of the flight.
         if self._frames > self.ENOUGH // self.VOTE + 1 and self._frames % self._interval:
             return None
-        noise = pixel_noise(counts, LEAST_NOISE)
+        noise = pixel_noise(counts)
         surroundings = np.asarray(cv2.medianBlur(counts, 3), np.uint16)
         outlying = _stands_out(counts, surroundings, self._sigmas * noise)
         self._votes -= self._votes > 0

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import Tau2CameraConfig
-from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder, LEAST_NOISE
+from thermal_fiducial.core.imaging.bad_pixels import BadPixelFiller, BadPixelFinder
 from thermal_fiducial.core.measurements import LATEST_NS
 from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.core.types import Counts, Gray, IntArray
@@ -248,7 +248,7 @@ class ShutterDetector:
         structure = _structure(image)
         before = self._live_structure
         collapsed = before is not None and structure < self.COLLAPSE * before
-        if collapsed and structure < self.FLAT_SIGMAS * pixel_noise(image, LEAST_NOISE):
+        if collapsed and structure < self.FLAT_SIGMAS * pixel_noise(image):
             self._closed_ns = stamp_ns if self._closed_ns is None else self._closed_ns
             if stamp_ns - self._closed_ns < self.LONGEST_NS:
                 return True

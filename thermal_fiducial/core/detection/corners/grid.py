@@ -95,9 +95,8 @@ class PoseFit(NamedTuple):
     information: FloatArray
     #: longest move of an edge in this step [px], along its normal
     moved_px: float
-    #: numbers of edges in view, of those with a step of the common contrast, and of those that agree with the pose
+    #: numbers of edges in view, and of those with a step of the common contrast that agree with the pose
     visible: int
-    shown: int
     agreeing: int
     contrast: float
     #: standard deviation of a pixel about the model [counts]
@@ -132,7 +131,6 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
         (fit.information[0] - prior) * fit.trust[0],
         float(np.abs(J[used] @ step).max()),
         len(used),
-        int(used.sum()),
         int(fit.kept.sum()),
         float(np.median(measured.contrast[0][used])),
         math.sqrt(np.median(measured.noise[0][used])),

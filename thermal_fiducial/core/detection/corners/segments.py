@@ -4,6 +4,7 @@ A segment is as long as a cell. It measures the displacement of its side, with a
 variance from its own residuals. Clutter, dead pixels and covered parts make outliers of the segments that they affect.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -27,8 +28,10 @@ _SEGMENT_OUTLIER = 2.5
 _RIDGE = 1e-6
 # Degrees of freedom at which the scatter of the segments and the noise of their pixels have equal weight.
 _SCATTER_COUNTS = 24.0
-# Variance of a standard normal variable that is clipped at _SEGMENT_OUTLIER.
-_KEPT_VARIANCE = 0.911
+# Variance of standard normal variables below _SEGMENT_OUTLIER.
+_KEPT_VARIANCE = 1.0 - math.sqrt(2.0 / math.pi) * _SEGMENT_OUTLIER * math.exp(-0.5 * _SEGMENT_OUTLIER**2) / math.erf(
+    math.sqrt(0.5) * _SEGMENT_OUTLIER
+)
 # Range of a segment's contrast over the marker's: less is covered, more is another object's edge; standard deviation of
 # the contrast within a plate.
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3

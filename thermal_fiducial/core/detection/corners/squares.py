@@ -20,9 +20,9 @@ _SQUARE_STD = 0.003
 _BENT = 0.1
 # The constraints are nonlinear: largest number of linearisations, and the step below which they are not repeated [px].
 _STEPS, _BENDS_PX = 3, 0.05
-# Squared Mahalanobis distance (99 % of two degrees of freedom) beyond which an outline is inconsistent with a square: a
-# square of the second planar pose is tried then.
-_INCONSISTENT = 9.0
+# Squared Mahalanobis distance (2 d.o.f.) beyond which an outline is inconsistent with a square: a square of the second
+# planar pose is tried then. One true square in 400 is as far off.
+_INCONSISTENT = 12.0
 # Step of the differences from which the derivatives are taken [px]: a millionth of a side, far above rounding.
 _STEP_PX = 1e-4
 _EYE, _OF_EACH = np.eye(2), np.eye(4)[:, None, :, None]
