@@ -160,6 +160,7 @@ def test_command_prints_tables_and_draws(tmp_path, capsys):
     said = capsys.readouterr().out
     assert 'Contrast left' in said
     assert 'in contact' in said
+    assert 'a warm surface that ends one cell outside it' in ' '.join(said.split())
     assert picture.stat().st_size > 10_000
     assert main(['markers', 'plan', '--distances', 'far']) == 2
     assert main(['markers', 'plan', '--thickness', '0']) == 2

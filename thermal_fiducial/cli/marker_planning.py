@@ -133,8 +133,8 @@ def _expectation(args: argparse.Namespace, measurements: Measurements, distance:
 def _view_table(distances: list[float], views: list[Expectation]) -> Table:
     headers = 'at m', 'side px', 'found', 'corner px', 'position mm', 'distance mm', 'rotation deg', 'flips'
     title = (
-        'One view of one marker: median errors, position of the camera in the frame of the marker; flips: how often '
-        'the wrong one of the two planar poses fits better'
+        'One view of one marker before a warm surface that ends one cell outside it: median errors, position of the '
+        'camera in the frame of the marker; flips: how often the wrong one of the two planar poses fits better'
     )
     table = table_of(title, headers)
     for distance, view in zip(distances, views, strict=True):
@@ -181,12 +181,13 @@ def _draw(
     fade.set(xlabel='time [s]', ylabel='contrast left [%]', ylim=(0, 100), title=f'{args.thickness:g} mm of acrylic')
     fade.legend(fontsize='small')
     pose.semilogy(distances, [1e3 * view.position for view in views], 'o-', label='camera position [mm]')
+    pose.semilogy(distances, [1e3 * view.distance for view in views], '^-', label='distance [mm]')
     pose.semilogy(distances, [view.rotation_deg for view in views], 's-', label='rotation [deg]')
     pose.set(xlabel='distance [m]', title=f'marker of {args.size:g} mm, tilted {args.tilt:g} deg: median error')
     found = pose.twinx()
-    found.fill_between(distances, [100.0 * view.found for view in views], alpha=0.15)
+    share = found.fill_between(distances, [100.0 * view.found for view in views], alpha=0.15, label='found [%]')
     found.set(ylabel='found [%]', ylim=(0, 100))
-    pose.legend(fontsize='small')
+    found.legend(handles=[*pose.get_lines(), share], loc='upper left', fontsize='small')
     with new_file(args.plot) as new:
         try:
             figure.savefig(new, dpi=130)
