@@ -29,6 +29,8 @@ NO_GRAVITY = 'refused: contradicts gravity'
 #: Standard deviation [s] below which the clock offset counts as known, and the least that an alternative hypothesis
 #: begins with: in the fastest flights it moves a marker by a pixel or two.
 KNOWN_OFFSET_STD = 0.003
+#: Standard deviations by which the first poses must have moved the clock offset for them to be used once more.
+_MOVED_OFFSET = 3.0
 #: A pose is far if it fails the gate even with the estimate's standard deviations times _FAR_TOO_SURE and _FAR [rad, m]
 #: added: probably a moved or duplicated marker. An alternative hypothesis that begins there needs as many poses as the
 #: estimate has accepted, at most _ENOUGH_POSES. Nearer ones need fewer: coasting for long would do more harm.
@@ -103,12 +105,22 @@ class Hypotheses:
         coasted_ns = hypothesis.estimate.stamp_ns - hypothesis.accepted_ns
         return coasted_ns > self._config.reinitialise_after * SECOND_NS
 
-    def from_nothing(self, pose: CameraPose, time_ns: int, window: FloatArray) -> Hypothesis | None:
+    def from_nothing(self, pose: CameraPose, time_ns: int, window: FloatArray, time_offset: float) -> Hypothesis | None:
         """A hypothesis initialised from a pose without prior; None where the pose contradicts gravity.
 
-        ``window`` (N, 6): the latest samples up to the pose's instant ``time_ns``.
+        Parameters
+        ----------
+        window : (N, 6) the latest samples up to the pose's instant ``time_ns``
+        time_offset : clock offset [s], beyond the parameter's, about which to linearise
         """
-        return self._begun(pose, time_ns, window, blank_state(self._config), self._config.time_offset_std)
+        blank = replace(blank_state(self._config), time_offset=time_offset)
+        return self._begun(pose, time_ns, window, blank, self._config.time_offset_std)
+
+    def relinearises(self, begun: Hypothesis, first_offset: float) -> bool:
+        """Whether a hypothesis that began at ``first_offset`` [s] has learned another clock offset."""
+        estimate = begun.estimate
+        moved = abs(estimate.state.time_offset - first_offset)
+        return moved > max(KNOWN_OFFSET_STD, _MOVED_OFFSET * estimate.std(TIME_OFFSET))
 
     def alternative_to(
         self, main: Hypothesis, pose: CameraPose, time_ns: int, motion: MotionAtPose, window: FloatArray

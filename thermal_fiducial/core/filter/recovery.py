@@ -97,6 +97,8 @@ class Belief(NamedTuple):
     #: whether the first of the poses refused in a row was near the estimate: then the estimate has drifted, for example
     #: by a fault of the IMU; a moved or duplicated marker is far off at once
     drifted: bool = False
+    #: clock offset [s], beyond the parameter's, about which an initialisation is linearised
+    first_offset: float = 0.0
     #: reason of the latest reset, in words
     reset_reason: str = ''
     #: while initialising: which sensor of the IMU the poses contradict, if any

@@ -1,0 +1,33 @@
+"""Initialisation in brisk motion while the clock offset is still unknown."""
+
+import numpy as np
+import pytest
+from support.flights import Flight, Motion, run, timeline, white_poses
+
+from thermal_fiducial.core.filter.ekf import PoseEkf
+
+#: Poses of several markers, and a clock offset of 2.3 of its prior's standard deviations.
+POSES = {'rotation_std': (1e-3,) * 3, 'translation_std': (1e-3, 1e-3, 2e-3)}
+OFFSET, LATE = -0.07, 0.03
+
+
+def shaken_by_hand(seed):
+    """0.7 m/s and 2 rad/s an axis at 3 to 6 rad/s: rates change by a third within the offset."""
+    rng = np.random.default_rng(300 + seed)
+    phase, frequency = rng.uniform(0.0, 2.0 * np.pi, (2, 3, 2)), rng.uniform(3.0, 6.0, (2, 3, 2))
+    rates = np.array([0.7, 2.0])[:, None, None]
+    return Motion(*np.stack([rates / frequency, frequency, phase], axis=-1))
+
+
+@pytest.mark.parametrize(('seed', 'pose_rate'), [(0, 9.0), (6, 9.0), (0, 30.0), (4, 30.0)])
+def test_a_start_in_brisk_motion_is_right_at_once(seed, pose_rate):
+    """Linearised about an offset of 0, the estimate refused up to 5 good poses, and an alternative replaced it."""
+    flight = Flight(seed, 3.0, shaken_by_hand(seed), pose_rate=pose_rate, offset=OFFSET, **POSES)
+    ekf = PoseEkf(white_poses())
+    states, updates = run(ekf, timeline(flight.samples(), flight.poses, LATE + OFFSET))
+    assert ekf.resets == 0
+    assert not any(update.refused for update in updates)
+    # three standard deviations of its own
+    error = ekf.camera_time_offset - OFFSET
+    assert abs(error) < 3.0 * ekf.diagnostics()['time offset std']
+    assert len(states) > 400
