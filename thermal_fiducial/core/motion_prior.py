@@ -24,8 +24,9 @@ _RESTART_NS = 1_000_000_000
 
 def possible(states: Sequence[Odometry]) -> list[Odometry]:
     """The states with a twist below ``FASTEST``."""
-    twists = (np.concatenate([state.velocity_body, state.angular_velocity_body]) for state in states)
-    return [state for state, twist in zip(states, twists, strict=True) if np.abs(twist).max() < FASTEST]
+    twists = np.array([(state.velocity_body, state.angular_velocity_body) for state in states]).reshape(-1, 6)
+    slow = (np.abs(twists) < FASTEST).all(axis=1)
+    return [state for state, usable in zip(states, slow.tolist(), strict=True) if usable]
 
 
 class MotionPrior:

@@ -120,8 +120,7 @@ def measure(
         part[:4] *= inliers[:, touched]
         moments[:, touched] = _moments(part)
         fit = _fit(moments, segments)
-    farthest = np.broadcast_to(reach, counts.shape[2:])
-    return _judged(fit, farthest.reshape(fit.noise.shape))
+    return _judged(fit, np.repeat(reach, counts.shape[3], axis=1).reshape(fit.noise.shape))
 
 
 def _moments(X: Float32Array) -> Float32Array:
@@ -185,9 +184,14 @@ def adjust(sides: Sides, segments: Segments, prior_px: float) -> tuple[FloatArra
     ----------
     prior_px : standard deviation of what is known of the corners beforehand [px]
     """
-    used = segments.variance < HOPELESS
+    used, cells = segments.variance < HOPELESS, sides.normal.shape[1]
+    # A segment lies where its columns do, between the corners that its side begins and ends at.
+    t = (sides.t * sides.fresh).sum(axis=0) / np.maximum(sides.fresh.sum(axis=0), 1)
+    by_end = t[..., None] * sides.normal
+    from_start, from_end = (each.reshape(-1, 4, cells, 1, 2) for each in (sides.normal - by_end, by_end))
+    A = (from_start * _AT_START + from_end * _AT_END).reshape(-1, 4 * cells, 8)
     sharpness = 1.0 / np.sqrt(segments.variance)
-    fit = robust_fit(_design(sides) * sharpness[..., None], segments.shift * sharpness, used, _EYE / prior_px**2)
+    fit = robust_fit(A * sharpness[..., None], segments.shift * sharpness, used, _EYE / prior_px**2)
     return fit.moved[..., None], np.linalg.inv(fit.information) / fit.trust[:, None, None] + OF_SIDES_PX**2 * _EYE
 
 
@@ -216,12 +220,3 @@ def robust_fit(A: FloatArray, shift: FloatArray, used: BoolArray, prior: FloatAr
     free = np.maximum(kept.sum(axis=1) - A.shape[2], 0.0)
     trust = (free + _SCATTER_COUNTS) / (chi2 + _SCATTER_COUNTS)
     return RobustFit(np.asarray(moved[..., 0]), np.asarray(information), np.asarray(trust), kept)
-
-
-def _design(sides: Sides) -> FloatArray:
-    """Derivative (N, S, 8) of the segments' displacements along their normals by the corners'."""
-    cells = sides.normal.shape[1]
-    t = (sides.t * sides.fresh).sum(axis=0) / np.maximum(sides.fresh.sum(axis=0), 1)
-    by_end = t[..., None] * sides.normal
-    from_start, from_end = (each.reshape(-1, 4, cells, 1, 2) for each in (sides.normal - by_end, by_end))
-    return np.asarray(from_start * _AT_START + from_end * _AT_END).reshape(-1, 4 * cells, 8)
