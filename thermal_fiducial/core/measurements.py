@@ -44,7 +44,7 @@ MAP_DTYPE = np.dtype(
 Markers = np.ndarray
 
 
-# All fields have four bytes: rows are rows of a table of numbers as well, which is read many times faster.
+# All fields have four bytes, so rows can be read as a table of numbers, many times faster.
 _COLUMN = {name: column for column, name in enumerate(MARKER_DTYPE.names or ()) if name != 'id'}
 _CORNERS = [_COLUMN[name] for name in CORNER_FIELDS]
 _COVARIANCES = [_COLUMN[f'c{corner}{term}'] for corner in range(4) for term in ('uu', 'uv', 'uv', 'vv')]
@@ -59,9 +59,9 @@ def columns(markers: Markers, names: tuple[str, ...]) -> FloatArray:
 
 
 def _numbers(markers: Markers, places: list[int]) -> FloatArray:
-    """Columns (N, len(places)) of the table that the rows are."""
+    """Columns (N, len(places)) of the rows, read as a table."""
     table = np.ascontiguousarray(markers).view(_F4).reshape(len(markers), len(MARKER_DTYPE.names or ()))
-    # A NaN that signals (bytes of no number of anybody's) is as good as any.
+    # Invalid bytes may be a signalling NaN; it is refused later like any other NaN.
     with np.errstate(invalid='ignore'):
         return table.take(places, axis=1).astype(np.float64)
 

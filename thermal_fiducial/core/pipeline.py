@@ -62,7 +62,7 @@ class PipelineConfig:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """What one thermal frame came to; a stage that was not reached is None."""
+    """Results of the stages for one thermal frame; None for those that it did not reach."""
 
     stamp_ns: int
     #: why the frame was withheld; empty for a good one
@@ -73,7 +73,7 @@ class FrameResult:
 
 
 def as_published(T: FloatArray) -> FloatArray:
-    """A transform after the way through a message, which carries position and quaternion."""
+    """A transform after conversion to position and quaternion and back, as in a message."""
     return transform_from_quaternion(T[:3, 3], quaternion_from_rotation(T[:3, :3]))
 
 
@@ -136,7 +136,7 @@ class Pipeline:
         return refinement is not None and self.mapper.apply(refinement)
 
     def _share_map(self) -> None:
-        """The detector looks for the markers of the map, as the ``marker_map`` topic gives them."""
+        """Give the detector the map, as the ``marker_map`` topic does."""
         rows = self.mapper.map.rows()
         poses = transform_from_quaternion(
             np.stack([rows[name] for name in 'xyz'], axis=-1),

@@ -11,8 +11,8 @@ from thermal_fiducial.core.types import Counts, Float32Array, Gray, SIGMA_OF_MED
 def pixel_noise(counts: Counts | Gray | Float32Array) -> float:
     """Standard deviation of pixel noise [counts]: median absolute difference of vertical neighbours, sparsely.
 
-    Differences along a column leave the column pattern out. Of whole counts the median may be 0, of noise of up to half
-    a count, which it is taken for then.
+    Differences along a column do not contain the column pattern. With whole counts and noise below half a count the
+    median may be 0; the result is half a count then.
     """
     rows = counts[4::16, ::3]
     below = counts[5::16, ::3]

@@ -17,7 +17,7 @@ Gray: TypeAlias = npt.NDArray[np.uint8]
 
 #: Nanoseconds of a second: stamps are whole nanoseconds, and seconds only differences of them.
 SECOND_NS = 1_000_000_000
-#: What is divided by is kept from zero with it: far below anything that is measured, far above rounding.
+#: Lower bound of divisors: far below all measured values, far above rounding.
 TINY = 1e-9
 #: Standard deviation of normal variables over the median of their absolute values.
 SIGMA_OF_MEDIAN = 1.4826
@@ -25,19 +25,19 @@ SIGMA_OF_MEDIAN = 1.4826
 
 @dataclass(frozen=True, slots=True)
 class Stacked:
-    """N things: of each field the first axis is theirs, of an array or of another batch; any other belongs to all."""
+    """A batch of N items: arrays and batches among the fields have N entries, other fields are common to all."""
 
     def only(self, keep: BoolArray | IntArray) -> Self:
-        """Those at the places ``keep``."""
+        """The items at ``keep``."""
         return self._of(_at(field, keep) for field in self._fields())
 
     def joined(self, others: Self) -> Self:
-        """Those of ``others`` as well."""
+        """These items and those of ``others``."""
         pairs = zip(self._fields(), others._fields(), strict=True)
         return self._of(a.joined(b) if isinstance(a, Stacked) else np.concatenate([a, b]) for a, b in pairs)
 
     def with_others(self, which: IntArray, others: Self) -> Self:
-        """The same with ``others`` at the places ``which``."""
+        """The batch with its items at ``which`` replaced by ``others``."""
         order = np.arange(len(self._fields()[0]))
         order[which] = len(order) + np.arange(len(which))
         return self.joined(others).only(order)

@@ -213,7 +213,7 @@ class ImagePoints(Stacked):
         return ImagePoints(px, x, J, inverse_2x2(J))
 
     def at_pixels(self, px: FloatArray) -> 'ImagePoints':
-        """Those at pixels (..., 2) that are so near that what is left of the distortion's curvature is nothing."""
+        """Points at pixels (..., 2) so near that the curvature of the distortion is negligible."""
         return ImagePoints(px, self.x + (self.inverse @ (px - self.px)[..., None])[..., 0], self.J, self.inverse)
 
 

@@ -56,7 +56,7 @@ class PlanarPoses:
         return self.ordered(np.stack([which, ~which], axis=1).astype(np.intp))
 
     def ordered(self, branches: IntArray) -> 'PlanarPoses':
-        """Those of the branches (N, 2) that come first and second."""
+        """The poses with the branches in the order (N, 2)."""
         rows = np.arange(len(branches))[:, None]
         arrays = self.T_camera_marker, self.information, self.rms_px, self.chi2
         return PlanarPoses(*(array[rows, branches] for array in arrays))

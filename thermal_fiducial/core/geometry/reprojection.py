@@ -1,4 +1,4 @@
-"""Re-projection of map markers into a frame: what the mapper, the candidates and the joint adjustment minimise.
+"""Re-projection of map markers into a frame: errors that mapper, candidates and joint adjustment minimise.
 
 Poses are perturbed in the ROS convention of :mod:`thermal_fiducial.core.measurements`: ``d`` is (x y z, rotation
 about x y z), both in the map frame. With ``p_camera = R' (R_m c + t_m - t)`` for a corner ``c`` of the marker,
@@ -14,7 +14,7 @@ from thermal_fiducial.core.geometry.se3 import skew, so3_exp, so3_log
 from thermal_fiducial.core.types import FloatArray
 
 if TYPE_CHECKING:
-    # The filter turns covariances too, and is back in flight sooner without OpenCV.
+    # Not imported here: the filter uses this module, and restarts sooner without OpenCV.
     from thermal_fiducial.core.geometry.camera import Camera
 
 #: Corners of a marker of side 2, clockwise from its top-left.

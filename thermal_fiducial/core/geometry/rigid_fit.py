@@ -1,7 +1,7 @@
 """Batched Levenberg-Marquardt for poses, in particular of rigid bodies of known points from their noisy images.
 
 The lens distortion is removed once: measured pixels are undistorted, and the derivative of the distortion there enters
-the whitening. What is minimised is a pinhole projection. The weight of a residual is exact to the order of residual
+the whitening, so the minimisation uses a pinhole projection. The weight of a residual is exact to the order of residual
 over focal length, and a residual of zero stays zero.
 """
 
@@ -16,13 +16,13 @@ from thermal_fiducial.core.geometry.reprojection import retract
 from thermal_fiducial.core.types import BoolArray, FloatArray
 
 _MAX_STEPS = 20
-# Costs are chi-squares: a step that lowers one by less is a tenth of a standard deviation, and the last; by how much
-# it misses is of the second order, a hundredth of that. Of a pose that the image refutes anyway a share of the cost
-# is enough, lest it creep along its valley; of one that is worse than an alternative, a share of what it is worse by.
-# One that costs so many times more even after a step is given up.
+# Costs are chi-squares. The last step of a pose is one that lowers its cost by less than _LITTLE, a tenth of a
+# standard deviation; its own error is of second order. A pose whose cost exceeds that of the best alternative, or
+# _REFUTED, which no correct pose reaches, ends earlier: with a gain below _LITTLE of the excess. It is given up if
+# its cost still exceeds _REFUTED and _TIMES_THE_BEST times the best together after a step.
 _LITTLE, _REFUTED, _TIMES_THE_BEST = 1e-2, 50.0, 10.0
-#: Damping of Levenberg-Marquardt: factors on it after a step that was better, and one that was not; and that at which
-#: no better one is found at all.
+#: Damping of Levenberg-Marquardt: factors after a step that lowers the cost, and after one that does not; largest
+#: damping, with which the search ends. The search begins with its inverse.
 EASED, MOST_DAMPED = 0.1, 1e6
 STIFFENED = 1.0 / EASED
 # Least depth [m] of a point in front of the camera.
@@ -66,8 +66,8 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
 
     Parameters
     ----------
-    evaluated : of poses the cost, half its gradient and half its Gauss-Newton Hessian for steps of the origin and
-        rotations about it, both in the parent frame
+    evaluated : function of poses: cost, half its gradient and half its Gauss-Newton Hessian, for steps of the origin
+        and rotations about it, both in the parent frame
     alternatives : number of consecutive starts of the same body, of which only the best is needed
 
     Returns
@@ -79,7 +79,7 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
     cost, gradient, information = evaluated(T)
     possible &= np.isfinite(cost)
     information[~possible], gradient[~possible] = np.eye(6), 0.0
-    damping = np.full(len(T), 1e-6)
+    damping = np.full(len(T), 1.0 / MOST_DAMPED)
     active = possible
     for steps in range(_MAX_STEPS):
         step = _solve(information, damping, gradient)
@@ -104,7 +104,7 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
 
 
 def costs(T: FloatArray, points: FloatArray, images: Images, inlier: float) -> FloatArray:
-    """The robust squared errors (B,) of :func:`evaluate` alone."""
+    """The costs (B,) of :func:`evaluate`, without derivatives."""
     p = se3.apply(T, points)
     z = p[..., 2:]
     residual = (images.whitening @ (p[..., :2] / np.maximum(z, _NEAR))[..., None])[..., 0] - images.target

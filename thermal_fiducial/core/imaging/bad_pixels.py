@@ -1,4 +1,4 @@
-"""Dead, stuck and hot pixels of a bolometer array: finding them while running and filling them in.
+"""Dead, stuck and hot pixels of a bolometer array: detection in flight, and interpolation.
 
 A pixel is bad when it stands out from all of its neighbours, or all but one. The scene cannot look like that: the point
 spread of the lens distributes any hot point over neighbouring pixels, and on an edge or at the corner of a marker a
@@ -12,26 +12,26 @@ from thermal_fiducial.core.pixel_noise import pixel_noise
 from thermal_fiducial.core.types import BoolArray, Counts, IntArray
 from thermal_fiducial.errors import InputError
 
-# How many times the spread of its neighbours a pixel must stand out by. A hot point of the scene, centred on a pixel
-# behind a lens with a point spread of 0.6 px, does so 4 times, but such points are few and carry no marker. The end of
-# a fine line (roofs, masts in real frames) stands out from seven of its neighbours up to 5 times, so where one is
-# excepted more is asked.
+# Least distance of a bad pixel from its neighbours, in multiples of their spread. A hot point of the scene, centred on
+# a pixel behind a lens with a point spread of 0.6 px, reaches 4, but such points are few and carry no marker. The end
+# of a fine line (roofs, masts in real frames) reaches 5 with respect to seven of its neighbours, so the limit is higher
+# where one neighbour is excepted.
 SPREADS_ALONE = 2
 SPREADS_OF_TWO = 12
 
 # Opposite neighbours (row, column), near ones first: the pixel lies in the middle of each pair.
 _PAIRS = np.array([(0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (2, 2), (2, -2), (1, 2), (2, 1), (1, -2), (2, -1)])
 _NEAR_PAIRS = 4
-# A far pair is taken only where no near one is whole: its difference counts this much more.
+# Added to the difference of a far pair, so that it is used only if no near one is sound.
 _FAR_PENALTY_COUNTS = 1 << 16
 
 
 class _Window:
-    """What pixels and their surroundings did over some frames."""
+    """Constancy of pixels and changes of their surroundings over some frames."""
 
     def __init__(self, counts: Counts, surroundings: Counts) -> None:
         self._first, self._lowest, self._highest = counts.copy(), surroundings.copy(), surroundings.copy()
-        # At the ends of the scale a sound pixel keeps its value too: the corner of a clipped marker, say.
+        # At the ends of the scale sound pixels keep their value too, for example at the corner of a clipped marker.
         #: pixels that have kept one value
         self.constant = (counts > counts.min()) & (counts < counts.max())
         self.frames = 0
@@ -70,9 +70,9 @@ class BadPixelFinder:
         self._window: _Window | None = None
 
     def add(self, counts: Counts) -> IntArray | None:
-        """Take a live frame; the bad pixels (N, 2) as column, row where this frame may have changed them."""
+        """Add a live frame; returns the bad pixels (N, 2), column and row, if it may have changed them, else None."""
         self._frames += 1
-        # The first frames are all looked at: a bad pixel should disturb no more than a moment of the flight.
+        # All of the first frames are examined, so that bad pixels are found at once.
         if self._frames > self.ENOUGH // self.VOTE + 1 and self._frames % self._interval:
             return None
         noise = pixel_noise(counts)
@@ -92,7 +92,7 @@ class BadPixelFinder:
         window = self._window = self._window or _Window(counts, surroundings)
         window.add(counts, surroundings)
         if window.frames == self.WINDOW:
-            # A scene that stands still says nothing: what was known of its pixels stays.
+            # A scene at rest is no evidence: its pixels keep their state.
             self._stuck = np.where(window.moved(moved_counts), window.constant, self._stuck & window.constant)
             self._window = None
 
@@ -100,7 +100,7 @@ class BadPixelFinder:
 def _stands_out(counts: Counts, surroundings: Counts, margin_counts: float) -> IntArray:
     """Flat indices of the pixels outside the range of their neighbours by the margin and by their spread.
 
-    ``surroundings``, the median of each pixel's neighbourhood, leaves few pixels to look at.
+    ``surroundings``, the median of each pixel's neighbourhood, leaves few candidates.
     """
     width = counts.shape[1]
     candidates = np.flatnonzero(cv2.absdiff(counts, surroundings) > margin_counts)

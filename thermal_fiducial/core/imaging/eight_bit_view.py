@@ -1,4 +1,4 @@
-"""Counts as an 8-bit picture for people, and for tools that take no more."""
+"""Counts as an 8-bit picture for people, and for tools that are limited to 8 bits."""
 
 import cv2
 import numpy as np
@@ -11,8 +11,8 @@ class EightBitView:
     """Counts as an 8-bit picture whose scale follows the scene slowly.
 
     The scale runs between two percentiles of a sub-sample, smoothed over frames, and in a frame moves by no more than a
-    small share of its span: an object that enters or leaves doesn't make the rest of the picture pump. Only when
-    nothing of the scene is on the scale any more does it jump there.
+    small share of its span: an object that enters or leaves hardly changes the rest of the picture. The scale jumps
+    only when the whole scene is outside it.
     """
 
     STEP = 8
@@ -25,7 +25,7 @@ class EightBitView:
         """Picture (height, width) uint8 of ``counts`` (height, width)."""
         low, high = self._follow(counts)
         span = max(high - low, self.config.view_minimum_span)
-        # What falls below the scale saturates at zero in the unsigned difference, what exceeds it in the conversion.
+        # Counts below the scale saturate in the unsigned difference, counts above it in the conversion.
         start = max(0.0, 0.5 * (low + high - span))
         above = cv2.subtract(counts, np.array([start]))
         return np.asarray(cv2.convertScaleAbs(above, alpha=255.0 / span), dtype=np.uint8)
@@ -39,7 +39,7 @@ class EightBitView:
         if self._range is None or now[0] > self._range[1] or now[1] < self._range[0]:
             self._range = now
         else:
-            # Relative to the span, or an object a hundred times hotter than the markers would black them out at once.
+            # Relative to the span, else an object a hundred times hotter than the markers would darken them at once.
             most = max(float(self._range[1] - self._range[0]), self.config.view_minimum_span)
             self._range = self._range + self.config.view_smoothing * np.clip(now - self._range, -most, most)
         return float(self._range[0]), float(self._range[1])

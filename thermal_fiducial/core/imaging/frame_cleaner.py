@@ -23,7 +23,7 @@ SHUTTER = 'FFC'
 SETTLING = 'settling after FFC'
 REPEATED_STAMP = 'stamp seen before'
 
-# Bits that a driver shifts counts up by at least, to fill 16.
+# Least shift of counts by drivers that fill 16 bits.
 _SHIFTED = 2
 # Rows of an image; a frame with up to MAX_TELEMETRY_ROWS more carries telemetry.
 STANDARD_HEIGHTS = (1024, 512, 480, 256, 240, 128, 120)
@@ -36,14 +36,14 @@ class CleanFrame:
 
     #: (height, width) counts without telemetry, flags and bad pixels; None: withheld
     counts: Counts | None
-    #: in words, empty for a frame that is passed on
+    #: reason in words; empty for a clean frame
     reason: str = ''
-    #: whether newer ones came before it
+    #: whether newer frames came before it
     late: bool = False
 
 
 class FrameCleaner:
-    """Turns what the camera sends into counts that show the scene at their stamp.
+    """Cleans raw frames to counts of the scene at their stamp.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class FrameCleaner:
         image = self._without_telemetry(counts, extra) if extra else counts
         if min(image.shape) < 16:
             raise InputError(f'frame of {image.shape[1]}x{image.shape[0]} pixels is too small')
-        # Some drivers shift counts up: in no living picture the lowest bits are zero in all pixels.
+        # Some drivers shift counts up; without a shift, noise sets the lowest bits of some pixels.
         used = int(np.bitwise_or.reduce(image[:: FreezeDetector.ROW_STEP], axis=None))
         shift = (used & -used).bit_length() - 1
         down = shift if used >> self.config.bits and shift >= _SHIFTED else 0
@@ -193,16 +193,16 @@ class Pauses:
 
 
 class FreezeDetector:
-    """Recognises repeated counts: noise never lets two frames of a living bolometer array agree."""
+    """Recognises repeated counts: because of noise, no two frames of a working bolometer array are equal."""
 
     ROW_STEP = 8
-    # So many rows repeated are a frame torn between old and new. Eight bits may be too coarse to show the noise, so
-    # there a row may repeat without being old, but not all of them.
+    # With so many repeated rows a frame is torn between old and new. Eight bits may be too coarse for the noise, so
+    # there single rows may repeat in a new frame, but not all.
     TORN = 0.25
     TORN_8_BIT = 0.999
 
     def __init__(self) -> None:
-        # As many as a driver has buffers: one that gets nothing new may send them in turn.
+        # Number of buffers of a driver, which may send them in turn while it gets nothing new.
         self._recent: deque[Counts] = deque(maxlen=4)
 
     def repeats(self, image: Counts, *, coarse: bool) -> bool:
@@ -216,8 +216,8 @@ class FreezeDetector:
 
 
 def _repeated_rows(sample: Counts, earlier: Counts) -> float:
-    """Share of the rows that repeat, of those that could change: clipped ones at the end of the scale can't."""
-    # Of rows with noise hardly any begin alike; the others need no look at the rest.
+    """Share of the rows that repeat, of those that could change: clipped rows at the end of the scale cannot."""
+    # Hardly any two rows with noise begin with the same pixels; only those are compared whole.
     same = sample[:, 0] == earlier[:, 0]
     same[same] = np.all(sample[same] == earlier[same], axis=1)
     if not same.any():
@@ -227,11 +227,11 @@ def _repeated_rows(sample: Counts, earlier: Counts) -> float:
 
 
 class ShutterDetector:
-    """Recognises the closed shutter: from one frame to the next all structure is gone."""
+    """Recognises the closed shutter: all structure disappears from one frame to the next."""
 
     FLAT_SIGMAS = 4.0
     COLLAPSE = 0.25
-    # The longest that a shutter stays closed; after it a flat picture is taken for a flat scene.
+    # Longest shutter event; a picture that is flat for longer is a flat scene.
     LONGEST_NS = 1_500_000_000
     SMOOTHING = 0.2
     # Fewer pixels have too few patches (8x8 px) to distinguish structure from noise.
@@ -261,7 +261,7 @@ class ShutterDetector:
 def _structure(image: Counts) -> float:
     """Steps between neighbouring patches [counts]: the tenth largest, so that a small marker is enough.
 
-    The median takes out bad pixels, the mean most of the noise.
+    The median removes bad pixels, the mean most of the noise.
     """
     patches = cv2.resize(cv2.medianBlur(np.ascontiguousarray(image[::4, ::4]), 3), None, fx=0.5, fy=0.5)
     steps = np.abs(np.diff(patches.astype(np.int32), axis=0)).ravel()
