@@ -66,7 +66,7 @@ def solve_camera_pose(
     starts = np.zeros((0, 4, 4)) if initial is None else initial[None]
     if compete or initial is None:
         single = _single_markers(camera.normalise(corners), squares)
-        starts = np.concatenate([starts, single[np.argsort(fitted.costs(single, weights))[:2]]])
+        starts = np.concatenate([starts, single[np.argsort(fitted.costs(single))[:2]]])
     T, chi2, information = fitted.solve(starts, weights)
     best = _likeliest(chi2, 8 * len(corners) - 6, initial is not None)
     seen = camera.project(se3.apply(se3.inverse(T[best]), squares.reshape(-1, 3)))

@@ -52,8 +52,6 @@ NO_SYSTEMATIC_ERRORS = SystematicErrors(0.0, 0.25, 0.0, 0.0, 0.0, 0.0)
 MAP_COMMON = 0.75
 #: Errors of successive odometry poses are correlated for seconds: this many count as one.
 CORRELATED_ODOMETRY = 30.0
-#: Largest standard deviations assumed for odometry that agrees with the markers [m, rad].
-ODOMETRY_AT_WORST = np.repeat([0.3, 0.2], 3)
 #: Part of the re-projection error, by bent plates and corner bias, that is no sign of an inconsistent marker [px].
 INCONSISTENT_PX = 0.3
 
@@ -205,12 +203,6 @@ def divided_prior(covariance: FloatArray, count: int) -> FloatArray:
 def alike_odometry(covariance: FloatArray) -> FloatArray:
     """Covariance (6, 6) of one of many successive odometry poses, as if they were independent."""
     return CORRELATED_ODOMETRY * covariance
-
-
-def bounded_odometry(covariance: FloatArray) -> FloatArray:
-    """Covariance (6, 6) of odometry that has agreed with the markers, scaled down to ``ODOMETRY_AT_WORST``."""
-    scale = float(np.min(ODOMETRY_AT_WORST**2 / np.maximum(np.diag(covariance), 1e-12)))
-    return np.asarray(min(1.0, scale) * covariance)
 
 
 # Weights of markers, and decisions between hypotheses; no published covariance has these in it.

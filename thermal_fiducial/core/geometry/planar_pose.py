@@ -153,8 +153,8 @@ class CameraFit:
         middle = squares.mean(axis=(0, 1))
         self._T_map_middle = se3.transform(np.eye(3), middle)
         self._points = (squares - middle).reshape(1, -1, 3)
-        self._corners = ImagePoints.seen_at(camera.normalise(corners.reshape(1, -1, 2)), camera)
-        self._whitening = whitening(covs)
+        points = ImagePoints.seen_at(camera.normalise(corners.reshape(1, -1, 2)), camera)
+        self._images = Images.of(points, whitening(covs).reshape(1, -1, 2, 2))
 
     def solve(
         self, T_map_camera: FloatArray, weights: FloatArray | None = None, inlier: float = INLIER
@@ -171,20 +171,18 @@ class CameraFit:
         T_map_camera (B, 4, 4), robust chi squares (B,), and information (B, 6, 6) of the map in the camera, turned
         about the middle of the markers.
         """
-        starts, images = se3.inverse(T_map_camera) @ self._T_map_middle, self._images(weights)
+        starts, images = se3.inverse(T_map_camera) @ self._T_map_middle, self._images
+        if weights is not None:
+            root = np.repeat(np.sqrt(weights), 4)[:, None]
+            images = Images(images.whitening * root[..., None], images.target * root)
         T_camera_middle, chi2, information = minimise(
             starts, lambda T: evaluate(T, self._points, images, inlier), alternatives=len(starts)
         )
         return self._T_map_middle @ se3.inverse(T_camera_middle), chi2, information
 
-    def costs(self, T_map_camera: FloatArray, weights: FloatArray | None = None) -> FloatArray:
+    def costs(self, T_map_camera: FloatArray) -> FloatArray:
         """Robust chi squares (B,) at camera poses (B, 4, 4), inf where a marker would be behind the camera."""
-        starts = se3.inverse(T_map_camera) @ self._T_map_middle
-        return costs(starts, self._points, self._images(weights), INLIER)
-
-    def _images(self, weights: FloatArray | None) -> Images:
-        W = self._whitening if weights is None else self._whitening * np.sqrt(weights)[:, None, None, None]
-        return Images.of(self._corners, W.reshape(1, -1, 2, 2))
+        return costs(se3.inverse(T_map_camera) @ self._T_map_middle, self._points, self._images, INLIER)
 
 
 def ippe_square(normalised: FloatArray, sizes: FloatArray) -> FloatArray:

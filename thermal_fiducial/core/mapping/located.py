@@ -13,7 +13,6 @@ import numpy as np
 
 from thermal_fiducial.core.error_model import (
     arms_of_scale,
-    bounded_odometry,
     correlated_sum,
     INCONSISTENT_PX,
     of_single_error,
@@ -52,8 +51,9 @@ class Sight(Stacked):
     observed: Observations
     #: (N,) standard deviation of a coordinate of the corners of each, rms [px]
     noise_px: FloatArray
-    #: (N,) of MapMarker
+    #: (N,) of MapMarker, and which of them are not in quarantine
     markers: ObjectArray
+    trusted: BoolArray
     #: (N, 4, 3) corners in the map [m]
     points: FloatArray
     #: (N, 4, 4), (N,) [m] and (N, 6, 6): poses, sides and covariances of the markers in the map
@@ -76,17 +76,13 @@ class Sight(Stacked):
             observed,
             np.sqrt(np.einsum('nckk->n', observed.covariances) / 8.0),
             np.array(known, dtype=np.object_),
+            np.array([marker.trusted for marker in known], dtype=np.bool_),
             corners_in_map(T_map_marker, sizes),
             T_map_marker,
             sizes,
             covariances,
             np.zeros_like(positions) if given else arms_of_scale(positions, marker_map.anchors),
         )
-
-    def trusted(self) -> 'Sight':
-        """The markers that are not in quarantine."""
-        chosen = np.array([marker.trusted for marker in self.markers], dtype=np.bool_)
-        return self if chosen.all() else self.only(chosen)
 
     def reprojected(self, camera: Camera, T_map_camera: FloatArray) -> 'Reprojected':
         """The map's markers projected into a camera at ``T_map_camera`` (4, 4)."""
@@ -181,12 +177,12 @@ class LocatedFrame:
 
     @cached_property
     def contradicts_odometry(self) -> bool:
-        """Whether pose and odometry contradict each other, even with the covariance of uncertain odometry."""
+        """Whether pose and odometry contradict each other."""
         if self.predicted is None or isinstance(self.outcome, Refusal):
             return False
         pose, odometry = self.outcome.pose, self.predicted.pose
         apart = difference(odometry.T_map_camera, pose.T_map_camera)
-        covariance = pose.covariance + bounded_odometry(odometry.covariance)
+        covariance = pose.covariance + odometry.covariance
         return bool(apart @ np.linalg.solve(covariance, apart) > CONTRADICTION)
 
     def known_errors(self, location: Location) -> tuple[FloatArray, FloatArray]:

@@ -110,7 +110,7 @@ class MarkerMapper:
         offset_std = self.config.time_offset_std
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
-        sight = known.trusted()
+        sight = known if known.trusted.all() else known.only(known.trusted)
         outcome: Location | Refusal = Refusal('no known marker in view')
         if len(sight.markers):
             last = self._last
@@ -146,9 +146,11 @@ class MarkerMapper:
             self._odometry_agreed |= frame.predicted is not None and not frame.contradicts_odometry
             self._last, updated = outcome.pose, True
             # Step 7: errors updated.
-            changed = self._update_errors(frame, outcome)
+            self._bias.add(outcome)
+            changed = self._trust.update(self.map.markers, frame.known.markers, *frame.known_errors(outcome))
             # Step 8: new markers placed relative to the camera.
             if not self.frozen:
+                self._count(frame)
                 self._memory.keep(frame.observed, outcome.pose, frame.camera, frame.predicted)
                 if not frame.is_known.all():
                     placed, waiting = self._place_new(frame, outcome.viewpoint)
@@ -158,15 +160,11 @@ class MarkerMapper:
             dict(self._trust.quarantined), not self.frozen and (changed or updated),
         )  # fmt: skip
 
-    def _update_errors(self, frame: LocatedFrame, location: Location) -> bool:
-        """Update the running errors of the known markers; whether one entered or left quarantine."""
-        self._bias.add(location)
-        known, (errors, explained) = frame.known.markers, frame.known_errors(location)
-        changed = self._trust.update(self.map.markers, known, errors, explained)
-        if not self.frozen:
-            for marker, running in zip(known, self._trust.running_errors(known).tolist(), strict=True):
-                self.map.markers[marker.id] = self.map.markers[marker.id].seen(frame.stamp_ns, running)
-        return changed
+    def _count(self, frame: LocatedFrame) -> None:
+        """Note the known markers of a frame as observed, with their running errors."""
+        known = frame.known.markers
+        for marker, running in zip(known, self._trust.running_errors(known).tolist(), strict=True):
+            self.map.markers[marker.id] = self.map.markers[marker.id].seen(frame.stamp_ns, running)
 
     def _place_new(self, frame: LocatedFrame, viewpoint: Viewpoint) -> tuple[bool, Waiting]:
         """Add views to the candidates of new markers; whether any entered the map, and what the others wait for."""
