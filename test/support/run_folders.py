@@ -39,9 +39,13 @@ def write_poses(path, stamps, T):
 
 
 def make_run(
-    folder: Path, seconds=20.0, seed=0, gap=(8.0, 10.0), shutter=(14.2, 14.7), with_output=True, with_truth=True
-):
-    """Write a run folder; markers are out of view in ``gap``, the camera's shutter is closed in ``shutter`` [s]."""
+    folder: Path, seconds=20.0, seed=0, gap=(8.0, 10.0), shutter=(14.2, 14.7), with_output=True, with_truth=True,
+    said_by_ns=0,
+):  # fmt: skip
+    """Write a run folder; markers are out of view in ``gap``, the camera's shutter is closed in ``shutter`` [s].
+
+    ``said_by_ns``: how far the clock of the diagnostics' stamps is ahead of that of the bag.
+    """
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True)
     stamps = START_NS + np.arange(0, int(seconds * 1e9), 5_000_000)
@@ -69,7 +73,7 @@ def make_run(
         json.dumps({'bag': 'made_up', 'transport': 'processes', 'mode': 'mapping', 'duration_s': seconds})
     )
     if with_output:
-        write_output(folder / 'output', stamps, fused, looked_at, frames, shutter)
+        write_output(folder / 'output', stamps, fused, looked_at, frames, shutter, said_by_ns)
     return folder
 
 
@@ -101,7 +105,7 @@ def write_detections(path, frames, rng):
                     writer.writerow([stamp, marker, *np.round(rng.uniform(0, 500, 8), 3), 0.03])
 
 
-def write_output(path, stamps, fused, looked_at, frames, shutter):
+def write_output(path, stamps, fused, looked_at, frames, shutter, said_by_ns=0):
     """What nodes published.
 
     ``pose`` a millisecond late with the right covariance; ``markers`` and ``camera_pose`` 25 ms late; diagnostics with
@@ -133,7 +137,8 @@ def write_output(path, stamps, fused, looked_at, frames, shutter):
                     status(level=0, name='pose_ekf', message=words, hardware_id='', values=values),
                     status(level=1, name='tau2_camera', message='FFC', hardware_id='', values=shut),
                 ]
-                bag.write('/diagnostics', stamp, types['diagnostic_msgs/msg/DiagnosticArray'](head, items))
+                said = header(stamp=time(*divmod(stamp + said_by_ns, 1_000_000_000)), frame_id='')
+                bag.write('/diagnostics', stamp, types['diagnostic_msgs/msg/DiagnosticArray'](said, items))
 
 
 def write_frames(bag, types, looked_at, frames, pose):

@@ -130,6 +130,17 @@ def test_a_run_whose_map_stayed_empty_has_a_report(small_run):
     assert write_report(small_run).is_file()
 
 
+def test_diagnostics_count_in_the_clock_of_the_bag(tmp_path):
+    """Nodes in processes of their own stamp them with the wall clock, three years after this flight."""
+    run = make_run(tmp_path / 'run', seconds=6.0, gap=(2.0, 3.0), shutter=(4.2, 4.7), said_by_ns=10**17)
+    evaluation, _ = evaluate_run(run)
+    assert [entry.is_shutter for entry in evaluation.interruptions] == [False, True]
+    times = [times for times, _ in evaluation.run.output.figures.values()]
+    times.append(np.array([time_ns for time_ns, _ in evaluation.run.output.withheld]))
+    assert len(np.concatenate(times))
+    assert np.abs(evaluation.seconds(np.concatenate(times))).max() < 10.0
+
+
 def test_one_shutter_event_is_one_event(run_folder):
     evaluation, numbers = evaluate_run(run_folder)
     shutter = next(card for card in cards(evaluation, numbers) if card.name == 'Shutter (FFC)')

@@ -93,8 +93,9 @@ def read_output(path: Path, offset_ns: int) -> RecordedOutput:
     if not path.is_dir():
         return RecordedOutput()
     with BagReader(path) as bag:
-        arrays = [item.message for item in bag.messages([_DIAGNOSTICS])]
-        statuses = [status for array in arrays for status in array.status]
+        # By when they came, in the clock of the bag: nodes in processes of their own stamp them with the wall clock.
+        arrays = [(item.stamp_ns, item.message) for item in bag.messages([_DIAGNOSTICS])]
+        statuses = [status for _, array in arrays for status in array.status]
         stamps, covariances = _covariances(bag)
         return RecordedOutput(
             stamps_ns=stamps,
@@ -138,9 +139,9 @@ def _innovations(statuses: Iterable[Any], offset_ns: int) -> Innovations:
     return replace(said, stamps_ns=said.stamps_ns + offset_ns)
 
 
-def _withheld(arrays: Sequence[Any]) -> tuple[tuple[int, dict[str, int]], ...]:
+def _withheld(arrays: Sequence[tuple[int, Any]]) -> tuple[tuple[int, dict[str, int]], ...]:
     found = []
-    for array in arrays:
+    for time_ns, array in arrays:
         for status in array.status:
             if status.name.rpartition('/')[2] == 'tau2_camera':
                 counts = {
@@ -148,18 +149,18 @@ def _withheld(arrays: Sequence[Any]) -> tuple[tuple[int, dict[str, int]], ...]:
                     for item in status.values
                     if item.key.startswith(_WITHHELD) and item.value.isdigit()
                 }
-                found.append((stamp_to_ns(array.header.stamp), counts))
+                found.append((time_ns, counts))
     return tuple(found)
 
 
-def _figures(arrays: Sequence[Any]) -> dict[str, tuple[IntArray, FloatArray]]:
+def _figures(arrays: Sequence[tuple[int, Any]]) -> dict[str, tuple[IntArray, FloatArray]]:
     found: defaultdict[str, list[tuple[int, float]]] = defaultdict(list)
-    for array in arrays:
+    for time_ns, array in arrays:
         for status in array.status:
             if status.name.rpartition('/')[2] == 'pose_ekf':
                 for item in status.values:
                     if (value := _number(item.value)) is not None:
-                        found[item.key].append((stamp_to_ns(array.header.stamp), value))
+                        found[item.key].append((time_ns, value))
     return {
         key: (np.array([time for time, _ in rows], np.int64), np.array([value for _, value in rows]))
         for key, rows in found.items()
