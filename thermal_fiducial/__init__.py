@@ -7,11 +7,13 @@ The layers, each importing only from those below it (checked by import-linter)::
 
     cli                               commands
     replay                            recorded bags through the real nodes
-    nodes     report                  thin ROS 2 nodes; plots and HTML
+    nodes  report                     thin ROS 2 nodes; plots and HTML
     ros                               messages to records, parameters, QoS, run loop
-    sim  files  fabrication  calibration  map_tools
+    sim  calibration  map_tools       simulator, calibration, maps off the robot
+    fabrication  cameras              drawings of markers, drivers of cameras
+    files                             bags, maps, calibrations, trajectories
     core                              the algorithms: no ROS, no files, no clock, no printing
-    config  errors
+    config  errors                    every parameter once; the one error for unusable input
 """
 
 from importlib import import_module

@@ -13,14 +13,25 @@ rows, a millisecond of read-out each, and interpolated linearly over the rows be
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.sim.lens import Lens
+from thermal_fiducial.sim.plate_lookup import (
+    cell_indices,
+    clipped,
+    cut_pixels,
+    homographies,
+    look_up,
+    NEAR,
+    outline_points,
+    ray_factors,
+    Strip,
+    strips,
+)
 from thermal_fiducial.sim.scene import Acrylic, Fog, Plate, Room
 from thermal_fiducial.sim.spline_trajectory import Path
 
@@ -28,12 +39,7 @@ from thermal_fiducial.sim.spline_trajectory import Path
 #: search for the largest distance between points in each projection.
 LATTICES = {23: (1, 19, 10), 97: (1, 84, 79), 251: (1, 234, 148)}
 
-#: Longest read-out of a strip [s]: interpolation over it misses 0.016 px of a vibration of 0.1 px at 180 Hz.
-STRIP_TIME = 1e-3
-
-_NEAR = 0.05
 _COARSE = 4
-_KERNEL = np.ones((3, 3), np.uint8)
 
 
 @dataclass(frozen=True)
@@ -89,7 +95,7 @@ class Renderer:
         self._lens, self._plates, self._room, self._fog, self._acrylic = lens, list(plates), room, fog, acrylic
         self._centres = np.array([plate.T_map_plate[:3, 3] for plate in plates]).reshape(-1, 3)
         self._normals = np.array([plate.T_map_plate[:3, 2] for plate in plates]).reshape(-1, 3)
-        self._outlines = np.array([_outline(plate) for plate in plates]).reshape(-1, 32, 3)
+        self._outlines = np.array([outline_points(plate) for plate in plates]).reshape(-1, 32, 3)
         self._trajectory, self._T_body_camera = trajectory, T_body_camera
         self._interval, self._warm_up = interval, quality.warm_up
         self._sub_frames = quality.sub_frames if lag > 0 else 1
@@ -98,7 +104,7 @@ class Renderer:
         self._norms = np.sqrt(1.0 + np.sum(self._rays[:2] ** 2, axis=0))
         self._coarse_rays = _coarse_rays(lens).astype(np.float32)
         self._coarse_norms = np.linalg.norm(self._coarse_rays, axis=-1)
-        self._strips, self._nodes = _strips(lens.height, readout)
+        self._strips, self._nodes = strips(lens.height, readout)
         self._coarse_delays = _coarse_delays(lens.height, readout)
         self._max_slope = 1.2 * float(np.sqrt(self._norms.max() ** 2 - 1.0))
         self._previous: float | None = None
@@ -138,7 +144,7 @@ class Renderer:
         image = self._background(t_middle)
         few = np.concatenate([poses[:: -max(1, len(poses) // 2), 0], poses[:1, -1]])
         for plate, box in self._in_view(few):
-            H = _homographies(plate, poses)
+            H = homographies(plate, poses)
             for strip in self._strips:
                 self._draw(image, plate, box, strip, H, t_middle)
         return image
@@ -154,7 +160,7 @@ class Renderer:
         return np.ascontiguousarray(fine[: self._lens.height, : self._lens.width])
 
     def _draw(
-        self, image: Float32Array, plate: Plate, box: tuple[slice, slice], strip: '_Strip', H: FloatArray, t: float
+        self, image: Float32Array, plate: Plate, box: tuple[slice, slice], strip: Strip, H: FloatArray, t: float
     ) -> None:
         """The part of a plate that lies in the strip; ``H`` (nodes, N, 3, 3)."""
         padded, kept = strip.rows_of(box[0])
@@ -163,20 +169,20 @@ class Renderer:
         H = strip.motion(H)
         rays, norms = self._rays[:, padded, box[1]], self._norms[padded, box[1]]
         shape, share = norms.shape, strip.share(padded)
-        u, v, inverse_depth = _look_up(_moved(rays[:3], share, H), H[:, [0, H.shape[1] // 2, -1]])
-        cells = _cells(u, v, plate)
+        u, v, inverse_depth = look_up(ray_factors(rays[:3], share, H), H[:, [0, H.shape[1] // 2, -1]])
+        cells = cell_indices(u, v, plate)
         level, cover = plate.levels.ravel()[cells[1]], plate.cover.ravel()[cells[1]]
-        cut = np.flatnonzero(_cut_pixels(plate.regions.ravel()[cells].reshape(3, *shape)))
+        cut = np.flatnonzero(cut_pixels(plate.regions.ravel()[cells].reshape(3, *shape)))
         if len(cut):
-            level[cut], cover[cut] = self._supersample(plate, _moved(rays, share, H)[:, cut], H)
+            level[cut], cover[cut] = self._supersample(plate, ray_factors(rays, share, H)[:, cut], H)
         terms = (level, cover, u[1], v[1], inverse_depth[1])
         level, cover, u, v, inverse_depth = (term.reshape(shape)[kept] for term in terms)
         self._blend(image[strip.within(box[0]), box[1]], plate, level, cover, (u, v, inverse_depth), norms[kept], t)
 
     def _supersample(self, plate: Plate, rays: Float32Array, H: FloatArray) -> tuple[Float32Array, Float32Array]:
         """Mean level and cover (M,) over the lattice of pixels ``rays`` (7 or 14, M)."""
-        u, v, _ = _look_up(rays, H, np.stack([self._dx, self._dy], axis=1))
-        cells = _cells(u, v, plate)
+        u, v, _ = look_up(rays, H, np.stack([self._dx, self._dy], axis=1))
+        cells = cell_indices(u, v, plate)
         return plate.levels.ravel()[cells].mean(axis=0), plate.cover.ravel()[cells].mean(axis=0)
 
     def _blend(
@@ -213,13 +219,13 @@ class Renderer:
     def _boxes(self, poses: FloatArray) -> tuple[IntArray, IntArray, BoolArray]:
         """Low and high corner (P, 2) [px] of the area that each plate may cover; whether any of it is in front (P,)."""
         points = (self._outlines - poses[:, None, None, :3, 3]) @ poses[:, None, :3, :3]
-        front = points[..., 2] > _NEAR
+        front = points[..., 2] > NEAR
         pixels = self._outline_pixels(points[..., :2] / np.where(front, points[..., 2], 1.0)[..., None])
         low, high = pixels.min(axis=(0, 2)), pixels.max(axis=(0, 2))
         some = np.any(front, axis=(0, 2))
         for index in np.flatnonzero(some & ~np.all(front, axis=(0, 2))):
-            clipped = np.concatenate([_clip(outline) for outline in points[:, index]])
-            pixels = self._outline_pixels(clipped[:, :2] / clipped[:, 2:])
+            visible = np.concatenate([clipped(outline) for outline in points[:, index]])
+            pixels = self._outline_pixels(visible[:, :2] / visible[:, 2:])
             low[index], high[index] = pixels.min(axis=0), pixels.max(axis=0)
         size = np.array([self._lens.width, self._lens.height])
         return (
@@ -265,122 +271,9 @@ def _coarse_rays(lens: Lens) -> FloatArray:
     return np.concatenate([slopes, np.ones((rows, columns, 1))], axis=-1)
 
 
-@dataclass(frozen=True)
-class _Strip:
-    """Rows ``start`` to ``stop`` of the image, read out between two nodes, or all rows at a single one."""
-
-    start: int
-    stop: int
-    node: int
-    rolling: bool
-
-    def within(self, rows: slice) -> slice:
-        """The part of ``rows`` that lies in the strip."""
-        return slice(max(rows.start, self.start), min(rows.stop, self.stop))
-
-    def rows_of(self, rows: slice) -> tuple[slice, slice]:
-        """The strip's part of ``rows``, extended by a row at each end if possible, and the part's place in it."""
-        own = self.within(rows)
-        padded = slice(max(own.start - 1, rows.start), min(own.stop + 1, rows.stop))
-        return padded, slice(own.start - padded.start, own.stop - padded.start)
-
-    def share(self, rows: slice) -> Float32Array:
-        """Position (rows, 1) of each of ``rows`` between the nodes: 0 at the first, 1 at the second."""
-        done = (np.arange(rows.start, rows.stop) - self.start) / (self.stop - self.start)
-        return np.asarray(done[:, None], dtype=np.float32)
-
-    def motion(self, H: FloatArray) -> FloatArray:
-        """H (nodes, N, 3, 3) at the first node, and its change until the second (1 or 2, N, 3, 3)."""
-        first = H[self.node]
-        return np.stack([first, H[self.node + 1] - first]) if self.rolling else first[None]
-
-
-def _strips(height: int, readout: float) -> tuple[list[_Strip], FloatArray]:
-    """Strips of an image, and the times [s] of the nodes between them, after that of the middle row."""
-    if readout <= 0:
-        return [_Strip(0, height, 0, rolling=False)], np.zeros(1)
-    count = min(int(np.ceil(readout / STRIP_TIME)), height)
-    borders = np.round(np.linspace(0, height, count + 1)).astype(int).tolist()
-    strips = [_Strip(start, stop, n, rolling=True) for n, (start, stop) in enumerate(pairwise(borders))]
-    return strips, readout * (np.array(borders) / (height - 1) - 0.5)
-
-
 def _coarse_delays(height: int, readout: float) -> FloatArray:
     """Times [s] at which rows of :func:`_coarse_rays` are read out, after the middle row: (rows,), or one for all."""
     if readout <= 0:
         return np.zeros(1)
     rows = (np.arange(-(-height // _COARSE)) + 0.5) * _COARSE - 0.5
     return np.asarray(readout * (rows / (height - 1) - 0.5))
-
-
-def _moved(rays: Float32Array, share: Float32Array, H: FloatArray) -> Float32Array:
-    """Factors (K or 2 K, rows * columns), for ``rays`` (K, rows, columns), of H at the first node and of its change."""
-    return np.concatenate([rays, share * rays] if len(H) > 1 else [rays]).reshape(len(H) * len(rays), -1)
-
-
-def _homographies(plate: Plate, poses: FloatArray) -> FloatArray:
-    """H (..., 3, 3) with H (x, y, 1) = (column, row, 1) / depth for the ray x y 1, seen from ``poses`` (..., 4, 4)."""
-    R_plate_map = plate.T_map_plate[:3, :3].T
-    D = R_plate_map @ poses[..., :3, :3]
-    o = (poses[..., :3, 3] - plate.T_map_plate[:3, 3]) @ R_plate_map.T
-    metres = D - (o / o[..., 2:])[..., None] * D[..., 2:, :]
-    metres[..., 2, :] = -D[..., 2, :] / o[..., 2:]
-    return np.asarray(plate.to_cells @ metres)
-
-
-def _look_up(
-    rays: Float32Array, H: FloatArray, offsets: FloatArray | None = None
-) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Column, row and inverse depth (N, M) where ``rays`` (of :func:`_moved`), moved by ``offsets`` (N, 2) [px], hit.
-
-    ``H`` is the :meth:`_Strip.motion` of the strip.
-    """
-    matrix = np.concatenate([_ray_terms(part, offsets) for part in H], axis=1)
-    u, v, inverse_depth = (matrix @ rays).reshape(3, H.shape[1], -1)
-    # Behind the camera this puts the point far off the plate.
-    depth = 1.0 / np.maximum(inverse_depth, np.float32(1e-6))
-    u *= depth
-    v *= depth
-    return u, v, inverse_depth
-
-
-def _ray_terms(H: FloatArray, offsets: FloatArray | None) -> Float32Array:
-    """Matrix (3 N, 3 or 7) that multiplies a ray (3 or 7,) for ``H`` (N, 3, 3)."""
-    terms = [H[..., 0], H[..., 1], H[..., 2]]
-    if offsets is not None:
-        dx, dy = offsets[:, :1], offsets[:, 1:]
-        terms += [H[..., 0] * dx, H[..., 0] * dy, H[..., 1] * dx, H[..., 1] * dy]
-    return np.stack(terms, axis=-1).transpose(1, 0, 2).reshape(-1, len(terms)).astype(np.float32)
-
-
-def _cells(u: Float32Array, v: Float32Array, plate: Plate) -> IntArray:
-    """Index into the plate's flat grids; points off the plate get their border."""
-    rows, columns = plate.levels.shape
-    row = np.clip(v, 0, rows - 0.5).astype(np.intp)
-    row *= columns
-    row += np.clip(u, 0, columns - 0.5).astype(np.intp)
-    return row
-
-
-def _cut_pixels(regions: Gray) -> BoolArray:
-    """Pixels (h, w) with several regions in their 3 x 3 neighbourhood at the times of ``regions`` (3, h, w)."""
-    highest = cv2.dilate(np.maximum(np.maximum(regions[0], regions[1]), regions[2]), _KERNEL)
-    lowest = cv2.erode(np.minimum(np.minimum(regions[0], regions[1]), regions[2]), _KERNEL)
-    return np.asarray(highest != lowest)
-
-
-def _outline(plate: Plate) -> FloatArray:
-    """Outline (32, 3) in ``map`` with eight points a side."""
-    corners = plate.outline_map
-    s = np.linspace(0.0, 1.0, 8, endpoint=False)[:, None]
-    return np.concatenate([a + s * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
-
-
-def _clip(outline: FloatArray) -> FloatArray:
-    """Points of a closed outline (N, 3) beyond the near plane, and its intersections with that plane."""
-    a, b = outline, np.roll(outline, -1, axis=0)
-    front = outline[:, 2] > _NEAR
-    crossing = front != np.roll(front, -1)
-    a, b = a[crossing], b[crossing]
-    share = (_NEAR - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
-    return np.concatenate([outline[front], a + share * (b - a)])
