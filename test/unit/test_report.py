@@ -1,5 +1,6 @@
 """The report on a run folder: what it reads, what it refuses, what it shows."""
 
+from dataclasses import replace
 from decimal import Decimal
 import json
 
@@ -128,6 +129,15 @@ def test_a_run_whose_map_stayed_empty_has_a_report(small_run):
     save_map(small_run / 'marker_map.yaml', MarkerMap())
     assert 'map' not in evaluate_run(small_run)[1]
     assert write_report(small_run).is_file()
+
+
+@pytest.mark.parametrize(('fixed', 'words'), [((2,), 'rms of 7 markers'), (range(2, 10), 'rms of 8 fixed markers')])
+def test_error_of_the_map_says_of_how_many_markers(small_run, fixed, words):
+    for name in ('map_true.yaml', 'marker_map.yaml'):
+        markers = wall().markers
+        save_map(small_run / name, MarkerMap({key: replace(m, fixed=key in fixed) for key, m in markers.items()}))
+    evaluation, numbers = evaluate_run(small_run)
+    assert next(card.note for card in cards(evaluation, numbers) if card.name == 'Map error') == words
 
 
 def test_diagnostics_count_in_the_clock_of_the_bag(tmp_path):

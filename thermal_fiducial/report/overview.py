@@ -77,7 +77,8 @@ def _map(numbers: dict[str, Any]) -> Card | None:
     values = numbers.get('map')
     if values is None:
         return None
-    return Card('Map error', number(values['position_rms_mm']), 'mm', f'rms of {values["not_fixed"]} markers')
+    measured = f'{values["not_fixed"]}' if values['not_fixed'] else f'{values["markers"]} fixed'
+    return Card('Map error', number(values['position_rms_mm']), 'mm', f'rms of {measured} markers')
 
 
 def _refused(numbers: dict[str, Any]) -> Card | None:
