@@ -304,7 +304,8 @@ class Tau2CameraConfig(SelfChecked):
     find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.', live=True)
     bits: int = param(
         14,
-        'Significant bits of a 16-bit pixel; flag bits above them are masked, left-aligned counts are shifted right.',
+        'Significant bits of a 16-bit pixel; flag bits above them are masked unless counts carry into them, '
+        'left-aligned counts are shifted right.',
         minimum=8,
         maximum=16,
     )

@@ -73,6 +73,17 @@ def test_flags_above_14_bits_are_masked():
     assert np.array_equal(Camera(bits=16)(flagged).counts, flagged)
 
 
+def test_counts_that_carry_beyond_14_bits_are_no_flags():
+    """Kelvin in hundredths: 295 K, and markers of 335 K, beyond 2^15. Masked, these would be the coldest."""
+    counts = noisy(scene(contrast=4000.0), np.random.default_rng(0), 5.0) + np.uint16(22500)
+    assert counts.min() < 1 << 15 < counts.max()
+    camera = Camera()
+    assert np.array_equal(camera(counts).counts, counts)
+    # and from then on, where none passes a multiple of 2^14
+    cold = noisy(scene(), np.random.default_rng(1)) + np.uint16(22500)
+    assert np.array_equal(camera(cold).counts, cold)
+
+
 @pytest.mark.parametrize(('shift', 'largest'), [(2, 1 << 14), (8, 1 << 8)])
 def test_counts_that_a_driver_shifted_up_are_shifted_back(shift, largest):
     """14 bits to fill 16, and 8 bits sent as mono16: masked like flags, the upper ones would wrap."""

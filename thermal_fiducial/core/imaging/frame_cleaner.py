@@ -25,6 +25,9 @@ REPEATED_STAMP = 'stamp seen before'
 
 # Least shift of counts by drivers that fill 16 bits.
 _SHIFTED = 2
+# Share (a power of two) of the range of counts by which neighbours differ at most, and the fewest pairs that show a
+# carry: flags look alike only between a pixel near nought and one near full scale.
+_NEARLY, _FEWEST_CARRIES = 3, 8
 # Rows of an image; a frame with up to MAX_TELEMETRY_ROWS more carries telemetry.
 STANDARD_HEIGHTS = (1024, 512, 480, 256, 240, 128, 120)
 MAX_TELEMETRY_ROWS = 4
@@ -55,6 +58,8 @@ class FrameCleaner:
         self.config = config
         self._known_bad: IntArray = np.reshape([] if bad_pixels is None else bad_pixels, (-1, 2)).astype(np.int64)
         self._telemetry_on_top = 0
+        #: whether counts use the bits that are masked otherwise: a radiometric camera fills all 16
+        self._counts_beyond = False
         self._restart((0, 0))
 
     def _restart(self, shape: tuple[int, int]) -> None:
@@ -119,7 +124,10 @@ class FrameCleaner:
         own = image.astype(np.uint16)
         if down:
             own >>= np.uint16(down)
-        own &= np.uint16((1 << self.config.bits) - 1)
+        elif used >> self.config.bits and not self._counts_beyond:
+            self._counts_beyond = _carries(own[:: FreezeDetector.ROW_STEP], self.config.bits)
+        if not self._counts_beyond:
+            own &= np.uint16((1 << self.config.bits) - 1)
         return own
 
     def _without_telemetry(self, frame: Counts | Gray, extra: int) -> Counts | Gray:
@@ -137,6 +145,17 @@ class FrameCleaner:
                 self._found = found
                 self._filler = BadPixelFiller(np.concatenate([self._known_bad, found]), self._shape)
         self._filler.fill(image)
+
+
+def _carries(rows: Counts, bits: int) -> bool:
+    """Whether the bits above ``bits`` belong to the counts of ``rows`` (N, width), and are no flags.
+
+    Where counts pass a multiple of 2^bits, neighbours are alike as a whole and apart by nearly all of 2^bits without
+    the bits above.
+    """
+    steps, lower = (np.abs(np.diff(part.astype(np.int32), axis=1)) for part in (rows, rows & ((1 << bits) - 1)))
+    near = 1 << (bits - _NEARLY)
+    return int(np.sum((steps < near) & (lower > (1 << bits) - near))) >= _FEWEST_CARRIES
 
 
 def _break_between(frame: Counts | Gray, row: int) -> float:
