@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.frame import Places
+from thermal_fiducial.core.detection.frame import LEAST_DEPTH, Places
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_corners
@@ -97,7 +97,7 @@ class FoundMarkers(Stacked):
 def depths(T_camera_marker: FloatArray, sizes: FloatArray) -> FloatArray:
     """Depths (N, 4) [m] of the corners of markers."""
     depth = T_camera_marker[:, 2, 3, None] + sizes[:, None] * (T_camera_marker[:, 2, :2] @ _FACE.T)
-    return np.fmax(np.where(np.isfinite(depth), depth, 1.0), 0.1)
+    return np.fmax(np.where(np.isfinite(depth), depth, 1.0), LEAST_DEPTH)
 
 
 class PartialMarkers(NamedTuple):

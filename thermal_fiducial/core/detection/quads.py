@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.types import Float32Array, FloatArray, Gray
+from thermal_fiducial.core.types import Float32Array, FloatArray, Gray, TINY
 
 # Window of the local standard deviation, at a quarter of the resolution: 68 px, a marker at working distance.
 _LOCAL = 17
@@ -98,7 +98,7 @@ class DarkRegions:
         limit = cv2.blur(self._smooth if scale.window_shrink == 1 else coarse, window)
         small = halved(coarse)
         deviation = small - cv2.blur(small, (_LOCAL, _LOCAL))
-        variance = np.maximum(cv2.blur(deviation * deviation, (_LOCAL, _LOCAL)), 1e-6)
+        variance = np.maximum(cv2.blur(deviation * deviation, (_LOCAL, _LOCAL)), TINY)
         floor = (_FLOOR_OF_CLEAR if clear else scale.floor) * noise
         asked = (scale.depth / np.sqrt(variance)) * (variance + floor * floor)
         cv2.subtract(limit, cv2.resize(asked, limit.shape[::-1], interpolation=cv2.INTER_LINEAR), dst=limit)

@@ -36,8 +36,6 @@ from thermal_fiducial.core.detection.twist import Twist, unknown_twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked, TINY
 
-# Change of the displacement by lag below which the refinement is not repeated [px].
-_BLUR_THAT_MATTERS_PX = 0.4
 #: Contrast-to-noise ratio above which a marker is clear: it is found at full and at half resolution.
 CLEAR_CNR = 20.0
 # Columns of pixels per cell for clear markers, and for faint ones.
@@ -45,6 +43,8 @@ _OF_CLEAR, _OF_FAINT = 6, 12
 # Displacement of a corner by lag, about the blur of the optics, up to which it is modelled as symmetric blur [px].
 # Beyond it, the lag tail is removed.
 _HARDLY_PX = 0.6
+# Change of the displacement by lag below which the refinement is not repeated [px].
+_BLUR_THAT_MATTERS_PX = 0.4
 _ROUNDS = 2
 _NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
 # Indices of the corners, clockwise, among the ends of the sides.

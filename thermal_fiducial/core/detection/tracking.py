@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.detection.frame import LEAST_DEPTH
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, pairs
 from thermal_fiducial.core.detection.twist import (
@@ -42,9 +43,8 @@ _COORDINATES = 8
 # Odometry that gives the twist of a frame: from so many time constants before it to one after it, which is symmetric
 # about the velocity that blurs it; largest number of states; time constant that is assumed without lag [ns].
 _LAGS_BEFORE, _STATES, _SHORTEST_LAG_NS = 3, 10, 5_000_000
-# Standard deviation of the clock offset before the filter has estimated it [s]: the filter's own prior,
-# ``time_offset_std``.
-_UNKNOWN_CLOCK_S = 0.03
+# Standard deviation of the clock offset before the filter has estimated it [s]: the filter's own prior.
+_UNKNOWN_CLOCK_S = PoseEkfConfig().time_offset_std
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ RANDOM = np.diag([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2
 # Correlation time of the acceleration [s].
 _CORRELATED_S = 0.4
 # Covariance of the acceleration by odometry due to errors of the filter's vertical and biases.
-_UNSURE = np.diag([0.3, 0.3, 0.3, 0.0, 0.0, 0.0]) ** 2
+_UNSURE = 0.3**2 * np.diag([1, 1, 1, 0, 0, 0])
 # Least covariance of a twist [m^2/s^2, rad^2/s^2].
 _LEAST = 1e-6 * np.eye(6)
 _EYE = np.eye(6)

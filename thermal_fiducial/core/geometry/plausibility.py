@@ -19,10 +19,10 @@ LARGEST_COORDINATE = 1e5
 SMALLEST_VARIANCE, LARGEST_VARIANCE = 1e-20, 1e8
 #: Least share of a variance that the other components may leave unexplained; rounding takes less than a tenth of it.
 _LEAST_INDEPENDENT = 1e-12
-#: Added to variances that may be zero, before the check: a share of the largest one, and this [m^2, rad^2].
-_NO_SHARE, _NO_VARIANCE = 1e-9, 1e-15
 #: Relative difference of entries that should be equal, by rounding of a few operations.
 _ROUNDING = 1e-9
+#: Added to variances that may be zero, before the check, beside that share of the largest one [m^2, rad^2].
+_NO_VARIANCE = 1e-15
 #: Focal length and distance of the principal point from the image, in longer sides of the image.
 _FOCAL_RANGE, _FARTHEST_CENTRE = (0.02, 1000.0), 1.0
 _IMAGE_SIDES = (8, 16384)
@@ -46,7 +46,7 @@ def checked_covariance(values: FloatArray, what: str, *, partial: bool = False) 
     P, eye = symmetric, np.eye(values.shape[-1])
     if partial:
         largest = max(float(np.diagonal(P, axis1=-2, axis2=-1).max()), 0.0)
-        P = P + (_NO_SHARE * largest + _NO_VARIANCE) * eye
+        P = P + (_ROUNDING * largest + _NO_VARIANCE) * eye
     variances = np.diagonal(P, axis1=-2, axis2=-1)
     low, high = float(variances.min()), float(variances.max())
     if not (low > SMALLEST_VARIANCE and high < LARGEST_VARIANCE):

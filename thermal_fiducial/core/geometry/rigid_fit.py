@@ -13,7 +13,7 @@ import numpy as np
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.reprojection import retract
-from thermal_fiducial.core.types import BoolArray, FloatArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, TINY
 
 _MAX_STEPS = 20
 # Costs are chi-squares. The last step of a pose is one that lowers its cost by less than _LITTLE, a tenth of a
@@ -25,8 +25,6 @@ _LITTLE, _REFUTED, _TIMES_THE_BEST = 1e-2, 50.0, 10.0
 #: damping, with which the search ends. The search begins with its inverse.
 EASED, MOST_DAMPED = 0.1, 1e6
 STIFFENED = 1.0 / EASED
-# Least depth [m] of a point in front of the camera.
-_NEAR = 1e-6
 # Replaces an initial pose that is not finite.
 _AHEAD = se3.transform(np.diag([1.0, -1.0, -1.0]), [0.0, 0.0, 1.0])
 #: Ridge that keeps information matrices regular, as a share of their largest entry.
@@ -107,9 +105,9 @@ def costs(T: FloatArray, points: FloatArray, images: Images, inlier: float) -> F
     """The costs (B,) of :func:`evaluate`, without derivatives."""
     p = se3.apply(T, points)
     z = p[..., 2:]
-    residual = (images.whitening @ (p[..., :2] / np.maximum(z, _NEAR))[..., None])[..., 0] - images.target
+    residual = (images.whitening @ (p[..., :2] / np.maximum(z, TINY))[..., None])[..., 0] - images.target
     squared, _ = _robust(np.sum(residual * residual, axis=-1), inlier)
-    return np.where((z > _NEAR).all(axis=(1, 2)), squared.sum(axis=-1), np.inf)
+    return np.where((z > TINY).all(axis=(1, 2)), squared.sum(axis=-1), np.inf)
 
 
 def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = np.inf) -> Evaluation:
@@ -121,8 +119,8 @@ def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = 
     rotated = points @ np.swapaxes(T[:, :3, :3], -1, -2)
     p = rotated + T[:, None, :3, 3]
     z = p[..., 2:]
-    seen = (z > _NEAR).all(axis=(1, 2))
-    z = np.maximum(z, _NEAR)
+    seen = (z > TINY).all(axis=(1, 2))
+    z = np.maximum(z, TINY)
     W = images.whitening
     seen_at = W @ (p[..., :2] / z)[..., None]
     residual = seen_at - images.target[..., None]

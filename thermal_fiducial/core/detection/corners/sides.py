@@ -30,7 +30,8 @@ NEIGHBOURS = (1, 2)
 _NARROW = 5.0
 # Approximation of the normal distribution by a hyperbolic tangent, good to 2e-4 (E. Page, "Approximations to the
 # cumulative normal function and its inverse for use on a pocket calculator", 1977).
-_LINEAR, _CUBIC = 0.7988, 0.7988 * 0.04417
+_LINEAR = 0.7988
+_CUBIC = 0.04417 * _LINEAR
 # The plate ends one cell outside, at an edge that is not in the model: distance from it that is left out [blurs].
 _PLATE_EDGE_SHOWS = 1.5
 # Least share of the side's step in a column: it falls off at the ends of the side.
