@@ -198,8 +198,6 @@ def confirmed(
     there : (N, 4, 2) predicted corners in the image [px]
     standing_picture : (N,) which are in a picture for a display, without motion blur
     """
-    if len(found.ids) == 0:
-        return np.zeros(0, dtype=bool)
     tails = None
     if to_tails is not None:
         tails = refined.corners_px @ to_tails[:, :, :2].swapaxes(1, 2) + to_tails[:, None, :, 2]
