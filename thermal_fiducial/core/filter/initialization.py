@@ -81,12 +81,13 @@ def start(
     if _contradicts_gravity(pose, imu, config.gravity):
         return None
     noise = PoseNoise.of(config.stamp_jitter, pose)
-    systematic = config.systematic_pose_std
+    systematic = config.systematic_pose_std**2 * pose.shape
     P = np.diag(_initial_variances(config))
-    P[np.ix_(POSE, POSE)] += (noise.white + systematic**2) * pose.shape
+    P[SYSTEMATIC, SYSTEMATIC] = systematic
+    P[np.ix_(POSE, POSE)] += noise.white * pose.shape + systematic
     # The systematic error of the pose is an error of the estimate, with the opposite sign.
-    P[POSE, SYSTEMATIC] -= systematic * np.linalg.cholesky(pose.shape)
-    P[SYSTEMATIC, POSE] = P[POSE, SYSTEMATIC].T
+    P[POSE, SYSTEMATIC] -= systematic
+    P[SYSTEMATIC, POSE] -= systematic
     # So is the error of the extrinsics.
     of_extrinsics = P[EXTRINSICS, EXTRINSICS]
     P[np.ix_(POSE, POSE)] += of_extrinsics
@@ -137,5 +138,4 @@ def _initial_variances(config: PoseEkfConfig) -> FloatArray:
     stds[ACCELEROMETER_MATRIX] = config.imu.accelerometer_scale_std
     stds[GRAVITY] = config.gravity * config.map_tilt_std
     stds[EXTRINSICS] = np.repeat((config.extrinsics_orientation_std, config.extrinsics_position_std), 3)
-    stds[SYSTEMATIC] = 1.0
     return np.square(stds)

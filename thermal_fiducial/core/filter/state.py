@@ -30,7 +30,7 @@ GRAVITY = slice(33, 35)
 TIME_OFFSET = 35
 #: T_body_camera, perturbed from the left [rad, m]; a consider parameter unless ``estimate_extrinsics``,
 EXTRINSICS = slice(36, 42)
-#: systematic error of the camera poses, in units of its standard deviation.
+#: systematic error of the camera poses, in the robot frame [rad, m]
 SYSTEMATIC = slice(42, 48)
 SIZE = 48
 #: Coordinates that an IMU step propagates, and coordinates that they are propagated from.
@@ -61,7 +61,7 @@ class NavigationState:
     time_offset: float
     #: (4, 4)
     T_body_camera: FloatArray
-    #: (6,) systematic error of the camera poses, in units of its standard deviation
+    #: (6,) systematic error of the camera poses, in the robot frame [rad, m]
     systematic: FloatArray
 
     @property

@@ -103,21 +103,17 @@ class PoseUpdater:
 
     def innovation(self, estimate: Estimate, pose: BodyPose, motion: MotionAtPose) -> Innovation:
         """Innovation of ``pose`` against ``estimate`` at the same instant."""
-        alike = estimate.pose_noise.alike(pose, self.config.systematic_angle)
-        # Unit systematic errors map to the pose by the Cholesky factor of its covariance.
-        root = self.config.systematic_pose_std * np.linalg.cholesky(pose.shape)
-        prior = _with_new_view(estimate, alike)
-        to_units = np.linalg.inv(root)
-        change = pose.map_change(estimate.pose_noise.last)
-        prior.covariance[SYSTEMATIC, SYSTEMATIC] += to_units @ change @ to_units.T
+        noise = estimate.pose_noise
+        alike = noise.alike(pose, self.config.systematic_angle)
+        systematic = self.config.systematic_pose_std**2 * pose.shape
+        prior = _with_new_view(estimate, alike, (1.0 - alike**2) * systematic + pose.map_change(noise.last))
         H = np.zeros((6, SIZE))
         H[_SIX, POSE] = 1.0
-        H[:, EXTRINSICS] = np.eye(6)
-        H[:, SYSTEMATIC] = root
+        H[:, EXTRINSICS] = H[:, SYSTEMATIC] = np.eye(6)
         R = prior.pose_noise.white * pose.shape
         moved = slide(prior.state, motion.imu)
         self._add_clock(prior, motion, moved, H, R)
-        value = pose_innovation(prior.state, pose.T_map_body) - root @ prior.state.systematic
+        value = pose_innovation(prior.state, pose.T_map_body) - prior.state.systematic
         S_inverse = np.asarray(np.linalg.inv(H @ prior.covariance @ H.T + R))
         return Innovation(value, S_inverse, H, R, float(value @ S_inverse @ value), prior, moved)
 
@@ -143,7 +139,7 @@ class PoseUpdater:
     def correct(self, pose: BodyPose, innovation: Innovation, motion: MotionAtPose) -> Estimate:
         """The estimate after an accepted pose."""
         prior = innovation.prior
-        error, covariance = self._gained(prior.covariance, innovation.value, innovation.H, innovation.R)
+        error, covariance = self._gained(pose, innovation)
         state, before = prior.state.plus(error), innovation.slide
         if self.config.estimate_time_offset:
             now = slide(state, motion.imu)
@@ -178,18 +174,17 @@ class PoseUpdater:
         slid[TIME_OFFSET] = 1.0
         return P + half + half.T + (consistent - variance) * np.outer(slid, slid)
 
-    def _gained(
-        self, P: FloatArray, innovation: FloatArray, H: FloatArray, R: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _gained(self, pose: BodyPose, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
         """Kalman update: the corrected error (48,) and the covariance (48, 48)."""
-        algebra = self._algebra
+        algebra, P = self._algebra, innovation.prior.covariance
         algebra.x, algebra.P = np.zeros(SIZE), P
-        algebra.update(innovation, lambda _: H, lambda _: np.zeros(len(innovation)), R=R)
+        algebra.update(innovation.value, lambda _: innovation.H, lambda _: np.zeros(6), R=innovation.R)
+        gain, covariance = algebra.K, 0.5 * (algebra.P + algebra.P.T)
         if not self.config.estimate_extrinsics:
             # A consider parameter (S. Schmidt, 1966): its cross-covariances change, itself it does not.
-            algebra.x[EXTRINSICS] = 0.0
-            algebra.P[EXTRINSICS, EXTRINSICS] = P[EXTRINSICS, EXTRINSICS]
-        return algebra.x, 0.5 * (algebra.P + algebra.P.T)
+            gain[EXTRINSICS] = 0.0
+            covariance[EXTRINSICS, EXTRINSICS] = P[EXTRINSICS, EXTRINSICS]
+        return _iterated(pose, innovation, gain), covariance
 
     def with_unknown_clock(self, estimate: Estimate) -> Estimate:
         """The estimate with a clock offset as uncertain as after a step of the camera's clock; all else stays."""
@@ -199,14 +194,33 @@ class PoseUpdater:
         return replace(estimate, covariance=covariance)
 
 
-def _with_new_view(estimate: Estimate, alike: float) -> Estimate:
-    """The estimate with its systematic error propagated to a new view: first-order Markov, correlation ``alike``."""
+def _with_new_view(estimate: Estimate, alike: float, added: FloatArray) -> Estimate:
+    """The estimate with its systematic error propagated to a new view: first-order Markov.
+
+    Parameters
+    ----------
+    alike : correlation of the errors in both views
+    added : covariance (6, 6) of what is new
+    """
     P = estimate.covariance.copy()
     P[SYSTEMATIC] *= alike
     P[:, SYSTEMATIC] *= alike
-    P[SYSTEMATIC, SYSTEMATIC].flat[::7] += 1.0 - alike * alike
+    P[SYSTEMATIC, SYSTEMATIC] += added
     state = replace(estimate.state, systematic=alike * estimate.state.systematic)
     return replace(estimate, state=state, covariance=P)
+
+
+def _iterated(pose: BodyPose, innovation: Innovation, gain: FloatArray) -> FloatArray:
+    """The corrected error (48,) by ``gain`` (48, 6), after a second Gauss-Newton step from the same prior.
+
+    After seconds without poses the position may be off by metres. Rotation times position, the second order of the
+    first step, is then larger than what the pose claims. (B. Bell, F. Cathey, "The iterated Kalman filter update as a
+    Gauss-Newton method", IEEE TAC 1993.)
+    """
+    error = gain @ innovation.value
+    state = innovation.prior.state.plus(error)
+    left = pose_innovation(state, pose.T_map_body) - state.systematic
+    return np.asarray(gain @ (left + error[POSE] + error[SYSTEMATIC]))
 
 
 def _of_core(error: FloatArray) -> FloatArray:
