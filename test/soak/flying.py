@@ -10,6 +10,7 @@ from soak.laps import Laps, TOPICS
 from soak.minutes import Errors, Meter, Minute, node_processes
 from thermal_fiducial.config import NODES
 from thermal_fiducial.files.marker_map import load_map
+from thermal_fiducial.replay.job import ReplayJob
 from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
 from thermal_fiducial.replay.topics import ENTRIES
@@ -37,7 +38,7 @@ def soak(
         meter = Meter(errors, lambda: node_processes(NODES), say)
         play = partial(replay_processes, rate=1.0, say=say)
     recorded = ENTRIES['images'].recorded(calibration_from_file=False, images=False)
-    play(laps, tuple(NODES), TOPICS, errors, recorded, arguments, meter, lines.append)
+    play(ReplayJob(laps, tuple(NODES), TOPICS, errors, recorded, arguments, meter, lines.append))
     saved = sorted(load_map(map_file).markers)
     expected = [marker.id for marker in laps.scenario.markers]
     if saved != expected:

@@ -6,7 +6,7 @@ reordered, and the result does not depend on timing.
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
@@ -21,8 +21,9 @@ from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
 from thermal_fiducial.replay.domain import own_domain
-from thermal_fiducial.replay.recorder import Recorder, Sink
-from thermal_fiducial.replay.topics import Playable, PLAYED, Topics
+from thermal_fiducial.replay.job import ReplayJob
+from thermal_fiducial.replay.recorder import Recorder
+from thermal_fiducial.replay.topics import PLAYED
 from thermal_fiducial.replay.waiting import Wait
 from thermal_fiducial.ros.counting import CountingNode
 from thermal_fiducial.ros.node import StageNode
@@ -38,28 +39,8 @@ _KINDS: dict[str, type[StageNode[Any]]] = {
 _POLL_S = 0.002
 
 
-def replay_lockstep(
-    bag: Playable,
-    nodes: Sequence[str],
-    played: Sequence[str],
-    files: Sink,
-    recorded: Topics,
-    ros_arguments: Sequence[str],
-    progress: Callable[[int], None],
-    warn: Callable[[str], None],
-) -> dict[str, Any]:
-    """Play topics ``played`` of ``bag`` through ``nodes`` into ``files``.
-
-    Parameters
-    ----------
-    bag : the bag, open
-    nodes : names of the nodes to run
-    played : topics to play
-    files : sink of the published messages
-    recorded : the topics to record
-    ros_arguments : for the nodes, after ``--ros-args``
-    progress : called with the bag's time [ns since its start]
-    warn : called with a message on a long wait without progress
+def replay_lockstep(job: ReplayJob) -> dict[str, Any]:
+    """Play a bag through the nodes in this process, as fast as they go.
 
     Returns
     -------
@@ -72,11 +53,11 @@ def replay_lockstep(
     """
     context = Context()
     with own_domain() as domain:
-        initialise(['--ros-args', *ros_arguments], context, domain)
+        initialise(['--ros-args', *job.ros_arguments], context, domain)
         graph = None
         try:
-            graph = _Graph(context, nodes, played, recorded, warn)
-            graph.play(bag, files, progress)
+            graph = _Graph(context, job)
+            graph.play()
         finally:
             if graph is not None:
                 graph.close()
@@ -87,25 +68,18 @@ def replay_lockstep(
 class _Graph:
     """The nodes, a player and a recorder in one executor."""
 
-    def __init__(
-        self,
-        context: Context,
-        nodes: Sequence[str],
-        played: Sequence[str],
-        recorded: Topics,
-        warn: Callable[[str], None],
-    ) -> None:
-        self._warn = warn
+    def __init__(self, context: Context, job: ReplayJob) -> None:
+        self._job = job
         self._arrived: list[tuple[str, bytes]] = []
-        self._order = {topic: index for index, topic in enumerate(recorded)}
+        self._order = {topic: index for index, topic in enumerate(job.recorded)}
         quiet: dict[str, Any] = {'context': context, 'enable_rosout': False, 'start_parameter_services': False}
         self._stages: list[StageNode[Any]] = []
-        for name in nodes:
+        for name in job.nodes:
             make: Callable[..., StageNode[Any]] = _KINDS[name]
             self._stages.append(make(live=False, **quiet))
         player = CountingNode('player', use_global_arguments=False, **quiet)
-        self._played = {topic: player.advertise(PLAYED[topic][0], topic, PLAYED[topic][1]) for topic in played}
-        recorder = Recorder(self._take, recorded, use_global_arguments=False, **quiet)
+        self._played = {topic: player.advertise(PLAYED[topic][0], topic, PLAYED[topic][1]) for topic in job.played}
+        recorder = Recorder(self._take, job.recorded, use_global_arguments=False, **quiet)
         self._nodes: list[CountingNode] = [*self._stages, player, recorder]
         self._inputs = [source for node in self._nodes for source in node.inputs]
         self._outputs = [output for node in self._nodes for output in node.outputs]
@@ -116,31 +90,32 @@ class _Graph:
         for node in self._nodes:
             self._executor.add_node(node)
 
-    def play(self, bag: Playable, files: Sink, progress: Callable[[int], None]) -> None:
+    def play(self) -> None:
         """Play the bag, with diagnostics once a second of the bag's time."""
         faults = [fault for stage in self._stages for fault in stage.faults]
         if faults:
             raise InputError('; '.join(faults))
         self._connect()
-        self._settle(bag.start_ns, files)
+        bag = self._job.bag
+        self._settle(bag.start_ns)
         next_diagnosis = bag.start_ns + SECOND_NS
         last_ns = bag.start_ns
         for message in bag.messages(self._played):
             while message.stamp_ns >= next_diagnosis:
-                self._diagnose(next_diagnosis, files)
-                progress(next_diagnosis - bag.start_ns)
+                self._diagnose(next_diagnosis)
+                self._job.progress(next_diagnosis - bag.start_ns)
                 next_diagnosis += SECOND_NS
             _check(message)
             self._played[message.topic].send(message.cdr)
-            self._settle(message.stamp_ns, files)
+            self._settle(message.stamp_ns)
             last_ns = message.stamp_ns
         # At the last message, not a full second later: rates would include the time after the end.
-        self._diagnose(max(last_ns, next_diagnosis - SECOND_NS + 1), files)
+        self._diagnose(max(last_ns, next_diagnosis - SECOND_NS + 1))
 
-    def _diagnose(self, time_ns: int, files: Sink) -> None:
+    def _diagnose(self, time_ns: int) -> None:
         for stage in self._stages:
             stage.diagnose(time_ns)
-        self._settle(time_ns, files)
+        self._settle(time_ns)
 
     def _take(self, topic: str, data: bytes) -> None:
         self._arrived.append((topic, data))
@@ -151,12 +126,12 @@ class _Graph:
         self._wait(lambda: [output.topic for output in self._outputs if output.listeners != readers[output.topic]])
         self._wait(lambda: [source.topic for source in self._inputs if source.publishers != writers[source.topic]])
 
-    def _settle(self, time_ns: int, files: Sink) -> None:
-        """Run callbacks until no message is in transit; pass recorded ones to ``files`` in a fixed order of topics."""
+    def _settle(self, time_ns: int) -> None:
+        """Run callbacks until no message is in transit; record the received ones in a fixed order of topics."""
         self._wait(self._under_way)
         self._arrived.sort(key=lambda entry: self._order[entry[0]])
         for topic, data in self._arrived:
-            files.add(topic, time_ns, data)
+            self._job.files.add(topic, time_ns, data)
         self._arrived.clear()
 
     def _under_way(self) -> list[str]:
@@ -173,7 +148,7 @@ class _Graph:
 
     def _wait(self, missing: Callable[[], list[str]]) -> None:
         """Run callbacks until ``missing`` returns nothing, however long one callback takes."""
-        wait = Wait(lambda: f'messages on {", ".join(missing())}', self._warn)
+        wait = Wait(lambda: f'messages on {", ".join(missing())}', self._job.warn)
         while missing():
             self._executor.spin_once(timeout_sec=_POLL_S)
             for stage in self._stages:

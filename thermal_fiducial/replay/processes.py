@@ -1,7 +1,7 @@
 """One process a node, in real time as on the robot; measures latencies and processor load."""
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,9 +22,10 @@ from thermal_fiducial.files.bags import (
 from thermal_fiducial.files.images import header_stamp_ns
 from thermal_fiducial.replay.children import NodeProcesses
 from thermal_fiducial.replay.domain import own_domain
+from thermal_fiducial.replay.job import ReplayJob
 from thermal_fiducial.replay.latency import LatencyMeter
-from thermal_fiducial.replay.recorder import Recorder, Sink
-from thermal_fiducial.replay.topics import Playable, PLAYED, Topics
+from thermal_fiducial.replay.recorder import Recorder
+from thermal_fiducial.replay.topics import PLAYED
 from thermal_fiducial.replay.waiting import Wait
 from thermal_fiducial.ros.counting import CountingNode
 from thermal_fiducial.ros.promptness import prompt
@@ -43,19 +44,8 @@ _AHEAD = 60
 _KINDS = {IMAGE_TOPIC: 'image', COMPRESSED_TOPIC: 'image', IMU_TOPIC: 'imu'}
 
 
-def replay_processes(
-    bag: Playable,
-    nodes: Sequence[str],
-    played: Sequence[str],
-    files: Sink,
-    recorded: Topics,
-    ros_arguments: Sequence[str],
-    progress: Callable[[int], None],
-    warn: Callable[[str], None],
-    rate: float,
-    say: Callable[[str], None],
-) -> dict[str, Any]:
-    """Play topics ``played`` of ``bag`` at ``rate`` times real time; otherwise as in lock-step.
+def replay_processes(job: ReplayJob, rate: float, say: Callable[[str], None]) -> dict[str, Any]:
+    """Play a bag through one process a node, at ``rate`` times real time.
 
     ``say`` is called with a line on the DDS domain of the nodes.
 
@@ -77,17 +67,17 @@ def replay_processes(
         try:
             with (
                 tempfile.TemporaryDirectory(prefix='thermal_fiducial_') as folder,
-                NodeProcesses(domain, nodes, ros_arguments, Path(folder)) as processes,
+                NodeProcesses(domain, job.nodes, job.ros_arguments, Path(folder)) as processes,
             ):
-                player = _Player(context, played, files, recorded)
+                player = _Player(context, job)
                 try:
-                    player.connect(processes, nodes, warn)
+                    player.connect(processes)
                     with prompt(_PRIORITY):
-                        timing = player.play(bag, processes, rate, progress)
+                        timing = player.play(processes, rate)
                 finally:
                     player.close()
             for fault in processes.unclean:
-                warn(f'at the end, {fault}')
+                job.warn(f'at the end, {fault}')
             return timing
         finally:
             context.try_shutdown()
@@ -119,28 +109,30 @@ class _Clock:
 class _Player:
     """Publishes the bag on time, and between its messages receives the nodes' outputs."""
 
-    def __init__(self, context: Context, played: Sequence[str], files: Sink, recorded: Topics) -> None:
+    def __init__(self, context: Context, job: ReplayJob) -> None:
         quiet: dict[str, Any] = {
             'context': context,
             'use_global_arguments': False,
             'enable_rosout': False,
             'start_parameter_services': False,
         }
-        self._files = files
+        self._job = job
         self._arrived: deque[tuple[str, bytes, int]] = deque()
         self._latency = LatencyMeter()
         self._player = CountingNode('player', **quiet)
-        self._recorder = Recorder(self._take, recorded, **quiet)
-        self._outputs = {topic: self._player.advertise(PLAYED[topic][0], topic, PLAYED[topic][1]) for topic in played}
+        self._recorder = Recorder(self._take, job.recorded, **quiet)
+        self._outputs = {
+            topic: self._player.advertise(PLAYED[topic][0], topic, PLAYED[topic][1]) for topic in job.played
+        }
         self._executor = make_executor(context)
         self._executor.add_node(self._player)
         self._executor.add_node(self._recorder)
 
-    def connect(self, processes: NodeProcesses, nodes: Sequence[str], warn: Callable[[str], None]) -> None:
+    def connect(self, processes: NodeProcesses) -> None:
         """Wait until the nodes are connected."""
         # camera_info is read by the detector and by the mapper.
-        readers = {CAMERA_INFO_TOPIC: len({'aruco_detector', 'marker_mapper'} & set(nodes))}
-        wait = Wait(lambda: f'the nodes at {", ".join(missing)}', warn)
+        readers = {CAMERA_INFO_TOPIC: len({'aruco_detector', 'marker_mapper'} & set(self._job.nodes))}
+        wait = Wait(lambda: f'the nodes at {", ".join(missing)}', self._job.warn)
         while missing := [
             *(topic for topic, output in self._outputs.items() if output.listeners < readers.get(topic, 1)),
             *(source.topic for source in self._recorder.inputs if source.publishers < 1),
@@ -152,8 +144,9 @@ class _Player:
         while time.monotonic() < deadline:
             self._executor.spin_once(timeout_sec=0.05)
 
-    def play(self, bag: Playable, nodes: NodeProcesses, rate: float, progress: Callable[[int], None]) -> dict[str, Any]:
+    def play(self, nodes: NodeProcesses, rate: float) -> dict[str, Any]:
         """Publish the bag; then wait for the last results."""
+        bag = self._job.bag
         cpu = nodes.cpu_seconds()
         clock, late_ns, next_check = _Clock(bag.start_ns, rate), 0, 0
         for message in _read_ahead(bag.messages(self._outputs)):
@@ -167,12 +160,12 @@ class _Player:
             elapsed = message.stamp_ns - bag.start_ns
             if elapsed >= next_check:
                 nodes.check()
-                progress(elapsed)
+                self._job.progress(elapsed)
                 next_check = elapsed + SECOND_NS
         seconds = clock.seconds
         used = {node: total - cpu[node] for node, total in nodes.cpu_seconds().items()}
         self._drain(nodes, clock)
-        self._latency.write(self._files.folder / 'latency.csv')
+        self._latency.write(self._job.files.folder / 'latency.csv')
         return {
             'rate': rate,
             'latency_ms': self._latency.summary(),
@@ -214,7 +207,7 @@ class _Player:
 
     def _file_one(self, clock: _Clock) -> None:
         topic, data, now = self._arrived.popleft()
-        self._files.add(topic, clock.bag_ns(now), data)
+        self._job.files.add(topic, clock.bag_ns(now), data)
 
     def close(self) -> None:
         """Destroy the player's nodes."""

@@ -16,6 +16,7 @@ from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, COMPRESSED_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.writing import into, write_text
+from thermal_fiducial.replay.job import ReplayJob
 from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
 from thermal_fiducial.replay.recorder import refuse_folder_in_use, RunFiles
@@ -85,7 +86,8 @@ def replay(
             in_real_time = partial(replay_processes, rate=options.rate, say=say)
             play = in_real_time if options.transport == 'processes' else replay_lockstep
             done = partial(_show_share, progress, max(bag.duration_ns, 1))
-            timing = play(bag, entry.nodes, (*also, *played), files, recorded, arguments, done, warn)
+            job = ReplayJob(bag, entry.nodes, (*also, *played), files, recorded, arguments, done, warn)
+            timing = play(job)
             _report_refusals(files, entry, warn)
         _report_silence(files, entry, warn)
         marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)

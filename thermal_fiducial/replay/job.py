@@ -1,0 +1,33 @@
+"""What a replay plays, records and reports, for either transport."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from thermal_fiducial.replay.recorder import Sink
+from thermal_fiducial.replay.topics import Playable, Topics
+
+
+@dataclass(frozen=True)
+class ReplayJob:
+    """One replay of an open bag.
+
+    Parameters
+    ----------
+    bag : the bag, open
+    nodes : names of the nodes to run
+    played : topics to play
+    files : sink of the published messages
+    recorded : the topics to record
+    ros_arguments : for the nodes, after ``--ros-args``
+    progress : called with the bag's time [ns since its start]
+    warn : called with a message on a long wait without progress
+    """
+
+    bag: Playable
+    nodes: Sequence[str]
+    played: Sequence[str]
+    files: Sink
+    recorded: Topics
+    ros_arguments: Sequence[str]
+    progress: Callable[[int], None]
+    warn: Callable[[str], None]
