@@ -141,7 +141,7 @@ def map_of_pose(
     best = int(np.argmin(np.trace(covariances, axis1=1, axis2=2)))
     arms = np.concatenate([positions, camera_position[None]]) - positions[best]
     A = lever_arm(arms)
-    common = MAP_COMMON * A @ covariances[best] @ np.swapaxes(A, -1, -2)
+    common = MAP_COMMON * A @ positive(covariances[best]) @ np.swapaxes(A, -1, -2)
     return np.asarray(common[-1] + correlated_sum(gains, positive(covariances - common[:-1])))
 
 

@@ -19,11 +19,10 @@ from thermal_fiducial.core.error_model import (
     noise_factor,
     noise_of_pose,
     of_single_error,
-    positive,
     scale_of_map,
     SystematicErrors,
 )
-from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera, inverse_2x2
 from thermal_fiducial.core.geometry.planar_pose import CameraFit, INLIER
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
@@ -39,7 +38,7 @@ SAME_POSE = np.deg2rad(2.0)
 #: Extent of the markers in view [rad] beyond which perspective resolves the planar ambiguity.
 WIDE = np.deg2rad(25.0)
 # Largest number of markers that give initial poses, the largest ones; all take part in their ranking.
-_PROPOSERS = 6
+_PROPOSERS = 4
 
 
 def locate(
@@ -117,7 +116,7 @@ class _JointFit:
         the pose.
         """
         n, residuals = len(weights), seen.residuals[..., None]
-        information = np.linalg.inv(self.sight.observed.covariances) * weights[:, None, None, None]
+        information = inverse_2x2(self.sight.observed.covariances) * weights[:, None, None, None]
         squared = (residuals * (information @ residuals)).sum(axis=(-2, -1))
         robust = np.maximum(squared / INLIER**2, 1.0)[..., None, None]
         J = seen.J_camera.reshape(8 * n, 6)
@@ -163,7 +162,7 @@ class _JointFit:
         of_focal = gains @ (sight.observed.corners - self.camera.principal_point).ravel()
         of_map = of_single_error(of_scale, model.marker_size_std) + of_single_error(of_focal, model.focal_length_std)
         if np.any(sight.map_covariances):
-            rest = positive(sight.map_covariances - scale_of_map(sight.scale_arms, model))
+            rest = sight.map_covariances - scale_of_map(sight.scale_arms, model)
             of_map += map_of_pose(map_gains, rest, sight.T_map_marker[:, :3, 3], T_map_camera[:3, 3])
         covariance = white + of_corners + of_map
         if not np.all(np.isfinite(covariance)):

@@ -78,8 +78,9 @@ class Trust:
         if blamed.any():
             blamed = inconsistent(blamed, known.tolist())
         changed = False
-        for marker, record, bad, error, ratio in zip(known, records, blamed, errors_px, ratios, strict=True):
-            record.disagreement += MEMORY * (float(bad) - record.disagreement)
+        columns = blamed.tolist(), errors_px.tolist(), ratios.tolist()
+        for marker, record, bad, error, ratio in zip(known, records, *columns, strict=True):
+            record.disagreement += MEMORY * (bad - record.disagreement)
             if marker.trusted and record.disagreement > QUARANTINE:
                 in_frames = f'in most of the last {1.0 / MEMORY:.0f} frames'
                 self._set_standing(markers, marker.id, f'{error:.1f} px off, {ratio:.1f} sigma, {in_frames}')
