@@ -42,6 +42,16 @@ def late_attributes(kind):
     return set().union(*map(self_attributes, methods.values())) - known
 
 
+def test_no_function_is_longer_than_a_screen():
+    long = [
+        f'{path.relative_to(PACKAGE)}: {node.name}, {node.end_lineno - node.lineno + 1} lines'
+        for path in sources(PACKAGE)
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef) and node.end_lineno - node.lineno >= 50
+    ]
+    assert long == []
+
+
 def test_a_node_fits_on_a_screen():
     """It converts, makes one call of the core, and publishes."""
     lengths = {path.name: len(path.read_text().splitlines()) for path in sources(PACKAGE / 'nodes')}

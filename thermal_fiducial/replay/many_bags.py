@@ -146,10 +146,7 @@ def run_batch(
     settings = read_settings(batch.options.params, {})
     if batch.options.map_file is None:
         raise InputError('a joint map needs --map with at least one marker of known pose')
-    with into(batch.out):
-        batch.out.mkdir(parents=True, exist_ok=True)
-        for earlier in (MAP_FILE, SUMMARY_FILE):
-            (batch.out / earlier).unlink(missing_ok=True)
+    _prepare_folder(batch.out)
     try:
         _replay_all(runs, client, progress, warn)
     except (InputError, RunError):
@@ -159,18 +156,29 @@ def run_batch(
         raise
     built, frames = _joint_map(batch, runs, settings)
     save_map(batch.out / MAP_FILE, built.map)
-    summary = {
+    summary = _summary_of(built) | {'runs': [run.run.name for run in runs], 'frames': frames}
+    write_text(batch.out / SUMMARY_FILE, json.dumps(summary, indent=2) + '\n')
+    return summary
+
+
+def _prepare_folder(out: Path) -> None:
+    """Create the folder of a batch, without map and summary of an earlier one."""
+    with into(out):
+        out.mkdir(parents=True, exist_ok=True)
+        for earlier in (MAP_FILE, SUMMARY_FILE):
+            (out / earlier).unlink(missing_ok=True)
+
+
+def _summary_of(built: Built) -> dict[str, Any]:
+    """Figures of the joint map."""
+    return {
         'format': 'thermal_fiducial/batch',
         'version': 1,
-        'runs': [run.run.name for run in runs],
-        'frames': frames,
         'frames_used': built.frames_used,
         'rms_px': None if built.refinement is None else built.refinement.rms_px,
         'markers': sorted(built.map.markers),
         'unplaced': {str(key): why for key, why in sorted(built.unplaced.items())},
     }
-    write_text(batch.out / SUMMARY_FILE, json.dumps(summary, indent=2) + '\n')
-    return summary
 
 
 def _replay_all(

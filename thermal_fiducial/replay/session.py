@@ -68,17 +68,14 @@ def replay(
         An unusable bag, parameter or file, or a run folder that cannot be written to. Files written until then are
         removed, except parameters and map.
     """
-    settings = _settings(options)
-    for line in settings.warnings:
-        warn(line)
+    settings = _settings(options, warn)
     from_file = bool(settings.tau2_camera.calibration_file)
     with BagReader(options.bag, options.remaps) as bag:
         entry = ENTRIES[options.entry] if options.entry else entry_of(bag.topics)
         played = entry.played(calibration_from_file=from_file)
         bag.require(played)
         also = [topic for topic in entry.also if topic in bag.topics]
-        transport = 'compressed' if entry.topic == COMPRESSED_TOPIC else 'raw'
-        settings = replace(settings, tau2_camera=replace(settings.tau2_camera, image_transport=transport))
+        settings = _with_transport(settings, entry)
         arguments = _prepare(options, settings, entry, warn)
         recorded = entry.recorded(calibration_from_file=from_file, images=options.images)
         extrinsics = settings.pose_ekf.camera_position, settings.pose_ekf.camera_orientation
@@ -106,13 +103,23 @@ def _report_silence(files: RunFiles, entry: Entry, warn: Callable[[str], None]) 
         warn(f'no pose went out. {reasons}')
 
 
-def _settings(options: Options) -> Settings:
+def _with_transport(settings: Settings, entry: Entry) -> Settings:
+    """The settings with the image transport of the bag."""
+    transport = 'compressed' if entry.topic == COMPRESSED_TOPIC else 'raw'
+    return replace(settings, tau2_camera=replace(settings.tau2_camera, image_transport=transport))
+
+
+def _settings(options: Options, warn: Callable[[str], None]) -> Settings:
+    """The parameters of the nodes; doubts about them are passed to ``warn``."""
     overrides: dict[str, Any] = {}
     if options.map_file is not None:
         overrides['map_file'] = str(options.map_file)
     if options.mode is not None:
         overrides['mode'] = options.mode
-    return read_settings(options.params, overrides)
+    settings = read_settings(options.params, overrides)
+    for line in settings.warnings:
+        warn(line)
+    return settings
 
 
 def _prepare(options: Options, settings: Settings, entry: Entry, warn: Callable[[str], None]) -> list[str]:
