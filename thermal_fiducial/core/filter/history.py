@@ -146,8 +146,8 @@ class History:
         before = self.belief
         if before.main or belief.main is None or before.first_offset:
             return False
-        blank = next((place for place, old in enumerate(self._beliefs) if not old.hypotheses), None)
-        if blank is None or not self._hypotheses.relinearises(belief.main, before.first_offset):
+        forgotten = all(old.hypotheses for old in self._beliefs)
+        if forgotten or not self._hypotheses.relinearises(belief.main, before.first_offset):
             return False
         while self.belief.hypotheses:
             self._forget_belief()
