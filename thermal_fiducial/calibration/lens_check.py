@@ -25,9 +25,9 @@ def reaches_corners(camera: Camera) -> bool:
     around = np.arange(_DIRECTIONS) * (2.0 * np.pi / _DIRECTIONS)
     ray = np.stack([np.cos(around), np.sin(around)], axis=-1)
     uv = camera.distort(np.tan(_ANGLES)[:, None, None] * ray)
-    distance = np.linalg.norm(uv - camera.K[:2, 2], axis=-1)
+    distance = np.linalg.norm(uv - camera.principal_point, axis=-1)
     last = np.array([camera.width, camera.height]) - 1.0
-    needed = _BEYOND_CORNER * float(np.linalg.norm(np.maximum(camera.K[:2, 2], last - camera.K[:2, 2])))
+    needed = _BEYOND_CORNER * float(np.linalg.norm(np.maximum(camera.principal_point, last - camera.principal_point)))
     inside = np.maximum.accumulate(distance, axis=0)[:-1] < needed
     growing = np.diff(distance, axis=0) > 0.0
     return bool(np.all(growing | ~inside) and np.all(distance.max(axis=0) >= needed))

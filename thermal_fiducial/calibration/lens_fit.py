@@ -40,7 +40,7 @@ def prior_sigmas(camera: Camera) -> FloatArray:
     """Standard deviations about zero of the distortion coefficients (MODELS[model],)."""
     last = np.array([camera.width, camera.height]) - 1.0
     focal = np.array([camera.K[0, 0], camera.K[1, 1]])
-    reach = float(np.linalg.norm(np.maximum(camera.K[:2, 2], last - camera.K[:2, 2]) / focal))
+    reach = float(np.linalg.norm(np.maximum(camera.principal_point, last - camera.principal_point) / focal))
     if camera.model == 'equidistant':
         return np.array([_FIRST, _HIGHER, _HIGHER, _HIGHER]) / reach ** np.array([2, 4, 6, 8])
     sigmas = np.array([_FIRST, _HIGHER, _TANGENTIAL, _TANGENTIAL, _HIGHER, _FIRST, _HIGHER, _HIGHER])
@@ -230,7 +230,7 @@ def by_parameters(camera: Camera, points: FloatArray, chosen: IntArray | None = 
     parameters = camera_parameters(camera)
     chosen = np.arange(len(parameters)) if chosen is None else chosen
     J = np.zeros((len(points), 2, len(chosen)))
-    distorted = (camera.distort(x) - camera.K[:2, 2]) / [camera.K[0, 0], camera.K[1, 1]]
+    distorted = (camera.distort(x) - camera.principal_point) / [camera.K[0, 0], camera.K[1, 1]]
     for place, index in enumerate(chosen.tolist()):
         if index < MATRIX:
             J[:, index % 2, place] = distorted[:, index] if index < 2 else 1.0

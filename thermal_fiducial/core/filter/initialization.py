@@ -81,18 +81,15 @@ def start(
     if _contradicts_gravity(pose, imu, config.gravity):
         return None
     noise = PoseNoise.of(config.stamp_jitter, pose)
-    systematic = config.systematic_pose_std**2 * pose.shape
     P = np.diag(_initial_variances(config))
-    P[SYSTEMATIC, SYSTEMATIC] = systematic
-    P[np.ix_(POSE, POSE)] += noise.white * pose.shape + systematic
-    # The systematic error of the pose is an error of the estimate, with the opposite sign.
-    P[POSE, SYSTEMATIC] -= systematic
-    P[SYSTEMATIC, POSE] -= systematic
-    # So is the error of the extrinsics.
-    of_extrinsics = P[EXTRINSICS, EXTRINSICS]
-    P[np.ix_(POSE, POSE)] += of_extrinsics
-    P[POSE, EXTRINSICS] -= of_extrinsics
-    P[EXTRINSICS, POSE] -= of_extrinsics
+    P[SYSTEMATIC, SYSTEMATIC] = config.systematic_pose_std**2 * pose.shape
+    P[np.ix_(POSE, POSE)] += noise.white * pose.shape
+    # What the pose is wrong by lastingly is an error of the estimate, with the opposite sign.
+    for place in (SYSTEMATIC, EXTRINSICS):
+        lasting = P[place, place]
+        P[np.ix_(POSE, POSE)] += lasting
+        P[POSE, place] -= lasting
+        P[place, POSE] -= lasting
     state = replace(
         prior,
         R_map_body=pose.T_map_body[:3, :3],

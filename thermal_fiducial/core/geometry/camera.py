@@ -126,7 +126,7 @@ class Camera:
             distorted, J = cv2.projectPoints(points, still, still, _EYE, self.D)
             J = J[:, 3:5]
         # One product of matrices costs less than one for each row of points.
-        uv = distorted.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]
+        uv = distorted.reshape(-1, 2) @ self.K[:2, :2].T + self.principal_point
         by_x = self.K[:2, :2] @ J.reshape(-1, 2, 2)
         return uv.reshape(x.shape), by_x.reshape(*x.shape, 2)
 
@@ -136,7 +136,7 @@ class Camera:
         Newton's method converges at the border of a lens, where OpenCV's fixed-point iteration does not.
         """
         uv = np.asarray(uv, dtype=np.float64)
-        x = (uv - self.K[:2, 2]) @ self._inverse_focal.T
+        x = (uv - self.principal_point) @ self._inverse_focal.T
         if self.model == 'equidistant' and x.size:
             undistorted = cv2.fisheye.undistortPoints(x.reshape(-1, 1, 2), _EYE, self.D)
             return np.asarray(undistorted, dtype=np.float64).reshape(x.shape)
