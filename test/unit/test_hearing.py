@@ -1,13 +1,11 @@
 """Nodes that DDS has left deaf: noticed by what others say that they publish, and started again."""
 
-import os
 import signal
-import subprocess
-import sys
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import pytest
 from sensor_msgs.msg import Imu
+from support.empty_stage import finished
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.ros import qos
@@ -78,19 +76,14 @@ def test_a_message_ends_the_suspicion(pair):
 PROGRAM = """
 from pathlib import Path
 import sys
-from dataclasses import dataclass
-from thermal_fiducial.ros.node import StageNode
+from support.empty_stage import EmptyStage
 from thermal_fiducial.ros.run import run
 
 lives = Path(sys.argv[1])
 
-@dataclass(frozen=True)
-class Nothing:
-    pass
-
-class Stage(StageNode[Nothing]):
+class Stage(EmptyStage):
     def __init__(self):
-        super().__init__('stage', Nothing)
+        super().__init__()
         count = int(lives.read_text()) + 1 if lives.exists() else 1
         lives.write_text(str(count))
         if count == 1:
@@ -109,8 +102,7 @@ sys.exit(run(Stage, []))
 
 
 def test_a_deaf_node_ends_in_order_and_starts_again_as_the_same_process(tmp_path):
-    command = [sys.executable, '-c', PROGRAM, str(tmp_path / 'lives')]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False, env=dict(os.environ))
+    done = finished(PROGRAM, str(tmp_path / 'lives'))
     assert (tmp_path / 'lives').read_text() == '2', done.stderr
     assert done.stdout == 'saved\nsaved\n'
     assert done.returncode in (7, -signal.SIGPROF)

@@ -12,6 +12,7 @@ from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import Imu
+from support.empty_stage import finished
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.config import group, param
@@ -217,18 +218,13 @@ def test_a_node_interrupted_in_its_imports_stops_silently_and_commands_are_unaff
 
 ENDED = """
 import os, re, signal, sys, time
-from dataclasses import dataclass
 from diagnostic_msgs.msg import DiagnosticArray
+from support.empty_stage import EmptyStage
 from thermal_fiducial.ros import run, stopping
-from thermal_fiducial.ros.node import StageNode
 
-@dataclass(frozen=True)
-class Nothing:
-    pass
-
-class Stage(StageNode[Nothing]):
+class Stage(EmptyStage):
     def __init__(self):
-        super().__init__('stage', Nothing)
+        super().__init__()
         self.output = self.advertise(DiagnosticArray, 'results')
         self.create_timer(0.01, lambda: self.guard(self.work, None))
 
@@ -277,12 +273,12 @@ HOLDS_THE_INTERPRETER = "re.match('(a+)+$', 64 * 'a' + 'b')"
 def test_a_node_stops_silently(at_work, while_destroyed, while_python_ends, limit, status):
     """Stopped in a callback that publishes, again while the interpreter ends, and with a library that never returns."""
     program = ENDED % (at_work, while_destroyed, while_python_ends, limit)
-    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
+    done = finished(program)
     assert (done.returncode, done.stdout, done.stderr) == (status, 'saved\n', '')
 
 
 def test_a_node_that_crashes_and_does_not_end_is_no_stopped_one():
     """It is to be started again: SIGPROF would say that it was asked to stop."""
     program = ENDED.replace('sys.exit(run.run(Stage))', CRASHES) % ('pass', HOLDS_THE_INTERPRETER, 'pass', SHORT)
-    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, timeout=60, check=False)
+    done = finished(program)
     assert (done.returncode, done.stdout) == (-signal.SIGALRM, 'saved\n')

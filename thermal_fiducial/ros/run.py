@@ -17,6 +17,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.node import StageNode
 from thermal_fiducial.ros.promptness import keep_for_good, take_priority
 from thermal_fiducial.ros.stopping import limit_the_end, release_the_end, StopSignals
+from thermal_fiducial.ros.unblocked import drop_what_does_not_fit, say_last
 
 PROFILE = Path(__file__).with_name('fastdds.xml')
 #: Environment variables of Fast DDS 2 (Jazzy) and Fast DDS 3.
@@ -89,12 +90,13 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
     -------
     Exit status: 0 stopped, 2 unusable arguments or parameters, or a map that cannot be saved (one line says which).
     """
+    drop_what_does_not_fit()
     stop = StopSignals(try_shutdown)
     try:
         if _make_and_spin(make_node, args, stop):
             _start_again()
     except InputError as error:
-        print(f'{Path(sys.argv[0]).name}: {error}', file=sys.stderr)
+        say_last(f'{Path(sys.argv[0]).name}: {error}')
         return 2
     finally:
         stop.ignore()
@@ -104,7 +106,6 @@ def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = No
 def _start_again() -> None:
     """Replace this process: nobody else would do it for ``ros2 run``, and launch would wait for a second."""
     release_the_end()
-    sys.stdout.flush()
     os.execv(sys.executable, sys.orig_argv)
 
 

@@ -1,0 +1,108 @@
+"""A node goes on where nobody reads what it prints: a full pipe, a stopped terminal, a journal that hangs."""
+
+import fcntl
+import os
+import pty
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+from support.empty_stage import environment
+
+pytestmark = pytest.mark.ros
+
+#: As much as a pipe may hold at least; the default is 16 times that.
+PAGE = 4096
+#: Far more lines than that, and a stop request; the alarm ends a node that hangs.
+PROGRAM = """
+import os, signal, sys
+from support.empty_stage import EmptyStage
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.run import run
+
+class Stage(EmptyStage):
+    def __init__(self):
+        super().__init__()
+        self.create_timer(0.01, self.talk)
+
+    def talk(self):
+        for count in range(2000):
+            self.get_logger().warning(f'line {count} that says as much as an ordinary one says')
+        os.kill(os.getpid(), signal.SIGINT)
+
+class Refused(EmptyStage):
+    def __init__(self):
+        super().__init__()
+        for count in range(2000):
+            self.get_logger().warning(f'line {count} that says as much as an ordinary one says')
+        raise InputError('no such file')
+
+signal.alarm(20)
+sys.exit(run({'talks': Stage, 'refused': Refused}[sys.argv[1]], []))
+"""
+
+
+def full_pipe():
+    """The end that is written to, once it is full, and the one that nobody reads."""
+    reading, writing = os.pipe()
+    fcntl.fcntl(writing, fcntl.F_SETPIPE_SZ, PAGE)
+    own = os.open(f'/proc/self/fd/{writing}', os.O_WRONLY | os.O_NONBLOCK)
+    os.write(own, PAGE * b'x')
+    os.close(own)
+    return writing, reading
+
+
+def stopped_terminal():
+    """A terminal whose other end nobody reads."""
+    other, terminal = pty.openpty()
+    return terminal, other
+
+
+def stuck_socket():
+    """As the system's journal gives it to a unit."""
+    ours, other = socket.socketpair()
+    ours.shutdown(socket.SHUT_RD)
+    return ours.detach(), other.detach()
+
+
+@pytest.mark.parametrize('make', [full_pipe, stopped_terminal, stuck_socket])
+@pytest.mark.parametrize(('way', 'status'), [('talks', 0), ('refused', 2)])
+def test_a_node_whose_output_nobody_reads_works_on_and_ends_as_it_should(make, way, status):
+    writing, reading = make()
+    try:
+        command = [sys.executable, '-c', PROGRAM, way]
+        done = subprocess.run(command, stdout=writing, stderr=writing, timeout=60, check=False, env=environment())
+        assert done.returncode == status
+    finally:
+        os.close(writing)
+        os.close(reading)
+
+
+def test_other_programs_at_the_same_pipe_still_wait_for_their_reader():
+    reading, writing = os.pipe()
+    with os.fdopen(reading):
+        command = [sys.executable, '-c', PROGRAM, 'talks']
+        done = subprocess.run(command, stderr=writing, timeout=60, check=False, env=environment())
+        assert (done.returncode, os.get_blocking(writing)) == (0, True)
+        os.close(writing)
+
+
+@pytest.mark.parametrize('closing', ['2>&-', '>&- 2>&-', '2>/dev/null'])
+def test_a_node_without_a_console_runs(closing):
+    line = f'exec "$0" -c "$1" talks {closing}'
+    done = subprocess.run(['sh', '-c', line, sys.executable, PROGRAM], timeout=60, check=False, env=environment())
+    assert done.returncode in (0, -signal.SIGPROF)
+
+
+def test_what_is_written_to_a_file_is_complete(tmp_path):
+    """Also behind what it held before."""
+    log = tmp_path / 'log'
+    log.write_text('before\n')
+    with log.open('a') as file:
+        command = [sys.executable, '-c', PROGRAM, 'refused']
+        done = subprocess.run(command, stderr=file, timeout=60, check=False, env=environment())
+    lines = log.read_text().splitlines()
+    assert (done.returncode, len(lines)) == (2, 2002)
+    assert (lines[0], lines[-1]) == ('before', '-c: no such file')
