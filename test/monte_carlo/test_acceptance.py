@@ -13,6 +13,7 @@ from support.flights import config, errors, Flight, matched, Motion, perfect, rm
 
 from thermal_fiducial.config import ImuNoise
 from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.filter.output import SmoothOutput
 from thermal_fiducial.core.geometry.se3 import so3_exp, so3_log, transform
 
 pytestmark = pytest.mark.slow
@@ -453,14 +454,14 @@ def test_extrinsics_are_refined_on_request():
 
 def test_smooth_output_has_no_steps_and_arrives():
     data = Flight(seed=SEEDS[0], seconds=5.0, motion=Motion.still())
-    ekf = PoseEkf(config(smoothing_time=0.1))
+    ekf, smoother = PoseEkf(config()), SmoothOutput(0.1)
     exact, smooth = [], []
     for item in timeline(data.samples(), data.poses, 0.03):
         if hasattr(item, 'T_map_camera'):
             ekf.add_pose(item)
         elif state := ekf.add_imu(item):
             exact.append(state.T_map_body[:3, 3])
-            smooth.append(ekf.smooth.T_map_body[:3, 3])
+            smooth.append(smoother.follow(state).T_map_body[:3, 3])
     exact, smooth = np.array(exact)[400:], np.array(smooth)[400:]
     steps = [np.linalg.norm(np.diff(path, axis=0), axis=1).max() for path in (exact, smooth)]
     assert steps[1] < 0.3 * steps[0]

@@ -198,17 +198,22 @@ def test_with_an_odom_frame_the_smooth_pose_is_in_it_and_both_make_the_pose(monk
     with ros_graph() as graph:
         frames = {'publish_tf': True, 'odom_frame': 'odom', 'smoothing_time': 0.5}
         node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0], **frames)
+        graph.listen(OdometryMessage, 'odometry_smooth')
+        graph.spin_until(lambda: all(output.listeners for output in node.outputs if 'smooth' in output.topic))
         # To the sample behind a pose: what is published is of the samples.
         fly(graph, range(61))
-        smooth = node.filter.smooth
+        graph.spin_until(lambda: len(graph.heard['odometry_smooth']) == graph.published(node, 'odometry_smooth'))
         state = node.filter.state.T_map_body
+    smooth = graph.heard['odometry_smooth'][-1].pose.pose
     map_to_odom, odom_to_base = sent[-1]
     assert (map_to_odom.header.frame_id, map_to_odom.child_frame_id) == ('map', 'odom')
     assert (odom_to_base.header.frame_id, odom_to_base.child_frame_id) == ('odom', 'base_link')
     assert map_to_odom.header.stamp == odom_to_base.header.stamp
     T_map_odom, T_odom_base = (convert.correction_of(message)[1] for message in sent[-1])
     # A quaternion in between: the last digits may differ.
-    np.testing.assert_allclose(T_odom_base, smooth.T_map_body, atol=1e-12)
+    np.testing.assert_allclose(
+        T_odom_base[:3, 3], [smooth.position.x, smooth.position.y, smooth.position.z], atol=1e-12
+    )
     np.testing.assert_allclose(T_map_odom @ T_odom_base, state, atol=1e-12)
 
 

@@ -1,5 +1,6 @@
 """What the filter keeps of samples and poses."""
 
+import numpy as np
 from support.flights import config, Flight
 
 from thermal_fiducial.core.filter.history import History
@@ -12,8 +13,8 @@ def test_a_start_without_further_poses_keeps_no_more_than_a_flight_does():
     history = History(Hypotheses(config()), kept, 0.0)
     pose = flight.poses[10]
     for sample in flight.samples():
-        imu = [*sample.angular_velocity, *sample.linear_acceleration]
-        history.append(sample.stamp_ns, imu, [1e-3] * 6)
+        imu = np.concatenate((sample.angular_velocity, sample.linear_acceleration))
+        history.imu.append(sample.stamp_ns, imu, np.full(6, 1e-3))
         if not history.holds(pose.stamp_ns) and sample.stamp_ns > pose.stamp_ns and len(history.imu) < 50:
             history.insert(pose)
         history.take_in()

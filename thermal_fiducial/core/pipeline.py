@@ -4,7 +4,7 @@ Tests, benchmarks and tools run it without ROS. What passes from stage to stage 
 precision, so a lock-step replay through the nodes gives the same numbers.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -28,7 +28,7 @@ from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.mapper import MapperResult, MarkerMap, MarkerMapper
 from thermal_fiducial.core.measurements import ImuSample, Markers, Odometry
-from thermal_fiducial.core.motion_prior import MotionPrior
+from thermal_fiducial.core.motion_prior import MotionPrior, possible
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray
 
 
@@ -77,6 +77,14 @@ def as_published(T: FloatArray) -> FloatArray:
     return transform_from_quaternion(T[:3, 3], quaternion_from_rotation(T[:3, :3]))
 
 
+def as_received(states: Sequence[Odometry]) -> list[Odometry]:
+    """The filter's odometry as detector and mapper read it from its messages."""
+    T = np.array([state.T_map_body for state in states])
+    quaternions = np.array([quaternion_from_rotation(R) for R in T[:, :3, :3]])
+    received = transform_from_quaternion(T[:, :3, 3], quaternions)
+    return possible([replace(state, T_map_body=pose) for state, pose in zip(states, received, strict=True)])
+
+
 class Pipeline:
     """Frames and IMU samples in, in the order of their arrival; odometry out.
 
@@ -102,15 +110,14 @@ class Pipeline:
         self.detector = MarkerDetector(config.aruco_detector, dictionary)
         self.mapper = MarkerMapper(config.marker_mapper, marker_map)
         self.filter = PoseEkf(config.pose_ekf)
-        self._odometry = MotionPrior(config.aruco_detector.camera_time_offset)
+        self._odometry = MotionPrior(config.aruco_detector.camera_time_offset, as_received)
         self._share_map()
 
     def add_imu(self, sample: ImuSample) -> Odometry | None:
         """Odometry at the stamp of an IMU sample; None before the filter is initialised."""
         odometry = self.filter.add_imu(sample)
         if odometry is not None:
-            published = replace(odometry, T_map_body=as_published(odometry.T_map_body))
-            self._odometry.add(published.stamp_ns, published)
+            self._odometry.add(odometry.stamp_ns, odometry)
         return odometry
 
     def add_image(self, stamp_ns: int, counts: Counts | Gray) -> FrameResult:

@@ -9,7 +9,7 @@ from nav_msgs.msg import Path
 from sensor_msgs.msg import TimeReference
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.output import in_frame
+from thermal_fiducial.core.filter.output import in_frame, SmoothOutput
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.bridge import FlightControllerBridge
@@ -45,20 +45,21 @@ class FilterOutputs:
         self._odometry = node.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
         self._camera_clock = node.advertise(TimeReference, 'camera_clock')
         self._path_output = node.advertise(Path, 'path')
-        if config.smoothing_time > 0.0:
+        self._smoother = SmoothOutput(config.smoothing_time) if config.smoothing_time > 0.0 else None
+        if self._smoother is not None:
             self._smooth_odometry = node.advertise(OdometryMessage, 'odometry_smooth', qos.IMU_RATE_RESULT)
         self._bridge = FlightControllerBridge(node, config, fault)
         self._transforms = TransformBroadcaster(node, config, frames, fault) if config.publish_tf else None
 
-    def send(self, odometry: Odometry, smooth: Odometry | None, *, lost: bool, jumps: int) -> None:
+    def send(self, odometry: Odometry, *, lost: bool, jumps: int) -> None:
         """Publish the state of the IMU frame after an IMU message, transformed to the robot's frame.
 
         Parameters
         ----------
-        smooth : the same with corrections spread over time; None if not configured
         lost : whether the pose is unfit to fly on
         jumps : number of jumps of the pose so far
         """
+        smooth = self._smoother.follow(odometry) if self._smoother else None
         if (T_imu_base := self._frames.T_imu_base) is not None:
             odometry = in_frame(odometry, T_imu_base)
             smooth = None if smooth is None else in_frame(smooth, T_imu_base)

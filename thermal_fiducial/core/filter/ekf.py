@@ -15,8 +15,8 @@ from thermal_fiducial.core.filter.hypotheses import Hypotheses, KNOWN_OFFSET_STD
 from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
 from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
-from thermal_fiducial.core.filter.innovations import PoseLog, PoseUpdate
-from thermal_fiducial.core.filter.output import odometry, SmoothOutput
+from thermal_fiducial.core.filter.innovations import PoseUpdate
+from thermal_fiducial.core.filter.output import odometry
 from thermal_fiducial.core.filter.recovery import Hypothesis
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
@@ -59,12 +59,8 @@ class PoseEkf:
         self._first_offset = camera_time_offset
         self._noise = ImuNoiseMonitor(config.imu)
         self._history = History(self._hypotheses, config.max_delay + WINDOW_SECONDS, camera_time_offset)
-        self._log = PoseLog()
         #: on the last IMU sample
         self._verdict = Verdict.USE
-        self._smoother = SmoothOutput(config.smoothing_time) if config.smoothing_time > 0.0 else None
-        #: the latest odometry without steps; None unless ``smoothing_time`` asks for it
-        self.smooth: Odometry | None = None
 
     def _begin_after_jump(self) -> None:
         """Reset, but keep the estimated clock offset: where stamps jump, mostly samples are missing."""
@@ -85,10 +81,11 @@ class PoseEkf:
         """
         if not self.keep_imu(sample):
             return None
-        self._take_in()
-        output = self._output(self._history.imu.imu[-1])
-        self.smooth = self._smoother.follow(output) if self._smoother and output else None
-        return output
+        history = self._history
+        history.take_in()
+        if history.main is None:
+            return None
+        return odometry(history.main.estimate, self._contradicting(history.main), history.imu.last)
 
     def keep_imu(self, sample: ImuSample) -> bool:
         """Buffer an IMU sample without propagating to it: the next :meth:`add_imu` propagates over all buffered ones.
@@ -107,9 +104,9 @@ class PoseEkf:
         if self._input.jump_ns:
             self._camera_clock.imu_jumped(self._input.jump_ns)
         imu, buffer = np.concatenate((sample.angular_velocity, sample.linear_acceleration)), self._history.imu
-        seconds = (sample.stamp_ns - buffer.newest_ns) / SECOND_NS if buffer else 0.0
-        densities = self._noise.densities(imu, seconds) if buffer else np.zeros(6)
-        self._history.append(sample.stamp_ns, imu, densities)
+        seconds = (sample.stamp_ns - buffer.newest_ns) / SECOND_NS
+        densities = self._noise.densities(imu, seconds) if len(buffer) else np.zeros(6)
+        buffer.append(sample.stamp_ns, imu, densities)
         return True
 
     def add_pose(self, pose: CameraPose) -> PoseUpdate:
@@ -124,9 +121,9 @@ class PoseEkf:
         if reason:
             return PoseUpdate(pose.stamp_ns, False, reason, np.nan)
         self._history.insert(pose)
-        self._take_in()
+        self._history.take_in()
         waiting = PoseUpdate(pose.stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
-        return self._log.latest.get(pose.stamp_ns, waiting)
+        return self._history.log.latest.get(pose.stamp_ns, waiting)
 
     def _in_present_clock(self, pose: CameraPose) -> CameraPose:
         """``pose`` with all steps of the camera's clock taken out of its stamp, a step that it reveals included."""
@@ -145,7 +142,7 @@ class PoseEkf:
         if not self._contradicts(pose) or not self._fits(restamped):
             return pose
         history.discard(self._camera_clock.follow(step_ns))
-        self._take_in()
+        self._history.take_in()
         return restamped
 
     def _contradicts(self, pose: CameraPose) -> bool:
@@ -182,28 +179,19 @@ class PoseEkf:
             return 'refused: too late'
         return 'refused: stamp repeated' if history.holds(pose.stamp_ns) else ''
 
-    def _take_in(self) -> None:
-        for update in self._history.take_in():
-            self._log.add(update)
-
     # --- output ---------------------------------------------------------------------------------------
 
-    def _output(self, imu: FloatArray) -> Odometry | None:
-        main = self._history.main
-        if main is None:
+    def _contradicting(self, main: Hypothesis) -> Estimate | None:
+        """The alternative estimate, if the latest poses contradict ``main`` and enough of them support it."""
+        begun = self._history.belief.alternative
+        if begun is None or begun.hits < self._config.initial_poses or not main.in_doubt:
             return None
-        other = self._contradicting() if main.in_doubt else None
-        return odometry(main.estimate, other, imu, self._history.imu.last_rate_variance)
-
-    def _contradicting(self) -> Estimate | None:
-        """The alternative estimate, where the latest poses support it."""
-        other = self._history.alternative
-        return other.estimate if other and other.hits >= self._config.initial_poses else None
+        return self._history.carried(begun, self._history.imu.newest_ns).estimate
 
     @property
     def decided(self) -> Mapping[int, PoseUpdate]:
         """Latest verdict on each of the latest poses, by camera stamp."""
-        return self._log.latest
+        return self._history.log.latest
 
     @property
     def state(self) -> NavigationState | None:
@@ -250,7 +238,7 @@ class PoseEkf:
         if self._verdict is not Verdict.USE:
             of_sample: Condition = self._verdict.value
             return of_sample
-        return condition_of(self._history, next(reversed(self._log.latest.values()), None), self._config)
+        return condition_of(self._history, next(reversed(self._history.log.latest.values()), None), self._config)
 
     @property
     def status(self) -> str:
@@ -271,16 +259,16 @@ class PoseEkf:
         main = self._history.main
         if main is None:
             return 0.0
-        return usable_seconds(main.estimate, self._history.imu.last_densities, self._config.lost_position_std)
+        return usable_seconds(main.estimate, self._history.imu.last.densities, self._config.lost_position_std)
 
     def diagnostics(self) -> dict[str, float]:
         """Condition of the filter in numbers (SI units)."""
         rate, force = self._noise.vibration
         numbers = {
-            'poses accepted': float(self._log.accepted),
-            'poses refused': float(self._log.refused),
+            'poses accepted': float(self._history.log.accepted),
+            'poses refused': float(self._history.log.refused),
             'IMU samples refused': float(self._imu_refused),
-            'NIS per d.o.f.': self._log.mean_nis(),
+            'NIS per d.o.f.': self._history.log.mean_nis(),
             'vibration rad/s/sqrt(Hz)': rate,
             'vibration m/s^2/sqrt(Hz)': force,
         }

@@ -11,7 +11,8 @@ import math
 from thermal_fiducial.core.filter.hypotheses import Hypotheses, NO_GRAVITY
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
-from thermal_fiducial.core.filter.innovations import PoseUpdate
+from thermal_fiducial.core.filter.innovations import PoseLog, PoseUpdate
+from thermal_fiducial.core.filter.propagation import propagated
 from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.filter.update import MotionAtPose
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
@@ -22,18 +23,18 @@ _KEPT_EVERY_NS = 100_000_000
 
 
 class History:
-    """Buffers of IMU samples, camera poses and beliefs.
+    """Buffers of IMU samples, camera poses, beliefs and verdicts.
 
     Parameters
     ----------
-    seconds : how long they are kept [s]
+    seconds : how long samples and poses are kept [s]
     camera_time_offset : prior of the clock offset t_imu - t_camera [s]
     """
 
     def __init__(self, hypotheses: Hypotheses, seconds: float, camera_time_offset: float) -> None:
         self._hypotheses = hypotheses
         self._kept_ns, self._offset_ns = round(seconds * SECOND_NS), round(camera_time_offset * SECOND_NS)
-        self.imu = ImuBuffer()
+        self.imu, self.log = ImuBuffer(), PoseLog()
         self._poses: list[CameraPose] = []
         self._beliefs = [Belief()]
         #: the estimate at the newest sample
@@ -44,25 +45,25 @@ class History:
         """Belief after the latest pose."""
         return self._beliefs[-1]
 
-    @property
+    def carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:
+        """A hypothesis propagated along the samples to an instant that is not later than the newest sample."""
+        estimate = hypothesis.estimate
+        if estimate.stamp_ns >= until_ns:
+            return hypothesis
+        steps = self.imu.steps(estimate.stamp_ns, until_ns)
+        return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self._hypotheses.random_walks))
+
     def alternative(self) -> Hypothesis | None:
         """The alternative hypothesis at the newest sample."""
         other = self.belief.alternative
-        return other and self._hypotheses.carried(other, self.imu, self.imu.newest_ns)
-
-    def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
-        """Add the newest sample (6,) and the noise densities (6,) of the step that ends with it."""
-        self.imu.append(stamp_ns, imu, densities)
-        # Half of the buffer at a time: each removal moves the rest.
-        if stamp_ns - self.imu.oldest_ns > 2 * self._kept_ns:
-            self._forget_old()
+        return other and self.carried(other, self.imu.newest_ns)
 
     def _forget_old(self) -> None:
         """Remove what is older than any pose that may still be inserted."""
         horizon_ns = self.imu.newest_ns - self._kept_ns
         if self.belief.stamp_ns < horizon_ns and self.belief.main is None:
             # Initialising, and no pose for that long: only the hypothesis carried to the present is needed.
-            self._beliefs = [self.belief._replace(alternative=self.alternative)]
+            self._beliefs = [self.belief._replace(alternative=self.alternative())]
         while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
             del self._beliefs[0]
         oldest = self._beliefs[0]
@@ -124,18 +125,19 @@ class History:
 
     # --- taking in poses ------------------------------------------------------------------------------
 
-    def take_in(self) -> list[PoseUpdate]:
-        """Apply all poses up to the newest sample and propagate to it; returns the verdicts on these poses."""
-        updates: list[PoseUpdate] = []
+    def take_in(self) -> None:
+        """Apply all poses up to the newest sample, log the verdicts on them, and propagate to that sample."""
         while (pose := self._next_due()) is not None:
-            belief, decided = self._after(pose)
+            belief, verdicts = self._after(pose)
             if self._relinearised(belief):
                 continue
             self._beliefs.append(belief)
             self.main = None
-            updates += decided
+            self.log.add(verdicts)
         self._go_on()
-        return updates
+        # Half of the buffer at a time: each removal moves the rest.
+        if self.imu.newest_ns - self.imu.oldest_ns > 2 * self._kept_ns:
+            self._forget_old()
 
     def _relinearised(self, belief: Belief) -> bool:
         """Whether an initialisation that ends with ``belief`` begins once more, linearised about its clock offset.
@@ -169,9 +171,9 @@ class History:
         belief = self.belief
         if belief.main is None:
             return
-        self.main = self._hypotheses.carried(self.main or belief.main, self.imu, self.imu.newest_ns)
+        self.main = self.carried(self.main or belief.main, self.imu.newest_ns)
         if self.main.estimate.stamp_ns - belief.main.estimate.stamp_ns > _KEPT_EVERY_NS:
-            self._beliefs.append(belief._replace(main=self.main, alternative=self.alternative))
+            self._beliefs.append(belief._replace(main=self.main, alternative=self.alternative()))
 
     def _after(self, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
         """The belief after the next pose, and the verdicts on that pose."""
@@ -206,7 +208,7 @@ class History:
     def _at(self, hypothesis: Hypothesis, pose: CameraPose) -> tuple[Hypothesis, MotionAtPose]:
         """A hypothesis at the instant of a pose, never earlier than where it is now, and the motion there."""
         time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
-        there = self._hypotheses.carried(hypothesis, self.imu, min(time_ns, self.imu.newest_ns))
+        there = self.carried(hypothesis, min(time_ns, self.imu.newest_ns))
         return there, self.imu.motion(there.estimate.stamp_ns, there.accepted_ns)
 
     def _begun(self, belief: Belief, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:

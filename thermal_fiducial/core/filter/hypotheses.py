@@ -1,4 +1,4 @@
-"""Hypotheses: how they are initialised, propagated along the IMU samples, and updated by poses that pass the gate."""
+"""Hypotheses: how they are initialised, and updated by poses that pass the gate."""
 
 from dataclasses import replace
 import math
@@ -6,11 +6,9 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import blank_state, start
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.pose_noise import BodyPose
-from thermal_fiducial.core.filter.propagation import propagated
 from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
@@ -38,25 +36,18 @@ _FAR_TOO_SURE, _FAR, _ENOUGH_POSES = 10.0, np.repeat([0.05, 0.2], 3), 300
 
 
 class Hypotheses:
-    """Initialises, propagates and updates hypotheses with the parameters of one filter."""
+    """Initialises and updates hypotheses with the parameters of one filter."""
 
     def __init__(self, config: PoseEkfConfig) -> None:
         self._updater = PoseUpdater(config)
-        self._walks = _random_walks(config)
+        #: (48,) squared densities of the random walks
+        self.random_walks = _random_walks(config)
         self.configure(config)
 
     def configure(self, config: PoseEkfConfig) -> None:
         """Take over the dynamic parameters of ``config``."""
         self._config = config
         self._updater.config = config
-
-    def carried(self, hypothesis: Hypothesis, imu: ImuBuffer, until_ns: int) -> Hypothesis:
-        """A hypothesis propagated along the samples to an instant that is not later than the newest sample."""
-        estimate = hypothesis.estimate
-        if estimate.stamp_ns >= until_ns:
-            return hypothesis
-        steps = imu.steps(estimate.stamp_ns, until_ns)
-        return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self._walks))
 
     def weigh(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> tuple[Hypothesis, PoseUpdate]:
         """A hypothesis after a pose at its instant, and the verdict on the pose."""

@@ -1,6 +1,7 @@
 """Buffer of the latest IMU samples: integration steps, interpolated samples and the motion at a pose's instant."""
 
 from bisect import bisect_left, bisect_right
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,14 @@ class Steps(NamedTuple):
     densities: FloatArray
 
 
+class LastSample(NamedTuple):
+    """The newest sample ``imu`` (6,); ``seconds`` and noise ``densities`` (6,) of the step that ends with it."""
+
+    imu: FloatArray
+    seconds: float
+    densities: FloatArray
+
+
 class ImuBuffer:
     """Samples in the order of their stamps; between two of them rate and force are linear in time."""
 
@@ -31,6 +40,9 @@ class ImuBuffer:
         self._stamps_ns: list[int] = []
         #: (capacity, 2, 6) samples, and noise densities of the steps that end with them
         self._rows = np.zeros((_CAPACITY, 2, 6))
+        #: stamps of the last sample and of the first one that is kept; 0 before the first
+        self.newest_ns = self.oldest_ns = 0
+        self.last = LastSample(np.zeros(6), math.inf, np.zeros(6))
 
     def __len__(self) -> int:
         """Number of samples."""
@@ -41,43 +53,29 @@ class ImuBuffer:
         """(N, 6) all samples."""
         return self._rows[: len(self._stamps_ns), 0]
 
-    @property
-    def newest_ns(self) -> int:
-        """Stamp of the last sample."""
-        return self._stamps_ns[-1]
-
-    @property
-    def oldest_ns(self) -> int:
-        """Stamp of the first sample that is kept."""
-        return self._stamps_ns[0]
-
-    @property
-    def last_densities(self) -> FloatArray:
-        """(6,) of the step that ends with the last sample."""
-        return np.asarray(self._rows[len(self._stamps_ns) - 1, 1])
-
-    @property
-    def last_rate_variance(self) -> float:
-        """White noise of the rate that the last sample says, of one axis [rad^2/s^2]."""
-        seconds = (self._stamps_ns[-1] - self._stamps_ns[-2]) / SECOND_NS
-        return float(self._rows[len(self._stamps_ns) - 1, 1, 0]) ** 2 / seconds
-
     def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
         """Add a sample (6,) and the noise densities (6,) of the step that ends with it; gaps are interpolated."""
-        if self._stamps_ns and stamp_ns - self.newest_ns > _LONGEST_NS:
-            begin_ns, begin = self.newest_ns, self._rows[len(self._stamps_ns) - 1, 0].copy()
-            parts = -((begin_ns - stamp_ns) // _LONGEST_NS)
-            for part in range(1, parts):
-                part_ns = (stamp_ns - begin_ns) * part // parts
-                self._add(begin_ns + part_ns, begin + part / parts * (imu - begin), densities)
-        self._add(stamp_ns, imu, densities)
-
-    def _add(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
         place = len(self._stamps_ns)
+        if place == 0:
+            self.oldest_ns = stamp_ns
+        elif stamp_ns - self.newest_ns > _LONGEST_NS:
+            self._fill_gap(stamp_ns, imu, densities)
+            place = len(self._stamps_ns)
         if place == len(self._rows):
             self._rows = np.concatenate((self._rows, np.zeros_like(self._rows)))
         self._stamps_ns.append(stamp_ns)
         self._rows[place, 0], self._rows[place, 1] = imu, densities
+        seconds = (stamp_ns - self.newest_ns) / SECOND_NS if place else math.inf
+        self.last = LastSample(imu, seconds, densities)
+        self.newest_ns = stamp_ns
+
+    def _fill_gap(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
+        """Interpolate between the newest sample and the next one, ``imu`` (6,) at ``stamp_ns``."""
+        begin_ns, begin = self.newest_ns, self.last.imu
+        parts = -((begin_ns - stamp_ns) // _LONGEST_NS)
+        for part in range(1, parts):
+            part_ns = begin_ns + (stamp_ns - begin_ns) * part // parts
+            self.append(part_ns, begin + part / parts * (imu - begin), densities)
 
     def forget_before(self, stamp_ns: int) -> None:
         """Remove samples before ``stamp_ns``, except the last one, which interpolation needs."""
@@ -85,6 +83,7 @@ class ImuBuffer:
         kept = self._rows[first : len(self._stamps_ns)].copy()
         self._rows[: len(kept)] = kept
         del self._stamps_ns[:first]
+        self.oldest_ns = self._stamps_ns[0]
 
     def steps(self, begin_ns: int, end_ns: int) -> Steps:
         """The steps between two arbitrary instants within the samples (trapezoid rule)."""

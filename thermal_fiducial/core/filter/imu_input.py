@@ -76,7 +76,10 @@ class ImuInput:
         self._last_ns: int | None = None
         self._stray_ns = self._first_stray_ns = 0
         self._strays = 0
+        #: longest recent step [ns]
         self._longest_ns = 0.0
+        #: longest step [ns] that is accepted at once, without waiting for a sample that follows
+        self._usual_ns: float = min(UNUSUAL_NS, self._max_gap_ns)
         #: jump of the stamps at the last sample that was used [ns]; 0 for a usual step
         self.jump_ns = 0
 
@@ -99,16 +102,12 @@ class ImuInput:
         self._follow(sample.stamp_ns)
         return Verdict.USE
 
-    @property
-    def _usual_ns(self) -> float:
-        """Longest step [ns] that is accepted at once, without waiting for a sample that follows."""
-        return min(max(UNUSUAL_FACTOR * self._longest_ns, UNUSUAL_NS), self._max_gap_ns)
-
     def _follow(self, stamp_ns: int, jump_ns: int = 0) -> None:
         assert self._last_ns is not None
         step_ns = stamp_ns - self._last_ns
         if 0 < step_ns <= self._max_gap_ns:
             self._longest_ns = max(self._longest_ns * (1.0 - step_ns / MEMORY_NS), step_ns)
+            self._usual_ns = min(max(UNUSUAL_FACTOR * self._longest_ns, UNUSUAL_NS), self._max_gap_ns)
         self._last_ns, self._strays, self.jump_ns = stamp_ns, 0, jump_ns
 
     def _stray(self, stamp_ns: int) -> Verdict:

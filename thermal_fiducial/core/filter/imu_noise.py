@@ -46,7 +46,6 @@ class ImuNoiseMonitor:
         self._floor = NoiseFloor()
         self._motion = StructureFunction()
         self._mean_force: list[float] = []
-        self._recent: list[FloatArray] = []
         # Of gyroscope and accelerometer, as single numbers: small arrays take ten times as long.
         self._sheet = noise.gyroscope_noise_density, noise.accelerometer_noise_density
         self._nonlinearity = noise.gyroscope_nonlinearity, noise.accelerometer_nonlinearity
@@ -60,7 +59,7 @@ class ImuNoiseMonitor:
 
     def densities(self, imu: FloatArray, seconds: float) -> FloatArray:
         """(6,) densities for the step of ``seconds`` that ends with sample ``imu`` (6,)."""
-        self._follow_spectrum(imu, seconds)
+        self._floor.add(imu, seconds)
         self._motion.add(imu, seconds)
         # Shorter steps are covered by the floor of the spectrum, once it has been measured.
         covered = seconds <= _INTERRUPTED and any(self._floor.densities)
@@ -85,16 +84,6 @@ class ImuNoiseMonitor:
         share = min(seconds / _SLOW, 1.0)
         self._mean_force = [mean + share * (now - mean) for mean, now in zip(self._mean_force, forces, strict=True)]
         return math.dist(forces, self._mean_force)
-
-    def _follow_spectrum(self, imu: FloatArray, seconds: float) -> None:
-        if seconds > _INTERRUPTED:
-            self._recent.clear()
-            self._floor.interrupt()
-        self._recent.append(imu)
-        if len(self._recent) == 3:
-            first, second, third = self._recent
-            self._floor.add(first - 2.0 * second + third, seconds)
-            del self._recent[0]
 
 
 class StructureFunction:
@@ -160,7 +149,7 @@ class NoiseFloor:
     """
 
     def __init__(self) -> None:
-        self._differences: list[FloatArray] = []
+        self._samples: list[FloatArray] = []
         self._seconds = 0.0
         self._window = self._bands = np.zeros((0, 1))
         self._power = np.zeros((1, 2))
@@ -168,25 +157,23 @@ class NoiseFloor:
         #: gyroscope and accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]; 0 until the first window is full
         self.densities = (0.0, 0.0)
 
-    def interrupt(self) -> None:
-        """Begin a new window: the next difference does not follow the last one."""
-        self._differences.clear()
-        self._seconds = 0.0
-
-    def add(self, difference: FloatArray, seconds: float) -> None:
-        """Take the second difference (6,) of samples ``seconds`` apart."""
-        self._differences.append(difference)
-        if not len(self._window):
+    def add(self, imu: FloatArray, seconds: float) -> None:
+        """Add a sample (6,) that follows the last one after ``seconds``; one behind a gap begins a new window."""
+        if seconds > _INTERRUPTED:
+            self._samples.clear()
+            self._seconds = 0.0
+        self._samples.append(imu)
+        differences = len(self._samples) - 2
+        if not len(self._window) and differences > 0:
             self._seconds += seconds
             if self._seconds >= _WINDOW:
-                self._prepare()
-        if 0 < len(self._window) <= len(self._differences):
+                self._prepare(differences)
+        if 0 < len(self._window) <= differences:
             self._measure()
-            del self._differences[: max(len(self._window) // _OVERLAPPING, 1)]
+            del self._samples[: max(differences // _OVERLAPPING, 1)]
 
-    def _prepare(self) -> None:
-        """Window and bands for the rate that the samples turn out to have."""
-        count = len(self._differences)
+    def _prepare(self, count: int) -> None:
+        """Window of ``count`` differences and bands, for the rate that the samples turn out to have."""
         seconds = self._seconds / count
         frequencies = np.fft.rfftfreq(count, seconds)
         edges = np.linspace(_LOWEST, min(_HIGHEST, 0.5 / seconds), _BANDS + 1)
@@ -199,7 +186,9 @@ class NoiseFloor:
         self._bands = inside / inside.sum(axis=1, keepdims=True) * scale
 
     def _measure(self) -> None:
-        spectrum = np.abs(np.fft.rfft(np.array(self._differences) * self._window, axis=0)) ** 2
+        samples = np.array(self._samples)
+        differences = samples[:-2] - 2.0 * samples[1:-1] + samples[2:]
+        spectrum = np.abs(np.fft.rfft(differences * self._window, axis=0)) ** 2
         power = (self._bands @ spectrum).reshape(-1, 2, 3).mean(axis=2)
         self._windows = min(self._windows + 1, _MEAN_OF)
         self._power = self._power + (power - self._power) / self._windows

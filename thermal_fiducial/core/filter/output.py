@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 
+from thermal_fiducial.core.filter.imu_buffer import LastSample
 from thermal_fiducial.core.filter.state import CORE, Estimate, NavigationState, POSITION, PUBLISHED, ROTATION, VELOCITY
 from thermal_fiducial.core.filter.update import pose_innovation
 from thermal_fiducial.core.geometry.reprojection import lever_arm, twist_transfer
@@ -23,14 +24,12 @@ _RATE_VARIANCES = slice(9 * 13, None, 13)
 LARGEST_STEP = 1.0
 
 
-def odometry(estimate: Estimate, other: Estimate | None, imu: FloatArray, rate_variance: float) -> Odometry:
+def odometry(estimate: Estimate, other: Estimate | None, sample: LastSample) -> Odometry:
     """Odometry at an IMU sample.
 
     Parameters
     ----------
     other : estimate of the same instant that contradicts it: it widens the covariance by its own and their difference
-    imu : (6,) the sample
-    rate_variance : white noise of the sample's rate [rad^2/s^2]
     """
     state = estimate.state
     R, velocity_body = state.R_map_body, state.velocity_body
@@ -44,13 +43,13 @@ def odometry(estimate: Estimate, other: Estimate | None, imu: FloatArray, rate_v
     J[0:3, POSITION] = J[3:6, ROTATION] = R
     J[6:9, ROTATION] = skew(velocity_body)
     covariance = J @ joint @ J.T
-    covariance.reshape(-1)[_RATE_VARIANCES] += rate_variance
+    covariance.reshape(-1)[_RATE_VARIANCES] += float(sample.densities[0]) ** 2 / sample.seconds
     of_map = estimate.pose_noise.last.map_covariance
     return Odometry(
         estimate.stamp_ns,
         state.T_map_body,
         velocity_body,
-        state.corrected(imu)[:3],
+        state.corrected(sample.imu)[:3],
         covariance[:6, :6] + of_map,
         covariance[6:, 6:],
     )
@@ -81,7 +80,8 @@ def in_frame(odometry: Odometry, T_body_frame: FloatArray) -> Odometry:
 class SmoothOutput:
     """A pose without steps, for controllers that need one: it lags behind, and its covariance is not consistent.
 
-    It integrates the filter's twist, and approaches the filter's pose with a time constant.
+    It integrates the filter's twist, and approaches the filter's pose with a time constant. It starts anew where stamps
+    go back.
     """
 
     def __init__(self, seconds: float) -> None:
@@ -92,7 +92,7 @@ class SmoothOutput:
 
     def follow(self, odometry: Odometry) -> Odometry:
         """Odometry with the smooth pose; its covariance and twist are the filter's."""
-        if self._consistent is None:
+        if self._consistent is None or odometry.stamp_ns <= self._consistent.stamp_ns:
             self._T = odometry.T_map_body
         else:
             dt = (odometry.stamp_ns - self._consistent.stamp_ns) * 1e-9
