@@ -2,10 +2,7 @@
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.history import History
-from thermal_fiducial.core.filter.hypotheses import NO_GRAVITY
-from thermal_fiducial.core.filter.initialization import FEWEST_SAMPLES
-from thermal_fiducial.core.filter.innovations import PoseUpdate
-from thermal_fiducial.core.filter.recovery import Hypothesis
+from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import SECOND_NS
 
@@ -20,13 +17,13 @@ def coasting_seconds(history: History, main: Hypothesis) -> float:
     return (history.imu.newest_ns - main.accepted_ns) / SECOND_NS
 
 
-def condition_of(history: History, latest: PoseUpdate | None, config: PoseEkfConfig) -> Condition:
-    """The condition of the filter; ``latest``: the latest verdict on a pose, if any."""
+def condition_of(history: History, config: PoseEkfConfig) -> Condition:
+    """The condition of the filter."""
     if not history.imu:
         return Condition('waiting for IMU')
     main = history.main
     if main is None:
-        return _without_estimate(history, latest, config)
+        return _without_estimate(history.belief, config)
     if main.position_std > config.lost_position_std:
         return Condition('lost', f'position known to {main.position_std:.2f} m')
     if main.in_doubt:
@@ -35,15 +32,8 @@ def condition_of(history: History, latest: PoseUpdate | None, config: PoseEkfCon
     return Condition('coasting', f'{coasting:.1f} s without a pose') if coasting > COASTING_S else TRACKING
 
 
-def _without_estimate(history: History, latest: PoseUpdate | None, config: PoseEkfConfig) -> Condition:
-    belief = history.belief
+def _without_estimate(belief: Belief, config: PoseEkfConfig) -> Condition:
     if belief.contradiction is not None:
         return belief.contradiction
-    if begun := belief.alternative:
-        return Condition('initialising', f'{begun.hits} of {config.initial_poses} poses')
-    if latest is None or latest.reason != NO_GRAVITY:
-        return WAITING
-    force = ' '.join(f'{value:.1f}' for value in history.imu.imu[-FEWEST_SAMPLES:, 3:].mean(axis=0))
-    return Condition(
-        'poses contradict gravity', f'the IMU says {force} m/s^2; its axes, sign, units? camera_orientation?'
-    )
+    begun = belief.alternative
+    return Condition('initialising', f'{begun.hits} of {config.initial_poses} poses') if begun else WAITING

@@ -238,7 +238,7 @@ class PoseEkf:
         if self._verdict is not Verdict.USE:
             of_sample: Condition = self._verdict.value
             return of_sample
-        return condition_of(self._history, next(reversed(self._history.log.latest.values()), None), self._config)
+        return condition_of(self._history, self._config)
 
     @property
     def status(self) -> str:

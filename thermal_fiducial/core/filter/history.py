@@ -8,9 +8,9 @@ from bisect import bisect_left, bisect_right, insort
 from collections.abc import Callable, Iterable
 import math
 
-from thermal_fiducial.core.filter.hypotheses import Hypotheses, NO_GRAVITY
+from thermal_fiducial.core.filter.hypotheses import Hypotheses
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
-from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
+from thermal_fiducial.core.filter.initialization import no_gravity, WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseLog, PoseUpdate
 from thermal_fiducial.core.filter.propagation import propagated
 from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
@@ -215,8 +215,11 @@ class History:
         time_ns = max(self._begin_ns(belief, pose), self.imu.oldest_ns)
         window = self.imu.window(time_ns, WINDOW_SECONDS)
         begun = self._hypotheses.from_nothing(pose, time_ns, window, belief.first_offset)
-        decided = [PoseUpdate(pose.stamp_ns, False, 'initialising' if begun else NO_GRAVITY, math.nan)]
-        return self._settled(belief._replace(alternative=begun), decided) if begun else (belief, decided)
+        if begun is None:
+            refused = PoseUpdate(pose.stamp_ns, False, 'refused: contradicts gravity', math.nan)
+            return belief._replace(contradiction=no_gravity(window)), [refused]
+        update = PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)
+        return self._settled(belief._replace(alternative=begun), [update])
 
     def _with_alternative(self, belief: Belief, at_pose: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> Belief:
         """``belief`` with an alternative hypothesis begun from a pose that the estimate at ``at_pose`` refuses."""

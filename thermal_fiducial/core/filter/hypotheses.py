@@ -22,8 +22,6 @@ from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, PoseUpd
 from thermal_fiducial.core.measurements import CameraPose, Condition
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-#: reason of refusal of a first pose whose vertical contradicts the measured specific force
-NO_GRAVITY = 'refused: contradicts gravity'
 #: Standard deviation [s] below which the clock offset counts as known, and the least that an alternative hypothesis
 #: begins with: in the fastest flights it moves a marker by a pixel or two.
 KNOWN_OFFSET_STD = 0.003

@@ -30,6 +30,7 @@ from thermal_fiducial.core.filter.state import (
 )
 from thermal_fiducial.core.filter.update import slide
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import FloatArray
 
 #: Window [s] in which rest is detected, and the fewest samples in it.
@@ -109,6 +110,13 @@ def _contradicts_gravity(pose: BodyPose, imu: FloatArray, gravity: float) -> boo
     if up @ force < math.cos(LARGEST_TILT) * size:
         return True
     return abs(size - gravity) > (NO_GRAVITY if _quiet(imu) else HARDLY_GRAVITY * gravity)
+
+
+def no_gravity(imu: FloatArray) -> Condition:
+    """What a first pose that contradicts gravity shows; ``imu``: samples (N, 6) up to its instant."""
+    force = ' '.join(f'{value:.1f}' for value in imu[-FEWEST_SAMPLES:, 3:].mean(axis=0))
+    details = f'the IMU says {force} m/s^2; its axes, sign, units? camera_orientation?'
+    return Condition('poses contradict gravity', details)
 
 
 def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatArray) -> FloatArray:

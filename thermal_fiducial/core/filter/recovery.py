@@ -101,7 +101,7 @@ class Belief(NamedTuple):
     first_offset: float = 0.0
     #: reason of the latest reset, in words
     reset_reason: str = ''
-    #: while initialising: which sensor of the IMU the poses contradict, if any
+    #: while initialising: which sensor of the IMU the last refused pose contradicts, if any
     contradiction: Condition | None = None
 
     @property

@@ -1,0 +1,80 @@
+"""The filter's condition in words, from what its history holds."""
+
+import numpy as np
+import pytest
+from support.flights import config, Flight, Motion
+
+from thermal_fiducial.core.filter.condition import (
+    COASTING_S,
+    coasting_seconds,
+    condition_of,
+    TRACKING,
+    WAITING,
+)
+from thermal_fiducial.core.filter.history import History
+from thermal_fiducial.core.filter.hypotheses import Hypotheses
+from thermal_fiducial.core.filter.recovery import REFUSALS_OF_DOUBT
+
+CONFIG = config(initial_poses=3)
+RATE = 200
+
+
+def history(until, poses, *, seconds=4.0, force=1.0):
+    """History after ``until`` [s] of a hovering robot: samples, forces times ``force``, and some of its poses."""
+    flight, kept = Flight(seed=1, seconds=seconds, motion=Motion.still()), History(Hypotheses(CONFIG), 2.0, 0.0)
+    for sample in flight.samples()[: round(until * RATE)]:
+        imu = np.concatenate((sample.angular_velocity, force * sample.linear_acceleration))
+        kept.imu.append(sample.stamp_ns, imu, np.repeat((1.7e-4, 2e-3), 3))
+    for pose in flight.poses[poses]:
+        kept.insert(pose)
+    kept.take_in()
+    return kept
+
+
+def test_at_first_it_waits_for_the_imu_then_for_markers():
+    assert condition_of(history(0.0, slice(0)), CONFIG).words == 'waiting for IMU'
+    assert condition_of(history(0.1, slice(0)), CONFIG) == WAITING
+
+
+@pytest.mark.parametrize('count', [1, 2])
+def test_the_first_poses_are_counted(count):
+    assert str(condition_of(history(1.0, slice(10, 10 + count)), CONFIG)) == f'initialising: {count} of 3 poses'
+
+
+def test_it_tracks_until_poses_stay_away():
+    assert condition_of(history(1.0, slice(5, 20)), CONFIG) == TRACKING
+    late = history(1.5, slice(5, 20))
+    seconds = coasting_seconds(late, late.main)
+    since = (late.imu.newest_ns - Flight(seed=1, seconds=4.0).poses[19].stamp_ns) / 1e9
+    # but for the clock offset that is estimated of the robot at rest: nothing moves, and so its prior stays
+    assert seconds == pytest.approx(since, abs=0.03)
+    assert seconds > COASTING_S
+    assert str(condition_of(late, CONFIG)) == f'coasting: {seconds:.1f} s without a pose'
+
+
+def test_lost_counts_before_coasting():
+    kept = history(1.5, slice(5, 20))
+    strict = config(lost_position_std=0.5 * kept.main.position_std)
+    condition = condition_of(kept, strict)
+    assert condition.words == 'lost'
+    assert condition.details == f'position known to {kept.main.position_std:.2f} m'
+
+
+def test_poses_that_are_refused_in_a_row_put_it_in_doubt():
+    kept = history(1.5, slice(5, 20))
+    for count, pose in enumerate(Flight(seed=1, seconds=4.0, motion=Motion.still()).poses[20:25], 1):
+        aside = pose.T_map_camera.copy()
+        aside[0, 3] += 3.0
+        kept.insert(type(pose)(pose.stamp_ns, aside, pose.covariance))
+        kept.take_in()
+        assert (condition_of(kept, CONFIG).words == 'in doubt') == (count >= REFUSALS_OF_DOUBT)
+    assert condition_of(kept, CONFIG).details == '5 poses in a row contradict the estimate'
+
+
+def test_a_sensor_that_poses_contradict_is_named_until_the_filter_is_initialised():
+    upside_down = history(1.0, slice(10, 11), force=-1.0)
+    condition = condition_of(upside_down, CONFIG)
+    assert condition.words == 'poses contradict gravity'
+    # noise of 20 samples at 200 Hz of 2e-3 m/s^2/sqrt(Hz) is below the digit that is said
+    assert condition.details.startswith('the IMU says ')
+    assert '-9.8 m/s^2' in condition.details
