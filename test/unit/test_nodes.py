@@ -211,17 +211,34 @@ def test_a_detector_that_cannot_keep_up_takes_the_newest_image_and_counts_the_ot
     graph.send('thermal/camera_info', info())
     output = graph.tester.advertise(Image, 'thermal/image')
     graph.spin_until(lambda: output.listeners == 1 and graph.input(node, 'thermal/image').publishers == 1)
-    images = frames(6)
-    for image in images:
-        output.send(image)
-    time.sleep(0.3)  # all have arrived, none has been looked at
-    graph.spin_until(lambda: graph.input(node, 'thermal/image').count == 6)
-    graph.spin_until(lambda: graph.heard['markers'])
+    images = frames(22)
+    for so_far, burst in ((2, images[:2]), (22, images[2:])):
+        for image in burst:
+            output.send(image)
+        time.sleep(0.3)  # all have arrived, none has been looked at
+        graph.spin_until(lambda so_far=so_far: graph.input(node, 'thermal/image').count == so_far)
+    graph.spin_until(lambda: len(graph.heard['markers']) == 2)
     stamps = [convert.stamp_ns(message.header.stamp) for message in graph.heard['markers']]
-    assert stamps == [convert.stamp_ns(images[-1].header.stamp)]
+    assert stamps == [convert.stamp_ns(images[k].header.stamp) for k in (1, 21)]
     _, reason, figures = graph.diagnose(node)
-    assert figures['left /thermal/image'] == '5'
-    assert '5 older images skipped' in reason
+    # Most of them did not fit into the queue.
+    assert figures['left /thermal/image'] == '20'
+    assert '20 older images skipped' in reason
+
+
+def test_images_of_two_publishers_are_not_taken_for_one_stream_with_losses(graph):
+    node = graph.add(ArucoDetector)
+    graph.send('thermal/camera_info', info())
+    outputs = [graph.tester.advertise(Image, 'thermal/image') for _ in range(2)]
+    source = graph.input(node, 'thermal/image')
+    graph.spin_until(lambda: all(output.listeners == 1 for output in outputs) and source.publishers == 2)
+    for k, image in enumerate(frames(12)):
+        # The first one has published three times as much as the other.
+        outputs[k % 4 == 3].send(image)
+        if k % 2:
+            time.sleep(0.05)
+            graph.spin_until(lambda k=k: source.count == k + 1)
+    assert source.left == 6
 
 
 def test_an_opencv_that_is_too_old_is_refused_with_the_version_needed(graph, monkeypatch):
@@ -230,13 +247,14 @@ def test_an_opencv_that_is_too_old_is_refused_with_the_version_needed(graph, mon
         graph.add(ArucoDetector)
 
 
-def test_an_unknown_dictionary_is_a_fault_and_the_node_lives(graph):
-    node = graph.add(ArucoDetector, dictionary='DICT_9X9_9')
+@pytest.mark.parametrize('name', ['DICT_9X9_9', 'a' * 300])
+def test_an_unknown_dictionary_is_a_fault_and_the_node_lives(graph, name):
+    node = graph.add(ArucoDetector, dictionary=name)
     graph.send('thermal/camera_info', info())
     graph.send('thermal/image', *frames(1))
     level, reason, figures = graph.diagnose(node)
     assert level == ERROR
-    assert 'DICT_9X9_9' in reason
+    assert name[:200] in reason
     assert figures['published /markers'] == '0'
 
 

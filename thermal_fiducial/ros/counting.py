@@ -4,13 +4,11 @@ A lock-step replay compares the counts to know when every published message has 
 """
 
 from collections.abc import Callable, Iterator
-import time
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.ros import qos
 
 
@@ -38,12 +36,36 @@ class Input:
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
-        #: messages taken or skipped
+        #: messages taken, and those replaced in the queue that are known of
         self.count = 0
-        #: messages skipped because a newer one had arrived
+        #: messages skipped because a newer one had arrived, here or in the queue of DDS
         self.left = self._left_before = 0
-        #: of rclpy
-        self.subscription: Any = None
+        # The publisher's number of the message that was taken last; 0: not known.
+        self._number = 0
+
+    def newest(self, message: Any, at_most: int) -> Any:
+        """The newest of a message that has been counted and those queued behind it, of which ``at_most`` are taken.
+
+        Counts those skipped, and those that newer ones have replaced in the queue, which must hold two or more: the
+        executor passes messages on without their numbers, so the number of the second one shows what is missing.
+        """
+        self._number += bool(self._number)
+        for _ in range(at_most):
+            taken = self.take()
+            if taken is None:
+                break
+            message, info = taken
+            replaced = self._replaced_before(info['publication_sequence_number'] or 0)
+            self.count += replaced
+            self.left += 1 + replaced
+        return message
+
+    def _replaced_before(self, number: int) -> int:
+        """How many messages were replaced before the one with this number, of the only publisher; 0: not known."""
+        before, self._number = self._number, number
+        if before and number > before + 1 and self.publishers == 1:
+            return number - before - 1
+        return 0
 
     def left_since(self) -> int:
         """Number of messages skipped since the last call."""
@@ -54,8 +76,8 @@ class Input:
         """Set the subscription that is counted."""
         self.subscription = subscription
 
-    def take(self) -> tuple[Any, float] | None:
-        """Take and count the oldest queued message; returns it and its time in the queue [s], None if there is none."""
+    def take(self) -> tuple[Any, dict[str, Any]] | None:
+        """Take and count the oldest queued message; returns it and rclpy's information on it, None if there is none."""
         subscription = self.subscription
         with subscription.handle:
             taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
@@ -63,7 +85,7 @@ class Input:
             return None
         self.count += 1
         message, info = taken
-        return message, (time.time_ns() - info['received_timestamp']) / SECOND_NS
+        return message, info
 
     def waiting(self, at_most: int) -> Iterator[Any]:
         """Take and count queued messages, ``at_most`` so many."""
@@ -114,7 +136,7 @@ class CountingNode(Node):
     def subscribe_newest(
         self, kind: type, topic: str, callback: Callable[[Any], None], profile: QoSProfile, *, raw: bool = False
     ) -> Input:
-        """Call ``callback`` with the newest message; older ones are skipped and counted.
+        """Call ``callback`` with the newest message; older ones are skipped and counted, also those beyond the queue.
 
         Lazy subscriptions (:meth:`subscribe_lazily`) are taken first.
         """
@@ -122,11 +144,8 @@ class CountingNode(Node):
 
         def receive(message: Any) -> None:
             self.take_waiting()
-            for newer in source.waiting(profile.depth):
-                message = newer
-                source.left += 1
             source.count += 1
-            self.guard(callback, message)
+            self.guard(callback, source.newest(message, profile.depth))
 
         source.attach(self.create_subscription(kind, topic, receive, profile, raw=raw))
         self.inputs.append(source)

@@ -1,11 +1,13 @@
 """The queue of IMU messages of the filter's node: catching up after a delay, and reporting the delay."""
 
 from collections.abc import Callable
+import time
 
 from sensor_msgs.msg import Imu
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.measurements import ImuSample
+from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.ros import message_bytes, qos
 from thermal_fiducial.ros.node import ERROR, OK, StageNode, WARN
 
@@ -52,7 +54,8 @@ class ImuQueue:
         """Process the oldest queued message; its time in the queue is the delay of the output."""
         oldest = self._input.take() if self._node.live else None
         if oldest is not None:
-            message, self._delay = oldest
+            message, info = oldest
+            self._delay = (time.time_ns() - info['received_timestamp']) / SECOND_NS
             self._longest = max(self._longest, self._delay)
             self._node.guard(self._on_message, message)
 
