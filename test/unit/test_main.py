@@ -31,6 +31,20 @@ def test_wrong_usage_exits_with_2(argv, capsys):
     assert 'usage: thermal-fiducial' in capsys.readouterr().err
 
 
+@pytest.mark.parametrize('name', ['a' * 300, 'a/' * 3000, 'file/b'])
+@pytest.mark.parametrize(
+    'words',
+    [['evaluate'], ['replay', '--out', 'run'], ['calibrate', 'intrinsics'], ['import', '--out', 'bag'], ['simulate']],
+)
+def test_names_that_no_file_can_have_are_refused_in_one_line(tmp_path, capfd, monkeypatch, words, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'file').write_text('')
+    assert main([*words, name]) == 2
+    error = capfd.readouterr().err
+    assert error.count('\n') == 1
+    assert len(error) < 600
+
+
 def test_unusable_input_is_one_line(tmp_path, capsys):
     assert main(['evaluate', str(tmp_path / 'missing')]) == 2
     error = capsys.readouterr().err

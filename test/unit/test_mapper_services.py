@@ -105,6 +105,12 @@ def test_a_free_mapper_refines_in_a_process_of_its_own_in_either_mode(graph, map
     assert set(multiprocessing.active_children()) == before
 
 
+def test_a_map_file_with_a_name_that_no_file_can_have_is_a_fault_and_the_node_ends_in_order(graph):
+    node = graph.add(MarkerMapperNode, map_file='a' * 300 + '.yaml')
+    assert 'File name too long' in graph.diagnose(node)[1]
+    node.close()
+
+
 def test_the_map_is_published_again_when_a_service_has_replaced_it(graph, map_file):
     graph.listen(PointCloud2, 'marker_map', qos.LATCHED)
     graph.add(MarkerMapperNode, map_file=str(map_file))

@@ -13,7 +13,7 @@ from thermal_fiducial.cameras.source import CapturedFrame, EndOfFramesError, now
 from thermal_fiducial.core.types import Counts
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.images import read_picture, without_libraries_lines
-from thermal_fiducial.files.reading import require_regular
+from thermal_fiducial.files.reading import is_there, require_regular, shown
 
 _PICTURES = ('.png', '.tif', '.tiff', '.pgm')
 _STACKS = ('.tif', '.tiff')
@@ -47,8 +47,8 @@ class Pictures:
         self._pictures: Iterator[Counts] = iter(())
         #: when the next picture is due, by the monotonic clock [s]
         self._due = 0.0
-        if not self._path.exists():
-            raise InputError(f'camera {path}: neither a device in /dev, nor "teax", nor a folder or video')
+        if not is_there(self._path):
+            raise InputError(f'camera {shown(path)}: neither a device in /dev, nor "teax", nor a folder or video')
         if not any(True for _ in self._one_pass()):
             raise InputError(f'camera {path}: no 16-bit grey picture in it')
         self.events.clear()

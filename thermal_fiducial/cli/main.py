@@ -12,6 +12,7 @@ from typing import Any
 from thermal_fiducial import __version__
 from thermal_fiducial.cli.subcommands import add_command
 from thermal_fiducial.errors import InputError, RunError
+from thermal_fiducial.files.reading import shown
 
 PROGRAM = 'thermal-fiducial'
 INSTALL_HINT = "pip install '.[tools,ros]' in the package's folder, or apt on the robot"
@@ -32,8 +33,11 @@ COMMANDS = {
     'check-bridge': 'verify what a flight controller would receive',
 }
 
-#: Errors of a file system that is full, read-only, not permitted or broken.
-_REFUSED = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO)
+#: Errors of a file system that is full, read-only, not permitted or broken, and of names that it cannot have.
+_REFUSED = (
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO),
+    *(errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR),
+)
 
 #: Modules of commands with a name that no module can have.
 MODULES = {'import': 'import_recording'}
@@ -122,7 +126,7 @@ def _reported(error: BaseException) -> tuple[int, str] | None:
         return 2, f'needs the Python package {error.name}: {INSTALL_HINT}'
     if isinstance(error, OSError) and error.errno in _REFUSED:
         _discard_output()
-        return 2, f'{error.filename or "output"}: {error.strerror}'
+        return 2, f'{shown(error.filename or "output")}: {error.strerror}'
     return None
 
 

@@ -21,7 +21,7 @@ from rosbags.typesys.store import Typestore
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bag_checks import check_announced, check_file, check_metadata, SINGLE_FILES
 from thermal_fiducial.files.decompression import bound_decompression
-from thermal_fiducial.files.reading import one_line
+from thermal_fiducial.files.reading import one_line, shown
 
 IMAGE_TOPIC = 'thermal/image_raw'
 COMPRESSED_TOPIC = 'thermal/image_raw/compressed'
@@ -204,7 +204,7 @@ class BagReader:
         there = self.topics
         for topic, msgtype in topics.items():
             if topic not in there:
-                listed = ', '.join(sorted(f'{name} ({kind})' for name, kind in there.items()))
+                listed = ', '.join(sorted(f'{shown(name)} ({kind})' for name, kind in there.items()))
                 raise InputError(f'{self.path}: no topic {topic} (remap another to it?); the bag has {listed}')
             if there[topic] != msgtype:
                 raise InputError(f'{self.path}: topic {topic} is {there[topic]}, not {msgtype}')

@@ -48,14 +48,13 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> Dictionary:
         bits = _unpacked(theirs.bytesList, theirs.markerSize)
         # OpenCV 4 has maxCorrectionBits 0 for the AprilTag families.
         return Dictionary(bits, max(theirs.maxCorrectionBits, correctable_bits(bits)))
-    packaged = PACKAGED / f'{name}.yaml'
-    path = packaged if '/' not in name and packaged.is_file() else Path(name)
+    path = _packaged().get(name, Path(name))
     try:
         text = read_text(path)
     except InputError:
         known = [
             *(word for word in dir(cv2.aruco) if word.startswith('DICT_')),
-            *(p.stem for p in PACKAGED.glob('*.yaml')),
+            *_packaged(),
         ]
         close = difflib.get_close_matches(name.upper(), known, 1)
         hint = f'; did you mean {close[0]}?' if close else ''
@@ -66,6 +65,11 @@ def load_dictionary(name_or_path: str | os.PathLike[str]) -> Dictionary:
         return _from_document(parse_yaml(str(path), text))
     except InputError as error:
         raise InputError(f'dictionary file {error}') from None
+
+
+def _packaged() -> dict[str, Path]:
+    """Dictionaries of the package by name."""
+    return {path.stem: path for path in PACKAGED.glob('*.yaml')}
 
 
 def other_patterns(markers: Iterable[int], of: str, read_as: str, folder: Path = Path()) -> str:
@@ -102,7 +106,7 @@ def dictionary_of_map(name: str, folder: Path) -> str:
     InputError
         Neither.
     """
-    if name.startswith('DICT_') or (PACKAGED / f'{Path(name).name}.yaml').is_file():
+    if name.startswith('DICT_') or Path(name).name in _packaged():
         return Path(name).name
     if name != Path(name).name:
         raise InputError(f'{name} is not opened, as it is neither a name nor a file beside the map')

@@ -15,7 +15,7 @@ TEXT_LIMIT_BYTES = 6_000_000
 LINE_LIMIT_BYTES = 10_000
 #: Most consecutive blank lines of a table.
 _BLANK_LINES = 100_000
-#: Longest path in an error message [characters].
+#: Longest path or other name in an error message [characters].
 _LONGEST_NAME = 400
 
 
@@ -31,6 +31,20 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
         return file.read(os.fstat(file.fileno()).st_size)
 
 
+def is_there(path: str | Path) -> bool:
+    """Whether there is a file or folder; False also if its name is too long, or its folder closed to this user."""
+    try:
+        return Path(path).exists()
+    except OSError:
+        return False
+
+
+def shown(name: str | Path) -> str:
+    """A path or another name of any length and letters as a message has it."""
+    name = str(name) if str(name).isprintable() else repr(str(name))
+    return name if len(name) <= _LONGEST_NAME else f'{name[:_LONGEST_NAME]}...'
+
+
 def require_regular(path: str | Path) -> None:
     """Raise InputError unless ``path`` is a readable regular file; reading a pipe or device might block forever."""
     with _opened(path, 1 << 63):
@@ -43,9 +57,7 @@ def _opened(path: str | Path, limit: int) -> Iterator[BinaryIO]:
         # Without O_NONBLOCK, opening a pipe without a writer blocks.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except (OSError, ValueError) as error:
-        name = str(path) if str(path).isprintable() else repr(str(path))
-        name = name if len(name) <= _LONGEST_NAME else f'{name[:_LONGEST_NAME]}...'
-        raise InputError(f'{name}: cannot read it: {getattr(error, "strerror", None) or error}') from None
+        raise InputError(f'{shown(path)}: cannot read it: {getattr(error, "strerror", None) or error}') from None
     try:
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode):

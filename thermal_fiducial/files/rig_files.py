@@ -12,7 +12,7 @@ from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternio
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import MODEL_SYNONYMS
-from thermal_fiducial.files.reading import read_text
+from thermal_fiducial.files.reading import read_text, shown
 from thermal_fiducial.files.schema import parse_yaml, Value
 
 #: Names of the noise densities, those of Kalibr.
@@ -125,9 +125,8 @@ def _document(path: Path) -> Value:
 def _needed(value: Value, name: str) -> Value:
     fields = value.mapping()
     if name not in fields:
-        raise value.error(
-            f'no {name if name.isprintable() else repr(name)}; it has {", ".join(list(fields)[:20]) or "nothing"}'
-        )
+        there = ', '.join(shown(field) for field in list(fields)[:20])
+        raise value.error(f'no {shown(name)}; it has {there or "nothing"}')
     return fields[name]
 
 

@@ -15,7 +15,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.csv_rows import named_rows
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.plain_yaml import load_plain
-from thermal_fiducial.files.reading import one_line, read_text
+from thermal_fiducial.files.reading import is_there, one_line, read_text
 from thermal_fiducial.files.writing import unfinished
 from thermal_fiducial.report.output_bag import read_output, RecordedOutput
 from thermal_fiducial.report.trajectory import read_truth, read_tum, Trajectory
@@ -110,7 +110,7 @@ def _own_truth(path: Path, summary: dict[str, Any]) -> Path | None:
     """The truth of a run folder, or of the replayed bag."""
     bag = bag_of_run(path, summary)
     places = [path / TRUTH, *([] if bag is None else [bag / TRUTH_OF_BAG])]
-    return next((place for place in places if place.exists()), None)
+    return next((place for place in places if is_there(place)), None)
 
 
 def bag_of_run(path: Path, summary: dict[str, Any]) -> Path | None:
@@ -119,7 +119,7 @@ def bag_of_run(path: Path, summary: dict[str, Any]) -> Path | None:
     places = [Path(known)] if isinstance(known, str) else []
     # A run folder may have been moved, with the bag in it or beside it.
     places += [path / name, path.parent / name] if isinstance(name, str) and name else []
-    return next((place for place in places if place.exists()), None)
+    return next((place for place in places if is_there(place)), None)
 
 
 def _camera_time_offset_ns(path: Path) -> int:

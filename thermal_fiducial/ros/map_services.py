@@ -17,6 +17,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import other_patterns
 from thermal_fiducial.files.map_keeper import MapKeeper
 from thermal_fiducial.files.marker_map import other_frame
+from thermal_fiducial.files.reading import is_there
 from thermal_fiducial.ros.map_refinement import MapRefinement
 from thermal_fiducial.ros.node import StageNode
 
@@ -162,7 +163,7 @@ class MapServices:
 
     def _save_at_the_end(self) -> None:
         file = self._node.config.map_file
-        lost = not self.mapper.frozen and not Path(file).exists()
+        lost = not self.mapper.frozen and not is_there(file)
         if file and (self._keeper.unsaved or lost) and self.mapper.map.markers:
             line, logger = self._save(self.mapper.map), self._node.get_logger()
             if self._keeper.obstacle:
