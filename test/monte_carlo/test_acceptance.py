@@ -165,6 +165,26 @@ def test_shaking_does_not_bias_the_time_offset(seed):
     assert numbers['time offset std'] < 0.005
 
 
+def of_any_imu(density):
+    """A gyroscope's noise density [rad/s/sqrt(Hz)], at night unless the clock offset is hardest to learn with it."""
+    return density if density == 2e-3 else pytest.param(density, marks=pytest.mark.nightly)
+
+
+@pytest.mark.parametrize('density', [of_any_imu(density) for density in (1.7e-4, 1e-3, 2e-3, 5e-3)])
+def test_noise_of_the_imu_is_not_taken_for_a_time_offset(density):
+    """Slow flights, clocks apart by as much as expected."""
+    noise = ImuNoise(gyroscope_noise_density=density, accelerometer_noise_density=max(2e-3, 10.0 * density))
+    ratios = []
+    for seed in range(6):
+        motion = Motion.random(np.random.default_rng(100 + seed), speed=0.25, turn=0.12)
+        data = Flight(seed, 12.0, motion, imu_rate=RATE, imu_noise=noise, offset=0.03 * (-1) ** seed)
+        _, _, ekf, _ = flown(data, white_poses(imu=noise))
+        numbers = ekf.diagnostics()
+        ratios.append((numbers['time offset'] - data.offset) / numbers['time offset std'])
+    # the 99 % limit of the mean of six squares
+    assert rms(ratios) < 1.67
+
+
 def first_seconds():
     """Squared errors of the poses in sigma, per degree of freedom, and the time offsets' (6, 2) errors and claims [s].
 
