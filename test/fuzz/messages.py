@@ -9,11 +9,12 @@ import tempfile
 from typing import Any
 import warnings
 
+import cv2
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from rclpy.context import Context
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import TimeReference
+from sensor_msgs.msg import CompressedImage, Image, TimeReference
 from std_msgs.msg import String
 from support import small_bag
 from support.direct_graph import DirectGraph
@@ -46,6 +47,8 @@ _LONGEST_LINE = 1000
 MAPPED = (0, 1, 2, 3)
 #: What the filter publishes for every sample of the IMU, and in thirty milliseconds of them.
 _OUTPUTS, _SAMPLES = ('/pose', '/odometry'), 6
+#: Pictures for a camera front end of their own, which reads no others.
+_COMPRESSED = '/packed/thermal/image_raw/compressed'
 #: Topic to how often it is mutated: images take long.
 _TOPICS = {
     '/imu/data': 10,
@@ -58,6 +61,7 @@ _TOPICS = {
     '/thermal/camera_info': 2,
     '/marker_map': 2,
     '/thermal/image_raw': 1,
+    _COMPRESSED: 1,
     '/thermal/image': 1,
     '/robot_description': 1,
 }
@@ -81,6 +85,7 @@ class Nodes:
         self._map_file = small_bag.side_files(folder, ids=MAPPED)[0]
         camera = {name: small_bag.PARAMETERS[name] for name in ('camera_position', 'camera_orientation')}
         self._graph.start(Tau2Camera)
+        self._graph.start(Tau2Camera, namespace='packed', image_transport='compressed')
         self._graph.start(ArucoDetector, **small_bag.PARAMETERS)
         self._graph.start(MarkerMapperNode, **small_bag.PARAMETERS, map_file=str(self._map_file), mode='mapping')
         self._graph.start(PoseEkfNode, **camera, bridge_rate=50.0)
@@ -195,6 +200,7 @@ def _good_messages(graph: DirectGraph) -> dict[str, list[Any]]:
     for message in frames(3):
         graph.send('/thermal/image_raw', message)
         found['/thermal/image_raw'].append(message)
+    found[_COMPRESSED] = [_compressed(message) for message in found['/thermal/image_raw']]
     state = State(START, np.eye(4), np.zeros(3), np.zeros(3), 1e-6 * np.eye(6), 1e-6 * np.eye(6))
     found['/thermal/image'] = found['/thermal/image_raw']
     found['/thermal/camera_info'] = [info()]
@@ -211,6 +217,13 @@ def _good_messages(graph: DirectGraph) -> dict[str, list[Any]]:
     missing = [topic for topic, messages in found.items() if not messages]
     assert not missing, missing
     return found
+
+
+def _compressed(image: Image) -> CompressedImage:
+    """A picture as image_transport compresses it."""
+    pixels = np.frombuffer(image.data, np.uint16).reshape(image.height, image.width)
+    data = cv2.imencode('.png', pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+    return CompressedImage(header=image.header, format='mono16; png compressed mono16', data=data)
 
 
 def run(numbers: range, begin: Callable[[str, int], None]) -> list[Finding]:

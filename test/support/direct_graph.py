@@ -21,17 +21,18 @@ class DirectGraph:
         self._heard: dict[str, list[Callable[[Any], None]]] = defaultdict(list)
         self._latched: dict[str, Any] = {}
 
-    def start(self, kind: type, **parameters: Any) -> Any:
+    def start(self, kind: type, namespace: str = '', **parameters: Any) -> Any:
         """Make a node; parameters with a double underscore for the dot."""
         overrides = [Parameter(name.replace('__', '.'), value=value) for name, value in parameters.items()]
         node = self._joined(kind)(
             live=False,
             context=self._context,
+            namespace=namespace or None,
             parameter_overrides=overrides,
             enable_rosout=False,
             start_parameter_services=False,
         )
-        name = node.get_name()
+        name = node.get_fully_qualified_name().lstrip('/')
         self.nodes[name] = node
         callbacks = [(subscription, subscription.callback) for subscription in node.subscriptions]
         # What would wait until a frame wants it comes at once.
