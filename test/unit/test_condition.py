@@ -75,6 +75,6 @@ def test_a_sensor_that_poses_contradict_is_named_until_the_filter_is_initialised
     upside_down = history(1.0, slice(10, 11), force=-1.0)
     condition = condition_of(upside_down, CONFIG)
     assert condition.words == 'poses contradict gravity'
-    # noise of 20 samples at 200 Hz of 2e-3 m/s^2/sqrt(Hz) is below the digit that is said
+    # the mean's noise, of 100 samples at 200 Hz of 2e-3 m/s^2/sqrt(Hz) is below the digit that is said
     assert condition.details.startswith('the IMU says ')
     assert '-9.8 m/s^2' in condition.details

@@ -33,24 +33,13 @@ from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import FloatArray
 
-#: Window [s] in which rest is detected, and the fewest samples in it.
-WINDOW_SECONDS, FEWEST_SAMPLES = 0.5, 20
-#: Limits at rest: standard deviations of the samples [rad/s, m/s^2], and mean rate, a plausible gyroscope bias [rad/s].
-STILL_RATE_STD, STILL_FORCE_STD, STILL_RATE = 0.02, 0.3, 0.1
-#: Largest difference of the mean specific force from gravity: at rest [m/s^2], in flight [share of gravity]. Beyond it
-#: the accelerometer's units are wrong.
-NO_GRAVITY, HARDLY_GRAVITY = 2.0, 0.5
+#: Window [s] of the samples that a first pose is compared with.
+WINDOW_SECONDS = 0.5
+#: Largest difference of the mean specific force from gravity, as a share of it: beyond it the accelerometer's units or
+#: sign are wrong.
+HARDLY_GRAVITY = 0.5
 #: Largest angle [rad] between a first pose's vertical and the specific force: beyond it the planar branch is wrong.
 LARGEST_TILT = math.radians(35.0)
-
-
-def _quiet(imu: FloatArray) -> bool:
-    """Whether samples (N, 6) are those of a robot at rest: small scatter, small mean rate."""
-    if len(imu) < FEWEST_SAMPLES:
-        return False
-    std = imu.std(axis=0)
-    quiet = std[:3].max() < STILL_RATE_STD and std[3:].max() < STILL_FORCE_STD
-    return bool(quiet and np.linalg.norm(imu.mean(axis=0)[:3]) < STILL_RATE)
 
 
 def blank_state(config: PoseEkfConfig) -> NavigationState:
@@ -104,17 +93,15 @@ def start(
 
 
 def _contradicts_gravity(pose: BodyPose, imu: FloatArray, gravity: float) -> bool:
-    """Whether attitude or size of the specific force of samples (N, 6) contradict ``gravity`` [m/s^2]."""
+    """Whether direction or size of the mean specific force of samples (N, 6) contradict ``gravity`` [m/s^2]."""
     up, force = pose.T_map_body[2, :3], imu.mean(axis=0)[3:]
     size = float(np.linalg.norm(force))
-    if up @ force < math.cos(LARGEST_TILT) * size:
-        return True
-    return abs(size - gravity) > (NO_GRAVITY if _quiet(imu) else HARDLY_GRAVITY * gravity)
+    return bool(up @ force < math.cos(LARGEST_TILT) * size) or abs(size - gravity) > HARDLY_GRAVITY * gravity
 
 
 def no_gravity(imu: FloatArray) -> Condition:
     """What a first pose that contradicts gravity shows; ``imu``: samples (N, 6) up to its instant."""
-    force = ' '.join(f'{value:.1f}' for value in imu[-FEWEST_SAMPLES:, 3:].mean(axis=0))
+    force = ' '.join(f'{value:.1f}' for value in imu.mean(axis=0)[3:])
     details = f'the IMU says {force} m/s^2; its axes, sign, units? camera_orientation?'
     return Condition('poses contradict gravity', details)
 
