@@ -93,29 +93,44 @@ class Camera:
         A point that the lens cannot show (behind a perspective camera, or beyond the radius where the
         model folds back) gives NaN.
         """
-        return self.project_jacobian(points)[0]
+        x, _, visible = self._in_front(points)
+        return np.where(visible, self.distort(x), np.nan)
 
     def project_jacobian(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Pixels (..., 2) of points (..., 3), and their derivative (..., 2, 3) [px/m]."""
-        points = np.asarray(points, dtype=np.float64)
-        in_front = points[..., 2] > TINY
-        depth = np.where(in_front, points[..., 2], 1.0)[..., None]
-        x = points[..., :2] / depth
+        x, depth, visible = self._in_front(points)
         uv, by_x = self.distort_linearised(x)
-        visible = in_front & ((x * x).sum(axis=-1) < self._fold_radius**2)
         by_depth = -by_x @ x[..., None]
         by_point = np.concatenate([by_x, by_depth], axis=-1) / depth[..., None]
-        return np.where(visible[..., None], uv, np.nan), by_point
+        return np.where(visible, uv, np.nan), by_point
+
+    def _in_front(self, points: npt.ArrayLike) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Normalised coordinates (..., 2) of points, their depths and which the lens can show, (..., 1) both."""
+        points = np.asarray(points, dtype=np.float64)
+        depth = points[..., 2:]
+        in_front = depth > TINY
+        depth = np.where(in_front, depth, 1.0)
+        x = points[..., :2] / depth
+        a, b = x[..., :1], x[..., 1:]
+        return x, depth, in_front & (a * a + b * b < self._fold_radius**2)
 
     def distort(self, normalised: npt.ArrayLike) -> FloatArray:
         """Pixels (..., 2) of normalised image coordinates x/z, y/z (..., 2)."""
-        return self.distort_linearised(normalised)[0]
+        x = np.asarray(normalised, dtype=np.float64)
+        return self._by_opencv(x)[0] if x.size else x
 
     def distort_linearised(self, normalised: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """:meth:`distort`, and its derivative (..., 2, 2) [px]."""
         x = np.asarray(normalised, dtype=np.float64)
         if not x.size:
             return x, np.zeros((*x.shape, 2))
+        uv, J = self._by_opencv(x)
+        # One product of matrices costs less than one for each point.
+        by_x = J.reshape(-1, 4) @ self._by_rows
+        return uv, by_x.reshape(*x.shape, 2)
+
+    def _by_opencv(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pixels of P points (..., 2) in normalised coordinates, and the derivative (2 P, 2) of their distortion."""
         still, points = np.zeros(3), np.ones((x.size // 2, 1, 3))
         points[:, 0, :2] = x.reshape(-1, 2)
         # At depth 1 its derivative by a translation of the camera is the one wanted. OpenCV leaves a skew of K out.
@@ -125,10 +140,8 @@ class Camera:
         else:
             distorted, J = cv2.projectPoints(points, still, still, _EYE, self.D)
             J = J[:, 3:5]
-        # One product of matrices costs less than one for each row of points.
         uv = distorted.reshape(-1, 2) @ self.K[:2, :2].T + self.principal_point
-        by_x = self.K[:2, :2] @ J.reshape(-1, 2, 2)
-        return uv.reshape(x.shape), by_x.reshape(*x.shape, 2)
+        return uv.reshape(x.shape), np.asarray(J)
 
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
         """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`.
@@ -177,6 +190,11 @@ class Camera:
     @cached_property
     def _last_pixel(self) -> FloatArray:
         return np.array([self.width - 1.0, self.height - 1.0])
+
+    @cached_property
+    def _by_rows(self) -> FloatArray:
+        """(4, 4) product with the focal lengths of matrices (2, 2) that are written in rows."""
+        return np.asarray(np.kron(self.K[:2, :2].T, np.eye(2)))
 
     @cached_property
     def _inverse_focal(self) -> FloatArray:
