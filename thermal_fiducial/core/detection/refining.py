@@ -240,7 +240,7 @@ def refine_corners(
     for index in range(_PASSES):
         widest = math.hypot(blur_px, math.sqrt(float((motion.spread * motion.spread).sum(axis=1).max())))
         sides = sides_of(start.x, camera, image.shape, cells, columns, widest)
-        blur = blurs(sides.normal[:, cells // 2], blur_px, motion.spread)
+        blur = blurs(sides.normal, blur_px, motion.spread)
         counts = counts_of(sides.pixel, image, motion.to_tails)
         segments = measure(counts, model(sides, behind, blur), REACHED * blur[0])
         refined, moving = _moved(sides, segments, as_squares(start, *adjust(sides, segments, _PRIOR_PX)))
@@ -260,11 +260,13 @@ def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCor
     blocks = known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
     covariances = together * blocks + OF_ALL_SIDES_PX**2 * _EYE
     # In an outline that is inconsistent with a square, some side belongs to another object.
-    doubt = known.doubt * sides.along.reshape(-1, 4).mean(axis=1) ** 2
+    doubt = known.doubt * (0.25 * sides.along.reshape(-1, 4).sum(axis=1)) ** 2
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]
     contrast, noise = (segments.contrast * share).sum(axis=1), np.sqrt((segments.noise * share).sum(axis=1))
     shift, deviation = known.moved.reshape(-1, 4, 2), np.sqrt(covariances.diagonal(axis1=2, axis2=3))
-    moving: BoolArray = np.asarray((np.abs(shift) > np.clip(_UNSURE * deviation, *_SETTLED_PX)).any(axis=(1, 2)))
+    least, most = _SETTLED_PX
+    settled = np.minimum(np.maximum(_UNSURE * deviation, least), most)
+    moving: BoolArray = np.asarray((np.abs(shift) > settled).any(axis=(1, 2)))
     corners = sides.ends.reshape(-1, 8, 2).take(_CORNERS, axis=1) + shift
     return RefinedCorners(corners, covariances, contrast, noise, doubt), moving

@@ -114,7 +114,7 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
     onward = layer.project(se3.apply(T, on_marker(middle + pattern.onward, size))) - nodes[:, 2]
     widest = math.hypot(layer.blur, float(np.linalg.norm(layer.lag_blur)))
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, _COLUMNS, widest)
-    blur = blurs(sides.normal[:, 0], layer.blur, layer.lag_blur[None])
+    blur = blurs(sides.normal, layer.blur, layer.lag_blur[None])
     modelled = _model(sides, pattern.step, blur)
     measured = measure(counts_of(sides.pixel, layer.image), modelled, REACHED * blur[0], len(nodes))
     used = measured.variance[0] < HOPELESS
@@ -139,25 +139,23 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
 
 def _model(
     sides: Sides, step: FloatArray, blur: tuple[FloatArray, FloatArray]
-) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """White's share of every pixel but for a constant, its derivative by distance, and its weight, (M, C, E, 1)."""
-    value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32))
-    sign = step[:, None].astype(np.float32)
-    value *= sign
-    slope *= sign
+) -> tuple[Float32Array, Float32Array, BoolArray]:
+    """White's share of every pixel but for a constant, its derivative by distance, whether it counts, (M, C, E, 1)."""
+    sharpness, height = (1.0 / blur[0]).astype(np.float32), step[:, None].astype(np.float32)
+    value, slope = blurred_step(sides.distance, sharpness, height)
     ends = _QUIET * blur[1] / sides.along
     straight = sides.fresh & (sides.t > ends) & (sides.t < 1.0 - ends)
-    weight: BoolArray = np.asarray((np.abs(sides.distance) <= sides.across - _QUIET * blur[0]) & straight)
+    counting: BoolArray = np.asarray((np.abs(sides.distance) <= sides.across - _QUIET * blur[0]) & straight)
     if sides.inside is not None:
-        weight &= sides.inside
-    return value, slope, weight.astype(np.float32)
+        counting &= sides.inside
+    return value, slope, counting
 
 
 def _design(
-    T: FloatArray, size: float, pattern: GridEdges, sides: Sides, weight: Float32Array, camera: Camera
+    T: FloatArray, size: float, pattern: GridEdges, sides: Sides, counting: BoolArray, camera: Camera
 ) -> FloatArray:
     """Derivative (E, 6) of displacements along the normals by translation and rotation, where columns count."""
-    counted: BoolArray = np.asarray(weight.any(axis=0))
+    counted: BoolArray = np.asarray(counting.any(axis=0))
     t = (sides.t * counted).sum(axis=(0, 2)) / np.maximum(counted.sum(axis=(0, 2)), 1)
     shares = pattern.nodes[:, 0] + t[:, None] * (pattern.nodes[:, 4] - pattern.nodes[:, 0])
     J = pose_jacobian(T, on_marker(shares, size), camera)

@@ -54,7 +54,7 @@ class Sides:
     inside: BoolArray | None
     #: (E, m, 2) unit normal inward, in the middle of each part
     normal: FloatArray
-    #: (E, 1) distance of the opposite side [px]
+    #: (E, m) distance of the opposite side along the normals [px]
     across: FloatArray
     #: (E, 1) length [px]
     along: FloatArray
@@ -95,28 +95,28 @@ def columns_across(
     shape, cells, columns, blur_px : as of :func:`sides_of`
     """
     span = nodes[:, 4] - nodes[:, 0]
-    du, dv = span[:, :1], span[:, 1:]
-    steep = np.abs(dv) > np.abs(du)
+    steep = (np.abs(span[:, 1]) > np.abs(span[:, 0]))[:, None]
     share, weights = _parts(cells, columns)
-    by_column = (2, columns, len(nodes), cells)
-    (along, rate), (across, climb) = (
-        (np.where(upright, nodes[..., 1], nodes[..., 0]) @ weights).reshape(by_column) for upright in (steep, ~steep)
-    )
+    # First the coordinate in which columns follow one another, then that along them.
+    upright, opposite_upright = _swapped(nodes, steep), _swapped(opposite, steep[:, 0])
+    lines = upright.transpose(2, 0, 1)[:, None] @ weights
+    (along, rate), (across, climb) = lines.reshape(2, 2, columns, len(nodes), cells)
     # Columns are rounded to whole pixels, by at most half a pixel: over that distance the side is straight.
     whole, slope = np.rint(along), climb / rate
     ahead = whole - along
     centre = across + slope * ahead
-    # Sign of the inward normal, by the side of the line on which the opposite side lies.
-    turn = du * opposite[:, 1:] - dv * opposite[:, :1]
-    inward = np.sign(turn * np.where(steep, -dv, du))
+    # Within a part, the slope hardly changes. Inward is where the opposite side lies.
+    slope = slope[columns // 2]
+    inward = np.sign(opposite_upright[:, 1:] - slope * opposite_upright[:, :1])
     pitch = inward / np.sqrt(1.0 + slope * slope)
-    by_way, leaning = pitch[columns // 2], -(slope * pitch)[columns // 2]
-    normal = np.stack([np.where(steep, by_way, leaning), np.where(steep, leaning, by_way)], axis=-1)
+    normal = _swapped(np.stack([-slope * pitch, pitch], axis=-1), steep)
     half = min(max(math.ceil(_REACHES * blur_px + 1.0), _SHORTEST), _LONGEST)
     base, offsets = np.rint(centre), np.arange(-half, half + 1)[:, None, None, None]
     fresh, inside = _seen(whole, base, steep, nodes, shape, half)
     off, rise = ((base - centre) * pitch).astype(np.float32), pitch.astype(np.float32)
-    across_stride, along_stride = np.where(steep, 1, shape[1]), np.where(steep, shape[1], 1)
+    # For each part, not for each side: numpy is slow where it repeats the few numbers of a row.
+    parts_steep = np.repeat(steep, cells, axis=1)
+    across_stride, along_stride = np.where(parts_steep, 1, shape[1]), np.where(parts_steep, shape[1], 1)
     pixel = (base * across_stride + whole * along_stride).astype(np.int64)
     return Sides(
         share + ahead / rate,
@@ -125,10 +125,15 @@ def columns_across(
         pixel + across_stride * offsets,
         inside,
         normal,
-        np.abs((opposite * normal[:, cells // 2]).sum(axis=-1, keepdims=True)),
-        np.sqrt((span * span).sum(axis=-1, keepdims=True)),
+        np.abs((normal @ opposite[..., None])[..., 0]),
+        np.hypot(span[:, :1], span[:, 1:]),
         nodes[:, ::4],
     )
+
+
+def _swapped(places: FloatArray, where: BoolArray) -> FloatArray:
+    """Places (..., 2) with both coordinates swapped ``where`` (...)."""
+    return np.where(where[..., None], places[..., ::-1], places)
 
 
 @cache
@@ -151,8 +156,8 @@ def _seen(
     np.not_equal(whole[1:], whole[:-1], out=fresh[1:])
     np.not_equal(whole[0, :, 1:], whole[-1, :, :-1], out=fresh[0, :, 1:])
     margin = half + _BEYOND_NODES
-    last = nodes[..., 0].max() - shape[1], nodes[..., 1].max() - shape[0]
-    if nodes.min() >= margin and max(last) <= -1.0 - margin:
+    u, v = nodes.reshape(-1, 2).max(axis=0).tolist()
+    if nodes.min() >= margin and max(u - shape[1], v - shape[0]) <= -1.0 - margin:
         return fresh, None
     far, end = np.where(steep, shape[::-1], shape).T[..., None] - 1.0
     fresh &= (whole >= 0.0) & (whole <= end) & (base >= _BOTH_SIDES) & (base <= far - _BOTH_SIDES)
@@ -192,22 +197,22 @@ def _changes(inward: Float32Array) -> Float32Array:
 
 
 def blurs(normal: FloatArray, optics: float, lag_blur: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Blur (E, 1) across and along sides with normals (E, 2), of markers with a motion blur (N, 2) [px]."""
-    u, v = normal[:, 0].reshape(len(lag_blur), -1), normal[:, 1].reshape(len(lag_blur), -1)
+    """Blur (E, m) across and along sides with normals (E, m, 2), of markers with a motion blur (N, 2) [px]."""
+    u, v = normal[..., 0].reshape(len(lag_blur), -1), normal[..., 1].reshape(len(lag_blur), -1)
     across, along = lag_blur[:, :1] * u + lag_blur[:, 1:] * v, lag_blur[:, 1:] * u - lag_blur[:, :1] * v
-    square = optics * optics
-    return np.sqrt(square + across * across).reshape(-1, 1), np.sqrt(square + along * along).reshape(-1, 1)
+    square, shape = optics * optics, normal.shape[:2]
+    return np.sqrt(square + across * across).reshape(shape), np.sqrt(square + along * along).reshape(shape)
 
 
 def model(
     sides: Sides, behind: Float32Array, blur: tuple[FloatArray, FloatArray]
-) -> tuple[Float32Array, Float32Array, Float32Array]:
-    """Share of white in every pixel, up to a constant, its derivative by distance, and the pixel's weight.
+) -> tuple[Float32Array, Float32Array, BoolArray]:
+    """Share of white in every pixel, up to a constant, its derivative by distance, and whether the pixel counts.
 
     Parameters
     ----------
     behind : (N, 4, m, 2) of :func:`edges_behind`
-    blur : (E, 1) across and along the sides
+    blur : (E, m) across and along the sides
 
     Returns
     -------
@@ -219,32 +224,33 @@ def model(
     t = sides.t.astype(np.float32)
     z = np.stack([t, 1.0 - t]) * (sides.along / blur[1]).astype(np.float32)
     own = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0)
-    fall = -own
-    value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32))
-    value *= fall
-    slope *= fall
+    value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32), -own)
     narrow = cell < _NARROW * blur[0]
     if narrow.any():
-        which, edges = np.flatnonzero(narrow), behind.reshape(-1, cells, len(NEIGHBOURS))
+        which, edges = np.flatnonzero(narrow.any(axis=1)), behind.reshape(-1, cells, len(NEIGHBOURS))
         _add_neighbours(value, slope, sides, which, edges, blur)
     reach = np.where(narrow, cell, cell - 2.0 * blur[0])
     quiet = np.minimum(reach, np.maximum(cell - _PLATE_EDGE_SHOWS * blur[0], 0.0))
-    weight = (sides.distance >= -quiet.astype(np.float32)) & (sides.distance <= reach.astype(np.float32))
-    weight &= sides.fresh & (own > _MOSTLY)
+    counting: BoolArray = np.asarray(sides.distance >= -quiet.astype(np.float32))
+    counting &= sides.distance <= reach.astype(np.float32)
+    counting &= sides.fresh & (own > _MOSTLY)
     if sides.inside is not None:
-        weight &= sides.inside
-    return value, slope, weight.astype(np.float32)
+        counting &= sides.inside
+    return value, slope, counting
 
 
-def blurred_step(distance: Float32Array, sharpness: Float32Array) -> tuple[Float32Array, Float32Array]:
-    """A step from 0 to 1 at zero, and its derivative, blurred by a Gaussian; ``sharpness`` is its inverse width."""
+def blurred_step(
+    distance: Float32Array, sharpness: Float32Array, height: Float32Array
+) -> tuple[Float32Array, Float32Array]:
+    """A step from 0 to ``height`` at zero, and its derivative, blurred by a Gaussian of inverse width ``sharpness``."""
+    half = np.float32(0.5) * height
     z = distance * sharpness
     square = z * z
-    bent = np.tanh(z * (square * _CUBIC + _LINEAR))
-    slope = (1.0 - bent * bent) * (square * (1.5 * _CUBIC) + 0.5 * _LINEAR) * sharpness
-    bent *= 0.5
-    bent += 0.5
-    return bent, np.asarray(slope, dtype=np.float32)
+    step = np.tanh(z * (square * _CUBIC + _LINEAR))
+    slope = (1.0 - step * step) * (square * (3.0 * _CUBIC) + _LINEAR) * (half * sharpness)
+    step += 1.0
+    step *= half
+    return step, slope
 
 
 def _add_neighbours(
@@ -258,12 +264,12 @@ def _add_neighbours(
     """Add to the model of the sides ``which`` what the edges ``behind`` (E, m, 2) contribute, blurred along."""
     cells = behind.shape[1]
     t = sides.t[:, which, :, None]
-    z = (t * cells - np.arange(cells + 1)) * (sides.along / (cells * blur[1]))[which, None]
-    step = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR))
-    amounts = (step[..., :-1] - step[..., 1:]).astype(np.float32) @ behind[which]
+    z = (t * cells - np.arange(cells + 1)) * (sides.along / (cells * blur[1]))[which, :, None]
+    begun = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR))
+    amounts = (begun[..., :-1] - begun[..., 1:]).astype(np.float32) @ behind[which]
     width = (sides.across / cells)[which].astype(np.float32)
     sharpness = (1.0 / blur[0])[which].astype(np.float32)
     for index, number in enumerate(NEIGHBOURS):
-        share, rise = blurred_step(sides.distance[:, :, which] - number * width, sharpness)
-        value[:, :, which] += amounts[..., index] * share
-        slope[:, :, which] += amounts[..., index] * rise
+        step, rise = blurred_step(sides.distance[:, :, which] - number * width, sharpness, amounts[..., index])
+        value[:, :, which] += step
+        slope[:, :, which] += rise

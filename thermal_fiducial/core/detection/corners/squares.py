@@ -26,6 +26,8 @@ _INCONSISTENT = 12.0
 # Step of the differences from which the derivatives are taken [px]: a millionth of a side, far above rounding.
 _STEP_PX = 1e-4
 _EYE, _OF_EACH = np.eye(2), np.eye(4)[:, None, :, None]
+# Mean displacement of all corners, for each of them.
+_TOGETHER = np.kron(np.full((4, 4), 0.25), _EYE)
 
 
 class Squared(NamedTuple):
@@ -53,9 +55,7 @@ def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squ
     at : (N, 4) initial corners
     seen, covariance : (N, 8, 1), (N, 8, 8) measured displacements of the corners [px]
     """
-    together = np.empty((len(seen), 4, 2))
-    together[:] = seen.reshape(-1, 4, 2).mean(axis=1, keepdims=True)
-    nearest = _corrected(at, together.reshape(-1, 8, 1), seen, covariance)
+    nearest = _corrected(at, _TOGETHER @ seen, seen, covariance)
     refuted = np.flatnonzero(nearest.chi2 > _INCONSISTENT)
     if len(refuted):
         other = _corrected(at.only(refuted), seen[refuted], seen[refuted], covariance[refuted])
@@ -77,9 +77,10 @@ def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance:
         before, moved = moved, seen - spread @ weighted
         if np.abs(moved - before).max() < _BENDS_PX:
             break
-    chi2, left = (error * weighted).sum(axis=(1, 2)), ((variance * weighted) ** 2).sum(axis=(1, 2))
-    constrained = 2.0 - (variance * information * _EYE).sum(axis=(1, 2))
-    doubt = np.where(chi2 > _INCONSISTENT, left, 0.0)
+    chi2 = np.einsum('nij,nij->n', error, weighted)
+    left = variance * weighted
+    constrained = 2.0 - np.einsum('nij,nii->n', variance, information)
+    doubt = np.where(chi2 > _INCONSISTENT, np.einsum('nij,nij->n', left, left), 0.0)
     return Squared(moved, covariance - spread @ information @ spread.swapaxes(1, 2), chi2, doubt, constrained)
 
 
@@ -100,6 +101,6 @@ def squareness(x: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArr
     weight = perspective(outlines)[..., None]
     corners = np.concatenate([weight * outlines, weight], axis=-1)
     h1, h2 = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
-    both, first, second = ((a * b).sum(axis=1) for a, b in ((h1, h2), (h1, h1), (h2, h2)))
+    both, first, second = (np.einsum('qk,qk->q', a, b) for a, b in ((h1, h2), (h1, h1), (h2, h2)))
     value = (np.stack([2.0 * both, first - second]) / (first + second)).reshape(2, -1, 9).swapaxes(0, 1)
     return value[..., :1], (value[..., 1:] - value[..., :1]) / _STEP_PX
