@@ -75,6 +75,19 @@ def test_a_table_wider_than_the_window_keeps_its_words(monkeypatch):
     assert all(f'headline{index}' in out.getvalue() for index in range(8))
 
 
+def test_a_table_that_fits_the_window_stays_within_it(monkeypatch):
+    """Between its least and its natural width rich prints beyond the window, and cuts the last column."""
+    out = io.StringIO()
+    monkeypatch.setattr(tables, 'Console', lambda: Console(file=out, width=80))
+    headers = 'marker|views [frames]|first view [s]|corner sigma [px]|residual [px]|sigma [mm]|sigma [deg]|error [mm]'
+    table = tables.table_of('', headers.split('|'))
+    table.add_row('0', '171', '4.10', '0.0173', '-', '0', '0', '0.000001')
+    tables.show(table)
+    shown = out.getvalue()
+    assert set(headers.replace('|', ' ').split()) | {'0.000001'} <= set(shown.split())
+    assert max(map(len, shown.splitlines())) <= 80
+
+
 @pytest.mark.parametrize(
     ('command', 'said'),
     [

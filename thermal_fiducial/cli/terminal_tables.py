@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 _WIDEST = 1000
 
@@ -13,7 +14,8 @@ def table_of(title: str, headers: Sequence[str], left: Sequence[str] = ()) -> Ta
     """An empty table, aligned to the right except for the columns named in ``left``."""
     table = Table(title=title or None, title_justify='left', box=box.SIMPLE_HEAD, pad_edge=False)
     for header in headers:
-        table.add_column(header, justify='left' if header in left else 'right', overflow='fold')
+        # As a Text, since rich takes the unit in [mm] for a style.
+        table.add_column(Text(header), justify='left' if header in left else 'right', overflow='fold')
     return table
 
 
@@ -22,9 +24,7 @@ def show(table: Table) -> None:
     console = Console()
     if _least_width(console, table) > console.width:
         table.collapse_padding = True
-        # Otherwise rich narrows the widest column and truncates its words.
-        for column in table.columns:
-            column.width = column.min_width
+    _set_widths(console, table)
     console.width = max(console.width, _least_width(console, table))
     console.print(table)
 
@@ -33,6 +33,23 @@ def fits(table: Table) -> bool:
     """Whether the window is wide enough for all words."""
     console = Console()
     return _least_width(console, table) <= console.width
+
+
+def _set_widths(console: Console, table: Table) -> None:
+    """Give each column its longest word, and share what is left among those with longer lines.
+
+    Rich by itself narrows the widest column first, truncates its words, and prints beyond the window.
+    """
+    spare = console.width - _least_width(console, table)
+    wanted = [max(len(str(text)) for text in (column.header, *column.cells)) for column in table.columns]
+    widths = [column.min_width or 0 for column in table.columns]
+    while spare > 0 and widths != wanted:
+        for index, width in enumerate(widths):
+            if spare > 0 and width < wanted[index]:
+                widths[index] += 1
+                spare -= 1
+    for column, width in zip(table.columns, widths, strict=True):
+        column.width = width
 
 
 def _least_width(console: Console, table: Table) -> int:
