@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from thermal_fiducial.core.mapping.map_data import MarkerMap
     from thermal_fiducial.core.mapping.mapper import MarkerMapper
     from thermal_fiducial.core.measurements import CameraPose, ImuSample, Odometry
-    from thermal_fiducial.core.pipeline import Pipeline, PipelineConfig
+    from thermal_fiducial.core.pipeline import Pipeline
     from thermal_fiducial.errors import InputError
     from thermal_fiducial.files.camera_info import load_camera
     from thermal_fiducial.files.dictionary import load_dictionary
     from thermal_fiducial.files.marker_map import load_map, save_map
-    from thermal_fiducial.files.sensor_bag import read_bag, ThermalFrame
+    from thermal_fiducial.files.sensor_bag import read_bag
     from thermal_fiducial.replay.settings import load_config
     from thermal_fiducial.sim.writer import simulate
 
@@ -52,9 +52,7 @@ __all__ = [
     'MarkerMapper',
     'Odometry',
     'Pipeline',
-    'PipelineConfig',
     'PoseEkf',
-    'ThermalFrame',
     'load_camera',
     'load_config',
     'load_dictionary',
@@ -71,12 +69,12 @@ _MODULES = {
     'core.mapping.map_data': ('MarkerMap',),
     'core.mapping.mapper': ('MarkerMapper',),
     'core.measurements': ('CameraPose', 'ImuSample', 'Odometry'),
-    'core.pipeline': ('Pipeline', 'PipelineConfig'),
+    'core.pipeline': ('Pipeline',),
     'errors': ('InputError',),
     'files.camera_info': ('load_camera',),
     'files.dictionary': ('load_dictionary',),
     'files.marker_map': ('load_map', 'save_map'),
-    'files.sensor_bag': ('ThermalFrame', 'read_bag'),
+    'files.sensor_bag': ('read_bag',),
     'replay.settings': ('load_config',),
     'sim.writer': ('simulate',),
 }

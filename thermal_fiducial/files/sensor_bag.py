@@ -31,6 +31,15 @@ def read_bag(path: str | Path, remap: Mapping[str, str] | None = None) -> Iterat
         ``thermal/camera_info`` and ``imu/data``; missing ones are skipped
     remap : topic of the bag to one of these names
 
+    Yields
+    ------
+    Camera
+        The calibration, as often as the bag has it.
+    ImuSample
+        Angular velocity and specific force.
+    ThermalFrame
+        All else: ``stamp_ns``, and ``counts``, an (H, W) array of uint16, or of uint8 in an 8-bit bag.
+
     Raises
     ------
     InputError

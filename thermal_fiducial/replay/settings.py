@@ -78,6 +78,12 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> PipelineCon
     path : ROS parameter file; None: the defaults
     overrides : name to value, which override the file
 
+    Returns
+    -------
+    PipelineConfig
+        A section a node, named like it: ``tau2_camera``, ``aruco_detector``, ``marker_mapper`` and ``pose_ekf``, with
+        the parameters as attributes. :class:`Pipeline` takes the whole, a stage its section.
+
     Raises
     ------
     InputError
