@@ -77,3 +77,29 @@ def test_an_axis_that_has_never_changed_is_at_rest(imu, noise):
     assert set(verdicts(imu, still)) == {Verdict.USE}
     assert set(verdicts(imu, noise(50), 400)) == {Verdict.USE}
     assert set(verdicts(imu, still, 450)) == {Verdict.USE}
+
+
+def excesses(imu, stamps_ms):
+    """By how much [ms] each step of samples at these stamps is longer than usual."""
+    rng, found = np.random.default_rng(4), []
+    for stamp in stamps_ms:
+        imu.judge(ImuSample(round(stamp * 1e6), rng.normal(size=3), rng.normal(size=3)))
+        found.append(imu.excess_ns * 1e-6)
+    return found
+
+
+def test_a_step_longer_than_recent_ones_is_noticed(imu):
+    found = excesses(imu, [*range(0, 500, 5), 510, 515])
+    assert found[:100] == [0.0] * 100
+    # the longest of recent steps decays with 2 s: nothing between samples 5 ms apart
+    assert found[100:] == pytest.approx([10.0, 0.0], abs=0.05)
+
+
+def test_where_steps_are_uneven_long_ones_are_usual(imu):
+    assert max(excesses(imu, np.cumsum([5, 5, 5, 15] * 50))[4:]) == 0.0
+
+
+def test_the_end_of_a_gap_is_measured_from_its_first_sample(imu):
+    # Three samples prove that it is the end of a gap; the gap ends with the first of them.
+    found = excesses(imu, [*range(0, 500, 5), 535, 540, 545, 550])
+    assert found[-4:] == pytest.approx([0.0, 0.0, 35.0, 0.0], abs=0.05)

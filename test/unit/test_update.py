@@ -19,7 +19,14 @@ from thermal_fiducial.core.filter.state import (
     TIME_OFFSET,
     VELOCITY,
 )
-from thermal_fiducial.core.filter.update import body_pose, MotionAtPose, pose_innovation, PoseUpdater, slide
+from thermal_fiducial.core.filter.update import (
+    body_pose,
+    MotionAtPose,
+    pose_innovation,
+    PoseUpdater,
+    slide,
+    with_clock_step,
+)
 from thermal_fiducial.core.geometry.se3 import so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose
 
@@ -273,3 +280,19 @@ def test_jitter_of_the_stamps_is_learned(estimate, motion):
         noise = updater.correct(pose, updater.innovation(now, pose, motion), motion).pose_noise
     # the memory of 300 poses of one number: 6 % of the deviation; three of that
     assert np.sqrt(noise.jitter) == pytest.approx(3e-3, rel=0.18)
+
+
+def test_a_step_of_the_clock_of_the_imu_does_not_show_in_the_next_pose(estimate, motion):
+    """The state at the camera's stamp is as well known as before; that at the IMU's is unknown along the motion."""
+    before = replace(estimate, covariance=1e-6 * np.eye(SIZE))
+    after = with_clock_step(before, motion.imu, 0.01)
+    J = np.eye(SIZE)
+    J[CORE, TIME_OFFSET] = slide(estimate.state, motion.imu)
+    at_camera = [(J @ each.covariance @ J.T)[CORE, CORE] for each in (before, after)]
+    np.testing.assert_allclose(*at_camera, atol=1e-12)
+    added = after.covariance - before.covariance
+    # v times 10 ms
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(added)[POSITION]), 0.01 * np.abs(estimate.state.velocity_body), rtol=1e-9
+    )
+    assert added[TIME_OFFSET, TIME_OFFSET] == pytest.approx(1e-4)

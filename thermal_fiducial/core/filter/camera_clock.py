@@ -13,9 +13,9 @@ from statistics import median
 
 from thermal_fiducial.core.measurements import CameraPose
 
-#: Smallest step [ns]: one frame period. Smaller ones are left to the estimated clock offset, as motion is nearly
-#: straight over that time.
-_SMALLEST_NS = 35_000_000
+#: Smallest step [ns] that is removed: one frame period. Smaller ones are left to the estimated clock offset, as motion
+#: is nearly straight over that time.
+SMALLEST_STEP_NS = 35_000_000
 #: Poses in a row that must agree on a step; poses kept for the usual delay, and the fewest for it to be known.
 _POSES, _USUAL, _ENOUGH = 5, 30, 15
 #: Largest spread [ns] of the delays of agreeing poses, beside half of the step.
@@ -65,7 +65,7 @@ class CameraClock:
         """
         late_ns = newest_ns - pose.stamp_ns
         usual_ns = median(late for _, late in self._usual) if len(self._usual) >= _ENOUGH else late_ns
-        if abs(late_ns - usual_ns) < _SMALLEST_NS:
+        if abs(late_ns - usual_ns) < SMALLEST_STEP_NS:
             self._usual.append((newest_ns, late_ns))
             self._latest.clear()
             self._imu_jump_ns = 0

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.camera_clock import CameraClock
+from thermal_fiducial.core.filter.camera_clock import CameraClock, SMALLEST_STEP_NS
 from thermal_fiducial.core.filter.coasting import usable_seconds
 from thermal_fiducial.core.filter.condition import coasting_seconds, condition_of
 from thermal_fiducial.core.filter.history import History
@@ -106,6 +106,8 @@ class PoseEkf:
         imu, buffer = np.concatenate((sample.angular_velocity, sample.linear_acceleration)), self._history.imu
         seconds = (sample.stamp_ns - buffer.newest_ns) / SECOND_NS
         densities = self._noise.densities(imu, seconds) if len(buffer) else np.zeros(6)
+        if self._config.estimate_time_offset and 0 < self._input.excess_ns < SMALLEST_STEP_NS:
+            self._history.suspect_clock_step(self._input.excess_ns)
         buffer.append(sample.stamp_ns, imu, densities)
         return True
 

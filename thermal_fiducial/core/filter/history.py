@@ -14,12 +14,15 @@ from thermal_fiducial.core.filter.initialization import no_gravity, WINDOW_SECON
 from thermal_fiducial.core.filter.innovations import PoseLog, PoseUpdate
 from thermal_fiducial.core.filter.propagation import propagated
 from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
-from thermal_fiducial.core.filter.update import MotionAtPose
+from thermal_fiducial.core.filter.update import MotionAtPose, with_clock_step
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Without poses the propagated estimate is stored at this interval [ns], which bounds what a late pose re-propagates.
 _KEPT_EVERY_NS = 100_000_000
+#: Standard deviation of a suspected step of the IMU's clock as a share of its size: it is all of it or nothing, samples
+#: being lost, with equal odds.
+_STEP_OR_LOSS = 0.5
 
 
 class History:
@@ -37,6 +40,8 @@ class History:
         self.imu, self.log = ImuBuffer(), PoseLog()
         self._poses: list[CameraPose] = []
         self._beliefs = [Belief()]
+        #: suspected steps of the IMU's clock: stamp of the sample before [ns], standard deviation [s]
+        self._clock_steps: list[tuple[int, float]] = []
         #: the estimate at the newest sample
         self.main: Hypothesis | None = None
 
@@ -50,8 +55,16 @@ class History:
         estimate = hypothesis.estimate
         if estimate.stamp_ns >= until_ns:
             return hypothesis
+        for begin_ns, std in self._clock_steps:
+            if estimate.stamp_ns <= begin_ns < until_ns:
+                estimate = with_clock_step(self.carried(hypothesis, begin_ns).estimate, self.imu.at(begin_ns), std)
+                hypothesis = hypothesis._replace(estimate=estimate)
         steps = self.imu.steps(estimate.stamp_ns, until_ns)
         return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self._hypotheses.random_walks))
+
+    def suspect_clock_step(self, size_ns: int) -> None:
+        """Count with a step of the IMU's clock by ``size_ns`` after the newest sample; or samples are lost there."""
+        self._clock_steps.append((self.imu.newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
 
     def alternative(self) -> Hypothesis | None:
         """The alternative hypothesis at the newest sample."""
@@ -69,6 +82,7 @@ class History:
         oldest = self._beliefs[0]
         del self._poses[: bisect_right(self._poses, oldest.pose_stamp_ns, key=_stamp)]
         self.imu.forget_before(min(horizon_ns, oldest.stamp_ns) if oldest.hypotheses else horizon_ns)
+        self._clock_steps = [step for step in self._clock_steps if step[0] >= self.imu.oldest_ns]
 
     def insert(self, pose: CameraPose) -> None:
         """Add a pose; :meth:`take_in` applies it once the samples reach its instant."""

@@ -11,6 +11,8 @@ CLOCK_EVIDENCE, GAP_EVIDENCE = 10, 3
 #: A step between stamps is unusual beyond this multiple of the longest recent one and beyond this length [ns]; time
 #: constant [ns] with which the longest one decays.
 UNUSUAL_FACTOR, UNUSUAL_NS, MEMORY_NS = 3.0, 30_000_000, 2_000_000_000
+#: A step longer than this multiple of the longest recent one is due to lost samples, or to a step of the clock.
+LOST_FACTOR = 1.5
 #: A sensor saturates at its full scale; a reading beyond this multiple of it is a corrupt message.
 IMPOSSIBLE_RANGES = 2.0
 #: An axis is frozen once it has repeated a value for this long [s], in at least this many samples, and in this multiple
@@ -80,6 +82,8 @@ class ImuInput:
         self._longest_ns = 0.0
         #: longest step [ns] that is accepted at once, without waiting for a sample that follows
         self._usual_ns: float = min(UNUSUAL_NS, self._max_gap_ns)
+        #: by how much the step to the last sample that was used exceeds the longest recent one, if by far [ns]
+        self.excess_ns = 0
         #: jump of the stamps at the last sample that was used [ns]; 0 for a usual step
         self.jump_ns = 0
 
@@ -105,6 +109,9 @@ class ImuInput:
     def _follow(self, stamp_ns: int, jump_ns: int = 0) -> None:
         assert self._last_ns is not None
         step_ns = stamp_ns - self._last_ns
+        gap_ns = jump_ns or step_ns
+        unusual = gap_ns > LOST_FACTOR * self._longest_ns > 0.0
+        self.excess_ns = round(gap_ns - self._longest_ns) if unusual else 0
         if 0 < step_ns <= self._max_gap_ns:
             self._longest_ns = max(self._longest_ns * (1.0 - step_ns / MEMORY_NS), step_ns)
             self._usual_ns = min(max(UNUSUAL_FACTOR * self._longest_ns, UNUSUAL_NS), self._max_gap_ns)

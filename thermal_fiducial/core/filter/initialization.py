@@ -14,7 +14,6 @@ from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
     ACCELEROMETER_MATRIX,
-    CORE,
     Estimate,
     EXTRINSICS,
     GRAVITY,
@@ -25,10 +24,9 @@ from thermal_fiducial.core.filter.state import (
     POSITION,
     SIZE,
     SYSTEMATIC,
-    TIME_OFFSET,
     VELOCITY,
 )
-from thermal_fiducial.core.filter.update import slide
+from thermal_fiducial.core.filter.update import of_clock, slide
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import FloatArray
@@ -111,10 +109,8 @@ def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatA
 
     The first pose measures the state at the camera's stamp, X(t + s) = X(t) Exp(slide s).
     """
-    slid = np.zeros(SIZE)
-    slid[CORE] = -slide(state, imu)
-    slid[TIME_OFFSET] = 1.0
-    covariance = np.outer(slid, slid)
+    error = of_clock(slide(state, imu))
+    covariance = np.outer(error, error)
     # Second order: clock offset times the unknown velocity.
     covariance[POSITION, POSITION] += np.eye(3) * config.initial_velocity_std**2
     return np.asarray(config.time_offset_std**2 * covariance)

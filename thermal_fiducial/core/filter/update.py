@@ -73,6 +73,28 @@ def slide(state: NavigationState, imu: FloatArray) -> FloatArray:
     return moved
 
 
+def of_clock(moved: FloatArray) -> FloatArray:
+    """(48,) error by 1 s of clock offset with which the state at the camera's stamps is right; ``moved``: the slide."""
+    error = _of_core(-moved)
+    error[TIME_OFFSET] = 1.0
+    return error
+
+
+def with_clock_step(estimate: Estimate, imu: FloatArray, std: float) -> Estimate:
+    """The estimate after an unknown step of the IMU's clock.
+
+    The clock offset changes, and state and stamp of the IMU no longer belong together. Poses do not show it at once, as
+    the state at their stamps stays the same.
+
+    Parameters
+    ----------
+    imu : (6,) the sample before it
+    std : standard deviation of the step [s]
+    """
+    error = of_clock(slide(estimate.state, imu))
+    return replace(estimate, covariance=estimate.covariance + std**2 * np.outer(error, error))
+
+
 def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> BodyPose:
     """Pose of the robot by a camera pose whose standard deviations are multiplied by ``scale``."""
     T_map_body = pose.T_map_camera @ inverse(T_body_camera)
@@ -170,8 +192,7 @@ class PoseUpdater:
         feigned = _FEIGNED * float(innovation.S_inverse.diagonal() @ noise)
         widest = max(variance, self.config.time_offset_std**2)
         consistent = min(variance / max(1.0 - variance * feigned, _LEAST_KEPT), widest)
-        slid = _of_core(-moved)
-        slid[TIME_OFFSET] = 1.0
+        slid = of_clock(moved)
         return P + half + half.T + (consistent - variance) * np.outer(slid, slid)
 
     def _gained(self, pose: BodyPose, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
