@@ -1,5 +1,6 @@
 """Nodes that DDS has left deaf: noticed by what others say that they publish, and started again."""
 
+from pathlib import Path
 import signal
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -13,6 +14,8 @@ from thermal_fiducial.ros.counting import CountingNode
 from thermal_fiducial.ros.hearing import Hearing
 
 pytestmark = pytest.mark.ros
+
+SHARED = Path('/dev/shm')
 
 
 class Pair:
@@ -37,7 +40,7 @@ class Pair:
                 status = DiagnosticStatus(name='mouth', values=[value, KeyValue(key='refused messages', value='0')])
                 self.diagnostics.send(DiagnosticArray(status=[status]))
                 self.graph.executor.spin_once(timeout_sec=0.02)
-            said.append(self.hearing.look())
+            said.append(self.hearing.look(stopped=look > 1))
             # The subscription begins with the third look; both ends are in this process.
             self.graph.spin_until(lambda n=look: n < 3 or self.diagnostics.listeners == 2)
         return said
@@ -64,10 +67,32 @@ def test_a_node_that_hears_nobody_although_others_are_there_is_deaf(pair):
     assert said.index('deaf: nothing arrives from any node') == 31
 
 
+def test_a_node_that_hears_no_more_after_it_heard_others_is_deaf_too(pair):
+    """It happened in flight: one message still came, and none from the node that publishes the input."""
+    said = pair.silent(40, [0, 0, 0, 0, 0, 0])
+    assert said.index('deaf: nothing arrives from any node') == 34
+
+
+def test_a_port_of_shared_memory_that_was_replaced_is_noticed_when_an_input_stops(pair):
+    """As Fast DDS replaces it: another process opens a new one under the same name."""
+    ports = [name for name in listening() if (SHARED / f'fastrtps_port{name}').exists()]
+    assert ports
+    assert pair.hearing.look(stopped=True) == ''
+    (SHARED / f'fastrtps_port{ports[0]}').unlink()
+    assert pair.hearing.look(stopped=False) == ''
+    assert pair.hearing.look(stopped=True) == f'deaf: port {ports[0]} of the shared memory has been replaced'
+
+
+def listening():
+    """Numbers of the ports of shared memory that threads of this process listen to."""
+    names = [file.read_text().strip() for file in Path('/proc/self/task').glob('*/comm')]
+    return [name.removeprefix('dds.shm.') for name in names if name.startswith('dds.shm.') and name[8:].isdigit()]
+
+
 def test_a_message_ends_the_suspicion(pair):
     pair.silent(6, [100, 130, 130, 130, 130, 140])
     pair.graph.send('imu/data', Imu())
-    assert pair.hearing.look() == ''
+    assert pair.hearing.look(stopped=False) == ''
     # Nothing is subscribed to for longer than that.
     pair.graph.spin_until(lambda: pair.diagnostics.listeners == 1)
     assert set(pair.silent(2)) == {''}

@@ -199,7 +199,7 @@ class StageNode(CountingNode, Generic[Config]):
         self._diagnosed_refused = self.refused
 
     def _listen(self) -> None:
-        self.deaf = self._hearing.look()
+        self.deaf = self._hearing.look(stopped=self._rates.stopped or bool(self._rates.stale))
         if self.deaf:
             self.get_logger().error(f'{self.deaf}; the node starts again')
 
