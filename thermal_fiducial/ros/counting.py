@@ -42,6 +42,8 @@ class Input:
         self.left = self._left_before = 0
         # The publisher's number of the message that was taken last; 0: not known.
         self._number = 0
+        #: of rclpy
+        self.subscription: Any = None
 
     def newest(self, message: Any, at_most: int) -> Any:
         """The newest of a message that has been counted and those queued behind it, of which ``at_most`` are taken.
