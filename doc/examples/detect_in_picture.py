@@ -16,6 +16,8 @@ def main(picture: str, calibration: str) -> None:
     config = load_config(dictionary='DICT_4X4_50', marker_size=0.3, bolometer_lag=0.0)
     detector = MarkerDetector(config.aruco_detector, load_dictionary('DICT_4X4_50'))
     counts = cv2.imread(picture, cv2.IMREAD_UNCHANGED)
+    if counts is None:
+        raise SystemExit(f'{picture}: no picture')
     markers = detector.detect(0, counts, load_camera(calibration))
     for row, corners in zip(markers, corners_px(markers), strict=True):
         points = ' '.join(f'({u:.2f}, {v:.2f})' for u, v in corners)

@@ -90,7 +90,10 @@ def test_a_run_without_truth_is_marked_so(runs, tmp_path, capsys):
     (blind / 'truth.tum').unlink()
     page = tmp_path / 'comparison.html'
     assert main(['evaluate', str(runs[0]), str(blind), '--compare', '--out', str(page)]) == 0
-    line = 'No errors of blind: no ground truth at their stamps (--truth names one).'
+    line = (
+        'No errors of blind: no ground truth at their stamps (--truth names one for all, truth.tum in a run folder one '
+        'for that run).'
+    )
     assert line in capsys.readouterr().out.replace('\n', ' ')
     assert line in page.read_text()
     # A comparison has no overview to lead to.

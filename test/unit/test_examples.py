@@ -60,6 +60,12 @@ def test_detect_in_picture(tmp_path, capsys):
     assert [line.split(':')[0] for line in lines] == ['marker 0', 'marker 1', 'marker 2', 'marker 3']
 
 
+def test_a_picture_that_is_not_there_is_named(tmp_path):
+    save_camera(tmp_path / 'camera.yaml', small_bag.CAMERA)
+    with pytest.raises(SystemExit, match=r'frame\.png: no picture'):
+        run('detect_in_picture', tmp_path / 'frame.png', tmp_path / 'camera.yaml')
+
+
 def test_localize_bag(folder, capsys):
     run('localize_bag', folder / 'bag', folder / 'params.yaml', folder / 'map.yaml', folder / 'pose.tum')
     assert capsys.readouterr().out == f'{folder / "pose.tum"}: tracking\n'

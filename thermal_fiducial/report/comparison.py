@@ -68,7 +68,8 @@ class Comparison:
         without = [name for name in self.names if not self.numbers[name]['evo']]
         if not without:
             return ''
-        return f'No errors of {", ".join(without)}: no ground truth at their stamps (--truth names one).'
+        where = '--truth names one for all, truth.tum in a run folder one for that run'
+        return f'No errors of {", ".join(without)}: no ground truth at their stamps ({where}).'
 
     def _rows(self, part: str, unit: str) -> list[tuple[str, ...]]:
         every = [self.numbers[name]['evo'].get(part, {}) for name in self.names]
