@@ -30,7 +30,9 @@ def main() -> int:
             minutes, warnings = soak(laps, folder, say, lockstep=arguments.lockstep)
             found = faults(minutes, laps.imu_count, warnings)
     if len(minutes) > 1:
-        print('grown since the second minute [MB]:', {name: round(mb, 1) for name, mb in growth_mb(minutes).items()})
+        print('grown since the second minute [MB], of it shared memory:')
+        for name, (grown, shared) in growth_mb(minutes).items():
+            print(f'  {name}: {grown:.1f}, {shared:.1f}')
         print('error has risen by {:.2f} mm, standard error {:.2f} mm'.format(*trend_mm(minutes)))
     print('\n'.join(found) or 'nothing amiss')
     return int(bool(found))

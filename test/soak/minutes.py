@@ -23,9 +23,14 @@ LOST_SHARE = 0.02
 
 @dataclass(frozen=True)
 class Minute:
-    """One minute: MB and per cent of a core by node, poses, root mean square and worst error of their positions."""
+    """One minute: MB and per cent of a core by node, poses, root mean square and worst error of their positions.
+
+    ``shared_mb`` is what of it is pages of DDS's shared memory. They belong to the segments of all nodes, and count for
+    every node that has read a message from them.
+    """
 
     memory_mb: dict[str, float]
+    shared_mb: dict[str, float]
     cpu_percent: dict[str, float]
     poses: int
     rms_mm: float
@@ -76,14 +81,22 @@ class Meter:
         seconds, self._at_ns = (elapsed_ns - self._at_ns) * 1e-9, elapsed_ns
         found = self._processes()
         memory = {name: process.memory_info().rss / 2**20 for name, process in found.items()}
+        shared = {name: shared_mb(process.pid) for name, process in found.items()}
         times = {name: sum(process.cpu_times()[:2]) for name, process in found.items()}
         before, self._cpu = self._cpu, times
         if before:
             cpu = {name: 100.0 * (times[name] - before[name]) / seconds for name in times}
             errors = 1e3 * self._errors.take()
             rms, worst = (np.sqrt(np.mean(errors**2)), errors.max()) if len(errors) else (0.0, 0.0)
-            self.minutes.append(Minute(memory, cpu, len(errors), float(rms), float(worst)))
+            self.minutes.append(Minute(memory, shared, cpu, len(errors), float(rms), float(worst)))
             self._say(row(len(self.minutes), self.minutes[-1]))
+
+
+def shared_mb(pid: int) -> float:
+    """Pages of shared memory that a process has touched."""
+    lines = Path(f'/proc/{pid}/status').read_text().splitlines()
+    (kilobytes,) = [line.split()[1] for line in lines if line.startswith('RssShmem:')]
+    return int(kilobytes) / 1024
 
 
 def node_processes(names: Iterable[str]) -> dict[str, psutil.Process]:
@@ -108,10 +121,13 @@ def row(number: int, minute: Minute) -> str:
     )
 
 
-def growth_mb(minutes: list[Minute]) -> dict[str, float]:
-    """What each node has grown by since the second minute, or since the first of two."""
-    settled = minutes[min(1, len(minutes) - 2)]
-    return {name: minutes[-1].memory_mb[name] - value for name, value in settled.memory_mb.items()}
+def growth_mb(minutes: list[Minute]) -> dict[str, tuple[float, float]]:
+    """What each node has grown by since the second minute, or since the first of two: all, and of it shared memory."""
+    settled, last = minutes[min(1, len(minutes) - 2)], minutes[-1]
+    return {
+        name: (last.memory_mb[name] - value, last.shared_mb[name] - settled.shared_mb[name])
+        for name, value in settled.memory_mb.items()
+    }
 
 
 def trend_mm(minutes: list[Minute]) -> tuple[float, float]:
@@ -131,9 +147,9 @@ def faults(minutes: list[Minute], imu_count: int, warnings: list[str]) -> list[s
     found = [f'said: {line}' for line in warnings]
     if len(minutes) < 2:
         return [*found, 'not two minutes were flown']
-    for name, grown in growth_mb(minutes).items():
+    for name, (grown, shared) in growth_mb(minutes).items():
         if grown > GROWTH_MB:
-            found.append(f'{name} grew by {grown:.1f} MB')
+            found.append(f'{name} grew by {grown:.1f} MB, {shared:.1f} of it shared memory')
     trend, deviation = trend_mm(minutes)
     if trend > TREND_MM + 3.0 * deviation:
         found.append(f'the error grew by {trend:.1f} mm')

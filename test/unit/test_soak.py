@@ -50,14 +50,17 @@ def test_the_truth_comes_round(laps):
 
 
 def minutes(memory, errors, poses=12_000):
-    return [Minute({'pose_ekf': mb}, {}, poses, error, 0.0) for mb, error in zip(memory, errors, strict=True)]
+    return [
+        Minute({'pose_ekf': mb}, {'pose_ekf': 0.5 * mb}, {}, poses, error, 0.0)
+        for mb, error in zip(memory, errors, strict=True)
+    ]
 
 
 @pytest.mark.parametrize(
     ('flown', 'expected'),
     [
         (minutes([90, 100, 101, 102], [9.0, 1.0, 1.1, 1.0]), []),
-        (minutes([90, 100, 103, 106], [1.0, 1.0, 1.0, 1.0]), ['pose_ekf grew by 6.0 MB']),
+        (minutes([90, 100, 103, 106], [1.0, 1.0, 1.0, 1.0]), ['pose_ekf grew by 6.0 MB, 3.0 of it shared memory']),
         (minutes([100] * 9, [9.0, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5]), ['the error grew by 3.5 mm']),
         (minutes([100] * 9, [9.0, 2.0, 4.0, 1.0, 5.0, 2.0, 4.0, 1.0, 5.0]), []),
         (minutes([100, 100], [1.0, 0.0], 6_000), ['12000 poses of 24000 samples of the IMU']),
