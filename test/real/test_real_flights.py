@@ -59,6 +59,22 @@ def test_the_fused_pose_stays_with_the_markers_by_their_systematic_error(camera,
     assert score.peak_mm < 1.33 * 29.0
 
 
+@pytest.mark.parametrize(
+    ('camera', 'other'), [('cam0', 'cam1'), pytest.param('cam1', 'cam0', marks=pytest.mark.nightly)]
+)
+def test_the_fused_pose_is_nearer_to_the_truth_than_its_markers(camera, other):
+    """Judged by the other camera, with a lens and a board of its own."""
+    run = board_run(camera, WHOLE)
+    stamps_ns, T_map_body = real_flights.board_reference(other)
+    judged = replace(run.flight, reference_ns=stamps_ns, reference=T_map_body)
+    fused, markers = run.updated.score(judged), run.markers.score(judged)
+    # Measured: 6.5 mm where markers alone are 10.6 mm off, 5.4 where they are 8.9; 0.31 deg for 0.46, 0.25 for 0.39.
+    assert fused.rms_mm < markers.rms_mm
+    assert fused.rms_deg < markers.rms_deg
+    # Asked of the claims, as the judge has errors of its own; measured 0.98 and 0.67.
+    assert 0.5 < fused.nees < 2.0
+
+
 #: Eight seconds have 13 gaps of more than 0.1 s; the error behind the longest ones is looked at at night.
 each_carpet = pytest.mark.parametrize(
     ('name', 'seconds'),

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 import yaml
 
+from support import self_calibration
 from support.batch_map import adjust
 from support.corner_runs import CornerFlight
 from thermal_fiducial.calibration.joint_pose import solve_camera_pose
@@ -40,6 +41,8 @@ _NEIGHBOURS = 4
 _FEWEST_MARKERS = 6
 #: Re-projection error [px] beyond which a frame's pose starts from its own markers, not from the last frame's pose.
 _LOST_PX = 2.0
+#: One frame in so many estimates lens and board: 50 of them.
+_OF_LENS = 16
 
 
 def folder(name) -> Path:
@@ -70,6 +73,30 @@ def april_board(camera='cam0', sigma_px=BOARD_SIGMA_PX, seconds=40.0, every=1) -
         size,
         ImuNoise(**published),
     )
+
+
+@cache
+def board_reference(camera) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (N,) [ns] and T_map_body (N, 4, 4) by ``camera`` alone, with lens and board from its own corners.
+
+    The published reference shares lens and board with the poses from the markers, and so their largest error. Where the
+    camera sits on the body is taken from it in the mean, as the published extrinsics belong to the published lens.
+    """
+    flight = april_board(camera)
+    place = {key: 4 * index + np.arange(4) for index, key in enumerate(sorted(flight.marker_map.markers))}
+    known = [flight.marker_map.markers[key] for key in place]
+    squares = corners_in_map(np.stack([m.T_map_marker for m in known]), np.array([m.size for m in known]))
+    seen = [np.concatenate([place[int(key)] for key in rows['id']]) for rows in flight.frames.values()]
+    views = self_calibration.Views(seen, [corners_px(rows).reshape(-1, 2) for rows in flight.frames.values()])
+    published = self_calibration.Lens(flight.camera.K, flight.camera.D)
+    some = self_calibration.Views(views.points[::_OF_LENS], views.pixels[::_OF_LENS])
+    lens, board = self_calibration.calibrate(some, published, squares.reshape(-1, 3))
+    stamps = np.array(list(flight.frames)) + round(1e9 * flight.time_offset)
+    T_map_camera = self_calibration.camera_poses(views, lens, board)
+    inside = (stamps >= flight.reference_ns[0]) & (stamps <= flight.reference_ns[-1])
+    mounted = inverse(flight.truth(stamps[inside])) @ T_map_camera[inside]
+    R_body_camera = Rotation.from_matrix(mounted[:, :3, :3]).mean().as_matrix()
+    return stamps, T_map_camera @ inverse(transform(R_body_camera, mounted[:, :3, 3].mean(axis=0)))
 
 
 @cache
