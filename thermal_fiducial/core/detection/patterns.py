@@ -228,9 +228,9 @@ class Decoder:
         return np.asarray((counts - counts[:, :1]) @ self._cells_of_samples)
 
 
-def shrunk(quads: FloatArray, cells: int) -> FloatArray:
-    """Outlines (Q, 4, 2) of the markers in white plates (Q, 4, 2) with a margin of one cell."""
-    return seen_between(quads, _in_plate(cells)).transpose(1, 2, 0)
+def shrunk(quads: FloatArray, cells: int, margin: float) -> FloatArray:
+    """Outlines (Q, 4, 2) of the markers in white plates (Q, 4, 2) with such a ``margin`` [cells]."""
+    return seen_between(quads, _in_plate(cells, margin)).transpose(1, 2, 0)
 
 
 def _beside_sides(cells: int) -> tuple[Float32Array, Float32Array]:
@@ -243,9 +243,9 @@ def _beside_sides(cells: int) -> tuple[Float32Array, Float32Array]:
 
 
 @cache
-def _in_plate(cells: int) -> FloatArray:
+def _in_plate(cells: int, margin: float) -> FloatArray:
     """Of :func:`bilinear`, (4, 4), for the corners of such a marker."""
-    low, high = 1.0 / (cells + 2), (cells + 1.0) / (cells + 2)
+    low, high = margin / (cells + 2.0 * margin), (cells + margin) / (cells + 2.0 * margin)
     return bilinear(np.array([low, high, high, low]), np.array([low, low, high, high]))
 
 

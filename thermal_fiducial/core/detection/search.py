@@ -19,6 +19,7 @@ from thermal_fiducial.core.detection.quads import (
     Scale,
     without_columns,
 )
+from thermal_fiducial.core.detection.refining import sides_px
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.
@@ -30,6 +31,8 @@ _HINT, _HINT_MARGIN = 0.5, 0.06
 # Factor on the shortest side of a marker in a picture for a display, which has little noise: in oblique views the other
 # sides are longer.
 _PICTURE_SIDE = 0.25
+# Width of cells up to which blur merges borders and plates of any margin [px].
+_MERGED_PX = 3.0
 _NONE = np.zeros(0, dtype=np.intp)
 
 
@@ -144,8 +147,15 @@ class BlindSearch:
 
 
 def _with_shrunk(outlines: FloatArray, cells: int) -> FloatArray:
-    """Outlines (Q, 4, 2), and the outlines of the markers in them if they are plates."""
-    return np.concatenate([outlines, shrunk(outlines, cells)]) if len(outlines) else outlines
+    """Outlines (Q, 4, 2), and those of the markers in them if they are plates with a margin of one cell, or of two.
+
+    Alignment makes up for half a cell. Two cells are tried for small markers alone: the borders of larger ones show.
+    """
+    if len(outlines) == 0:
+        return outlines
+    inner = shrunk(outlines, cells, 2.0)
+    small = inner[sides_px(inner) < _MERGED_PX * cells]
+    return np.concatenate([outlines, shrunk(outlines, cells, 1.0), small])
 
 
 def _large(quads: FloatArray, min_side_px: float) -> BoolArray:
