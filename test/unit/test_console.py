@@ -101,6 +101,33 @@ def test_missing_inputs_are_named(command, said, tmp_path, capsys, monkeypatch):
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    'command',
+    [
+        ['calibrate', 'intrinsics', 'views', '--out'],
+        ['calibrate', 'intrinsics', 'views', '--report'],
+        ['calibrate', 'camera-imu', 'motion', '--map', 'map.yaml', '--calibration', 'lens.yaml', '--out'],
+        ['calibrate', 'imu', 'rest', '--out'],
+        ['map', 'build', 'photos', '--out'],
+        ['map', 'refine', 'map.yaml', 'run', '--out'],
+        ['map', 'merge', 'map.yaml', 'other.yaml', '--out'],
+        ['map', 'show', 'map.yaml', '--plot'],
+        ['evaluate', 'run', 'run', '--compare', '--out'],
+        ['markers', 'plan', '--plot'],
+        ['markers', 'dictionary'],
+        ['markers', 'measure'],
+    ],
+)
+@pytest.mark.parametrize(('name', 'said'), [('results/file.yaml', 'no folder results'), ('here', 'is a folder')])
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(command, name, said, tmp_path, capsys, monkeypatch):
+    """The inputs are not there: they would be complained of if they had been looked for."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'here').mkdir()
+    with pytest.raises(SystemExit, match='2'):
+        main([*command, name])
+    assert f'{name}: {said}' in capsys.readouterr().err
+
+
 def test_missing_ground_truth_is_no_bag(tmp_path):
     from thermal_fiducial.errors import InputError
     from thermal_fiducial.report.trajectory import read_truth

@@ -12,7 +12,7 @@ from thermal_fiducial.cli import calibrate_intrinsics
 from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
 from thermal_fiducial.cli.progress import tracked
-from thermal_fiducial.cli.subcommands import add_command
+from thermal_fiducial.cli.subcommands import add_command, file_to_write
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -49,7 +49,7 @@ def _add_camera_imu(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bag', type=Path, help='bag with thermal/image_raw and imu/data, moving before mapped markers')
     parser.add_argument('--map', type=Path, required=True, help='marker map (YAML)')
     parser.add_argument('--calibration', type=Path, help='camera_info YAML (default: the camera_info of the bag)')
-    parser.add_argument('--out', type=Path, default=Path('extrinsics.yaml'), help='parameters to write')
+    parser.add_argument('--out', type=file_to_write, default=Path('extrinsics.yaml'), help='parameters to write')
     noise = ImuNoise()
     for name, unit in (
         ('gyroscope_noise_density', 'rad/s/sqrt(Hz)'),

@@ -13,6 +13,7 @@ from thermal_fiducial.calibration.report import BoardView, write_report
 from thermal_fiducial.calibration.sources import is_folder_of_pictures, measured_points
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Target
 from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pictures
+from thermal_fiducial.cli.subcommands import file_to_write
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.mapping.map_data import MarkerMap
@@ -37,8 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='folder of pictures (8 or 16 bit), a bag with thermal/image_raw, or a CSV file of measured points '
         '(columns view, point, u, v [px], x, y [m]; with --size)',
     )
-    parser.add_argument('--out', type=Path, default=Path('camera_info.yaml'), help='calibration to write')
-    parser.add_argument('--report', type=Path, help='report to write (default: next to the calibration, .html)')
+    parser.add_argument('--out', type=file_to_write, default=Path('camera_info.yaml'), help='calibration to write')
+    parser.add_argument(
+        '--report', type=file_to_write, help='report to write (default: next to the calibration, .html)'
+    )
     parser.add_argument('--models', default=','.join(CANDIDATES), help='to choose among, by held-out error')
     parser.add_argument('--focal-px', type=float, default=600.0, help='rough focal length to start from [px]')
     parser.add_argument('--most-views', type=int, default=80, help='stop looking for views after this many')

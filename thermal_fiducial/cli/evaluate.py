@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.subcommands import file_to_write
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.report.page import evaluate_run, require_packages, VIDEO, write_page
 from thermal_fiducial.report.run_folder import Run
@@ -38,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--compare', action='store_true', help="several runs side by side, with evo's conventions and numbers"
     )
-    parser.add_argument('--out', type=Path, default=COMPARISON, metavar='HTML', help='page of --compare')
+    parser.add_argument('--out', type=file_to_write, default=COMPARISON, metavar='HTML', help='page of --compare')
 
 
 def run(args: argparse.Namespace) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 
 from thermal_fiducial.cli import map_cloud, map_comparison, map_sources
 from thermal_fiducial.cli.marker_sizes import add_sizes, join_sizes
-from thermal_fiducial.cli.subcommands import add_command, Commands
+from thermal_fiducial.cli.subcommands import add_command, Commands, file_to_write
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.plausibility import LARGEST_COORDINATE
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     shown = _command(commands, 'show', 'table of the markers, and a plot', _show)
     shown.add_argument(
         '--plot',
-        type=Path,
+        type=file_to_write,
         metavar='PNG',
         help='picture of the map from above, from the side and from the front, with uncertainties',
     )
@@ -99,7 +99,7 @@ def _add_editing(commands: Commands) -> None:
     delete.add_argument('ids', type=int, nargs='+', metavar='ID', help='markers of the map')
     merge = _command(commands, 'merge', 'add the markers of another map, aligned by the markers in common', _merge)
     merge.add_argument('other', type=Path, metavar='OTHER', help='map file with markers in common')
-    merge.add_argument('--out', type=Path, metavar='FILE', help='default: MAP itself')
+    merge.add_argument('--out', type=file_to_write, metavar='FILE', help='default: MAP itself')
     anchor = _command(commands, 'anchor', 'move the whole map onto surveyed markers', _anchor)
     anchor.add_argument(
         'survey', type=Path, metavar='CSV', help='lines "id,x,y,z": centres of three markers or more [m]'

@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from thermal_fiducial.cli.subcommands import file_to_write
 from thermal_fiducial.config import size_overrides
 from thermal_fiducial.core.geometry.se3 import apply, inverse, quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.errors import InputError
@@ -31,8 +32,8 @@ def add_align(parser: argparse.ArgumentParser) -> None:
         help='rough pose of the map in the cloud (default: the same frame)',
     )
     parser.add_argument('--reach', type=float, default=0.5, metavar='M', help='how rough that may be')
-    parser.add_argument('--out', type=Path, metavar='YAML', help='file for the transform')
-    parser.add_argument('--plot', type=Path, metavar='PNG', help='draw map and cloud into a picture')
+    parser.add_argument('--out', type=file_to_write, metavar='YAML', help='file for the transform')
+    parser.add_argument('--plot', type=file_to_write, metavar='PNG', help='draw map and cloud into a picture')
     parser.set_defaults(do=_align)
 
 

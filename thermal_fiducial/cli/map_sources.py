@@ -9,6 +9,7 @@ import numpy as np
 from thermal_fiducial.cli.map_photos import detect_in_photos, isotropic, photos_in
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.run_parameters import camera_of_run, sizes_of_run
+from thermal_fiducial.cli.subcommands import file_to_write
 from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.detection.detector import rows_from_corners
 from thermal_fiducial.core.geometry.camera import Camera
@@ -49,7 +50,7 @@ def add_build(parser: argparse.ArgumentParser) -> None:
     start = parser.add_mutually_exclusive_group(required=True)
     start.add_argument('--origin', type=int, metavar='ID', help='marker that becomes the origin of the map')
     start.add_argument('--map', type=Path, metavar='MAP', help='map with known markers to start from')
-    parser.add_argument('--out', type=Path, required=True, metavar='MAP', help='the map to write')
+    parser.add_argument('--out', type=file_to_write, required=True, metavar='MAP', help='the map to write')
     parser.set_defaults(do=_build)
 
 
@@ -61,7 +62,7 @@ def add_refine(parser: argparse.ArgumentParser) -> None:
         '--calibration', type=Path, metavar='FILE', help='camera_info YAML of the camera (default: that of the run)'
     )
     parser.add_argument('--max-frames', type=int, default=1500, metavar='N', help='frames used, evenly chosen')
-    parser.add_argument('--out', type=Path, metavar='FILE', help='default: MAP itself')
+    parser.add_argument('--out', type=file_to_write, metavar='FILE', help='default: MAP itself')
     parser.set_defaults(do=_refine)
 
 

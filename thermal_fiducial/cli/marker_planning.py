@@ -8,6 +8,7 @@ from rich.table import Table
 
 from thermal_fiducial.cli.marker_drawings import add_force, refuse_to_overwrite
 from thermal_fiducial.cli.progress import progress_bar
+from thermal_fiducial.cli.subcommands import file_to_write
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray
@@ -69,7 +70,7 @@ def add_plan(parser: argparse.ArgumentParser) -> None:
     scene.add_argument('--fog', type=float, default=0.0, metavar='1/M', help='extinction in the long-wave infrared')
     scene.add_argument('--tilt', type=float, default=30.0, metavar='DEG', help='angle between normal and line of sight')
     scene.add_argument('--distances', default='1,1.5,2,3,4,6,8,12', metavar='LIST', help='distances [m]')
-    parser.add_argument('--plot', type=Path, metavar='FILE', help='picture of both tables (PNG, PDF, SVG)')
+    parser.add_argument('--plot', type=file_to_write, metavar='FILE', help='picture of both tables (PNG, PDF, SVG)')
     parser.add_argument(
         '--tables', type=Path, default=PACKAGED, help='file of ``markers measure`` (default: that of the package)'
     )
@@ -198,7 +199,7 @@ def _draw(
 def add_measure(parser: argparse.ArgumentParser) -> None:
     """Arguments of ``markers measure``."""
     parser.set_defaults(do=_measure)
-    parser.add_argument('out', type=Path, help='file to write (YAML)')
+    parser.add_argument('out', type=file_to_write, help='file to write (YAML)')
     parser.add_argument('--markers', type=int, default=16, help='number of markers for each side, contrast and tilt')
     parser.add_argument('--seed', type=int, default=1, help='seed of the rendering')
     add_force(parser)

@@ -2,12 +2,11 @@
 
 import argparse
 from collections import Counter
-from pathlib import Path
 
 from thermal_fiducial.cli import marker_drawings, marker_planning
 from thermal_fiducial.cli.marker_choice import add_choice, chosen
 from thermal_fiducial.cli.progress import progress_bar
-from thermal_fiducial.cli.subcommands import add_command
+from thermal_fiducial.cli.subcommands import add_command, file_to_write
 from thermal_fiducial.cli.terminal_tables import show, table_of
 from thermal_fiducial.core.detection.patterns import Dictionary
 from thermal_fiducial.errors import InputError
@@ -101,7 +100,9 @@ def _bridge(args: argparse.Namespace) -> int:
 
 def _add_dictionary(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(do=_dictionary)
-    parser.add_argument('out', type=Path, help="dictionary file to write (YAML); its name becomes the dictionary's")
+    parser.add_argument(
+        'out', type=file_to_write, help="dictionary file to write (YAML); its name becomes the dictionary's"
+    )
     parser.add_argument('--bits', type=int, default=4, help='bits along a side')
     parser.add_argument('--distance', type=int, default=4, help='least Hamming distance')
     parser.add_argument('--count', type=int, help='number of markers to keep, the stiffest first (default: all)')

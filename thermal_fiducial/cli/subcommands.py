@@ -1,6 +1,7 @@
-"""Sub-commands of the program, and of its commands."""
+"""Sub-commands of the program and of its commands, and a kind of argument that many have."""
 
 import argparse
+from pathlib import Path
 from typing import TypeAlias
 
 Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
@@ -9,3 +10,19 @@ Commands: TypeAlias = 'argparse._SubParsersAction[argparse.ArgumentParser]'
 def add_command(commands: Commands, name: str, text: str) -> argparse.ArgumentParser:
     """Parser of a new sub-command; ``text`` stands in the list of them and in the sub-command's own help."""
     return commands.add_parser(name, help=text, description=text[0].upper() + text[1:])
+
+
+def file_to_write(text: str) -> Path:
+    """Type of an argument: a file that the command will write, refused before the work that leads to it.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        Its folder is not there, or it is a folder itself.
+    """
+    path = Path(text)
+    if not path.parent.is_dir():
+        raise argparse.ArgumentTypeError(f'{path}: no folder {path.parent}')
+    if path.is_dir():
+        raise argparse.ArgumentTypeError(f'{path}: is a folder, not a file to write')
+    return path
