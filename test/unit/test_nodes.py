@@ -523,6 +523,15 @@ def test_reset_starts_anew(graph):
     assert graph.diagnose(node)[2]['jumps'] == '2'
 
 
+def test_poses_that_have_stopped_are_not_taken_for_another_clock(graph):
+    node = graph.add(PoseEkfNode, camera_position=[0.1, 0.0, 0.0])
+    fly(graph, [message for k in range(60) for message in ([imu(k), pose(k - 4)] if k % 6 == 5 else [imu(k)])])
+    assert graph.call(Trigger, 'pose_ekf/reset', Trigger.Request()).success
+    # Three seconds on.
+    fly(graph, [imu(k) for k in range(60, 680, 20)])
+    assert graph.diagnose(node)[1] == 'waiting for markers'
+
+
 # --- parameters ---------------------------------------------------------------------------------------
 
 

@@ -24,9 +24,10 @@ class FilterStatus:
         #: last status without numbers, last headline, whether the pose was lost then, whether ever initialised
         self._words, self._headline, self._was_lost, self._initialised = '', '', True, False
         self._last_refusal = ''
-        #: stamps of the latest IMU sample and camera pose; None before the first
+        #: stamp of the latest IMU sample; None before the first
         self._imu_ns: int | None = None
-        self._pose_ns: int | None = None
+        #: stamp of the latest camera pose less that of the IMU sample before it [s]
+        self._apart_s = 0.0
         #: stamps of poses whose innovations have been published
         self._published: set[int] = set()
 
@@ -43,7 +44,8 @@ class FilterStatus:
 
     def after_pose(self, update: PoseUpdate) -> None:
         """Keep the reason of the last refusal until a pose is accepted."""
-        self._pose_ns = update.stamp_ns
+        if self._imu_ns is not None:
+            self._apart_s = (update.stamp_ns - self._imu_ns) / SECOND_NS
         self._last_refusal = '' if update.accepted or update.pending else update.reason
 
     def state(self) -> tuple[bytes, str]:
@@ -70,13 +72,10 @@ class FilterStatus:
     def _condition(self) -> Condition:
         """Condition of the filter; where it lacks poses because their clock is not the IMU's, that."""
         condition = self._filter.condition
-        if condition != WAITING or self._imu_ns is None or self._pose_ns is None:
+        if condition != WAITING or abs(self._apart_s) < _APART_S:
             return condition
-        apart = (self._pose_ns - self._imu_ns) / SECOND_NS
-        if abs(apart) < _APART_S:
-            return condition
-        side = 'ahead of' if apart > 0.0 else 'behind'
-        return Condition('camera and IMU have two clocks', f'poses are {abs(apart):.4g} s {side} the IMU')
+        side = 'ahead of' if self._apart_s > 0.0 else 'behind'
+        return Condition('camera and IMU have two clocks', f'poses are {abs(self._apart_s):.4g} s {side} the IMU')
 
     def figures(self) -> dict[str, object]:
         """Key-value pairs of the diagnostics."""
