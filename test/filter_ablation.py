@@ -112,7 +112,10 @@ MECHANISMS = {
     'errors in variables': Mechanism(('slow and noisy',), off={'update:_FEIGNED': 0.0}),
     'motion at a pose from 0.1 s': Mechanism(('slow and noisy',), off={'imu_buffer:_MOTION_SECONDS': 0.0}),
     'steps of the clock of the camera': Mechanism(
-        ('stepping clock',), ('camera_clock',), {'camera_clock:CameraClock.proposed': _first(0)}
+        ('stepping clock',), ('camera_clock:CameraClock',), {'camera_clock:CameraClock.proposed': _first(0)}
+    ),
+    'stamps off the grid of frames': Mechanism(
+        ('small step of clock',), ('camera_clock:FrameGrid',), {'camera_clock:FrameGrid.off_grid': lambda *_: 0}
     ),
     'error of the extrinsics': Mechanism(
         ('carpet_mountain', 'carpet_slow_circle'),

@@ -1,7 +1,9 @@
-"""Steps of the camera's clock that are too large for the offset in the state: the delay of poses changes at once.
+"""Steps of the camera's clock.
 
-A changed delay alone does not prove a step of the clock, as a pipeline may stall. So a step is only proposed here, once
-several poses agree on it; the filter accepts it if restamped poses pass the gate that they fail as they came.
+Small ones are left to the offset in the state; its variance grows where a stamp is off the grid of frames. Of those
+that are too large for it the delay of poses changes at once. A changed delay alone does not prove a step of the clock,
+as a pipeline may stall. So a step is only proposed here, once several poses agree on it; the filter accepts it if
+restamped poses pass the gate that they fail as they came.
 
 A step of the IMU's clock looks the same, but then the stamps of the IMU have jumped by the same amount.
 """
@@ -20,6 +22,9 @@ SMALLEST_STEP_NS = 35_000_000
 _POSES, _USUAL, _ENOUGH = 5, 30, 15
 #: Largest spread [ns] of the delays of agreeing poses, beside half of the step.
 _AGREEMENT_NS = 50_000_000
+#: A stamp is off the grid of frames beyond this multiple of the largest recent distance, which is jitter, and this
+#: length [ns]. After this time [ns] the grid is lost, as errors of the period add up.
+_OFF_GRID, _OFF_GRID_NS, _LOST_NS = 3, 1_000_000, 1_000_000_000
 #: Poses with an unusual delay after a jump of the IMU's stamps that are held back until a cause is found.
 _PATIENCE = 15
 
@@ -85,3 +90,31 @@ class CameraClock:
         self._latest.clear()
         self._imu_jump_ns = 0
         return wrong
+
+
+class FrameGrid:
+    """The grid of the camera's stamps: whole periods apart, as poses of some frames may be missing."""
+
+    def __init__(self) -> None:
+        self._last_ns = 0
+        #: latest steps between stamps, and their distances from a whole number of periods [ns]
+        self._steps: deque[int] = deque(maxlen=_USUAL)
+        self._distances: deque[int] = deque(maxlen=_USUAL)
+
+    def off_grid(self, stamp_ns: int) -> int:
+        """Distance [ns] of a stamp from the grid of the last ones; 0 unless it is far larger than all recent ones."""
+        step_ns, known = stamp_ns - self._last_ns, sorted(self._steps)
+        if -_LOST_NS < step_ns <= 0:
+            return 0
+        self._last_ns = stamp_ns
+        if not 0 < step_ns < _LOST_NS:
+            return 0
+        self._steps.append(step_ns)
+        if len(known) < _ENOUGH:
+            return 0
+        # The shortest step may be that of a clock that went back.
+        period_ns = known[1]
+        distance_ns = abs(step_ns - max(round(step_ns / period_ns), 1) * period_ns)
+        usual_ns = max(self._distances) if len(self._distances) >= _ENOUGH else distance_ns
+        self._distances.append(distance_ns)
+        return distance_ns if distance_ns > _OFF_GRID * usual_ns + _OFF_GRID_NS else 0

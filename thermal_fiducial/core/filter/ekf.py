@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.filter.camera_clock import CameraClock, SMALLEST_STEP_NS
+from thermal_fiducial.core.filter.camera_clock import CameraClock, FrameGrid, SMALLEST_STEP_NS
 from thermal_fiducial.core.filter.coasting import usable_seconds
 from thermal_fiducial.core.filter.condition import coasting_seconds, condition_of
 from thermal_fiducial.core.filter.history import History
@@ -50,7 +50,7 @@ class PoseEkf:
         self._hypotheses = Hypotheses(config)
         self._imu_refused = 0
         self._input = ImuInput(config.max_imu_gap, config.imu.gyroscope_range, config.imu.accelerometer_range)
-        self._camera_clock = CameraClock()
+        self._camera_clock, self._frame_grid = CameraClock(), FrameGrid()
         self._begin(config.camera_time_offset)
 
     def _begin(self, camera_time_offset: float) -> None:
@@ -116,13 +116,14 @@ class PoseEkf:
 
         ``pose.stamp_ns`` is in the camera's clock; the clock offset, parameter and estimate, is added here.
         """
+        off_grid_ns = self._frame_grid.off_grid(pose.stamp_ns) if self._config.estimate_time_offset else 0
         pose = self._in_present_clock(pose)
         if self._history.main is None and self._camera_clock.in_question:
             return PoseUpdate(pose.stamp_ns, False, CLOCK_JUMPED, np.nan)
         reason = self._unusable(pose)
         if reason:
             return PoseUpdate(pose.stamp_ns, False, reason, np.nan)
-        self._history.insert(pose)
+        self._history.insert(pose, off_grid_ns)
         self._history.take_in()
         waiting = PoseUpdate(pose.stamp_ns, False, 'waits for the IMU', np.nan, pending=True)
         return self._history.log.latest.get(pose.stamp_ns, waiting)

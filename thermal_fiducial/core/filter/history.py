@@ -14,7 +14,7 @@ from thermal_fiducial.core.filter.initialization import no_gravity, WINDOW_SECON
 from thermal_fiducial.core.filter.innovations import PoseLog, PoseUpdate
 from thermal_fiducial.core.filter.propagation import propagated
 from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
-from thermal_fiducial.core.filter.update import MotionAtPose, with_clock_step
+from thermal_fiducial.core.filter.update import MotionAtPose, with_camera_step, with_clock_step
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
@@ -40,6 +40,8 @@ class History:
         self.imu, self.log = ImuBuffer(), PoseLog()
         self._poses: list[CameraPose] = []
         self._beliefs = [Belief()]
+        #: suspected steps of the camera's clock [ns], by the stamp of the first pose behind them
+        self._camera_steps: dict[int, int] = {}
         #: suspected steps of the IMU's clock: stamp of the sample before [ns], standard deviation [s]
         self._clock_steps: list[tuple[int, float]] = []
         #: the estimate at the newest sample
@@ -82,10 +84,17 @@ class History:
         oldest = self._beliefs[0]
         del self._poses[: bisect_right(self._poses, oldest.pose_stamp_ns, key=_stamp)]
         self.imu.forget_before(min(horizon_ns, oldest.stamp_ns) if oldest.hypotheses else horizon_ns)
+        kept = {pose.stamp_ns for pose in self._poses}
+        self._camera_steps = {stamp: step for stamp, step in self._camera_steps.items() if stamp in kept}
         self._clock_steps = [step for step in self._clock_steps if step[0] >= self.imu.oldest_ns]
 
-    def insert(self, pose: CameraPose) -> None:
-        """Add a pose; :meth:`take_in` applies it once the samples reach its instant."""
+    def insert(self, pose: CameraPose, camera_step_ns: int = 0) -> None:
+        """Add a pose; :meth:`take_in` applies it once the samples reach its instant.
+
+        ``camera_step_ns``: size of a step of the camera's clock since the last pose, if one is suspected.
+        """
+        if camera_step_ns:
+            self._camera_steps[pose.stamp_ns] = camera_step_ns
         insort(self._poses, pose, key=_stamp)
         self._go_back_before(pose.stamp_ns)
 
@@ -223,6 +232,8 @@ class History:
         """A hypothesis at the instant of a pose, never earlier than where it is now, and the motion there."""
         time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
         there = self.carried(hypothesis, min(time_ns, self.imu.newest_ns))
+        if step_ns := self._camera_steps.get(pose.stamp_ns, 0):
+            there = there._replace(estimate=with_camera_step(there.estimate, step_ns / SECOND_NS))
         return there, self.imu.motion(there.estimate.stamp_ns, there.accepted_ns)
 
     def _begun(self, belief: Belief, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:

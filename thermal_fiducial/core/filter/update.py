@@ -95,6 +95,13 @@ def with_clock_step(estimate: Estimate, imu: FloatArray, std: float) -> Estimate
     return replace(estimate, covariance=estimate.covariance + std**2 * np.outer(error, error))
 
 
+def with_camera_step(estimate: Estimate, std: float) -> Estimate:
+    """The estimate after an unknown step of the camera's clock, of standard deviation ``std`` [s]."""
+    covariance = estimate.covariance.copy()
+    covariance[TIME_OFFSET, TIME_OFFSET] += std**2
+    return replace(estimate, covariance=covariance)
+
+
 def body_pose(pose: CameraPose, T_body_camera: FloatArray, scale: float) -> BodyPose:
     """Pose of the robot by a camera pose whose standard deviations are multiplied by ``scale``."""
     T_map_body = pose.T_map_camera @ inverse(T_body_camera)
