@@ -14,6 +14,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, remove_ros_args, try_shutdown
 
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.litter import remove_litter
 from thermal_fiducial.ros.node import StageNode
 from thermal_fiducial.ros.promptness import keep_for_good, take_priority
 from thermal_fiducial.ros.stopping import limit_the_end, release_the_end, StopSignals
@@ -115,6 +116,7 @@ def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] 
     with ExitStack() as ending:
         ending.callback(try_shutdown)
         try:
+            remove_litter()
             initialise(args, signals=SignalHandlerOptions.NO)
             _refuse_others(args)
             node = _made(make_node)
