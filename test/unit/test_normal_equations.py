@@ -1,0 +1,110 @@
+"""Schur complement, solutions and covariances of a bundle adjustment, against its system in one piece."""
+
+import numpy as np
+import pytest
+
+from thermal_fiducial.core.mapping import normal_equations
+from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations
+
+FRAMES, MARKERS = 7, 5
+
+
+def system(seed, held):
+    """Equations, their blocks, and J' J in one piece, of keyframes that see two to four markers each."""
+    rng = np.random.default_rng(seed)
+    shown = [rng.choice(MARKERS, size=rng.integers(2, 5), replace=False) for _ in range(FRAMES)]
+    frame = np.repeat(np.arange(FRAMES), [len(markers) for markers in shown])
+    marker = np.concatenate(shown)
+    J_frame, J_marker = rng.normal(size=(2, len(frame), 8, 6))
+    whole = np.zeros((6 * (FRAMES + MARKERS), 6 * (FRAMES + MARKERS)))
+    for f, m, of_frame, of_marker in zip(frame, marker, J_frame, J_marker, strict=True):
+        J = np.zeros((8, len(whole)))
+        J[:, 6 * f : 6 * f + 6] = of_frame
+        J[:, 6 * (FRAMES + m) : 6 * (FRAMES + m) + 6] = of_marker
+        whole += J.T @ J
+    each = np.arange(FRAMES + MARKERS)
+    own = whole.reshape(len(each), 6, len(each), 6)[each, :, each]
+    blocks = Blocks(own[:FRAMES], own[FRAMES:], np.swapaxes(J_frame, 1, 2) @ J_marker)
+    return NormalEquations(frame, marker, held), blocks, whole
+
+
+def unknowns(held):
+    """Which rows of the system in one piece are those of keyframes and free markers."""
+    return np.flatnonzero(np.repeat(np.concatenate([np.ones(FRAMES, dtype=bool), ~held]), 6))
+
+
+def only(*markers):
+    held = np.zeros(MARKERS, dtype=bool)
+    held[list(markers)] = True
+    return held
+
+
+@pytest.fixture(params=['dense', 'sparse product', 'sparse'])
+def way(request, monkeypatch):
+    """Each of the ways to solve: of small and crowded maps, of others, and of large ones."""
+    if request.param != 'dense':
+        monkeypatch.setattr(normal_equations, '_FULL', 2.0)
+    if request.param == 'sparse':
+        monkeypatch.setattr(normal_equations, '_DENSE', 0)
+
+
+@pytest.mark.usefixtures('way')
+@pytest.mark.parametrize('held', [only(0), only(1, 3)])
+def test_the_solution_is_that_of_the_system_in_one_piece(held):
+    equations, blocks, whole = system(1, held)
+    rng, free = np.random.default_rng(2), unknowns(held)
+    right = rng.normal(size=(FRAMES + MARKERS, 6, 2))
+    frames, markers = equations.reduced(blocks).solve(right[:FRAMES], right[FRAMES:])
+    expected = np.linalg.solve(whole[np.ix_(free, free)], right.reshape(-1, 2)[free])
+    found = np.concatenate([frames, markers]).reshape(-1, 2)
+    # The ridge is 1e-12 of the largest entry; the condition of these systems is below a thousand.
+    np.testing.assert_allclose(found[free], expected, rtol=1e-8, atol=1e-9 * np.abs(expected).max())
+    assert not markers[held].any()
+
+
+@pytest.mark.usefixtures('way')
+def test_the_covariances_are_those_of_the_free_markers_in_the_inverse():
+    held = only(2)
+    equations, blocks, whole = system(3, held)
+    free = unknowns(held)
+    inverse = np.linalg.inv(whole[np.ix_(free, free)])
+    covariances = equations.reduced(blocks).covariances(4.0, np.zeros((MARKERS, 6, 6)))
+    for place, marker in enumerate(np.flatnonzero(~held)):
+        rows = slice(6 * (FRAMES + place), 6 * (FRAMES + place) + 6)
+        np.testing.assert_allclose(covariances[marker], 4.0 * inverse[rows, rows], rtol=1e-8, atol=1e-12)
+    assert not covariances[2].any()
+
+
+@pytest.mark.usefixtures('way')
+def test_what_is_unknown_of_a_held_marker_moves_the_free_ones():
+    """By the derivative of the solution, and whatever the noise of the views."""
+    held, of_held = only(2), np.zeros((MARKERS, 6, 6))
+    of_held[2] = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    equations, blocks, whole = system(4, held)
+    free, fixed = unknowns(held), 6 * (FRAMES + 2) + np.arange(6)
+    gains = -np.linalg.solve(whole[np.ix_(free, free)], whole[np.ix_(free, fixed)])
+    covariances = equations.reduced(blocks).covariances(0.0, of_held)
+    for place, marker in enumerate(np.flatnonzero(~held)):
+        G = gains[6 * (FRAMES + place) : 6 * (FRAMES + place) + 6]
+        np.testing.assert_allclose(covariances[marker], G @ of_held[2] @ G.T, rtol=1e-8, atol=1e-8)
+    np.testing.assert_array_equal(covariances[2], of_held[2])
+
+
+def test_damping_adds_to_the_diagonals_of_both():
+    held = only(0)
+    equations, blocks, whole = system(5, held)
+    free = unknowns(held)
+    right = np.random.default_rng(6).normal(size=(FRAMES + MARKERS, 6, 1))
+    frames, markers = equations.reduced(blocks, damping=0.5).solve(right[:FRAMES], right[FRAMES:])
+    damped = (whole + 0.5 * np.diag(np.diag(whole)))[np.ix_(free, free)]
+    expected = np.linalg.solve(damped, right.reshape(-1, 1)[free])
+    found = np.concatenate([frames, markers]).reshape(-1, 1)[free]
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
+
+
+@pytest.mark.parametrize('of', ['frame', 'marker'])
+def test_a_system_that_is_not_positive_definite_has_no_solution(of):
+    """A keyframe or a marker with less than no information, as rounding may leave it."""
+    equations, blocks, _ = system(7, only(0))
+    getattr(blocks, of)[3] = -np.eye(6)
+    assert equations.reduced(blocks) is None
