@@ -20,6 +20,7 @@ from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.mapping.trust import CornerBias
 from thermal_fiducial.core.measurements import CORNER_FIELDS, corners_px
 
 ERRORS = SystematicErrors()
@@ -195,3 +196,45 @@ def test_a_partially_visible_marker_does_not_change_the_bias():
         m.process(stamp(k), rows, CAMERA)
     # It falls from 0.1 px at the start to 0.07 px without that marker; had that marker a vote, it would be 0.2.
     assert m.corner_bias_px < 0.08
+
+
+def displaced(rows, by):
+    """``rows`` with their corners displaced by (N, 4, 2) [px]."""
+    for name, column in zip(CORNER_FIELDS, (corners_px(rows) + by).reshape(-1, 8).T, strict=True):
+        rows[name] = column
+    return rows
+
+
+def learned(frames, displacement):
+    """The errors of corners with noise of 0.03 px, displaced by a function of the frame's number and rows."""
+    rng, bias = np.random.default_rng(6), CornerBias()
+    poses = wall(rng)
+    for k in range(frames):
+        rows = see(flight(k / 30), poses, 0.03, rng)
+        found = located(poses, displaced(rows, displacement(k, rows)))
+        bias.add(replace(found, pose=replace(found.pose, stamp_ns=stamp(k))))
+    return bias
+
+
+def test_a_mistaken_marker_does_not_change_the_bias():
+    """A corner of one of eight markers is half a pixel off in six frames, at 0.03 px claimed, as if it were covered."""
+
+    def mistaken(k, rows):
+        off = np.zeros((len(rows), 4, 2))
+        off[0, 0, 0] = 0.5 * (30 <= k < 36)
+        return off
+
+    with_it, without = learned(60, mistaken).px, learned(60, lambda _, rows: np.zeros((len(rows), 4, 2))).px
+    # Five products count as those of a marker off by two sigma, of 0.04 px by then, in the mean of eight markers; so do
+    # 59 frames, which show a quarter of the bias. As they are they would count twice as much.
+    assert with_it**2 - without**2 < 5 * (2 * 0.04) ** 2 / 8 / (59 * 0.25)
+
+
+@pytest.mark.parametrize('share', [0.1, 0.5])
+def test_the_shape_of_markers_is_learned_from_what_lasts_of_their_residuals(share):
+    shapes = 0.03 * share * np.random.default_rng(7).normal(size=(8, 4, 2))
+    found = learned(60, lambda _, rows: shapes[rows['id']]).shape
+    # The prior of 0.7 counts as 5 frames of 64. Noise makes the mean of 59 products of 48 degrees of freedom uncertain
+    # by 0.02 / 0.75, and the shapes that were drawn are good to a fifth: 2.5 sigma of both.
+    expected = (5 * 0.7**2 + 59 * share**2) / 64
+    assert abs(found**2 - expected) < 2.5 * np.hypot(0.025, 0.2 * share**2)

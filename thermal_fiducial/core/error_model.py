@@ -38,8 +38,9 @@ class SystematicErrors:
     #: its axis by as much of the distance to the markers, in maps with exact sizes too. Enters poses from markers
     #: (:func:`of_single_error`).
     focal_length_std: float = 0.002
-    #: Corners of one marker in all of its views [share of the corners' noise]: its shape and the model of its edges.
-    #: As measured on rendered flights with three lenses and 0.5 to 9 K. Enters the covariance of a joint adjustment.
+    #: Corners of one marker in all of its views [share of the corners' noise]: its shape and the model of its edges. To
+    #: begin with, and at most, as measured on rendered flights with three lenses and 0.5 to 9 K; learned in flight from
+    #: residuals that last (``CornerBias``). Enters the covariance of a joint adjustment.
     marker_shape: float = 0.7
 
 

@@ -130,7 +130,10 @@ class MarkerMapper:
     def _errors(self) -> SystematicErrors:
         config = self.config
         return SystematicErrors(
-            self._bias.px, marker_size_std=config.marker_size_std, focal_length_std=config.focal_length_std
+            self._bias.px,
+            marker_size_std=config.marker_size_std,
+            focal_length_std=config.focal_length_std,
+            marker_shape=self._bias.shape,
         )
 
     def learn(self, frame: LocatedFrame) -> MapperResult:

@@ -167,7 +167,7 @@ class _Sparse:
 
 
 def _factorised(S: Any) -> _Dense | _Sparse:
-    """What solves with a positive definite matrix; LinAlgError if a small one is none, RuntimeError if it is singular."""
+    """What solves with a positive definite matrix; LinAlgError if a small one is not, RuntimeError if singular."""
     if isinstance(S, np.ndarray):
         np.linalg.cholesky(S)
         return _Dense(S)

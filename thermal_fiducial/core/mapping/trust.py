@@ -11,7 +11,7 @@ from statistics import median
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import INCONSISTENT_PX, SystematicErrors, visible_share
+from thermal_fiducial.core.error_model import CHI2_OF_VIEW, INCONSISTENT_PX, SystematicErrors, visible_share
 from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.mapping.map_data import MapMarker
 from thermal_fiducial.core.types import FloatArray, ObjectArray
@@ -24,8 +24,14 @@ MEMORY = 0.05
 QUARANTINE, RELEASE = 0.7, 0.1
 #: Ratio of an error to its standard deviation above which a frame counts as inconsistent.
 DISAGREEMENT = 4.0
-#: Corner bias: weight of the prior in frames, and forgetting factor per frame, a memory of 300 frames.
-BIAS_PRIOR, BIAS_MEMORY = 30.0, 1.0 - 1.0 / 300.0
+#: Systematic errors of corners: weight of the prior in frames, and forgetting factor per frame, a memory of 300 frames.
+BIAS_PRIOR, BIAS_MEMORY = 5.0, 1.0 - 1.0 / 300.0
+#: Residuals of a marker beyond this many standard deviations of the bias count as so many.
+BIAS_OUTLIER = 2.0
+#: The same of the shape, as a variance in units of the noise: 99.9 % of markers with noise alone.
+LARGEST_SHAPE = CHI2_OF_VIEW / 8.0
+#: Part of the variance of independent corners that is left without their mean.
+SHAPE_VISIBLE = 0.75
 #: Fewest markers for the corner bias: the pose absorbs nearly all of the error of fewer.
 FEWEST_MARKERS = 3
 # Longest time between frames whose residuals are compared [ns]: later the corners are elsewhere in the image.
@@ -147,18 +153,19 @@ def _preference(a: MapMarker, b: MapMarker) -> int:
 
 
 class CornerBias:
-    """Systematic error of the corners (lens, detector), from the correlation of residuals of successive frames.
+    """Systematic errors of the corners (lens, detector), from the correlation of residuals of successive frames.
 
     White noise of two frames is independent, so the mean product of a corner's residuals in successive frames is the
-    variance of the systematic error, less the part that the pose absorbs. Errors of partially visible markers are
-    correlated for other reasons; markers are weighted by their claimed noise.
+    variance of the systematic error, less the part that the pose absorbs. Without the mean over each marker's corners
+    it is that of the markers' shapes. Errors of partially visible markers are correlated for other reasons; in the bias
+    markers are weighted by their claimed noise.
     """
 
     def __init__(self) -> None:
-        #: standard deviation [px]
-        self.px = SystematicErrors().corner_px
-        self._weight = BIAS_PRIOR
-        self._sum = BIAS_PRIOR * self.px**2
+        #: standard deviations: of the bias [px], and of the shapes as a share of the corners' noise
+        self.px, self.shape = SystematicErrors().corner_px, SystematicErrors().marker_shape
+        # Sums over frames: their number, the weights of their markers, what these show of the bias, products of both.
+        self._sums = np.zeros(5)
         #: the last frame, and the weights (N,) of its markers
         self._last: tuple[Location | None, FloatArray] = None, np.zeros(0)
 
@@ -175,11 +182,24 @@ class CornerBias:
         then = [places[location.pose.marker_ids[place]] for place in now]
         if len(now) < FEWEST_MARKERS:
             return
-        # Residuals of moved markers are correlated too: the products are clipped at the limit of inconsistency.
-        products = (location.seen.residuals[now] * last.seen.residuals[then]).sum(axis=(1, 2)) / 8.0
-        products = np.clip(products, -(INCONSISTENT_PX**2), INCONSISTENT_PX**2)
-        shares = shares[now] * before[then]
-        visible = visible_share(location.seen.J_camera.reshape(-1, 2, 6), location.correlations)
-        self._weight = BIAS_MEMORY * self._weight + visible * float(shares.sum()) / len(now)
-        self._sum = BIAS_MEMORY * self._sum + float(shares @ products) / len(now)
-        self.px = math.sqrt(max(self._sum / self._weight, 0.0))
+        residuals, former = location.seen.residuals[now], last.seen.residuals[then]
+        products = (residuals * former).sum(axis=(1, 2)) / 8.0
+        of_shape = products - (residuals.mean(axis=1) * former.mean(axis=1)).sum(axis=1) / 2.0
+        of_shape = np.clip(of_shape / (noise[now] * last.sight.noise_px[then]), -LARGEST_SHAPE, LARGEST_SHAPE)
+        # Residuals of moved or mistaken markers are correlated too.
+        limit = min(INCONSISTENT_PX, BIAS_OUTLIER * self.px) ** 2
+        shares = shares[now] * before[then] / len(now)
+        weight = float(shares.sum())
+        visible = weight * visible_share(location.seen.J_camera.reshape(-1, 2, 6), location.correlations)
+        of_bias = float(shares @ np.clip(products, -limit, limit))
+        self._sums = BIAS_MEMORY * self._sums + (1.0, weight, visible, of_bias, of_shape.mean() / SHAPE_VISIBLE)
+        frames, weight, visible, of_bias, shapes = self._sums.tolist()
+        prior = SystematicErrors()
+        self.px = _learned(prior.corner_px, of_bias / visible, weight)
+        # Not all that lasts until the next frame is alike in all views: the shape is never more than at first.
+        self.shape = min(_learned(prior.marker_shape, shapes / frames, frames), prior.marker_shape)
+
+
+def _learned(prior: float, variance: float, frames: float) -> float:
+    """Standard deviation by its prior and by the ``variance`` that a number of ``frames`` show."""
+    return math.sqrt((BIAS_PRIOR * prior**2 + frames * max(variance, 0.0)) / (BIAS_PRIOR + frames))
