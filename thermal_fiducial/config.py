@@ -375,6 +375,13 @@ class ArucoDetectorConfig(SelfChecked):
     blur_px: float = param(
         0.66, 'Standard deviation of the blur of optics and pixels.', unit='px', minimum=0.3, maximum=3.0
     )
+    plate_thickness: float = param(
+        0.0,
+        'Thickness of the plates of the markers, whose sides are as cold as their faces; 0: printed, or cut from foil.',
+        unit='m',
+        minimum=0.0,
+        maximum=0.05,
+    )
     refinement: str = param(
         'auto',
         "Corner refinement. auto, edges: intersections of fitted side lines; subpix: OpenCV's cornerSubPix.",

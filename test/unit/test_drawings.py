@@ -410,8 +410,9 @@ def test_commands_write_the_files_that_they_print(tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(
         f'marker-{marker}.{kind}' for marker in (2, 3) for kind in ('svg', 'dxf', 'pdf', 'png')
     )
-    last = capsys.readouterr().out.splitlines()[-1]
-    assert last == 'parameters of the nodes for these markers: dictionary: STENCIL_4X4_100, marker_size: 0.12'
+    head, last = capsys.readouterr().out.splitlines()[-1].rsplit(': dictionary: ')
+    assert head == 'parameters of the nodes for these markers'
+    assert last == 'STENCIL_4X4_100, marker_size: 0.12, plate_thickness: 0.003'
     assert main(['markers', 'check', '--ids', '0-4']) == 0
     assert '5 of 5 markers can be cut' in capsys.readouterr().out
     assert main(['markers', 'bridge', '--dictionary', 'DICT_4X4_50', '--ids', '0']) == 0

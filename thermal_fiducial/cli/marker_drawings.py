@@ -76,7 +76,8 @@ def _sheet(args: argparse.Namespace) -> int:
 
 
 def _say_parameters(args: argparse.Namespace) -> None:
-    print(f'parameters of the nodes for these markers: dictionary: {args.dictionary}, marker_size: {args.size / 1e3:g}')
+    metres = f'marker_size: {args.size / 1e3:g}, plate_thickness: {args.thickness / 1e3:g}'
+    print(f'parameters of the nodes for these markers: dictionary: {args.dictionary}, {metres}')
 
 
 def add_board(parser: argparse.ArgumentParser) -> None:

@@ -12,7 +12,8 @@ from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import among, depths, ExpectedMarkers, KnownMarkers
 from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder, Dictionary
-from thermal_fiducial.core.detection.refining import refine, RefinedCorners, RefinedMarkers
+from thermal_fiducial.core.detection.plates import corners_of_faces
+from thermal_fiducial.core.detection.refining import refine, RefinedMarkers
 from thermal_fiducial.core.detection.tracking import MotionTrack, predict_frame
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
@@ -94,20 +95,30 @@ class MarkerDetector:
         refined = self._estimator.published(frame, found, refined, config)
         ids, corners = refined.ids, refined.corners
         at = refined.places.at.at_pixels(corners.corners_px)
-        poses = self._poses(ids, corners, at, T_camera_map)
-        rows = marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)
+        at, poses = self._faces(ids, corners.covariances, at, T_camera_map)
+        rows = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
         if T_camera_map is not None and expected is not None and among(ids, known.ids).sum() < _ENOUGH_WHOLE:
             rows = self._with_partial(rows, frame, T_camera_map, prediction.position_std_m)
         self._history = self._after(frame, findings, refined, poses, saw_partial=len(rows) > len(ids))
         return rows
 
+    def _faces(
+        self, ids: IntArray, covariances: FloatArray, at: ImagePoints, T_camera_map: FloatArray | None
+    ) -> tuple[ImagePoints, PlanarPoses]:
+        """Corners of the markers' faces, and the poses by them, from the corners of the outlines."""
+        poses, thickness = self._poses(ids, covariances, at, T_camera_map), self.config.plate_thickness
+        if thickness == 0.0 or len(ids) == 0:
+            return at, poses
+        at = corners_of_faces(at, poses.T_camera_marker[:, 0], self._known.sizes[ids], thickness)
+        return at, self._poses(ids, covariances, at, T_camera_map)
+
     def _poses(
-        self, ids: IntArray, corners: RefinedCorners, at: ImagePoints, T_camera_map: FloatArray | None
+        self, ids: IntArray, covariances: FloatArray, at: ImagePoints, T_camera_map: FloatArray | None
     ) -> PlanarPoses:
         """Both planar poses of each marker, the likelier first."""
         sizes = self._known.sizes[ids]
-        poses = planar_poses(at, corners.covariances, sizes)
-        return choose_branches(poses, at, corners.covariances, sizes, self._known.T_map_marker[ids], T_camera_map)
+        poses = planar_poses(at, covariances, sizes)
+        return choose_branches(poses, at, covariances, sizes, self._known.T_map_marker[ids], T_camera_map)
 
     def _with_partial(self, rows: Markers, frame: Frame, T_camera_map: FloatArray, position_std_m: float) -> Markers:
         """The rows of whole markers, and those of known ones that are partially visible."""
@@ -117,8 +128,9 @@ class MarkerDetector:
         ids, corners = self._partial.look(frame, candidates, position_std_m, allowed, self.config)
         if len(ids) == 0:
             return rows
-        poses = self._poses(ids, corners, ImagePoints.at(corners.corners_px, frame.camera), T_camera_map)
-        partial = marker_rows(ids, corners.corners_px, corners.covariances, poses, corners.contrast)
+        at = ImagePoints.at(corners.corners_px, frame.camera)
+        at, poses = self._faces(ids, corners.covariances, at, T_camera_map)
+        partial = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
         rows = np.concatenate([rows, partial])
         return np.asarray(rows[np.argsort(rows['id'], kind='stable')])
 
