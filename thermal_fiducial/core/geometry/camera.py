@@ -116,21 +116,13 @@ class Camera:
 
     def distort(self, normalised: npt.ArrayLike) -> FloatArray:
         """Pixels (..., 2) of normalised image coordinates x/z, y/z (..., 2)."""
-        x = np.asarray(normalised, dtype=np.float64)
-        return self._by_opencv(x)[0] if x.size else x
+        return self.distort_linearised(normalised)[0]
 
     def distort_linearised(self, normalised: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
         """:meth:`distort`, and its derivative (..., 2, 2) [px]."""
         x = np.asarray(normalised, dtype=np.float64)
         if not x.size:
             return x, np.zeros((*x.shape, 2))
-        uv, J = self._by_opencv(x)
-        # One product of matrices costs less than one for each point.
-        by_x = J.reshape(-1, 4) @ self._by_rows
-        return uv, by_x.reshape(*x.shape, 2)
-
-    def _by_opencv(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixels of P points (..., 2) in normalised coordinates, and the derivative (2 P, 2) of their distortion."""
         still, points = np.zeros(3), np.ones((x.size // 2, 1, 3))
         points[:, 0, :2] = x.reshape(-1, 2)
         # At depth 1 its derivative by a translation of the camera is the one wanted. OpenCV leaves a skew of K out.
@@ -140,8 +132,10 @@ class Camera:
         else:
             distorted, J = cv2.projectPoints(points, still, still, _EYE, self.D)
             J = J[:, 3:5]
-        uv = distorted.reshape(-1, 2) @ self.K[:2, :2].T + self.principal_point
-        return uv.reshape(x.shape), np.asarray(J)
+        # One product of matrices costs less than one for each point.
+        uv = distorted.reshape(-1, 2) @ self.K[:2, :2].T + self.K[:2, 2]
+        by_x = J.reshape(-1, 4) @ self._by_rows
+        return uv.reshape(x.shape), by_x.reshape(*x.shape, 2)
 
     def normalise(self, uv: npt.ArrayLike) -> FloatArray:
         """Normalised image coordinates x/z, y/z (..., 2) of pixels (..., 2): the inverse of :meth:`distort`.
@@ -149,7 +143,7 @@ class Camera:
         Newton's method converges at the border of a lens, where OpenCV's fixed-point iteration does not.
         """
         uv = np.asarray(uv, dtype=np.float64)
-        x = (uv - self.principal_point) @ self._inverse_focal.T
+        x = (uv - self.K[:2, 2]) @ self._inverse_focal.T
         if self.model == 'equidistant' and x.size:
             undistorted = cv2.fisheye.undistortPoints(x.reshape(-1, 1, 2), _EYE, self.D)
             return np.asarray(undistorted, dtype=np.float64).reshape(x.shape)

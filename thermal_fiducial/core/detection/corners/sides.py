@@ -98,7 +98,8 @@ def columns_across(
     steep = (np.abs(span[:, 1]) > np.abs(span[:, 0]))[:, None]
     share, weights = _parts(cells, columns)
     # First the coordinate in which columns follow one another, then that along them.
-    upright, opposite_upright = _swapped(nodes, steep), _swapped(opposite, steep[:, 0])
+    upright = np.where(steep[..., None], nodes[..., ::-1], nodes)
+    opposite_upright = np.where(steep, opposite[:, ::-1], opposite)
     lines = upright.transpose(2, 0, 1)[:, None] @ weights
     (along, rate), (across, climb) = lines.reshape(2, 2, columns, len(nodes), cells)
     # Columns are rounded to whole pixels, by at most half a pixel: over that distance the side is straight.
@@ -109,7 +110,8 @@ def columns_across(
     slope = slope[columns // 2]
     inward = np.sign(opposite_upright[:, 1:] - slope * opposite_upright[:, :1])
     pitch = inward / np.sqrt(1.0 + slope * slope)
-    normal = _swapped(np.stack([-slope * pitch, pitch], axis=-1), steep)
+    normal = np.stack([-slope * pitch, pitch], axis=-1)
+    normal = np.where(steep[..., None], normal[..., ::-1], normal)
     half = min(max(math.ceil(_REACHES * blur_px + 1.0), _SHORTEST), _LONGEST)
     base, offsets = np.rint(centre), np.arange(-half, half + 1)[:, None, None, None]
     fresh, inside = _seen(whole, base, steep, nodes, shape, half)
@@ -129,11 +131,6 @@ def columns_across(
         np.hypot(span[:, :1], span[:, 1:]),
         nodes[:, ::4],
     )
-
-
-def _swapped(places: FloatArray, where: BoolArray) -> FloatArray:
-    """Places (..., 2) with both coordinates swapped ``where`` (...)."""
-    return np.where(where[..., None], places[..., ::-1], places)
 
 
 @cache
