@@ -92,6 +92,8 @@ def _photo_detector(args: argparse.Namespace) -> 'cv2.aruco.ArucoDetector':
 def _detector(args: argparse.Namespace) -> MarkerDetector:
     defaults = ArucoDetectorConfig()
     config = ArucoDetectorConfig(
+        # The camera is held still for each photo; from an unknown motion lag would displace corners by pixels.
+        bolometer_lag=0.0,
         dictionary=args.dictionary,
         marker_size=args.marker_size or defaults.marker_size,
         marker_size_overrides=tuple(args.marker_size_override),
