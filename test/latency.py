@@ -87,10 +87,16 @@ def _measured(bag: Path, run: Path, load: str) -> Measured:
         frame.get('p99', math.inf),
         sum(value > _OLD_MS for value in corrected),
         given['imu/data'] - int(figures['pose_ekf']['received /imu/data']),
-        given['thermal/image_raw'] - int(figures['tau2_camera']['received /thermal/image_raw']),
+        _lost_frames(given['thermal/image_raw'], figures['tau2_camera'], figures['aruco_detector']),
         left,
         summary['cpu_percent'],
     )
+
+
+def _lost_frames(given: int, camera: dict[str, str], detector: dict[str, str]) -> int:
+    """Frames that did not reach the front end, and those that it sent on and the detector neither used nor left."""
+    used = int(detector['published /markers']) + int(detector.get('left /thermal/image', 0))
+    return given - int(camera['received /thermal/image_raw']) + int(camera['published /thermal/image']) - used
 
 
 def table(rows: list[Measured]) -> str:
