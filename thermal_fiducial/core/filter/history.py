@@ -43,7 +43,7 @@ class History:
         #: suspected steps of the camera's clock [ns], by the stamp of the first pose behind them
         self._camera_steps: dict[int, int] = {}
         #: suspected steps of the IMU's clock: stamp of the sample before [ns], standard deviation [s]
-        self._clock_steps: list[tuple[int, float]] = []
+        self._imu_steps: list[tuple[int, float]] = []
         #: the estimate at the newest sample
         self.main: Hypothesis | None = None
 
@@ -57,7 +57,7 @@ class History:
         estimate = hypothesis.estimate
         if estimate.stamp_ns >= until_ns:
             return hypothesis
-        for begin_ns, std in self._clock_steps:
+        for begin_ns, std in self._imu_steps:
             if estimate.stamp_ns <= begin_ns < until_ns:
                 estimate = with_clock_step(self.carried(hypothesis, begin_ns).estimate, self.imu.at(begin_ns), std)
                 hypothesis = hypothesis._replace(estimate=estimate)
@@ -66,7 +66,7 @@ class History:
 
     def suspect_clock_step(self, size_ns: int) -> None:
         """Count with a step of the IMU's clock by ``size_ns`` after the newest sample; or samples are lost there."""
-        self._clock_steps.append((self.imu.newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
+        self._imu_steps.append((self.imu.newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
 
     def alternative(self) -> Hypothesis | None:
         """The alternative hypothesis at the newest sample."""
@@ -86,7 +86,7 @@ class History:
         self.imu.forget_before(min(horizon_ns, oldest.stamp_ns) if oldest.hypotheses else horizon_ns)
         kept = {pose.stamp_ns for pose in self._poses}
         self._camera_steps = {stamp: step for stamp, step in self._camera_steps.items() if stamp in kept}
-        self._clock_steps = [step for step in self._clock_steps if step[0] >= self.imu.oldest_ns]
+        self._imu_steps = [step for step in self._imu_steps if step[0] >= self.imu.oldest_ns]
 
     def insert(self, pose: CameraPose, camera_step_ns: int = 0) -> None:
         """Add a pose; :meth:`take_in` applies it once the samples reach its instant.
@@ -258,7 +258,7 @@ class History:
         return belief._replace(alternative=begun, hits_before=at_pose.hits, drifted=drifted)
 
     def _settled(self, belief: Belief, decided: list[PoseUpdate]) -> tuple[Belief, list[PoseUpdate]]:
-        settled = self._hypotheses.settled(belief)
+        settled = belief.settled(self._hypotheses.config)
         if settled.main is None or settled.main is belief.main:
             return settled, decided
         reason = 'reset' if belief.main else 'initialised'

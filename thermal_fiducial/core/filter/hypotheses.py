@@ -9,7 +9,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.initialization import blank_state, start
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.pose_noise import BodyPose
-from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
+from thermal_fiducial.core.filter.recovery import Hypothesis
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
     GYROSCOPE_BIAS,
@@ -44,7 +44,7 @@ class Hypotheses:
 
     def configure(self, config: PoseEkfConfig) -> None:
         """Take over the dynamic parameters of ``config``."""
-        self._config = config
+        self.config = config
         self._updater.config = config
 
     def weigh(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> tuple[Hypothesis, PoseUpdate]:
@@ -52,7 +52,7 @@ class Hypotheses:
         estimate = hypothesis.estimate
         measured = self._measured(pose, estimate.state)
         innovation = self._updater.innovation(estimate, measured, motion)
-        if innovation.nis <= self._config.gate and not self._is_stale(hypothesis):
+        if innovation.nis <= self.config.gate and not self._is_stale(hypothesis):
             corrected = self._updater.correct(measured, innovation, motion)
             return hypothesis.accepting(corrected), PoseUpdate(pose.stamp_ns, True, '', innovation.nis)
         noise = estimate.pose_noise.weighed(measured, innovation.value, innovation.S_inverse)
@@ -68,7 +68,7 @@ class Hypotheses:
         innovation = self._updater.innovation(estimate, measured, motion)
         turn, shift = innovation.value[:3], innovation.value[3:]
         seconds = (hypothesis.estimate.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
-        if turn @ np.linalg.solve(np.linalg.inv(innovation.S_inverse)[:3, :3], turn) > self._config.gate:
+        if turn @ np.linalg.solve(np.linalg.inv(innovation.S_inverse)[:3, :3], turn) > self.config.gate:
             apart = f'{math.degrees(np.linalg.norm(turn)):.0f} deg apart after {seconds:.2f} s'
             return Condition('poses contradict the gyroscope', f'{apart}; its units, axes, sign? camera_orientation?')
         apart = f'{np.linalg.norm(shift):.2f} m apart after {seconds:.2f} s'
@@ -80,19 +80,15 @@ class Hypotheses:
         estimate = hypothesis.estimate
         measured = self._measured(pose, estimate.state)
         unclocked = self._updater.with_unknown_clock(estimate)
-        return self._updater.innovation(unclocked, measured, motion).nis <= self._config.gate
+        return self._updater.innovation(unclocked, measured, motion).nis <= self.config.gate
 
     def _measured(self, pose: CameraPose, state: NavigationState) -> BodyPose:
-        return body_pose(pose, state.T_body_camera, self._config.pose_noise_scale)
-
-    def settled(self, belief: Belief) -> Belief:
-        """The belief after the alternative hypothesis was compared with the main one."""
-        return belief.settled(self._config)
+        return body_pose(pose, state.T_body_camera, self.config.pose_noise_scale)
 
     def _is_stale(self, hypothesis: Hypothesis) -> bool:
         """Whether it has coasted longer than ``reinitialise_after``, and must not be corrected any more."""
         coasted_ns = hypothesis.estimate.stamp_ns - hypothesis.accepted_ns
-        return coasted_ns > self._config.reinitialise_after * SECOND_NS
+        return coasted_ns > self.config.reinitialise_after * SECOND_NS
 
     def from_nothing(self, pose: CameraPose, time_ns: int, window: FloatArray, time_offset: float) -> Hypothesis | None:
         """A hypothesis initialised from a pose without prior; None where the pose contradicts gravity.
@@ -102,8 +98,8 @@ class Hypotheses:
         window : (N, 6) the latest samples up to the pose's instant ``time_ns``
         time_offset : clock offset [s], beyond the parameter's, about which to linearise
         """
-        blank = replace(blank_state(self._config), time_offset=time_offset)
-        return self._begun(pose, time_ns, window, blank, self._config.time_offset_std)
+        blank = replace(blank_state(self.config), time_offset=time_offset)
+        return self._begun(pose, time_ns, window, blank, self.config.time_offset_std)
 
     def relinearises(self, begun: Hypothesis, first_offset: float) -> bool:
         """Whether a hypothesis that began at ``first_offset`` [s] has learned another clock offset."""
@@ -125,7 +121,7 @@ class Hypotheses:
             return None
         widened = _far_covariance(estimate.covariance)
         far = self._updater.innovation(replace(estimate, covariance=widened), measured, motion)
-        needed = 0 if far.nis <= self._config.gate else min(main.hits, _ENOUGH_POSES)
+        needed = 0 if far.nis <= self.config.gate else min(main.hits, _ENOUGH_POSES)
         return begun._replace(needed=needed)
 
     def _clock_std(self, main: Hypothesis, pose: CameraPose, motion: MotionAtPose) -> float:
@@ -133,7 +129,7 @@ class Hypotheses:
 
         The parameter's where an unknown offset explains why ``main`` refuses the pose, else that of ``main``.
         """
-        unknown = self._config.time_offset_std
+        unknown = self.config.time_offset_std
         if self.explains(main, pose, motion):
             return unknown
         return min(unknown, math.hypot(main.estimate.std(TIME_OFFSET), KNOWN_OFFSET_STD))
@@ -141,7 +137,7 @@ class Hypotheses:
     def _begun(
         self, pose: CameraPose, time_ns: int, window: FloatArray, prior: NavigationState, clock_std: float
     ) -> Hypothesis | None:
-        config = replace(self._config, time_offset_std=clock_std)
+        config = replace(self.config, time_offset_std=clock_std)
         measured = self._measured(pose, prior)
         estimate = start(config, measured, time_ns, prior, window)
         if estimate is None:
