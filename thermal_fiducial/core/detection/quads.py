@@ -4,6 +4,7 @@ The threshold is a share of the local standard deviation, so that markers of any
 the order of the noise it rises again: a marker of twice the noise is still segmented, a bare wall hardly at all.
 """
 
+import math
 from typing import Any, NamedTuple, TypeAlias
 
 import cv2
@@ -20,8 +21,8 @@ _COLUMNS = 9
 # In a picture for a display: odd width of the surroundings, no wider than the white around the smallest markers; least
 # difference of a dark pixel from their mean [gray levels] and [standard deviations of the noise].
 _PICTURE_WINDOW_PX, _PICTURE_STEP, _PICTURE_NOISE = 5, 3.0, 2.0
-# Mean of Gaussian noise clipped at one standard deviation moves by 0.68 of a small offset.
-_CLIPPED = 1.0 / 0.68
+# Mean of Gaussian noise clipped at one standard deviation moves by the share of it within, 0.68, of a small offset.
+_CLIPPED = 1.0 / math.erf(math.sqrt(0.5))
 # Floor of the local standard deviation where all markers have a high contrast [standard deviations of the noise].
 _FLOOR_OF_CLEAR = 4.0
 # Tolerance of polygon approximation as a share of an outline's length: above the effect of noise, below a side.

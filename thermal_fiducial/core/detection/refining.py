@@ -260,7 +260,7 @@ def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCor
     blocks = known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
     covariances = together * blocks + OF_ALL_SIDES_PX**2 * _EYE
     # In an outline that is inconsistent with a square, some side belongs to another object.
-    doubt = known.doubt * (0.25 * sides.along.reshape(-1, 4).sum(axis=1)) ** 2
+    doubt = known.doubt * (sides.along.reshape(-1, 4).sum(axis=1) / 4) ** 2
     good = segments.variance < HOPELESS
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]
     contrast, noise = (segments.contrast * share).sum(axis=1), np.sqrt((segments.noise * share).sum(axis=1))

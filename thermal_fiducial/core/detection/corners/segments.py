@@ -153,7 +153,7 @@ def _fit(moments: Float32Array, segments: int) -> _SegmentFit:
     level = means[3] - contrast * means[1] - product * means[2]
     usable: BoolArray = np.asarray(number >= _FEWEST_PIXELS)
     typical = median_of(own, usable)
-    noise = np.where(own > _NOISIER * typical, own, typical) + 1e-3
+    noise = np.where(own > _NOISIER * typical, own, typical) + TINY
     return _SegmentFit(contrast, product, c / determinant, a / determinant, level, usable, noise)
 
 

@@ -27,7 +27,7 @@ _INCONSISTENT = 12.0
 _STEP_PX = 1e-4
 _EYE, _OF_EACH = np.eye(2), np.eye(4)[:, None, :, None]
 # Mean displacement of all corners, for each of them.
-_TOGETHER = np.kron(np.full((4, 4), 0.25), _EYE)
+_TOGETHER = np.kron(np.ones((4, 4)) / 4, _EYE)
 
 
 class Squared(NamedTuple):
