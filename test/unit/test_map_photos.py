@@ -79,20 +79,39 @@ def test_an_origin_that_is_in_no_photo_is_named_with_its_dictionary(photographed
     assert 'marker 49 of DICT_4X4_50, the origin, is in none of the 12 photos' in capsys.readouterr().err
 
 
-def test_a_map_from_thermal_photos_claims_what_they_show(photographed, poses, tmp_path):
-    """A camera that hangs still for each picture has no motion blur that its corners could be displaced by."""
+def thermal_photos(folder, poses):
+    """Twelve pictures of 16 bits."""
     rng = np.random.default_rng(7)
     for k in range(12):
         shown = photo(flight(2.0 * k), poses).astype(float)
         counts = 5000.0 + shown + rng.normal(0.0, 1.5, shown.shape)
-        cv2.imwrite(str(tmp_path / f'{k}.png'), np.rint(counts).astype(np.uint16))
-    start, out = tmp_path / 'start.yaml', tmp_path / 'hall.yaml'
+        cv2.imwrite(str(folder / f'{k}.png'), np.rint(counts).astype(np.uint16))
+
+
+def mapped_errors(photographed, folder, poses):
+    """Built markers, and the differences of their poses from the true ones; marker 2 is known."""
+    start, out = folder / 'start.yaml', folder / 'hall.yaml'
     save_map(start, MarkerMap({2: MapMarker(2, SIZE, True, poses[2])}, dictionary=DICTIONARY))
-    assert build((tmp_path, *photographed[1:]), '--map', start, '--out', out) == 0
+    out.unlink(missing_ok=True)
+    assert build((folder, *photographed[1:]), '--map', start, '--out', out) == 0
     built = load_map(out).markers
-    for key in sorted(poses.keys() - {2}):
-        d = difference(built[key].T_map_marker, poses[key])
+    return built, {key: difference(built[key].T_map_marker, poses[key]) for key in sorted(poses.keys() - {2})}
+
+
+def test_a_map_from_thermal_photos_claims_what_they_show(photographed, poses, tmp_path):
+    """A camera that hangs still for each picture has no motion blur that its corners could be displaced by."""
+    thermal_photos(tmp_path, poses)
+    built, differences = mapped_errors(photographed, tmp_path, poses)
+    for key, d in differences.items():
         # Measured: 0.3 to 1.0 a degree of freedom and up to 2.5 mm; it was 0.02 to 0.05 and 13 mm when the camera might
         # have moved. 3.7 is the 99.9 % quantile of chi square with 6 degrees of freedom, over 6.
         assert 0.1 < d @ np.linalg.solve(built[key].covariance, d) / 6.0 < 3.7
         assert np.linalg.norm(d[:3]) < 0.005
+
+
+def test_a_thickness_in_millimetres_is_refused(photographed, tmp_path, capsys):
+    assert (
+        build(photographed, '--origin', 2, '--marker-size', SIZE, '--plate-thickness', 3, '--out', tmp_path / 'a.yaml')
+        == 2
+    )
+    assert 'plate_thickness: 3.0 is outside 0.0 .. 0.05' in capsys.readouterr().err

@@ -11,9 +11,11 @@ from thermal_fiducial.calibration.sources import clean_frames, imu_track, RawFra
 from thermal_fiducial.cli import calibrate_intrinsics
 from thermal_fiducial.cli.calibrate_imu import add_imu
 from thermal_fiducial.cli.calibrate_intrinsics import mapped_detector
+from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.progress import tracked
 from thermal_fiducial.cli.subcommands import add_command, file_to_write
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
+from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MarkerMap
@@ -49,6 +51,7 @@ def _add_camera_imu(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('bag', type=Path, help='bag with thermal/image_raw and imu/data, moving before mapped markers')
     parser.add_argument('--map', type=Path, required=True, help='marker map (YAML)')
     parser.add_argument('--calibration', type=Path, help='camera_info YAML (default: the camera_info of the bag)')
+    add_thickness(parser)
     parser.add_argument('--out', type=file_to_write, default=Path('extrinsics.yaml'), help='parameters to write')
     noise = ImuNoise()
     for name, unit in (
@@ -77,18 +80,20 @@ def _camera_imu(args: argparse.Namespace) -> int:
         camera = recorded_camera(bag) if args.calibration is None else load_camera(args.calibration)
         imu, start_ns = imu_track(bag)
         frames = tracked(clean_frames(bag), 'finding markers', bag.message_count([bag.image_topic]))
-        seen = sorted(_mapped_corners(frames, marker_map, camera), key=lambda frame: frame.stamp_ns)
+        detector = mapped_detector(marker_map, args.plate_thickness)
+        seen = sorted(_mapped_corners(frames, detector, marker_map, camera), key=lambda frame: frame.stamp_ns)
     result = calibrate_rolling_camera_imu(seen, camera, imu, start_ns, noise)
     write_text(args.out, _extrinsics_text(result))
     print(_extrinsics_text(result))
     return 0
 
 
-def _mapped_corners(frames: Iterable[RawFrame], marker_map: MarkerMap, camera: Camera) -> Iterator['FrameCorners']:
+def _mapped_corners(
+    frames: Iterable[RawFrame], detector: MarkerDetector, marker_map: MarkerMap, camera: Camera
+) -> Iterator['FrameCorners']:
     """Detections of mapped markers, frames without any left out."""
     from thermal_fiducial.calibration.rolling import FrameCorners
 
-    detector = mapped_detector(marker_map)
     for frame in frames:
         rows = detector.detect(frame.stamp_ns, frame.counts, camera)
         rows = rows[np.isin(rows['id'], list(marker_map.markers))]

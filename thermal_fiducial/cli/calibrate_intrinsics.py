@@ -139,9 +139,10 @@ def _place(text: str) -> tuple[int, int]:
     return column, row
 
 
-def mapped_detector(board: MarkerMap) -> MarkerDetector:
-    """Detector with the markers of ``board`` as its map."""
-    detector = MarkerDetector(ArucoDetectorConfig(dictionary=board.dictionary), load_dictionary(board.dictionary))
+def mapped_detector(board: MarkerMap, thickness: float = 0.0) -> MarkerDetector:
+    """Detector with the markers of ``board``, plates of ``thickness`` [m], as its map."""
+    config = ArucoDetectorConfig(dictionary=board.dictionary, plate_thickness=thickness)
+    detector = MarkerDetector(config, load_dictionary(board.dictionary))
     detector.set_map(board.geometry())
     return detector
 

@@ -94,6 +94,7 @@ def _detector(args: argparse.Namespace) -> MarkerDetector:
     config = ArucoDetectorConfig(
         # The camera is held still for each photo; from an unknown motion lag would displace corners by pixels.
         bolometer_lag=0.0,
+        plate_thickness=args.plate_thickness,
         dictionary=args.dictionary,
         marker_size=args.marker_size or defaults.marker_size,
         marker_size_overrides=tuple(args.marker_size_override),

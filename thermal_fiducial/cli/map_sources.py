@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from thermal_fiducial.cli.map_photos import detect_in_photos, isotropic, photos_in
+from thermal_fiducial.cli.marker_sizes import add_thickness
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.cli.run_parameters import camera_of_run, sizes_of_run
 from thermal_fiducial.cli.subcommands import file_to_write
@@ -50,6 +51,7 @@ def add_build(parser: argparse.ArgumentParser) -> None:
     start = parser.add_mutually_exclusive_group(required=True)
     start.add_argument('--origin', type=int, metavar='ID', help='marker that becomes the origin of the map')
     start.add_argument('--map', type=Path, metavar='MAP', help='map with known markers to start from')
+    add_thickness(parser)
     parser.add_argument('--out', type=file_to_write, required=True, metavar='MAP', help='the map to write')
     parser.set_defaults(do=_build)
 

@@ -23,6 +23,17 @@ def add_sizes(parser: argparse.ArgumentParser, *, behind: bool = False, without:
     )
 
 
+def add_thickness(parser: argparse.ArgumentParser) -> None:
+    """Add the option for the thickness of the plates, as the nodes have it."""
+    parser.add_argument(
+        '--plate-thickness',
+        type=float,
+        default=0.0,
+        metavar='M',
+        help='thickness of the plates, if they are cut from acrylic [m] (default: 0)',
+    )
+
+
 def join_sizes(args: argparse.Namespace) -> None:
     """Join the overrides of both places in ``args.marker_size_override``; for a marker the last one holds."""
     args.marker_size_override = [*args.sizes_before, *args.sizes_behind]
