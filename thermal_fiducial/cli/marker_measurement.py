@@ -11,7 +11,7 @@ from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import columns, corners_px, Markers
-from thermal_fiducial.core.types import Counts, FloatArray, SIGMA_OF_MEDIAN
+from thermal_fiducial.core.types import Counts, FloatArray, IntArray, SIGMA_OF_MEDIAN
 from thermal_fiducial.fabrication.planning import expected_errors, Measurements, pose_errors
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.lens import Lens
@@ -110,7 +110,7 @@ def _plate(T: FloatArray, bits: np.ndarray, contrast: float) -> Plate:
     return Plate(T, side, side, levels, np.ones_like(levels), contrast, 0.0)
 
 
-def detect(view: View, detector: MarkerDetector, camera: Camera) -> tuple[Markers, FloatArray]:
+def detect(view: View, detector: MarkerDetector, camera: Camera) -> tuple[Markers, IntArray]:
     """Rows of the markers of ``view`` that were found, and for each its index among the true ones."""
     rows = detector.detect(view.stamp_ns, view.counts, camera)
     order = {marker_id: index for index, marker_id in enumerate(view.ids)}

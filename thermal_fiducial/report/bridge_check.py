@@ -90,7 +90,7 @@ def _values(record: BridgeRecord) -> list[Finding]:
 
 def _rate(record: BridgeRecord) -> list[Finding]:
     steps = np.diff(np.sort(record.stamps_ns)) / SECOND_NS
-    mean = steps.mean()
+    mean = float(steps.mean())
     rate, gap = (1.0 / mean if mean > 0.0 else 0.0), steps.max()
     seen = f'{rate:.1f} Hz, longest gap {gap * 1e3:.0f} ms'
     if rate < ARDUPILOT_RATE:

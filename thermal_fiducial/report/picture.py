@@ -97,7 +97,8 @@ def _draw_map(axis: Axes, evaluation: Evaluation) -> None:
     for marker in markers:
         outline = corners_in_map(marker.T_map_marker, marker.size)[:, :2]
         axis.fill(*outline.T, facecolor=FIDUCIAL, edgecolor=FIDUCIAL, linewidth=3.0)
-        axis.annotate(str(marker.id), outline.mean(axis=0), (7.0, 0.0), textcoords='offset points', va='center')
+        x, y = outline.mean(axis=0).tolist()
+        axis.annotate(str(marker.id), (x, y), (7.0, 0.0), textcoords='offset points', va='center')
     axis.set_aspect('equal', adjustable='datalim')
     axis.set(title='The map from above', xlabel='x [m]', ylabel='y [m]')
     axis.legend(loc='upper left', fontsize=7.5, borderaxespad=0.1)
