@@ -75,6 +75,13 @@ def test_a_process_that_dies_is_reported_once_and_replaced(worker):
     assert result_of(worker)[1] == 0.0
 
 
+def test_a_process_that_has_hung_up_but_not_ended_is_replaced(worker):
+    worker.start('hang up')
+    assert 'ended' in failure(worker)
+    worker.start(0.0)
+    assert result_of(worker)[1] == 0.0
+
+
 def signalled(number):
     """The process of the worker, after a signal."""
     (process,) = multiprocessing.active_children()

@@ -74,6 +74,8 @@ class Background(Generic[Task, Result]):
             try:
                 self._outcome = wait()
             except (EOFError, OSError):
+                # Its end of the pipe is closed before it has ended: the next task must not go to it.
+                self.close()
                 self._outcome = InputError(f'its process ended, or gave no answer for {self.patience_s:g} s')
             except Exception as error:  # reported by the node, whatever it is
                 self._outcome = error
