@@ -79,10 +79,7 @@ def as_published(T: FloatArray) -> FloatArray:
 
 def as_received(states: Sequence[Odometry]) -> list[Odometry]:
     """The filter's odometry as detector and mapper read it from its messages."""
-    T = np.array([state.T_map_body for state in states])
-    quaternions = np.array([quaternion_from_rotation(R) for R in T[:, :3, :3]])
-    received = transform_from_quaternion(T[:, :3, 3], quaternions)
-    return possible([replace(state, T_map_body=pose) for state, pose in zip(states, received, strict=True)])
+    return possible([replace(state, T_map_body=as_published(state.T_map_body)) for state in states])
 
 
 class Pipeline:
