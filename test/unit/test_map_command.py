@@ -77,6 +77,18 @@ def test_check_distinguishes_sound_from_doubtful(path, capsys):
     assert doubts.endswith(': 2 doubts\n')
 
 
+@pytest.mark.parametrize('name', ['gone.yaml', '/elsewhere/own.yaml'])
+def test_check_names_a_dictionary_that_cannot_be_opened(name, path, capsys):
+    """It said "sound" although it had not looked at the IDs. Edits need no dictionary."""
+    path.write_text(path.read_text().replace('DICT_4X4_50', name))
+    assert run('check', path) == 1
+    doubt, verdict = capsys.readouterr().out.splitlines()
+    assert doubt.startswith('whether its dictionary has these markers is unknown: ')
+    assert name in doubt
+    assert verdict == f'{path}: 1 doubt'
+    assert run('rename', path, 4, 4000) == 0
+
+
 def test_edits_make_versions_that_can_be_undone(path, poses, capsys):
     first = path.read_bytes()
     assert run('fix', path, 1, 2) == 0

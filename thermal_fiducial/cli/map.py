@@ -197,12 +197,19 @@ def _moved(args: argparse.Namespace, marker_map: MarkerMap, covariance: FloatArr
 
 def _rename(args: argparse.Namespace) -> int:
     def renamed(marker_map: MarkerMap) -> MarkerMap:
-        foreign = not_in_dictionary([args.new], marker_map.dictionary, args.map.parent)
-        if foreign or args.new < 0:
+        if args.new < 0 or _is_foreign(args.new, marker_map, args.map.parent):
             raise InputError(f'{args.map}: there is no marker {args.new} in {marker_map.dictionary}')
         return map_editing.rename(marker_map, args.old, args.new)
 
     return _edit(args, f'rename {args.old} to {args.new}', renamed)
+
+
+def _is_foreign(key: int, marker_map: MarkerMap, folder: Path) -> bool:
+    try:
+        return bool(not_in_dictionary([key], marker_map.dictionary, folder))
+    except InputError:
+        # The dictionary lies elsewhere, on the robot say: any ID may be in it.
+        return False
 
 
 def _delete(args: argparse.Namespace) -> int:

@@ -136,13 +136,20 @@ def _grow(
 
 def say_doubts(marker_map: MarkerMap, path: Path) -> list[Doubt]:
     """Print and return the doubts about the map in the file ``path``."""
-    found = doubts(marker_map)
-    for key in not_in_dictionary(marker_map.markers, marker_map.dictionary, path.parent):
-        found.append(Doubt(f'marker {key}: not in {marker_map.dictionary}', True))
+    found = [*doubts(marker_map), *_doubts_of_dictionary(marker_map, path.parent)]
     for doubt in found:
         print(doubt.text)
     print(f'{path}: {len(found)} doubt{"" if len(found) == 1 else "s"}' if found else f'{path}: sound')
     return found
+
+
+def _doubts_of_dictionary(marker_map: MarkerMap, folder: Path) -> list[Doubt]:
+    try:
+        foreign = not_in_dictionary(marker_map.markers, marker_map.dictionary, folder)
+    except InputError as error:
+        # The poses may be right all the same: a node reads the patterns from its own parameter.
+        return [Doubt(f'whether its dictionary has these markers is unknown: {error}', False)]
+    return [Doubt(f'marker {key}: not in {marker_map.dictionary}', True) for key in foreign]
 
 
 def _print_what_was_used(built: Built, frames: int) -> None:

@@ -90,11 +90,14 @@ def other_patterns(markers: Iterable[int], of: str, read_as: str, folder: Path =
 
 
 def not_in_dictionary(markers: Iterable[int], name: str, folder: Path) -> list[int]:
-    """IDs ``markers`` that the dictionary of a map in ``folder`` lacks; none if it cannot be opened."""
-    try:
-        known = len(load_dictionary(dictionary_of_map(name, folder)).bits)
-    except InputError:
-        return []
+    """IDs ``markers`` that the dictionary of a map in ``folder`` lacks.
+
+    Raises
+    ------
+    InputError
+        The dictionary cannot be opened.
+    """
+    known = len(load_dictionary(dictionary_of_map(name, folder)).bits)
     return [marker for marker in sorted(markers) if marker >= known]
 
 
