@@ -109,8 +109,6 @@ class CountingNode(Node):
     def __init__(self, name: str, **kwargs: Any) -> None:
         #: subscriptions that the executor ignores: their messages stay queued until :meth:`take_waiting`
         self.lazy: dict[Any, Input] = {}
-        #: others that it ignores, see :meth:`observe`
-        self._observed: set[Any] = set()
         super().__init__(name, **kwargs)
         self.inputs: list[Input] = []
         self.outputs: list[Output] = []
@@ -165,22 +163,10 @@ class CountingNode(Node):
         self.lazy[subscription] = source
         return source
 
-    def observe(self, kind: type, topic: str, profile: QoSProfile) -> Input:
-        """A subscription whose messages stay in its queue until somebody takes them; no input of the node."""
-        source = Input(self.resolve_topic_name(topic))
-        source.attach(self.create_subscription(kind, topic, lambda _: None, profile))
-        self._observed.add(source.subscription)
-        return source
-
-    def ignore(self, source: Input) -> None:
-        """End a subscription of :meth:`observe`."""
-        self._observed.discard(source.subscription)
-        self.destroy_subscription(source.subscription)
-
     @property
     def subscriptions(self) -> Iterator[Any]:
         """Subscriptions that the executor serves."""
-        return (item for item in super().subscriptions if item not in self.lazy and item not in self._observed)
+        return (item for item in super().subscriptions if item not in self.lazy)
 
     def take_waiting(self) -> None:
         """Take all queued messages of the lazy subscriptions, in the order of subscription."""

@@ -19,7 +19,7 @@ from thermal_fiducial.files.reading import one_line
 from thermal_fiducial.ros import convert, params
 from thermal_fiducial.ros.console import Console
 from thermal_fiducial.ros.counting import CountingNode
-from thermal_fiducial.ros.hearing import Hearing
+from thermal_fiducial.ros.hearing import replaced_ports
 from thermal_fiducial.ros.input_rates import InputRates
 
 Config = TypeVar('Config')
@@ -83,7 +83,6 @@ class StageNode(CountingNode, Generic[Config]):
         self.last_refusal = ''
         self._diagnosed_refused = 0
         self._rates = InputRates(self.inputs, _expected_rate(self.config))
-        self._hearing = Hearing(self)
         #: why the node cannot go on in this process; see ``run``
         self.deaf = ''
         #: console lines for a pilot
@@ -199,8 +198,9 @@ class StageNode(CountingNode, Generic[Config]):
         self._diagnosed_refused = self.refused
 
     def _listen(self) -> None:
-        self.deaf = self._hearing.look(stopped=self._rates.stopped or bool(self._rates.stale))
-        if self.deaf:
+        """While an input is missing, find out whether it cannot be heard in this process."""
+        if (self._rates.silent or self._rates.stale) and (ports := replaced_ports()):
+            self.deaf = f'deaf: port {", ".join(ports)} of the shared memory has been replaced'
             self.get_logger().error(f'{self.deaf}; the node starts again')
 
     def _level(self) -> tuple[bytes, str]:
