@@ -1,5 +1,7 @@
 """The store of keyframes: bounded, spread out, moved as one."""
 
+import time
+
 import numpy as np
 from support.walls import CAMERA, flight
 
@@ -26,6 +28,22 @@ def test_rare_views_outlive_common_ones():
     for k in range(1, 2000):
         store.add(frame(k, transform(np.eye(3), [0.0, 0.0, 1e-4 * (k % 7)])))
     assert 0 in store.frames
+
+
+def test_frames_on_all_sides_of_the_origin_are_thinned_as_soon_as_others():
+    """Cells with a corner in the origin never become fewer than its octants, however coarse they are."""
+    rng = np.random.default_rng(0)
+    turns, places = so3_exp(rng.normal(size=(300, 3))), rng.uniform(-4.0, 4.0, (300, 3))
+
+    def seconds(origin):
+        store, begun = KeyframeStore(10), time.perf_counter()
+        for k in range(300):
+            store.add(frame(k, transform(turns[k], places[k] + origin)))
+        return time.perf_counter() - begun
+
+    ratios = [seconds(np.zeros(3)) / seconds(np.full(3, 100.0)) for _ in range(3)]
+    # As many coarser grids, 4 or 5, are tried around the origin as elsewhere; until floating point overflows, 1024.
+    assert min(ratios) < 10.0
 
 
 def test_bridges_are_never_dropped():

@@ -156,11 +156,14 @@ class KeyframeStore:
         return kept
 
     def _cells(self, coarseness: float) -> dict[tuple[int, ...], list[int]]:
-        """Stamps of the keyframes by cell of camera position and viewing direction."""
+        """Stamps of the keyframes by cell of camera position and viewing direction.
+
+        A cell has its middle, not a corner, in the origin of the map, so that coarse enough ones hold all keyframes.
+        """
         T = np.stack([frame.T_map_camera for frame in self.frames.values()])
         scaled = np.concatenate([T[:, :3, 3] / _CELL_M, T[:, :3, 2] / _CELL_DIRECTION], axis=-1) / coarseness
         cells: dict[tuple[int, ...], list[int]] = defaultdict(list)
-        for stamp, key in zip(self.frames, np.floor(scaled).astype(int).tolist(), strict=True):
+        for stamp, key in zip(self.frames, np.rint(scaled).astype(int).tolist(), strict=True):
             cells[tuple(key)].append(stamp)
         return cells
 
