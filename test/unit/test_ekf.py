@@ -236,6 +236,15 @@ def test_after_long_enough_without_markers_it_resets(flight, patience, resets):
     assert errors(flight, states, 5.0)[0].max() < 0.1
 
 
+def test_a_pose_after_too_long_without_one_is_refused_for_that(flight):
+    poses = [pose for pose in flight.poses if not 1.0 < (pose.stamp_ns - START_NS) * 1e-9 < 4.0]
+    ekf = PoseEkf(config(reinitialise_after=2.0))
+    run(ekf, timeline(flight.samples(), poses, 0.03))
+    reasons = {update.reason for update in ekf.decided.values() if update.refused}
+    # Not for its innovation, which is below the gate.
+    assert reasons == {'refused: after 3 s without one'}
+
+
 def test_unusable_poses_are_refused_with_a_reason(short_flight, flown):
     ekf, flight = flown, short_flight
     pose = flight.poses[0]

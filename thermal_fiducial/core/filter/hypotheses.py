@@ -48,18 +48,22 @@ class Hypotheses:
         self._updater.config = config
 
     def weigh(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> tuple[Hypothesis, PoseUpdate]:
-        """A hypothesis after a pose at its instant, and the verdict on the pose."""
+        """A hypothesis after a pose at its instant, and the verdict on the pose.
+
+        One that has coasted longer than ``reinitialise_after`` must not be corrected any more.
+        """
         estimate = hypothesis.estimate
         measured = self._measured(pose, estimate.state)
         innovation = self._updater.innovation(estimate, measured, motion)
-        if innovation.nis <= self.config.gate and not self._is_stale(hypothesis):
+        coasted = (estimate.stamp_ns - hypothesis.accepted_ns) / SECOND_NS
+        stale = coasted > self.config.reinitialise_after
+        if innovation.nis <= self.config.gate and not stale:
             corrected = self._updater.correct(measured, innovation, motion)
             return hypothesis.accepting(corrected), PoseUpdate(pose.stamp_ns, True, '', innovation.nis)
         noise = estimate.pose_noise.weighed(measured, innovation.value, innovation.S_inverse)
         refusing = hypothesis.refusing(replace(estimate, pose_noise=noise))
-        return refusing, PoseUpdate(
-            pose.stamp_ns, False, f'refused: {math.sqrt(innovation.nis):.1f} sigma', innovation.nis
-        )
+        why = f'after {coasted:.0f} s without one' if stale else f'{math.sqrt(innovation.nis):.1f} sigma'
+        return refusing, PoseUpdate(pose.stamp_ns, False, f'refused: {why}', innovation.nis)
 
     def contradiction(self, hypothesis: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> Condition:
         """Which sensor of the IMU a refused pose contradicts; ``hypothesis`` is at the pose's instant."""
@@ -84,11 +88,6 @@ class Hypotheses:
 
     def _measured(self, pose: CameraPose, state: NavigationState) -> BodyPose:
         return body_pose(pose, state.T_body_camera, self.config.pose_noise_scale)
-
-    def _is_stale(self, hypothesis: Hypothesis) -> bool:
-        """Whether it has coasted longer than ``reinitialise_after``, and must not be corrected any more."""
-        coasted_ns = hypothesis.estimate.stamp_ns - hypothesis.accepted_ns
-        return coasted_ns > self.config.reinitialise_after * SECOND_NS
 
     def from_nothing(self, pose: CameraPose, time_ns: int, window: FloatArray, time_offset: float) -> Hypothesis | None:
         """A hypothesis initialised from a pose without prior; None where the pose contradicts gravity.
