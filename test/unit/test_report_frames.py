@@ -3,6 +3,7 @@
 import base64
 from importlib.util import find_spec
 import json
+import re
 import shutil
 
 import cv2
@@ -85,6 +86,16 @@ def test_the_page_holds_the_strip(flight):
     page = write_report(flight / 'run').read_text()
     assert page.count('<img src="data:image/webp;base64,') == len(strip(read_run(flight / 'run')))
     assert '4 markers</figcaption>' in page
+    # A picture that is loaded when it is reached takes no room until then: links jumped past their sections.
+    assert 'loading="lazy"' not in page
+
+
+def test_the_video_shows_a_frame_before_it_is_played(flight, tmp_path):
+    """On phones and in a page on paper it was a black square."""
+    shutil.copytree(flight / 'run', tmp_path / 'run')
+    (tmp_path / 'run' / 'flight.mp4').write_bytes(b'')
+    page = write_report(tmp_path / 'run').read_text()
+    assert re.search(r'<video [^>]*src="flight.mp4" poster="data:image/webp;base64,', page)
 
 
 @needs_encoder

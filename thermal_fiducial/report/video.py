@@ -118,7 +118,8 @@ def _place(run: Run, stamp_ns: int) -> str:
     if abs(int(fused.stamps_ns[at]) - stamp_ns - run.offset_ns) > _NEAR_NS:
         return 'no pose'
     p: FloatArray = fused.positions[at]
-    return f'x {p[0]:.2f}  y {p[1]:.2f}  z {p[2]:.2f} m'
+    # Without "z" places just below zero are written -0.00.
+    return f'x {p[0]:z.2f}  y {p[1]:z.2f}  z {p[2]:z.2f} m'
 
 
 @contextmanager
