@@ -354,9 +354,7 @@ def test_an_imu_message_without_accelerations_is_refused():
         convert.imu_sample(message)
 
 
-def test_diagnostics_and_path():
+def test_diagnostics():
     (status,) = sent(convert.diagnostics('node', b'\x01', 'why', {'a': 1.5, 'b': 'x'}, STAMP)).status
     assert (status.name, status.level, status.message) == ('node', b'\x01', 'why')
     assert [(item.key, item.value) for item in status.values] == [('a', '1.5'), ('b', 'x')]
-    path = sent(convert.path([(STAMP, Pose()), (STAMP + 1, Pose())], HEAD))
-    assert [convert.stamp_ns(pose.header.stamp) for pose in path.poses] == [STAMP, STAMP + 1]

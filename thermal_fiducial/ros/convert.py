@@ -5,7 +5,7 @@ Messages validate nothing, so inputs are checked here, and outputs are converted
 """
 
 from array import array
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
@@ -13,12 +13,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import (
     Point,
     Pose,
-    PoseStamped,
     Quaternion,
     TransformStamped,
     Vector3,
 )
-from nav_msgs.msg import Path
 import numpy as np
 import numpy.typing as npt
 from sensor_msgs.msg import CameraInfo, Image, TimeReference
@@ -180,13 +178,6 @@ def transform_of_message(message: TransformStamped, what: str) -> FloatArray:
     """
     p = message.transform.translation
     return transform_of(Pose(position=Point(x=p.x, y=p.y, z=p.z), orientation=message.transform.rotation), what)
-
-
-def path(poses: Iterable[tuple[int, Pose]], head: Header) -> Path:
-    """Path through stamped poses, all in the header's frame."""
-    return Path(
-        header=head, poses=[PoseStamped(header=header(stamp, head.frame_id), pose=place) for stamp, place in poses]
-    )
 
 
 def diagnostics(name: str, level: bytes, message: str, values: Mapping[str, object], stamp: int) -> DiagnosticArray:

@@ -1,9 +1,8 @@
 """Outputs of the filter: for every IMU message pose, odometry, bridge and TF; at a low rate the path."""
 
-from collections import deque
 from collections.abc import Callable
 
-from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 from nav_msgs.msg import Path
 from sensor_msgs.msg import TimeReference
@@ -15,11 +14,9 @@ from thermal_fiducial.ros import convert, qos
 from thermal_fiducial.ros.bridge import FlightControllerBridge
 from thermal_fiducial.ros.counting import CountingNode
 from thermal_fiducial.ros.message_bytes import StateBytes
+from thermal_fiducial.ros.path_bytes import PathBytes
 from thermal_fiducial.ros.robot_frames import RobotFrames
 from thermal_fiducial.ros.transforms import TransformBroadcaster
-
-_PATH_STEP_NS = 200_000_000
-_PATH_LENGTH = 3000
 
 
 class FilterOutputs:
@@ -40,11 +37,11 @@ class FilterOutputs:
         self._state = StateBytes(config.map_frame, config.base_frame)
         #: stamp of the latest state; 0 before there is one
         self.stamp_ns = 0
-        self._path: deque[tuple[int, Pose]] = deque(maxlen=_PATH_LENGTH)
+        self._path = PathBytes(config.map_frame)
         self._pose = node.advertise(PoseWithCovarianceStamped, 'pose', qos.IMU_RATE_RESULT)
         self._odometry = node.advertise(OdometryMessage, 'odometry', qos.IMU_RATE_RESULT)
         self._camera_clock = node.advertise(TimeReference, 'camera_clock')
-        self._path_output = node.advertise(Path, 'path')
+        self._path_output = node.advertise(Path, 'path', qos.NEWEST_RESULT)
         self._smoother = SmoothOutput(config.smoothing_time) if config.smoothing_time > 0.0 else None
         if self._smoother is not None:
             self._smooth_odometry = node.advertise(OdometryMessage, 'odometry_smooth', qos.IMU_RATE_RESULT)
@@ -76,16 +73,12 @@ class FilterOutputs:
         if not lost:
             # _state holds the smooth output if there is one, else the odometry.
             self._bridge.send(smooth or odometry, self._state, jumps)
-        self._extend_path(odometry)
+        self._path.add(odometry.stamp_ns, odometry.T_map_body)
 
     def send_clock(self, camera_stamp_ns: int, offset: float | None) -> None:
         """Publish the camera's clock offset [s] at the stamp of a frame, if it is known."""
         if offset is not None:
             self._camera_clock.send(convert.clock_reference(camera_stamp_ns, offset))
-
-    def _extend_path(self, odometry: Odometry) -> None:
-        if not self._path or not 0 <= odometry.stamp_ns - self._path[-1][0] < _PATH_STEP_NS:
-            self._path.append((odometry.stamp_ns, convert.pose(odometry.T_map_body)))
 
     def clear_path(self) -> None:
         """Start a new path after a discontinuity."""
@@ -93,6 +86,5 @@ class FilterOutputs:
 
     def send_path(self) -> None:
         """Publish the path so far if it has subscribers."""
-        if self._path and self._path_output.listeners:
-            head = convert.header(self._path[-1][0], self._config.map_frame)
-            self._path_output.send(convert.path(self._path, head))
+        if self._path_output.listeners and (path := self._path.message()):
+            self._path_output.send(path)

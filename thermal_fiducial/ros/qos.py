@@ -27,6 +27,8 @@ IMU_INPUT = _profile(400, reliable=False)
 IMAGE_OUTPUT = _profile(5)
 #: results at frame rate, and subscriptions to them
 RESULT = _profile(30)
+#: results of which each has all that the last one had: DDS keeps the memory of as many as ever waited for a slow reader
+NEWEST_RESULT = _profile(1)
 #: results at IMU rate
 IMU_RATE_RESULT = _profile(400)
 #: /tf_static: transient local, deep enough for several publishers
