@@ -27,21 +27,32 @@ def pose(size_px, u, v, tilt, size=0.3):
     return se3.transform(R, np.array([u, v, 1.0]) * size * 265.0 / size_px)
 
 
-def draw(camera, grid, T, size=0.3, samples=4, blur=BLUR):
-    """White's share (height, width) of a plate at T_camera_marker; ``grid`` has its cells, a white ring about it."""
+def draw(camera, grid, T, size=0.3, samples=4, blur=BLUR, thickness=0.0):
+    """White's share (height, width) of a plate at T_camera_marker; ``grid`` has its cells, a white ring about it.
+
+    White is what is seen through the holes of both its face and its back, ``thickness`` behind it.
+    """
     fine = (np.arange(camera.width * samples) + 0.5) / samples - 0.5
     rows = (np.arange(camera.height * samples) + 0.5) / samples - 0.5
     image = np.empty((camera.height, camera.width), dtype=np.float32)
     # Strips of rows bound the lag tail.
     for first in range(0, camera.height, 32):
         v = rows[first * samples : (first + 32) * samples]
-        x, y = plane_points(camera, T, fine, v)
-        cells = len(grid) - 2
-        column = np.clip(np.floor((x / size + 0.5) * cells) + 1, 0, cells + 1).astype(int)
-        row = np.clip(np.floor((0.5 - y / size) * cells) + 1, 0, cells + 1).astype(int)
-        shares = grid[row, column].reshape(len(v) // samples, samples, camera.width, samples)
+        seen = cells_at(grid, size, *plane_points(camera, T, fine, v))
+        if thickness:
+            back = T @ se3.transform(np.eye(3), [0.0, 0.0, -thickness])
+            seen = np.minimum(seen, cells_at(grid, size, *plane_points(camera, back, fine, v)))
+        shares = seen.reshape(len(v) // samples, samples, camera.width, samples)
         image[first : first + 32] = shares.mean(axis=(1, 3))
     return cv2.GaussianBlur(image, (0, 0), blur) if blur > 0.0 else image
+
+
+def cells_at(grid, size, x, y):
+    """Values of the cells at points of the marker's plane."""
+    cells = len(grid) - 2
+    column = np.clip(np.floor((x / size + 0.5) * cells) + 1, 0, cells + 1).astype(int)
+    row = np.clip(np.floor((0.5 - y / size) * cells) + 1, 0, cells + 1).astype(int)
+    return grid[row, column]
 
 
 def plate(marker_id):

@@ -33,7 +33,7 @@ def test_an_outline_is_where_rays_past_the_back_edges_cross_the_face():
     farther = np.where(np.abs(crossed) > np.abs(faces), crossed, faces)
     # Where the ray comes from beyond the other side the face itself is the outline.
     farther = np.where(np.sign(crossed) == np.sign(faces), farther, faces)
-    outlines = outlines_on_faces(faces, cameras, THICKNESS)
+    outlines = outlines_on_faces(faces, np.sign(faces[..., :2]), cameras, THICKNESS)
     # Rounding of metres.
     np.testing.assert_allclose(outlines, farther, atol=1e-12)
     seen_from_side = np.any(outlines != faces, axis=(1, 2))

@@ -129,7 +129,7 @@ class MarkerDetector:
         if len(ids) == 0:
             return rows
         at = ImagePoints.at(corners.corners_px, frame.camera)
-        at, poses = self._faces(ids, corners.covariances, at, T_camera_map)
+        poses = self._poses(ids, corners.covariances, at, T_camera_map)
         partial = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
         rows = np.concatenate([rows, partial])
         return np.asarray(rows[np.argsort(rows['id'], kind='stable')])

@@ -123,12 +123,12 @@ class PartialMarkerSearch:
         if T is None:
             return None
         pattern = grid_edges(self._bits[marker.id])
-        rough = adjusted(T, marker.size, pattern, coarse)
+        rough = adjusted(T, marker.size, pattern, coarse, config.plate_thickness)
         if rough is None or not self._recognised(rough, marker, coarse, allowed, frame.noise, config):
             return None
         fine, fit = layer_of(frame, marker.seen(), config.blur_px), rough
         for _ in range(_STEPS):
-            step = adjusted(fit.T_camera_marker, marker.size, pattern, fine)
+            step = adjusted(fit.T_camera_marker, marker.size, pattern, fine, config.plate_thickness)
             if step is None:
                 return None
             fit = step

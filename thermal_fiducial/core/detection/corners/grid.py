@@ -21,6 +21,7 @@ from thermal_fiducial.core.detection.corners.segments import (
 )
 from thermal_fiducial.core.detection.corners.sides import blurred_step, blurs, columns_across, NODES, Sides
 from thermal_fiducial.core.detection.frame import counts_of, Frame, LEAST_DEPTH, Places, rolling_displacement
+from thermal_fiducial.core.detection.plates import outlines_on_faces
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, Stacked, TINY
@@ -103,9 +104,12 @@ class PoseFit(NamedTuple):
     noise: float
 
 
-def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> PoseFit | None:
-    """One linearised adjustment of a marker's pose ``T`` (4, 4) in the camera; None with too few visible edges."""
-    nodes = layer.project(se3.apply(T, on_marker(pattern.nodes, size)))
+def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer, thickness: float = 0.0) -> PoseFit | None:
+    """One linearised adjustment of a marker's pose ``T`` (4, 4) in the camera; None with too few visible edges.
+
+    ``thickness``: of its plate [m].
+    """
+    nodes = layer.project(se3.apply(T, _outlines(T, size, pattern, thickness)))
     inside: BoolArray = np.asarray(layer.camera.contains(nodes).any(axis=1) & np.isfinite(nodes).all(axis=(1, 2)))
     if inside.sum() < 6:
         return None
@@ -135,6 +139,15 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer) -> Po
         float(np.median(measured.contrast[0][used])),
         math.sqrt(np.median(measured.noise[0][used])),
     )
+
+
+def _outlines(T: FloatArray, size: float, pattern: GridEdges, thickness: float) -> FloatArray:
+    """Points (E, 5, 3) of the edges as the camera sees them, on the marker's face [m]."""
+    points = on_marker(pattern.nodes, size)
+    # The plate is what is black in the pattern; ``onward`` has its second axis down, the marker's is up.
+    towards_white = pattern.step[:, None] * np.sign(pattern.onward) * [1.0, -1.0]
+    camera = se3.inverse(T)[:3, 3]
+    return outlines_on_faces(points, towards_white[:, None], camera[None], thickness)
 
 
 def _model(
