@@ -16,10 +16,10 @@ def _profile(depth: int, *, reliable: bool = True, latched: bool = False) -> QoS
     )
 
 
-#: subscription to images and camera_info of any publisher
-CAMERA_INPUT = _profile(5, reliable=False)
-#: subscription that processes only the newest image: DDS keeps the memory of as many as were ever queued, and two show
-#: how many have been replaced
+#: subscription to images and camera_info of any publisher. Of images that had to wait the detector takes the newest;
+#: the front end needs those before it for the lag tail. DDS keeps the memory of as many as were ever queued
+CAMERA_INPUT = _profile(3, reliable=False)
+#: subscription that processes only the newest image; two show how many have been replaced
 IMAGE_INPUT = _profile(2, reliable=False)
 #: subscription to the IMU of any publisher
 IMU_INPUT = _profile(400, reliable=False)
