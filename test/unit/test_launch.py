@@ -5,9 +5,10 @@ import re
 import runpy
 import signal
 import sys
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 
 import pytest
+from support import launch_api
 import yaml
 
 from thermal_fiducial import config
@@ -33,79 +34,18 @@ ARGUMENTS = {
 }  # fmt: skip
 
 
-def _record(kind):
-    return lambda *args, **kwargs: SimpleNamespace(kind=kind, args=args, **kwargs)
-
-
-class Context(dict):
-    """Stand-in of LaunchContext: the configurations, and what was on the command line."""
-
-    is_shutdown = False
-
-    @property
-    def argv(self):
-        return [f'{name}:={value}' for name, value in self.items()]
-
-
-class NotInstalledError(KeyError):
-    """Stand-in of PackageNotFoundError."""
-
-
-def prefix(package):
-    if package == 'rviz2':
-        raise NotInstalledError(package)
-    return f'/prefix/{package}'
-
-
-class Configuration:
-    """Stand-in of LaunchConfiguration: the context is a dict."""
-
-    def __init__(self, name):
-        self.name = name
-
-    def perform(self, context):
-        return {**context.declared, **context}[self.name]
-
-
 @pytest.fixture
 def launched(monkeypatch):
-    """Run a launch file with arguments: its declared arguments (name to default) and its nodes."""
-    stand_ins = {
-        'launch': {'LaunchDescription': list},
-        'launch.launch_context': {'LaunchContext': Context},
-        'launch.launch_description': {'LaunchDescription': list},
-        'launch.actions': {
-            'DeclareLaunchArgument': _record('argument'),
-            'OpaqueFunction': _record('function'),
-            'LogInfo': _record('log'),
-            'TimerAction': _record('timer'),
-        },
-        'launch.substitutions': {'LaunchConfiguration': Configuration},
-        'launch_ros': {},
-        'launch_ros.actions': {'Node': _record('node')},
-        'ament_index_python': {},
-        'ament_index_python.packages': {
-            'get_package_share_directory': lambda package: f'/share/{package}',
-            'get_package_prefix': lambda package: f'/prefix/{package}',
-            'PackageNotFoundError': NotInstalledError,
-        },
-    }
-    for name, content in stand_ins.items():
-        module = ModuleType(name)
-        module.__dict__.update(content)
-        monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.delitem(sys.modules, 'thermal_fiducial.ros.launching', raising=False)
+    """Run a launch file with arguments: its declared arguments (name to default) and its actions."""
 
-    def launch(file, **arguments):
-        actions = runpy.run_path(str(ROOT / 'launch' / file))['generate_launch_description']()
-        declared = {action.args[0]: action.default_value for action in actions if action.kind == 'argument'}
-        (start,) = [action.function for action in actions if action.kind == 'function']
-        context = Context(arguments)
-        context.declared = declared
-        return declared, start(context)
+    def launch(file, pushed='', **arguments):
+        description = runpy.run_path(str(ROOT / 'launch' / file))['generate_launch_description']()
+        context = launch_api.LaunchContext(f'{name}:={value}' for name, value in arguments.items())
+        context.launch_configurations['ros_namespace'] = pushed
+        return launch_api.declared(description), launch_api.started(description, context)
 
-    yield launch
-    sys.modules.pop('thermal_fiducial.ros.launching', None)
+    with launch_api.installed(monkeypatch, '/share/thermal_fiducial', also=('rviz2',)):
+        yield launch
 
 
 @pytest.mark.parametrize('mode', ['mapping', 'localization'])
@@ -176,15 +116,29 @@ def test_a_second_camera_has_its_own_front_end_and_the_others_map_and_odometry(l
     _, nodes = launched('localization.launch.py', namespace='drone', second_camera='down', second_camera_device='teax')
     assert [node.executable for node in nodes] == [*NODES, 'thermal_source', 'tau2_camera', 'aruco_detector']
     assert nodes[2].parameters[1]['second_camera'] == 'down'
-    assert {node.namespace for node in nodes[4:]} == {'drone/down'}
+    assert {node.namespace for node in nodes[4:]} == {'/drone/down'}
     assert nodes[4].parameters[-1] == {'camera': 'teax'}
     assert ('odometry', '/drone/odometry') in nodes[6].remappings
     _, nodes = launched('localization.launch.py', second_camera='down')
     assert [(node.executable, node.namespace) for node in nodes[4:]] == [
-        ('tau2_camera', 'down'),
-        ('aruco_detector', 'down'),
+        ('tau2_camera', '/down'),
+        ('aruco_detector', '/down'),
     ]
     assert ('marker_map', '/marker_map') in nodes[5].remappings
+
+
+@pytest.mark.parametrize(
+    ('namespace', 'expected'), [('', '/fleet'), ('drone', '/fleet/drone'), ('/drone', '/drone'), ('/', '/')]
+)
+def test_a_second_camera_follows_the_nodes_into_a_namespace_that_was_pushed(launched, namespace, expected):
+    """PushRosNamespace, for example of a launch file for many drones."""
+    context = launch_api.LaunchContext()
+    context.launch_configurations['ros_namespace'] = 'fleet'
+    _, nodes = launched('localization.launch.py', pushed='fleet', namespace=namespace, second_camera='down')
+    assert {node.full_namespace(context) for node in nodes[:4]} == {expected}
+    root = expected.rstrip('/')
+    assert {node.full_namespace(context) for node in nodes[4:]} == {f'{root}/down'}
+    assert ('odometry', f'{root}/odometry') in nodes[5].remappings
 
 
 def test_a_landing_pad_is_reported_where_one_is_named(launched):
@@ -223,11 +177,11 @@ def test_launches_in_the_documents_name_files_and_arguments_that_exist(launched)
     for file, words in calls:
         arguments = dict(word.split(':=', 1) for word in words.split())
         _, actions = launched(file, **(arguments | {'params_file': ''}))
-        assert [action.msg for action in actions if action.kind == 'log'] == []
+        assert [action.msg for action in actions if isinstance(action, launch_api.LogInfo)] == []
 
 
 def test_without_rviz_the_nodes_start_with_a_warning(launched, monkeypatch):
-    monkeypatch.setattr(sys.modules['ament_index_python.packages'], 'get_package_prefix', prefix)
+    monkeypatch.setattr(sys.modules['ament_index_python.packages'], 'get_package_prefix', launch_api.prefix)
     _, actions = launched('localization.launch.py', rviz='true')
     assert [action.executable for action in actions[:4]] == NODES
     assert 'rviz2 is not installed' in actions[4].msg
@@ -235,7 +189,7 @@ def test_without_rviz_the_nodes_start_with_a_warning(launched, monkeypatch):
 
 def test_a_crash_is_followed_by_another_start_and_refused_parameters_are_not(launched):
     _, nodes = launched('localization.launch.py')
-    context = Context()
+    context = launch_api.LaunchContext()
     ekf = nodes[3]
     for status in (1, -11, -signal.SIGALRM, 134):
         log, timer = ekf.on_exit(SimpleNamespace(returncode=status), context)

@@ -104,7 +104,7 @@ def _actions(
     names = ['thermal_source', *NODES] if given['camera'] else list(NODES)
     names += ['landing_target'] if given['landing_pad'] else []
     actions += [_node(name, settings) for name in names]
-    actions += _second_camera(given, settings)
+    actions += _second_camera(given, settings, _namespace(context, given['namespace']))
     if _is_true('rviz', given):
         actions.append(_rviz(given['namespace'], share))
     return actions
@@ -123,15 +123,22 @@ def _node(name: str, settings: dict[str, Any]) -> Node:
     return Node(executable=name, name=name, on_exit=after, **settings)
 
 
-def _second_camera(given: dict[str, str], settings: dict[str, Any]) -> list[Node]:
-    """Front end and detector of a second camera; the map and odometry topics are those of the first."""
+def _namespace(context: LaunchContext, own: str) -> str:
+    """Absolute namespace of the nodes: behind that of PushRosNamespace, unless ``own`` is absolute itself."""
+    pushed = context.launch_configurations.get('ros_namespace', '')
+    joined = own if own.startswith('/') else f'{pushed}/{own}'
+    return '/' + joined.strip('/')
+
+
+def _second_camera(given: dict[str, str], settings: dict[str, Any], namespace: str) -> list[Node]:
+    """Front end and detector of a second camera; map and odometry are those of the others, in ``namespace``."""
     name, device = given['second_camera'], given['second_camera_device']
     if not name:
         return []
-    own = given['namespace'].strip('/')
-    shared = [(topic, f'/{own}/{topic}'.replace('//', '/')) for topic in ('marker_map', 'odometry', 'camera_clock')]
+    own = namespace.rstrip('/')
+    shared = [(topic, f'{own}/{topic}') for topic in ('marker_map', 'odometry', 'camera_clock')]
     parameters = [*settings['parameters'], *([{'camera': device}] if device else [])]
-    changes = {'namespace': f'{own}/{name}'.strip('/'), 'remappings': shared, 'parameters': parameters}
+    changes = {'namespace': f'{own}/{name}', 'remappings': shared, 'parameters': parameters}
     nodes = ['tau2_camera', 'aruco_detector']
     return [_node(node, settings | changes) for node in (['thermal_source', *nodes] if device else nodes)]
 
