@@ -15,7 +15,8 @@ from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, Stacked
 
 _F4 = '<f4'
-#: Frames older than the newest one by more than this are those of a clock that was set back [ns].
+#: Messages older than the newest one by more than this are those of a clock that was set back, or of a bag that was
+#: restarted [ns].
 LATEST_NS = 1_000_000_000
 
 CORNER_FIELDS = tuple(f'{axis}{corner}' for corner in range(4) for axis in 'uv')

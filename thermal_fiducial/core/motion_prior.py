@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.measurements import LATEST_NS, Odometry
 from thermal_fiducial.core.types import SECOND_NS
 
 #: Fastest component of a twist [m/s, rad/s]: no camera that sees markers moves like this, a filter that diverges does.
@@ -18,8 +18,6 @@ FASTEST = 50.0
 _KEPT_NS = 500_000_000
 # Largest number of states: two seconds of odometry at 1 kHz.
 _MOST = 2000
-# Stamps that go back by more are those of another clock, or of a bag that was restarted [ns].
-_RESTART_NS = 1_000_000_000
 
 
 def possible(states: Sequence[Odometry]) -> list[Odometry]:
@@ -59,7 +57,7 @@ class MotionPrior:
 
     def add(self, stamp_ns: int, state: Any) -> None:
         """Keep the state of a stamp, decoded or not."""
-        if self._stamps_ns and stamp_ns < self._stamps_ns[-1] - _RESTART_NS:
+        if self._stamps_ns and stamp_ns < self._stamps_ns[-1] - LATEST_NS:
             self._stamps_ns, self._states = [], []
         place = bisect_left(self._stamps_ns, stamp_ns)
         if place < len(self._stamps_ns) and self._stamps_ns[place] == stamp_ns:

@@ -12,9 +12,10 @@ from thermal_fiducial.core.geometry.reprojection import corners_in_map, reprojec
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
-from thermal_fiducial.core.mapping.candidates import DECISIVE, SAME_FIT
+from thermal_fiducial.core.mapping.candidates import DECISIVE
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.mapping.marker_views import SAME_POSE
 from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
@@ -105,7 +106,7 @@ def decide(snapshot: Snapshot, marker_id: int, size: float, alternatives: Sequen
     cost, best = outcomes[0]
     for other_cost, other in outcomes[1:]:
         apart = rotation_angle(best.T_map_marker[:3, :3].T @ other.T_map_marker[:3, :3])
-        if apart > SAME_FIT and other_cost - cost < DECISIVE:
+        if apart > SAME_POSE and other_cost - cost < DECISIVE:
             return None
     return best
 

@@ -5,8 +5,9 @@ arrival. The exception is :class:`MotionAtPose`, which also averages the few sam
 """
 
 from bisect import bisect_left, bisect_right, insort
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 import math
+from operator import attrgetter
 
 from thermal_fiducial.core.filter.hypotheses import Hypotheses
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
@@ -23,6 +24,7 @@ _KEPT_EVERY_NS = 100_000_000
 #: Standard deviation of a suspected step of the IMU's clock as a share of its size: it is all of it or nothing, samples
 #: being lost, with equal odds.
 _STEP_OR_LOSS = 0.5
+_stamp = attrgetter('stamp_ns')
 
 
 class History:
@@ -263,6 +265,3 @@ class History:
             return settled, decided
         reason = 'reset' if belief.main else 'initialised'
         return settled, [*decided, PoseUpdate(settled.pose_stamp_ns, True, reason, math.nan)]
-
-
-_stamp: Callable[[CameraPose], int] = lambda pose: pose.stamp_ns  # noqa: E731

@@ -16,7 +16,7 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.keyframes import Displacement
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.mapping.marker_views import FittedPoses, MarkerView, MarkerViews, Viewpoint
+from thermal_fiducial.core.mapping.marker_views import FittedPoses, MarkerView, MarkerViews, SAME_POSE, Viewpoint
 from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.types import FloatArray
 
@@ -29,8 +29,6 @@ MAX_VIEWS = 16
 DECISIVE = 25.0
 #: Mean chi square of a view (8 residuals) above which the views cannot be of one marker at rest.
 INCONSISTENT = 200.0
-#: Fits that end closer to each other than this count as one [rad].
-SAME_FIT = np.deg2rad(2.0)
 #: Candidates that are judged in one frame: bounds its time when many are new.
 TRIALS = 3
 #: Largest number of candidates, which bounds memory against false positives: those observed longest ago are dropped.
@@ -96,7 +94,7 @@ class Candidate:
         if not fits.chi2[0] <= INCONSISTENT * len(self.views):
             return Placement(None, nothing, f'marker {self.id}: its views contradict each other')
         scale = noise_factor(float(fits.chi2[0]), 8 * len(self.views) - 6)
-        others = np.flatnonzero(rotation_angle(fits.T[0, :3, :3].T @ fits.T[:, :3, :3]) > SAME_FIT)
+        others = np.flatnonzero(rotation_angle(fits.T[0, :3, :3].T @ fits.T[:, :3, :3]) > SAME_POSE)
         if len(others) and fits.cost[others[0]] - fits.cost[0] < DECISIVE * scale:
             return Placement(None, nothing, f'planar ambiguity of marker {self.id} unsettled')
         return Placement(fits.T[0], fits.covariance(scale))
@@ -105,7 +103,7 @@ class Candidate:
         """All poses (4, 4) that a fit to the views ends in, the best first."""
         fits, poses = self._fits(camera), list[FloatArray]()
         for T in fits.T[np.isfinite(fits.chi2)]:
-            if all(rotation_angle(T[:3, :3].T @ other[:3, :3]) > SAME_FIT for other in poses):
+            if all(rotation_angle(T[:3, :3].T @ other[:3, :3]) > SAME_POSE for other in poses):
                 poses.append(T)
         return poses
 

@@ -27,14 +27,12 @@ from thermal_fiducial.core.geometry.planar_pose import CameraFit, INLIER
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle
 from thermal_fiducial.core.mapping.located import Location, Refusal, Reprojected, Sight
-from thermal_fiducial.core.mapping.marker_views import Viewpoint
+from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray, TINY
 
 #: Difference of chi square that rules out the worse of two poses: odds of e^-10.
 DECISIVE = 20.0
-#: Poses nearer to each other than this [rad] are one pose whose covariance covers both.
-SAME_POSE = np.deg2rad(2.0)
 #: Extent of the markers in view [rad] beyond which perspective resolves the planar ambiguity.
 WIDE = np.deg2rad(25.0)
 # Largest number of markers that give initial poses, the largest ones; all take part in their ranking.

@@ -11,6 +11,8 @@ from thermal_fiducial.core.geometry.reprojection import linearise
 from thermal_fiducial.core.geometry.rigid_fit import Evaluation, minimise
 from thermal_fiducial.core.types import FloatArray, IntArray
 
+#: Poses nearer to each other than this [rad] are one pose, and not the two of a planar ambiguity.
+SAME_POSE = np.deg2rad(2.0)
 # A corner that moves faster in the image than this is hardly before the camera at all [px/m, px/rad].
 _STEEPEST = 1e6
 # How often a fit may change its mind about the cameras' poses.
