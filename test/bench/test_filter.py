@@ -10,8 +10,8 @@ from scipy.stats import chi2
 from support.flights import config, errors, Flight, matched, perfect, rms, run, START_NS, timeline
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.filter.coasting import coasting_variance
 from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.filter.propagation import coasting_variance
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.measurements import ImuSample
 

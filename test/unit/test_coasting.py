@@ -7,8 +7,8 @@ import pytest
 from support.flights import config, Flight, MATCHED_IMU, Motion, run, timeline
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.filter.coasting import coasting_variance, HORIZON, usable_seconds
 from thermal_fiducial.core.filter.ekf import PoseEkf
+from thermal_fiducial.core.filter.propagation import coasting_variance, HORIZON, usable_seconds
 from thermal_fiducial.core.filter.state import POSITION
 
 IMU = config().imu
