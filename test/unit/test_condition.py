@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support.flights import config, Flight, Motion
 
+from thermal_fiducial.core.filter.belief import REFUSALS_OF_DOUBT
 from thermal_fiducial.core.filter.condition import (
     COASTING_S,
     coasting_seconds,
@@ -13,7 +14,6 @@ from thermal_fiducial.core.filter.condition import (
 )
 from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.filter.hypotheses import Hypotheses
-from thermal_fiducial.core.filter.recovery import REFUSALS_OF_DOUBT
 
 CONFIG = config(initial_poses=3)
 RATE = 200

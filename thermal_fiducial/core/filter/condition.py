@@ -1,8 +1,8 @@
 """What the filter does, or what it lacks, in words."""
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.belief import Belief, Hypothesis
 from thermal_fiducial.core.filter.history import History
-from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import SECOND_NS
 

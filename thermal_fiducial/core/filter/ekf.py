@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.belief import Hypothesis
 from thermal_fiducial.core.filter.camera_clock import CameraClock, FrameGrid, SMALLEST_STEP_NS
 from thermal_fiducial.core.filter.condition import coasting_seconds, condition_of
 from thermal_fiducial.core.filter.history import History
@@ -17,7 +18,6 @@ from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.output import odometry
 from thermal_fiducial.core.filter.propagation import usable_seconds
-from thermal_fiducial.core.filter.recovery import Hypothesis
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.measurements import CameraPose, Condition, ImuSample, Odometry

@@ -9,12 +9,12 @@ from collections.abc import Iterable
 import math
 from operator import attrgetter
 
+from thermal_fiducial.core.filter.belief import Belief, Hypothesis
 from thermal_fiducial.core.filter.hypotheses import Hypotheses
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import no_gravity, WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseLog, PoseUpdate
 from thermal_fiducial.core.filter.propagation import propagated
-from thermal_fiducial.core.filter.recovery import Belief, Hypothesis
 from thermal_fiducial.core.filter.update import MotionAtPose, with_camera_step, with_clock_step
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.types import FloatArray, SECOND_NS

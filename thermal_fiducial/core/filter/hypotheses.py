@@ -6,10 +6,10 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.belief import Hypothesis
 from thermal_fiducial.core.filter.initialization import blank_state, start
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.pose_noise import BodyPose
-from thermal_fiducial.core.filter.recovery import Hypothesis
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
     GYROSCOPE_BIAS,

@@ -7,7 +7,7 @@ import pytest
 from support.estimates import any_estimate
 from support.flights import config
 
-from thermal_fiducial.core.filter.recovery import Belief, Hypothesis, REFUSALS_OF_DOUBT
+from thermal_fiducial.core.filter.belief import Belief, Hypothesis, REFUSALS_OF_DOUBT
 from thermal_fiducial.core.filter.state import POSITION
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import Condition
