@@ -87,7 +87,7 @@ def test_the_fold_is_where_the_distorted_radius_falls(model):
     rng, r = np.random.default_rng(3), np.linspace(0.0, 6.0, 2401)
     folds = 0
     for _ in range(30):
-        D = rng.normal(0.0, 0.2, MODELS[model])
+        D = rng.normal(0.0, 0.2, len(MODELS[model]))
         if model != 'equidistant':
             D[2:4] = 0.0
         lens = Camera(640, 512, K, model, D)
@@ -102,7 +102,7 @@ def test_the_fold_is_where_the_distorted_radius_falls(model):
 @pytest.mark.parametrize('model', ['plumb_bob', 'rational_polynomial', 'equidistant'])
 @pytest.mark.parametrize('size', [5e-324, 1e-313, 1e-160, 1e160, 1e300])
 def test_coefficients_of_any_size_do_not_break_a_projection(model, size):
-    D = np.full(MODELS[model], size)
+    D = np.full(len(MODELS[model]), size)
     with np.errstate(all='ignore'):
         assert Camera(640, 512, K, model, D).project([0.0, 0.0, 1.0]).shape == (2,)
 

@@ -12,7 +12,7 @@ import numpy as np
 from thermal_fiducial.calibration.lens_fit import camera_parameters, LensFit
 from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.camera import Camera, MODELS
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.errors import InputError
 
@@ -21,11 +21,6 @@ LEAST_VIEWS = 6
 # A view whose rms is this many times the median view's was moving, half hidden or wrongly numbered.
 _OUTLIER_RATIO = 2.5
 _NAMES = ('fx', 'fy', 'cx', 'cy')
-_COEFFICIENTS = {
-    'equidistant': ('k1', 'k2', 'k3', 'k4'),
-    'plumb_bob': ('k1', 'k2', 'p1', 'p2', 'k3'),
-    'rational_polynomial': ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6'),
-}
 
 
 @dataclass(frozen=True)
@@ -66,13 +61,13 @@ class Calibration:
 
     def parameter_rows(self) -> list[tuple[str, float, float]]:
         """Name, value and standard deviation of every intrinsic parameter."""
-        names = (*_NAMES, *_COEFFICIENTS[self.camera.model])
+        names = (*_NAMES, *MODELS[self.camera.model])
         values = camera_parameters(self.camera).tolist()
         return list(zip(names, values, self.sigmas.tolist(), strict=True))
 
     def lens_name(self) -> str:
         """Model and the coefficients that were estimated, e.g. ``plumb_bob (k1, k2)``."""
-        names = [_COEFFICIENTS[self.camera.model][index] for index in self.free]
+        names = [MODELS[self.camera.model][index] for index in self.free]
         return f'{self.camera.model} ({", ".join(names) or "no coefficient"})'
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from thermal_fiducial.calibration.targets import Sighting
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.camera import Camera, MODELS
+from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import FloatArray, IntArray
 
 # Huber threshold [standard deviations].
@@ -37,7 +37,7 @@ MATRIX = 4
 
 
 def prior_sigmas(camera: Camera) -> FloatArray:
-    """Standard deviations about zero of the distortion coefficients (MODELS[model],)."""
+    """Standard deviations about zero of the distortion coefficients (D,)."""
     last = np.array([camera.width, camera.height]) - 1.0
     focal = np.array([camera.K[0, 0], camera.K[1, 1]])
     reach = float(np.linalg.norm(np.maximum(camera.principal_point, last - camera.principal_point) / focal))
@@ -45,7 +45,7 @@ def prior_sigmas(camera: Camera) -> FloatArray:
         return np.array([_FIRST, _HIGHER, _HIGHER, _HIGHER]) / reach ** np.array([2, 4, 6, 8])
     sigmas = np.array([_FIRST, _HIGHER, _TANGENTIAL, _TANGENTIAL, _HIGHER, _FIRST, _HIGHER, _HIGHER])
     powers = np.array([2, 4, 1, 1, 6, 2, 4, 6])
-    return np.asarray((sigmas / reach**powers)[: MODELS[camera.model]])
+    return np.asarray((sigmas / reach**powers)[: len(camera.D)])
 
 
 class LensFit:
@@ -84,10 +84,10 @@ class LensFit:
         self._camera, self._radius = camera, radius if centroids is None else 0.0
         self._centroid = np.zeros_like(self._pixels) if centroids is None else np.concatenate(centroids)
         self._converged = converged
-        coefficients = range(MODELS[camera.model]) if free is None else sorted(free)
+        coefficients = range(len(camera.D)) if free is None else sorted(free)
         shared = [] if poses_only else [*range(MATRIX), *(MATRIX + index for index in coefficients)]
         self._free: IntArray = np.array(shared, dtype=np.int64)
-        self._prior = np.zeros(MATRIX + MODELS[camera.model])
+        self._prior = np.zeros(MATRIX + len(camera.D))
         self._prior[MATRIX:] = prior_sigmas(camera) ** -2
 
     def solve(self, T: FloatArray) -> tuple[Camera, FloatArray]:

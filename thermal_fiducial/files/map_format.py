@@ -7,6 +7,7 @@ and ``map upgrade`` converts it.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from dataclasses import fields as fields_of
 import json
 import re
 from typing import TypeVar
@@ -29,11 +30,6 @@ _ROUNDING = 1e-6
 _MOST = 2**63 - 1
 _LARGEST_ID = 2**31 - 1
 _LARGEST_M = 1e5
-_FIELDS = {'format', 'version', 'revision', 'frame_id', 'dictionary', 'markers'}
-_MARKER_FIELDS = {
-    'id', 'size', 'fixed', 'position', 'orientation', 'covariance', 'reprojection_error_px', 'observations',
-    'first_seen_ns', 'last_seen_ns', 'trusted',
-}  # fmt: skip
 _SIMPLE = re.compile(r'[A-Za-z][A-Za-z0-9_./-]*')
 _WORDS = {'true', 'false', 'yes', 'no', 'on', 'off', 'null', 'y', 'n'}
 
@@ -120,7 +116,7 @@ def _head(root: Value) -> dict[str, Value]:
     kind = root.content.get('format')
     if kind is None or kind.content != FORMAT:
         raise root.error(f'not a marker map: format {"missing" if kind is None else kind.quoted()} is not {FORMAT!r}')
-    return root.mapping(_FIELDS)
+    return root.mapping({'format', 'version', *_names(MapDocument)})
 
 
 def _filled(root: Value, fields: dict[str, Value], revision: int) -> MapDocument:
@@ -149,7 +145,7 @@ def _entry(value: Value) -> MarkerEntry:
     value.content['id'].field = value.field
     marker_id = value.content['id'].integer(0, _LARGEST_ID)
     value.field = f'{name} (marker {marker_id})'
-    fields = value.mapping(_MARKER_FIELDS)
+    fields = value.mapping(_names(MarkerEntry))
     for needed in ('position', 'orientation'):
         if needed not in fields:
             raise value.error(f'no {needed}')
@@ -166,6 +162,11 @@ def _entry(value: Value) -> MarkerEntry:
         last_seen_ns=_optional(fields, 'last_seen_ns', _count, 0),
         trusted=_optional(fields, 'trusted', Value.flag, True),
     )
+
+
+def _names(kind: type) -> set[str]:
+    """Fields of a record, which have the names of those in the file."""
+    return {field.name for field in fields_of(kind)}
 
 
 def _optional(fields: dict[str, Value], name: str, read: Callable[[Value], T], default: T) -> T:

@@ -18,8 +18,12 @@ import numpy.typing as npt
 from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked, TINY
 from thermal_fiducial.errors import InputError
 
-#: Number of coefficients that each model takes (shorter lists are filled up with zeros).
-MODELS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
+#: Coefficients of each model, in the order of camera_info (shorter lists are filled up with zeros).
+MODELS = {
+    'plumb_bob': ('k1', 'k2', 'p1', 'p2', 'k3'),
+    'rational_polynomial': ('k1', 'k2', 'p1', 'p2', 'k3', 'k4', 'k5', 'k6'),
+    'equidistant': ('k1', 'k2', 'k3', 'k4'),
+}
 # Newton's iteration doubles the digits: after a step this small nothing is left, and ten are enough at any lens's
 # border.
 _STEPS, _SHORT = 10, 1e-6
@@ -58,14 +62,15 @@ class Camera:
         D = np.zeros(0) if self.D is None else np.array(self.D, dtype=np.float64).reshape(-1)
         if self.model not in MODELS:
             raise InputError(f'distortion model {self.model!r} is not one of {", ".join(MODELS)}')
-        if len(D) > MODELS[self.model] and np.any(D[MODELS[self.model] :]):
-            raise InputError(f'{self.model} takes {MODELS[self.model]} coefficients, not {len(D)}')
+        count = len(MODELS[self.model])
+        if D[count:].any():
+            raise InputError(f'{self.model} takes {count} coefficients, not {len(D)}')
         if not (np.all(np.isfinite(K)) and np.all(np.isfinite(D)) and K[0, 0] > 0 and K[1, 1] > 0):
             raise InputError('camera matrix without a focal length: the camera is not calibrated')
         if self.width <= 0 or self.height <= 0:
             raise InputError(f'image size {self.width}x{self.height} in the calibration')
-        filled = np.zeros(MODELS[self.model])
-        filled[: min(len(D), len(filled))] = D[: len(filled)]
+        filled = np.zeros(count)
+        filled[: len(D)] = D[:count]
         object.__setattr__(self, 'K', K)
         object.__setattr__(self, 'D', filled)
 
