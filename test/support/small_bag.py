@@ -16,7 +16,7 @@ import yaml
 from support.flights import Motion
 from support.opencv import draw_marker
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.geometry.se3 import apply, inverse, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.files import bag_messages

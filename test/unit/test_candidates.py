@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.small_bag import CAMERA as STRAIGHT
 
-from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.candidates import Candidate
 from thermal_fiducial.core.mapping.marker_views import MarkerView, Viewpoint

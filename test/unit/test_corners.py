@@ -9,7 +9,8 @@ from thermal_fiducial.core.detection.corners.sides import edges_behind
 from thermal_fiducial.core.detection.refining import refine_corners
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.planar_pose import marker_corners, solve_marker_poses
+from thermal_fiducial.core.geometry.planar_pose import solve_marker_poses
+from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.files.dictionary import load_dictionary
 
 K = [[529.0, 0, 319.5], [0, 529.0, 255.5], [0, 0, 1]]

@@ -10,7 +10,8 @@ from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.reprojection import difference, retract
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
-from thermal_fiducial.core.mapping.mapper import CONTRADICTED, MapMarker, MarkerMap, MarkerMapper
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.mapper import CONTRADICTED, MarkerMapper
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.map_tools.map_editing import transformed
 

@@ -8,7 +8,8 @@ from support.walls import CAMERA, flight, look, see, SIZE, stamp, wall
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.reprojection import difference
-from thermal_fiducial.core.mapping.mapper import MapMarker, MarkerMap, MarkerMapper
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import MARKER_DTYPE
 
 

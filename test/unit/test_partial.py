@@ -18,7 +18,7 @@ from thermal_fiducial.core.detection.partial import PartialMarkerSearch
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, Odometry
 from thermal_fiducial.sim.spline_trajectory import SplineTrajectory
 from thermal_fiducial.sim.thermal_camera import render_frames

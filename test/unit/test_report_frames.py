@@ -13,7 +13,7 @@ from support import small_bag
 from support.run_folders import write_poses
 
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.geometry.se3 import apply, inverse, transform
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import IMAGE_TOPIC

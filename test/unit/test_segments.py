@@ -10,7 +10,7 @@ from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, m
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind, model, sides_of
 from thermal_fiducial.core.detection.frame import counts_of
 from thermal_fiducial.core.geometry import se3
-from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.reprojection import marker_corners
 
 CAMERA, ID, CONTRAST, NOISE = CAMERAS['plumb_bob'], 7, 200.0, 8.0
 BEHIND = edges_behind(BITS)

@@ -7,7 +7,7 @@ import pytest
 from thermal_fiducial.core.detection.corners.sides import sides_of
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.reprojection import marker_corners
 
 CAMERA = Camera(640, 512, [[765.0, 0, 319.5], [0, 765.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.2, 0.05, 0, 0, 0])
 

@@ -24,7 +24,7 @@ from thermal_fiducial.calibration.batch_adjustment import (
 )
 from thermal_fiducial.calibration.preintegration import AXES, ImuTrack
 from thermal_fiducial.calibration.rolling import FrameCorners, RowMoments, SolvedFrame
-from thermal_fiducial.config import ImuNoise
+from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import CameraPose
@@ -75,7 +75,7 @@ class CameraImuCalibration:
 
 
 def calibrate_camera_imu(
-    poses: Sequence[CameraPose], imu: ImuTrack, start_ns: int, noise: ImuNoise, gravity: float = 9.80665
+    poses: Sequence[CameraPose], imu: ImuTrack, start_ns: int, noise: ImuNoise
 ) -> CameraImuCalibration:
     """Estimate the extrinsics from poses, as if all rows were read out at once.
 
@@ -84,14 +84,13 @@ def calibrate_camera_imu(
     poses : of the camera in the map, stamped by the camera's clock, in order
     imu : samples; times are seconds of the IMU's clock since ``start_ns``
     noise : of the IMU at rest; where it shakes, the samples show how much more there is
-    gravity : its magnitude [m/s^2]
 
     Raises
     ------
     InputError
         Too few poses, no IMU samples around them, or motion that the answer cannot be read from.
     """
-    recording = _RigRecording(imu, start_ns, gravity)
+    recording = _RigRecording(imu, start_ns)
     poses = [pose for pose, use in zip(poses, recording.covers(poses), strict=True) if use]
     _, first = recording.solved(poses, noise)
     problem, second = recording.solved(poses, imu.noise(noise), first.jitter, first.state)
@@ -104,21 +103,20 @@ def calibrate_rolling_camera_imu(
     imu: ImuTrack,
     start_ns: int,
     noise: ImuNoise,
-    gravity: float = 9.80665,
 ) -> CameraImuCalibration:
     """Estimate the extrinsics and the read-out time from the corners of mapped markers.
 
     Parameters
     ----------
     frames : in order, stamped by the camera's clock
-    imu, start_ns, noise, gravity : as for :func:`calibrate_camera_imu`
+    imu, start_ns, noise : as for :func:`calibrate_camera_imu`
 
     Raises
     ------
     InputError
         As there.
     """
-    recording = _RigRecording(imu, start_ns, gravity)
+    recording = _RigRecording(imu, start_ns)
     at_once = _solved(frames, camera)
     inside = recording.covers([frame.pose for frame in at_once])
     at_once = [frame for frame, use in zip(at_once, inside, strict=True) if use]
@@ -195,7 +193,6 @@ class _RigRecording:
 
     imu: ImuTrack
     start_ns: int
-    gravity: float
 
     def covers(self, poses: Sequence[CameraPose]) -> BoolArray:
         """Which poses have IMU samples around them.
@@ -234,7 +231,7 @@ class _RigRecording:
         moments = None if rows is None else RowMoments.stacked(rows)
         problem = Problem(stamps, measured, root, self.imu, noise, moments, readout, jitter)
         if state is None or len(state.p) != len(poses):
-            state = first_state(stamps, measured, self.imu, self.gravity)
+            state = first_state(stamps, measured, self.imu, PoseEkfConfig.gravity)
         return problem, problem.solved(state)
 
     def _seconds(self, poses: Sequence[CameraPose]) -> FloatArray:

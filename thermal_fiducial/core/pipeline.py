@@ -26,7 +26,8 @@ from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
-from thermal_fiducial.core.mapping.mapper import MapperResult, MarkerMap, MarkerMapper
+from thermal_fiducial.core.mapping.map_data import MapperResult, MarkerMap
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.measurements import ImuSample, Markers, Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior, possible
 from thermal_fiducial.core.types import Counts, FloatArray, Gray, IntArray

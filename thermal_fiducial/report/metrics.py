@@ -149,16 +149,16 @@ def jitter(e: Errors) -> dict[str, float]:
     }
 
 
-def relative_pose_error(e: Errors, interval_ns: int = RELATIVE_NS) -> dict[str, float]:
-    """Drift over ``interval_ns``: rms of the relative pose error [mm, deg]."""
-    i, j = pairs_apart(e.stamps_ns, interval_ns)
+def relative_pose_error(e: Errors) -> dict[str, float]:
+    """Drift over ``RELATIVE_NS``: rms of the relative pose error [mm, deg]."""
+    i, j = pairs_apart(e.stamps_ns, RELATIVE_NS)
     if not len(i):
         return {}
     true_step = inverse(e.truth[i]) @ e.truth[j]
     step = inverse(e.estimate[i]) @ e.estimate[j]
     E = inverse(true_step) @ step
     return {
-        'interval_s': interval_ns / SECOND_NS,
+        'interval_s': RELATIVE_NS / SECOND_NS,
         'position_mm': 1e3 * _rms(np.linalg.norm(E[:, :3, 3], axis=1)),
         'attitude_deg': float(np.rad2deg(_rms(np.linalg.norm(so3_log(E[:, :3, :3]), axis=1)))),
     }

@@ -157,8 +157,9 @@ def _mesh(points: FloatArray, faces: IntArray, colour: str, opacity: float, name
     )
 
 
-def _sphere(rings: int = 8, sectors: int = 12) -> tuple[FloatArray, IntArray]:
+def _sphere() -> tuple[FloatArray, IntArray]:
     """Points (P, 3) of a unit sphere and its triangles (F, 3)."""
+    rings, sectors = 8, 12
     theta = np.linspace(0.0, np.pi, rings + 1)[:, None]
     phi = np.linspace(0.0, 2.0 * np.pi, sectors, endpoint=False)[None, :]
     points = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0.0 * phi], axis=-1)

@@ -19,6 +19,8 @@ START_NS = 1_700_000_000_000_000_000
 CHUNK = 30
 
 _DEFAULT_QUALITY = Quality()
+# Distance from the image's border from which on a marker counts as wholly in it [px].
+_MARGIN_PX = 1.0
 
 
 @dataclass(frozen=True)
@@ -132,17 +134,17 @@ def simulate_imu(scenario: Scenario | str, seconds: float | None = None, seed: i
 
 
 def true_corners(
-    lens: Lens, markers: Sequence[Marker], plates: Sequence[Plate], T_map_camera: FloatArray, margin_px: float = 1.0
+    lens: Lens, markers: Sequence[Marker], plates: Sequence[Plate], T_map_camera: FloatArray
 ) -> dict[int, FloatArray]:
     """ID to corners (4, 2) [px] of the markers that lie wholly in the image, face the camera and are not hidden."""
     R, origin = T_map_camera[:3, :3], T_map_camera[:3, 3]
-    high = np.array([lens.width, lens.height]) - 1 - margin_px
+    high = np.array([lens.width, lens.height]) - 1 - _MARGIN_PX
     poses = np.array([marker.T_map_marker for marker in markers])
     points = (np.array([marker.corners_map for marker in markers]) - origin) @ R
     faces = np.sum((origin - poses[:, :3, 3]) * poses[:, :3, 2], axis=1) > 0
     ahead = np.flatnonzero(faces & np.all(points[..., 2] >= 0.05, axis=1))
     pixels = lens.project(points[ahead])
-    inside = np.all((pixels >= margin_px) & (pixels <= high), axis=(1, 2))
+    inside = np.all((pixels >= _MARGIN_PX) & (pixels <= high), axis=(1, 2))
     ahead, pixels = ahead[inside], pixels[inside]
     whole = np.all(_unfolded(lens, points[ahead], pixels), axis=1)
     seen = [(markers[index], uv) for index, uv in zip(ahead[whole], pixels[whole], strict=True)]

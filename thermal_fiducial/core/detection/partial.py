@@ -28,7 +28,7 @@ from thermal_fiducial.core.detection.refining import RefinedCorners
 from thermal_fiducial.core.detection.visible_cells import VisibleCells
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.planar_pose import marker_corners
+from thermal_fiducial.core.geometry.reprojection import marker_corners
 from thermal_fiducial.core.types import BoolArray, FloatArray, Gray, IntArray
 
 # Least width of cells for separate straight edges [px]; approximate width of cells in the coarse layer [px].

@@ -16,18 +16,10 @@ from thermal_fiducial.core.geometry.reprojection import corners_in_map, marker_c
 from thermal_fiducial.core.geometry.rigid_fit import costs, evaluate, Images, minimise
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
 
-__all__ = [
-    'CameraFit',
-    'PlanarPoses',
-    'choose_branches',
-    'ippe_square',
-    'marker_corners',
-    'planar_poses',
-    'solve_marker_poses',
-]
-
 #: Mahalanobis distance of a corner (99 % of a chi-square of two degrees of freedom) beyond which it loses weight.
 INLIER = 3.0
+# Ratio of the squared errors of a marker's two poses beyond which the image rules out the worse one.
+_AMBIGUOUS = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +35,13 @@ class PlanarPoses:
     #: (N, 2) weighted squared errors: with consistent corner covariances, chi-square of two degrees of freedom
     chi2: FloatArray
 
-    def ambiguous(self, ratio: float = 10.0) -> BoolArray:
+    def ambiguous(self) -> BoolArray:
         """Of which markers (N,) the image allows the other branch.
 
-        Its squared error is below ``ratio`` times that of the first branch, or times 2 if that is larger, the
+        Its squared error is below ``_AMBIGUOUS`` times that of the first branch, or times 2 if that is larger, the
         expectation for consistent covariances.
         """
-        return np.asarray(self.chi2[:, 1] <= ratio * np.maximum(self.chi2[:, 0], 2.0))
+        return np.asarray(self.chi2[:, 1] <= _AMBIGUOUS * np.maximum(self.chi2[:, 0], 2.0))
 
     def swapped(self, which: BoolArray) -> 'PlanarPoses':
         """The poses with the branches of the markers ``which`` (N,) swapped."""

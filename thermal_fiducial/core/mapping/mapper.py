@@ -22,14 +22,12 @@ from thermal_fiducial.core.mapping.candidates import Candidate, entry, NewMarker
 from thermal_fiducial.core.mapping.keyframes import FrameMemory, VIEWS
 from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import LocatedFrame, Location, predicted_camera, Refusal, Sight
-from thermal_fiducial.core.mapping.map_data import jump, MapMarker, MapperResult, MarkerMap
+from thermal_fiducial.core.mapping.map_data import jump, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.trust import CornerBias, Trust
 from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import FloatArray
-
-__all__ = ['MapMarker', 'MapperResult', 'MarkerMap', 'MarkerMapper']
 
 #: Reason for which the map is not updated from a frame with a pose.
 CONTRADICTED = 'the known markers in view contradict the odometry'
