@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.detection.patterns import Decoder, sampled
-from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
+from thermal_fiducial.core.geometry.se3 import bilinear, diagonals, seen_between
 from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, TINY
 
 _STEPS = 3
@@ -73,7 +73,7 @@ def aligned(
     J = np.empty((len(ids), 15, grid.weights.shape[1]), dtype=np.float32)
     J[:, 8:14] = grid.smooth
     J[:, 14] = (grid.blur @ cells @ grid.blur.T).reshape(len(ids), -1)
-    cell = float(np.median(np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1))) / (math.sqrt(2.0) * decoder.cells)
+    cell = float(np.median(diagonals(quads))) / (math.sqrt(2.0) * decoder.cells)
     smoothing = _SMOOTHING if noisy else min(_SMOOTHING, _SMOOTHING_CELLS * cell)
     image, origin = _window(image, quads, decoder.cells)
     quads = quads - origin
@@ -92,7 +92,7 @@ def aligned(
         # Keeps the system solvable where the image has no gradient in some direction.
         diagonal += TINY * (1.0 + diagonal.max(axis=1, keepdims=True))
         step = -np.linalg.solve(information, J @ np.swapaxes(value, -1, -2))[:, :8, 0]
-        longest = _LONGEST / decoder.cells * np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)[:, None] / np.sqrt(2.0)
+        longest = _LONGEST / decoder.cells * diagonals(quads)[:, None] / np.sqrt(2.0)
         quads = quads + np.swapaxes(np.clip(step, -longest, longest).reshape(-1, 2, 4), -1, -2)
     return quads + origin
 

@@ -211,8 +211,7 @@ def confirmed(
 
 def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, decoder: Decoder) -> Reading:
     """Readings of quadrilaterals (Q, 4, 2), at half resolution if all are large enough."""
-    sides = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=-1)
-    if sides.min() < _WIDE_CELL_PX * decoder.cells:
+    if np.sqrt(se3.squared_sides(quads).min()) < _WIDE_CELL_PX * decoder.cells:
         return decoder.read(image, quads, lag_tails=lag_tails)
     half_tails = None if lag_tails is None else halfway(lag_tails)
     return decoder.read(halved(image), halfway(quads), lag_tails=half_tails)

@@ -27,6 +27,7 @@ from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.geometry.planar_pose import ippe_square
+from thermal_fiducial.core.geometry.se3 import diagonals
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray
 
 # Polarity: memory in frames, and the surplus of markers of one polarity from which on it is certain.
@@ -236,7 +237,7 @@ def near_prediction(
 
 def _shifted(image: Float32Array, ids: IntArray, corners: FloatArray, decoder: Decoder) -> FloatArray:
     """Corners (N, 4, 2) moved to the best correlation with their patterns on a grid, interpolated by its centroid."""
-    cell = np.linalg.norm(corners[:, 2] - corners[:, 0], axis=-1) / (np.sqrt(2.0) * decoder.cells)
+    cell = diagonals(corners) / (np.sqrt(2.0) * decoder.cells)
     step = cell[:, None, None] * NEAR_CELLS
     tried = (corners[:, None] + step[:, :, None]).reshape(-1, 4, 2)
     similarity = np.abs(decoder.match(image, tried, np.repeat(ids, len(NEAR_CELLS)))).reshape(len(ids), -1)

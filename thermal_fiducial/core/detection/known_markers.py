@@ -18,7 +18,6 @@ CUT_OFF_PX = 2.0
 TOGETHER = 0.35
 # Least cosine between a marker's normal and the line of sight for it to be expected.
 _MAX_TILT_COSINE = 0.2
-_NEXT = np.array([1, 2, 3, 0])
 # Corners of a marker of side 1 in its plane.
 _FACE = marker_corners(1.0)[:, :2]
 # A marker predicted with this margin inside the image counts as wholly visible [px].
@@ -90,7 +89,7 @@ class FoundMarkers(Stacked):
         if len(others.ids) == 0:
             return self
         apart = np.linalg.norm(others.places.at.px.mean(axis=1)[:, None] - self.places.at.px.mean(axis=1), axis=-1)
-        extent = np.linalg.norm(self.places.at.px[:, 2] - self.places.at.px[:, 0], axis=-1)
+        extent = se3.diagonals(self.places.at.px)
         return self.joined(others.only(~among(others.ids, self.ids) & (apart > TOGETHER * extent).all(axis=1)))
 
 
@@ -138,8 +137,7 @@ class KnownMarkers:
         corners = camera.project(points)
         centre = points.mean(axis=1)
         facing = (normal * centre).sum(axis=1) < -_MAX_TILT_COSINE * np.sqrt((centre * centre).sum(axis=1))
-        span = corners.take(_NEXT, axis=1) - corners
-        large = ((span * span).sum(axis=-1) >= min_side_px**2).all(axis=1)
+        large = (se3.squared_sides(corners) >= min_side_px**2).all(axis=1)
         seen = np.flatnonzero(camera.contains(corners, CUT_OFF_PX).all(axis=1) & facing & large)
         points = points[seen]
         return ExpectedMarkers(self.ids[seen], points[..., :2] / points[..., 2:], points[..., 2], np.zeros(len(seen)))

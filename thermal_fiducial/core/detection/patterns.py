@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.detection.frame import without_tails
-from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
+from thermal_fiducial.core.geometry.se3 import bilinear, diagonals, seen_between
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray, Stacked, TINY
 
 # Distance from a side at which black and white are compared: in cells, and at most in pixels.
@@ -213,7 +213,7 @@ class Decoder:
 
     def _steps(self, image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None) -> FloatArray:
         """Mean counts just outside the sides minus those just inside (Q, 4)."""
-        side = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1) / np.sqrt(2.0)
+        side = diagonals(quads) / np.sqrt(2.0)
         near = np.minimum(_OUTSIDE / self.cells, _OUTSIDE_PX / np.maximum(side, 1.0))[:, None, None]
         weights = self._along_sides + near.astype(np.float32) * self._away
         counts = sampled(image, seen_between(quads, weights))

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import cv2
 import numpy as np
 
+from thermal_fiducial.core.geometry.se3 import squared_sides
 from thermal_fiducial.core.types import Float32Array, FloatArray, Gray, TINY
 
 # Window of the local standard deviation, at a quarter of the resolution: 68 px, a marker at working distance.
@@ -27,7 +28,7 @@ _CLIPPED = 1.0 / math.erf(math.sqrt(0.5))
 _FLOOR_OF_CLEAR = 4.0
 # Tolerance of polygon approximation as a share of an outline's length: above the effect of noise, below a side.
 _STRAIGHT = 0.05
-_CORNERS, _NEXT = 4, np.array([1, 2, 3, 0])
+_CORNERS = 4
 # Of OpenCV.
 _Image: TypeAlias = np.ndarray[Any, Any]
 
@@ -141,8 +142,7 @@ def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray) -> FloatArray
     if not quads:
         return np.zeros((0, 4, 2))
     found = np.array(quads, dtype=np.float64)
-    span = found.take(_NEXT, axis=1) - found
-    return _clockwise(found[((span * span).sum(axis=-1) >= min_side_px**2).all(axis=1)])
+    return _clockwise(found[(squared_sides(found) >= min_side_px**2).all(axis=1)])
 
 
 def _clockwise(quads: FloatArray) -> FloatArray:

@@ -34,6 +34,7 @@ from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, unknown_twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.se3 import squared_sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked, TINY
 
 #: Contrast-to-noise ratio above which a marker is clear: it is found at full and at half resolution.
@@ -46,7 +47,7 @@ _HARDLY_PX = 0.6
 # Change of the displacement by lag below which the refinement is not repeated [px].
 _BLUR_THAT_MATTERS_PX = 0.4
 _ROUNDS = 2
-_NEXT, _EYE = np.array([1, 2, 3, 0]), np.eye(2)
+_EYE = np.eye(2)
 # Indices of the corners, clockwise, among the ends of the sides.
 _CORNERS = np.array([0, 1, 3, 2])
 # Largest number of passes. A corner has converged when its last step is below _UNSURE of its standard deviations,
@@ -211,8 +212,7 @@ def _motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlu
 
 def sides_px(corners: FloatArray) -> FloatArray:
     """Mean sides (N,) of quadrilaterals (N, 4, 2)."""
-    span = corners.take(_NEXT, axis=1) - corners
-    return np.asarray(np.sqrt((span * span).sum(axis=-1)).mean(axis=1))
+    return np.asarray(np.sqrt(squared_sides(corners)).mean(axis=1))
 
 
 def refine_corners(

@@ -20,6 +20,7 @@ from thermal_fiducial.core.detection.quads import (
     without_columns,
 )
 from thermal_fiducial.core.detection.refining import sides_px
+from thermal_fiducial.core.geometry.se3 import diagonals, squared_sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.
@@ -103,7 +104,8 @@ class BlindSearch:
         # A search at full resolution alone is for clear markers, which need no alignment.
         pull = SearchScales.FAINT in scales
         reading, quads = self._read(frame, half, (fine, faint), allowed, seen.ids if pull else None)
-        good = accepted(reading, frame.noise, self._decoder.correctable, config) & _large(quads, min_side_px)
+        good = accepted(reading, frame.noise, self._decoder.correctable, config)
+        good &= (squared_sides(quads) >= min_side_px**2).all(axis=1)
         good &= frame.camera.contains(quads, CUT_OFF_PX).all(axis=1)
         if not good.any():
             return Outlines.none()
@@ -158,12 +160,6 @@ def _with_shrunk(outlines: FloatArray, cells: int) -> FloatArray:
     return np.concatenate([outlines, shrunk(outlines, cells, 1.0), small])
 
 
-def _large(quads: FloatArray, min_side_px: float) -> BoolArray:
-    """Which quadrilaterals (Q, 4, 2) have no side shorter than ``min_side_px``."""
-    span = quads[:, [1, 2, 3, 0]] - quads
-    return np.asarray((np.sum(span * span, axis=-1) >= min_side_px**2).all(axis=1))
-
-
 def _chosen(reading: Reading, quads: FloatArray, places: IntArray, noise: float) -> Outlines:
     """Markers at indices ``places`` of the quadrilaterals, corners ordered from the marker's first one."""
     turned = (np.arange(4) - reading.turns[places][:, None]) % 4
@@ -188,7 +184,7 @@ def _rough(reading: Reading, quads: FloatArray, seen: IntArray) -> IntArray:
     hinted &= ~among(reading.ids, np.concatenate([reading.ids[clear], seen]))
     places = np.flatnonzero(hinted)[np.argsort(-similarity[hinted], kind='stable')]
     places = places[np.unique(reading.ids[places], return_index=True)[1]]
-    centre, across = quads.mean(axis=1), np.linalg.norm(quads[clear, 2] - quads[clear, 0], axis=-1)
+    centre, across = quads.mean(axis=1), diagonals(quads[clear])
     distance = np.linalg.norm(centre[places, None] - centre[clear], axis=-1)
     return np.asarray(places[(distance > 0.5 * across).all(axis=1)])
 
@@ -216,7 +212,7 @@ def inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: B
     """
     mine, others = np.flatnonzero(good), np.flatnonzero(readable)
     similarity, centre = np.abs(reading.correlation), quads.mean(axis=1)
-    across = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)
+    across = diagonals(quads)
     apart = np.linalg.norm(centre[mine, None] - centre[others], axis=-1)
     together = apart < TOGETHER * np.maximum(across[mine, None], across[others])
     opposite = reading.correlation[mine, None] * reading.correlation[others] < 0.0
@@ -228,7 +224,7 @@ def inside_out(reading: Reading, quads: FloatArray, good: BoolArray, readable: B
 def _once(reading: Reading, quads: FloatArray, good: BoolArray, drop_duplicates: bool) -> IntArray:
     """Index of the best reading of every ID; IDs at two places are left out if ``drop_duplicates``."""
     similarity = np.abs(reading.correlation)
-    across = np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1)
+    across = diagonals(quads)
     centre = quads.mean(axis=1)
     best = []
     for marker_id in np.unique(reading.ids[good]).tolist():

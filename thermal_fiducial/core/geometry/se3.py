@@ -1,4 +1,4 @@
-"""Rotations and rigid transforms.
+"""Rotations and rigid transforms; squares as a camera sees them, quadrilaterals.
 
 ``T_a_b`` is 4x4 and maps coordinates in b to coordinates in a, ``p_a = T_a_b @ p_b``; inner names cancel.
 Rotation vectors are in radians. All functions accept leading batch dimensions unless they say otherwise.
@@ -195,6 +195,17 @@ def seen_between(c: FloatArray, weights: Real) -> Real:
     points = corners @ weights if weights.ndim == 2 else (corners[:, :, None] @ weights)[:, :, 0]
     points[:2] /= points[2]
     return points[:2]
+
+
+def squared_sides(quads: FloatArray) -> FloatArray:
+    """Squared lengths (Q, 4) of the sides of quadrilaterals (Q, 4, 2), from each corner to the next."""
+    to_next = quads.take(_NEXT, axis=1) - quads
+    return np.asarray((to_next * to_next).sum(axis=-1))
+
+
+def diagonals(quads: FloatArray) -> FloatArray:
+    """Lengths (Q,) of the diagonals of quadrilaterals (Q, 4, 2) from their first corners."""
+    return np.asarray(np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1))
 
 
 def perspective(c: FloatArray) -> FloatArray:
