@@ -19,6 +19,8 @@ _NORM_TOLERANCE = 0.01
 _LONGEST_SHOWN = 100
 #: Parameters that rclpy declares on every node.
 _OF_ROS = ('use_sim_time', 'start_type_description_service')
+#: Prefix of ROS's parameters for the quality of service, which a file for several packages may have.
+QOS_OVERRIDES = 'qos_overrides.'
 
 
 def param(
@@ -780,7 +782,7 @@ def check_names(names: Iterable[str]) -> None:
     """
     known = {name for kind in (NODES | OPTIONAL_NODES).values() for name, _, _ in parameters(kind)}
     for name in sorted(set(names) - known - set(_OF_ROS)):
-        if name.startswith('qos_overrides.'):
+        if name.startswith(QOS_OVERRIDES):
             continue
         close = difflib.get_close_matches(name, known, 1)
         shown = _shown(name).strip('\'"')

@@ -66,3 +66,14 @@ def test_a_clock_that_stands_still_or_goes_back_is_survived():
         source.count += 30
         rates.look(time_ns)
     assert (rates.doubt(), rates.figures()['rate /main [Hz]']) == ('', '30')
+
+
+def test_a_simulated_clock_that_begins_late_is_no_low_rate():
+    """It is 0 until its first message; a bag that is played at half speed has 15 Hz by the wall, 30 by this clock."""
+    source = Input('/main')
+    rates = InputRates([source], expected=30.0)
+    for sample in range(40):
+        source.count += 15
+        rates.look(0 if sample < 3 else 1_700_000_000 * SECOND + sample * SECOND // 2)
+        assert rates.doubt() == ''
+    assert rates.figures()['rate /main [Hz]'] == '30'

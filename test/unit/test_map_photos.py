@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 import pytest
+from support.opencv import need_4_7
 from support.walls import CAMERA, flight, SIZE, wall
 
 from thermal_fiducial.cli.main import main
@@ -39,6 +40,7 @@ def poses():
 @pytest.fixture(scope='module')
 def photographed(tmp_path_factory, poses):
     """Arguments: a folder of photos, and the camera."""
+    need_4_7()
     folder = tmp_path_factory.mktemp('photos')
     for k in range(12):
         cv2.imwrite(str(folder / f'{k}.png'), photo(flight(2.0 * k), poses))

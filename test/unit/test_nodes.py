@@ -634,6 +634,28 @@ def test_an_unusable_parameter_is_one_line(rule, reason):
     assert reason in said[0]
 
 
+def test_overrides_of_the_quality_of_service_are_named_as_ignored(capfd):
+    with ros_graph('-p', 'qos_overrides./thermal/image_raw.subscription.depth:=1') as graph:
+        node = graph.add(Tau2Camera)
+        assert graph.input(node, 'thermal/image_raw').subscription.qos_profile.depth == qos.CAMERA_INPUT.depth
+    assert 'parameters qos_overrides.*: ignored' in capfd.readouterr().err
+
+
+def test_rates_are_those_of_a_simulated_clock(graph):
+    """As of a bag that is played much faster than it was recorded."""
+    node = graph.add(Tau2Camera, live=True, use_sim_time=True)
+    for timer in node.timers:
+        timer.cancel()
+    output = graph.output(node, 'diagnostics')
+    graph.spin_until(lambda: output.listeners == 1)
+    for k, image in enumerate(frames(12)):
+        graph.send('thermal/image_raw', image)
+        node.diagnose(START + k * 500_000_000)
+    heard = graph.heard['/diagnostics']
+    graph.spin_until(lambda: len(heard) == 12)
+    assert {item.key: item.value for item in heard[-1].status[0].values}['rate /thermal/image_raw [Hz]'] == '2'
+
+
 def test_parameters_of_the_other_nodes_are_neither_refused_nor_declared():
     with ros_graph('-p', 'gate:=30.0', '-p', 'min_contrast:=0.5', '-p', 'whitelist:=[]') as graph:
         node = graph.add(ArucoDetector)

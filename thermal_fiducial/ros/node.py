@@ -181,7 +181,7 @@ class StageNode(CountingNode, Generic[Config]):
     def diagnose(self, stamp_ns: int) -> None:
         """Publish the diagnostics of the time since the last call, and print changes of the headline."""
         self.take_waiting()
-        self._rates.look(time.monotonic_ns() if self.live else stamp_ns)
+        self._rates.look(stamp_ns if not self.live or self._on_sim_time else time.monotonic_ns())
         if self.live and not self.deaf:
             self._listen()
         level, reason = self._level()
@@ -196,6 +196,11 @@ class StageNode(CountingNode, Generic[Config]):
         name = self.get_fully_qualified_name().lstrip('/')
         self._diagnostics.send(convert.diagnostics(name, level, reason, values, stamp_ns))
         self._diagnosed_refused = self.refused
+
+    @property
+    def _on_sim_time(self) -> bool:
+        """Whether ``use_sim_time`` is set: a bag that is played at half speed has its own rates on its own clock."""
+        return bool(self.get_parameter('use_sim_time').value)
 
     def _listen(self) -> None:
         """While an input is missing, find out whether it cannot be heard in this process."""

@@ -9,7 +9,7 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from thermal_fiducial.config import check_names, from_mapping, parameters
+from thermal_fiducial.config import check_names, from_mapping, parameters, QOS_OVERRIDES
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 
 Config = TypeVar('Config')
@@ -37,8 +37,10 @@ def declare(node: Node, kind: type[Config]) -> Config:
     """
     # rclpy has no public access to the overrides, and automatically_declare_parameters_from_overrides fails on an
     # empty list, which has no type.
-    own = {name for name, _, _ in parameters(kind)}
-    check_names(set(getattr(node, '_parameter_overrides', {})) - own)
+    given = set(getattr(node, '_parameter_overrides', {}))
+    check_names(given - {name for name, _, _ in parameters(kind)})
+    if any(name.startswith(QOS_OVERRIDES) for name in given):
+        node.get_logger().warning(f'parameters {QOS_OVERRIDES}*: ignored, the quality of service is fixed')
     for name, item, default in parameters(kind):
         try:
             _declare(node, name, item, default)
