@@ -5,7 +5,7 @@ import sys
 from types import ModuleType, SimpleNamespace
 
 import cv2
-from geometry_msgs.msg import PoseWithCovariance
+from geometry_msgs.msg import PoseArray, PoseWithCovariance
 import numpy as np
 import pytest
 from sensor_msgs.msg import PointCloud2
@@ -15,7 +15,7 @@ from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.measurements import corners_px, MARKER_DTYPE
 from thermal_fiducial.nodes.aruco_detector import ArucoDetector
-from thermal_fiducial.ros import convert, detections
+from thermal_fiducial.ros import clouds, convert, detections, qos
 from thermal_fiducial.ros.annotations import image_annotations
 
 HEAD = convert.header(START, 'thermal_camera_optical')
@@ -92,6 +92,21 @@ def test_vision():
     assert (detection.id, result.hypothesis.class_id, result.hypothesis.score) == ('7', '7', 1.0)
     assert result.pose.pose.position.z == detection.bbox.center.position.z == 2.5
     assert (detection.bbox.size.x, detection.bbox.size.y) == (0.3, 0.3)
+
+
+@pytest.mark.ros
+def test_boxes_have_the_sides_that_the_map_gives_as_the_poses_do(monkeypatch):
+    sent = []
+    monkeypatch.setattr(detections, 'vision', lambda messages, markers, head, sides: sent.append(sides) or PoseArray())
+    monkeypatch.setitem(detections.KINDS, 'vision', ('geometry_msgs', 'PoseArray'))
+    with ros_graph() as graph:
+        graph.add(ArucoDetector, marker_size=2.0 * small_bag.SIZE, detections='vision')
+        graph.send('thermal/camera_info', info())
+        known = small_bag.map_of(small_bag.CENTRES).rows()
+        graph.send('marker_map', clouds.cloud(known, convert.header(START, 'map')), profile=qos.LATCHED)
+        graph.send('thermal/image', *frames(1))
+        graph.spin_until(lambda: sent)
+    assert sent[0] == pytest.approx([small_bag.SIZE] * 4)
 
 
 def test_image_annotations():

@@ -64,7 +64,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         self._markers.send(clouds.MARKER_CLOUDS.message(markers, head))
         if self._marker_poses.listeners:
             self._marker_poses.send(clouds.marker_poses(markers, head))
-        self._others.send(markers, head)
+        self._others.send(markers, head, self.detector.size)
         if self._annotated.listeners:
             self._annotated.send(convert.image(display.annotated(self._gray(counts), markers), head))
 

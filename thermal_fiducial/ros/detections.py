@@ -13,7 +13,7 @@ from geometry_msgs.msg import TransformStamped, Vector3
 import numpy as np
 from std_msgs.msg import Header
 
-from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
+from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.measurements import corners_px, Markers
 from thermal_fiducial.ros import convert
 from thermal_fiducial.ros.annotations import image_annotations
@@ -42,7 +42,6 @@ class OtherDetections:
 
     def __init__(self, node: StageNode[Any], config: ArucoDetectorConfig, fault: Callable[[str], None]) -> None:
         self._config, self._prefix = config, node.frame_prefix
-        self._sizes = size_overrides(config.marker_size_overrides)
         self._messages: Any = None
         self._broadcaster: Any = None
         if config.detections:
@@ -67,22 +66,21 @@ class OtherDetections:
             except ImportError:
                 fault('parameter publish_marker_tf: tf2_ros is not installed')
 
-    def send(self, markers: Markers, head: Header) -> None:
-        """Publish the markers of a frame, also when there are none."""
+    def send(self, markers: Markers, head: Header, size: Callable[[int], float]) -> None:
+        """Publish the markers of a frame, also when there are none; ``size``: side of a marker by its ID [m]."""
         if self._messages is not None:
-            self._output.send(self._message(markers, head))
+            self._output.send(self._message(markers, head, size))
         if self._foxglove is not None and self._annotations.listeners:
             self._annotations.send(image_annotations(self._foxglove, markers, head))
         if self._broadcaster is not None and len(markers):
             self._broadcaster.sendTransform([_transform(row, head, self._prefix) for row in markers])
 
-    def _message(self, markers: Markers, head: Header) -> Any:
+    def _message(self, markers: Markers, head: Header, size: Callable[[int], float]) -> Any:
         if self._config.detections == 'aruco_opencv':
             return aruco_opencv(self._messages, markers, head)
         if self._config.detections == 'apriltag':
             return apriltag(self._messages, markers, head, self._config.dictionary)
-        sides = [self._sizes.get(int(row['id']), self._config.marker_size) for row in markers]
-        return vision(self._messages, markers, head, sides)
+        return vision(self._messages, markers, head, [size(int(row['id'])) for row in markers])
 
 
 def aruco_opencv(messages: Any, markers: Markers, head: Header) -> Any:
