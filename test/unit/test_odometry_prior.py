@@ -6,8 +6,8 @@ from support.walls import flight, stamp
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.reprojection import difference
-from thermal_fiducial.core.mapping.located import predicted_camera
 from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.motion_prior import predicted_camera
 
 
 def odometry(k, ahead=0.0, sigma=(5e-3, 2e-3)):

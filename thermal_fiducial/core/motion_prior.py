@@ -1,19 +1,29 @@
 """The filter's latest odometry and clock offset, as detector and mapper use them.
 
 Only the filter estimates motion and clock offset. Detector and mapper query this record by the stamps of their frames.
+
+A single marker determines a camera's attitude to degrees only, and its position to that angle times the distance;
+inertial odometry is far better for seconds. Until the filter has estimated the clock offset, the covariance of a camera
+pose by odometry contains the motion during the standard deviation of the offset.
 """
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from thermal_fiducial.core.measurements import LATEST_NS, Odometry
-from thermal_fiducial.core.types import SECOND_NS
+from thermal_fiducial.core.error_model import of_single_error, positive
+from thermal_fiducial.core.geometry.reprojection import lever_arm, turned
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.measurements import CameraPose, LATEST_NS, Odometry
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Fastest component of a twist [m/s, rad/s]: no camera that sees markers moves like this, a filter that diverges does.
 FASTEST = 50.0
+#: Longest time [ns] over which an odometry state is extrapolated to a frame.
+NEAR_NS = 300_000_000
 # Largest delay of frames, for which states are kept [ns].
 _KEPT_NS = 500_000_000
 # Largest number of states: two seconds of odometry at 1 kHz.
@@ -86,3 +96,51 @@ class MotionPrior:
         kept = min(count, at_most)
         chosen = [first + place * (count - 1) // max(kept - 1, 1) for place in range(kept)]
         return self._read([self._states[place] for place in chosen]) if chosen else []
+
+
+@dataclass(frozen=True)
+class PredictedCamera:
+    """Camera pose at a frame by odometry."""
+
+    pose: CameraPose
+    #: the odometry state that it is extrapolated from
+    odometry: Odometry
+
+
+def predicted_camera(
+    prior: MotionPrior | None, camera_stamp_ns: int, T_body_camera: FloatArray, time_offset_std: float
+) -> PredictedCamera | None:
+    """The camera at the frame ``camera_stamp_ns``; None where odometry has no state near it.
+
+    Parameters
+    ----------
+    prior : the filter's odometry and clock offset
+    time_offset_std : standard deviation of the clock offset before the filter has estimated it [s]
+    """
+    if prior is None:
+        return None
+    instant_ns = prior.in_odometry_clock(camera_stamp_ns)
+    odometry = prior.nearest(instant_ns)
+    if odometry is None or abs(instant_ns - odometry.stamp_ns) >= NEAR_NS:
+        return None
+    dt = (instant_ns - odometry.stamp_ns) / SECOND_NS
+    step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
+    T_map_body = odometry.T_map_body @ step
+    R, J = T_map_body[:3, :3], lever_arm(T_map_body[:3, :3] @ T_body_camera[:3, 3])
+    covariance = J @ odometry.pose_covariance @ J.T
+    if not prior.clock_is_known:
+        velocity = J @ np.concatenate([R @ odometry.velocity_body, R @ odometry.angular_velocity_body])
+        covariance += of_single_error(velocity, time_offset_std)
+    return PredictedCamera(CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), odometry)
+
+
+def displacement_covariance(first: CameraPose, predicted: PredictedCamera) -> FloatArray:
+    """Covariance (6, 6) of the displacement by odometry since ``first``: the smaller of two bounds.
+
+    One is the difference of the covariances, as if the error grew by independent increments; the other the error of
+    the velocity, constant over that time.
+    """
+    seconds, now = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS, predicted.odometry
+    of_speed = seconds**2 * turned(now.twist_covariance, now.T_map_body[:3, :3])
+    bounds = positive(predicted.pose.covariance - first.covariance), of_speed
+    return min(bounds, key=lambda covariance: float(np.trace(covariance)))

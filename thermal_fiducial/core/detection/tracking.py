@@ -14,11 +14,11 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.detection.frame import LEAST_DEPTH
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, pairs
 from thermal_fiducial.core.detection.twist import (
-    carried,
     corrected,
-    growth,
     interaction,
     line_through,
+    predicted_twist,
+    process_noise,
     RANDOM,
     transferred,
     Twist,
@@ -94,14 +94,14 @@ class MotionTrack:
         # Without markers the twist is not extrapolated: a wrong one would keep them from being found again.
         saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_NS
         if self.twist is not None and dt is not None and saw_lately:
-            before = carried(self.twist, dt)
+            before = predicted_twist(self.twist, dt)
         if len(odometry) == 0 or abs(odometry_ns - odometry[-1].stamp_ns) >= _STALE_NS:
             return before
         seen, later = (
             transferred(odometry[-1], self.from_body),
             (odometry[-1].stamp_ns - odometry_ns) / SECOND_NS,
         )
-        unsure = (growth(abs(later))[0] + clock_std_s**2) * RANDOM
+        unsure = (process_noise(abs(later))[0] + clock_std_s**2) * RANDOM
         information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + unsure))
         return corrected(before or unknown_twist(), information, information @ seen.value, later)
 

@@ -75,13 +75,13 @@ def unknown_twist() -> Twist:
     return Twist(np.zeros(6), np.diag(np.concatenate([_UNKNOWN, RANDOM.diagonal()])))
 
 
-def carried(twist: Twist, seconds: float) -> Twist:
+def predicted_twist(twist: Twist, seconds: float) -> Twist:
     """Twist predicted by the motion model ``seconds`` later, or earlier if negative."""
     left, sign = math.exp(-abs(seconds) / _CORRELATED_S), math.copysign(1.0, seconds)
     lasting = sign * _CORRELATED_S * (1.0 - left)
     F = np.eye(12)
     F[:6, 6:], F[6:, 6:] = lasting * _EYE, left * _EYE
-    own, both, change = growth(abs(seconds))
+    own, both, change = process_noise(abs(seconds))
     covariance = F @ twist.covariance @ F.T
     covariance[:6, :6] += own * RANDOM
     covariance[:6, 6:] += sign * both * RANDOM
@@ -90,7 +90,7 @@ def carried(twist: Twist, seconds: float) -> Twist:
     return Twist(twist.value + lasting * twist.acceleration, covariance, left * twist.acceleration)
 
 
-def growth(seconds: float) -> tuple[float, float, float]:
+def process_noise(seconds: float) -> tuple[float, float, float]:
     """Process noise over a time in units of :data:`RANDOM`: of the twist, cross-covariance, of the acceleration.
 
     Singer, eq. 7.
@@ -116,7 +116,7 @@ def line_through(stamp_ns: int, odometry: Sequence[Odometry], transfer: FloatArr
     typical = transfer @ (sum(state.twist_covariance for state in odometry) / len(t)) @ transfer.T
     noise = np.zeros((6, 6))
     noise[3:, 3:] = typical[3:, 3:]
-    slope = noise / square + growth(float(t[-1] - t[0]))[2] * RANDOM + _UNSURE
+    slope = noise / square + process_noise(float(t[-1] - t[0]))[2] * RANDOM + _UNSURE
     covariance = np.empty((12, 12))
     unsure = clock_std_s**2 * (np.outer(acceleration, acceleration) + slope)
     covariance[:6, :6] = noise / len(t) + middle**2 * slope + unsure + _LEAST

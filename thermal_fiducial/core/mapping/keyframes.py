@@ -10,10 +10,10 @@ from thermal_fiducial.core.error_model import alike_odometry, divided_prior, NO_
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.adjustment_problem import Priors, Snapshot
-from thermal_fiducial.core.mapping.located import growth, PredictedCamera
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.measurements import CameraPose, Observations
+from thermal_fiducial.core.motion_prior import displacement_covariance, PredictedCamera
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 
 # Side of a cell of camera positions [m] and of viewing directions [components of a unit vector] to begin with.
@@ -226,7 +226,9 @@ class FrameMemory:
         if self._gap is None:
             self._gap = predicted.pose
         # The covariance of the odometry at the gap's first marker is the common error of all views.
-        return Viewpoint.known(predicted.pose.T_map_camera, growth(self._gap, predicted), self._gap.covariance)
+        return Viewpoint.known(
+            predicted.pose.T_map_camera, displacement_covariance(self._gap, predicted), self._gap.covariance
+        )
 
     def bridgeable(self, stamp_ns: int, longest: float) -> bool:
         """Whether known markers were in view not more than ``longest`` [s] before."""

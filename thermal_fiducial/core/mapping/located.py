@@ -1,9 +1,4 @@
-"""Records of localization: the known markers of a frame, the camera pose by odometry, and the located frame.
-
-A single marker determines a camera's attitude to degrees only, and its position to that angle times the distance;
-inertial odometry is far better for seconds. The filter estimates the clock offset between camera and odometry. Until
-it has, the covariance of the predicted pose contains the motion during the standard deviation of the offset.
-"""
+"""Records of localization: the known markers of a frame, their re-projection, and the located frame."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,33 +10,20 @@ from thermal_fiducial.core.error_model import (
     arms_of_scale,
     correlated_sum,
     INCONSISTENT_PX,
-    of_single_error,
     positive,
 )
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, lever_arm, linearise, turned
-from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.geometry.reprojection import corners_in_map, difference, linearise
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
-from thermal_fiducial.core.measurements import CameraPose, Observations, Odometry
-from thermal_fiducial.core.motion_prior import MotionPrior
-from thermal_fiducial.core.types import BoolArray, FloatArray, ObjectArray, SECOND_NS, Stacked
+from thermal_fiducial.core.measurements import CameraPose, Observations
+from thermal_fiducial.core.motion_prior import PredictedCamera
+from thermal_fiducial.core.types import BoolArray, FloatArray, ObjectArray, Stacked
 
 #: Standard deviation of the attitude [rad] beyond which a pose is not published: a first-order covariance fails there.
 VAGUE = 0.2
-#: Longest time [ns] over which an odometry state is extrapolated to a frame.
-NEAR_NS = 300_000_000
 #: Squared Mahalanobis distance (6 d.o.f.) beyond which markers and odometry contradict each other: ten sigma.
 CONTRADICTION = 100.0
-
-
-@dataclass(frozen=True)
-class PredictedCamera:
-    """Camera pose at a frame by odometry."""
-
-    pose: CameraPose
-    #: the odometry state that it is extrapolated from
-    odometry: Odometry
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,42 +179,3 @@ class LocatedFrame:
         by_marker = np.einsum('nri,nri->n', seen.J_marker @ known.map_covariances, seen.J_marker)
         explained = 2.0 * known.noise_px**2 + np.nan_to_num(by_camera + by_marker) / 4.0 + INCONSISTENT_PX**2
         return errors, np.sqrt(explained)
-
-
-def predicted_camera(
-    prior: MotionPrior | None, camera_stamp_ns: int, T_body_camera: FloatArray, time_offset_std: float
-) -> PredictedCamera | None:
-    """The camera at the frame ``camera_stamp_ns``; None where odometry has no state near it.
-
-    Parameters
-    ----------
-    prior : the filter's odometry and clock offset
-    time_offset_std : standard deviation of the clock offset before the filter has estimated it [s]
-    """
-    if prior is None:
-        return None
-    instant_ns = prior.in_odometry_clock(camera_stamp_ns)
-    odometry = prior.nearest(instant_ns)
-    if odometry is None or abs(instant_ns - odometry.stamp_ns) >= NEAR_NS:
-        return None
-    dt = (instant_ns - odometry.stamp_ns) / SECOND_NS
-    step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
-    T_map_body = odometry.T_map_body @ step
-    R, J = T_map_body[:3, :3], lever_arm(T_map_body[:3, :3] @ T_body_camera[:3, 3])
-    covariance = J @ odometry.pose_covariance @ J.T
-    if not prior.clock_is_known:
-        velocity = J @ np.concatenate([R @ odometry.velocity_body, R @ odometry.angular_velocity_body])
-        covariance += of_single_error(velocity, time_offset_std)
-    return PredictedCamera(CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), odometry)
-
-
-def growth(first: CameraPose, predicted: PredictedCamera) -> FloatArray:
-    """Covariance (6, 6) of the displacement by odometry since ``first``: the smaller of two bounds.
-
-    One is the difference of the covariances, as if the error grew by independent increments; the other the error of
-    the velocity, constant over that time.
-    """
-    seconds, now = (predicted.pose.stamp_ns - first.stamp_ns) / SECOND_NS, predicted.odometry
-    of_speed = seconds**2 * turned(now.twist_covariance, now.T_map_body[:3, :3])
-    bounds = positive(predicted.pose.covariance - first.covariance), of_speed
-    return min(bounds, key=lambda covariance: float(np.trace(covariance)))

@@ -21,12 +21,12 @@ from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, entry, NewMarkers
 from thermal_fiducial.core.mapping.keyframes import FrameMemory, VIEWS
 from thermal_fiducial.core.mapping.localization import locate
-from thermal_fiducial.core.mapping.located import LocatedFrame, Location, predicted_camera, Refusal, Sight
+from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.map_data import jump, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.trust import CornerBias, Trust
 from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
-from thermal_fiducial.core.motion_prior import MotionPrior
+from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
 from thermal_fiducial.core.types import FloatArray
 
 #: Reason for which the map is not updated from a frame with a pose.

@@ -13,9 +13,8 @@ import numpy as np
 from thermal_fiducial.core.error_model import CHI2_OF_POSE
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse
-from thermal_fiducial.core.mapping.located import predicted_camera
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.motion_prior import MotionPrior
+from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
 from thermal_fiducial.core.types import FloatArray
 
 #: A pose of the second camera is carried on to a frame of the first over at most this [ns]: two periods at 30 Hz.
@@ -55,7 +54,7 @@ class SecondCamera:
         self._first_ns = pose.stamp_ns
         if waiting is None or abs(pose.stamp_ns - waiting.stamp_ns) > _CARRIED_NS:
             return pose
-        there = carried(waiting, pose.stamp_ns, prior, self._T_body_first)
+        there = moved_by_odometry(waiting, pose.stamp_ns, prior, self._T_body_first)
         joint = None if there is None else intersection(pose, there)
         if joint is None:
             self.contradicted += there is not None
@@ -87,7 +86,9 @@ def intersection(first: CameraPose, second: CameraPose) -> CameraPose | None:
     return replace(first, T_map_camera=T_map_camera, covariance=0.5 * (covariance + covariance.T))
 
 
-def carried(pose: CameraPose, stamp_ns: int, prior: MotionPrior, T_body_camera: FloatArray) -> CameraPose | None:
+def moved_by_odometry(
+    pose: CameraPose, stamp_ns: int, prior: MotionPrior, T_body_camera: FloatArray
+) -> CameraPose | None:
     """``pose`` at another stamp, moved as the odometry has moved in between; None where there is none near both."""
     if stamp_ns == pose.stamp_ns:
         return pose
