@@ -69,11 +69,11 @@ MECHANISMS = {
         {'located:LocatedFrame.contradicts_odometry': False},
     ),
     'odometry of keyframes': Mechanism(
-        ('chain', 'tags test_22'), (), {'keyframes:alike_odometry': lambda covariance: 1e12 * covariance}
+        ('chain', 'tags test_22'), (), {'keyframes:of_correlated_odometry': lambda covariance: 1e12 * covariance}
     ),
     'bridging': Mechanism(
         ('chain', 'tags test_22'),
-        ('keyframes:FrameMemory.bridge', 'keyframes:FrameMemory.bridgeable', 'located:growth'),
+        ('keyframes:FrameMemory.bridge', 'keyframes:FrameMemory.bridgeable', 'keyframes:displacement_covariance'),
         {'keyframes:FrameMemory.bridgeable': lambda *_, **__: False},
     ),
     'two cameras of a candidate': Mechanism(

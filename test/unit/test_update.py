@@ -21,10 +21,10 @@ from thermal_fiducial.core.filter.state import (
 )
 from thermal_fiducial.core.filter.update import (
     body_pose,
+    core_derivative,
     MotionAtPose,
     pose_innovation,
     PoseUpdater,
-    slide,
     with_clock_step,
 )
 from thermal_fiducial.core.geometry.se3 import so3_exp, so3_log, transform
@@ -132,9 +132,9 @@ def test_a_pose_after_a_long_gap_places_the_robot_where_it_says(estimate, still)
 
 
 def at_camera_stamp(estimate, motion):
-    """Covariance of the core at the stamp of the camera, and with the clock offset: errors of X(t) Exp(slide s)."""
+    """Covariance of the core at the camera's stamp, and with the clock offset: errors of X(t) Exp(derivative s)."""
     J = np.eye(SIZE)
-    J[CORE, TIME_OFFSET] = slide(estimate.state, motion.imu)
+    J[CORE, TIME_OFFSET] = core_derivative(estimate.state, motion.imu)
     P = J @ estimate.covariance @ J.T
     return P[CORE, CORE], P[CORE, TIME_OFFSET]
 
@@ -145,9 +145,9 @@ def test_an_error_of_the_velocity_does_not_change_the_clock_offset(estimate, mot
     unknown = replace(estimate, covariance=np.zeros((SIZE, SIZE)))
     unknown.covariance[CORE, CORE] = np.diag(np.repeat((1e-2, 0.3, 1e-2), 3) ** 2)
     unknown.covariance[VELOCITY, POSITION] = unknown.covariance[POSITION, VELOCITY] = 1.5e-3 * np.eye(3)
-    slid = np.zeros(SIZE)
-    slid[CORE], slid[TIME_OFFSET] = -slide(estimate.state, motion.imu), 1.0
-    unknown.covariance[...] += std**2 * np.outer(slid, slid)
+    by_offset = np.zeros(SIZE)
+    by_offset[CORE], by_offset[TIME_OFFSET] = -core_derivative(estimate.state, motion.imu), 1.0
+    unknown.covariance[...] += std**2 * np.outer(by_offset, by_offset)
     np.testing.assert_allclose(at_camera_stamp(unknown, motion)[1], 0.0, atol=1e-12)
     seen = transform(estimate.state.R_map_body, estimate.state.position + 0.02)
     pose = BodyPose(0, seen, 1e-6 * np.eye(6))
@@ -287,7 +287,7 @@ def test_a_step_of_the_clock_of_the_imu_does_not_show_in_the_next_pose(estimate,
     before = replace(estimate, covariance=1e-6 * np.eye(SIZE))
     after = with_clock_step(before, motion.imu, 0.01)
     J = np.eye(SIZE)
-    J[CORE, TIME_OFFSET] = slide(estimate.state, motion.imu)
+    J[CORE, TIME_OFFSET] = core_derivative(estimate.state, motion.imu)
     at_camera = [(J @ each.covariance @ J.T)[CORE, CORE] for each in (before, after)]
     np.testing.assert_allclose(*at_camera, atol=1e-12)
     added = after.covariance - before.covariance

@@ -201,7 +201,7 @@ def divided_prior(covariance: FloatArray, count: int) -> FloatArray:
 # Odometry.
 
 
-def alike_odometry(covariance: FloatArray) -> FloatArray:
+def of_correlated_odometry(covariance: FloatArray) -> FloatArray:
     """Covariance (6, 6) of one of many successive odometry poses, as if they were independent."""
     return CORRELATED_ODOMETRY * covariance
 

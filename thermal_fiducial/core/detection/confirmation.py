@@ -217,7 +217,7 @@ def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, 
     return decoder.read(halved(image), halfway(quads), lag_tails=half_tails)
 
 
-def speaks_for_itself(reading: Reading, decoder: Decoder) -> BoolArray:
+def certain_without_sides(reading: Reading, decoder: Decoder) -> BoolArray:
     """Which readings (N,) suffice without sharp sides: clear margin, white surroundings, a dictionary of many bits."""
     return np.asarray(_stands_out(reading, decoder) & (decoder.correctable >= _MANY_BITS))
 
@@ -246,7 +246,7 @@ def with_corners_by_pattern(
     shift, upright = refined.blur.shift[small], np.zeros(len(small), dtype=np.int64)
     corners = aligned(frame.image, found.places.at.px[small] + shift, found.ids[small], upright, decoder, noisy=False)
     reading = decoder.read(frame.image, corners)
-    good = (reading.ids == found.ids[small]) & (reading.turns == 0) & speaks_for_itself(reading, decoder)
+    good = (reading.ids == found.ids[small]) & (reading.turns == 0) & certain_without_sides(reading, decoder)
     good &= accepted(reading, frame.noise, decoder.correctable, config)
     good &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)
     which, corners, shift = small[good], corners[good], shift[good]

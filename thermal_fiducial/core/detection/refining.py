@@ -175,19 +175,19 @@ def _at_stamp(
     if frame.twist is not None or known is None:
         twist = track.correct(frame.stamp_ns, frame.twist, ids, at.x, places.depth, deviation)
     if twist is None:
-        unsure = doubted + _never_seen(frame, places, seen, unknown_twist(), cells)
+        unsure = doubted + _of_unpredicted_motion(frame, places, seen, unknown_twist(), cells)
         return RefinedMarkers(ids, seen, blur, replace(seen, covariances=unsure), replace(places, at=at), None)
     lag_blur = places.lag_blur(twist, frame.lag)
     rolling = rolling_displacement(places, twist, frame, (seen.corners_px + blur.removed)[..., 1])
     px = seen.corners_px - lag_blur + blur.removed - rolling
     unknown = of_motion_blur(frame.lag * places.flow, twist.covariance_ago(frame.lag), lag_blur)
     if frame.twist is None:
-        unknown = unknown + _never_seen(frame, places, seen, twist, cells)
+        unknown = unknown + _of_unpredicted_motion(frame, places, seen, twist, cells)
     corners = replace(seen, corners_px=px, covariances=doubted + unknown)
     return RefinedMarkers(ids, seen, blur, corners, replace(places, at=at.at_pixels(px)), twist)
 
 
-def _never_seen(frame: Frame, places: Places, seen: RefinedCorners, twist: Twist, cells: int) -> FloatArray:
+def _of_unpredicted_motion(frame: Frame, places: Places, seen: RefinedCorners, twist: Twist, cells: int) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] by the motion in a frame without a predicted twist."""
     since = frame.lag - delays(seen.corners_px[..., 1], frame)
     unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), TINY)

@@ -26,7 +26,7 @@ from thermal_fiducial.core.filter.state import (
     SYSTEMATIC,
     VELOCITY,
 )
-from thermal_fiducial.core.filter.update import of_clock, slide
+from thermal_fiducial.core.filter.update import core_derivative, of_clock
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import FloatArray
@@ -107,9 +107,9 @@ def no_gravity(imu: FloatArray) -> Condition:
 def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatArray) -> FloatArray:
     """Covariance (48, 48) by an unknown clock offset s; ``imu`` (6,) is the latest sample.
 
-    The first pose measures the state at the camera's stamp, X(t + s) = X(t) Exp(slide s).
+    The first pose measures the state at the camera's stamp, X(t + s) = X(t) Exp(derivative s).
     """
-    error = of_clock(slide(state, imu))
+    error = of_clock(core_derivative(state, imu))
     covariance = np.outer(error, error)
     # Second order: clock offset times the unknown velocity.
     covariance[POSITION, POSITION] += np.eye(3) * config.initial_velocity_std**2

@@ -42,8 +42,8 @@ class Innovation(NamedTuple):
     nis: float
     #: the estimate before the update, its systematic error already propagated to the view of this pose
     prior: Estimate
-    #: time derivative (9,) of the prior's core error coordinates, as of :func:`slide`
-    slide: FloatArray
+    #: time derivative (9,) of the prior's core error coordinates, as of :func:`core_derivative`
+    core_derivative: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,18 +64,21 @@ class MotionAtPose:
     turning: float
 
 
-def slide(state: NavigationState, imu: FloatArray) -> FloatArray:
-    """Time derivative (9,) of the core state for an IMU sample ``imu`` (6,): X(t + s) = X(t) Exp(slide s)."""
-    moved, velocity = np.empty(9), state.velocity_body
-    moved[:6] = state.corrected(imu)
-    moved[VELOCITY] += state.gravity @ state.R_map_body - skew(moved[ROTATION]) @ velocity
-    moved[POSITION] = velocity
-    return moved
+def core_derivative(state: NavigationState, imu: FloatArray) -> FloatArray:
+    """Time derivative (9,) of the core state for an IMU sample ``imu`` (6,): X(t + s) = X(t) Exp(derivative s)."""
+    derivative, velocity = np.empty(9), state.velocity_body
+    derivative[:6] = state.corrected(imu)
+    derivative[VELOCITY] += state.gravity @ state.R_map_body - skew(derivative[ROTATION]) @ velocity
+    derivative[POSITION] = velocity
+    return derivative
 
 
-def of_clock(moved: FloatArray) -> FloatArray:
-    """(48,) error by 1 s of clock offset with which the state at the camera's stamps is right; ``moved``: the slide."""
-    error = _of_core(-moved)
+def of_clock(derivative: FloatArray) -> FloatArray:
+    """(48,) error by 1 s of clock offset with which the state at the camera's stamps is right.
+
+    ``derivative`` (9,): of :func:`core_derivative`.
+    """
+    error = _of_core(-derivative)
     error[TIME_OFFSET] = 1.0
     return error
 
@@ -91,7 +94,7 @@ def with_clock_step(estimate: Estimate, imu: FloatArray, std: float) -> Estimate
     imu : (6,) the sample before it
     std : standard deviation of the step [s]
     """
-    error = of_clock(slide(estimate.state, imu))
+    error = of_clock(core_derivative(estimate.state, imu))
     return replace(estimate, covariance=estimate.covariance + std**2 * np.outer(error, error))
 
 
@@ -140,18 +143,18 @@ class PoseUpdater:
         H[_SIX, POSE] = 1.0
         H[:, EXTRINSICS] = H[:, SYSTEMATIC] = np.eye(6)
         R = prior.pose_noise.white * pose.shape
-        moved = slide(prior.state, motion.imu)
-        self._add_clock(prior, motion, moved, H, R)
+        derivative = core_derivative(prior.state, motion.imu)
+        self._add_clock(prior, motion, derivative, H, R)
         value = pose_innovation(prior.state, pose.T_map_body) - prior.state.systematic
         S_inverse = np.asarray(np.linalg.inv(H @ prior.covariance @ H.T + R))
-        return Innovation(value, S_inverse, H, R, float(value @ S_inverse @ value), prior, moved)
+        return Innovation(value, S_inverse, H, R, float(value @ S_inverse @ value), prior, derivative)
 
     def _add_clock(
-        self, prior: Estimate, motion: MotionAtPose, moved: FloatArray, H: FloatArray, R: FloatArray
+        self, prior: Estimate, motion: MotionAtPose, derivative: FloatArray, H: FloatArray, R: FloatArray
     ) -> None:
         """Add errors of the camera's clock to H and R: stamp jitter, and the clock offset, estimated or not."""
         config = self.config
-        twist, acceleration = moved[POSE], moved[VELOCITY]
+        twist, acceleration = derivative[POSE], derivative[VELOCITY]
         unknown = prior.pose_noise.jitter + (0.0 if config.estimate_time_offset else config.time_offset_std**2)
         R += unknown * np.outer(twist, twist)
         if not config.estimate_time_offset:
@@ -169,9 +172,9 @@ class PoseUpdater:
         """The estimate after an accepted pose."""
         prior = innovation.prior
         error, covariance = self._gained(pose, innovation)
-        state, before = prior.state.plus(error), innovation.slide
+        state, before = prior.state.plus(error), innovation.core_derivative
         if self.config.estimate_time_offset:
-            now = slide(state, motion.imu)
+            now = core_derivative(state, motion.imu)
             state = state.plus(_of_core((before - now) * error[TIME_OFFSET]))
             covariance = self._in_clock_of_imu(covariance, now - before, now, innovation, motion)
         noise = prior.pose_noise.with_stamps(before[POSE], innovation.value, innovation.S_inverse)
@@ -179,17 +182,18 @@ class PoseUpdater:
         return replace(prior, state=state, covariance=covariance, pose_noise=replace(noise, last=pose))
 
     def _in_clock_of_imu(
-        self, P: FloatArray, change: FloatArray, moved: FloatArray, innovation: Innovation, motion: MotionAtPose
+        self, P: FloatArray, change: FloatArray, derivative: FloatArray, innovation: Innovation, motion: MotionAtPose
     ) -> FloatArray:
-        """The covariance after an update that changed the slide by ``change`` (9,) to ``moved`` (9,).
+        """The covariance after an update that changed the core's derivative by ``change`` (9,) to ``derivative`` (9,).
 
-        A pose measures the state at the camera's stamp, X(t) Exp(slide s). The error of that state does not depend on
-        the linearisation point of the slide, so the error of X(t) is shifted with it; otherwise each correction of the
-        velocity would feign information about the offset s. (G. Huang, A. Mourikis, S. Roumeliotis,
+        A pose measures the state at the camera's stamp, X(t) Exp(derivative s). The error of that state does not depend
+        on the linearisation point of the derivative, so the error of X(t) is shifted with it; otherwise each correction
+        of the velocity would feign information about the offset s. (G. Huang, A. Mourikis, S. Roumeliotis,
         "Observability-based Rules for Designing Consistent EKF SLAM Estimators", IJRR 2010, keep other unobservable
         directions in the same way.)
 
-        Noise of the slide feigns information too (errors in variables): the offset's variance is widened by its worth.
+        Noise of the derivative feigns information too (errors in variables): the offset's variance is widened by its
+        worth.
         """
         with_offset = P[TIME_OFFSET]
         variance = float(with_offset[TIME_OFFSET])
@@ -199,8 +203,8 @@ class PoseUpdater:
         feigned = _FEIGNED * float(innovation.S_inverse.diagonal() @ noise)
         widest = max(variance, self.config.time_offset_std**2)
         consistent = min(variance / max(1.0 - variance * feigned, _LEAST_KEPT), widest)
-        slid = of_clock(moved)
-        return P + half + half.T + (consistent - variance) * np.outer(slid, slid)
+        by_offset = of_clock(derivative)
+        return P + half + half.T + (consistent - variance) * np.outer(by_offset, by_offset)
 
     def _gained(self, pose: BodyPose, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
         """Kalman update: the corrected error (48,) and the covariance (48, 48)."""

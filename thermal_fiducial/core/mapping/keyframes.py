@@ -6,7 +6,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import alike_odometry, divided_prior, NO_SYSTEMATIC_ERRORS, SystematicErrors
+from thermal_fiducial.core.error_model import (
+    divided_prior,
+    NO_SYSTEMATIC_ERRORS,
+    of_correlated_odometry,
+    SystematicErrors,
+)
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.adjustment_problem import Priors, Snapshot
@@ -269,5 +274,5 @@ class FrameMemory:
         frame = Keyframe(pose.stamp_ns, pose.T_map_camera, self._camera, seen.ids, seen.corners, seen.covariances)
         if predicted is None:
             return frame
-        information = np.asarray(np.linalg.inv(alike_odometry(predicted.pose.covariance)), dtype=np.float64)
+        information = np.asarray(np.linalg.inv(of_correlated_odometry(predicted.pose.covariance)), dtype=np.float64)
         return replace(frame, T_odometry=predicted.pose.T_map_camera, information=information)
