@@ -15,7 +15,8 @@ pytestmark = pytest.mark.ros
 
 #: As much as a pipe may hold at least; the default is 16 times that.
 PAGE = 4096
-#: Far more lines than that, and a stop request; the alarm ends a node that hangs.
+#: Far more lines than that, and a stop request; the alarm ends a node that hangs. They take a second by themselves, and
+#: twenty where fifteen others want the processor.
 PROGRAM = """
 import os, signal, sys
 from support.empty_stage import EmptyStage
@@ -39,7 +40,7 @@ class Refused(EmptyStage):
             self.get_logger().warning(f'line {count} that says as much as an ordinary one says')
         raise InputError('no such file')
 
-signal.alarm(20)
+signal.alarm(50)
 sys.exit(run({'talks': Stage, 'refused': Refused}[sys.argv[1]], []))
 """
 
