@@ -144,7 +144,8 @@ def test_the_smooth_topic_is_another_one_and_feeds_the_bridge():
     assert 0.0 < steps[1] < 0.5 * steps[0]
 
 
-def test_px4_messages_that_are_not_installed_are_a_fault():
+def test_px4_messages_that_are_not_installed_are_a_fault(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'px4_msgs.msg', None)
     with ros_graph() as graph:
         node = graph.add(PoseEkfNode, bridge_rate=50.0, px4=True)
         assert node.faults == ['parameter px4: px4_msgs is not installed']
@@ -226,7 +227,8 @@ def test_an_odom_frame_without_a_smooth_output_is_a_fault(monkeypatch):
         assert node.faults == ['parameter odom_frame: without smoothing_time nothing is smooth']
 
 
-def test_tf2_that_is_not_installed_is_a_fault():
+def test_tf2_that_is_not_installed_is_a_fault(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tf2_ros', None)
     with ros_graph() as graph:
         node = graph.add(PoseEkfNode, publish_tf=True)
         assert node.faults == ['parameter publish_tf: tf2_ros is not installed']

@@ -134,7 +134,8 @@ def test_annotations_have_the_fields_that_foxglove_knows():
 
 
 @pytest.mark.ros
-def test_annotations_without_foxglove_msgs_are_a_fault_that_names_the_picture():
+def test_annotations_without_foxglove_msgs_are_a_fault_that_names_the_picture(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'foxglove_msgs.msg', None)
     with ros_graph() as graph:
         node = graph.add(ArucoDetector, marker_size=small_bag.SIZE, image_annotations=True)
         (fault,) = node.faults
@@ -143,7 +144,8 @@ def test_annotations_without_foxglove_msgs_are_a_fault_that_names_the_picture():
 
 @pytest.mark.ros
 @pytest.mark.parametrize(('kind', 'package'), [(kind, package) for kind, (package, _) in detections.KINDS.items()])
-def test_messages_that_are_not_installed_are_a_fault_and_markers_come_all_the_same(kind, package):
+def test_messages_that_are_not_installed_are_a_fault_and_markers_come_all_the_same(monkeypatch, kind, package):
+    monkeypatch.setitem(sys.modules, f'{package}.msg', None)
     with ros_graph() as graph:
         node = graph.add(ArucoDetector, marker_size=small_bag.SIZE, detections=kind)
         assert node.faults == [f'parameter detections: {package} is not installed']

@@ -2,6 +2,7 @@
 
 from copy import deepcopy
 from dataclasses import replace
+import sys
 import time
 
 import cv2
@@ -693,7 +694,8 @@ def test_live_parameters_of_the_filter_reach_it(graph, monkeypatch):
     assert [config.gate for config in taken] == [50.0]
 
 
-def test_names_are_relative(graph):
+def test_names_are_relative(graph, monkeypatch):
+    monkeypatch.setitem(sys.modules, 'tf2_msgs.msg', None)
     with ros_graph('-r', '__ns:=/drone', '-r', 'pose:=vision/pose') as other:
         node = other.add(PoseEkfNode)
         topics = {output.topic for output in node.outputs} | {source.topic for source in node.inputs}
