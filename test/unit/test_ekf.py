@@ -245,6 +245,27 @@ def test_a_pose_after_too_long_without_one_is_refused_for_that(flight):
     assert reasons == {'refused: after 3 s without one'}
 
 
+@pytest.mark.parametrize(
+    'bad',
+    [
+        lambda sample, k: replace(sample, stamp_ns=sample.stamp_ns + k * 5_000_000, angular_velocity=np.full(3, 1e3)),
+        lambda sample, k: sample,
+    ],
+    ids=['beyond all range', 'one stamp'],
+)
+def test_an_imu_without_a_usable_sample_leaves_no_pose_to_fly_on(short_flight, bad):
+    ekf, samples = PoseEkf(config()), short_flight.samples()
+    run(ekf, timeline(samples, short_flight.poses))
+    lost = []
+    for k in range(1, 101):
+        assert ekf.add_imu(bad(samples[-1], k)) is None
+        lost.append(ekf.lost)
+    # Nine in a row may be those behind a jump of the stamps, which are followed from the tenth on.
+    assert lost == [k >= 10 for k in range(1, 101)]
+    assert ekf.add_imu(replace(samples[-1], stamp_ns=samples[-1].stamp_ns + 20_000_000)) is not None
+    assert not ekf.lost
+
+
 def test_unusable_poses_are_refused_with_a_reason(short_flight, flown):
     ekf, flight = flown, short_flight
     pose = flight.poses[0]

@@ -12,7 +12,7 @@ from thermal_fiducial.core.filter.camera_clock import CameraClock, FrameGrid, SM
 from thermal_fiducial.core.filter.condition import coasting_seconds, condition_of
 from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.filter.hypotheses import Hypotheses, KNOWN_OFFSET_STD
-from thermal_fiducial.core.filter.imu_input import ImuInput, Verdict
+from thermal_fiducial.core.filter.imu_input import CLOCK_EVIDENCE, ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
 from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseUpdate
@@ -48,7 +48,7 @@ class PoseEkf:
         """Discard the estimate and all samples and poses; the diagnostics give the ``reason``."""
         config, self._restart_reason = self._config, reason
         self._hypotheses = Hypotheses(config)
-        self._imu_refused = 0
+        self._imu_refused = self._refused_in_row = 0
         self._input = ImuInput(config.max_imu_gap, config.imu.gyroscope_range, config.imu.accelerometer_range)
         self._camera_clock, self._frame_grid = CameraClock(), FrameGrid()
         self._begin(config.camera_time_offset)
@@ -100,7 +100,9 @@ class PoseEkf:
         self._verdict = verdict
         if verdict not in (Verdict.USE, Verdict.RESTART):
             self._imu_refused += 1
+            self._refused_in_row += 1
             return False
+        self._refused_in_row = 0
         if self._input.jump_ns:
             self._camera_clock.imu_jumped(self._input.jump_ns)
         imu, buffer = np.concatenate((sample.angular_velocity, sample.linear_acceleration)), self._history.imu
@@ -250,9 +252,9 @@ class PoseEkf:
 
     @property
     def lost(self) -> bool:
-        """Whether not to fly on the pose: worse than ``lost_position_std``, contradicted by poses, or IMU frozen."""
-        main = self._history.main
-        if main is None or self._verdict is Verdict.FROZEN or main.in_doubt:
+        """Whether not to fly on the pose: worse than ``lost_position_std``, contradicted by poses, or without IMU."""
+        main, imu_failed = self._history.main, self._verdict is Verdict.FROZEN or self._refused_in_row >= CLOCK_EVIDENCE
+        if main is None or imu_failed or main.in_doubt:
             return True
         return main.position_std > self._config.lost_position_std
 
