@@ -6,7 +6,7 @@ import yaml
 
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.bad_pixel_list import load_bad_pixels, save_bad_pixels
+from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.camera_info import load_camera, save_camera
 
 K = [[529.1, 0.0, 317.2], [0.0, 528.4, 259.9], [0.0, 0.0, 1.0]]
@@ -95,11 +95,10 @@ def test_saving_where_nothing_can_be_written_is_refused(tmp_path):
         save_camera(tmp_path / 'none' / 'camera.yaml', CAMERAS[0])
 
 
-def test_bad_pixels_are_read_back(tmp_path):
+def test_bad_pixels_are_columns_and_rows(tmp_path):
     path = tmp_path / 'bad.txt'
-    pixels = np.array([[3, 4], [639, 511]])
-    save_bad_pixels(path, pixels)
-    assert np.array_equal(load_bad_pixels(path), pixels)
+    path.write_text('# column row\n3 4\n639 511\n')
+    assert np.array_equal(load_bad_pixels(path), [[3, 4], [639, 511]])
 
 
 def test_comments_commas_and_empty_lists(tmp_path):

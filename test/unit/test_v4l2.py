@@ -24,7 +24,7 @@ STRUCTURES = {
     'v4l2_streamparm': api.StreamParameters,
 }
 REQUESTS = (
-    'QUERYCAP', 'G_FMT', 'S_FMT', 'REQBUFS', 'QUERYBUF', 'QBUF', 'DQBUF', 'STREAMON', 'STREAMOFF', 'G_PARM', 'S_PARM'
+    'QUERYCAP', 'G_FMT', 'S_FMT', 'REQBUFS', 'QUERYBUF', 'QBUF', 'DQBUF', 'STREAMON', 'G_PARM', 'S_PARM'
 )  # fmt: skip
 #: name in the header to ours
 CONSTANTS = {

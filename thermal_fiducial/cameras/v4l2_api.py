@@ -150,7 +150,6 @@ QUERYBUF = _request(9, Buffer, read=True, write=True)
 QBUF = _request(15, Buffer, read=True, write=True)
 DQBUF = _request(17, Buffer, read=True, write=True)
 STREAMON = _request(18, c_int32, read=False, write=True)
-STREAMOFF = _request(19, c_int32, read=False, write=True)
 G_PARM = _request(21, StreamParameters, read=True, write=True)
 S_PARM = _request(22, StreamParameters, read=True, write=True)
 

@@ -32,11 +32,6 @@ class Cuttability:
         """Whether the marker is one piece of acrylic, so that it needs no bridges."""
         return self.islands == 0 and self.point_contacts == 0
 
-    @property
-    def narrowest_web_cells(self) -> float:
-        """Width of the thinnest acrylic [cells]: 1, or 0 where holes touch at a point."""
-        return 0.0 if self.point_contacts else 1.0
-
 
 def acrylic_cells(bits: Gray) -> BoolArray:
     """Acrylic cells (n + 2, n + 2) of a marker with bits (n, n): the border of one cell and the black bits."""

@@ -8,7 +8,6 @@ import numpy as np
 from thermal_fiducial.core.types import IntArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import read_text
-from thermal_fiducial.files.writing import write_text
 
 _WHOLE = re.compile(r'[0-9]{1,6}')
 
@@ -34,9 +33,3 @@ def _pixel(path: str | Path, number: int, line: str) -> tuple[int, int]:
     if len(words) != 2 or not all(_WHOLE.fullmatch(word) for word in words):
         raise InputError(f'bad pixel list {path}, line {number}: {line.strip()[:60]!r} is not "column row"')
     return int(words[0]), int(words[1])
-
-
-def save_bad_pixels(path: str | Path, pixels: IntArray) -> None:
-    """Write pixels (N, 2) for :func:`load_bad_pixels`. Raises InputError if the file cannot be written."""
-    lines = ['# column row', *(f'{column} {row}' for column, row in np.asarray(pixels).reshape(-1, 2))]
-    write_text(path, '\n'.join(lines) + '\n')

@@ -26,11 +26,6 @@ class Tag:
     why: str
     error: MarkerError | None = None
 
-    @property
-    def is_doubtful(self) -> bool:
-        """Whether it was measured but is not used."""
-        return self.status in ('quarantined', 'on trial', 'not in the map')
-
 
 def tags(run: Run) -> list[Tag]:
     """All markers of the map and of the detections, by ID."""
