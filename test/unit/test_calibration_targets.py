@@ -124,6 +124,11 @@ def test_command_calibrates_a_folder(tmp_path, capsys):
     assert drawn.count('<svg') == drawn.count('<figure') == 5
     assert 'currentColor' in drawn
     assert not re.search(r'fill: (black|#000000)', drawn)
+    # The length of the arrows is written below them, clear of the title.
+    title, key = (
+        float(re.search(rf' y="([\d.]+)"[^>]*>{words}', drawn)[1]) for words in ('mean residual', r'[\d.]+ px<')
+    )
+    assert key > title + 100
     bars = drawn[drawn.index('rms of each view') :]
     assert all(f'>{index:02}.png</text>' in bars for index in range(8))
     assert all(f'{index:02}.png:' in seen for index in range(8))

@@ -105,7 +105,8 @@ def _field(size: tuple[int, int], pixels: FloatArray, residuals: FloatArray) -> 
     scale = long * GRID[0] / size[0]
     arrows = axes.quiver(u, v, du, dv, angles='xy', scale_units='xy', scale=scale, color=_INK, width=0.004)
     _frame(axes, size)
-    axes.quiverkey(arrows, 0.9, 1.05, long, f'{long:.2g} px', labelpos='W')
+    # Below, beside the name of the axis: above it would run into the title.
+    axes.quiverkey(arrows, 0.95, -0.1, long, f'{long:.2g} px', labelpos='W')
     return _html(figure, 'mean residual of each cell')
 
 
