@@ -183,7 +183,9 @@ MECHANISMS = {
     'passes until settled': Mechanism('fast, 8 K, blind', (), {'refining:_PASSES': 1}),
     'second round': Mechanism('fast, 8 K, blind', (), {'refining:_ROUNDS': 1}),
     'edges behind the sides': Mechanism(
-        'fast, 8 K, blind', ('corners.sides:_add_neighbours',), {'corners.sides:_NARROW': 0.0}
+        'fast, 8 K, blind',
+        ('corners.sides:_add_neighbours',),
+        {'refining:_NARROW_OF_CLEAR': 0.0, 'refining:NARROW': 0.0},
     ),
     'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),

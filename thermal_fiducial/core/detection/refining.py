@@ -16,7 +16,7 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, of_motion_blur, unknown_motion
 from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED, Segments
-from thermal_fiducial.core.detection.corners.sides import blurs, model, Sides, sides_of
+from thermal_fiducial.core.detection.corners.sides import blurs, model, NARROW, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.frame import (
     counts_of,
@@ -41,6 +41,9 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 CLEAR_CNR = 20.0
 # Columns of pixels per cell for clear markers, and for faint ones.
 _OF_CLEAR, _OF_FAINT = 6, 12
+# Width of cells, in blurs, below which the model of clear markers in counts contains parallel edges. They need few
+# pixels, and none near these edges, where the model's error shows.
+_NARROW_OF_CLEAR = 4.0
 # Displacement of a corner by lag, about the blur of the optics, up to which it is modelled as symmetric blur [px].
 # Beyond it, the lag tail is removed.
 _HARDLY_PX = 0.6
@@ -139,12 +142,14 @@ def refine(
     """
     if len(found.ids) == 0:
         return RefinedMarkers.none(frame)
-    columns = _OF_CLEAR if np.abs(found.cnr).min() > CLEAR_CNR else _OF_FAINT
+    clear = np.abs(found.cnr).min() > CLEAR_CNR
+    columns = _OF_CLEAR if clear else _OF_FAINT
+    narrow = _NARROW_OF_CLEAR if clear and not frame.displayed else NARROW
     twist, places = frame.twist, found.places
     for _ in range(_ROUNDS):
         blur = _motion_blur(frame, places, twist)
         start = places.at.at_pixels(places.at.px + blur.shift)
-        seen = refine_corners(frame.image, start, frame.camera, behind, config.blur_px, columns, blur)
+        seen = refine_corners(frame.image, start, frame.camera, behind, config.blur_px, columns, narrow, blur)
         markers = _at_stamp(frame, found.ids, places, blur, seen, twist, track, behind.shape[2])
         change = np.abs(markers.corners.corners_px - seen.corners_px + blur.shift)
         if markers.twist is None or change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX:
@@ -222,6 +227,7 @@ def refine_corners(
     behind: Float32Array,
     blur_px: float,
     columns: int = _OF_CLEAR,
+    narrow: float = _NARROW_OF_CLEAR,
     motion: MotionBlur | None = None,
 ) -> RefinedCorners:
     """Corners of N markers, refined in passes until they converge.
@@ -233,6 +239,7 @@ def refine_corners(
     behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
     blur_px : standard deviation of optics and pixel
     columns : of pixels, in a segment
+    narrow : of :func:`thermal_fiducial.core.detection.corners.sides.model`
     motion : blur by motion; none when left out
     """
     start, motion = corners, motion or MotionBlur.none(len(corners.px))
@@ -242,7 +249,7 @@ def refine_corners(
         sides = sides_of(start.x, camera, image.shape, cells, columns, widest)
         blur = blurs(sides.normal, blur_px, motion.spread)
         counts = counts_of(sides.pixel, image, motion.to_tails)
-        segments = measure(counts, model(sides, behind, blur), REACHED * blur[0])
+        segments = measure(counts, model(sides, behind, blur, narrow), REACHED * blur[0])
         refined, moving = _moved(sides, segments, as_squares(start, *adjust(sides, segments, _PRIOR_PX)))
         found = found.with_others(which, refined) if index else refined
         which = which[moving]

@@ -26,8 +26,8 @@ _REACHES, _SHORTEST, _LONGEST = 2.5, 4, 10
 _BOTH_SIDES, _BEYOND_NODES = 3, 3.0
 #: Parallel edges in the model, by their distance from the side [cells].
 NEIGHBOURS = (1, 2)
-# Width of cells, in blurs, below which parallel edges overlap the side's profile.
-_NARROW = 5.0
+#: Width of cells, in blurs, below which pixels near parallel edges are needed, and the model contains these edges.
+NARROW = 5.0
 # Approximation of the normal distribution by a hyperbolic tangent, good to 2e-4 (E. Page, "Approximations to the
 # cumulative normal function and its inverse for use on a pocket calculator", 1977).
 _LINEAR = 0.7988
@@ -202,7 +202,7 @@ def blurs(normal: FloatArray, optics: float, lag_blur: FloatArray) -> tuple[Floa
 
 
 def model(
-    sides: Sides, behind: Float32Array, blur: tuple[FloatArray, FloatArray]
+    sides: Sides, behind: Float32Array, blur: tuple[FloatArray, FloatArray], narrow: float = NARROW
 ) -> tuple[Float32Array, Float32Array, BoolArray]:
     """Share of white in every pixel, up to a constant, its derivative by distance, and whether the pixel counts.
 
@@ -210,6 +210,7 @@ def model(
     ----------
     behind : (N, 4, m, 2) of :func:`edges_behind`
     blur : (E, m) across and along the sides
+    narrow : width of cells below which the model contains parallel edges, in blurs
 
     Returns
     -------
@@ -222,11 +223,11 @@ def model(
     z = np.stack([t, 1.0 - t]) * (sides.along / blur[1]).astype(np.float32)
     own = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0)
     value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32), -own)
-    narrow = cell < _NARROW * blur[0]
-    if narrow.any():
-        which, edges = np.flatnonzero(narrow.any(axis=1)), behind.reshape(-1, cells, len(NEIGHBOURS))
+    overlapping = cell < narrow * blur[0]
+    if overlapping.any():
+        which, edges = np.flatnonzero(overlapping.any(axis=1)), behind.reshape(-1, cells, len(NEIGHBOURS))
         _add_neighbours(value, slope, sides, which, edges, blur)
-    reach = np.where(narrow, cell, cell - 2.0 * blur[0])
+    reach = np.where(overlapping, cell, cell - 2.0 * blur[0])
     quiet = np.minimum(reach, np.maximum(cell - _PLATE_EDGE_SHOWS * blur[0], 0.0))
     counting: BoolArray = np.asarray(sides.distance >= -quiet.astype(np.float32))
     counting &= sides.distance <= reach.astype(np.float32)
