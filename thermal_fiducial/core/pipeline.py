@@ -23,7 +23,12 @@ from thermal_fiducial.core.detection.patterns import Dictionary
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import (
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    transform,
+    transform_from_quaternion,
+)
 from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.mapping.bundle_adjustment import refine
 from thermal_fiducial.core.mapping.map_data import MapperResult, MarkerMap
@@ -75,7 +80,7 @@ class FrameResult:
 
 def as_published(T: FloatArray) -> FloatArray:
     """A transform after conversion to position and quaternion and back, as in a message."""
-    return transform_from_quaternion(T[:3, 3], quaternion_from_rotation(T[:3, :3]))
+    return transform(rotation_from_quaternion(quaternion_from_rotation(T[:3, :3])), T[:3, 3])
 
 
 def as_received(states: Sequence[Odometry]) -> list[Odometry]:
