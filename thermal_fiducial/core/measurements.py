@@ -33,6 +33,10 @@ MARKER_DTYPE = np.dtype(
     + [(name, _F4) for name in CORNER_COVARIANCE_FIELDS]
 )
 
+_MARKER_NAMES = MARKER_DTYPE.names or ()
+#: Fields that were added later: clouds without them, of other detectors and of older bags, are read all the same.
+LATER_MARKER_FIELDS = _MARKER_NAMES[_MARKER_NAMES.index('contrast_counts') + 1 :]
+
 #: A row of the ``marker_map`` topic: pose and side of a marker in ``map``, one-sigma position, error and number of
 #: observations, and whether it is fixed (surveyed), used for poses, and in view of the frame that published it.
 MAP_DTYPE = np.dtype(
@@ -46,7 +50,7 @@ Markers = np.ndarray
 
 
 # All fields have four bytes, so rows can be read as a table of numbers, many times faster.
-_COLUMN = {name: column for column, name in enumerate(MARKER_DTYPE.names or ()) if name != 'id'}
+_COLUMN = {name: column for column, name in enumerate(_MARKER_NAMES) if name != 'id'}
 _CORNERS = [_COLUMN[name] for name in CORNER_FIELDS]
 _COVARIANCES = [_COLUMN[f'c{corner}{term}'] for corner in range(4) for term in ('uu', 'uv', 'uv', 'vv')]
 _BRANCHES = [_COLUMN[f'{prefix}{name}'] for prefix in ('', 'a') for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')]
@@ -61,7 +65,7 @@ def columns(markers: Markers, names: tuple[str, ...]) -> FloatArray:
 
 def _numbers(markers: Markers, places: list[int]) -> FloatArray:
     """Columns (N, len(places)) of the rows, read as a table."""
-    table = np.ascontiguousarray(markers).view(_F4).reshape(len(markers), len(MARKER_DTYPE.names or ()))
+    table = np.ascontiguousarray(markers).view(_F4).reshape(len(markers), len(_MARKER_NAMES))
     # Invalid bytes may be a signalling NaN; it is refused later like any other NaN.
     with np.errstate(invalid='ignore'):
         return table.take(places, axis=1).astype(np.float64)

@@ -18,6 +18,7 @@ from thermal_fiducial.core.measurements import (
     columns,
     CORNER_COVARIANCE_FIELDS,
     CORNER_FIELDS,
+    LATER_MARKER_FIELDS,
     MAP_DTYPE,
     MARKER_DTYPE,
     Markers,
@@ -190,7 +191,7 @@ def markers(message: PointCloud2) -> Markers:
     InputError
         A missing field, inconsistent sizes, or invalid corners, covariances or poses.
     """
-    rows = cloud_rows(message, MARKER_DTYPE, optional=CORNER_COVARIANCE_FIELDS)
+    rows = cloud_rows(message, MARKER_DTYPE, optional=LATER_MARKER_FIELDS)
     if not {field.name for field in message.fields}.issuperset(CORNER_COVARIANCE_FIELDS):
         with np.errstate(over='ignore'):
             variance = rows['sigma_px'] ** 2
