@@ -106,12 +106,9 @@ def first_state(stamps: FloatArray, measured: FloatArray, imu: ImuTrack, gravity
 
 
 def _aligned(camera: FloatArray, body: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """R, b and mean squared error of body = R camera + b (Kabsch)."""
-    mean_camera, mean_body = camera.mean(axis=0), body.mean(axis=0)
-    U, _, Vt = np.linalg.svd((body - mean_body).T @ (camera - mean_camera))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    b = mean_body - R @ mean_camera
-    return R, b, float(np.mean((body - camera @ R.T - b) ** 2))
+    """R, b and mean squared error of body = R camera + b."""
+    T = se3.rigid_alignment(body, camera)
+    return T[:3, :3], T[:3, 3], float(np.mean((body - se3.apply(T, camera)) ** 2))
 
 
 class Problem:

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.core.geometry.reprojection import turned
-from thermal_fiducial.core.geometry.se3 import apply
-from thermal_fiducial.core.mapping.map_data import align, Alignment, MapMarker, MarkerMap, rigid
+from thermal_fiducial.core.geometry.se3 import apply, rigid_alignment
+from thermal_fiducial.core.mapping.map_data import align, Alignment, MapMarker, MarkerMap
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 
@@ -138,7 +138,7 @@ def anchor(marker_map: MarkerMap, surveyed: Mapping[int, FloatArray]) -> tuple[M
     extents = np.linalg.svd(target - target.mean(axis=0), compute_uv=False)
     if extents[1] < 0.02 * extents[0]:
         raise InputError('the surveyed markers lie on a line: they leave a rotation open')
-    T = rigid(target, source)
+    T = rigid_alignment(target, source)
     distances = np.linalg.norm(apply(T, source) - target, axis=-1)
     return transformed(marker_map, T), dict(zip(common, distances.tolist(), strict=True))
 

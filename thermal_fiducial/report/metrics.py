@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core.filter.innovations import Innovations
-from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform
+from thermal_fiducial.core.geometry.se3 import apply, inverse, rigid_alignment, so3_exp, so3_log, transform
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
 from thermal_fiducial.report.trajectory import Trajectory
 
@@ -117,10 +117,7 @@ def aligned_residuals(e: Errors) -> FloatArray:
 
 def rigid_residuals(p_hat: FloatArray, p_true: FloatArray) -> FloatArray:
     """Residuals (N, 3) [m] of points (N, 3) after the rigid motion that fits them best to ``p_true`` (N, 3)."""
-    centre_hat, centre_true = p_hat.mean(axis=0), p_true.mean(axis=0)
-    U, _, Vt = np.linalg.svd((p_true - centre_true).T @ (p_hat - centre_hat))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt
-    return np.asarray(p_true - centre_true - (p_hat - centre_hat) @ R.T)
+    return p_true - apply(rigid_alignment(p_true, p_hat), p_hat)
 
 
 def pairs_apart(stamps_ns: IntArray, interval_ns: int) -> tuple[IntArray, IntArray]:

@@ -115,6 +115,18 @@ def apply(T: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
     return np.asarray(points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
 
 
+def rigid_alignment(target: npt.ArrayLike, source: npt.ArrayLike) -> FloatArray:
+    """T_target_source (4, 4) with the least squares of ``target - T source``, points (N, 3).
+
+    B. Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987; here by singular values.
+    """
+    target, source = np.asarray(target, dtype=np.float64), np.asarray(source, dtype=np.float64)
+    centre_target, centre_source = target.mean(axis=0), source.mean(axis=0)
+    U, _, Vt = np.linalg.svd((target - centre_target).T @ (source - centre_source))
+    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return transform(R, centre_target - R @ centre_source)
+
+
 def rotation_from_quaternion(q_xyzw: npt.ArrayLike) -> FloatArray:
     """Rotation matrix (..., 3, 3) of quaternions x y z w (..., 4); they are normalised first."""
     q = np.asarray(q_xyzw, dtype=np.float64)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from thermal_fiducial.core.geometry.reprojection import corners_in_map
-from thermal_fiducial.core.geometry.se3 import apply, quaternion_from_rotation, transform
+from thermal_fiducial.core.geometry.se3 import apply, quaternion_from_rotation, rigid_alignment
 from thermal_fiducial.core.measurements import CameraPose, MAP_DTYPE
 from thermal_fiducial.core.types import BoolArray, FloatArray
 from thermal_fiducial.errors import InputError
@@ -168,8 +168,7 @@ class Alignment:
 def align(resting: Mapping[int, MapMarker], moving: Mapping[int, MapMarker]) -> Alignment:
     """Rigid transform that takes ``moving`` onto ``resting``, by the corners of the markers that both have.
 
-    Least squares (B. Horn, "Closed-form solution of absolute orientation using unit quaternions", 1987; here by
-    singular values); markers that disagree with the others (moved between the two surveys) are left out.
+    Least squares; markers that disagree with the others (moved between the two surveys) are left out.
 
     Raises
     ------
@@ -184,12 +183,12 @@ def align(resting: Mapping[int, MapMarker], moving: Mapping[int, MapMarker]) -> 
             raise InputError(f'marker {key} is {resting[key].size} m in one map and {moving[key].size} m in the other')
     target, source = (_corners([markers[key] for key in common]) for markers in (resting, moving))
     # Each marker alone gives a transform; the one that suits the median marker best shows who disagrees.
-    single = [rigid(t, s) for t, s in zip(target, source, strict=True)]
+    single = [rigid_alignment(t, s) for t, s in zip(target, source, strict=True)]
     T = min(single, key=lambda T: float(np.median(_distances(T, target, source))))
     for _ in range(_REWEIGHTINGS):
         residuals = _distances(T, target, source)
         used = residuals <= max(_OUTLIER * float(np.median(residuals)), _TOLERANCE_M)
-        T = rigid(target[used].reshape(-1, 3), source[used].reshape(-1, 3))
+        T = rigid_alignment(target[used].reshape(-1, 3), source[used].reshape(-1, 3))
     residuals = _distances(T, target, source)
     outliers = tuple(key for key, keep in zip(common, used, strict=True) if not keep)
     return Alignment(T, dict(zip(common, residuals.tolist(), strict=True)), outliers)
@@ -206,14 +205,6 @@ def jump(new: Mapping[int, MapMarker], old: Mapping[int, MapMarker]) -> FloatArr
 def _distances(T: FloatArray, target: FloatArray, source: FloatArray) -> FloatArray:
     """Rms distance (K,) of the corners (K, 4, 3) of each marker."""
     return np.asarray(np.sqrt(np.mean(np.sum((apply(T, source) - target) ** 2, axis=-1), axis=-1)))
-
-
-def rigid(target: FloatArray, source: FloatArray) -> FloatArray:
-    """T_target_source (4, 4) with the least squares of ``target - T source``, points (N, 3)."""
-    centre_target, centre_source = target.mean(axis=0), source.mean(axis=0)
-    U, _, Vt = np.linalg.svd((target - centre_target).T @ (source - centre_source))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return transform(R, centre_target - R @ centre_source)
 
 
 def _corners(markers: list[MapMarker]) -> FloatArray:
