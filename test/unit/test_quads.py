@@ -15,7 +15,7 @@ from thermal_fiducial.core.detection.quads import (
 )
 
 SHAPE = 240, 320
-FINE = Scale(smoothing_px=1.0, window_px=7, window_shrink=2, depth=0.2, floor=1.5)
+FINE = Scale(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2.5)
 NOTHING = np.zeros((0, 4, 2))
 #: Clockwise from the top left.
 QUAD = np.array([[80.0, 60.0], [140.0, 70.0], [130.0, 130.0], [70.0, 115.0]])
@@ -112,3 +112,16 @@ def test_holes_are_outlined_and_what_is_hidden_or_has_three_corners_is_not():
     assert len(find_quads(mask.copy(), 12.0, NOTHING)) == 1
     around = QUAD.mean(axis=0) + 1.2 * (QUAD - QUAD.mean(axis=0))
     assert len(find_quads(mask, 12.0, around[None])) == 0
+
+
+def test_outlines_may_be_taken_to_the_edges():
+    """A square of 20 px in a ring of dark: its outline, through the centres of its own pixels or of the ring's."""
+    mask = np.zeros(SHAPE, dtype=np.uint8)
+    mask[30:50, 40:60] = 255
+    edges = np.array([[39.5, 29.5], [59.5, 29.5], [59.5, 49.5], [39.5, 49.5]])
+    for dark in (mask, cv2.bitwise_not(mask)):
+        quads = find_quads(dark, 12.0, NOTHING, 0.5)
+        # Corners of a hole's outline are cut off by a pixel.
+        assert nearest_corner(quads, edges) < 1.0
+    assert nearest_corner(find_quads(mask.copy(), 12.0, NOTHING, 0.5), edges) < 1e-9
+    assert nearest_corner(find_quads(mask.copy(), 12.0, NOTHING), edges) == pytest.approx(0.5)

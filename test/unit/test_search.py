@@ -80,7 +80,7 @@ def test_faint_markers_brighter_than_all_round_are_found():
     assert found.count(21) >= 4
 
 
-@pytest.mark.parametrize(('side', 'half_cells'), [(16, 2), (14, 3), (14, 4)])
+@pytest.mark.parametrize(('side', 'half_cells'), [(16, 2), (14, 3), (14, 4), (13, 2)])
 @pytest.mark.parametrize('contrast', [2000.0, 100.0])
 def test_bright_markers_far_away_are_found(contrast, side, half_cells):
     """Plates on a cold wall, whose white and that of bits swamps the border of less than three pixels between."""
@@ -94,9 +94,10 @@ def test_bright_markers_far_away_are_found(contrast, side, half_cells):
         fine[v : v + width, u : u + width] = cv2.resize(plate, (width, width), interpolation=cv2.INTER_NEAREST)
     image = cv2.GaussianBlur(cv2.resize(fine, (640, 512), interpolation=cv2.INTER_AREA), (0, 0), 0.6)
     found = search((7000.0 + contrast * image + rng.normal(0.0, 1.25, image.shape)).astype(np.float32))
-    # By four seeds 9 to 12 of 12 with one cell around, 11 or 12 with more; at most 2 when only the outlines themselves
-    # are read, and 1 to 7 with more than one cell when all plates are taken to end one cell outside.
-    assert len(set(found.ids.tolist()) & set(shown.tolist())) >= 9
+    # By four seeds 11 or 12 of 12; of 13 px 5 to 9 when the search smooths by a pixel and outlines end at the centres
+    # of pixels. At most 2 when only the outlines themselves are read, and 1 to 7 with more than one cell around when
+    # all plates are taken to end one cell outside.
+    assert len(set(found.ids.tolist()) & set(shown.tolist())) >= 11
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
@@ -147,7 +148,8 @@ def test_rules():
     assert search(image, ArucoDetectorConfig(duplicates='best')).ids.tolist() == [21]
     alone = scene(21, 100.0, 2.0)
     assert search(alone, allowed=np.arange(50) != 21).ids.tolist() == []
-    assert search(alone, ArucoDetectorConfig(min_side_px=80.0)).ids.tolist() == []
+    # Outlines are accurate to a tenth; the marker has 72 px.
+    assert search(alone, ArucoDetectorConfig(min_side_px=90.0)).ids.tolist() == []
     assert search(alone, ArucoDetectorConfig(min_contrast=100.0)).ids.tolist() == []
 
 

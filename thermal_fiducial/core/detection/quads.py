@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.core.geometry.se3 import squared_sides
-from thermal_fiducial.core.types import Float32Array, FloatArray, Gray, TINY
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, TINY
 
 # Window of the local standard deviation, at a quarter of the resolution: 68 px, a marker at working distance.
 _LOCAL = 17
@@ -118,20 +118,21 @@ def dark_in_picture(picture: Float32Array, noise: float) -> Gray:
     return np.asarray(cv2.compare(picture, limit, cv2.CMP_LT), dtype=np.uint8)
 
 
-def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray) -> FloatArray:
+def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray, edge_px: float = 0.0) -> FloatArray:
     """Convex quadrilaterals (Q, 4, 2) [px], clockwise, among the outlines in a mask, of its spots and of its holes.
 
     Parameters
     ----------
     mask : (height, width), in which what is hidden is cleared
-    min_side_px : shortest side
+    min_side_px : shortest side of an outline
     hidden : (N, 4, 2) where not to look [px]
+    edge_px : distance from the centres of a region's outermost pixels, where outlines run, to its edge
     """
     for quad in np.rint(hidden).astype(np.int32):
         cv2.fillConvexPoly(mask, quad, 0)
     outlines, _ = cv2.findContours(mask, cv2.RETR_LIST, cv2.CHAIN_APPROX_SIMPLE)
     shortest, longest = 3.2 * min_side_px, 2.0 * sum(mask.shape)
-    quads = []
+    quads, spots = [], []
     for outline in outlines:
         if len(outline) < _CORNERS or not shortest <= cv2.arcLength(outline, True) <= longest:
             continue
@@ -139,10 +140,23 @@ def find_quads(mask: Gray, min_side_px: float, hidden: FloatArray) -> FloatArray
         simple = cv2.approxPolyDP(hull, _STRAIGHT * cv2.arcLength(hull, True), True)
         if len(simple) == _CORNERS:
             quads.append(simple[:, 0])
+            spots.append(cv2.contourArea(outline, oriented=True) < 0.0)
     if not quads:
         return np.zeros((0, 4, 2))
     found = np.array(quads, dtype=np.float64)
-    return _clockwise(found[(squared_sides(found) >= min_side_px**2).all(axis=1)])
+    sides = np.sqrt(squared_sides(found))
+    large = (sides >= min_side_px).all(axis=1)
+    return _clockwise(_at_edges(found[large], sides[large].mean(axis=1), np.array(spots)[large], edge_px))
+
+
+def _at_edges(quads: FloatArray, sides: FloatArray, spots: BoolArray, edge_px: float) -> FloatArray:
+    """Quadrilaterals (Q, 4, 2) with mean ``sides`` (Q,), ``edge_px`` outside their outlines if ``spots`` (Q,).
+
+    Outlines of holes run through the region around them: their edges lie inside.
+    """
+    factor = 1.0 + 2.0 * edge_px * np.where(spots, 1.0, -1.0) / sides
+    middle = quads.mean(axis=1, keepdims=True)
+    return np.asarray(middle + factor[:, None, None] * (quads - middle))
 
 
 def _clockwise(quads: FloatArray) -> FloatArray:

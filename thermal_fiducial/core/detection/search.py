@@ -24,7 +24,7 @@ from thermal_fiducial.core.geometry.se3 import diagonals, squared_sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.
-_FINE = Scale(smoothing_px=1.0, window_px=7, window_shrink=2, depth=0.2, floor=1.5)
+_FINE = Scale(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2.5)
 _FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0)
 # Correlation from which an outline needs no alignment; least correlation, and its margin, for alignment to be tried.
 _CLEAR = 0.95
@@ -32,6 +32,9 @@ _HINT, _HINT_MARGIN = 0.5, 0.06
 # Factor on the shortest side of a marker in a picture for a display, which has little noise: in oblique views the other
 # sides are longer.
 _PICTURE_SIDE = 0.25
+# Outlines run through the centres of the outermost pixels: distance to the edge there. With corners that blur rounds,
+# their sides are shorter than the marker's by up to so much [px].
+_EDGE_PX, _SHORTER_PX = 0.5, 2.0
 # Width of cells up to which blur merges borders and plates of any margin [px].
 _MERGED_PX = 3.0
 _NONE = np.zeros(0, dtype=np.intp)
@@ -89,11 +92,13 @@ class BlindSearch:
         """
         # The plate, and as much again for its blurred edge.
         hidden = _grown(seen.places.at.px, (self._decoder.cells + 4) / self._decoder.cells)
-        min_side_px = _PICTURE_SIDE * config.min_side_px if frame.displayed else config.min_side_px
+        min_side_px, edge_px = config.min_side_px - _SHORTER_PX, _EDGE_PX
+        if frame.displayed:
+            min_side_px, edge_px = _PICTURE_SIDE * config.min_side_px, 0.0
         fine = faint = np.zeros((0, 4, 2))
         half, clear = frame.image, scales != SearchScales.ALL
         if SearchScales.FINE in scales:
-            fine = find_quads(self._fine_mask(frame, clear=clear), min_side_px, hidden)
+            fine = find_quads(self._fine_mask(frame, clear=clear), min_side_px, hidden, edge_px)
         if SearchScales.FAINT in scales:
             half = without_columns(halved(frame.image), 0.5 * frame.noise)
             masks = (self._faint.mask(half if kind > 0.0 else -half, 0.5 * frame.noise, clear=clear) for kind in kinds)
