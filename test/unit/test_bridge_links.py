@@ -55,7 +55,8 @@ def test_two_publishers_and_a_missing_subscriber_are_reported():
         }
 
 
-def test_px4_without_its_messages_is_a_fault_though_the_odometry_is_sound():
+def test_px4_without_its_messages_is_a_fault_though_the_odometry_is_sound(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'px4_msgs.msg', None)
     with ros_graph() as graph:
         node = graph.add(PoseEkfNode, bridge_rate=50.0, px4=True)
         assert listened(graph, node, [])['filter'] == (
