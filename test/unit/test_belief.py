@@ -77,7 +77,11 @@ def test_poses_that_contradict_the_estimate_and_agree_reset_it():
     assert belief.main.estimate is AGREEING.estimate
     assert not belief.main.in_doubt
     assert belief.alternative is None
-    assert (belief.resets, belief.reset_reason) == (1, 'the poses contradict the estimate and agree with each other')
+    assert belief.resets == 1
+    # With the parameters that do this in fast motion: a line readout of 16 ms that was not declared did.
+    assert belief.reset_reason == (
+        'the poses contradict the estimate and agree with each other; if in fast motion: readout_time, bolometer_lag?'
+    )
 
 
 @pytest.mark.parametrize(
