@@ -1,4 +1,4 @@
-"""The filter's speed, and its error beside that of a batch smoother, and beside what is possible without markers."""
+"""The filter's speed, its error beside a batch smoother's and what is possible without markers; its clock offset."""
 
 from dataclasses import replace
 from functools import partial
@@ -7,12 +7,24 @@ import numpy as np
 from numpy.polynomial import polynomial
 import pytest
 from scipy.stats import chi2
-from support.flights import config, errors, Flight, matched, perfect, rms, run, START_NS, timeline
+from support.flights import (
+    config,
+    errors,
+    Flight,
+    matched,
+    Motion,
+    perfect,
+    rms,
+    run,
+    START_NS,
+    timeline,
+    white_poses,
+)
 
-from thermal_fiducial.config import ImuNoise
+from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.propagation import coasting_variance
-from thermal_fiducial.core.geometry.se3 import rotation_angle
+from thermal_fiducial.core.geometry.se3 import rotation_angle, so3_exp, transform
 from thermal_fiducial.core.measurements import ImuSample
 
 SETTLED = 5.0
@@ -151,3 +163,88 @@ def test_coasting_beside_its_bound(benchmark, write_table):
     # the 95th percentile of 60 flights scatters by a tenth
     assert np.max(shares) < 1.25
     assert np.min(covered) >= 0.95
+
+
+# --- clock offset ---------------------------------------------------------------------------------------
+
+#: Densities of gyroscope and accelerometer: the default, and six, twelve and thirty times as noisy.
+GRADES = ((1.7e-4, 2e-3), (1e-3, 1e-2), (2e-3, 2e-2), (5e-3, 5e-2))
+#: Seconds of poses after which the offset is looked at; flights of each IMU.
+LEARNED, CLOCK_SEEDS = 5.0, range(8)
+LATE = 0.03
+#: Flights of a minute without a step of any clock. A pose in ten comes up to 80 ms later than the others.
+STEADY_MINUTES, LATE_SHARE, LATER = 30, 0.1, 0.08
+#: A change of the offset [s] from pose to pose that no learning makes, once it is known: half a step that is removed.
+STEP = 0.017
+
+
+def gentle(seed, imu_noise, seconds, **rest):
+    """A flight at 0.25 m/s and 0.12 rad/s, rms, whose clock offset is drawn from the filter's prior."""
+    rng = np.random.default_rng(500 + seed)
+    motion = Motion.random(rng, speed=0.25, turn=0.12)
+    offset = PoseEkfConfig().time_offset_std * rng.normal()
+    return Flight(seed=seed, seconds=seconds, motion=motion, imu_noise=imu_noise, offset=offset, **rest)
+
+
+def with_declared_errors(data):
+    """Samples and poses with what the filter allows for: scale errors, systematic ones of twice the white variance."""
+    rng = np.random.default_rng(900 + data.seed)
+    of_rate, of_force = np.eye(3) + rng.normal(0.0, ImuNoise().gyroscope_scale_std, (2, 3, 3))
+    samples = [
+        replace(s, angular_velocity=of_rate @ s.angular_velocity, linear_acceleration=of_force @ s.linear_acceleration)
+        for s in data.samples()
+    ]
+    drawn, poses = rng.normal(size=6), []
+    for pose in data.poses:
+        e, T = np.linalg.cholesky(2.0 * pose.covariance) @ drawn, pose.T_map_camera
+        poses.append(replace(pose, T_map_camera=transform(so3_exp(e[3:]) @ T[:3, :3], T[:3, 3] + e[:3])))
+    return samples, poses
+
+
+def clock_error(seed, imu_noise, declared):
+    """Error of the clock offset and what is claimed of it [s]."""
+    data = gentle(seed, imu_noise, LEARNED + 0.3)
+    samples, poses = with_declared_errors(data) if declared else (data.samples(), data.poses)
+    ekf = PoseEkf(white_poses(imu=imu_noise))
+    run(ekf, timeline(samples, poses, LATE + data.offset))
+    learned = ekf.diagnostics()
+    return learned['time offset'] - data.offset, learned['time offset std']
+
+
+def false_steps(seed):
+    """How often a minute of flight looks like a step of the camera's clock, which there is not."""
+    data = gentle(seed, ImuNoise(), 60.0, imu_rate=100.0)
+    rng, ekf = np.random.default_rng(seed), PoseEkf(white_poses())
+    later = LATER * rng.uniform(size=len(data.poses)) * (rng.uniform(size=len(data.poses)) < LATE_SHARE)
+    steps, before = 0, None
+    for item in timeline(data.samples(), data.poses, LATE + data.offset + later):
+        if isinstance(item, ImuSample):
+            ekf.add_imu(item)
+            continue
+        ekf.add_pose(item)
+        known = ekf.camera_time_offset
+        steps += None not in (before, known) and abs(known - before) > STEP
+        before = known
+    return steps
+
+
+def test_clock_offset(benchmark, write_table):
+    """Prior of 30 ms, poses late by 30 ms: the offset's error beside its claim after 5 s, and steps that are none."""
+    benchmark.pedantic(clock_error, args=(0, ImuNoise(), True), rounds=1)
+    rows = [['gyroscope, accelerometer', 'errors of the rig', 'error, rms', 'claimed', 'error over claim, rms']]
+    shares = {True: [], False: []}
+    for declared, words in ((True, 'as declared'), (False, 'none')):
+        for densities in GRADES:
+            noise = ImuNoise(gyroscope_noise_density=densities[0], accelerometer_noise_density=densities[1])
+            error, claim = np.array([clock_error(seed, noise, declared) for seed in CLOCK_SEEDS]).T
+            shares[declared].append(rms(error / claim))
+            grade = f'{densities[0]:g} rad/s/√Hz, {densities[1]:g} m/s²/√Hz'
+            rows.append([grade, words, f'{1e3 * rms(error):.1f} ms', f'{1e3 * rms(claim):.1f} ms'])
+            rows[-1].append(f'{shares[declared][-1]:.2f}')
+        rows.append(['all four', words, '', '', f'{rms(np.array(shares[declared])):.2f}'])
+    steps = sum(false_steps(seed) for seed in range(STEADY_MINUTES))
+    rows.append([f'steps of the clock found in {STEADY_MINUTES} min without any', '', '', '', f'{steps}'])
+    write_table('clock', rows)
+    # 32 draws of a Gaussian have an rms of 1 +- 0.13
+    assert 0.8 < rms(np.array(shares[True])) < 1.3
+    assert steps == 0

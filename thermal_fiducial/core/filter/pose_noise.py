@@ -18,7 +18,8 @@ from thermal_fiducial.core.geometry.reprojection import turned
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.types import FloatArray
 
-#: Initial and least variance of the white error, as a share of the pose's covariance: the rest is systematic.
+#: Initial and least variance of the white error, as a share of the pose's covariance. The systematic error has all of
+#: it besides: with half of it the fused pose before a recorded board claims less than its error.
 WHITE = 0.5
 #: Adaptation of the white variance where poses claim too little: memory in poses, largest multiple of the initial
 #: value, largest step of its logarithm by one pose.
