@@ -207,7 +207,9 @@ MECHANISMS = {
         'slow, 0.1 K, blind', ('alignment',), {'search:_rough': lambda *_: np.zeros(0, dtype=np.intp)}
     ),
     'markers in plates': Mechanism(
-        'fast, 0.5 K, blind', ('patterns:shrunk',), {'search:_with_shrunk': lambda quads, _: quads}
+        'fast, 0.5 K, blind',
+        ('patterns:shrunk', 'search:_with_shrunk'),
+        {'search:_with_shrunk': lambda quads, _: quads},
     ),
     'large markers halved': Mechanism('landing', ('confirmation:_read',), {'confirmation:_WIDE_CELL_PX': np.inf}),
     'columns of the frame': Mechanism('slow, 0.1 K, guided', (), {'frame:without_columns': lambda counts, _: counts}),
