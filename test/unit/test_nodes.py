@@ -248,6 +248,13 @@ def test_an_opencv_that_is_too_old_is_refused_with_the_version_needed(graph, mon
         graph.add(ArucoDetector)
 
 
+def test_an_opencv_without_aruco_is_refused_with_the_package_that_has_it(graph, monkeypatch):
+    """As pip's opencv-python-headless 4.6; launch would start a node that crashes again and again."""
+    monkeypatch.delattr('cv2.aruco')
+    with pytest.raises(InputError, match=r'without aruco: take opencv-contrib-python-headless'):
+        graph.add(ArucoDetector)
+
+
 @pytest.mark.parametrize('name', ['DICT_9X9_9', 'a' * 300])
 def test_an_unknown_dictionary_is_a_fault_and_the_node_lives(graph, name):
     node = graph.add(ArucoDetector, dictionary=name)

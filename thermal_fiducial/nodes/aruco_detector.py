@@ -83,10 +83,12 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
 
 
 def _require_opencv() -> None:
-    """Report an OpenCV that is too old at the start, before a missing function fails in flight."""
+    """Report an unusable OpenCV at the start, before a missing function fails in flight."""
     if tuple(int(part) for part in cv2.__version__.split('.')[:2]) < _OPENCV:
         needed = '.'.join(map(str, _OPENCV))
         raise InputError(f'OpenCV {cv2.__version__}: {needed} or newer is needed')
+    if not hasattr(cv2, 'aruco'):
+        raise InputError(f'OpenCV {cv2.__version__} without aruco: take opencv-contrib-python-headless of that version')
 
 
 def main() -> int:
