@@ -298,6 +298,24 @@ def test_errors_that_last_are_in_the_covariances():
     assert 6.0 - 2.7 < np.mean(nees) < 6.0 * 32 / 25 + 2.7
 
 
+def test_a_side_that_is_covered_in_all_views_is_in_the_covariance():
+    """Its outline ends 3 px beyond the side; where that looks like a square, in one view of ten, it claims little."""
+    poses = wall(np.random.default_rng(0))
+    recorded = snapshot(np.random.default_rng(1), poses, count=60, disturbance=0.0)
+    off = np.zeros((8, 4, 2))
+    off[5, :2, 1] = 3.0, 2.0
+    frames = []
+    for index, frame in enumerate(recorded.keyframes):
+        covariances = frame.covariances.copy()
+        if index % 10:
+            covariances[frame.ids == 5] = 4.0**2 * np.eye(2)
+        frames.append(replace(frame, corners=frame.corners + off[frame.ids], covariances=covariances))
+    refinement = refine(replace(recorded, keyframes=tuple(frames), errors=SystematicErrors()))
+    d, C = difference(refinement.markers[5].T_map_marker, poses[5]), refinement.markers[5].covariance
+    # Six are expected of as much as is claimed; hundreds where the claim of each view counts as white noise.
+    assert d @ np.linalg.solve(C, d) < 6.0
+
+
 def test_a_marker_that_starts_behind_the_camera_spoils_nothing():
     poses = wall(np.random.default_rng(0))
     start = snapshot(np.random.default_rng(1), poses)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from thermal_fiducial.core.geometry.reprojection import lever_arm
-from thermal_fiducial.core.types import FloatArray, IntArray
+from thermal_fiducial.core.types import FloatArray
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,12 @@ MAP_COMMON = 0.75
 CORRELATED_ODOMETRY = 30.0
 #: Part of the re-projection error, by bent plates and corner bias, that is no sign of an inconsistent marker [px].
 INCONSISTENT_PX = 0.3
+
+
+#: Largest noise of corners by pixels [px]: markers of twice the noise of a pixel claim 0.35. What a marker claims
+#: beyond it in most views is by an object that covers a side, and the same in all views, also in those few in which the
+#: outline looks like a square. Enters the covariance of a joint adjustment (:func:`shape_of_corners`).
+WHITE_PX = 0.5
 
 
 # Poses from the corners of a frame.
@@ -160,15 +166,16 @@ def of_single_error(moved: FloatArray, std: float = 1.0) -> FloatArray:
 # The map, from a joint adjustment.
 
 
-def shape_of_corners(precisions: FloatArray, views: IntArray, errors: SystematicErrors) -> FloatArray:
+def shape_of_corners(variances: FloatArray, typical: FloatArray, errors: SystematicErrors) -> FloatArray:
     """Standard deviations (M,) [px] of the corner errors of M markers that are the same in all views.
 
     Parameters
     ----------
-    precisions : (M,) sum over the views of a marker of its corners' inverse variance [1/px^2]
-    views : (M,) number of views
+    variances : (M,) of the corners of a marker, harmonic mean over its views [px^2]
+    typical : (M,) median over the views
     """
-    return np.asarray(errors.marker_shape * np.sqrt(views / precisions))
+    covered = np.maximum(typical - WHITE_PX**2, 0.0)
+    return np.asarray(np.sqrt(errors.marker_shape**2 * variances + covered))
 
 
 def arms_of_scale(positions: FloatArray, held: FloatArray) -> FloatArray:

@@ -136,9 +136,11 @@ def _shape_covariances(
     """
     if errors.marker_shape == 0.0:
         return np.zeros((len(problem.ids), 6, 6))
-    precision = np.bincount(problem.marker, 0.5 * np.mean(np.sum(problem.W**2, axis=(2, 3)), axis=1))
-    views = np.bincount(problem.marker).astype(np.int64)
-    std = shape_of_corners(precision.astype(np.float64), views, errors)
+    precision = 0.5 * np.mean(np.sum(problem.W**2, axis=(2, 3)), axis=1)
+    views = np.bincount(problem.marker)
+    middle = np.cumsum(views) - 1 - views // 2
+    typical = 1.0 / precision[np.lexsort((precision, problem.marker))[middle]]
+    std = shape_of_corners(views / np.bincount(problem.marker, precision), typical, errors)
     rng, covariances = np.random.default_rng(0), np.zeros((len(problem.ids), 6, 6))
     for _ in range(_SAMPLES // _AT_ONCE):
         samples = std[:, None, None, None] * rng.standard_normal((len(problem.ids), 4, 2, _AT_ONCE))
