@@ -55,7 +55,7 @@ def _first(value: Any) -> Callable[..., Any]:
 def _exactly_linear(self: Any, prior: Any, motion: Any, moved: Any, H: Any, R: Any) -> None:
     """Without the second order of the clock offset."""
     twist = moved[np.r_[0:3, 6:9]]
-    R += prior.pose_noise.jitter * np.outer(twist, twist)
+    R += prior.pose_noise.jitter.value * np.outer(twist, twist)
     H[:, 35] = twist
 
 
@@ -82,6 +82,9 @@ MECHANISMS = {
         ('jittering',),
         ('pose_noise:PoseNoise.with_stamps',),
         {'pose_noise:PoseNoise.with_stamps': lambda self, *_: self},
+    ),
+    'vibration of the mount': Mechanism(
+        ('shaking mount',), ('pose_noise:PoseNoise.with_vibration', 'update:by_mount'), changes={'mount_vibration': 0.0}
     ),
     'scale of the gyroscope': Mechanism(('scale errors',), changes={'gyroscope_scale_std': 0.0}),
     'scale of the accelerometer': Mechanism(('scale errors',), changes={'accelerometer_scale_std': 0.0}),

@@ -607,6 +607,13 @@ class PoseEkfConfig(SelfChecked):
         minimum=0.0,
         maximum=0.05,
     )
+    mount_vibration: float = param(
+        5.0e-4,
+        'Initial standard deviation of the vibration of the camera against the IMU, estimated from the poses. 0: none.',
+        unit='rad',
+        minimum=0.0,
+        maximum=0.01,
+    )
     estimate_extrinsics: bool = param(
         False,
         'Estimate the errors of camera_position and camera_orientation; otherwise they are counted in the covariance.',

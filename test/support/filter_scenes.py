@@ -250,6 +250,23 @@ def jittering(seed: int) -> Arrivals:
     )
 
 
+def shaking_mount(seed: int) -> Arrivals:
+    """A camera on a soft mount that rotates by 0.12 deg against the IMU, about each axis at a frequency of its own.
+
+    Its poses are of many markers.
+    """
+    well_seen = {'rotation_std': (1e-3, 1e-3, 2e-4), 'translation_std': (1e-4, 1e-4, 5e-4)}
+    flight, rng = Flight(seed=seed, seconds=16.0, **well_seen), np.random.default_rng(seed)
+    phases, frequencies = rng.uniform(0.0, 2.0 * np.pi, 3), np.array([11.0, 15.1, 8.9])
+    poses = []
+    for pose in flight.poses:
+        angles = 2.0 * np.pi * frequencies * (pose.stamp_ns - START_NS) / 1e9 + phases
+        T = pose.T_map_camera.copy()
+        T[:3, :3] = T[:3, :3] @ so3_exp(np.radians(0.12) * np.sin(angles))
+        poses.append(replace(pose, T_map_camera=T))
+    return _arrivals(flight, poses)
+
+
 def tilted_map(seed: int) -> Arrivals:
     """A map 0.5 deg off the vertical."""
     flight = Flight(seed=seed, seconds=16.0)
@@ -350,7 +367,7 @@ def _scenes() -> dict[str, Scene]:
     flights = (
         brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, starved,
         jittering, tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start, stepping_clock,
-        small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making,
+        small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making, shaking_mount,
     )  # fmt: skip
     scenes: dict[str, Scene] = {scene.__name__.replace('_', ' '): partial(of_flights, scene) for scene in flights}
     # The clock's error over its claim takes more of them.

@@ -21,16 +21,17 @@ from thermal_fiducial.core.filter.state import (
 )
 from thermal_fiducial.core.filter.update import (
     body_pose,
+    by_mount,
     core_derivative,
     MotionAtPose,
     pose_innovation,
     PoseUpdater,
     with_clock_step,
 )
-from thermal_fiducial.core.geometry.se3 import so3_exp, so3_log, transform
+from thermal_fiducial.core.geometry.se3 import inverse, so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import CameraPose
 
-FULL = config(estimate_extrinsics=True, stamp_jitter=0.0)
+FULL = config(estimate_extrinsics=True, stamp_jitter=0.0, mount_vibration=0.0)
 RATE = np.array([0.5, -1.0, 0.7])
 
 
@@ -193,7 +194,7 @@ def weighed(estimate, still, errors):
     """Variance of the white error that is learned from poses with ``errors`` (N, 6), in standard deviations claimed."""
     updater = PoseUpdater(config(systematic_pose_std=0.01, stamp_jitter=0.0, estimate_time_offset=False))
     R = np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)
-    now = replace(known(estimate, 1e-14), pose_noise=PoseNoise.of(0.0, ELSEWHERE))
+    now = replace(known(estimate, 1e-14), pose_noise=PoseNoise.of(ELSEWHERE))
     for stamp, error in enumerate(np.sqrt(R.diagonal()) * errors):
         T = now.state.T_map_body @ transform(so3_exp(error[:3]), error[3:])
         pose = BodyPose(stamp, T, R)
@@ -270,7 +271,7 @@ def test_jitter_of_the_stamps_is_learned(estimate, motion):
     white = config(systematic_pose_std=0.01, estimate_time_offset=False, time_offset_std=0.0)
     rng, updater = np.random.default_rng(9), PoseUpdater(white)
     R = np.diag(np.repeat((1e-5, 2e-5), 3) ** 2)
-    noise = PoseNoise.of(5e-4, ELSEWHERE)
+    noise = PoseNoise.of(ELSEWHERE, 5e-4)
     velocity = estimate.state.velocity
     for stamp in range(1000):
         late = rng.normal(0.0, 3e-3)
@@ -279,7 +280,33 @@ def test_jitter_of_the_stamps_is_learned(estimate, motion):
         now = replace(known(estimate, 1e-14), pose_noise=noise)
         noise = updater.correct(pose, updater.innovation(now, pose, motion), motion).pose_noise
     # the memory of 300 poses of one number: 6 % of the deviation; three of that
-    assert np.sqrt(noise.jitter) == pytest.approx(3e-3, rel=0.18)
+    assert np.sqrt(noise.jitter.value) == pytest.approx(3e-3, rel=0.18)
+
+
+def test_a_rotation_of_the_camera_against_the_robot_moves_the_pose_as_its_noise_says(estimate):
+    turn, T_body_camera = 1e-6 * np.array([1.0, -2.0, 3.0]), estimate.state.T_body_camera
+    turned = transform(so3_exp(turn) @ T_body_camera[:3, :3], T_body_camera[:3, 3])
+    measured = estimate.state.T_map_body @ turned @ inverse(T_body_camera)
+    moved = pose_innovation(estimate.state, measured)
+    # Second order of a microradian, and rounding of metres.
+    np.testing.assert_allclose(moved, by_mount(estimate.state) @ turn, atol=1e-11)
+
+
+@pytest.mark.parametrize('accepted', [True, False])
+def test_vibration_of_the_mount_is_learned(estimate, still, accepted):
+    """A camera that rotates by 2 mrad against the robot, in poses that claim far less."""
+    updater, rng = PoseUpdater(config(systematic_pose_std=0.01, estimate_time_offset=False)), np.random.default_rng(10)
+    R, noise, state = 1e-10 * np.eye(6), PoseNoise.of(ELSEWHERE, mount_vibration=5e-4), estimate.state
+    for stamp in range(1000):
+        error = by_mount(state) @ rng.normal(0.0, 2e-3, 3)
+        pose = BodyPose(stamp, state.T_map_body @ transform(so3_exp(error[:3]), error[3:]), R)
+        innovation = updater.innovation(replace(known(estimate, 1e-14), pose_noise=noise), pose, still)
+        if accepted:
+            noise = updater.correct(pose, innovation, still).pose_noise
+        else:
+            noise = updater.adapted(noise, pose, innovation)
+    # The memory of 300 poses of three numbers: 3 % of the deviation; the limit of squares takes some. Three of that.
+    assert np.sqrt(noise.vibration.value) == pytest.approx(2e-3, rel=0.1)
 
 
 def test_a_step_of_the_clock_of_the_imu_does_not_show_in_the_next_pose(estimate, motion):

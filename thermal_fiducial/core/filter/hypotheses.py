@@ -60,7 +60,7 @@ class Hypotheses:
         if innovation.nis <= self.config.gate and not stale:
             corrected = self._updater.correct(measured, innovation, motion)
             return hypothesis.accepting(corrected), PoseUpdate(pose.stamp_ns, True, '', innovation.nis)
-        noise = estimate.pose_noise.weighed(measured, innovation.value, innovation.S_inverse)
+        noise = self._updater.adapted(estimate.pose_noise, measured, innovation)
         refusing = hypothesis.refusing(replace(estimate, pose_noise=noise))
         why = f'after {coasted:.0f} s without one' if stale else f'{math.sqrt(innovation.nis):.1f} sigma'
         return refusing, PoseUpdate(pose.stamp_ns, False, f'refused: {why}', innovation.nis)

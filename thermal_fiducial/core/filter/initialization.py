@@ -68,7 +68,7 @@ def start(
     """
     if _contradicts_gravity(pose, imu, config.gravity):
         return None
-    noise = PoseNoise.of(config.stamp_jitter, pose)
+    noise = PoseNoise.of(pose, config.stamp_jitter, config.mount_vibration)
     P = np.diag(_initial_variances(config))
     P[SYSTEMATIC, SYSTEMATIC] = config.systematic_pose_std**2 * pose.shape
     P[np.ix_(POSE, POSE)] += noise.white * pose.shape

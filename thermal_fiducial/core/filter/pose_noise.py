@@ -1,8 +1,9 @@
-"""Noise of the camera poses: their covariance, split into white and systematic errors; the white part is adapted.
+"""Noise of the camera poses: their covariance, split into white and systematic errors; what is white is adapted.
 
 The error of a pose is the sum of a white and a systematic error. Errors of lens and corners are systematic: they stay
 the same while the view does, and change as the camera turns or sees other markers. Their size is in the covariance
-already: the mapper learns it from the corners' residuals. White noise beyond the claim is learned from innovations.
+already: the mapper learns it from the corners' residuals. White noise beyond the claim is learned from innovations:
+in proportion to the claim, along the motion (jitter of stamps), and in rotation (vibration of the camera's mount).
 
 Source: R. Mehra, "Approaches to Adaptive Filtering", IEEE TAC 1972.
 """
@@ -10,6 +11,7 @@ Source: R. Mehra, "Approaches to Adaptive Filtering", IEEE TAC 1972.
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,9 +26,11 @@ WHITE = 0.5
 #: Adaptation of the white variance where poses claim too little: memory in poses, largest multiple of the initial
 #: value, largest step of its logarithm by one pose.
 _WHITE_MEMORY, _LARGEST, _LARGEST_STEP = 10.0, 30.0, 0.3
-#: Adaptation of the stamps' jitter: weight of the parameter in poses, memory in poses, range of the standard deviation
-#: [s], and the limit of the normalised squared innovation along the motion.
-_PRIOR_STAMPS, _MEMORY, _STAMP_RANGE, _LARGEST_SQUARE = 10.0, 300.0, (1e-4, 5e-3), 9.0
+#: Adaptation of the stamps' jitter and the mount's vibration: weight of the parameter in poses, memory in poses, and
+#: the limit of the normalised squared innovation in their directions.
+_PRIOR, _MEMORY, _LARGEST_SQUARE = 10.0, 300.0, 9.0
+#: Range of their standard deviations [s], [rad].
+_STAMP_RANGE, _VIBRATION_RANGE = (1e-4, 5e-3), (1e-5, 1e-2)
 #: Least covariance of a pose: rounding of float32 corners [rad, m].
 _ROUNDING = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
 
@@ -67,23 +71,57 @@ def log_overlap(A: FloatArray, B: FloatArray) -> float:
     return min(float(0.25 * (determinants[0] + determinants[1]) - 0.5 * determinants[2]), 0.0)
 
 
+class LearnedVariance(NamedTuple):
+    """Variance of a white error that is learned from innovations, 0 for none; information about its logarithm."""
+
+    value: float
+    information: float = 0.0
+
+    def adapted(
+        self, directions: FloatArray, change: FloatArray, S_inverse: FloatArray, stds: tuple[float, float]
+    ) -> 'LearnedVariance':
+        """One step of Fisher scoring on the likelihood of an innovation's ``change`` (6,).
+
+        Parameters
+        ----------
+        directions : (6, K) derivative of the innovation by K independent errors of this variance
+        S_inverse : (6, 6) of the innovation's covariance
+        stds : range of the standard deviation
+        """
+        if not self.value:
+            return self
+        weighted = S_inverse @ directions
+        precision = directions.T @ weighted
+        along = change @ weighted
+        square = min(float(along @ along), _LARGEST_SQUARE * float(precision.trace()))
+        share = self.value * precision
+        information = (1.0 - 1.0 / _MEMORY) * self.information + 0.5 * float(np.sum(share * share))
+        step = 0.5 * (self.value * square - float(share.trace())) / (0.5 * _PRIOR + information)
+        low, high = stds
+        return LearnedVariance(min(max(self.value * math.exp(step), low**2), high**2), information)
+
+
+_NONE = LearnedVariance(0.0)
+
+
 @dataclass(frozen=True, slots=True)
 class PoseNoise:
-    """Adapted variances: white error of camera poses as a multiple of their own covariance, and jitter of stamps."""
+    """Adapted variances: white errors of camera poses, as a multiple of their own covariance and beside it."""
 
     white: float
     #: the last accepted pose
     last: BodyPose
-    #: variance of the jitter of the camera's stamps [s^2], 0 for exact stamps; information about its logarithm
-    jitter: float = 0.0
-    jitter_information: float = 0.0
+    #: jitter of the camera's stamps [s^2]
+    jitter: LearnedVariance = _NONE
+    #: rotation of the camera against the IMU by vibration, about each axis [rad^2]
+    vibration: LearnedVariance = _NONE
     #: (6,) of the last pose that was compared with the estimate, accepted or not
     innovation: FloatArray = field(default_factory=lambda: np.zeros(6))
 
     @classmethod
-    def of(cls, stamp_jitter: float, first: BodyPose) -> 'PoseNoise':
-        """Initial values, for the parameter ``stamp_jitter`` [s] and the ``first`` pose."""
-        return cls(WHITE, first, stamp_jitter**2)
+    def of(cls, first: BodyPose, stamp_jitter: float = 0.0, mount_vibration: float = 0.0) -> 'PoseNoise':
+        """Initial values; ``stamp_jitter`` [s] and ``mount_vibration`` [rad] are standard deviations."""
+        return cls(WHITE, first, LearnedVariance(stamp_jitter**2), LearnedVariance(mount_vibration**2))
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'PoseNoise':
         """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
@@ -138,18 +176,16 @@ class PoseNoise:
 
         ``twist`` (6,): derivative of the pose with respect to its stamp [rad/s, m/s].
         """
-        if not self.jitter:
-            return self
-        change = self._change(innovation)
-        weighted = S_inverse @ twist
-        precision = float(twist @ weighted)
-        square = min(float(change @ weighted) ** 2, _LARGEST_SQUARE * precision)
-        share = self.jitter * precision
-        information = (1.0 - 1.0 / _MEMORY) * self.jitter_information + 0.5 * share**2
-        step = 0.5 * (self.jitter * square - share) / (0.5 * _PRIOR_STAMPS + information)
-        low, high = _STAMP_RANGE
-        jitter = min(max(self.jitter * math.exp(step), low**2), high**2)
-        return replace(self, jitter=jitter, jitter_information=information)
+        jitter = self.jitter.adapted(twist[:, None], self._change(innovation), S_inverse, _STAMP_RANGE)
+        return replace(self, jitter=jitter)
+
+    def with_vibration(self, turning: FloatArray, innovation: FloatArray, S_inverse: FloatArray) -> 'PoseNoise':
+        """Adapt the vibration of the mount; refused poses count too, see :meth:`weighed`.
+
+        ``turning`` (6, 3): derivative of the pose by the camera's rotation against the robot.
+        """
+        vibration = self.vibration.adapted(turning, self._change(innovation), S_inverse, _VIBRATION_RANGE)
+        return replace(self, vibration=vibration)
 
     def _change(self, innovation: FloatArray) -> FloatArray:
         """(6,) change of the innovation since the last pose, scaled to the variance of one white innovation."""

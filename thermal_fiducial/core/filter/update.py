@@ -7,7 +7,7 @@ import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
-from thermal_fiducial.core.filter.pose_noise import BodyPose
+from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise
 from thermal_fiducial.core.filter.state import (
     CORE,
     Estimate,
@@ -126,6 +126,11 @@ def pose_innovation(state: NavigationState, T_map_body: FloatArray) -> FloatArra
     return np.concatenate((rotation, so3_left_jacobian_inverse(rotation) @ offset))
 
 
+def by_mount(state: NavigationState) -> FloatArray:
+    """(6, 3) derivative of a measured pose by a rotation of the camera against the robot, about the camera [rad]."""
+    return np.vstack((np.eye(3), skew(state.T_body_camera[:3, 3])))
+
+
 class PoseUpdater:
     """Innovations of poses, and the corrections by them."""
 
@@ -142,7 +147,8 @@ class PoseUpdater:
         H = np.zeros((6, SIZE))
         H[_SIX, POSE] = 1.0
         H[:, EXTRINSICS] = H[:, SYSTEMATIC] = np.eye(6)
-        R = prior.pose_noise.white * pose.shape
+        turning = by_mount(prior.state)
+        R = prior.pose_noise.white * pose.shape + prior.pose_noise.vibration.value * (turning @ turning.T)
         derivative = core_derivative(prior.state, motion.imu)
         self._add_clock(prior, motion, derivative, H, R)
         value = pose_innovation(prior.state, pose.T_map_body) - prior.state.systematic
@@ -155,7 +161,7 @@ class PoseUpdater:
         """Add errors of the camera's clock to H and R: stamp jitter, and the clock offset, estimated or not."""
         config = self.config
         twist, acceleration = derivative[POSE], derivative[VELOCITY]
-        unknown = prior.pose_noise.jitter + (0.0 if config.estimate_time_offset else config.time_offset_std**2)
+        unknown = prior.pose_noise.jitter.value + (0.0 if config.estimate_time_offset else config.time_offset_std**2)
         R += unknown * np.outer(twist, twist)
         if not config.estimate_time_offset:
             return
@@ -178,8 +184,14 @@ class PoseUpdater:
             state = state.plus(_of_core((before - now) * error[TIME_OFFSET]))
             covariance = self._in_clock_of_imu(covariance, now - before, now, innovation, motion)
         noise = prior.pose_noise.with_stamps(before[POSE], innovation.value, innovation.S_inverse)
-        noise = noise.weighed(pose, innovation.value, innovation.S_inverse)
+        noise = self.adapted(noise, pose, innovation)
         return replace(prior, state=state, covariance=covariance, pose_noise=replace(noise, last=pose))
+
+    def adapted(self, noise: PoseNoise, pose: BodyPose, innovation: Innovation) -> PoseNoise:
+        """``noise`` adapted to the innovation of an accepted or refused pose."""
+        value, S_inverse = innovation.value, innovation.S_inverse
+        noise = noise.with_vibration(by_mount(innovation.prior.state), value, S_inverse)
+        return noise.weighed(pose, value, S_inverse)
 
     def _in_clock_of_imu(
         self, P: FloatArray, change: FloatArray, derivative: FloatArray, innovation: Innovation, motion: MotionAtPose
