@@ -71,8 +71,7 @@ bench: $(READY)
 
 faults: $(READY)
 	@echo '== Faults in flight: about an hour on two cores; fewer flights: make faults FAULTS_ARGS="--seeds 1"'
-	PYTHONPATH=test $(BIN)/python -m faults $(FAULTS_ARGS)
-	$(BIN)/python test/documents.py
+	PYTHONPATH=test $(BIN)/python -m faults $(FAULTS_ARGS); ended=$$?; $(BIN)/python test/documents.py && exit $$ended
 
 soak: $(READY)
 	@echo '== An hour of flight in real time; shorter: make soak SOAK_ARGS="--minutes 6"'
