@@ -5,7 +5,7 @@ import multiprocessing
 from multiprocessing.connection import Connection
 import os
 import signal
-from threading import Thread
+from threading import current_thread, Thread
 import time
 from typing import Generic, TypeVar
 
@@ -130,6 +130,9 @@ class Background(Generic[Task, Result]):
     def close(self) -> None:
         """Terminate the process, even during a task."""
         self._process.kill()
+        # One thread at a time may wait for the process: of two, one comes back before it has been taken off the list.
+        if self._thread is not None and self._thread is not current_thread():
+            self._thread.join()
         self._process.join()
 
 
