@@ -5,7 +5,7 @@ import multiprocessing
 from multiprocessing.connection import Connection
 import os
 import signal
-from threading import current_thread, Thread
+from threading import Thread
 import time
 from typing import Generic, TypeVar
 
@@ -75,7 +75,8 @@ class Background(Generic[Task, Result]):
                 self._outcome = wait()
             except (EOFError, OSError):
                 # Its end of the pipe is closed before it has ended: the next task must not go to it.
-                self.close()
+                self._process.kill()
+                self._process.join()
                 self._outcome = InputError(f'its process ended, or gave no answer for {self.patience_s:g} s')
             except Exception as error:  # reported by the node, whatever it is
                 self._outcome = error
@@ -130,8 +131,8 @@ class Background(Generic[Task, Result]):
     def close(self) -> None:
         """Terminate the process, even during a task."""
         self._process.kill()
-        # One thread at a time may wait for the process: of two, one comes back before it has been taken off the list.
-        if self._thread is not None and self._thread is not current_thread():
+        # First its thread: of two that wait for a process, one comes back before it has been taken off the list.
+        if self._thread is not None:
             self._thread.join()
         self._process.join()
 
