@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, TypeAlias
 import cv2
 import numpy as np
 
-from thermal_fiducial.core.geometry.se3 import squared_sides
+from thermal_fiducial.core.geometry.se3 import grown, squared_sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, TINY
 
 # Window of the local standard deviation, at a quarter of the resolution: 68 px, a marker at working distance.
@@ -155,8 +155,7 @@ def _at_edges(quads: FloatArray, sides: FloatArray, spots: BoolArray, edge_px: f
     Outlines of holes run through the region around them: their edges lie inside.
     """
     factor = 1.0 + 2.0 * edge_px * np.where(spots, 1.0, -1.0) / sides
-    middle = quads.mean(axis=1, keepdims=True)
-    return np.asarray(middle + factor[:, None, None] * (quads - middle))
+    return grown(quads, factor[:, None, None])
 
 
 def _clockwise(quads: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ from thermal_fiducial.core.detection.quads import (
     without_columns,
 )
 from thermal_fiducial.core.detection.refining import sides_px
-from thermal_fiducial.core.geometry.se3 import diagonals, squared_sides
+from thermal_fiducial.core.geometry.se3 import diagonals, grown, squared_sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.
@@ -91,7 +91,7 @@ class BlindSearch:
         kinds : polarities searched at half resolution, 1 for markers darker than their surroundings, -1 for brighter
         """
         # The plate, and as much again for its blurred edge.
-        hidden = _grown(seen.places.at.px, (self._decoder.cells + 4) / self._decoder.cells)
+        hidden = grown(seen.places.at.px, (self._decoder.cells + 4) / self._decoder.cells)
         min_side_px, edge_px = config.min_side_px - _SHORTER_PX, _EDGE_PX
         if frame.displayed:
             min_side_px, edge_px = _PICTURE_SIDE * config.min_side_px, 0.0
@@ -170,12 +170,6 @@ def _chosen(reading: Reading, quads: FloatArray, places: IntArray, noise: float)
     turned = (np.arange(4) - reading.turns[places][:, None]) % 4
     corners = np.take_along_axis(quads[places], turned[..., None], axis=1)
     return Outlines(reading.ids[places], corners, reading.contrast[places] / noise)
-
-
-def _grown(quads: FloatArray, factor: float) -> FloatArray:
-    """Quadrilaterals (N, 4, 2) scaled about their centres."""
-    middle = quads.mean(axis=1, keepdims=True)
-    return np.asarray(middle + factor * (quads - middle))
 
 
 def _rough(reading: Reading, quads: FloatArray, seen: IntArray) -> IntArray:

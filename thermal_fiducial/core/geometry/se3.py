@@ -220,6 +220,12 @@ def diagonals(quads: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(quads[:, 2] - quads[:, 0], axis=-1))
 
 
+def grown(quads: FloatArray, factor: float | FloatArray) -> FloatArray:
+    """Quadrilaterals (Q, 4, 2) scaled about their centres by a ``factor``, one for all or (Q, 1, 1)."""
+    middle = quads.mean(axis=1, keepdims=True)
+    return np.asarray(middle + factor * (quads - middle))
+
+
 def perspective(c: FloatArray) -> FloatArray:
     """Third homogeneous coordinates (Q, 4) that make views (Q, 4, 2) of the corners of squares: alike from in front.
 
