@@ -22,7 +22,7 @@ REFUSALS_OF_DOUBT = 3
 _REFUTED = 3
 NEVER = -(1 << 62)
 #: Reason of a reset. In fast motion poses are off together by a line readout or a lag that is not as declared.
-CONTRADICTED = (
+OUTVOTED = (
     'the poses contradict the estimate and agree with each other; if in fast motion: readout_time, bolometer_lag?'
 )
 
@@ -147,7 +147,7 @@ class Belief(NamedTuple):
         lasting = other.accepted_ns - other.started_ns >= config.reset_after * SECOND_NS
         against = main.hits - self.hits_before
         agreed = other.hits >= max(2 * other.misses, _PREFERRED * against, other.needed)
-        return CONTRADICTED if lasting and agreed else ''
+        return OUTVOTED if lasting and agreed else ''
 
     def _promoted(self, reason: str) -> 'Belief':
         """The belief with the alternative as its estimate; ``reason`` in words, empty at initialisation."""

@@ -44,6 +44,8 @@ class Innovation(NamedTuple):
     prior: Estimate
     #: time derivative (9,) of the prior's core error coordinates, as of :func:`core_derivative`
     core_derivative: FloatArray
+    #: derivative (6, 3) of the pose by the camera's rotation against the robot, as of :func:`by_mount`
+    by_mount: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +155,7 @@ class PoseUpdater:
         self._add_clock(prior, motion, derivative, H, R)
         value = pose_innovation(prior.state, pose.T_map_body) - prior.state.systematic
         S_inverse = np.asarray(np.linalg.inv(H @ prior.covariance @ H.T + R))
-        return Innovation(value, S_inverse, H, R, float(value @ S_inverse @ value), prior, derivative)
+        return Innovation(value, S_inverse, H, R, float(value @ S_inverse @ value), prior, derivative, turning)
 
     def _add_clock(
         self, prior: Estimate, motion: MotionAtPose, derivative: FloatArray, H: FloatArray, R: FloatArray
@@ -190,7 +192,7 @@ class PoseUpdater:
     def adapted(self, noise: PoseNoise, pose: BodyPose, innovation: Innovation) -> PoseNoise:
         """``noise`` adapted to the innovation of an accepted or refused pose."""
         value, S_inverse = innovation.value, innovation.S_inverse
-        noise = noise.with_vibration(by_mount(innovation.prior.state), value, S_inverse)
+        noise = noise.with_vibration(innovation.by_mount, value, S_inverse)
         return noise.weighed(pose, value, S_inverse)
 
     def _in_clock_of_imu(
