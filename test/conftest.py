@@ -17,7 +17,7 @@ from support import small_bag
 from support.ros_graph import ros_graph
 
 from thermal_fiducial.replay.domain import own_domain
-from thermal_fiducial.ros.run import use_transport_profile
+from thermal_fiducial.ros.process.run import use_transport_profile
 
 cv2.setNumThreads(1)
 _domain = own_domain()

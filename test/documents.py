@@ -25,7 +25,7 @@ import yaml
 from thermal_fiducial.config import NODES, OPTIONAL_NODES, parameters
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
 from thermal_fiducial.files.camera_info import save_camera
-from thermal_fiducial.ros.node import StageNode
+from thermal_fiducial.ros.base.node import StageNode
 from thermal_fiducial.ros.parameter_file import parameter_file
 
 ROOT = Path(__file__).resolve().parents[1]

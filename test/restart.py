@@ -24,9 +24,10 @@ from thermal_fiducial.files.images import header_stamp_ns
 from thermal_fiducial.replay.children import NodeProcesses
 from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.replay.topics import PLAYED
-from thermal_fiducial.ros import convert, qos
-from thermal_fiducial.ros.counting import CountingNode
-from thermal_fiducial.ros.run import initialise, make_executor
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.counting import CountingNode
+from thermal_fiducial.ros.messages import convert
+from thermal_fiducial.ros.process.run import initialise, make_executor
 
 #: Undisturbed flight before each kill, with which the filter has come into its own again [s].
 _BEFORE = 6.0

@@ -11,7 +11,7 @@ from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.replay.settings import read_settings
 from thermal_fiducial.report import metrics
 from thermal_fiducial.report.trajectory import read_tum, Trajectory
-from thermal_fiducial.ros import convert
+from thermal_fiducial.ros.messages import convert
 from thermal_fiducial.sim.thermal_camera import plan
 from thermal_fiducial.sim.writer import write_flight
 

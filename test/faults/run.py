@@ -21,7 +21,7 @@ from thermal_fiducial.nodes.aruco_detector import ArucoDetector
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
-from thermal_fiducial.ros import clouds, convert
+from thermal_fiducial.ros.messages import clouds, convert
 
 #: Nodes by what they are fed with: the corners of the frames, or the frames.
 BY_CORNERS = {'marker_mapper': MarkerMapperNode, 'pose_ekf': PoseEkfNode}

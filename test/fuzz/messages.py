@@ -31,7 +31,7 @@ from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
 from thermal_fiducial.replay.domain import own_domain
-from thermal_fiducial.ros import convert
+from thermal_fiducial.ros.messages import convert
 
 #: After so many mutated messages a good flight must give good poses ...
 AT_ONCE = 50

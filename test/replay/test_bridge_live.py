@@ -21,8 +21,9 @@ from support.messages import pose_with_covariance
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.measurements import ImuSample
 from thermal_fiducial.replay.domain import own_domain
-from thermal_fiducial.ros import convert, qos
-from thermal_fiducial.ros.counting import CountingNode
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.counting import CountingNode
+from thermal_fiducial.ros.messages import convert
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 

@@ -19,7 +19,7 @@ from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.trajectory_file import load_tum, tum_line
 from thermal_fiducial.replay import lockstep, waiting
 from thermal_fiducial.replay.recorder import RunFiles
-from thermal_fiducial.ros import convert
+from thermal_fiducial.ros.messages import convert
 
 pytestmark = pytest.mark.ros
 

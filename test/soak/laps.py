@@ -16,7 +16,7 @@ from sensor_msgs.msg import Imu
 
 from thermal_fiducial.files.bags import BagMessage, BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.images import header_stamp_ns
-from thermal_fiducial.ros import convert
+from thermal_fiducial.ros.messages import convert
 from thermal_fiducial.sim.lens import Lens
 from thermal_fiducial.sim.scenario import named
 from thermal_fiducial.sim.spline_trajectory import Motion

@@ -10,7 +10,7 @@ import psutil
 from rclpy.serialization import deserialize_message
 
 from soak.laps import Laps
-from thermal_fiducial.ros import convert
+from thermal_fiducial.ros.messages import convert
 
 MINUTE_NS = 60_000_000_000
 #: What a node may grow by after the second minute, when all that is made on first use is there [MB].

@@ -6,7 +6,7 @@ from pathlib import Path
 import subprocess
 import sys
 
-from thermal_fiducial.ros.node import StageNode
+from thermal_fiducial.ros.base.node import StageNode
 
 ROOT = Path(__file__).resolve().parents[2]
 

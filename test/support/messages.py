@@ -6,7 +6,7 @@ import numpy as np
 from sensor_msgs.msg import Imu
 
 from support import small_bag
-from thermal_fiducial.ros import convert
+from thermal_fiducial.ros.messages import convert
 
 START = small_bag.START_NS
 FRAME_NS = 33_333_333

@@ -7,9 +7,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 
-from thermal_fiducial.ros import qos
-from thermal_fiducial.ros.counting import CountingNode
-from thermal_fiducial.ros.run import make_executor
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.counting import CountingNode
+from thermal_fiducial.ros.process.run import make_executor
 
 
 class Graph:

@@ -18,8 +18,8 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.map_history import autosave_file
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
-from thermal_fiducial.ros.run import run
-from thermal_fiducial.ros.stopping import STOPS
+from thermal_fiducial.ros.process.run import run
+from thermal_fiducial.ros.process.stopping import STOPS
 
 MARKERS = 60
 AUTOSAVE_S = 0.05

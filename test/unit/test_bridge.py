@@ -14,9 +14,9 @@ from support.ros_graph import ros_graph
 from thermal_fiducial.core.geometry.se3 import rotation_from_quaternion, so3_exp, transform
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
-from thermal_fiducial.ros import convert
-from thermal_fiducial.ros.bridge import px4_odometry
-from thermal_fiducial.ros.node import ERROR
+from thermal_fiducial.ros.base.node import ERROR
+from thermal_fiducial.ros.filter_node.bridge import px4_odometry
+from thermal_fiducial.ros.messages import convert
 
 pytestmark = pytest.mark.ros
 START = small_bag.START_NS

@@ -221,7 +221,7 @@ import sys
 for name in ('rich', 'matplotlib', 'scipy', 'rosbags', 'jinja2', 'ezdxf'):
     sys.modules[name] = None
 from thermal_fiducial.cli.main import main
-from thermal_fiducial.ros import bridge_listener
+from thermal_fiducial.ros.watching import bridge_listener
 bridge_listener.DISCOVERY_S = 0.2
 sys.exit(main(['check-bridge', '--seconds', '0.1', '--ros-args', '-r', '__ns:=/drone', '-r', 'imu/data:=imu/raw']))
 """

@@ -12,7 +12,7 @@ from support.ros_graph import ros_graph
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.report.bridge_check import Level
 from thermal_fiducial.report.bridge_links import check_links
-from thermal_fiducial.ros import bridge_listener
+from thermal_fiducial.ros.watching import bridge_listener
 
 pytestmark = pytest.mark.ros
 MAVROS = ('-r', 'bridge/odometry:=mavros/odometry/out')

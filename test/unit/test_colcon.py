@@ -75,7 +75,7 @@ def test_what_is_installed(workspace):
         assert (package / file).is_file()
     assert {path.name for path in (ROOT / 'launch').glob('*.py')} == {p.name for p in (package / 'launch').iterdir()}
     (code,) = prefix.glob('lib/python3*/site-packages/thermal_fiducial')
-    for data in ('ros/fastdds.xml', 'py.typed'):
+    for data in ('ros/process/fastdds.xml', 'py.typed'):
         assert (code / data).is_file()
 
 

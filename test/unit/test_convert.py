@@ -14,7 +14,7 @@ from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import CORNER_COVARIANCE_FIELDS, MAP_DTYPE, MARKER_DTYPE, Odometry
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.images import image_to_array
-from thermal_fiducial.ros import clouds, convert, message_bytes
+from thermal_fiducial.ros.messages import clouds, convert, message_bytes
 
 STAMP = 1_700_000_000_123_456_789
 HEAD = convert.header(STAMP, 'frame')

@@ -15,8 +15,10 @@ from support.ros_graph import ros_graph
 
 from thermal_fiducial.core.measurements import corners_px, MARKER_DTYPE
 from thermal_fiducial.nodes.aruco_detector import ArucoDetector
-from thermal_fiducial.ros import clouds, convert, detections, qos
-from thermal_fiducial.ros.annotations import image_annotations
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.camera_nodes import detections
+from thermal_fiducial.ros.messages import clouds, convert
+from thermal_fiducial.ros.messages.annotations import image_annotations
 
 HEAD = convert.header(START, 'thermal_camera_optical')
 CORNERS = np.array([[100.0, 80.0], [160.0, 82.0], [158.0, 141.0], [99.0, 140.0]])

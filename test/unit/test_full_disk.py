@@ -29,8 +29,8 @@ from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.files.trajectory_file import save_tum
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.replay.session import Options, replay
-from thermal_fiducial.ros import clouds, convert
-from thermal_fiducial.ros.node import WARN
+from thermal_fiducial.ros.base.node import WARN
+from thermal_fiducial.ros.messages import clouds, convert
 
 
 @contextmanager

@@ -10,8 +10,8 @@ from sensor_msgs.msg import Imu
 from support.empty_stage import environment, finished
 from support.ros_graph import ros_graph
 
-from thermal_fiducial.ros import qos
-from thermal_fiducial.ros.hearing import replaced_ports
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.hearing import replaced_ports
 
 pytestmark = pytest.mark.ros
 
@@ -40,8 +40,8 @@ from pathlib import Path
 import sys
 from sensor_msgs.msg import Imu
 from support.empty_stage import EmptyStage
-from thermal_fiducial.ros import qos
-from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.process.run import run
 from unit.test_hearing import listening, SHARED
 
 marker = Path(sys.argv.pop())
@@ -94,7 +94,7 @@ PROGRAM = """
 from pathlib import Path
 import sys
 from support.empty_stage import EmptyStage
-from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.process.run import run
 
 lives = Path(sys.argv[1])
 

@@ -26,8 +26,9 @@ from thermal_fiducial.nodes.aruco_detector import ArucoDetector
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
-from thermal_fiducial.ros import clouds, convert, qos
-from thermal_fiducial.ros.node import OK
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import OK
+from thermal_fiducial.ros.messages import clouds, convert
 
 pytestmark = pytest.mark.ros
 EYE = np.eye(4)

@@ -2,8 +2,8 @@
 
 import pytest
 
-from thermal_fiducial.ros.counting import Input
-from thermal_fiducial.ros.input_rates import InputRates
+from thermal_fiducial.ros.base.counting import Input
+from thermal_fiducial.ros.base.input_rates import InputRates
 
 SECOND = 1_000_000_000
 

@@ -8,9 +8,10 @@ from support.messages import pose_with_covariance
 from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, so3_exp, transform
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
 from thermal_fiducial.nodes.landing_target import LandingTarget
-from thermal_fiducial.ros import clouds, convert, qos
-from thermal_fiducial.ros.landing_pad import from_mavros
-from thermal_fiducial.ros.node import ERROR, OK, WARN
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import ERROR, OK, WARN
+from thermal_fiducial.ros.frames.landing_pad import from_mavros
+from thermal_fiducial.ros.messages import clouds, convert
 
 pytestmark = pytest.mark.ros
 STAMP = 1_700_000_000_000_000_000

@@ -11,7 +11,7 @@ import time
 import pytest
 from support.empty_stage import environment, finished
 
-from thermal_fiducial.ros.litter import remove_litter
+from thermal_fiducial.ros.process.litter import remove_litter
 
 DEAD, LIVING, YOUNG = 'fastrtps_0123456789abcdef', 'fastrtps_1123456789abcdef', 'fastrtps_2123456789abcdef'
 OTHERS = ('fastrtps_port7411', 'fastrtps_port7411_el', 'sem.fastrtps_3123456789abcdef', 'fastrtps_x_el')
@@ -35,7 +35,7 @@ def test_only_segments_that_nobody_holds_are_removed(tmp_path):
 PROGRAM = """
 import sys
 from support.empty_stage import EmptyStage
-from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.process.run import run
 
 class Stage(EmptyStage):
     def __init__(self):

@@ -17,8 +17,9 @@ from thermal_fiducial.files.map_history import entries
 from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.files.point_cloud import save_alignment
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
-from thermal_fiducial.ros import clouds, convert, qos
-from thermal_fiducial.ros.node import ERROR, WARN
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import ERROR, WARN
+from thermal_fiducial.ros.messages import clouds, convert
 
 pytestmark = pytest.mark.ros
 

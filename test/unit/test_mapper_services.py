@@ -13,7 +13,8 @@ from thermal_fiducial.core.mapping.map_data import MapMarker, MapperResult, Mark
 from thermal_fiducial.files.map_history import entries
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
-from thermal_fiducial.ros import map_status, qos
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.mapper_node import map_status
 
 pytestmark = pytest.mark.ros
 MODES = ('mapping', 'localization')

@@ -11,7 +11,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.images import image_to_array
-from thermal_fiducial.ros import convert, message_bytes
+from thermal_fiducial.ros.messages import convert, message_bytes
 
 
 def state(**other):

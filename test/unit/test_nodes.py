@@ -31,8 +31,9 @@ from thermal_fiducial.nodes.aruco_detector import ArucoDetector
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
-from thermal_fiducial.ros import clouds, convert, message_bytes, qos
-from thermal_fiducial.ros.node import ERROR, OK, WARN
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import ERROR, OK, WARN
+from thermal_fiducial.ros.messages import clouds, convert, message_bytes
 
 pytestmark = pytest.mark.ros
 START = small_bag.START_NS

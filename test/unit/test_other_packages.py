@@ -11,7 +11,9 @@ from support.messages import frames, imu, info, pose
 from thermal_fiducial.nodes.aruco_detector import ArucoDetector
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
-from thermal_fiducial.ros import convert, detections, qos
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.camera_nodes import detections
+from thermal_fiducial.ros.messages import convert
 
 pytestmark = pytest.mark.ros
 

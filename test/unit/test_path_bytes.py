@@ -9,8 +9,8 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
-from thermal_fiducial.ros import convert, path_bytes
-from thermal_fiducial.ros.path_bytes import PathBytes
+from thermal_fiducial.ros.messages import convert, path_bytes
+from thermal_fiducial.ros.messages.path_bytes import PathBytes
 
 START, STEP = 1_700_000_000_900_000_000, 200_000_000
 

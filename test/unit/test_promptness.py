@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from thermal_fiducial.ros import promptness
+from thermal_fiducial.ros.process import promptness
 
 
 @pytest.fixture

@@ -23,10 +23,11 @@ from thermal_fiducial.nodes.landing_target import LandingTarget
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
-from thermal_fiducial.ros import convert, qos
-from thermal_fiducial.ros.frame_tree import fixed_joints, FrameTree
-from thermal_fiducial.ros.node import WARN
-from thermal_fiducial.ros.robot_frames import RobotFrames
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import WARN
+from thermal_fiducial.ros.frames.frame_tree import fixed_joints, FrameTree
+from thermal_fiducial.ros.frames.robot_frames import RobotFrames
+from thermal_fiducial.ros.messages import convert
 
 CAMERA = 'thermal_camera_optical'
 #: As REP-103 has it: the housing looks along x, the optical frame along z.

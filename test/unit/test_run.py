@@ -17,8 +17,9 @@ from support.ros_graph import ros_graph
 
 from thermal_fiducial.config import group, param
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.ros import qos, run
-from thermal_fiducial.ros.node import StageNode
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.process import run
 
 pytestmark = pytest.mark.ros
 
@@ -187,7 +188,7 @@ def test_a_node_interrupted_in_its_constructor_stops_silently(ending):
 import os, signal, sys
 import rclpy
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
-from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.process.run import run
 
 class Stopped(MarkerMapperNode):
     def declare_parameter(self, *args, **kwargs):
@@ -220,7 +221,7 @@ ENDED = """
 import os, re, signal, sys, time
 from diagnostic_msgs.msg import DiagnosticArray
 from support.empty_stage import EmptyStage
-from thermal_fiducial.ros import run, stopping
+from thermal_fiducial.ros.process import run, stopping
 
 class Stage(EmptyStage):
     def __init__(self):

@@ -16,7 +16,7 @@ from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode
 from thermal_fiducial.replay.settings import read_settings
-from thermal_fiducial.ros import clouds, convert
+from thermal_fiducial.ros.messages import clouds, convert
 
 MS = 1_000_000
 T_BODY_FIRST = small_bag.T_BODY_CAMERA

@@ -18,7 +18,7 @@ from support.tiny import TINY
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.replay.children import NodeProcesses
-from thermal_fiducial.ros import convert
+from thermal_fiducial.ros.messages import convert
 from thermal_fiducial.sim.thermal_camera import plan, START_NS
 
 

@@ -10,8 +10,8 @@ from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
 from thermal_fiducial.nodes.thermal_source import ThermalSource
-from thermal_fiducial.ros import convert
-from thermal_fiducial.ros.node import ERROR, OK
+from thermal_fiducial.ros.base.node import ERROR, OK
+from thermal_fiducial.ros.messages import convert
 
 pytestmark = pytest.mark.ros
 PICTURES = [np.random.default_rng(k).integers(6000, 9000, (48, 64), dtype=np.uint16) for k in range(40)]

@@ -21,7 +21,7 @@ PROGRAM = """
 import os, signal, sys
 from support.empty_stage import EmptyStage
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.process.run import run
 
 class Stage(EmptyStage):
     def __init__(self):

@@ -16,9 +16,10 @@ from thermal_fiducial.cli import watch as command
 from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.measurements import MARKER_DTYPE
 from thermal_fiducial.replay.domain import own_domain
-from thermal_fiducial.ros import clouds, convert, qos
-from thermal_fiducial.ros.live_status import Advice, LiveStatus, STAGES
-from thermal_fiducial.ros.watcher import watch
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.messages import clouds, convert
+from thermal_fiducial.ros.watching.live_status import Advice, LiveStatus, STAGES
+from thermal_fiducial.ros.watching.watcher import watch
 
 FIGURES = {'time offset': '0.0182', 'time offset std': '0.0004', 'usable for': '9.75', 'lost': 'False'}
 

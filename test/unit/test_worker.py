@@ -9,7 +9,7 @@ import pytest
 from support.tasks import work
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.ros.worker import Background, Foreground
+from thermal_fiducial.ros.process.worker import Background, Foreground
 
 
 def until(condition, seconds=20.0):

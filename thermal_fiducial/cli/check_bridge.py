@@ -14,7 +14,7 @@ from thermal_fiducial.report.bridge_record import BridgeRecord, BridgeRecorder, 
 from thermal_fiducial.report.landing_check import check_landing
 
 if TYPE_CHECKING:
-    from thermal_fiducial.ros.bridge_listener import Links
+    from thermal_fiducial.ros.watching.bridge_listener import Links
 
 _WIDTH = 118
 
@@ -69,7 +69,7 @@ def _listen(topic: str, seconds: float, ros_arguments: list[str]) -> 'tuple[Brid
     if not 0.0 < seconds < 3600.0:
         raise InputError(f'--seconds {seconds:g}: between 0 and 3600')
     try:
-        from thermal_fiducial.ros.bridge_listener import listen, Topics
+        from thermal_fiducial.ros.watching.bridge_listener import listen, Topics
     except ImportError as error:
         raise InputError(f'listening needs ROS 2 ({error.name} is missing); name a recording instead') from None
     recorder = BridgeRecorder(live=True)

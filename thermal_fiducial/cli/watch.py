@@ -8,7 +8,7 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.ros.live_status import Advice, LiveState, LiveStatus
+from thermal_fiducial.ros.watching.live_status import Advice, LiveState, LiveStatus
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     if not 0.0 < args.wait < 3600.0:
         raise InputError(f'--wait {args.wait:g}: between 0 and 3600')
     try:
-        from thermal_fiducial.ros.watcher import watch
+        from thermal_fiducial.ros.watching.watcher import watch
     except ImportError as error:
         raise InputError(f'watching needs ROS 2 ({error.name} is missing)') from None
     if args.once:

@@ -3,7 +3,6 @@
 import sys
 from typing import Any
 
-import cv2
 from geometry_msgs.msg import PoseArray
 import numpy as np
 from sensor_msgs.msg import Image, PointCloud2
@@ -12,17 +11,15 @@ from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.core.types import Counts, Gray
-from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.files.images import image_to_array
-from thermal_fiducial.ros import clouds, convert, display, message_bytes, qos
-from thermal_fiducial.ros.camera_node import CameraStageNode
-from thermal_fiducial.ros.detections import OtherDetections
-from thermal_fiducial.ros.node import OK, WARN
-from thermal_fiducial.ros.run import run
-
-#: Oldest version that the tests have run with, that of Ubuntu 24.04.
-_OPENCV = (4, 6)
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import OK, WARN
+from thermal_fiducial.ros.camera_nodes.camera_node import CameraStageNode
+from thermal_fiducial.ros.camera_nodes.detections import OtherDetections
+from thermal_fiducial.ros.camera_nodes.opencv import require_opencv
+from thermal_fiducial.ros.messages import clouds, convert, display, message_bytes
+from thermal_fiducial.ros.process.run import run
 
 
 class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
@@ -31,7 +28,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
     stage = 1
 
     def __init__(self, **kwargs: Any) -> None:
-        _require_opencv()
+        require_opencv()
         super().__init__('aruco_detector', ArucoDetectorConfig, **kwargs)
         self.detector = self.attempt(self._make_detector, None)
         self.view = EightBitView(Tau2CameraConfig())
@@ -80,15 +77,6 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         if left := self._images.left_since():
             return WARN, f'{self._seen} markers; {left} older images skipped'
         return OK, '1 marker' if self._seen == 1 else f'{self._seen} markers'
-
-
-def _require_opencv() -> None:
-    """Report an unusable OpenCV at the start, before a missing function fails in flight."""
-    if tuple(int(part) for part in cv2.__version__.split('.')[:2]) < _OPENCV:
-        needed = '.'.join(map(str, _OPENCV))
-        raise InputError(f'OpenCV {cv2.__version__}: {needed} or newer is needed')
-    if not hasattr(cv2, 'aruco'):
-        raise InputError(f'OpenCV {cv2.__version__} without aruco: take opencv-contrib-python-headless of that version')
 
 
 def main() -> int:

@@ -12,11 +12,12 @@ from thermal_fiducial.config import LandingTargetConfig
 from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
 from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.ros import clouds, convert, message_bytes, qos
-from thermal_fiducial.ros.landing_pad import for_mavros, pad_in_map
-from thermal_fiducial.ros.node import OK, StageNode, WARN
-from thermal_fiducial.ros.robot_frames import RobotFrames
-from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import OK, StageNode, WARN
+from thermal_fiducial.ros.frames.landing_pad import for_mavros, pad_in_map
+from thermal_fiducial.ros.frames.robot_frames import RobotFrames
+from thermal_fiducial.ros.messages import clouds, convert, message_bytes
+from thermal_fiducial.ros.process.run import run
 
 _WAITING = 10  # most frames waiting for their camera pose
 

@@ -8,12 +8,14 @@ from sensor_msgs.msg import PointCloud2
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.mapping.map_data import MapperResult
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.ros import clouds, map_status, qos
-from thermal_fiducial.ros.camera_node import CameraStageNode
-from thermal_fiducial.ros.camera_poses import CameraPoses
-from thermal_fiducial.ros.map_services import MapServices
-from thermal_fiducial.ros.map_topics import MapTopics
-from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.camera_nodes.camera_node import CameraStageNode
+from thermal_fiducial.ros.mapper_node import map_status
+from thermal_fiducial.ros.mapper_node.camera_poses import CameraPoses
+from thermal_fiducial.ros.mapper_node.map_services import MapServices
+from thermal_fiducial.ros.mapper_node.map_topics import MapTopics
+from thermal_fiducial.ros.messages import clouds
+from thermal_fiducial.ros.process.run import run
 
 
 class MarkerMapperNode(CameraStageNode[MarkerMapperConfig]):

@@ -9,15 +9,16 @@ from std_srvs.srv import Trigger
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.types import FloatArray
-from thermal_fiducial.ros import message_bytes, qos
-from thermal_fiducial.ros.filter_memory import FilterMemory
-from thermal_fiducial.ros.filter_outputs import FilterOutputs
-from thermal_fiducial.ros.filter_status import FilterStatus
-from thermal_fiducial.ros.imu_queue import ImuQueue
-from thermal_fiducial.ros.map_corrections import MapCorrections
-from thermal_fiducial.ros.node import StageNode
-from thermal_fiducial.ros.robot_frames import RobotFrames
-from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.filter_node.filter_memory import FilterMemory
+from thermal_fiducial.ros.filter_node.filter_outputs import FilterOutputs
+from thermal_fiducial.ros.filter_node.filter_status import FilterStatus
+from thermal_fiducial.ros.filter_node.imu_queue import ImuQueue
+from thermal_fiducial.ros.frames.robot_frames import RobotFrames
+from thermal_fiducial.ros.mapper_node.map_corrections import MapCorrections
+from thermal_fiducial.ros.messages import message_bytes
+from thermal_fiducial.ros.process.run import run
 
 
 class PoseEkfNode(StageNode[PoseEkfConfig]):

@@ -13,10 +13,11 @@ from thermal_fiducial.core.imaging.frame_cleaner import FrameCleaner
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.files.bad_pixel_list import load_bad_pixels
 from thermal_fiducial.files.images import image_to_array
-from thermal_fiducial.ros import convert, message_bytes, qos
-from thermal_fiducial.ros.calibration_output import CalibrationOutput
-from thermal_fiducial.ros.node import OK, StageNode, WARN
-from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import OK, StageNode, WARN
+from thermal_fiducial.ros.camera_nodes.calibration_output import CalibrationOutput
+from thermal_fiducial.ros.messages import convert, message_bytes
+from thermal_fiducial.ros.process.run import run
 
 
 class Tau2Camera(StageNode[Tau2CameraConfig]):

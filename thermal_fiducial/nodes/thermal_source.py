@@ -9,10 +9,11 @@ from thermal_fiducial.cameras.capture import Capture
 from thermal_fiducial.cameras.choice import make_source
 from thermal_fiducial.cameras.source import CapturedFrame
 from thermal_fiducial.config import ThermalSourceConfig
-from thermal_fiducial.ros import convert, qos
-from thermal_fiducial.ros.calibration_output import CalibrationOutput
-from thermal_fiducial.ros.node import ERROR, OK, StageNode
-from thermal_fiducial.ros.run import run
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import ERROR, OK, StageNode
+from thermal_fiducial.ros.camera_nodes.calibration_output import CalibrationOutput
+from thermal_fiducial.ros.messages import convert
+from thermal_fiducial.ros.process.run import run
 
 
 class ThermalSource(StageNode[ThermalSourceConfig]):

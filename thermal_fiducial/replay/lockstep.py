@@ -25,9 +25,9 @@ from thermal_fiducial.replay.job import ReplayJob
 from thermal_fiducial.replay.recorder import Recorder
 from thermal_fiducial.replay.topics import PLAYED
 from thermal_fiducial.replay.waiting import Wait
-from thermal_fiducial.ros.counting import CountingNode
-from thermal_fiducial.ros.node import StageNode
-from thermal_fiducial.ros.run import initialise, make_executor
+from thermal_fiducial.ros.base.counting import CountingNode
+from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.process.run import initialise, make_executor
 
 _KINDS: dict[str, type[StageNode[Any]]] = {
     'tau2_camera': Tau2Camera,

@@ -29,7 +29,7 @@ from thermal_fiducial.map_tools.map_building import build_map, Built
 from thermal_fiducial.replay.earlier_runs import refuse_other_folder
 from thermal_fiducial.replay.session import MAP_FILE, Options, replay
 from thermal_fiducial.replay.settings import read_settings, Settings
-from thermal_fiducial.ros import clouds, convert
+from thermal_fiducial.ros.messages import clouds, convert
 
 #: Written last; it and the map of an earlier batch are deleted before the first replay.
 SUMMARY_FILE = 'batch.json'

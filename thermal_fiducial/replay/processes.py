@@ -27,9 +27,9 @@ from thermal_fiducial.replay.latency import LatencyMeter
 from thermal_fiducial.replay.recorder import Recorder
 from thermal_fiducial.replay.topics import PLAYED
 from thermal_fiducial.replay.waiting import Wait
-from thermal_fiducial.ros.counting import CountingNode
-from thermal_fiducial.ros.promptness import prompt
-from thermal_fiducial.ros.run import initialise, make_executor
+from thermal_fiducial.ros.base.counting import CountingNode
+from thermal_fiducial.ros.process.promptness import prompt
+from thermal_fiducial.ros.process.run import initialise, make_executor
 
 #: Time for the nodes to match among themselves after both ends of each topic are in the graph [s].
 _MATCHING_S = 0.7

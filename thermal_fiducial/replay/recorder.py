@@ -22,8 +22,8 @@ from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.trajectory_file import tum_line
 from thermal_fiducial.files.writing import claim, is_claimed, unfinished, write_text
 from thermal_fiducial.replay.topics import Topics, type_name
-from thermal_fiducial.ros import clouds, convert
-from thermal_fiducial.ros.counting import CountingNode
+from thermal_fiducial.ros.base.counting import CountingNode
+from thermal_fiducial.ros.messages import clouds, convert
 
 _FUSED, _FIDUCIAL, _DETECTIONS = _TABLES = ('fused.tum', 'fiducial.tum', 'detections.csv')
 

@@ -21,7 +21,7 @@ from thermal_fiducial.files.bags import (
     MAP_ERROR_TOPIC,
     MARKERS_TOPIC,
 )
-from thermal_fiducial.ros import qos
+from thermal_fiducial.ros.base import qos
 
 Topics: TypeAlias = dict[str, tuple[type, Any]]
 

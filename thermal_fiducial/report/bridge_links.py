@@ -6,7 +6,7 @@ from thermal_fiducial.report.bridge_check import Finding, Level
 
 if TYPE_CHECKING:
     # Recordings are also checked without ROS.
-    from thermal_fiducial.ros.bridge_listener import Links
+    from thermal_fiducial.ros.watching.bridge_listener import Links
 
 
 def check_links(links: 'Links') -> list[Finding]:

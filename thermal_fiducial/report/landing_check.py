@@ -5,7 +5,7 @@ import numpy as np
 from thermal_fiducial.core.types import BoolArray, IntArray, SECOND_NS
 from thermal_fiducial.report.bridge_check import Finding, Level
 from thermal_fiducial.report.bridge_record import BridgeRecord, LandingRecord
-from thermal_fiducial.ros.landing_pad import from_mavros
+from thermal_fiducial.ros.frames.landing_pad import from_mavros
 
 #: ArduPilot needs a target once a second; both autopilots drop a target after some seconds without a message [s].
 LONGEST_GAP = 1.0

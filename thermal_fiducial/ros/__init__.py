@@ -1,1 +1,1 @@
-"""What every node shares: message <-> numpy, parameters, QoS, the run loop. See :mod:`thermal_fiducial.ros.node`."""
+"""What nodes are made of besides the core: messages, a base of all nodes, and the parts of each node."""

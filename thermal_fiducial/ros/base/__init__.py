@@ -1,0 +1,1 @@
+"""The base of all nodes: parameters, QoS, rates of inputs, diagnostics, console lines."""

@@ -1,0 +1,1 @@
+"""Parts of the nodes that have a camera: calibration, motion prior, detections for other packages."""

@@ -1,0 +1,99 @@
+"""Base of detector and mapper: the camera calibration, and the filter's odometry as a motion prior."""
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+from nav_msgs.msg import Odometry as OdometryMessage
+from sensor_msgs.msg import CameraInfo, TimeReference
+
+from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.measurements import Odometry
+from thermal_fiducial.core.motion_prior import MotionPrior
+from thermal_fiducial.core.types import Counts, Gray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.frames.robot_frames import RobotFrames
+from thermal_fiducial.ros.messages import convert, message_bytes
+
+Config = TypeVar('Config', bound=ArucoDetectorConfig | MarkerMapperConfig)
+
+
+class CameraStageNode(StageNode[Config]):
+    """A stage node that subscribes to ``thermal/camera_info`` (keeping the last valid one) and ``odometry``."""
+
+    def __init__(self, name: str, kind: type[Config], **kwargs: Any) -> None:
+        super().__init__(name, kind, **kwargs)
+        self._camera: Camera | None = None
+        self._camera_info = b''
+        self._calibrations = 0
+        #: the filter's latest states
+        self.odometry = MotionPrior(self.config.camera_time_offset, self._read_odometry)
+
+    def follow_hints(self) -> None:
+        """Subscribe to calibration and odometry; call it after subscribing to the node's main input."""
+        self.subscribe_lazily(CameraInfo, 'thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
+        self.subscribe_lazily(OdometryMessage, 'odometry', self._on_odometry, qos.IMU_INPUT)
+        RobotFrames(self)
+        self.subscribe_lazily(TimeReference, 'camera_clock', self._on_camera_clock, qos.RESULT)
+
+    def camera(self) -> Camera:
+        """The calibration.
+
+        Raises
+        ------
+        InputError
+            None has been received yet.
+        """
+        if self._camera is None:
+            raise InputError('no camera_info')
+        return self._camera
+
+    def camera_of(self, image: Counts | Gray) -> Camera:
+        """The calibration, which must have the size of ``image`` (H, W).
+
+        Raises
+        ------
+        InputError
+            None has been received yet, or it has another size.
+        """
+        camera = self.camera()
+        if image.shape != (camera.height, camera.width):
+            size = f'{image.shape[1]}x{image.shape[0]}'
+            raise InputError(f'image of {size}, camera_info of {camera.width}x{camera.height} pixels')
+        return camera
+
+    def figures(self) -> dict[str, object]:
+        """Number of different calibrations received."""
+        return {'calibrations': self._calibrations}
+
+    def _on_odometry(self, message: bytes) -> None:
+        """Keep odometry serialised: only the few states that a frame needs are decoded."""
+        self.odometry.add(message_bytes.stamp_ns(message), message)
+
+    def _read_odometry(self, messages: Sequence[bytes]) -> list[Odometry]:
+        """Decode odometry; invalid messages are refused, and the frame is processed without prior."""
+        try:
+            return message_bytes.odometry(messages)
+        except InputError as error:
+            if len(messages) > 1:
+                return [state for message in messages for state in self._read_odometry([message])]
+            self.refuse(str(error))
+            return []
+
+    def _on_camera_clock(self, message: bytes) -> None:
+        self.odometry.set_clock_offset(message_bytes.clock_offset(message))
+
+    def _on_camera_info(self, message: bytes) -> None:
+        """Validate a calibration if it differs from the last one; most drivers repeat it with each frame."""
+        if message[message_bytes.BEHIND_STAMP :] == self._camera_info:
+            return
+        camera = convert.camera(message_bytes.read(message, CameraInfo, 'camera_info'))
+        self._camera_info = message[message_bytes.BEHIND_STAMP :]
+        if self._camera is not None and camera.matches(self._camera):
+            return
+        self._camera = camera
+        self._calibrations += 1
+        if self._calibrations > 1:
+            self.get_logger().warning('camera_info has changed: the new calibration is used from here on')

@@ -1,0 +1,149 @@
+"""Extrinsics of camera and IMU on the robot: from TF, else from a URDF, else from the parameters."""
+
+from collections.abc import Callable
+import importlib
+import math
+from typing import Any
+
+import numpy as np
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
+from std_msgs.msg import String
+
+from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.frames.frame_tree import fixed_joints, FrameTree
+from thermal_fiducial.ros.messages import convert
+
+_PARAMETERS, _URDF, _TF = 'the parameters', 'robot_description', '/tf_static'
+#: Ascending precedence of the sources.
+_RANKS = (_PARAMETERS, _URDF, _TF)
+#: Wait for TF and URDF [s] before the parameters are reported as in use; both are latched and arrive within 1 s.
+_PATIENCE = 2.0
+#: Tolerance for equal poses, above the rounding of texts and quaternions [m, rad].
+_SAME = 1e-6
+#: Largest distance of the robot frame from the IMU [m]: the range of the parameter ``camera_position``.
+_FARTHEST = 10.0
+
+
+class RobotFrames:
+    """Subscribes to ``/tf_static`` and ``robot_description``; create it after the node's main input.
+
+    Parameters
+    ----------
+    node : its config has ``extrinsics``, ``base_frame``, ``camera_frame`` and the camera's pose
+    on_moved : called after the node was configured with another pose of the camera
+    """
+
+    def __init__(self, node: StageNode[Any], on_moved: Callable[[], None] | None = None) -> None:
+        self._node, self._on_moved = node, on_moved
+        self._trees = {_URDF: FrameTree(), _TF: FrameTree()}
+        self._imu_frame = ''
+        #: source of the camera's pose
+        self.source = _PARAMETERS
+        #: whether the wait for TF and URDF is over
+        self.decided = not node.live
+        #: pose (4, 4) of the robot frame in the IMU frame; None: they are identical
+        self.T_imu_base: FloatArray | None = None
+        if node.config.extrinsics == 'parameters':
+            self.decided = True
+            self._say()
+            return
+        node.subscribe(String, 'robot_description', self._on_description, qos.LATCHED)
+        try:
+            message = importlib.import_module('tf2_msgs.msg').TFMessage
+        except ImportError:
+            pass  # tf2_msgs is not installed: no TF
+        else:
+            node.subscribe(message, '/tf_static', self._on_static, qos.STATIC_TF)
+        if node.live:
+            clock = Clock(clock_type=ClockType.STEADY_TIME)
+            self._timer = node.create_timer(_PATIENCE, self._give_up, clock=clock)
+
+    @property
+    def parameters_hold(self) -> bool:
+        """Whether the wait is over and the parameters are the source."""
+        return self.decided and self.source == _PARAMETERS
+
+    def note_imu_frame(self, frame: str) -> None:
+        """Use the frame of an IMU message as the IMU frame, if TF or the URDF know it."""
+        if frame != self._imu_frame:
+            self._imu_frame = frame
+            self._look()
+
+    def _on_description(self, message: String) -> None:
+        prefix = self._node.frame_prefix
+        for parent, child, T_parent_child in fixed_joints(message.data):
+            self._trees[_URDF].add(prefix + parent, prefix + child, T_parent_child)
+        self._look()
+
+    def _on_static(self, message: Any) -> None:
+        for item in message.transforms:
+            T_parent_child = convert.transform_of_message(item, '/tf_static')
+            self._trees[_TF].add(item.header.frame_id, item.child_frame_id, T_parent_child)
+        self._look()
+
+    def _look(self) -> None:
+        """Adopt the pose of the best source; a later change by the same source is only reported."""
+        for source in (_TF, _URDF):
+            config, tree = self._node.config, self._trees[source]
+            T_imu_base = tree.between(self._imu_frame, config.base_frame)
+            if T_imu_base is not None and _same(T_imu_base, np.eye(4)):
+                T_imu_base = None
+            body = config.base_frame if T_imu_base is None else self._imu_frame
+            T_body_camera = tree.between(body, config.camera_frame)
+            if T_body_camera is None or _RANKS.index(source) < _RANKS.index(self.source):
+                continue
+            moved = not _same(T_body_camera, _in_force(config))
+            if source == self.source and moved and (T_imu_base is None) == (self.T_imu_base is None):
+                text = f'{source} has moved the camera on the robot: ignored until the node is restarted'
+                self._node.console.event('camera', text)
+                return
+            self._take(source, T_body_camera, T_imu_base, moved=moved)
+            return
+
+    def _take(self, source: str, T_body_camera: FloatArray, T_imu_base: FloatArray | None, *, moved: bool) -> None:
+        if T_imu_base is not None and not np.abs(T_imu_base[:3, 3]).max() < _FARTHEST:
+            raise InputError(f'{source} has the robot {np.abs(T_imu_base[:3, 3]).max():.3g} m from its IMU')
+        apart = inverse(_in_force(self._node.config)) @ T_body_camera
+        if moved:
+            orientation = quaternion_from_rotation(T_body_camera[:3, :3])
+            self._node.derive(
+                camera_position=tuple(T_body_camera[:3, 3].tolist()), camera_orientation=tuple(orientation.tolist())
+            )
+        new = source != self.source
+        self.source, self.T_imu_base = source, T_imu_base
+        if moved:
+            self._say(f', {np.linalg.norm(apart[:3, 3]):.3f} m and {_angle_deg(apart):.2f} deg from the previous pose')
+            self._node.configure(self._node.config)
+            if self._on_moved is not None:
+                self._on_moved()
+        elif new:
+            self._say()
+
+    def _give_up(self) -> None:
+        self._timer.cancel()
+        self.decided = True
+        if self.source == _PARAMETERS:
+            self._say()
+
+    def _say(self, remark: str = '') -> None:
+        config = self._node.config
+        frame = self._imu_frame if self.T_imu_base is not None else config.base_frame
+        line = f'camera on the robot ({config.camera_frame} in {frame}): from {self.source}{remark}'
+        self._node.get_logger().info(line)
+
+
+def _in_force(config: Any) -> FloatArray:
+    return transform_from_quaternion(config.camera_position, config.camera_orientation)
+
+
+def _same(T: FloatArray, other: FloatArray) -> bool:
+    return bool(np.allclose(T, other, rtol=0.0, atol=_SAME))
+
+
+def _angle_deg(T: FloatArray) -> float:
+    return math.degrees(2.0 * math.acos(min(abs(float(quaternion_from_rotation(T[:3, :3])[3])), 1.0)))

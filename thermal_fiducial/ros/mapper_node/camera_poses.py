@@ -1,0 +1,96 @@
+"""Output of the mapper: the camera pose of each frame, fused with that of a second camera if there is one."""
+
+from dataclasses import replace
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from sensor_msgs.msg import CameraInfo, PointCloud2
+
+from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.mapping.second_camera import SecondCamera
+from thermal_fiducial.core.measurements import CameraPose
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.camera_nodes.camera_node import CameraStageNode
+from thermal_fiducial.ros.mapper_node.map_corrections import LatePoses
+from thermal_fiducial.ros.messages import clouds, convert
+from thermal_fiducial.ros.messages.message_bytes import PoseBytes
+
+
+class CameraPoses:
+    """Publishes ``camera_pose``, and separately the part of its covariance that is due to the map's error.
+
+    A second camera (parameter ``second_camera``) is located in the map of ``mapper`` but never changes it: new
+    markers enter the map through the first camera only.
+    """
+
+    def __init__(self, node: CameraStageNode[MarkerMapperConfig], mapper: MarkerMapper) -> None:
+        self._node, self._mapper = node, mapper
+        #: transforms poses into the map as of their stamps
+        self.late = LatePoses()
+        self._output = node.advertise(PoseWithCovarianceStamped, 'camera_pose')
+        self._map_error = node.advertise(PoseWithCovarianceStamped, 'camera_pose/map_error')
+        self._bytes = PoseBytes(node.config.map_frame)
+        self._camera: Camera | None = None
+        self._second: SecondCamera | None = None
+        name = node.config.second_camera
+        self._locator = MarkerMapper(_of_second(node.config), mapper.map)
+        if name:
+            self.configure()
+            node.subscribe_newest(PointCloud2, f'{name}/markers', self._on_second, qos.RESULT, raw=True)
+            node.subscribe(CameraInfo, f'{name}/thermal/camera_info', self._on_camera_info, qos.CAMERA_INPUT)
+
+    def configure(self) -> None:
+        """Update the extrinsics of both cameras."""
+        config = self._node.config
+        self._locator.configure(_of_second(config))
+        if config.second_camera:
+            first = transform_from_quaternion(config.camera_position, config.camera_orientation)
+            second = transform_from_quaternion(config.second_camera_position, config.second_camera_orientation)
+            self._second = SecondCamera(first, second)
+
+    def send(self, stamp_ns: int, pose: CameraPose | None) -> None:
+        """Publish the pose of a frame of the first camera, if it has one, in the map as of its stamp."""
+        self.late.add(stamp_ns)
+        if pose is not None:
+            self._publish(pose if self._second is None else self._second.with_second(pose, self._node.odometry))
+
+    def _publish(self, pose: CameraPose) -> None:
+        pose = self.late.as_of_its_stamp(pose)
+        self._bytes.fill(pose.stamp_ns, pose.T_map_camera)
+        # Before the pose, so that a subscriber of both has the map's error when the pose arrives.
+        self._map_error.send(self._bytes.of(pose.map_covariance))
+        self._output.send(self._bytes.of(pose.covariance))
+
+    def _on_camera_info(self, message: CameraInfo) -> None:
+        self._camera = convert.camera(message)
+
+    def _on_second(self, message: bytes) -> None:
+        if self._camera is None:
+            raise InputError(f'no camera_info of {self._node.config.second_camera}')
+        self._locator.map = self._mapper.map
+        result = self._locator.process(*clouds.stamped_markers(message), self._camera, self._node.odometry)
+        if result.pose is not None and self._second is not None:
+            alone = self._second.add_second(result.pose)
+            if alone is not None:
+                self._publish(alone)
+
+    def figures(self) -> dict[str, object]:
+        """Counters of the second camera's poses."""
+        second = self._second
+        if second is None:
+            return {}
+        words = {'joined': second.joined, 'alone': second.alone, 'contradicted': second.contradicted}
+        return {f'second camera: {word}': count for word, count in words.items()}
+
+
+def _of_second(config: MarkerMapperConfig) -> MarkerMapperConfig:
+    """Parameters of the mapper that localizes the second camera in a frozen map."""
+    return replace(
+        config,
+        mode='localization',
+        camera_position=config.second_camera_position,
+        camera_orientation=config.second_camera_orientation,
+    )

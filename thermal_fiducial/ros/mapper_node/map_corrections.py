@@ -1,0 +1,94 @@
+"""Map corrections during the delay of poses, at the publisher and at the subscriber of ``camera_pose``."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
+import numpy as np
+
+from thermal_fiducial.core.error_model import positive
+from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.measurements import CameraPose, in_moved_map, LATEST_NS
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.base.counting import CountingNode
+from thermal_fiducial.ros.messages import convert, message_bytes
+
+#: Number of corrections and of map covariances kept.
+_REMEMBERED = 10
+
+
+class LatePoses:
+    """For the publisher: transforms poses of frames processed after a correction into the map as of their stamps."""
+
+    def __init__(self) -> None:
+        #: stamp of the newest frame so far
+        self.newest_ns = 0
+        self._moved_ns = 0
+        self._T_new_old: FloatArray = np.eye(4)
+
+    def add(self, stamp_ns: int) -> None:
+        """Log the stamp of a frame; a much older stamp means a backward clock jump."""
+        self.newest_ns = max(stamp_ns, self.newest_ns) if stamp_ns >= self.newest_ns - LATEST_NS else stamp_ns
+
+    def moved(self, T_new_old: FloatArray) -> None:
+        """Log that the map moved by ``T_new_old`` (4, 4) after the newest frame."""
+        self._moved_ns, self._T_new_old = self.newest_ns, T_new_old
+
+    def as_of_its_stamp(self, pose: CameraPose) -> CameraPose:
+        """``pose``, given in the present map, in the map as of its stamp."""
+        if 0 <= self._moved_ns - pose.stamp_ns <= LATEST_NS:
+            return in_moved_map(pose, inverse(self._T_new_old))
+        return pose
+
+
+class MapCorrections:
+    """For the subscriber: transforms poses into the present map and adds the covariance of the map's error.
+
+    ``window`` [s]: larger differences of stamps are due to another clock.
+    """
+
+    def __init__(self, window: float) -> None:
+        self._window_ns = window * SECOND_NS
+        self._corrections: deque[tuple[int, FloatArray]] = deque(maxlen=_REMEMBERED)
+        self._errors: deque[CameraPose] = deque(maxlen=_REMEMBERED)
+        #: the last map error received with a pose
+        self._error: CameraPose | None = None
+
+    def follow(self, node: CountingNode, on_moved: Callable[[FloatArray], None]) -> None:
+        """Subscribe to errors and corrections of the map; ``on_moved`` is called with T_new_old (4, 4) of each."""
+
+        def on_error(message: bytes) -> None:
+            self.note_error(message_bytes.map_error(message))
+
+        def on_correction(message: TransformStamped) -> None:
+            stamp_ns, T_new_old = convert.correction_of(message)
+            self.add(stamp_ns, T_new_old)
+            on_moved(T_new_old)
+
+        node.subscribe_lazily(PoseWithCovarianceStamped, 'camera_pose/map_error', on_error, qos.RESULT)
+        node.subscribe(TransformStamped, 'map_correction', on_correction, qos.RESULT)
+
+    def add(self, stamp_ns: int, T_new_old: FloatArray) -> None:
+        """Log that the map moved by ``T_new_old`` (4, 4) after the frame of ``stamp_ns``."""
+        self._corrections.append((stamp_ns, T_new_old))
+
+    def note_error(self, error: CameraPose) -> None:
+        """Log the map's error at a pose (the covariance of ``error``)."""
+        self._errors.append(error)
+
+    def in_present_map(self, pose: CameraPose) -> CameraPose:
+        """``pose``, given in the map as of its stamp, in the present map, with the covariance of the map's error."""
+        self._error = next((error for error in self._errors if error.stamp_ns == pose.stamp_ns), self._error)
+        error = self._error
+        if error is not None and abs(pose.stamp_ns - error.stamp_ns) <= self._window_ns:
+            # The map's error changes slowly, so the last one is used, limited to what the pose's covariance contains.
+            of_map, relative = error.covariance, pose.covariance - error.covariance
+            if np.linalg.eigvalsh(relative)[0] < 0.0:
+                of_map = pose.covariance - positive(relative)
+            pose = replace(pose, map_covariance=of_map)
+        for stamp_ns, T_new_old in self._corrections:
+            if 0 <= stamp_ns - pose.stamp_ns <= self._window_ns:
+                pose = in_moved_map(pose, T_new_old)
+        return pose

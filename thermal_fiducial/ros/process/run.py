@@ -1,0 +1,166 @@
+"""The run loop of all nodes."""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+import os
+from pathlib import Path
+import sys
+from typing import Any
+
+import rclpy
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import ok, remove_ros_args, try_shutdown
+
+from thermal_fiducial.errors import InputError
+from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.process.litter import remove_litter
+from thermal_fiducial.ros.process.promptness import keep_for_good, take_priority
+from thermal_fiducial.ros.process.stopping import limit_the_end, release_the_end, StopSignals
+from thermal_fiducial.ros.process.unblocked import drop_what_does_not_fit, say_last
+
+PROFILE = Path(__file__).with_name('fastdds.xml')
+#: Environment variables of Fast DDS 2 (Jazzy) and Fast DDS 3.
+_PROFILE_VARIABLES = ('FASTRTPS_DEFAULT_PROFILES_FILE', 'FASTDDS_DEFAULT_PROFILES_FILE')
+
+
+def use_transport_profile() -> None:
+    """Let Fast DDS send images through shared memory, unless the user has a profile; call before ``rclpy.init``."""
+    if not any(os.environ.get(name) for name in _PROFILE_VARIABLES):
+        os.environ.update(dict.fromkeys(_PROFILE_VARIABLES, str(PROFILE)))
+
+
+def make_executor(context: Context | None = None) -> Any:
+    """EventsExecutor (22 us a callback) if this rclpy has it, else SingleThreadedExecutor (96 us).
+
+    Never the MultiThreadedExecutor: it loses two thirds of a 200 Hz stream.
+    """
+    try:
+        from rclpy.experimental.events_executor import EventsExecutor
+    except ImportError:
+        return SingleThreadedExecutor(context=context)
+    return EventsExecutor(context=context)
+
+
+def initialise(
+    args: Sequence[str] | None,
+    context: Context | None = None,
+    domain_id: int | None = None,
+    signals: SignalHandlerOptions | None = None,
+) -> None:
+    """``rclpy.init`` that raises :class:`InputError` for bad arguments or parameter files.
+
+    Raises
+    ------
+    InputError
+        Arguments or a parameter file that ROS cannot read.
+    """
+    use_transport_profile()
+    try:
+        rclpy.init(
+            args=None if args is None else list(args),
+            context=context,
+            domain_id=domain_id,
+            signal_handler_options=signals,
+        )
+    except RuntimeError as error:
+        if _is_secured() and not os.environ.get('ROS_SECURITY_KEYSTORE'):
+            raise InputError('ROS_SECURITY_ENABLE is true, and ROS_SECURITY_KEYSTORE is not set') from None
+        raise InputError(_first_line(error)) from None
+
+
+def _is_secured() -> bool:
+    return os.environ.get('ROS_SECURITY_ENABLE', '') == 'true'
+
+
+def _first_line(error: RuntimeError) -> str:
+    """The message of rcl, without its source line."""
+    return str(error).splitlines()[0].removeprefix('failed to initialize rcl: ').partition(', at /')[0]
+
+
+def run(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None = None) -> int:
+    """Run a node until it is asked to stop; one that DDS has left deaf is started again in place of this process.
+
+    Parameters
+    ----------
+    make_node : constructor of the node
+    args : ROS arguments; default: the command line
+
+    Returns
+    -------
+    Exit status: 0 stopped, 2 unusable arguments or parameters, or a map that cannot be saved (one line says which).
+    """
+    drop_what_does_not_fit()
+    stop = StopSignals(try_shutdown)
+    try:
+        if _make_and_spin(make_node, args, stop):
+            _start_again()
+    except InputError as error:
+        say_last(f'{Path(sys.argv[0]).name}: {error}')
+        return 2
+    finally:
+        stop.ignore()
+    return 0
+
+
+def _start_again() -> None:
+    """Replace this process: nobody else would do it for ``ros2 run``, and launch would wait for a second."""
+    release_the_end()
+    os.execv(sys.executable, sys.orig_argv)
+
+
+def _make_and_spin(make_node: Callable[[], StageNode[Any]], args: Sequence[str] | None, stop: StopSignals) -> bool:
+    """Run a node to its orderly end; whether it is to be started again."""
+    # Saving comes first in the shutdown, before steps that may fail or hang.
+    with ExitStack() as ending:
+        ending.callback(try_shutdown)
+        try:
+            remove_litter()
+            initialise(args, signals=SignalHandlerOptions.NO)
+            _refuse_others(args)
+            node = _made(make_node)
+            ending.callback(node.destroy_node)
+            executor = make_executor()
+            ending.callback(executor.shutdown)
+            ending.push(limit_the_end)
+            ending.callback(node.close)
+            executor.add_node(node)
+            _spin(node, executor, stop)
+            return bool(node.deaf) and not stop.asked
+        except InputError:
+            raise
+        except ExternalShutdownException:
+            pass
+        except Exception:
+            # A stop request during construction makes rcl fail: not an error of the node.
+            if ok() and not stop.asked:
+                raise
+            limit_the_end()
+    return False
+
+
+def _made(make_node: Callable[[], StageNode[Any]]) -> StageNode[Any]:
+    """The node; InputError if SROS2 denies it, so that it is not restarted."""
+    try:
+        return make_node()
+    except RuntimeError as error:
+        if _is_secured() and ok():
+            raise InputError(f'ROS_SECURITY_ENABLE is true: {_first_line(error)}') from None
+        raise
+
+
+def _refuse_others(args: Sequence[str] | None) -> None:
+    """Refuse arguments that ROS would ignore silently, such as all after a mistyped ``--ros-args``."""
+    others = remove_ros_args(sys.argv)[1:] if args is None else remove_ros_args(list(args))
+    if others:
+        raise InputError(f'argument {others[0]}: a node has none but those behind --ros-args')
+
+
+def _spin(node: StageNode[Any], executor: Any, stop: StopSignals) -> None:
+    keep_for_good()
+    if node.realtime_priority and not take_priority(node.realtime_priority):
+        node.get_logger().info('no real-time priority: this user may not')
+    # EventsExecutor.spin() and spin_once(None) run no callbacks on some builds.
+    while ok() and not (stop.asked or node.deaf):
+        executor.spin_once(timeout_sec=1.0)

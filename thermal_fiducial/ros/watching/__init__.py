@@ -1,0 +1,1 @@
+"""What watches running nodes: their topics and diagnostics, the outputs for an autopilot."""

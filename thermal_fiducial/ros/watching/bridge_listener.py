@@ -1,0 +1,151 @@
+"""Subscribes to the outputs for a flight controller, on the remapped topics of the running filter."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, replace
+import time
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.context import Context
+from rclpy.node import Node
+from sensor_msgs.msg import Imu
+
+from thermal_fiducial.ros.base import qos
+from thermal_fiducial.ros.process.run import initialise, make_executor
+
+_FILTER, _LANDING = 'pose_ekf', 'landing_target'
+_ODOMETRY, _IMU, _POSE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu', 'geometry_msgs/msg/PoseStamped'
+#: Message type for PX4 over uXRCE-DDS.
+PX4_KIND = 'px4_msgs/msg/VehicleOdometry'
+#: Odometry topics of the filter that are not for a flight controller.
+_NOT_FOR_IT = ('odometry', 'odometry_smooth')
+#: Timeout of the search for a filter [s].
+DISCOVERY_S = 5.0
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Resolved topic names."""
+
+    odometry: str
+    imu: str
+    landing: str
+    #: topic for the autopilot: px4_msgs/VehicleOdometry for PX4 over uXRCE-DDS, else the same as ``odometry``
+    autopilot: str
+    #: name of the publishing node
+    sender: str
+
+
+@dataclass(frozen=True)
+class Links:
+    """Publishers and subscribers of the autopilot's topic, and the filter's last diagnostic."""
+
+    topic: str
+    #: publishers of the odometry, and subscribers of the autopilot's topic without this node
+    senders: int
+    receivers: int
+    #: message of the filter's diagnostic if it is an error, else empty
+    complaint: str
+
+
+def listen(
+    seconds: float,
+    on_odometry: Callable[[Any, int], None],
+    on_imu: Callable[[Any], None],
+    on_landing_target: Callable[[Any], None],
+    *,
+    topic: str = '',
+    announce: Callable[[Topics], None] = lambda topics: None,
+    ros_arguments: Sequence[str] = (),
+    domain_id: int | None = None,
+) -> Links:
+    """Pass odometry (with its arrival time [ns]), IMU messages and landing targets to callbacks for ``seconds``.
+
+    Parameters
+    ----------
+    topic : odometry to subscribe to; empty: the running filter's output for a flight controller, remapped or not
+    announce : called with the topics once they are resolved
+    ros_arguments : as after ``--ros-args``
+    """
+    context = Context()
+    initialise(['--ros-args', *ros_arguments], context, domain_id)
+    executor = make_executor(context)
+    node = Node('check_bridge', context=context)
+    try:
+        executor.add_node(node)
+        topics = Topics(*map(node.resolve_topic_name, astuple(_find(node, executor, topic))))
+        announce(topics)
+        node.create_subscription(
+            Odometry, topics.odometry, lambda message: on_odometry(message, time.time_ns()), qos.IMU_INPUT
+        )
+        node.create_subscription(Imu, topics.imu, on_imu, qos.IMU_INPUT)
+        node.create_subscription(PoseStamped, topics.landing, on_landing_target, qos.RESULT)
+        said: dict[str, DiagnosticStatus] = {}
+        node.create_subscription(DiagnosticArray, '/diagnostics', lambda array: _note(array, said), qos.RESULT)
+        _spin(executor, seconds, lambda: False)
+        return _links(node, topics, said)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        context.try_shutdown()
+
+
+def _find(node: Node, executor: Any, topic: str) -> Topics:
+    """Topics of the filter in the graph; the default names if there is none."""
+    found: list[Topics] = []
+
+    def look() -> bool:
+        for name, namespace in node.get_node_names_and_namespaces():
+            if name == _FILTER and (topics := _topics_of_filter(node, namespace)) is not None:
+                found.append(topics)
+        return bool(found)
+
+    _spin(executor, DISCOVERY_S, look)
+    ours = 'bridge/odometry'
+    topics = found[0] if found else Topics(ours, 'imu/data', _LANDING, ours, _FILTER)
+    topics = replace(topics, landing=_landing_topic(node) or topics.landing)
+    return replace(topics, odometry=topic, autopilot=topic) if topic else topics
+
+
+def _topics_of_filter(node: Node, namespace: str) -> Topics | None:
+    published = node.get_publisher_names_and_types_by_node(_FILTER, namespace)
+    subscribed = node.get_subscriber_names_and_types_by_node(_FILTER, namespace)
+    odometry = sorted(name for name, kinds in published if _ODOMETRY in kinds)
+    imu = [name for name, kinds in subscribed if _IMU in kinds]
+    if not (odometry and imu):
+        return None
+    base = namespace.rstrip('/')
+    bridge = [name for name in odometry if name not in {f'{base}/{own}' for own in _NOT_FOR_IT}]
+    sent = (bridge or odometry)[0]
+    px4 = [name for name, kinds in published if PX4_KIND in kinds]
+    return Topics(sent, imu[0], f'{base}/{_LANDING}', (px4 or [sent])[0], f'{base}/{_FILTER}')
+
+
+def _landing_topic(node: Node) -> str:
+    """Remapped topic of the node landing_target; empty if it does not run."""
+    for name, namespace in node.get_node_names_and_namespaces():
+        if name == _LANDING:
+            published = node.get_publisher_names_and_types_by_node(name, namespace)
+            return next((topic for topic, kinds in published if _POSE in kinds), '')
+    return ''
+
+
+def _note(array: DiagnosticArray, said: dict[str, DiagnosticStatus]) -> None:
+    said.update({status.name: status for status in array.status})
+
+
+def _links(node: Node, topics: Topics, said: dict[str, DiagnosticStatus]) -> Links:
+    receivers = node.count_subscribers(topics.autopilot)
+    if topics.autopilot == topics.odometry:
+        receivers -= 1
+    status = said.get(topics.sender.lstrip('/'), DiagnosticStatus())
+    complaint = status.message if status.level == DiagnosticStatus.ERROR else ''
+    return Links(topics.autopilot, node.count_publishers(topics.odometry), receivers, complaint)
+
+
+def _spin(executor: Any, seconds: float, done: Callable[[], bool]) -> None:
+    end = time.monotonic() + seconds
+    while not done() and (left := end - time.monotonic()) > 0.0:
+        executor.spin_once(timeout_sec=min(left, 0.1))
