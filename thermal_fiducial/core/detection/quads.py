@@ -17,7 +17,7 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 _LOCAL = 17
 # Odd width of the median filter that removes specks.
 _SPECKS = 3
-# Half-resolution pixels along a row over which columns are compared.
+# Columns among which one is compared with their mean.
 _COLUMNS = 9
 # In a picture for a display: odd width of the surroundings, no wider than the white around the smallest markers; least
 # difference of a dark pixel from their mean [gray levels] and [standard deviations of the noise].
@@ -45,16 +45,18 @@ def halfway(places: FloatArray) -> FloatArray:
 
 
 def without_columns(counts: Float32Array, noise: float) -> Float32Array:
-    """``counts`` without the fixed-pattern offsets of its columns.
+    """``counts`` without the fixed-pattern offsets of its columns from their neighbours.
 
-    An offset is the mean difference of a column's pixels from neighbouring columns, clipped at the noise so that the
-    scene has little influence.
+    The steps from column to column, clipped at their noise so that the scene has little influence, add up to the
+    pattern. Of their sum, only what differs between neighbouring columns is certain.
     """
-    deviation = np.asarray(cv2.blur(counts, (_COLUMNS, 1)))
-    np.subtract(counts, deviation, out=deviation)
-    np.clip(deviation, -noise, noise, out=deviation)
-    offsets = np.float32(_CLIPPED) * cv2.reduce(deviation, 0, cv2.REDUCE_AVG)
-    return np.asarray(np.subtract(counts, offsets, out=deviation))
+    steps = cv2.subtract(counts[:, 1:], counts[:, :-1])
+    limit = np.float32(math.sqrt(2.0) * noise)
+    np.clip(steps, -limit, limit, out=steps)
+    offsets = np.zeros((1, counts.shape[1]), dtype=np.float32)
+    np.cumsum(_CLIPPED * cv2.reduce(steps, 0, cv2.REDUCE_AVG)[0], out=offsets[0, 1:])
+    offsets -= cv2.blur(offsets, (_COLUMNS, 1))
+    return np.subtract(counts, offsets)
 
 
 class Scale(NamedTuple):
