@@ -15,6 +15,8 @@ import numpy as np
 from support.filter_scenes import Figures, SCENES
 from support.taken_out import ablation_row, lines_of
 
+from thermal_fiducial.config import PoseEkfConfig
+from thermal_fiducial.core.filter.pose_noise import WHITE
 from thermal_fiducial.core.filter.update import body_pose
 
 FILTER = 'thermal_fiducial.core.filter'
@@ -52,13 +54,6 @@ def _first(value: Any) -> Callable[..., Any]:
     return lambda self, given, *_: given if value is None else value
 
 
-def _exactly_linear(self: Any, prior: Any, motion: Any, moved: Any, H: Any, R: Any) -> None:
-    """Without the second order of the clock offset."""
-    twist = moved[np.r_[0:3, 6:9]]
-    R += prior.pose_noise.jitter.value * np.outer(twist, twist)
-    H[:, 35] = twist
-
-
 def _with_the_map(pose: Any, T_body_camera: Any, scale: float) -> Any:
     """The map's error as one that changes with the view."""
     return body_pose(replace(pose, map_covariance=np.zeros((6, 6))), T_body_camera, scale)
@@ -66,7 +61,9 @@ def _with_the_map(pose: Any, T_body_camera: Any, scale: float) -> Any:
 
 MECHANISMS = {
     'systematic error of poses': Mechanism(('lasting errors',), changes={'systematic_pose_std': 0.01}),
-    'error of the map apart': Mechanism(('map in the making',), off={'hypotheses:body_pose': _with_the_map}),
+    'error of the map apart': Mechanism(
+        ('map in the making',), off={'hypotheses:body_pose': _with_the_map, 'history:body_pose': _with_the_map}
+    ),
     'change of the error of the map': Mechanism(
         ('map in the making',),
         ('pose_noise:BodyPose.map_change',),
@@ -74,18 +71,14 @@ MECHANISMS = {
     ),
     'size of white errors is learned': Mechanism(
         ('noise of poses', 'lasting errors'),
-        ('pose_noise:PoseNoise.weighed',),
-        {'pose_noise:PoseNoise.weighed': lambda self, *_: self},
+        off={'pose_noise:_WHITE_RANGE': (WHITE, WHITE)},
     ),
-    'jitter of stamps': Mechanism(('jittering',), ('pose_noise:PoseNoise.with_stamps',), changes={'stamp_jitter': 0.0}),
+    'jitter of stamps': Mechanism(('jittering',), changes={'stamp_jitter': 0.0}),
     'jitter is learned': Mechanism(
         ('jittering',),
-        ('pose_noise:PoseNoise.with_stamps',),
-        {'pose_noise:PoseNoise.with_stamps': lambda self, *_: self},
+        off={'pose_noise:_JITTER_RANGE': (PoseEkfConfig().stamp_jitter ** 2,) * 2},
     ),
-    'vibration of the mount': Mechanism(
-        ('shaking mount',), ('pose_noise:PoseNoise.with_vibration', 'update:by_mount'), changes={'mount_vibration': 0.0}
-    ),
+    'vibration of the mount': Mechanism(('shaking mount',), ('update:by_mount',), changes={'mount_vibration': 0.0}),
     'scale of the gyroscope': Mechanism(('scale errors',), changes={'gyroscope_scale_std': 0.0}),
     'scale of the accelerometer': Mechanism(('scale errors',), changes={'accelerometer_scale_std': 0.0}),
     'floor of the vibration': Mechanism(('shaken',), ('imu_noise:NoiseFloor',), changes={'vibration': 0.0}),
@@ -105,12 +98,12 @@ MECHANISMS = {
         ('slow and noisy', 'unknown clock at start'), changes={'estimate_time_offset': False, 'time_offset_std': 0.0}
     ),
     'second order of the clock offset': Mechanism(
-        ('unknown clock at start', 'slow and noisy'), off={'update:PoseUpdater._add_clock': _exactly_linear}
+        ('unknown clock at start', 'slow and noisy'), off={'update:_second_order_of_clock': lambda *_: 0.0}
     ),
     'covariance in the clock of the IMU': Mechanism(
         ('slow and noisy', 'unknown clock at start'),
-        ('update:PoseUpdater._in_clock_of_imu',),
-        {'update:PoseUpdater._in_clock_of_imu': _first(None)},
+        ('update:_in_clock_of_imu',),
+        {'update:_in_clock_of_imu': lambda _, covariance, *__: covariance},
     ),
     'errors in variables': Mechanism(('slow and noisy',), off={'update:_FEIGNED': 0.0}),
     'motion at a pose from 0.1 s': Mechanism(('slow and noisy',), off={'imu_buffer:_MOTION_SECONDS': 0.0}),

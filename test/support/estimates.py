@@ -11,7 +11,7 @@ from thermal_fiducial.core.filter.state import Estimate, SIZE
 from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian_inverse, so3_log, transform
 
 #: Far from everything: its systematic error is another one.
-ELSEWHERE = BodyPose(0, transform(np.eye(3), [1e3, 0.0, 0.0]), 1e-4 * np.eye(6))
+ELSEWHERE = BodyPose(transform(np.eye(3), [1e3, 0.0, 0.0]), 1e-4 * np.eye(6))
 
 
 def difference(state, other):
@@ -48,4 +48,4 @@ def any_estimate():
         bias=0.01 * rng.normal(size=6),
         scale=0.01 * rng.normal(size=(2, 3, 3)),
     )
-    return Estimate(1_000, state, A @ A.T, pose_noise=PoseNoise(1.0, ELSEWHERE))
+    return Estimate(1_000, state, A @ A.T, pose_noise=PoseNoise.of(ELSEWHERE))

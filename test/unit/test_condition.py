@@ -13,7 +13,6 @@ from thermal_fiducial.core.filter.condition import (
     WAITING,
 )
 from thermal_fiducial.core.filter.history import History
-from thermal_fiducial.core.filter.hypotheses import Hypotheses
 
 CONFIG = config(initial_poses=3)
 RATE = 200
@@ -21,7 +20,7 @@ RATE = 200
 
 def history(until, poses, *, seconds=4.0, force=1.0):
     """History after ``until`` [s] of a hovering robot: samples, forces times ``force``, and some of its poses."""
-    flight, kept = Flight(seed=1, seconds=seconds, motion=Motion.still()), History(Hypotheses(CONFIG), 2.0, 0.0)
+    flight, kept = Flight(seed=1, seconds=seconds, motion=Motion.still()), History(CONFIG, 0.0)
     for sample in flight.samples()[: round(until * RATE)]:
         imu = np.concatenate((sample.angular_velocity, force * sample.linear_acceleration))
         kept.imu.append(sample.stamp_ns, imu, np.repeat((1.7e-4, 2e-3), 3))

@@ -4,13 +4,12 @@ import numpy as np
 from support.flights import config, Flight
 
 from thermal_fiducial.core.filter.history import History
-from thermal_fiducial.core.filter.hypotheses import Hypotheses
+from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
 
 
 def test_a_start_without_further_poses_keeps_no_more_than_a_flight_does():
     """One marker in passing, then none for long: samples must not gather until the next comes."""
-    flight, kept = Flight(seed=1, seconds=8.0, imu_rate=50.0), 0.5
-    history = History(Hypotheses(config()), kept, 0.0)
+    flight, history = Flight(seed=1, seconds=8.0, imu_rate=50.0), History(config(max_delay=0.0), 0.0)
     pose = flight.poses[10]
     for sample in flight.samples():
         imu = np.concatenate((sample.angular_velocity, sample.linear_acceleration))
@@ -20,4 +19,4 @@ def test_a_start_without_further_poses_keeps_no_more_than_a_flight_does():
         history.take_in()
     assert history.belief.alternative is not None
     # Blocks of twice what is kept, and a sample.
-    assert len(history.imu) <= 2 * kept * 50 + 2
+    assert len(history.imu) <= 2 * WINDOW_SECONDS * 50 + 2

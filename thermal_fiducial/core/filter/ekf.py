@@ -11,10 +11,9 @@ from thermal_fiducial.core.filter.belief import Hypothesis
 from thermal_fiducial.core.filter.camera_clock import CameraClock, FrameGrid, SMALLEST_STEP_NS
 from thermal_fiducial.core.filter.condition import coasting_seconds, condition_of
 from thermal_fiducial.core.filter.history import History
-from thermal_fiducial.core.filter.hypotheses import Hypotheses, KNOWN_OFFSET_STD
+from thermal_fiducial.core.filter.hypotheses import is_of_unknown_clock, KNOWN_OFFSET_STD
 from thermal_fiducial.core.filter.imu_input import CLOCK_EVIDENCE, ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
-from thermal_fiducial.core.filter.initialization import WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.output import odometry
 from thermal_fiducial.core.filter.propagation import usable_seconds
@@ -41,13 +40,11 @@ class PoseEkf:
 
     def configure(self, config: PoseEkfConfig) -> None:
         """Take over the dynamic parameters of ``config``."""
-        self._config = config
-        self._hypotheses.configure(config)
+        self._config = self._history.config = config
 
     def reset(self, reason: str = 'on request') -> None:
         """Discard the estimate and all samples and poses; the diagnostics give the ``reason``."""
         config, self._restart_reason = self._config, reason
-        self._hypotheses = Hypotheses(config)
         self._imu_refused = self._refused_in_row = 0
         self._input = ImuInput(config.max_imu_gap, config.imu.gyroscope_range, config.imu.accelerometer_range)
         self._camera_clock, self._frame_grid = CameraClock(), FrameGrid()
@@ -58,7 +55,7 @@ class PoseEkf:
         #: prior of the clock offset t_imu - t_camera [s]
         self._first_offset = camera_time_offset
         self._noise = ImuNoiseMonitor(config.imu)
-        self._history = History(self._hypotheses, config.max_delay + WINDOW_SECONDS, camera_time_offset)
+        self._history = History(config, camera_time_offset)
         #: on the last IMU sample
         self._verdict = Verdict.USE
 
@@ -158,8 +155,8 @@ class PoseEkf:
 
     def _fits(self, pose: CameraPose) -> bool:
         """Whether a pose passes the gate if the clock offset is taken for unknown."""
-        found = self._history.main_at(pose)
-        return found is not None and self._hypotheses.explains(found[0], pose, found[1])
+        innovation = self._history.compared(pose)
+        return innovation is not None and is_of_unknown_clock(self._config, innovation)
 
     def move_map(self, T_new_old: FloatArray) -> None:
         """Apply a correction of the map to estimates and buffered poses: T_new = T_new_old @ T_old."""
@@ -289,7 +286,7 @@ class PoseEkf:
             'usable for': self.usable_for,
             'time offset': self._clock_offset(main),
             'time offset std': self._time_offset_std(main),
-            'white pose error': math.sqrt(noise.white),
+            'white pose error': math.sqrt(noise.white.value),
             'stamp jitter': math.sqrt(noise.jitter.value),
             'mount vibration': math.sqrt(noise.vibration.value),
             'gyroscope bias': float(np.linalg.norm(state.bias[:3])),

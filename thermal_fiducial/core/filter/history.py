@@ -1,7 +1,7 @@
 """Samples, poses and the belief after each pose; late poses are inserted at their stamp, and later ones re-applied.
 
 The belief after a pose depends on the samples and poses up to that instant, in the order of their stamps, not of their
-arrival. The exception is :class:`MotionAtPose`, which also averages the few samples after the pose that have arrived.
+arrival. The exception is ``MotionAtPose``, which also averages the few samples after the pose that have arrived.
 """
 
 from bisect import bisect_left, bisect_right, insort
@@ -9,13 +9,20 @@ from collections.abc import Iterable
 import math
 from operator import attrgetter
 
+from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis
-from thermal_fiducial.core.filter.hypotheses import Hypotheses
+from thermal_fiducial.core.filter.hypotheses import (
+    alternative_to,
+    contradiction,
+    first_hypothesis,
+    relinearises,
+    weigh,
+)
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import no_gravity, WINDOW_SECONDS
 from thermal_fiducial.core.filter.innovations import PoseLog, PoseUpdate
-from thermal_fiducial.core.filter.propagation import propagated
-from thermal_fiducial.core.filter.update import MotionAtPose, with_camera_step, with_clock_step
+from thermal_fiducial.core.filter.propagation import propagated, random_walks
+from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
@@ -32,13 +39,15 @@ class History:
 
     Parameters
     ----------
-    seconds : how long samples and poses are kept [s]
     camera_time_offset : prior of the clock offset t_imu - t_camera [s]
     """
 
-    def __init__(self, hypotheses: Hypotheses, seconds: float, camera_time_offset: float) -> None:
-        self._hypotheses = hypotheses
-        self._kept_ns, self._offset_ns = round(seconds * SECOND_NS), round(camera_time_offset * SECOND_NS)
+    def __init__(self, config: PoseEkfConfig, camera_time_offset: float) -> None:
+        #: dynamic parameters may change
+        self.config = config
+        self._walks = random_walks(config)
+        self._kept_ns = round((config.max_delay + WINDOW_SECONDS) * SECOND_NS)
+        self._offset_ns = round(camera_time_offset * SECOND_NS)
         self.imu, self.log = ImuBuffer(), PoseLog()
         self._poses: list[CameraPose] = []
         self._beliefs = [Belief()]
@@ -61,10 +70,11 @@ class History:
             return hypothesis
         for begin_ns, std in self._imu_steps:
             if estimate.stamp_ns <= begin_ns < until_ns:
-                estimate = with_clock_step(self.carried(hypothesis, begin_ns).estimate, self.imu.at(begin_ns), std)
+                before = self.carried(hypothesis, begin_ns).estimate
+                estimate = before.after_imu_step(self.imu.at(begin_ns), std)
                 hypothesis = hypothesis._replace(estimate=estimate)
         steps = self.imu.steps(estimate.stamp_ns, until_ns)
-        return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self._hypotheses.random_walks))
+        return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self._walks))
 
     def suspect_clock_step(self, size_ns: int) -> None:
         """Count with a step of the IMU's clock by ``size_ns`` after the newest sample; or samples are lost there."""
@@ -134,12 +144,12 @@ class History:
         """Instant of a pose that begins an initialisation."""
         return self.due_ns(pose, None) + round(belief.first_offset * SECOND_NS)
 
-    def main_at(self, pose: CameraPose) -> tuple[Hypothesis, MotionAtPose] | None:
-        """The estimate and the motion at the instant of a pose, which is only compared with them."""
+    def compared(self, pose: CameraPose) -> Innovation | None:
+        """Innovation of a pose that is not inserted, against the estimate at its instant; None without one."""
         for belief in reversed(self._beliefs):
             time_ns = min(self.due_ns(pose, belief.main), self.imu.newest_ns)
             if belief.main and belief.main.estimate.stamp_ns <= time_ns:
-                return self._at(belief.main, pose)
+                return self._innovation(belief.main, pose)
         return None
 
     def move_map(self, T_new_old: FloatArray) -> None:
@@ -174,7 +184,7 @@ class History:
         if before.main or belief.main is None or before.first_offset:
             return False
         forgotten = all(old.hypotheses for old in self._beliefs)
-        if forgotten or not self._hypotheses.relinearises(belief.main, before.first_offset):
+        if forgotten or not relinearises(belief.main, before.first_offset):
             return False
         while self.belief.hypotheses:
             self._forget_belief()
@@ -207,20 +217,18 @@ class History:
         if not belief.hypotheses:
             return self._begun(belief, pose)
         update = PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)
-        refused = None
-        if belief.main:
-            at_pose, motion = self._at(belief.main, pose)
-            main, update = self._hypotheses.weigh(at_pose, motion, pose)
+        against_main = self._innovation(belief.main, pose) if belief.main else None
+        if belief.main and against_main:
+            main, update = weigh(self.config, belief.main, against_main, pose.stamp_ns)
             belief = belief._replace(main=main)
-            refused = None if update.accepted else (at_pose, motion)
         if belief.alternative:
-            at_pose, motion = self._at(belief.alternative, pose)
-            alternative, verdict = self._hypotheses.weigh(at_pose, motion, pose)
-            belief = belief._replace(alternative=alternative)
+            innovation = self._innovation(belief.alternative, pose)
+            alternative, verdict = weigh(self.config, belief.alternative, innovation, pose.stamp_ns)
             if belief.main is None and not verdict.accepted:
-                belief = belief._replace(contradiction=self._hypotheses.contradiction(at_pose, motion, pose))
-        elif refused:
-            belief = self._with_alternative(belief, *refused, pose)
+                belief = belief._replace(contradiction=contradiction(self.config, belief.alternative, innovation))
+            belief = belief._replace(alternative=alternative)
+        elif against_main and not update.accepted:
+            belief = self._with_alternative(belief, against_main)
         return self._settled(belief, [update])
 
     def _go_back_to(self, pose: CameraPose) -> None:
@@ -230,37 +238,40 @@ class History:
                 return
             self._forget_belief()
 
-    def _at(self, hypothesis: Hypothesis, pose: CameraPose) -> tuple[Hypothesis, MotionAtPose]:
-        """A hypothesis at the instant of a pose, never earlier than where it is now, and the motion there."""
+    def _innovation(self, hypothesis: Hypothesis, pose: CameraPose) -> Innovation:
+        """Innovation of a pose against a hypothesis at its instant, never earlier than where the hypothesis is now."""
         time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
-        there = self.carried(hypothesis, min(time_ns, self.imu.newest_ns))
+        estimate = self.carried(hypothesis, min(time_ns, self.imu.newest_ns)).estimate
         if step_ns := self._camera_steps.get(pose.stamp_ns, 0):
-            there = there._replace(estimate=with_camera_step(there.estimate, step_ns / SECOND_NS))
-        return there, self.imu.motion(there.estimate.stamp_ns, there.accepted_ns)
+            estimate = estimate.after_camera_step(step_ns / SECOND_NS)
+        motion = self.imu.motion(estimate.stamp_ns, hypothesis.accepted_ns)
+        measured = body_pose(pose, estimate.state.T_body_camera, self.config.pose_noise_scale)
+        return innovation_of(self.config, estimate, measured, motion)
 
     def _begun(self, belief: Belief, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
         time_ns = max(self._begin_ns(belief, pose), self.imu.oldest_ns)
         window = self.imu.window(time_ns, WINDOW_SECONDS)
-        begun = self._hypotheses.from_nothing(pose, time_ns, window, belief.first_offset)
+        begun = first_hypothesis(self.config, pose, time_ns, window, belief.first_offset)
         if begun is None:
             refused = PoseUpdate(pose.stamp_ns, False, 'refused: contradicts gravity', math.nan)
             return belief._replace(contradiction=no_gravity(window)), [refused]
         update = PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)
         return self._settled(belief._replace(alternative=begun), [update])
 
-    def _with_alternative(self, belief: Belief, at_pose: Hypothesis, motion: MotionAtPose, pose: CameraPose) -> Belief:
-        """``belief`` with an alternative hypothesis begun from a pose that the estimate at ``at_pose`` refuses."""
-        time_ns = at_pose.estimate.stamp_ns
-        window = self.imu.window(time_ns, WINDOW_SECONDS)
-        begun = self._hypotheses.alternative_to(at_pose, pose, time_ns, motion, window)
+    def _with_alternative(self, belief: Belief, refused: Innovation) -> Belief:
+        """``belief`` with an alternative hypothesis begun from a pose that the estimate has just refused."""
+        main = belief.main
+        assert main is not None
+        window = self.imu.window(refused.estimate.stamp_ns, WINDOW_SECONDS)
+        begun = alternative_to(self.config, main, refused, window)
         if begun is None:
             return belief
-        drifted = begun.needed == 0 or (belief.drifted and at_pose.refused_in_row > 0)
+        drifted = begun.needed == 0 or (belief.drifted and main.refused_in_row > 1)
         begun = begun._replace(needed=0) if drifted else begun
-        return belief._replace(alternative=begun, hits_before=at_pose.hits, drifted=drifted)
+        return belief._replace(alternative=begun, hits_before=main.hits, drifted=drifted)
 
     def _settled(self, belief: Belief, decided: list[PoseUpdate]) -> tuple[Belief, list[PoseUpdate]]:
-        settled = belief.settled(self._hypotheses.config)
+        settled = belief.settled(self.config)
         if settled.main is None or settled.main is belief.main:
             return settled, decided
         reason = 'reset' if belief.main else 'initialised'

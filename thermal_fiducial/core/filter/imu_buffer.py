@@ -1,12 +1,12 @@
 """Buffer of the latest IMU samples: integration steps, interpolated samples and the motion at a pose's instant."""
 
 from bisect import bisect_left, bisect_right
+from dataclasses import dataclass
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.filter.update import MotionAtPose
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: The motion at a pose is the mean of the samples this long [s] before and after it, as far as they have arrived.
@@ -31,6 +31,24 @@ class LastSample(NamedTuple):
     imu: FloatArray
     seconds: float
     densities: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class MotionAtPose:
+    """What the IMU shows of the motion at a pose's instant.
+
+    Attributes
+    ----------
+    imu : (6,) mean of equally many samples before and after it: a one-sided mean would bias the clock offset
+    rate_variance : white noise of one axis of the mean rate [rad^2/s^2]
+    velocity_variance : what accelerometer noise has added to the velocity since the last accepted pose [m^2/s^2]
+    turning : magnitude of the angular acceleration [rad/s^2]
+    """
+
+    imu: FloatArray
+    rate_variance: float
+    velocity_variance: float
+    turning: float
 
 
 class ImuBuffer:

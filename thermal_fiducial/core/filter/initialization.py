@@ -20,13 +20,13 @@ from thermal_fiducial.core.filter.state import (
     GYROSCOPE_BIAS,
     GYROSCOPE_MATRIX,
     NavigationState,
+    of_clock,
     POSE,
     POSITION,
     SIZE,
     SYSTEMATIC,
     VELOCITY,
 )
-from thermal_fiducial.core.filter.update import core_derivative, of_clock
 from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import FloatArray
@@ -71,7 +71,7 @@ def start(
     noise = PoseNoise.of(pose, config.stamp_jitter, config.mount_vibration)
     P = np.diag(_initial_variances(config))
     P[SYSTEMATIC, SYSTEMATIC] = config.systematic_pose_std**2 * pose.shape
-    P[np.ix_(POSE, POSE)] += noise.white * pose.shape
+    P[np.ix_(POSE, POSE)] += noise.white.value * pose.shape
     # What the pose is wrong by lastingly is an error of the estimate, with the opposite sign.
     for place in (SYSTEMATIC, EXTRINSICS):
         lasting = P[place, place]
@@ -109,7 +109,7 @@ def _of_unknown_clock(config: PoseEkfConfig, state: NavigationState, imu: FloatA
 
     The first pose measures the state at the camera's stamp, X(t + s) = X(t) Exp(derivative s).
     """
-    error = of_clock(core_derivative(state, imu))
+    error = of_clock(state.derivative(imu))
     covariance = np.outer(error, error)
     # Second order: clock offset times the unknown velocity.
     covariance[POSITION, POSITION] += np.eye(3) * config.initial_velocity_std**2

@@ -7,7 +7,7 @@ import numpy as np
 
 from thermal_fiducial.core.filter.imu_buffer import LastSample
 from thermal_fiducial.core.filter.state import CORE, Estimate, NavigationState, POSITION, PUBLISHED, ROTATION, VELOCITY
-from thermal_fiducial.core.filter.update import pose_innovation
+from thermal_fiducial.core.filter.update import pose_error
 from thermal_fiducial.core.geometry.reprojection import lever_arm, twist_transfer
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import Odometry
@@ -57,7 +57,7 @@ def odometry(estimate: Estimate, other: Estimate | None, sample: LastSample) -> 
 
 def _difference(state: NavigationState, other: NavigationState) -> FloatArray:
     """Core error (9,) of ``state`` if ``other`` is the true state."""
-    apart = pose_innovation(state, other.T_map_body)
+    apart = pose_error(state, other.T_map_body)
     velocity = (other.velocity - state.velocity) @ state.R_map_body
     return np.concatenate((apart[:3], velocity, apart[3:]))
 

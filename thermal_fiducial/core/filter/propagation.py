@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial import polynomial
 
+from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.imu_buffer import Steps
 from thermal_fiducial.core.filter.state import (
     ACCELEROMETER_BIAS,
@@ -29,6 +30,7 @@ from thermal_fiducial.core.filter.state import (
     POSITION,
     ROTATION,
     SIZE,
+    TIME_OFFSET,
     VELOCITY,
 )
 from thermal_fiducial.core.geometry.se3 import SKEW, skew
@@ -79,13 +81,17 @@ def step_matrices(imu: FloatArray, seconds: FloatArray) -> StepMatrices:
     return StepMatrices(_IDENTITY + A_dt @ mean, mean[..., :6] * dt[..., None])
 
 
-def propagated(estimate: Estimate, steps: Steps, stamp_ns: int, random_walks: FloatArray) -> Estimate:
-    """The estimate after ``steps`` that end at ``stamp_ns``.
+def random_walks(config: PoseEkfConfig) -> FloatArray:
+    """Squared densities (48,) of the random walks of the parameters."""
+    walks = np.zeros(SIZE)
+    walks[GYROSCOPE_BIAS] = config.imu.gyroscope_random_walk
+    walks[ACCELEROMETER_BIAS] = config.imu.accelerometer_random_walk
+    walks[TIME_OFFSET] = config.time_offset_random_walk
+    return np.square(walks)
 
-    Parameters
-    ----------
-    random_walks : (48,) squared densities of the parameters' random walks
-    """
+
+def propagated(estimate: Estimate, steps: Steps, stamp_ns: int, walks: FloatArray) -> Estimate:
+    """The estimate after ``steps`` that end at ``stamp_ns``; ``walks`` (48,) of :func:`random_walks`."""
     state = estimate.state
     imu = state.corrected(steps.imu)
     matrices = step_matrices(imu, steps.seconds)
@@ -101,7 +107,7 @@ def propagated(estimate: Estimate, steps: Steps, stamp_ns: int, random_walks: Fl
         P[CORE] = cross
         P[:, CORE] = cross.T
         P[CORE, CORE] = cross[:, MOVED_BY] @ transition.T + noise
-        diagonal += random_walks * dt
+        diagonal += walks * dt
     moved = replace(state, R_map_body=R_map_body[-1], velocity=velocity, position=position)
     return Estimate(stamp_ns, moved, P, estimate.pose_noise)
 

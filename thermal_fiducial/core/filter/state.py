@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
-from thermal_fiducial.core.geometry.se3 import so3_exp, so3_left_jacobian_inverse, transform
+from thermal_fiducial.core.geometry.se3 import skew, so3_exp, so3_left_jacobian_inverse, transform
 from thermal_fiducial.core.types import FloatArray
 
 #: Error coordinates by index. Core, expressed in the robot frame [rad, m/s, m],
@@ -78,6 +78,14 @@ class NavigationState:
         """Samples (..., 6) corrected for bias and scale errors [rad/s, m/s^2]."""
         return imu - self.bias - (self.scale @ imu.reshape(-1, 2, 3, 1)).reshape(imu.shape)
 
+    def derivative(self, imu: FloatArray) -> FloatArray:
+        """Time derivative (9,) of the core for a sample ``imu`` (6,): X(t + s) = X(t) Exp(derivative s)."""
+        derivative, velocity = np.empty(9), self.velocity_body
+        derivative[:6] = self.corrected(imu)
+        derivative[VELOCITY] += self.gravity @ self.R_map_body - skew(derivative[ROTATION]) @ velocity
+        derivative[POSITION] = velocity
+        return derivative
+
     def plus(self, error: FloatArray) -> 'NavigationState':
         """The state corrected by ``error`` (48,): X Exp(xi) for the group part, a sum for the rest."""
         R_left = self.R_map_body @ _left_jacobian(error[ROTATION])
@@ -131,9 +139,46 @@ class Estimate:
             pose_noise=self.pose_noise.in_moved_map(T_new_old),
         )
 
+    def after_camera_step(self, std: float) -> 'Estimate':
+        """The estimate after an unknown step of the camera's clock, of standard deviation ``std`` [s]."""
+        covariance = self.covariance.copy()
+        covariance[TIME_OFFSET, TIME_OFFSET] += std**2
+        return replace(self, covariance=covariance)
+
+    def after_imu_step(self, imu: FloatArray, std: float) -> 'Estimate':
+        """The estimate after an unknown step of the IMU's clock.
+
+        The clock offset changes, and state and stamp of the IMU no longer belong together. Poses do not show it at
+        once, as the state at their stamps stays the same.
+
+        Parameters
+        ----------
+        imu : (6,) the sample before it
+        std : standard deviation of the step [s]
+        """
+        error = of_clock(self.state.derivative(imu))
+        return replace(self, covariance=self.covariance + std**2 * np.outer(error, error))
+
     def std(self, place: slice | int) -> float:
         """Root of the sum of the variances of some coordinates."""
         return math.sqrt(float(np.sum(self.covariance.diagonal()[place])))
+
+
+def of_core(error: FloatArray) -> FloatArray:
+    """Error coordinates (48,) with the given core (9,), zero elsewhere."""
+    whole = np.zeros(SIZE)
+    whole[CORE] = error
+    return whole
+
+
+def of_clock(derivative: FloatArray) -> FloatArray:
+    """(48,) error by 1 s of clock offset with which the state at the camera's stamps is right.
+
+    ``derivative`` (9,): of the core, :meth:`NavigationState.derivative`.
+    """
+    error = of_core(-derivative)
+    error[TIME_OFFSET] = 1.0
+    return error
 
 
 def _left_jacobian(phi: FloatArray) -> FloatArray:
