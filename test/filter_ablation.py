@@ -90,7 +90,7 @@ MECHANISMS = {
     'what gaps hide': Mechanism(
         ('gaps of imu', 'carpet_slow_circle'),
         ('imu_noise:StructureFunction',),
-        {'imu_noise:StructureFunction.hidden': lambda *_: (0.0, 0.0)},
+        {'imu_noise:StructureFunction.interpolation_noise': lambda *_: (0.0, 0.0)},
     ),
     'saturation': Mechanism(('saturated',), off={'imu_noise:_SATURATED': (0.0, 0.0)}),
     'frozen axes': Mechanism(('frozen',), ('imu_input:Axis',), {'imu_input:Axis.is_frozen': _first(False)}),
@@ -121,8 +121,8 @@ MECHANISMS = {
     'far poses need evidence': Mechanism(('twin marker', 'wrong poses'), off={'hypotheses:_ENOUGH_POSES': 0}),
     'contradiction in what is published': Mechanism(
         ('moved markers', 'stepping clock'),
-        ('ekf:PoseEkf._contradicting',),
-        {'ekf:PoseEkf._contradicting': lambda *_: None},
+        ('history:History.contradicting',),
+        {'history:History.contradicting': lambda *_: None},
     ),
 }
 

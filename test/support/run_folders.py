@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 from rosbags.typesys import get_typestore, Stores
 
-from thermal_fiducial.core.filter.innovations import innovations_text, PoseUpdate
+from thermal_fiducial.core.filter.verdicts import PoseUpdate
 from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation, so3_exp, transform
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.files.bag_writer import BagWriter
 from thermal_fiducial.files.bags import TRUTH_TOPIC
+from thermal_fiducial.files.innovations import innovations_text
 from thermal_fiducial.files.marker_map import save_map
 from thermal_fiducial.files.trajectory_file import save_tum
 

@@ -19,13 +19,13 @@ from support import small_bag
 from support.messages import frames, imu, info, pose
 from support.ros_graph import ros_graph
 
-from thermal_fiducial.core.filter.innovations import innovations_of
 from thermal_fiducial.core.filter.state import POSITION
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import MAP_DTYPE, MARKER_DTYPE
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.images import image_to_array
+from thermal_fiducial.files.innovations import innovations_of
 from thermal_fiducial.files.marker_map import load_map, save_map
 from thermal_fiducial.nodes.aruco_detector import ArucoDetector
 from thermal_fiducial.nodes.marker_mapper import MarkerMapperNode

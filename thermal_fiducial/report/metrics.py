@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.filter.innovations import Innovations
 from thermal_fiducial.core.geometry.se3 import apply, inverse, rigid_alignment, so3_exp, so3_log, transform
 from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, SECOND_NS
+from thermal_fiducial.files.innovations import Innovations
 from thermal_fiducial.report.trajectory import Trajectory
 
 #: Interval of the jitter: a period of the camera [ns].

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from thermal_fiducial.core.filter.innovations import INNOVATIONS, Innovations, innovations_of
 from thermal_fiducial.core.types import FloatArray, IntArray
 from thermal_fiducial.files.bags import BagReader, CAMERA_POSE_TOPIC, MARKERS_TOPIC
 from thermal_fiducial.files.images import header_stamp_ns, stamp_to_ns
+from thermal_fiducial.files.innovations import INNOVATIONS, Innovations, innovations_of
 
 #: Most messages from which covariances are read, evenly over the run.
 MOST_COVARIANCES = 6000

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from thermal_fiducial.core.filter.innovations import INNOVATIONS
+from thermal_fiducial.files.innovations import INNOVATIONS
 from thermal_fiducial.report.evaluation import Evaluation
 
 #: Most columns of a table that stands beside another one.

@@ -14,10 +14,10 @@ from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.filter.hypotheses import is_of_unknown_clock, KNOWN_OFFSET_STD
 from thermal_fiducial.core.filter.imu_input import CLOCK_EVIDENCE, ImuInput, Verdict
 from thermal_fiducial.core.filter.imu_noise import ImuNoiseMonitor
-from thermal_fiducial.core.filter.innovations import PoseUpdate
 from thermal_fiducial.core.filter.output import odometry
 from thermal_fiducial.core.filter.propagation import usable_seconds
 from thermal_fiducial.core.filter.state import Estimate, NavigationState, TIME_OFFSET
+from thermal_fiducial.core.filter.verdicts import PoseUpdate
 from thermal_fiducial.core.geometry.plausibility import checked_covariance
 from thermal_fiducial.core.measurements import CameraPose, Condition, ImuSample, Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
@@ -82,7 +82,7 @@ class PoseEkf:
         history.take_in()
         if history.main is None:
             return None
-        return odometry(history.main.estimate, self._contradicting(history.main), history.imu.last)
+        return odometry(history.main.estimate, history.contradicting(), history.imu.last)
 
     def keep_imu(self, sample: ImuSample) -> bool:
         """Buffer an IMU sample without propagating to it: the next :meth:`add_imu` propagates over all buffered ones.
@@ -182,13 +182,6 @@ class PoseEkf:
         return 'refused: stamp repeated' if history.holds(pose.stamp_ns) else ''
 
     # --- output ---------------------------------------------------------------------------------------
-
-    def _contradicting(self, main: Hypothesis) -> Estimate | None:
-        """The alternative estimate, if the latest poses contradict ``main`` and enough of them support it."""
-        begun = self._history.belief.alternative
-        if begun is None or begun.hits < self._config.initial_poses or not main.in_doubt:
-            return None
-        return self._history.carried(begun, self._history.imu.newest_ns).estimate
 
     @property
     def decided(self) -> Mapping[int, PoseUpdate]:

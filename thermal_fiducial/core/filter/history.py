@@ -20,9 +20,10 @@ from thermal_fiducial.core.filter.hypotheses import (
 )
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import no_gravity, WINDOW_SECONDS
-from thermal_fiducial.core.filter.innovations import PoseLog, PoseUpdate
 from thermal_fiducial.core.filter.propagation import propagated, random_walks
+from thermal_fiducial.core.filter.state import Estimate
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
+from thermal_fiducial.core.filter.verdicts import PoseLog, PoseUpdate
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
@@ -63,14 +64,14 @@ class History:
         """Belief after the latest pose."""
         return self._beliefs[-1]
 
-    def carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:
+    def _carried(self, hypothesis: Hypothesis, until_ns: int) -> Hypothesis:
         """A hypothesis propagated along the samples to an instant that is not later than the newest sample."""
         estimate = hypothesis.estimate
         if estimate.stamp_ns >= until_ns:
             return hypothesis
         for begin_ns, std in self._imu_steps:
             if estimate.stamp_ns <= begin_ns < until_ns:
-                before = self.carried(hypothesis, begin_ns).estimate
+                before = self._carried(hypothesis, begin_ns).estimate
                 estimate = before.after_imu_step(self.imu.at(begin_ns), std)
                 hypothesis = hypothesis._replace(estimate=estimate)
         steps = self.imu.steps(estimate.stamp_ns, until_ns)
@@ -80,17 +81,24 @@ class History:
         """Count with a step of the IMU's clock by ``size_ns`` after the newest sample; or samples are lost there."""
         self._imu_steps.append((self.imu.newest_ns, _STEP_OR_LOSS * size_ns / SECOND_NS))
 
-    def alternative(self) -> Hypothesis | None:
+    def _alternative(self) -> Hypothesis | None:
         """The alternative hypothesis at the newest sample."""
         other = self.belief.alternative
-        return other and self.carried(other, self.imu.newest_ns)
+        return other and self._carried(other, self.imu.newest_ns)
+
+    def contradicting(self) -> Estimate | None:
+        """The alternative estimate at the newest sample, if the latest poses contradict the main one and support it."""
+        other = self.belief.alternative
+        if other is None or other.hits < self.config.initial_poses or not (self.main and self.main.in_doubt):
+            return None
+        return self._carried(other, self.imu.newest_ns).estimate
 
     def _forget_old(self) -> None:
         """Remove what is older than any pose that may still be inserted."""
         horizon_ns = self.imu.newest_ns - self._kept_ns
         if self.belief.stamp_ns < horizon_ns and self.belief.main is None:
             # Initialising, and no pose for that long: only the hypothesis carried to the present is needed.
-            self._beliefs = [self.belief._replace(alternative=self.alternative())]
+            self._beliefs = [self.belief._replace(alternative=self._alternative())]
         while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
             del self._beliefs[0]
         oldest = self._beliefs[0]
@@ -206,9 +214,9 @@ class History:
         belief = self.belief
         if belief.main is None:
             return
-        self.main = self.carried(self.main or belief.main, self.imu.newest_ns)
+        self.main = self._carried(self.main or belief.main, self.imu.newest_ns)
         if self.main.estimate.stamp_ns - belief.main.estimate.stamp_ns > _KEPT_EVERY_NS:
-            self._beliefs.append(belief._replace(main=self.main, alternative=self.alternative()))
+            self._beliefs.append(belief._replace(main=self.main, alternative=self._alternative()))
 
     def _after(self, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
         """The belief after the next pose, and the verdicts on that pose."""
@@ -241,7 +249,7 @@ class History:
     def _innovation(self, hypothesis: Hypothesis, pose: CameraPose) -> Innovation:
         """Innovation of a pose against a hypothesis at its instant, never earlier than where the hypothesis is now."""
         time_ns = max(self.due_ns(pose, hypothesis), hypothesis.estimate.stamp_ns)
-        estimate = self.carried(hypothesis, min(time_ns, self.imu.newest_ns)).estimate
+        estimate = self._carried(hypothesis, min(time_ns, self.imu.newest_ns)).estimate
         if step_ns := self._camera_steps.get(pose.stamp_ns, 0):
             estimate = estimate.after_camera_step(step_ns / SECOND_NS)
         motion = self.imu.motion(estimate.stamp_ns, hypothesis.accepted_ns)

@@ -63,7 +63,7 @@ class ImuNoiseMonitor:
         self._motion.add(imu, seconds)
         # Shorter steps are covered by the floor of the spectrum, once it has been measured.
         covered = seconds <= _INTERRUPTED and any(self._floor.densities)
-        between = (0.0, 0.0) if covered else self._motion.hidden(seconds)
+        between = (0.0, 0.0) if covered else self._motion.interpolation_noise(seconds)
         values = imu.tolist()
         rates, forces = values[:3], values[3:]
         motions = math.hypot(*rates), self._motion_of(forces, seconds)
@@ -125,7 +125,7 @@ class StructureFunction:
         mean = (of_lag @ squares) / np.maximum(counts, 1)[:, None]
         self._measured = self._measured + gain[:, None] * (mean - self._measured)
 
-    def hidden(self, seconds: float) -> tuple[float, float]:
+    def interpolation_noise(self, seconds: float) -> tuple[float, float]:
         """Squared noise densities of rate and force for the interpolation error of a step of ``seconds``."""
         place = math.log2(seconds / _SHORTEST_LAG)
         lower = min(max(int(place), 0), len(_LAGS) - 2)

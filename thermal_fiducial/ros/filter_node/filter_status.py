@@ -2,9 +2,10 @@
 
 from thermal_fiducial.core.filter.condition import TRACKING, WAITING
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.filter.innovations import INNOVATIONS, innovations_text, LAST_REFUSED, PoseUpdate
+from thermal_fiducial.core.filter.verdicts import PoseUpdate
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import SECOND_NS
+from thermal_fiducial.files.innovations import INNOVATIONS, innovations_text, LAST_REFUSED
 from thermal_fiducial.ros.base.console import Console
 from thermal_fiducial.ros.base.node import ERROR, OK, WARN
 from thermal_fiducial.ros.filter_node.imu_queue import ImuQueue

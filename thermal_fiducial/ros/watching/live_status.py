@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
-from thermal_fiducial.core.filter.innovations import LAST_REFUSED
 from thermal_fiducial.core.imaging.frame_cleaner import SHUTTER
+from thermal_fiducial.files.innovations import LAST_REFUSED
 
 #: Timeouts of odometry, after which there is no pose to fly on, and of a node's diagnostics [s].
 SILENT_S, MUTE_S = 0.5, 3.0
