@@ -1,6 +1,7 @@
 """What is measured in each minute of flight, and what is made of it."""
 
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -103,8 +104,10 @@ def node_processes(names: Iterable[str]) -> dict[str, psutil.Process]:
     """The nodes among this process's children."""
     found = {}
     for child in psutil.Process().children():
-        words = child.cmdline()
-        found |= {name: child for name in names if f'thermal_fiducial.nodes.{name}' in words}
+        # A process that has ended has no command line any more.
+        with suppress(psutil.NoSuchProcess):
+            words = child.cmdline()
+            found |= {name: child for name in names if f'thermal_fiducial.nodes.{name}' in words}
     return found
 
 

@@ -140,6 +140,7 @@ def matched(**changes) -> PoseEkfConfig:
         'estimate_time_offset': False,
         'time_offset_std': 0.0,
         'stamp_jitter': 0.0,
+        'mount_vibration': 0.0,
         'map_tilt_std': 0.0,
         'systematic_pose_std': 0.01,
         'pose_noise_scale': WHITE**-0.5,

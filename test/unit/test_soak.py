@@ -1,6 +1,9 @@
 """What ``make soak`` measures and how it judges."""
 
 from dataclasses import replace
+import os
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -12,7 +15,7 @@ pytest.importorskip('psutil')
 
 from soak.flying import soak
 from soak.laps import lap, Laps, Repeated
-from soak.minutes import faults, Minute
+from soak.minutes import faults, Minute, node_processes
 from support.tiny import TINY
 
 from thermal_fiducial.errors import InputError
@@ -68,6 +71,14 @@ def minutes(memory, errors, poses=12_000):
 )
 def test_growth_trends_and_missing_poses_are_named(flown, expected):
     assert faults(flown, 12_000 * len(flown), []) == expected
+
+
+def test_a_process_that_has_ended_is_no_node():
+    ended = subprocess.Popen([sys.executable, '-c', ''])
+    # It stays a child, without a command line, until somebody waits for it.
+    os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)
+    assert node_processes(['']) == {}
+    ended.wait()
 
 
 @pytest.mark.ros
