@@ -184,12 +184,17 @@ MECHANISMS = {
     'second round': Mechanism('fast, 8 K, blind', (), {'refining:_ROUNDS': 1}),
     'edges behind the sides': Mechanism(
         'fast, 8 K, blind',
-        ('corners.sides:_add_neighbours',),
+        ('corners.sides:_of_cells',),
         {'refining:_NARROW_OF_CLEAR': 0.0, 'refining:NARROW': 0.0},
     ),
     'outlying segments': Mechanism('slow, 8 K, blind', (), {'corners.segments:_ROUNDS': 1}),
     'outlying pixels': Mechanism('slow, 8 K, blind', (), {'corners.segments:_PIXEL_OUTLIER': np.inf}),
     'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'refining:_HARDLY_PX': np.inf}),
+    'ends of motion blur': Mechanism(
+        'fast, 8 K, guided',
+        ('frame:_moments', 'frame:_halves', 'refining:MotionBlur.parts'),
+        {'refining:WITHOUT_TAIL': [(0.0, 1.0)]},
+    ),
     'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),
     'error of the lag model': Mechanism(
         'fast, 8 K, blind', (), {'corner_errors:OF_LAG': 0.0, 'corner_errors:OF_LAG_FORM': 0.0}

@@ -114,11 +114,11 @@ class DisplayedSides:
         a, b = inset + (1.0 - 2.0 * inset) * np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
         inner = np.moveaxis(se3.seen_between(seen.x, se3.bilinear(a, b)), 0, -1)
         sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _WIDEST_PX)
-        blur = blurs(sides.normal, blur_px, refined.blur.spread)
+        blur = blurs(sides, blur_px, refined.blur.spread)
         value, slope, counting = model(sides, self._behind[refined.ids], blur)
         counting &= self._white[refined.ids].reshape(-1, self._bits)
         counts = counts_of(sides.pixel, frame.image, refined.blur.to_tails)
-        return measure(counts, (value, slope, counting), REACHED * blur[0])
+        return measure(counts, (value, slope, counting), REACHED * blur.across)
 
 
 def _outward(corners: FloatArray) -> FloatArray:

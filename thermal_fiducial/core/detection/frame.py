@@ -41,9 +41,27 @@ _TAIL = 0.75
 _FORGOTTEN = math.exp(-_TAIL)
 # Weight of the present image when the lag tail is removed.
 _GAIN = 1.0 / (1.0 - _FORGOTTEN)
+
+
+def _moments(youngest: float, oldest: float) -> tuple[float, float]:
+    """Mean age and its standard deviation of the response between two ages, all in time constants."""
+    span = oldest - youngest
+    left = math.exp(-span)
+    return youngest + 1.0 - span * left / (1.0 - left), math.sqrt(1.0 - span**2 * left / (1.0 - left) ** 2)
+
+
+def _halves() -> list[tuple[float, float]]:
+    """The response younger than the lag tail as two Gaussians, of its younger and of its older half."""
+    median = -math.log(0.5 * (1.0 + _FORGOTTEN))
+    halves = _moments(0.0, median), _moments(median, _TAIL)
+    return [((mean - REMAINING) / SPREAD, spread / SPREAD) for mean, spread in halves]
+
+
 #: Motion blur that remains, as shares of that by the whole lag: its mean displacement, and its standard deviation.
-REMAINING = 1.0 - _TAIL * _FORGOTTEN * _GAIN
-SPREAD = math.sqrt(1.0 - _TAIL**2 * _FORGOTTEN * _GAIN**2)
+REMAINING, SPREAD = _moments(0.0, _TAIL)
+#: That motion blur as Gaussians of equal weight. It has sharp ends, and one Gaussian would have none: where it is as
+#: long as cells are wide, sides would be off by a tenth of it.
+WITHOUT_TAIL = _halves()
 #: Age, in time constants, of the velocity that gives the displacement of the lag tail.
 LAG_TAIL_AGE = 1.0 + 0.5 * _TAIL
 

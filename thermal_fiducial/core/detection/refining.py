@@ -16,7 +16,7 @@ import numpy as np
 from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, of_motion_blur, unknown_motion
 from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED, Segments
-from thermal_fiducial.core.detection.corners.sides import blurs, model, NARROW, Sides, sides_of
+from thermal_fiducial.core.detection.corners.sides import Blur, blurs, model, NARROW, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.frame import (
     counts_of,
@@ -29,6 +29,7 @@ from thermal_fiducial.core.detection.frame import (
     rolling_displacement,
     SPREAD,
     stretch,
+    WITHOUT_TAIL,
 )
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.tracking import MotionTrack
@@ -99,6 +100,12 @@ class MotionBlur(Stacked):
     removed: FloatArray
     #: (N, 2) standard deviation of the remaining motion blur, along the motion [px]
     spread: FloatArray
+
+    def parts(self, sides: Sides, optics: float) -> list[Blur]:
+        """Gaussians that make up the blur of the ``sides``; none where it hardly differs from one."""
+        if self.to_tails is None:
+            return []
+        return [blurs(sides, optics, self.spread, *half) for half in WITHOUT_TAIL]
 
     @staticmethod
     def none(count: int) -> 'MotionBlur':
@@ -247,9 +254,10 @@ def refine_corners(
     for index in range(_PASSES):
         widest = math.hypot(blur_px, math.sqrt(float((motion.spread * motion.spread).sum(axis=1).max())))
         sides = sides_of(start.x, camera, image.shape, cells, columns, widest)
-        blur = blurs(sides.normal, blur_px, motion.spread)
+        blur = blurs(sides, blur_px, motion.spread)
         counts = counts_of(sides.pixel, image, motion.to_tails)
-        segments = measure(counts, model(sides, behind, blur, narrow), REACHED * blur[0])
+        modelled = model(sides, behind, blur, narrow, motion.parts(sides, blur_px))
+        segments = measure(counts, modelled, REACHED * blur.across)
         refined, moving = _moved(sides, segments, as_squares(start, *adjust(sides, segments, _PRIOR_PX)))
         found = found.with_others(which, refined) if index else refined
         which = which[moving]

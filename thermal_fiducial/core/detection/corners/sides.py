@@ -5,9 +5,11 @@ whole pixels, or by rows if these cross it at a larger angle. Pixels are not int
 The model of a column is a blurred step from white to black, plus the nearest parallel edges inside the marker.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -36,6 +38,17 @@ _CUBIC = 0.04417 * _LINEAR
 _PLATE_EDGE_SHOWS = 1.5
 # Least share of the side's step in a column: it falls off at the ends of the side.
 _MOSTLY = 0.7
+
+
+class Blur(NamedTuple):
+    """Gaussian blur of sides [px], (E, m) each."""
+
+    #: standard deviations across and along the sides
+    across: FloatArray
+    along: FloatArray
+    #: displacement inward, and along the sides from their starts to their ends
+    inward: FloatArray
+    onward: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,24 +206,29 @@ def _changes(inward: Float32Array) -> Float32Array:
     return np.ascontiguousarray(np.moveaxis(np.diff(inward, axis=2), 2, 3))
 
 
-def blurs(normal: FloatArray, optics: float, lag_blur: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Blur (E, m) across and along sides with normals (E, m, 2), of markers with a motion blur (N, 2) [px]."""
-    u, v = normal[..., 0].reshape(len(lag_blur), -1), normal[..., 1].reshape(len(lag_blur), -1)
-    across, along = lag_blur[:, :1] * u + lag_blur[:, 1:] * v, lag_blur[:, 1:] * u - lag_blur[:, :1] * v
-    square, shape = optics * optics, normal.shape[:2]
-    return np.sqrt(square + across * across).reshape(shape), np.sqrt(square + along * along).reshape(shape)
+def blurs(sides: Sides, optics: float, motion: FloatArray, mean: float = 0.0, spread: float = 1.0) -> Blur:
+    """Blur of the sides of N markers by optics [px] and a motion (N, 2) [px].
+
+    ``mean`` and ``spread``: mean and standard deviation of the blur by motion, in that motion.
+    """
+    span = sides.ends[:, 1] - sides.ends[:, 0]
+    by_side = np.repeat(motion, len(span) // len(motion), axis=0)
+    across = (sides.normal @ by_side[..., None])[..., 0]
+    along = (span * by_side).sum(axis=1, keepdims=True) / sides.along + np.zeros_like(across)
+    return Blur(np.hypot(optics, spread * across), np.hypot(optics, spread * along), mean * across, mean * along)
 
 
 def model(
-    sides: Sides, behind: Float32Array, blur: tuple[FloatArray, FloatArray], narrow: float = NARROW
+    sides: Sides, behind: Float32Array, blur: Blur, narrow: float = NARROW, parts: Sequence[Blur] = ()
 ) -> tuple[Float32Array, Float32Array, BoolArray]:
     """Share of white in every pixel, up to a constant, its derivative by distance, and whether the pixel counts.
 
     Parameters
     ----------
     behind : (N, 4, m, 2) of :func:`edges_behind`
-    blur : (E, m) across and along the sides
+    blur : of the sides
     narrow : width of cells below which the model contains parallel edges, in blurs
+    parts : of equal weight that make up ``blur`` where it is not Gaussian
 
     Returns
     -------
@@ -218,23 +236,52 @@ def model(
     """
     cells = behind.shape[2]
     cell = sides.across / cells
-    # Share of the side's step in a column, blurred along the side: less than 1 near the ends.
-    t = sides.t.astype(np.float32)
-    z = np.stack([t, 1.0 - t]) * (sides.along / blur[1]).astype(np.float32)
-    own = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0)
-    value, slope = blurred_step(sides.distance, (1.0 / blur[0]).astype(np.float32), -own)
-    overlapping = cell < narrow * blur[0]
-    if overlapping.any():
-        which, edges = np.flatnonzero(overlapping.any(axis=1)), behind.reshape(-1, cells, len(NEIGHBOURS))
-        _add_neighbours(value, slope, sides, which, edges, blur)
-    reach = np.where(overlapping, cell, cell - 2.0 * blur[0])
-    quiet = np.minimum(reach, np.maximum(cell - _PLATE_EDGE_SHOWS * blur[0], 0.0))
+    overlapping = cell < narrow * blur.across
+    edges, which = behind.reshape(-1, cells, len(NEIGHBOURS)), np.flatnonzero(overlapping.any(axis=1))
+    modelled = [_blurred_sides(sides, edges, which, part) for part in parts or (blur,)]
+    value, slope, own = modelled[0]
+    if parts:
+        value, slope, own = (sum(terms[1:], terms[0]) / len(terms) for terms in zip(*modelled, strict=True))
+    reach = np.where(overlapping, cell, cell - 2.0 * blur.across)
+    quiet = np.minimum(reach, np.maximum(cell - _PLATE_EDGE_SHOWS * blur.across, 0.0))
     counting: BoolArray = np.asarray(sides.distance >= -quiet.astype(np.float32))
     counting &= sides.distance <= reach.astype(np.float32)
     counting &= sides.fresh & (own > _MOSTLY)
     if sides.inside is not None:
         counting &= sides.inside
     return value, slope, counting
+
+
+def _blurred_sides(
+    sides: Sides, behind: Float32Array, overlapping: IntArray, blur: Blur
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Value and derivative of every pixel (M, C, E, m), and the share (C, E, m) of the side's step in every column.
+
+    Parameters
+    ----------
+    behind : (E, m, 2) change of value across the edges behind the sides
+    overlapping : indices of the sides whose parallel edges are in the model
+    """
+    distance, sharpness = sides.distance - blur.inward.astype(np.float32), (1.0 / blur.across).astype(np.float32)
+    t = (sides.t - blur.onward / sides.along).astype(np.float32)
+    # Blurred along the side, the share is less than 1 near the ends.
+    z = np.stack([t, 1.0 - t]) * (sides.along / blur.along).astype(np.float32)
+    own = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0)
+    value, slope = blurred_step(distance, sharpness, -own)
+    if len(overlapping):
+        amounts = _of_cells(t[:, overlapping], (sides.along / blur.along)[overlapping]) @ behind[overlapping]
+        for index, number in enumerate(NEIGHBOURS):
+            away = (number * sides.across[overlapping] / behind.shape[1]).astype(np.float32)
+            step, rise = blurred_step(distance[:, :, overlapping] - away, sharpness[overlapping], amounts[..., index])
+            value[:, :, overlapping] += step
+            slope[:, :, overlapping] += rise
+    return value, slope, own
+
+
+def _of_cells(t: Float32Array, sharpness: FloatArray) -> Float32Array:
+    """Shares (C, E, m, m) of the m cells along a side in columns at ``t`` (C, E, m), blurred along the side."""
+    z = (t[..., None] - np.linspace(0.0, 1.0, t.shape[-1] + 1)) * sharpness[..., None]
+    return np.asarray(-np.diff(0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR))), dtype=np.float32)
 
 
 def blurred_step(
@@ -249,25 +296,3 @@ def blurred_step(
     step += 1.0
     step *= half
     return step, slope
-
-
-def _add_neighbours(
-    value: Float32Array,
-    slope: Float32Array,
-    sides: Sides,
-    which: np.ndarray,
-    behind: Float32Array,
-    blur: tuple[FloatArray, FloatArray],
-) -> None:
-    """Add to the model of the sides ``which`` what the edges ``behind`` (E, m, 2) contribute, blurred along."""
-    cells = behind.shape[1]
-    t = sides.t[:, which, :, None]
-    z = (t * cells - np.arange(cells + 1)) * (sides.along / (cells * blur[1]))[which, :, None]
-    begun = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR))
-    amounts = (begun[..., :-1] - begun[..., 1:]).astype(np.float32) @ behind[which]
-    width = (sides.across / cells)[which].astype(np.float32)
-    sharpness = (1.0 / blur[0])[which].astype(np.float32)
-    for index, number in enumerate(NEIGHBOURS):
-        step, rise = blurred_step(sides.distance[:, :, which] - number * width, sharpness, amounts[..., index])
-        value[:, :, which] += step
-        slope[:, :, which] += rise
