@@ -4,7 +4,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.polynomial import polynomial
 import pytest
 from scipy.stats import chi2
 from support.flights import (
@@ -23,7 +22,8 @@ from support.flights import (
 
 from thermal_fiducial.config import ImuNoise, PoseEkfConfig
 from thermal_fiducial.core.filter.ekf import PoseEkf
-from thermal_fiducial.core.filter.propagation import coasting_variance
+from thermal_fiducial.core.filter.propagation import hovered, random_walks
+from thermal_fiducial.core.filter.state import POSITION
 from thermal_fiducial.core.geometry.se3 import rotation_angle, so3_exp, transform
 from thermal_fiducial.core.measurements import ImuSample
 
@@ -138,8 +138,9 @@ def bounds(seed, imu):
     run(ekf, timeline(data.samples(), data.poses))
     known = replace(ekf.estimate, covariance=np.zeros_like(ekf.estimate.covariance))
     densities = np.repeat((COASTING_IMU.gyroscope_noise_density, COASTING_IMU.accelerometer_noise_density), 3)
-    variances = [polynomial.polyval(GAPS, coasting_variance(estimate, densities)) for estimate in (ekf.estimate, known)]
-    return np.sqrt(np.array(variances) / 3.0 * chi2.ppf(0.95, 3))
+    walks = random_walks(exact)
+    stds = [[hovered(each, densities, walks, gap).std(POSITION) for gap in GAPS] for each in (ekf.estimate, known)]
+    return np.array(stds) * np.sqrt(chi2.ppf(0.95, 3) / 3.0)
 
 
 def test_coasting_beside_its_bound(benchmark, write_table):

@@ -58,8 +58,8 @@ def test_the_error_of_the_map_counts_in_the_position_but_not_relative_to_the_map
     of_map = np.diag([0.16, 0.0, 0.0, 9.0, 9.0, 9.0])
     noise = replace(noise, last=replace(noise.last, map_covariance=of_map))
     begun = begun._replace(estimate=replace(begun.estimate, pose_noise=noise))
-    assert begun.position_std_in_map == pytest.approx(0.3)
-    assert begun.position_std == pytest.approx(0.5)
+    assert begun.estimate.std(POSITION) == pytest.approx(0.3)
+    assert begun.estimate.position_std == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(('poses', 'initialised'), [(2, False), (3, True)])

@@ -53,10 +53,10 @@ def test_it_tracks_until_poses_stay_away():
 
 def test_lost_counts_before_coasting():
     kept = history(1.5, slice(5, 20))
-    strict = config(lost_position_std=0.5 * kept.main.position_std)
+    strict = config(lost_position_std=0.5 * kept.main.estimate.position_std)
     condition = condition_of(kept, strict)
     assert condition.words == 'lost'
-    assert condition.details == f'position known to {kept.main.position_std:.2f} m'
+    assert condition.details == f'position known to {kept.main.estimate.position_std:.2f} m'
 
 
 def test_poses_that_are_refused_in_a_row_put_it_in_doubt():

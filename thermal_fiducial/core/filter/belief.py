@@ -5,7 +5,6 @@ when many poses pass its gate while the estimate refuses them, so that the gate 
 is initialised in the same way, without an estimate to replace.
 """
 
-import math
 from typing import NamedTuple
 
 from thermal_fiducial.config import PoseEkfConfig
@@ -64,17 +63,6 @@ class Hypothesis(NamedTuple):
     def in_moved_map(self, T_new_old: FloatArray) -> 'Hypothesis':
         """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
         return self._replace(estimate=self.estimate.in_moved_map(T_new_old))
-
-    @property
-    def position_std(self) -> float:
-        """Root of the sum of the position variances, the map's error included [m]."""
-        of_map = self.estimate.pose_noise.last.map_covariance[:3, :3]
-        return math.hypot(self.position_std_in_map, math.sqrt(float(of_map.trace())))
-
-    @property
-    def position_std_in_map(self) -> float:
-        """Root of the sum of the position variances relative to the map, its error left out, as poses see it [m]."""
-        return self.estimate.std(POSITION)
 
     @property
     def in_doubt(self) -> bool:
@@ -142,7 +130,7 @@ class Belief(NamedTuple):
         """Why the alternative ``other`` replaces ``main``, in words; empty if it does not."""
         if other.accepted_ns - main.accepted_ns > config.reinitialise_after * SECOND_NS:
             return f'no pose was accepted for {config.reinitialise_after:.0f} s'
-        if main.position_std_in_map > config.lost_position_std:
+        if main.estimate.std(POSITION) > config.lost_position_std:
             return 'the pose was lost, and markers are seen again'
         lasting = other.accepted_ns - other.started_ns >= config.reset_after * SECOND_NS
         against = main.hits - self.hits_before

@@ -24,8 +24,8 @@ def condition_of(history: History, config: PoseEkfConfig) -> Condition:
     main = history.main
     if main is None:
         return _without_estimate(history.belief, config)
-    if main.position_std > config.lost_position_std:
-        return Condition('lost', f'position known to {main.position_std:.2f} m')
+    if main.estimate.position_std > config.lost_position_std:
+        return Condition('lost', f'position known to {main.estimate.position_std:.2f} m')
     if main.in_doubt:
         return Condition('in doubt', f'{main.refused_in_row} poses in a row contradict the estimate')
     coasting = coasting_seconds(history, main)

@@ -246,7 +246,7 @@ class PoseEkf:
         main, imu_failed = self._history.main, self._verdict is Verdict.FROZEN or self._refused_in_row >= CLOCK_EVIDENCE
         if main is None or imu_failed or main.in_doubt:
             return True
-        return main.position_std > self._config.lost_position_std
+        return main.estimate.position_std > self._config.lost_position_std
 
     @property
     def usable_for(self) -> float:
@@ -254,7 +254,8 @@ class PoseEkf:
         main = self._history.main
         if main is None:
             return 0.0
-        return usable_seconds(main.estimate, self._history.imu.last.densities, self._config.lost_position_std)
+        history = self._history
+        return usable_seconds(main.estimate, history.imu.last.densities, history.walks, self._config.lost_position_std)
 
     def diagnostics(self) -> dict[str, float]:
         """Condition of the filter in numbers (SI units)."""
@@ -275,7 +276,7 @@ class PoseEkf:
         return {
             'seconds since accepted pose': coasting_seconds(self._history, main),
             'resets': float(self.resets),
-            'position std': main.position_std,
+            'position std': main.estimate.position_std,
             'usable for': self.usable_for,
             'time offset': self._clock_offset(main),
             'time offset std': self._time_offset_std(main),

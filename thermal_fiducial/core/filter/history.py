@@ -46,7 +46,8 @@ class History:
     def __init__(self, config: PoseEkfConfig, camera_time_offset: float) -> None:
         #: dynamic parameters may change
         self.config = config
-        self._walks = random_walks(config)
+        #: (48,) squared densities of the random walks
+        self.walks = random_walks(config)
         self._kept_ns = round((config.max_delay + WINDOW_SECONDS) * SECOND_NS)
         self._offset_ns = round(camera_time_offset * SECOND_NS)
         self.imu, self.log = ImuBuffer(), PoseLog()
@@ -75,7 +76,7 @@ class History:
                 estimate = before.after_imu_step(self.imu.at(begin_ns), std)
                 hypothesis = hypothesis._replace(estimate=estimate)
         steps = self.imu.steps(estimate.stamp_ns, until_ns)
-        return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self._walks))
+        return hypothesis._replace(estimate=propagated(estimate, steps, until_ns, self.walks))
 
     def suspect_clock_step(self, size_ns: int) -> None:
         """Count with a step of the IMU's clock by ``size_ns`` after the newest sample; or samples are lost there."""

@@ -8,11 +8,11 @@ Sources: A. Barrau, S. Bonnabel, "The Invariant Extended Kalman Filter as a Stab
 Loan, "Computing Integrals Involving the Matrix Exponential", IEEE TAC 1978.
 """
 
+from bisect import bisect_left
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.polynomial import polynomial
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.imu_buffer import Steps
@@ -33,15 +33,16 @@ from thermal_fiducial.core.filter.state import (
     TIME_OFFSET,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry.se3 import SKEW, skew
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.geometry.se3 import SKEW
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Terms of the exponential's series: exact to 1e-13 for a turn of 0.03 rad, of a brisk flight sampled at 100 Hz, and to
 #: 2e-10 for 0.1 rad, over a gap.
 _TERMS = 6
 _IDENTITY = np.eye(9)
-#: Longest time of coasting that is looked ahead [s], and steps in it [s].
-HORIZON, HORIZON_STEP = 60.0, 0.05
+#: Longest time of coasting that is looked ahead [s], and its resolution [s]. A time of hover is divided into so many
+#: steps: the exponential is exact for any, and of the variance by white noise 1 % is missing.
+HORIZON, _TICK, _STEPS = 60.0, 0.05, 5
 #: Scale and cross-axis errors of both triads.
 _SCALES = slice(GYROSCOPE_MATRIX.start, ACCELEROMETER_MATRIX.stop)
 
@@ -145,36 +146,27 @@ def _transitions(matrices: StepMatrices, R_map_body: FloatArray, steps: Steps) -
     return transitions
 
 
-def usable_seconds(estimate: Estimate, densities: FloatArray, position_std: float) -> float:
+def usable_seconds(estimate: Estimate, densities: FloatArray, walks: FloatArray, position_std: float) -> float:
     """Seconds [s] of coasting until the position is worse than ``position_std`` [m]; at most ``HORIZON``."""
-    times = np.arange(0.0, HORIZON + HORIZON_STEP, HORIZON_STEP)
-    beyond = polynomial.polyval(times, coasting_variance(estimate, densities)) > position_std**2
-    return float(times[np.argmax(beyond)]) if beyond.any() else HORIZON
+    ticks = range(round(HORIZON / _TICK))
+    return _TICK * bisect_left(
+        ticks, True, key=lambda tick: hovered(estimate, densities, walks, _TICK * tick).position_std > position_std
+    )
 
 
-def coasting_variance(estimate: Estimate, densities: FloatArray) -> FloatArray:
-    """Sum of the position variances [m^2] after t seconds of hover, coefficients of t^0 .. t^6.
+def hovered(estimate: Estimate, densities: FloatArray, walks: FloatArray, seconds: float) -> Estimate:
+    """The estimate after ``seconds`` of hover without poses.
 
-    The error is rho + nu t + alpha t^2 / 2 + beta t^3 / 6 + noise, with alpha the acceleration error by tilt and
-    accelerometer, and beta its growth by the gyroscope's bias error. ``densities`` (6,): noise of gyroscope and
-    accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)].
+    Parameters
+    ----------
+    densities : (6,) noise of gyroscope and accelerometer [rad/s/sqrt(Hz), m/s^2/sqrt(Hz)]
+    walks : (48,) of :func:`random_walks`
     """
+    if seconds == 0.0:
+        return estimate
     state = estimate.state
-    hovering = -state.gravity @ state.R_map_body
-    lift = skew(hovering)
-    rho, nu, alpha, beta = (np.zeros((3, SIZE)) for _ in range(4))
-    rho[:, POSITION] = nu[:, VELOCITY] = np.eye(3)
-    alpha[:, ROTATION], alpha[:, ACCELEROMETER_BIAS], beta[:, GYROSCOPE_BIAS] = -lift, -np.eye(3), lift
-    alpha[:, ACCELEROMETER_MATRIX] = -np.kron(np.eye(3), hovering)
-    alpha[:, GRAVITY] = state.R_map_body[:2].T
-    terms = (rho, nu, alpha / 2.0, beta / 6.0)
-    coefficients = np.zeros(7)
-    for i, left in enumerate(terms):
-        for j, right in enumerate(terms):
-            coefficients[i + j] += np.einsum('ik,kl,il', left, estimate.covariance, right)
-    coefficients[0] += np.trace(estimate.pose_noise.last.map_covariance[:3, :3])
-    # White acceleration noise on three axes, each sigma^2 t^3 / 3, and tilt about two axes by white rate noise.
-    rate, force = float(densities[0]), float(densities[3])
-    coefficients[3] += force**2
-    coefficients[5] += 2.0 * rate**2 * float(state.gravity @ state.gravity) / 20.0
-    return coefficients
+    # The reading that holds the robot still in the air, by the estimate.
+    hover = np.concatenate((np.zeros(3), -state.gravity @ state.R_map_body))
+    exact = replace(state, bias=np.zeros(6), scale=np.zeros((2, 3, 3)), velocity=np.zeros(3))
+    steps = Steps(np.tile(hover, (_STEPS, 1)), np.full(_STEPS, seconds / _STEPS), np.tile(densities, (_STEPS, 1)))
+    return propagated(replace(estimate, state=exact), steps, estimate.stamp_ns + round(seconds * SECOND_NS), walks)

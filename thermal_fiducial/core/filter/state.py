@@ -160,8 +160,14 @@ class Estimate:
         return replace(self, covariance=self.covariance + std**2 * np.outer(error, error))
 
     def std(self, place: slice | int) -> float:
-        """Root of the sum of the variances of some coordinates."""
+        """Root of the sum of the variances of some coordinates: relative to the map, as poses show them."""
         return math.sqrt(float(np.sum(self.covariance.diagonal()[place])))
+
+    @property
+    def position_std(self) -> float:
+        """Root of the sum of the position variances, the map's error included [m]."""
+        of_map = self.pose_noise.last.map_covariance[:3, :3]
+        return math.hypot(self.std(POSITION), math.sqrt(float(of_map.trace())))
 
 
 def of_core(error: FloatArray) -> FloatArray:
