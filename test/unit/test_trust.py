@@ -11,10 +11,11 @@ def markers(count=4, **values):
     return {key: MapMarker(key, 0.3, False, np.eye(4), **values) for key in range(count)}
 
 
-def frame(trust, known, errors_px):
+def frame(trust, known, errors_px, left_out=()):
     """A frame in which each of the first markers has its error, of 0.1 px that are explained."""
-    seen = np.array([known[key] for key in range(len(errors_px))], dtype=np.object_)
-    return trust.update(known, seen, np.array(errors_px), np.full(len(errors_px), 0.1))
+    count = len(errors_px)
+    seen = np.array([known[key] for key in range(count)], dtype=np.object_)
+    return trust.update(known, seen, np.array(errors_px), np.full(count, 0.1), np.isin(np.arange(count), left_out))
 
 
 def test_a_marker_off_in_most_frames_of_a_second_is_quarantined_and_one_that_fits_again_released():
@@ -65,3 +66,12 @@ def test_the_running_error_is_the_mean_at_first_and_then_forgets():
 def test_of_two_that_contradict_each_other_the_better_known_one_holds(a, b, expected):
     pair = [MapMarker(key, 0.3, T_map_marker=np.eye(4), **({'fixed': False} | own)) for key, own in enumerate((a, b))]
     assert inconsistent(np.array([True, True]), pair).tolist() == expected
+
+
+def test_a_marker_that_odometry_contradicts_is_quarantined_though_its_error_alone_is_no_evidence():
+    known = markers(count=2)
+    trust = Trust(known)
+    changes = [frame(trust, known, [0.1, 0.3], left_out=[1]) for _ in range(24)]
+    assert changes.index(True) == 23
+    assert known[0].trusted
+    assert not known[1].trusted

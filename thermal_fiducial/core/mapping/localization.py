@@ -69,12 +69,12 @@ def locate(
     T = fit.solve(hypotheses[:1], by_map)[0][0]
     seen = sight.reprojected(camera, T)
     if not np.all(np.isfinite(seen.residuals)):
-        return Refusal(f'no camera pose explains {_names(sight)}')
+        return Refusal(f'no camera pose explains {names(sight)}')
     # Steps 5 and 6: refined with the weights of their errors.
     found = frame.refined(T, seen, by_map * marker_weights(seen.errors_px, running_errors, model))
     T_other = None if found is None else frame.alternative(found, hypotheses)
     if found is None or T_other is None:
-        return found or Refusal(f'the pose from {_names(sight)} is not determined')
+        return found or Refusal(f'the pose from {names(sight)} is not determined')
     return _either(frame, found, T_other, prior)
 
 
@@ -92,7 +92,7 @@ def _either(frame: '_JointFit', found: Location, T_other: FloatArray, prior: Flo
     if prior is None:
         covariances = np.stack([pose.covariance, other.pose.covariance])
         viewpoint = Viewpoint(np.stack([T, T_other]), covariances, np.zeros((6, 6)))
-        return Refusal(f'planar ambiguity of {_names(frame.sight)} unsettled', viewpoint)
+        return Refusal(f'planar ambiguity of {names(frame.sight)} unsettled', viewpoint)
     turns = rotation_angle(prior[:3, :3].T @ np.stack([T, T_other])[:, :3, :3])
     return other if turns[1] < turns[0] else found
 
@@ -218,6 +218,7 @@ def _hypotheses(sight: Sight, fit: CameraFit, prior: FloatArray | None) -> Float
     return np.asarray(poses[np.argsort(fit.costs(poses), kind='stable')])
 
 
-def _names(sight: Sight) -> str:
+def names(sight: Sight) -> str:
+    """The markers of a frame, in words."""
     ids = sight.observed.ids.tolist()
     return f'marker {ids[0]}' if len(ids) == 1 else 'markers ' + ', '.join(str(i) for i in ids)

@@ -179,3 +179,7 @@ class LocatedFrame:
         by_marker = np.einsum('nri,nri->n', seen.J_marker @ known.map_covariances, seen.J_marker)
         explained = 2.0 * known.noise_px**2 + np.nan_to_num(by_camera + by_marker) / 4.0 + INCONSISTENT_PX**2
         return errors, np.sqrt(explained)
+
+    def left_out(self, location: Location) -> BoolArray:
+        """Which of the K known markers (K,) the pose left out, though they were trusted."""
+        return self.known.trusted & ~np.isin(self.known.observed.ids, location.sight.observed.ids)

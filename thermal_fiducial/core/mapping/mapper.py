@@ -19,6 +19,7 @@ from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, entry, NewMarkers
+from thermal_fiducial.core.mapping.contradiction import are_two_that_contradict, contradicting, settled
 from thermal_fiducial.core.mapping.keyframes import FrameMemory, VIEWS
 from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
@@ -26,7 +27,7 @@ from thermal_fiducial.core.mapping.map_data import jump, MapperResult, MarkerMap
 from thermal_fiducial.core.mapping.marker_views import Viewpoint
 from thermal_fiducial.core.mapping.trust import CornerBias, Trust
 from thermal_fiducial.core.measurements import CameraPose, Markers, Observations
-from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
+from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera, PredictedCamera
 from thermal_fiducial.core.types import FloatArray
 
 #: Reason for which the map is not updated from a frame with a pose.
@@ -111,18 +112,31 @@ class MarkerMapper:
         sight = known if known.trusted.all() else known.only(known.trusted)
         outcome: Location | Refusal = Refusal('no known marker in view')
         if len(sight.markers):
-            last = self._last
-            near = last is not None and 0 < stamp_ns - last.stamp_ns < CONTINUITY_NS
-            expected = predicted.pose if predicted is not None else last if near else None
-            T_expected = None if expected is None else expected.T_map_camera
-            running_errors = self._trust.running_errors(sight.markers)
-            outcome = locate(stamp_ns, sight, running_errors, camera, T_expected, self._errors)
+            outcome = self._located(stamp_ns, sight, camera, predicted)
         elif len(known.markers):
             outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
         pose = None if isinstance(outcome, Refusal) or outcome.reason else outcome.pose
         return LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome, pose)
+
+    def _located(
+        self, stamp_ns: int, sight: Sight, camera: Camera, predicted: PredictedCamera | None
+    ) -> Location | Refusal:
+        """The camera from the trusted markers in view, at least one."""
+        last = self._last
+        near = last is not None and 0 < stamp_ns - last.stamp_ns < CONTINUITY_NS
+        expected = predicted.pose if predicted is not None else last if near else None
+        T_expected = None if expected is None else expected.T_map_camera
+
+        def fit(some: Sight) -> Location | Refusal:
+            running_errors = self._trust.running_errors(some.markers)
+            return locate(stamp_ns, some, running_errors, camera, T_expected, self._errors)
+
+        found = fit(sight)
+        if isinstance(found, Refusal) or not are_two_that_contradict(found):
+            return found
+        return contradicting(sight) if predicted is None else settled(found, camera, predicted.pose, fit)
 
     @property
     def _errors(self) -> SystematicErrors:
@@ -148,7 +162,8 @@ class MarkerMapper:
             self._last, updated = outcome.pose, True
             # Step 7: errors updated.
             self._bias.add(outcome)
-            changed = self._trust.update(self.map.markers, frame.known.markers, *frame.known_errors(outcome))
+            errors, left_out = frame.known_errors(outcome), frame.left_out(outcome)
+            changed = self._trust.update(self.map.markers, frame.known.markers, *errors, left_out)
             # Step 8: new markers placed relative to the camera.
             if not self.frozen:
                 self._count(frame)

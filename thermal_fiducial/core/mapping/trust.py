@@ -14,7 +14,7 @@ import numpy as np
 from thermal_fiducial.core.error_model import CHI2_OF_VIEW, INCONSISTENT_PX, SystematicErrors, visible_share
 from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.types import FloatArray, ObjectArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, ObjectArray
 
 #: Reason of quarantine of markers that the map file already had there.
 FROM_FILE = 'in quarantine since before the map was loaded'
@@ -58,7 +58,12 @@ class Trust:
         return np.sqrt([self._record(marker).mean_square_px for marker in markers])
 
     def update(
-        self, markers: dict[int, MapMarker], known: ObjectArray, errors_px: np.ndarray, explained_px: np.ndarray
+        self,
+        markers: dict[int, MapMarker],
+        known: ObjectArray,
+        errors_px: np.ndarray,
+        explained_px: np.ndarray,
+        left_out: BoolArray,
     ) -> bool:
         """Update with a frame; persistently inconsistent markers are put in quarantine, consistent ones released.
 
@@ -67,6 +72,7 @@ class Trust:
         markers : of the map; those that enter or leave quarantine are replaced
         known : the N of them in the frame
         errors_px, explained_px : (N,) their rms re-projection errors, and the standard deviations of these
+        left_out : (N,) which of them the pose left out, as odometry contradicts them: inconsistent
 
         Returns
         -------
@@ -83,6 +89,7 @@ class Trust:
         blamed = ratios > DISAGREEMENT
         if blamed.any():
             blamed = inconsistent(blamed, known.tolist())
+        blamed = blamed | left_out
         changed = False
         columns = blamed.tolist(), errors_px.tolist(), ratios.tolist()
         for marker, record, bad, error, ratio in zip(known, records, *columns, strict=True):

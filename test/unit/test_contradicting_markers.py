@@ -1,0 +1,75 @@
+"""Two markers of a map contradict each other, as one of them was moved: which one, odometry says."""
+
+import numpy as np
+import pytest
+from support.scenes import motion_prior
+from support.walls import CAMERA, flight, see, SIZE, stamp, wall
+
+from thermal_fiducial.config import MarkerMapperConfig
+from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.geometry.se3 import so3_exp, transform
+from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
+from thermal_fiducial.core.mapping.mapper import MarkerMapper
+from thermal_fiducial.core.measurements import Odometry
+
+#: Odometry at poses from two markers: 0.2 deg, and 15 mm across the view.
+SIGMA = (15e-3, 3.5e-3)
+
+
+def odometry(k):
+    """Odometry at frame ``k``, as a filter has it that has seen both markers before."""
+    covariance = np.diag([SIGMA[0]] * 3 + [SIGMA[1]] * 3) ** 2
+    return Odometry(stamp(k), flight(k / 30), np.zeros(3), np.zeros(3), covariance, np.diag([0.02] * 6) ** 2)
+
+
+def flown(moved, shift, turn=0.0, frames=40, with_odometry=True):
+    """Results of frames with markers 1 and 2, of which ``moved`` hangs elsewhere than in the map."""
+    rng = np.random.default_rng(3)
+    poses = {key: T for key, T in wall(rng).items() if key in (1, 2)}
+    mapper = MarkerMapper(
+        MarkerMapperConfig(mode='localization', camera_orientation=(0.0, 0.0, 0.0, 1.0)),
+        MarkerMap({key: MapMarker(key, SIZE, True, T) for key, T in poses.items()}),
+    )
+    there = poses | {moved: poses[moved] @ transform(so3_exp([0.0, turn, 0.0]), [shift, 0.0, 0.0])}
+    results = []
+    for k in range(frames):
+        rows = see(flight(k / 30), there, 0.02, rng)
+        prior = motion_prior(odometry(k)) if with_odometry else None
+        results.append(mapper.process(stamp(k), rows, CAMERA, prior))
+    return results
+
+
+@pytest.mark.parametrize('moved', [1, 2])
+@pytest.mark.parametrize(('shift', 'turn'), [(0.1, 0.0), (0.1, 0.26)])
+def test_the_pose_comes_from_the_marker_that_odometry_agrees_with(moved, shift, turn):
+    results = flown(moved, shift, turn)
+    for k, result in enumerate(results):
+        error = difference(result.pose.T_map_camera, flight(k / 30))
+        # The other marker's pose is 100 mm off: nearer to the truth than to that.
+        assert np.linalg.norm(error[:3]) < 0.05
+        # Six degrees of freedom, 99.9 %.
+        assert error @ np.linalg.solve(result.pose.covariance, error) < 22.5
+    # Most of the last 20 frames.
+    assert list(results[-1].quarantined) == [moved]
+
+
+@pytest.mark.parametrize('moved', [1, 2])
+def test_where_odometry_does_not_decide_the_pose_claims_what_the_markers_differ_by(moved):
+    """A shift of 20 mm is within the odometry's error, and not within that of the corners."""
+    results = flown(moved, 0.02)
+    for k, result in enumerate(results):
+        error = difference(result.pose.T_map_camera, flight(k / 30))
+        assert error @ np.linalg.solve(result.pose.covariance, error) < 22.5
+    # An error of the map, which the filter must not average away.
+    variances = [result.pose.map_covariance[:3, :3].trace() for result in results]
+    assert np.mean(variances) > 0.02**2
+    assert not results[-1].quarantined
+
+
+def test_without_odometry_no_pose_is_published():
+    assert all(result.pose is None for result in flown(2, 0.1, with_odometry=False))
+
+
+def test_markers_that_agree_are_all_used():
+    for result in flown(2, 0.0):
+        assert result.pose.marker_ids == (1, 2)
