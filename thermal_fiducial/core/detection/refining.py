@@ -72,7 +72,8 @@ class RefinedCorners(Stacked):
     covariances : (N, 4, 2, 2) [px^2]
     contrast : (N,) white minus black [counts]
     noise : (N,) standard deviation of a pixel about the model [counts]
-    doubt : (N,) additional variance where the outline is inconsistent with a square, else 0; not in covariances [px^2]
+    doubt : (N,) additional variance where the outline is inconsistent with a square, or has not converged, else 0;
+        not in covariances [px^2]
     """
 
     corners_px: FloatArray
@@ -283,5 +284,7 @@ def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCor
     least, most = _SETTLED_PX
     settled = np.minimum(np.maximum(_UNSURE * deviation, least), most)
     moving: BoolArray = np.asarray((np.abs(shift) > settled).any(axis=(1, 2)))
+    # Corners that have not converged are known no better than by their last step.
+    doubt = np.where(moving, np.maximum(doubt, (shift * shift).max(axis=(1, 2))), doubt)
     corners = sides.ends.reshape(-1, 8, 2).take(_CORNERS, axis=1) + shift
     return RefinedCorners(corners, covariances, contrast, noise, doubt), moving

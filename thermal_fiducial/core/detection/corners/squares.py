@@ -24,6 +24,8 @@ _INCONSISTENT = 12.0
 # Step of the differences from which the derivatives are taken [px]: a millionth of a side, far above rounding.
 _STEP_PX = 1e-4
 _VARIANCE, _OF_EACH = _SQUARE_STD**2 * np.eye(2), np.eye(4)[:, None, :, None]
+# Mean displacement of all corners, for each of them.
+_TOGETHER = np.kron(np.ones((4, 4)) / 4, np.eye(2))
 
 
 class Squared(NamedTuple):
@@ -43,15 +45,15 @@ class Squared(NamedTuple):
 def as_squares(at: ImagePoints, seen: FloatArray, covariance: FloatArray) -> Squared:
     """Displacements of corners with the constraint of a square.
 
-    Two planar poses of a small square look almost alike. The one nearer to the initial corners is taken unless the
-    image rules it out.
+    Two planar poses of a small square look almost alike. The one nearer to the initial corners, translated, is taken
+    unless the image rules it out.
 
     Parameters
     ----------
     at : (N, 4) initial corners
     seen, covariance : (N, 8, 1), (N, 8, 8) measured displacements of the corners [px]
     """
-    nearest = _corrected(at, np.zeros_like(seen), seen, covariance)
+    nearest = _corrected(at, _TOGETHER @ seen, seen, covariance)
     refuted = np.flatnonzero(nearest.chi2 > _INCONSISTENT)
     if len(refuted):
         other = _corrected(at.only(refuted), seen[refuted], seen[refuted], covariance[refuted])
