@@ -35,7 +35,7 @@ VIEWS = {
 }
 CONFIG = ArucoDetectorConfig(blur_px=BLUR_WITH_PIXEL)
 SEARCH = PartialMarkerSearch(Decoder(BITS), BITS)
-STILL = Twist(np.zeros(6), 1e-9 * np.eye(12))
+STILL = Twist(np.zeros(6), 1e-9 * np.eye(6))
 
 
 @cache

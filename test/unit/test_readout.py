@@ -17,7 +17,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 
 CAMERA = Camera(640, 512, [[440.0, 0, 319.5], [0, 440.0, 255.5], [0, 0, 1]], 'plumb_bob', [-0.3, 0.1, 0, 0, 0])
-TWIST = Twist(np.array([0.8, -1.5, 0.6, -1.8, 1.5, 0.8]), np.eye(12), np.array([3.0, 0.0, 2.0, 6.0, -4.0, 5.0]))
+TWIST = Twist(np.array([0.8, -1.5, 0.6, -1.8, 1.5, 0.8]), np.eye(6), np.array([3.0, 0.0, 2.0, 6.0, -4.0, 5.0]))
 FRAME = Frame(0, np.zeros((512, 640), dtype=np.float32), 1.0, CAMERA, TWIST, 0.0, 0.025)
 
 
@@ -77,7 +77,7 @@ def test_nothing_moves_when_all_rows_are_read_at_once():
 @pytest.mark.parametrize('speed', [-1.0, 1.0])
 def test_what_runs_with_the_read_out_leaves_longer_ways(speed):
     places = places_of(np.array([[[-0.1, -0.1, 1], [0.1, -0.1, 1], [0.1, 0.1, 1], [-0.1, 0.1, 1]]]))
-    falling = Twist(np.array([0.0, -speed, 0, 0, 0, 0]), np.eye(12))
+    falling = Twist(np.array([0.0, -speed, 0, 0, 0, 0]), np.eye(6))
     rate = FRAME.readout / 511 * (places.flow @ falling.value)[..., 1]
     np.testing.assert_allclose(stretch(places, falling, FRAME), 1.0 / (1.0 - rate), rtol=1e-12)
     assert np.all((stretch(places, falling, FRAME) > 1.0) == (speed > 0.0))

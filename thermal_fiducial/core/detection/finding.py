@@ -37,7 +37,7 @@ _ENOUGH = 0.5
 # Longest interval of blind searches [frames] without a map or with a wrong prediction.
 _UNSURE = 2
 # Least correlation with its pattern of a followed marker, in an image that lag blurs.
-_STILL_SIMILAR = 0.7
+_STILL_SIMILAR = 0.5
 
 
 @dataclass(frozen=True, slots=True)

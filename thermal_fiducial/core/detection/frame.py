@@ -12,8 +12,7 @@ derivative makes a ghost of every step). Only the response older than a time m, 
 motion blur remains, which the edge model contains, and a known mean delay.
 
 With an acceleration a, the image of s ago lies s w - s^2 a / 2 behind. The mean delay of an exponential,
--tau w + tau^2 a, is therefore that of the velocity one time constant ago, and the lag tail is displaced by the velocity
-of tau + m / 2 ago.
+-tau w + tau^2 a, is therefore that of the velocity one time constant ago, which is taken for the lag tail as well.
 """
 
 from dataclasses import dataclass
@@ -62,8 +61,6 @@ REMAINING, SPREAD = _moments(0.0, _TAIL)
 #: That motion blur as Gaussians of equal weight. It has sharp ends, and one Gaussian would have none: where it is as
 #: long as cells are wide, sides would be off by a tenth of it.
 WITHOUT_TAIL = _halves()
-#: Age, in time constants, of the velocity that gives the displacement of the lag tail.
-LAG_TAIL_AGE = 1.0 + 0.5 * _TAIL
 
 
 @dataclass(frozen=True)

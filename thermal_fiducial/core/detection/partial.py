@@ -236,7 +236,7 @@ def _pose_covariance(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> Floa
     blocks = np.broadcast_to((OF_BENT_SCALE_PX if frame.displayed else OF_SIDES_PX) ** 2 * np.eye(2), (4, 2, 2))
     if frame.twist is not None:
         places = places_of_points(se3.apply(T, window), frame.camera)
-        lag_blur, twist_covariance = places.lag_blur(frame.twist, frame.lag), frame.twist.covariance_ago(frame.lag)
+        lag_blur, twist_covariance = places.lag_blur(frame.twist, frame.lag), frame.twist.covariance
         blocks = blocks + of_motion_blur(frame.lag * places.flow, twist_covariance, lag_blur)[0]
     gain = np.linalg.pinv(J).reshape(6, 4, 2)
     systematic = np.einsum('ick,ckl,jcl->ij', gain, blocks, gain)

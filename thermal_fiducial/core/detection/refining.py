@@ -22,7 +22,6 @@ from thermal_fiducial.core.detection.frame import (
     counts_of,
     delays,
     Frame,
-    LAG_TAIL_AGE,
     lag_tail_maps,
     Places,
     REMAINING,
@@ -193,7 +192,7 @@ def _at_stamp(
     lag_blur = places.lag_blur(twist, frame.lag)
     rolling = rolling_displacement(places, twist, frame, (seen.corners_px + blur.removed)[..., 1])
     px = seen.corners_px - lag_blur + blur.removed - rolling
-    unknown = of_motion_blur(frame.lag * places.flow, twist.covariance_ago(frame.lag), lag_blur)
+    unknown = of_motion_blur(frame.lag * places.flow, twist.covariance, lag_blur)
     if frame.twist is None:
         unknown = unknown + _of_unpredicted_motion(frame, places, seen, twist, cells)
     corners = replace(seen, corners_px=px, covariances=doubted + unknown)
@@ -205,7 +204,7 @@ def _of_unpredicted_motion(frame: Frame, places: Places, seen: RefinedCorners, t
     since = frame.lag - delays(seen.corners_px[..., 1], frame)
     unsharpness = seen.noise / np.maximum(np.abs(seen.contrast), TINY)
     cell = sides_px(seen.corners_px) / cells
-    return unknown_motion(since[..., None, None] * places.flow, twist.covariance_ago(frame.lag), unsharpness, cell)
+    return unknown_motion(since[..., None, None] * places.flow, twist.covariance, unsharpness, cell)
 
 
 def _motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlur:
@@ -214,10 +213,8 @@ def _motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlu
     mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
     if twist is None or (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
         return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean)
-    # So far the velocity has carried the image since its lag tail was seen, as the read-out shows it.
-    tail = -frame.lag * (places.flow @ twist.ago(LAG_TAIL_AGE * frame.lag))
-    if frame.readout > 0.0:
-        tail = tail * stretch(places, twist, frame)[..., None]
+    # As the read-out shows it.
+    tail = lag_blur * stretch(places, twist, frame)[..., None] if frame.readout > 0.0 else lag_blur
     removed = (1.0 - REMAINING) * tail
     shift = lag_blur - removed + rolling
     return MotionBlur(lag_tail_maps(places.at.px + shift, tail), shift, removed, SPREAD * mean)

@@ -1,7 +1,7 @@
 """Motion of the camera from frame to frame, estimated from its markers and from odometry.
 
-A Kalman filter of the camera's twist and acceleration: predicted from the last frame, corrected by odometry around the
-frame and by the displacement of the markers' corners since the last frame.
+The camera's twist is that of the odometry around the frame, else that of the last frame, corrected by the displacement
+of the markers' corners since the last frame.
 """
 
 from collections.abc import Sequence
@@ -16,12 +16,9 @@ from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, pairs
 from thermal_fiducial.core.detection.twist import (
     corrected,
     interaction,
-    line_through,
-    predicted_twist,
-    process_noise,
-    RANDOM,
-    transferred,
+    later_twist,
     Twist,
+    twist_by_odometry,
     unknown_twist,
 )
 from thermal_fiducial.core.geometry import se3
@@ -32,8 +29,6 @@ from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 
 # Longest time between frames whose motion is related [ns].
 _STALE_NS = 150_000_000
-# Fewest odometry states from which the acceleration is fitted, too.
-_ENOUGH_STATES = 4
 # Jitter of the camera's stamps [s].
 _JITTER_S = 0.001
 # Standard deviation of the delay of corners in a lagging image before the twist is known [lag].
@@ -88,22 +83,12 @@ class MotionTrack:
         clock_std_s : standard deviation of that stamp [s]
         """
         odometry_ns = stamp_ns if odometry_ns is None else odometry_ns
-        if len(odometry) >= _ENOUGH_STATES:
-            return line_through(odometry_ns, odometry, self.from_body, clock_std_s)
-        dt, before = self._since(stamp_ns), None
+        if len(odometry) and abs(odometry_ns - odometry[-1].stamp_ns) < _STALE_NS:
+            return twist_by_odometry(odometry_ns, odometry, self.from_body, self.lag, clock_std_s)
+        dt = self._since(stamp_ns)
         # Without markers the twist is not extrapolated: a wrong one would keep them from being found again.
         saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_NS
-        if self.twist is not None and dt is not None and saw_lately:
-            before = predicted_twist(self.twist, dt)
-        if len(odometry) == 0 or abs(odometry_ns - odometry[-1].stamp_ns) >= _STALE_NS:
-            return before
-        seen, later = (
-            transferred(odometry[-1], self.from_body),
-            (odometry[-1].stamp_ns - odometry_ns) / SECOND_NS,
-        )
-        unsure = (process_noise(abs(later))[0] + clock_std_s**2) * RANDOM
-        information: FloatArray = np.asarray(np.linalg.inv(seen.covariance + unsure))
-        return corrected(before or unknown_twist(), information, information @ seen.value, later)
+        return later_twist(self.twist, dt) if self.twist is not None and dt is not None and saw_lately else None
 
     def expected(self, stamp_ns: int, twist: Twist) -> ExpectedMarkers:
         """The last frame's markers, predicted at this frame."""
@@ -151,7 +136,9 @@ class MotionTrack:
         spread = weighted @ stretch
         share = spread / (1.0 + stretched @ stretch)
         information = weighted @ A - spread[:, None] * share
-        return corrected(start, information, weighted @ velocity - share * (stretched @ velocity), -0.5 * (begin + end))
+        later = -0.5 * (begin + end)
+        value = weighted @ velocity - share * (stretched @ velocity)
+        return corrected(start, information, value, later, later + self.lag)
 
     def all_clearer_than(self, cnr: float) -> bool:
         """Whether the last frame had markers, all with a contrast-to-noise ratio above ``cnr``."""
