@@ -102,7 +102,7 @@ def propagated(estimate: Estimate, steps: Steps, stamp_ns: int, walks: FloatArra
     variances = steps.densities * steps.densities / steps.seconds[:, None]
     noises = (by_imu * variances[:, None]) @ by_imu.swapaxes(-1, -2)
     P = estimate.covariance.copy()
-    diagonal = np.einsum('ii->i', P)
+    diagonal = P.reshape(-1)[:: SIZE + 1]
     for transition, noise, dt in zip(transitions, noises, steps.seconds.tolist(), strict=True):
         cross = transition @ P[MOVED_BY]
         P[CORE] = cross

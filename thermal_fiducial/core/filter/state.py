@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.filter.pose_noise import PoseNoise
-from thermal_fiducial.core.geometry.se3 import skew, so3_exp, so3_left_jacobian_inverse, transform
+from thermal_fiducial.core.geometry.se3 import skew, so3_exp, so3_left_jacobian, transform
 from thermal_fiducial.core.types import FloatArray
 
 #: Error coordinates by index. Core, expressed in the robot frame [rad, m/s, m],
@@ -88,11 +88,11 @@ class NavigationState:
 
     def plus(self, error: FloatArray) -> 'NavigationState':
         """The state corrected by ``error`` (48,): X Exp(xi) for the group part, a sum for the rest."""
-        R_left = self.R_map_body @ _left_jacobian(error[ROTATION])
+        R_left = self.R_map_body @ so3_left_jacobian(error[ROTATION])
         T_body_camera = self.T_body_camera
         if error[EXTRINSICS].any():
             turn, shift = error[EXTRINSICS][:3], error[EXTRINSICS][3:]
-            T_body_camera = transform(so3_exp(turn), _left_jacobian(turn) @ shift) @ T_body_camera
+            T_body_camera = transform(so3_exp(turn), so3_left_jacobian(turn) @ shift) @ T_body_camera
         return NavigationState(
             orthonormal(self.R_map_body @ so3_exp(error[ROTATION])),
             self.velocity + R_left @ error[VELOCITY],
@@ -185,11 +185,6 @@ def of_clock(derivative: FloatArray) -> FloatArray:
     error = of_core(-derivative)
     error[TIME_OFFSET] = 1.0
     return error
-
-
-def _left_jacobian(phi: FloatArray) -> FloatArray:
-    """(3, 3) of the exponential at a rotation vector (3,) [rad]."""
-    return np.asarray(np.linalg.inv(so3_left_jacobian_inverse(phi)))
 
 
 def with_horizontal(gravity: FloatArray, horizontal: FloatArray) -> FloatArray:

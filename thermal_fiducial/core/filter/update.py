@@ -1,5 +1,6 @@
 """Correction of an estimate by a camera pose. The covariance algebra is filterpy's, the state on the group ours."""
 
+from copy import copy
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,7 +23,7 @@ from thermal_fiducial.core.filter.state import (
     VELOCITY,
 )
 from thermal_fiducial.core.geometry.reprojection import lever_arm
-from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_left_jacobian_inverse, so3_log
+from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_left_jacobian, so3_log
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
 
@@ -30,6 +31,8 @@ from thermal_fiducial.core.types import FloatArray
 #: in units of the innovation, growing with the gain. Taking it away at most doubles the offset's variance in one step.
 _FEIGNED, _LEAST_KEPT = 1.5, 0.5
 _SIX = np.arange(6)
+#: Copied for every update, as an update leaves its results in the object.
+_ALGEBRA = ExtendedKalmanFilter(dim_x=SIZE, dim_z=6)
 
 
 class Innovation(NamedTuple):
@@ -73,7 +76,7 @@ def pose_error(state: NavigationState, T_map_body: FloatArray) -> FloatArray:
     """(6,) Log(X^-1 Z) on SE(3), rotation first: the left-invariant error of ``state`` if ``T_map_body`` is true."""
     rotation = so3_log(state.R_map_body.T @ T_map_body[:3, :3])
     offset = (T_map_body[:3, 3] - state.position) @ state.R_map_body
-    return np.concatenate((rotation, so3_left_jacobian_inverse(rotation) @ offset))
+    return np.concatenate((rotation, np.linalg.solve(so3_left_jacobian(rotation), offset)))
 
 
 def by_mount(state: NavigationState) -> FloatArray:
@@ -188,7 +191,7 @@ def _in_clock_of_imu(config: PoseEkfConfig, P: FloatArray, now: FloatArray, inno
 
 def _gained(config: PoseEkfConfig, innovation: Innovation) -> tuple[FloatArray, FloatArray]:
     """Kalman update: the corrected error (48,) and the covariance (48, 48)."""
-    algebra, P = ExtendedKalmanFilter(dim_x=SIZE, dim_z=6), innovation.prior.covariance
+    algebra, P = copy(_ALGEBRA), innovation.prior.covariance
     algebra.x, algebra.P = np.zeros(SIZE), P
     algebra.update(innovation.value, lambda _: innovation.H, lambda _: np.zeros(6), R=innovation.R)
     gain, covariance = algebra.K, 0.5 * (algebra.P + algebra.P.T)

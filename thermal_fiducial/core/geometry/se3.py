@@ -79,6 +79,20 @@ def so3_log(R: npt.ArrayLike) -> FloatArray:
     return np.asarray(scale[..., None] * v)
 
 
+def so3_left_jacobian(phi: FloatArray) -> FloatArray:
+    """J_l (3, 3) with ``exp(phi + d) ~ exp(J_l d) exp(phi)``, of one rotation vector (3,) [rad] (Sola, eq. 145)."""
+    squared = float(phi @ phi)
+    if squared < SMALL_ANGLE**2:
+        b = 1 / 2 - squared * (1 / 24 - squared / 720)
+        c = 1 / 6 - squared * (1 / 120 - squared / 5040)
+    else:
+        angle = math.sqrt(squared)
+        b = (1.0 - math.cos(angle)) / squared
+        c = (angle - math.sin(angle)) / (angle * squared)
+    K = skew(phi)
+    return np.asarray(np.eye(3) + b * K + c * (K @ K))
+
+
 def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
     """Inverse (..., 3, 3) of J_l with ``exp(phi + d) ~ exp(J_l d) exp(phi)``, for norms below 2 pi (Sola, eq. 146)."""
     phi = np.asarray(phi, dtype=np.float64)
