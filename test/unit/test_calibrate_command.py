@@ -30,7 +30,24 @@ def test_camera_against_imu(tmp_path, capsys):
     assert np.degrees(se3.rotation_angle(R.T @ T_BODY_CAMERA[:3, :3])) < 1.0
     # These frames have no lag, but the detector undoes the 10 ms that a bolometer has.
     assert 0.0 < found['camera_time_offset'] < 0.02
-    assert '+-' in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert '+-' in printed.out
+    # What the recording leaves open goes on to the filter, which would otherwise take 2 mm and 2 mrad.
+    left_mm = [float(value) for value in _axes_of(printed.out, 'camera_position')]
+    left_deg = [float(value) for value in _axes_of(printed.out, 'camera_orientation')]
+    assert max(left_mm) > 2.0
+    # Tolerances: the digits that are printed.
+    assert 1e3 * found['extrinsics_position_std'] == pytest.approx(max(left_mm), abs=0.01)
+    assert np.degrees(found['extrinsics_orientation_std']) == pytest.approx(
+        max([*left_deg, np.degrees(0.002)]), abs=1e-4
+    )
+    assert 'turns about all three axes' in printed.err
+
+
+def _axes_of(text, name):
+    """The standard deviations of the three axes behind the parameter ``name``."""
+    line = next(line for line in text.splitlines() if f'{name}:' in line)
+    return line.partition('+- [')[2].partition(']')[0].split(',')
 
 
 @pytest.mark.parametrize('missing', [IMU_TOPIC, IMAGE_TOPIC, CAMERA_INFO_TOPIC, 'bag', 'map', 'time'])

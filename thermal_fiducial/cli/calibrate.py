@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,10 @@ from thermal_fiducial.files.writing import write_text
 if TYPE_CHECKING:
     from thermal_fiducial.calibration.camera_imu import CameraImuCalibration
     from thermal_fiducial.calibration.rolling import FrameCorners
+
+#: What the filter takes for the errors of extrinsics and stamps where nothing else is said.
+_USUAL = PoseEkfConfig()
+_REMEDY = 'record a minute with turns about all three axes and motion along them'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -85,6 +90,7 @@ def _camera_imu(args: argparse.Namespace) -> int:
     result = calibrate_rolling_camera_imu(seen, camera, imu, start_ns, noise)
     write_text(args.out, _extrinsics_text(result))
     print(_extrinsics_text(result))
+    _warn_of_wide(*_extrinsics_std(result))
     return 0
 
 
@@ -105,6 +111,30 @@ def _mapped_corners(
         yield FrameCorners(frame.stamp_ns, corners_px(rows), corner_covariances(rows), T_map_marker, sizes)
 
 
+def _extrinsics_std(result: 'CameraImuCalibration') -> tuple[float, float]:
+    """Standard deviations of position [m] and orientation [rad] for the filter, those of the worst axes.
+
+    At least the filter's defaults, since calibrations scatter by more than they claim.
+    """
+    sigma = np.sqrt(np.diag(result.covariance))
+    position = max(float(sigma[3:6].max()), _USUAL.extrinsics_position_std)
+    orientation = max(float(sigma[:3].max()), _USUAL.extrinsics_orientation_std)
+    return position, orientation
+
+
+def _warn_of_wide(position: float, orientation: float) -> None:
+    """Warn of extrinsics that the recording leaves wider [m, rad] than the filter's defaults."""
+    if position <= _USUAL.extrinsics_position_std and orientation <= _USUAL.extrinsics_orientation_std:
+        return
+    known = _in_words(position, orientation)
+    usual = _in_words(_USUAL.extrinsics_position_std, _USUAL.extrinsics_orientation_std)
+    print(f'warning: extrinsics known to {known} only, {usual} are usual: {_REMEDY}', file=sys.stderr)
+
+
+def _in_words(position: float, orientation: float) -> str:
+    return f'{1e3 * position:.1f} mm and {np.degrees(orientation):.2f} deg'
+
+
 def _percent(result: 'CameraImuCalibration', places: tuple[int, ...]) -> str:
     return ', '.join(f'{100.0 * result.axes[k]:.2f} +- {100.0 * result.axes_sigma[k]:.2f}' for k in places)
 
@@ -115,6 +145,7 @@ def _extrinsics_text(result: 'CameraImuCalibration') -> str:
     p = result.T_body_camera[:3, 3]
     sigma = np.sqrt(np.diag(result.covariance))
     rotation, position = np.degrees(sigma[:3]), 1e3 * sigma[3:6]
+    position_std, orientation_std = _extrinsics_std(result)
     rms = np.sqrt(np.mean(np.sum(result.residuals[:, :3] ** 2, axis=1)))
     return '\n'.join(
         [
@@ -126,9 +157,11 @@ def _extrinsics_text(result: 'CameraImuCalibration') -> str:
             '  ros__parameters:',
             f'    camera_position: {np.round(p, 6).tolist()}  # +- {np.round(position, 2).tolist()} mm',
             f'    camera_orientation: {np.round(q, 8).tolist()}  # +- {np.round(rotation, 4).tolist()} deg',
+            f'    extrinsics_position_std: {position_std:.6f}',
+            f'    extrinsics_orientation_std: {orientation_std:.6f}',
             f'    camera_time_offset: {result.time_offset:.6f}  # +- {1e3 * sigma[6]:.3f} ms',
             f'    readout_time: {result.readout_time:.6f}  # +- {1e3 * result.readout_sigma:.3f} ms',
-            f'    stamp_jitter: {max(result.stamp_jitter, PoseEkfConfig().stamp_jitter):.6f}  # found: '
+            f'    stamp_jitter: {max(result.stamp_jitter, _USUAL.stamp_jitter):.6f}  # found: '
             f'{1e3 * result.stamp_jitter:.3f} ms',
             '',
         ]
