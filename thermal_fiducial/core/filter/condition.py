@@ -1,4 +1,8 @@
-"""What the filter does, or what it lacks, in words."""
+"""What the filter does, or what it lacks, in words; what it has estimated, in numbers."""
+
+import math
+
+import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis
@@ -37,3 +41,20 @@ def _without_estimate(belief: Belief, config: PoseEkfConfig) -> Condition:
         return belief.contradiction
     begun = belief.alternative
     return Condition('initialising', f'{begun.hits} of {config.initial_poses} poses') if begun else WAITING
+
+
+def figures_of(history: History, main: Hypothesis, gravity: float) -> dict[str, float]:
+    """Figures of the estimate ``main`` for the diagnostics (SI units); ``gravity``: its size."""
+    state, noise = main.estimate.state, main.estimate.pose_noise
+    return {
+        'seconds since accepted pose': coasting_seconds(history, main),
+        'position std': main.estimate.position_std,
+        'white pose error': math.sqrt(noise.white.value),
+        'stamp jitter': math.sqrt(noise.jitter.value),
+        'mount vibration': math.sqrt(noise.vibration.value),
+        'gyroscope bias': float(np.linalg.norm(state.bias[:3])),
+        'accelerometer bias': float(np.linalg.norm(state.bias[3:])),
+        'gyroscope scale error': float(np.abs(state.scale[0]).max()),
+        'accelerometer scale error': float(np.abs(state.scale[1]).max()),
+        'map tilt': math.asin(float(np.hypot(*state.gravity[:2])) / gravity),
+    }

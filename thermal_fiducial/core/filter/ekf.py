@@ -2,14 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-import math
 
 import numpy as np
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.belief import Hypothesis
 from thermal_fiducial.core.filter.camera_clock import CameraClock, FrameGrid, SMALLEST_STEP_NS
-from thermal_fiducial.core.filter.condition import coasting_seconds, condition_of
+from thermal_fiducial.core.filter.condition import condition_of, figures_of
 from thermal_fiducial.core.filter.history import History
 from thermal_fiducial.core.filter.hypotheses import is_of_unknown_clock, KNOWN_OFFSET_STD
 from thermal_fiducial.core.filter.imu_input import CLOCK_EVIDENCE, ImuInput, Verdict
@@ -119,8 +118,7 @@ class PoseEkf:
         pose = self._in_present_clock(pose)
         if self._history.main is None and self._camera_clock.in_question:
             return PoseUpdate(pose.stamp_ns, False, CLOCK_JUMPED, np.nan)
-        reason = self._unusable(pose)
-        if reason:
+        if reason := self._unusable(pose):
             return PoseUpdate(pose.stamp_ns, False, reason, np.nan)
         self._history.insert(pose, off_grid_ns)
         self._history.take_in()
@@ -170,16 +168,7 @@ class PoseEkf:
             checked_covariance(pose.covariance, 'covariance')
         except InputError as error:
             return f'refused: {error}'
-        history, imu = self._history, self._history.imu
-        if not imu:
-            return 'refused: no IMU yet'
-        due_ns = history.due_ns(pose, history.main)
-        if due_ns - imu.newest_ns > self._config.max_imu_gap * SECOND_NS:
-            return 'refused: far ahead of the IMU'
-        oldest_ns = max(imu.oldest_ns, imu.newest_ns - round(self._config.max_delay * SECOND_NS))
-        if due_ns <= oldest_ns or history.is_forgotten(pose):
-            return 'refused: too late'
-        return 'refused: stamp repeated' if history.holds(pose.stamp_ns) else ''
+        return self._history.untimely(pose)
 
     # --- output ---------------------------------------------------------------------------------------
 
@@ -269,23 +258,12 @@ class PoseEkf:
             'vibration m/s^2/sqrt(Hz)': force,
         }
         main = self._history.main
-        return numbers if main is None else numbers | self._figures_of(main)
-
-    def _figures_of(self, main: Hypothesis) -> dict[str, float]:
-        state, noise = main.estimate.state, main.estimate.pose_noise
-        return {
-            'seconds since accepted pose': coasting_seconds(self._history, main),
+        if main is None:
+            return numbers
+        of_filter = {
             'resets': float(self.resets),
-            'position std': main.estimate.position_std,
             'usable for': self.usable_for,
             'time offset': self._clock_offset(main),
             'time offset std': self._time_offset_std(main),
-            'white pose error': math.sqrt(noise.white.value),
-            'stamp jitter': math.sqrt(noise.jitter.value),
-            'mount vibration': math.sqrt(noise.vibration.value),
-            'gyroscope bias': float(np.linalg.norm(state.bias[:3])),
-            'accelerometer bias': float(np.linalg.norm(state.bias[3:])),
-            'gyroscope scale error': float(np.abs(state.scale[0]).max()),
-            'accelerometer scale error': float(np.abs(state.scale[1]).max()),
-            'map tilt': math.asin(float(np.hypot(*state.gravity[:2])) / self._config.gravity),
         }
+        return numbers | of_filter | figures_of(self._history, main, self._config.gravity)

@@ -4,7 +4,7 @@ The belief after a pose depends on the samples and poses up to that instant, in 
 arrival. The exception is ``MotionAtPose``, which also averages the few samples after the pose that have arrived.
 """
 
-from bisect import bisect_left, bisect_right, insort
+from bisect import bisect_right, insort
 from collections.abc import Iterable
 import math
 from operator import attrgetter
@@ -135,14 +135,17 @@ class History:
         del self._beliefs[-1]
         self.main = None
 
-    def is_forgotten(self, pose: CameraPose) -> bool:
-        """Whether a pose is older than the oldest belief, so that it cannot be inserted."""
-        return pose.stamp_ns <= self._beliefs[0].pose_stamp_ns
-
-    def holds(self, stamp_ns: int) -> bool:
-        """Whether a pose with this stamp is buffered."""
-        place = bisect_left(self._poses, stamp_ns, key=_stamp)
-        return place < len(self._poses) and self._poses[place].stamp_ns == stamp_ns
+    def untimely(self, pose: CameraPose) -> str:
+        """Why a pose with this stamp cannot be inserted; empty if it can."""
+        if not self.imu:
+            return 'refused: no IMU yet'
+        newest_ns, due_ns = self.imu.newest_ns, self.due_ns(pose, self.main)
+        if due_ns - newest_ns > self.config.max_imu_gap * SECOND_NS:
+            return 'refused: far ahead of the IMU'
+        oldest_ns = max(self.imu.oldest_ns, newest_ns - round(self.config.max_delay * SECOND_NS))
+        if due_ns <= oldest_ns or pose.stamp_ns <= self._beliefs[0].pose_stamp_ns:
+            return 'refused: too late'
+        return 'refused: stamp repeated' if any(pose.stamp_ns == known.stamp_ns for known in self._poses) else ''
 
     def due_ns(self, pose: CameraPose, hypothesis: Hypothesis | None) -> int:
         """Instant of a pose in the IMU's clock, with the clock offset that ``hypothesis`` has estimated."""
