@@ -7,14 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from thermal_fiducial.core.filter.imu_input import GAP_NS
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: The motion at a pose is the mean of the samples this long [s] before and after it, as far as they have arrived.
 _MOTION_SECONDS = 0.05
 #: Initial capacity [samples]: five seconds at 200 Hz.
 _CAPACITY = 1000
-#: Longest step [ns]; longer ones are divided: over a gap the error of rate and force is noise, not a constant.
-_LONGEST_NS = 30_000_000
 
 
 class Steps(NamedTuple):
@@ -66,17 +65,12 @@ class ImuBuffer:
         """Number of samples."""
         return len(self._stamps_ns)
 
-    @property
-    def imu(self) -> FloatArray:
-        """(N, 6) all samples."""
-        return self._rows[: len(self._stamps_ns), 0]
-
     def append(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
         """Add a sample (6,) and the noise densities (6,) of the step that ends with it; gaps are interpolated."""
         place = len(self._stamps_ns)
         if place == 0:
             self.oldest_ns = stamp_ns
-        elif stamp_ns - self.newest_ns > _LONGEST_NS:
+        elif stamp_ns - self.newest_ns > GAP_NS:
             self._fill_gap(stamp_ns, imu, densities)
             place = len(self._stamps_ns)
         if place == len(self._rows):
@@ -88,9 +82,12 @@ class ImuBuffer:
         self.newest_ns = stamp_ns
 
     def _fill_gap(self, stamp_ns: int, imu: FloatArray, densities: FloatArray) -> None:
-        """Interpolate between the newest sample and the next one, ``imu`` (6,) at ``stamp_ns``."""
+        """Interpolate between the newest sample and the next one, ``imu`` (6,) at ``stamp_ns``.
+
+        Over a gap the error of rate and force is noise, not a constant.
+        """
         begin_ns, begin = self.newest_ns, self.last.imu
-        parts = -((begin_ns - stamp_ns) // _LONGEST_NS)
+        parts = -((begin_ns - stamp_ns) // GAP_NS)
         for part in range(1, parts):
             part_ns = begin_ns + (stamp_ns - begin_ns) * part // parts
             self.append(part_ns, begin + part / parts * (imu - begin), densities)

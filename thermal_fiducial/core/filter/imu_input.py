@@ -8,9 +8,10 @@ from thermal_fiducial.core.types import SECOND_NS
 
 #: Samples in a row that must follow each other after a jump: for a stepped clock, and for the end of a gap.
 CLOCK_EVIDENCE, GAP_EVIDENCE = 10, 3
-#: A step between stamps is unusual beyond this multiple of the longest recent one and beyond this length [ns]; time
-#: constant [ns] with which the longest one decays.
-UNUSUAL_FACTOR, UNUSUAL_NS, MEMORY_NS = 3.0, 30_000_000, 2_000_000_000
+#: A longer step between stamps is a gap [ns]: the motion in it is not known from the samples at its ends.
+GAP_NS = 30_000_000
+#: A gap is unusual beyond this multiple of the longest recent step; time constant [ns] with which that one decays.
+UNUSUAL_FACTOR, MEMORY_NS = 3.0, 2_000_000_000
 #: A step longer than this multiple of the longest recent one is due to lost samples, or to a step of the clock.
 LOST_FACTOR = 1.5
 #: A sensor saturates at its full scale; a reading beyond this multiple of it is a corrupt message.
@@ -81,7 +82,7 @@ class ImuInput:
         #: longest recent step [ns]
         self._longest_ns = 0.0
         #: longest step [ns] that is accepted at once, without waiting for a sample that follows
-        self._usual_ns: float = min(UNUSUAL_NS, self._max_gap_ns)
+        self._usual_ns: float = min(GAP_NS, self._max_gap_ns)
         #: by how much the step to the last sample that was used exceeds the longest recent one, if by far [ns]
         self.excess_ns = 0
         #: jump of the stamps at the last sample that was used [ns]; 0 for a usual step
@@ -114,7 +115,7 @@ class ImuInput:
         self.excess_ns = round(gap_ns - self._longest_ns) if unusual else 0
         if 0 < step_ns <= self._max_gap_ns:
             self._longest_ns = max(self._longest_ns * (1.0 - step_ns / MEMORY_NS), step_ns)
-            self._usual_ns = min(max(UNUSUAL_FACTOR * self._longest_ns, UNUSUAL_NS), self._max_gap_ns)
+            self._usual_ns = min(max(UNUSUAL_FACTOR * self._longest_ns, GAP_NS), self._max_gap_ns)
         self._last_ns, self._strays, self.jump_ns = stamp_ns, 0, jump_ns
 
     def _stray(self, stamp_ns: int) -> Verdict:

@@ -6,7 +6,8 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import ImuNoise
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.filter.imu_input import GAP_NS
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Time constant [s] of the mean force; motion is what differs from it.
 _SLOW = 0.2
@@ -25,8 +26,8 @@ _LEAST_MOTION = (2.0 * (_LAGS / 0.2) ** 3 / (1.0 + (_LAGS / 0.2) ** 2))[:, None]
 _MOTION_TIME = 1.0
 #: Standard deviation of what a saturated sample may miss: a spin beyond the range [rad/s], a hit [m/s^2].
 _SATURATED = 5.0, 150.0
-#: Steps longer than this [s] interrupt the spectrum; their interpolation error is added.
-_INTERRUPTED = 0.03
+#: Gaps [s] interrupt the spectrum; their interpolation error is added.
+_GAP = GAP_NS / SECOND_NS
 #: Number of bands, and their lowest and highest frequency [Hz]: above the motion, below the IMU's own low-pass filter.
 #: The quietest band is the floor of the spectrum: rotor tones leave at least one band nearly untouched.
 _BANDS, _LOWEST, _HIGHEST = 4, 12.5, 50.0
@@ -62,7 +63,7 @@ class ImuNoiseMonitor:
         self._floor.add(imu, seconds)
         self._motion.add(imu, seconds)
         # Shorter steps are covered by the floor of the spectrum, once it has been measured.
-        covered = seconds <= _INTERRUPTED and any(self._floor.densities)
+        covered = seconds <= _GAP and any(self._floor.densities)
         between = (0.0, 0.0) if covered else self._motion.interpolation_noise(seconds)
         values = imu.tolist()
         rates, forces = values[:3], values[3:]
@@ -159,7 +160,7 @@ class NoiseFloor:
 
     def add(self, imu: FloatArray, seconds: float) -> None:
         """Add a sample (6,) that follows the last one after ``seconds``; one behind a gap begins a new window."""
-        if seconds > _INTERRUPTED:
+        if seconds > _GAP:
             self._samples.clear()
             self._seconds = 0.0
         self._samples.append(imu)
