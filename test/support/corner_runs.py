@@ -178,12 +178,12 @@ class _Chain:
     def add_camera(self, flight):
         """The same flight through a second camera, in the same map."""
         self._second = _Chain(flight, self.mapper.map, 'localization', {})
-        self._pair = SecondCamera(self.flight.T_body_camera, flight.T_body_camera)
+        self._pair = SecondCamera(self.flight.T_body_camera, flight.T_body_camera, self.config.time_offset_std)
 
     def add_second_frame(self, stamp_ns) -> None:
         flight, mapper = self._second.flight, self._second.mapper
         pose = mapper.process(stamp_ns, flight.frames[stamp_ns], flight.camera, self._prior).pose
-        alone = None if pose is None else self._pair.add_second(pose)
+        alone = None if pose is None else self._pair.add_second(pose, self._prior)
         if alone is not None:
             self.filter.add_pose(alone)
 

@@ -44,7 +44,7 @@ def flying(speed):
 
 def test_an_exact_pose_of_the_second_is_one_of_the_first():
     cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND)
-    alone = cameras.add_second(second_pose(0, np.eye(4)))
+    alone = cameras.add_second(second_pose(0, np.eye(4)), MotionPrior())
     np.testing.assert_allclose(alone.T_map_camera, T_BODY_FIRST, atol=1e-15)
     assert cameras.alone == 1
 
@@ -75,7 +75,7 @@ def test_poses_that_contradict_each_other_are_not_joined():
     cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND)
     first = pose(100 * MS, T_BODY_FIRST)
     cameras.with_second(pose(0, T_BODY_FIRST), MotionPrior())
-    cameras.add_second(second_pose(100 * MS, transform(np.eye(3), [0.5, 0.0, 0.0])))
+    cameras.add_second(second_pose(100 * MS, transform(np.eye(3), [0.5, 0.0, 0.0])), MotionPrior())
     assert cameras.with_second(first, MotionPrior()) is first
     assert (cameras.joined, cameras.contradicted) == (0, 1)
 
@@ -86,7 +86,7 @@ def test_a_pose_of_another_instant_is_carried_by_the_odometry(lead_ms):
     cameras, prior, stamp = SecondCamera(T_BODY_FIRST, T_BODY_SECOND), flying(4.0), 100 * MS
     cameras.with_second(pose(30 * MS, T_BODY_FIRST), prior)
     seen = stamp - lead_ms * MS
-    cameras.add_second(second_pose(seen, transform(np.eye(3), [4e-9 * seen, 0.0, 0.0])))
+    cameras.add_second(second_pose(seen, transform(np.eye(3), [4e-9 * seen, 0.0, 0.0])), prior)
     truth = transform(np.eye(3), [0.4, 0.0, 0.0]) @ T_BODY_FIRST
     joint = cameras.with_second(pose(stamp, truth), prior)
     assert (cameras.joined, joint.stamp_ns) == (1, stamp)
@@ -96,13 +96,71 @@ def test_a_pose_of_another_instant_is_carried_by_the_odometry(lead_ms):
 def test_each_pose_counts_once_and_an_old_one_not_at_all():
     cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND)
     cameras.with_second(pose(0, T_BODY_FIRST), flying(0.0))
-    cameras.add_second(second_pose(20 * MS, np.eye(4)))
+    cameras.add_second(second_pose(20 * MS, np.eye(4)), flying(0.0))
     for stamp in (33, 66):
         cameras.with_second(pose(stamp * MS, T_BODY_FIRST), flying(0.0))
     assert cameras.joined == 1
-    cameras.add_second(second_pose(80 * MS, np.eye(4)))
+    cameras.add_second(second_pose(80 * MS, np.eye(4)), flying(0.0))
     late = pose(180 * MS, T_BODY_FIRST)
     assert cameras.with_second(late, flying(0.0)) is late
+
+
+def swung(seconds):
+    """Pose of a robot that swings along x, by 0.5 m at up to 1 m/s."""
+    return transform(np.eye(3), [0.5 * np.sin(2.0 * seconds), 0.0, 0.0])
+
+
+def swing(seconds):
+    """Its odometry."""
+    velocity = np.array([np.cos(2.0 * seconds), 0.0, 0.0])
+    small = 1e-6 * np.eye(6)
+    return Odometry(round(seconds * 1e9), swung(seconds), velocity, np.zeros(3), small, small)
+
+
+def swings(cameras, behind_s, frames, rng):
+    """Both cameras on that robot; the second's stamps are ``behind_s`` too early. Returns the odometry."""
+    prior, sigma = MotionPrior(), 4e-3
+    for k in range(5 * frames):
+        prior.add(swing(k / 150).stamp_ns, swing(k / 150))
+        if k % 5:
+            continue
+        for add, T, behind in (
+            (cameras.add_second, T_BODY_SECOND, behind_s),
+            (cameras.with_second, T_BODY_FIRST, 0.0),
+        ):
+            noisy = transform(np.eye(3), sigma * rng.normal(size=3)) @ swung(k / 150) @ T
+            add(pose(round((k / 150 - behind) * 1e9), noisy, (sigma**2,) * 3 + (1e-6,) * 3), prior)
+    return prior
+
+
+@pytest.mark.parametrize('behind_ms', [0, 20, -20, 50])
+def test_the_difference_of_the_clocks_is_learned_and_poses_of_the_second_alone_follow_it(behind_ms):
+    cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND, time_offset_std=0.03)
+    prior = swings(cameras, behind_ms / 1e3, 90, np.random.default_rng(4))
+    error, std = cameras.clock.seconds - behind_ms / 1e3, np.sqrt(cameras.clock.variance)
+    # 90 poses of 4 mm at 0.7 m/s that count as three.
+    assert std < 5e-3
+    assert abs(error) < 3.0 * std
+    assert cameras.contradicted <= 1
+    # 0.2 s later the first still has no pose. At a speed of 1 m/s the stamps alone put the second's off by 20 mm.
+    at = 89 / 30 + 0.2
+    for k in range(450, 480):
+        prior.add(swing(k / 150).stamp_ns, swing(k / 150))
+    stamp_ns = round((at - behind_ms / 1e3) * 1e9)
+    alone = cameras.add_second(pose(stamp_ns, swung(at) @ T_BODY_SECOND), prior)
+    assert alone.stamp_ns == stamp_ns
+    truth = swung(at - behind_ms / 1e3) @ T_BODY_FIRST
+    assert abs(alone.T_map_camera[0, 3] - truth[0, 3]) < 3.0 * std
+    assert alone.covariance[0, 0] > 1e-4 + 0.5 * (std * np.cos(2.0 * at)) ** 2
+
+
+def test_contradictions_make_the_clocks_uncertain_again():
+    """A step of 60 ms of the second's clock is found."""
+    cameras, rng = SecondCamera(T_BODY_FIRST, T_BODY_SECOND, time_offset_std=0.03), np.random.default_rng(5)
+    swings(cameras, 0.0, 90, rng)
+    swings(cameras, 0.06, 90, rng)
+    assert cameras.contradicted > 0
+    assert abs(cameras.clock.seconds - 0.06) < 3.0 * np.sqrt(cameras.clock.variance)
 
 
 def test_parameters_in_the_second_cameras_namespace_are_its_own(tmp_path):

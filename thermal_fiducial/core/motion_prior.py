@@ -105,6 +105,8 @@ class PredictedCamera:
     pose: CameraPose
     #: the odometry state that it is extrapolated from
     odometry: Odometry
+    #: (6,) of the camera in the map [m/s, rad/s]
+    velocity: FloatArray
 
 
 def predicted_camera(
@@ -128,10 +130,10 @@ def predicted_camera(
     T_map_body = odometry.T_map_body @ step
     R, J = T_map_body[:3, :3], lever_arm(T_map_body[:3, :3] @ T_body_camera[:3, 3])
     covariance = J @ odometry.pose_covariance @ J.T
+    velocity = J @ np.concatenate([R @ odometry.velocity_body, R @ odometry.angular_velocity_body])
     if not prior.clock_is_known:
-        velocity = J @ np.concatenate([R @ odometry.velocity_body, R @ odometry.angular_velocity_body])
         covariance += of_single_error(velocity, time_offset_std)
-    return PredictedCamera(CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), odometry)
+    return PredictedCamera(CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), odometry, velocity)
 
 
 def displacement_covariance(first: CameraPose, predicted: PredictedCamera) -> FloatArray:

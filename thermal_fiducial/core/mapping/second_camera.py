@@ -13,9 +13,10 @@ import numpy as np
 from thermal_fiducial.core.error_model import CHI2_OF_POSE
 from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
 from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.mapping.second_clock import SecondClock
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: A pose of the second camera is carried on to a frame of the first over at most this [ns]: two periods at 30 Hz.
 _CARRIED_NS = 70_000_000
@@ -29,22 +30,25 @@ class SecondCamera:
     Parameters
     ----------
     T_body_first, T_body_second : (4, 4) the cameras on the robot
+    time_offset_std : standard deviation of the difference of their clocks [s]
     """
 
-    def __init__(self, T_body_first: FloatArray, T_body_second: FloatArray) -> None:
+    def __init__(self, T_body_first: FloatArray, T_body_second: FloatArray, time_offset_std: float = 0.0) -> None:
         self._T_body_first = T_body_first
         self._T_second_first = inverse(T_body_second) @ T_body_first
         self._waiting: CameraPose | None = None
         self._first_ns: int | None = None
+        self.clock = SecondClock(time_offset_std)
         #: number of fused frames, of the second's poses published alone, and of those that contradicted the first
         self.joined = self.alone = self.contradicted = 0
 
-    def add_second(self, pose: CameraPose) -> CameraPose | None:
-        """Add a pose of the second camera; returned as a pose of the first while that has none, else None."""
+    def add_second(self, pose: CameraPose, prior: MotionPrior) -> CameraPose | None:
+        """Add a pose of the second camera; returned as a pose of the first, in its clock, while that has none."""
         pose = seen_from(pose, self._T_second_first)
         if self._first_ns is None or pose.stamp_ns - self._first_ns > _ALONE_NS:
             self.alone += 1
-            return pose
+            in_clock = self._in_clock_of_first(pose, pose.stamp_ns, prior)
+            return pose if in_clock is None else in_clock[0]
         self._waiting = pose
         return None
 
@@ -54,13 +58,31 @@ class SecondCamera:
         self._first_ns = pose.stamp_ns
         if waiting is None or abs(pose.stamp_ns - waiting.stamp_ns) > _CARRIED_NS:
             return pose
-        there = moved_by_odometry(waiting, pose.stamp_ns, prior, self._T_body_first)
-        joint = None if there is None else intersection(pose, there)
+        in_clock = self._in_clock_of_first(waiting, pose.stamp_ns, prior)
+        if in_clock is None:
+            return pose
+        there, velocity = in_clock
+        joint = intersection(pose, there)
         if joint is None:
-            self.contradicted += there is not None
+            self.contradicted += 1
+            self.clock.doubt()
             return pose
         self.joined += 1
+        apart = difference(there.T_map_camera, pose.T_map_camera)
+        self.clock.add(pose.stamp_ns, apart, velocity, pose.covariance + waiting.covariance)
         return joint
+
+    def _in_clock_of_first(
+        self, pose: CameraPose, stamp_ns: int, prior: MotionPrior
+    ) -> tuple[CameraPose, FloatArray] | None:
+        """A pose of the second camera at ``stamp_ns`` of the first one's clock, and the velocity (6,) there."""
+        instant_ns = pose.stamp_ns + round(self.clock.seconds * SECOND_NS)
+        there = moved_by_odometry(replace(pose, stamp_ns=instant_ns), stamp_ns, prior, self._T_body_first)
+        now = predicted_camera(prior, stamp_ns, self._T_body_first, 0.0)
+        if there is None:
+            return None
+        velocity = np.zeros(6) if now is None else now.velocity
+        return replace(there, covariance=there.covariance + self.clock.covariance(velocity)), velocity
 
 
 def seen_from(pose: CameraPose, T_camera_other: FloatArray) -> CameraPose:

@@ -1,6 +1,7 @@
 """Output of the mapper: the camera pose of each frame, fused with that of a second camera if there is one."""
 
 from dataclasses import replace
+import math
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from sensor_msgs.msg import CameraInfo, PointCloud2
@@ -49,7 +50,7 @@ class CameraPoses:
         if config.second_camera:
             first = transform_from_quaternion(config.camera_position, config.camera_orientation)
             second = transform_from_quaternion(config.second_camera_position, config.second_camera_orientation)
-            self._second = SecondCamera(first, second)
+            self._second = SecondCamera(first, second, config.time_offset_std)
 
     def send(self, stamp_ns: int, pose: CameraPose | None) -> None:
         """Publish the pose of a frame of the first camera, if it has one, in the map as of its stamp."""
@@ -73,17 +74,18 @@ class CameraPoses:
         self._locator.map = self._mapper.map
         result = self._locator.process(*clouds.stamped_markers(message), self._camera, self._node.odometry)
         if result.pose is not None and self._second is not None:
-            alone = self._second.add_second(result.pose)
+            alone = self._second.add_second(result.pose, self._node.odometry)
             if alone is not None:
                 self._publish(alone)
 
     def figures(self) -> dict[str, object]:
-        """Counters of the second camera's poses."""
+        """Counters of the second camera's poses, and the difference of the clocks."""
         second = self._second
         if second is None:
             return {}
-        words = {'joined': second.joined, 'alone': second.alone, 'contradicted': second.contradicted}
-        return {f'second camera: {word}': count for word, count in words.items()}
+        words: dict[str, object] = {'joined': second.joined, 'alone': second.alone, 'contradicted': second.contradicted}
+        clock = f'{1e3 * second.clock.seconds:.1f} +- {1e3 * math.sqrt(second.clock.variance):.1f}'
+        return {f'second camera: {word}': figure for word, figure in (words | {'clock [ms]': clock}).items()}
 
 
 def _of_second(config: MarkerMapperConfig) -> MarkerMapperConfig:
