@@ -25,6 +25,11 @@ OF_BENT_BLUR_PX = 0.1
 #: of rendered frames after the Tau 2's plateau equalisation, errors of the displacement found are 3 to 4 of the sigmas
 #: that independent segments would have, of markers of 14 to 60 px seen at up to 70 degrees.
 OF_BORDER_PX, OF_BORDERS_TOGETHER = 0.05, 12.0
+#: Corners of a marker whose contrast is uneven, by smoke before it or by what it hangs in front of [px over the share
+#: by which the contrast changes from cell to cell]. A blurred step whose contrast has a slope, fitted without one in
+#: pixels up to a cell away, is displaced by 0.7 of what the contrast changes in a cell; a slope of the level displaces
+#: nothing.
+OF_UNEVEN_CONTRAST_PX = 0.7
 #: The time constant of the lag, and the displacement of an edge by a response that is no exponential, both as shares of
 #: the motion blur. Rendered frames of a lag in steps, and of one of 14 ms taken for 10.
 OF_LAG, OF_LAG_FORM = 0.35, 0.02

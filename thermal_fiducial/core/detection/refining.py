@@ -14,7 +14,12 @@ import math
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.corner_errors import OF_ALL_SIDES_PX, of_motion_blur, unknown_motion
+from thermal_fiducial.core.detection.corner_errors import (
+    OF_ALL_SIDES_PX,
+    of_motion_blur,
+    OF_UNEVEN_CONTRAST_PX,
+    unknown_motion,
+)
 from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED, Segments
 from thermal_fiducial.core.detection.corners.sides import Blur, blurs, model, NARROW, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
@@ -284,4 +289,7 @@ def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCor
     # Corners that have not converged are known no better than by their last step.
     doubt = np.where(moving, np.maximum(doubt, (shift * shift).max(axis=(1, 2))), doubt)
     corners = sides.ends.reshape(-1, 8, 2).take(_CORNERS, axis=1) + shift
+    # More passes would not make corners better that are displaced by their own contrast.
+    uneven = OF_UNEVEN_CONTRAST_PX * segments.slope_of_contrast() / np.maximum(np.abs(contrast), TINY)
+    covariances = covariances + (uneven * uneven)[:, None, None, None] * _EYE
     return RefinedCorners(corners, covariances, contrast, noise, doubt), moving

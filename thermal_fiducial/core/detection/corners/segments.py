@@ -57,6 +57,20 @@ class Segments(NamedTuple):
     #: variance of a pixel about the model
     noise: FloatArray
 
+    def slope_of_contrast(self) -> FloatArray:
+        """Slope (N,) of the contrast along the sides, rms, as a change from segment to segment.
+
+        Over two segments a slope changes it twice as much as over one, noise and the cells behind the sides as much. A
+        few segments that other objects cover do not count.
+        """
+        used = (self.variance < HOPELESS).reshape(len(self.variance), 4, -1)
+        contrast, sizes = self.contrast.reshape(used.shape), []
+        for apart in (1, 2):
+            change = np.abs(contrast[..., apart:] - contrast[..., :-apart]).reshape(len(used), -1)
+            both = used[..., apart:] & used[..., :-apart]
+            sizes.append(SIGMA_OF_MEDIAN * median_of(change, both.reshape(len(used), -1))[:, 0])
+        return np.asarray(np.sqrt(np.maximum(sizes[1] ** 2 - sizes[0] ** 2, 0.0) / 3.0))
+
 
 class RobustFit(NamedTuple):
     """N fits of P unknowns to S shifts."""
