@@ -9,6 +9,7 @@ from support.flights import config
 
 from thermal_fiducial.core.filter.belief import Belief, Hypothesis, REFUSALS_OF_DOUBT
 from thermal_fiducial.core.filter.state import POSITION
+from thermal_fiducial.core.filter.verdicts import PoseUpdate
 from thermal_fiducial.core.geometry.se3 import so3_exp, transform
 from thermal_fiducial.core.measurements import Condition
 
@@ -26,6 +27,10 @@ def known_to(position_std, stamp_ns=0):
 
 def hypothesis(position_std=0.01, **changes):
     return Hypothesis(known_to(position_std), 0, 0)._replace(**changes)
+
+
+def verdict(stamp_ns):
+    return PoseUpdate(stamp_ns, True, '', 6.0)
 
 
 #: It has accepted a second's poses, and refuses the latest ones.
@@ -139,10 +144,10 @@ def test_an_alternative_that_half_of_the_poses_miss_is_dropped(main):
 
 
 def test_samples_are_needed_from_the_earlier_hypothesis_on():
-    assert Belief(pose_stamp_ns=7).stamp_ns == 7
+    assert Belief(verdict=verdict(7)).stamp_ns == 7
     early, late = hypothesis(), Hypothesis(known_to(0.01, FRAME_NS), 0, 0)
-    assert Belief(main=late, alternative=early, pose_stamp_ns=2 * FRAME_NS).stamp_ns == 0
-    assert Belief(main=late, pose_stamp_ns=2 * FRAME_NS).stamp_ns == FRAME_NS
+    assert Belief(main=late, alternative=early, verdict=verdict(2 * FRAME_NS)).stamp_ns == 0
+    assert Belief(main=late, verdict=verdict(2 * FRAME_NS)).stamp_ns == FRAME_NS
 
 
 def test_a_correction_of_the_map_moves_both_hypotheses():

@@ -5,10 +5,12 @@ when many poses pass its gate while the estimate refuses them, so that the gate 
 is initialised in the same way, without an estimate to replace.
 """
 
+import math
 from typing import NamedTuple
 
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.state import Estimate, POSITION
+from thermal_fiducial.core.filter.verdicts import PoseUpdate
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
@@ -80,8 +82,8 @@ class Belief(NamedTuple):
 
     main: Hypothesis | None = None
     alternative: Hypothesis | None = None
-    #: camera stamp of the last pose that was applied
-    pose_stamp_ns: int = NEVER
+    #: on the last pose that was applied
+    verdict: PoseUpdate = PoseUpdate(NEVER, False, '', math.nan)
     #: times that an alternative has replaced an estimate
     resets: int = 0
     #: ``hits`` of the estimate when the alternative began
@@ -100,6 +102,11 @@ class Belief(NamedTuple):
     def hypotheses(self) -> list[Hypothesis]:
         """Main and alternative, as far as they exist."""
         return [hypothesis for hypothesis in (self.main, self.alternative) if hypothesis]
+
+    @property
+    def pose_stamp_ns(self) -> int:
+        """Camera stamp of the last pose that was applied."""
+        return self.verdict.stamp_ns
 
     @property
     def stamp_ns(self) -> int:
@@ -141,10 +148,12 @@ class Belief(NamedTuple):
         """The belief with the alternative as its estimate; ``reason`` in words, empty at initialisation."""
         assert self.alternative
         resets = self.resets + (self.main is not None)
+        words = 'reset' if self.main else 'initialised'
         fresh = self.alternative._replace(accepted_in_row=1, refused_in_row=0, needed=0)
         return self._replace(
             main=fresh,
             alternative=None,
+            verdict=PoseUpdate(self.pose_stamp_ns, True, words, math.nan),
             resets=resets,
             reset_reason=reason,
             contradiction=None,

@@ -175,12 +175,12 @@ class History:
     def take_in(self) -> None:
         """Apply all poses up to the newest sample, log the verdicts on them, and propagate to that sample."""
         while (pose := self._next_due()) is not None:
-            belief, verdicts = self._after(pose)
+            belief = self._after(pose)
             if self._relinearised(belief):
                 continue
             self._beliefs.append(belief)
             self.main = None
-            self.log.add(verdicts)
+            self.log.add(belief.verdict)
         self._go_on()
         # Half of the buffer at a time: each removal moves the rest.
         if self.imu.newest_ns - self.imu.oldest_ns > 2 * self._kept_ns:
@@ -222,26 +222,26 @@ class History:
         if self.main.estimate.stamp_ns - belief.main.estimate.stamp_ns > _KEPT_EVERY_NS:
             self._beliefs.append(belief._replace(main=self.main, alternative=self._alternative()))
 
-    def _after(self, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
-        """The belief after the next pose, and the verdicts on that pose."""
+    def _after(self, pose: CameraPose) -> Belief:
+        """The belief after the next pose."""
         self._go_back_to(pose)
-        belief = self.belief._replace(pose_stamp_ns=pose.stamp_ns)
+        config, belief = self.config, self.belief
+        belief = belief._replace(verdict=PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan))
         if not belief.hypotheses:
             return self._begun(belief, pose)
-        update = PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)
         against_main = self._innovation(belief.main, pose) if belief.main else None
         if belief.main and against_main:
-            main, update = weigh(self.config, belief.main, against_main, pose.stamp_ns)
-            belief = belief._replace(main=main)
+            main, verdict = weigh(config, belief.main, against_main, pose.stamp_ns)
+            belief = belief._replace(main=main, verdict=verdict)
         if belief.alternative:
             innovation = self._innovation(belief.alternative, pose)
-            alternative, verdict = weigh(self.config, belief.alternative, innovation, pose.stamp_ns)
+            alternative, verdict = weigh(config, belief.alternative, innovation, pose.stamp_ns)
             if belief.main is None and not verdict.accepted:
-                belief = belief._replace(contradiction=contradiction(self.config, belief.alternative, innovation))
+                belief = belief._replace(contradiction=contradiction(config, belief.alternative, innovation))
             belief = belief._replace(alternative=alternative)
-        elif against_main and not update.accepted:
+        elif against_main and not belief.verdict.accepted:
             belief = self._with_alternative(belief, against_main)
-        return self._settled(belief, [update])
+        return belief.settled(config)
 
     def _go_back_to(self, pose: CameraPose) -> None:
         """Remove beliefs that were only propagated, without a pose, beyond the instant of ``pose``."""
@@ -260,15 +260,15 @@ class History:
         measured = body_pose(pose, estimate.state.T_body_camera, self.config.pose_noise_scale)
         return innovation_of(self.config, estimate, measured, motion)
 
-    def _begun(self, belief: Belief, pose: CameraPose) -> tuple[Belief, list[PoseUpdate]]:
+    def _begun(self, belief: Belief, pose: CameraPose) -> Belief:
+        """``belief``, which is empty, with an alternative hypothesis begun from a pose."""
         time_ns = max(self._begin_ns(belief, pose), self.imu.oldest_ns)
         window = self.imu.window(time_ns, WINDOW_SECONDS)
         begun = first_hypothesis(self.config, pose, time_ns, window, belief.first_offset)
         if begun is None:
             refused = PoseUpdate(pose.stamp_ns, False, 'refused: contradicts gravity', math.nan)
-            return belief._replace(contradiction=no_gravity(window)), [refused]
-        update = PoseUpdate(pose.stamp_ns, False, 'initialising', math.nan)
-        return self._settled(belief._replace(alternative=begun), [update])
+            return belief._replace(contradiction=no_gravity(window), verdict=refused)
+        return belief._replace(alternative=begun).settled(self.config)
 
     def _with_alternative(self, belief: Belief, refused: Innovation) -> Belief:
         """``belief`` with an alternative hypothesis begun from a pose that the estimate has just refused."""
@@ -281,10 +281,3 @@ class History:
         drifted = begun.needed == 0 or (belief.drifted and main.refused_in_row > 1)
         begun = begun._replace(needed=0) if drifted else begun
         return belief._replace(alternative=begun, hits_before=main.hits, drifted=drifted)
-
-    def _settled(self, belief: Belief, decided: list[PoseUpdate]) -> tuple[Belief, list[PoseUpdate]]:
-        settled = belief.settled(self.config)
-        if settled.main is None or settled.main is belief.main:
-            return settled, decided
-        reason = 'reset' if belief.main else 'initialised'
-        return settled, [*decided, PoseUpdate(settled.pose_stamp_ns, True, reason, math.nan)]

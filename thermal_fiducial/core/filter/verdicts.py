@@ -1,6 +1,5 @@
 """Verdicts on poses, as the filter logs them."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import islice
 import math
@@ -40,16 +39,14 @@ class PoseLog:
         self.latest: dict[int, PoseUpdate] = {}
         self.accepted = self.refused = 0
 
-    def add(self, updates: Iterable[PoseUpdate]) -> None:
-        """Log verdicts; a pose that is applied again after a late one counts once."""
-        for update in updates:
-            known = self.latest.pop(update.stamp_ns, None)
-            if known is None:
-                self.accepted += update.accepted
-                self.refused += update.refused
-            self.latest[update.stamp_ns] = update
-            if len(self.latest) > _KEPT:
-                del self.latest[next(iter(self.latest))]
+    def add(self, update: PoseUpdate) -> None:
+        """Log a verdict; a pose that is applied again after a late one counts once."""
+        if self.latest.pop(update.stamp_ns, None) is None:
+            self.accepted += update.accepted
+            self.refused += update.refused
+        self.latest[update.stamp_ns] = update
+        if len(self.latest) > _KEPT:
+            del self.latest[next(iter(self.latest))]
 
     def mean_nis(self) -> float:
         """Mean NIS per degree of freedom of the latest accepted poses: 1 is consistent, less conservative."""
