@@ -40,8 +40,8 @@ _MOST = 2
 _APART, _UNSURE, _MOST_STEPS = 0.7, 2.5, 7
 # Least number of visible cells, and of visible cells in which any other marker differs: a stain may change one.
 _CELLS, _DIFFERENT = 16, 2
-# Least correlation; least margin over the runner-up as a share of a perfect view's; least evidence (chi square).
-_SIMILAR, _MARGIN, _EVIDENCE = 0.8, 0.5, 25.0
+# Least correlation; least margin over the runner-up as a share of a perfect view's.
+_SIMILAR, _MARGIN = 0.8, 0.5
 # Correlation below which the marker is given up.
 _HINT = 0.55
 # Least share of the visible edges that show a step of the common contrast and agree with the pose.
@@ -196,7 +196,6 @@ class PartialMarkerSearch:
             and correlation >= _SIMILAR
             and correlation - likeness.runner_up >= margin
             and likeness.distance >= _DIFFERENT
-            and likeness.evidence >= _EVIDENCE
             and likeness.contrast * np.sign(rough.contrast) >= config.guided_min_contrast * noise
         )
 

@@ -32,12 +32,6 @@ class CellMatch(NamedTuple):
     cells: int
     distance: int
 
-    @property
-    def evidence(self) -> float:
-        """Difference of chi square between the marker and the most similar other pattern."""
-        left = max(1.0 - self.correlation**2, TINY)
-        return self.cells * (self.correlation**2 - self.runner_up**2) / left
-
 
 class VisibleCells:
     """Patterns of a dictionary with their white surroundings, for correlation of any subset of their cells.

@@ -106,7 +106,7 @@ def costs(T: FloatArray, points: FloatArray, images: Images, inlier: float) -> F
     p = se3.apply(T, points)
     z = p[..., 2:]
     residual = (images.whitening @ (p[..., :2] / np.maximum(z, TINY))[..., None])[..., 0] - images.target
-    squared, _ = _robust(np.sum(residual * residual, axis=-1), inlier)
+    squared, _ = robust(np.sum(residual * residual, axis=-1), inlier**2)
     return np.where((z > TINY).all(axis=(1, 2)), squared.sum(axis=-1), np.inf)
 
 
@@ -131,18 +131,18 @@ def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = 
     J[..., :3] = d_p
     np.matmul(d_p, (rotated @ _MINUS_SKEW).reshape(*p.shape, 3), out=J[..., 3:])
     J = J.reshape(len(T), 2 * p.shape[1], 6)
-    squared, excess = _robust(np.sum(residual * residual, axis=(-1, -2)), inlier)
-    weighted = np.swapaxes(J if excess is None else J / np.repeat(excess, 2, axis=-1)[..., None], -1, -2)
+    squared, weights = robust(np.sum(residual * residual, axis=(-1, -2)), inlier**2)
+    weighted = np.swapaxes(J if inlier == np.inf else J * np.repeat(weights, 2, axis=-1)[..., None], -1, -2)
     gradient = (weighted @ residual.reshape(len(T), 2 * p.shape[1], 1))[..., 0]
     return np.where(seen, squared.sum(axis=-1), np.inf), gradient, weighted @ J
 
 
-def _robust(squared: FloatArray, inlier: float) -> tuple[FloatArray, FloatArray | None]:
-    """Robust costs of squared errors, and the factors on their influence; None if all are inliers."""
-    if inlier == np.inf:
-        return squared, None
-    excess = np.maximum(squared / inlier**2, 1.0)
-    return np.where(excess > 1.0, inlier**2 * (1.0 + np.log(excess)), squared), excess
+def robust(squared: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
+    """Costs of squared errors, which grow but logarithmically beyond ``limit``, and the weights of the errors."""
+    if limit == np.inf:
+        return squared, np.ones_like(squared)
+    excess = np.maximum(squared / limit, 1.0)
+    return np.where(excess > 1.0, limit * (1.0 + np.log(excess)), squared), 1.0 / excess
 
 
 def _solve(information: FloatArray, damping: FloatArray, gradient: FloatArray) -> FloatArray:

@@ -8,9 +8,10 @@ import numpy as np
 from thermal_fiducial.core.error_model import CHI2_OF_POSE, CHI2_OF_VIEW, NO_SYSTEMATIC_ERRORS, SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference, linearise, retract, whitening
+from thermal_fiducial.core.geometry.rigid_fit import robust
 from thermal_fiducial.core.mapping.map_data import gauge, MapMarker
 from thermal_fiducial.core.mapping.normal_equations import Blocks, NormalEquations
-from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray, TINY
+from thermal_fiducial.core.types import BoolArray, FloatArray, IntArray
 
 # Chi square of a view whose marker is behind the camera.
 _BEHIND_CHI2 = 1e8
@@ -108,12 +109,12 @@ class Linearised:
 
     def weights(self, scale: float) -> FloatArray:
         """Robust weights (n,) of the views, for corners of ``scale`` times their variance."""
-        return _robust_weights(self.chi2, CHI2_OF_VIEW * scale)
+        return robust(self.chi2, CHI2_OF_VIEW * scale)[1]
 
     def cost(self, scale: float) -> float:
         """Robust sum of squares."""
-        of_views = np.sum(_robust_cost(self.chi2, CHI2_OF_VIEW * scale))
-        of_cameras = np.sum(_robust_cost(self.camera_chi2, CHI2_OF_POSE))
+        of_views = np.sum(robust(self.chi2, CHI2_OF_VIEW * scale)[0])
+        of_cameras = np.sum(robust(self.camera_chi2, CHI2_OF_POSE)[0])
         return float(of_views + of_cameras + np.sum(self.marker_chi2))
 
 
@@ -204,7 +205,7 @@ class MapProblem:
         weights = now.weights(scale)[:, None, None]
         of_camera, of_marker = (weights * np.swapaxes(J, -1, -2) for J in (now.J_camera, now.J_marker))
         r = now.r[..., None]
-        odometry = self.odometry.information * _robust_weights(now.camera_chi2, CHI2_OF_POSE)[:, None, None]
+        odometry = self.odometry.information * robust(now.camera_chi2, CHI2_OF_POSE)[1][:, None, None]
         blocks = Blocks(
             frame=self.over_frames(of_camera @ now.J_camera) + odometry,
             marker=self.over_markers(of_marker @ now.J_marker) + self.known.information,
@@ -235,12 +236,3 @@ def _known(snapshot: Snapshot, ids: IntArray, T_map_marker: FloatArray) -> Prior
             T[index], covariance = snapshot.known[key]
             information[index] = np.linalg.inv(covariance)
     return Priors(T, information)
-
-
-def _robust_weights(chi2: FloatArray, limit: float) -> FloatArray:
-    return np.asarray(np.minimum(1.0, limit / np.maximum(chi2, TINY)))
-
-
-def _robust_cost(chi2: FloatArray, limit: float) -> FloatArray:
-    """The cost whose derivative has the robust weights: quadratic, then logarithmic."""
-    return np.where(chi2 <= limit, chi2, limit * (1.0 - np.log(_robust_weights(chi2, limit))))
