@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, Field, field, fields, MISSING
 import difflib
 import math
+import os
 from typing import Any, TypeVar
 
 from thermal_fiducial.errors import InputError
@@ -34,6 +35,7 @@ def param(
     length: int | None = None,
     normed: bool = False,
     verify: Callable[[Any], object] | None = None,
+    path: bool = False,
     live: bool = False,
 ) -> Any:
     """One parameter: a dataclass field whose metadata fill ROS's parameter descriptor.
@@ -48,6 +50,7 @@ def param(
     length : number of elements of a tuple of floats
     normed : whether the tuple must have unit norm (a quaternion)
     verify : called with the value; raises InputError if it is unusable
+    path : whether the string may be a path, in which a leading ~ is the user's home: no shell replaces it there
     live : whether the parameter is dynamic; otherwise it is declared read-only
     """
     metadata = {
@@ -58,6 +61,7 @@ def param(
         'length': length,
         'normed': normed,
         'verify': verify,
+        'path': path,
         'live': live,
     }
     return field(default=default, metadata=metadata)
@@ -129,6 +133,8 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
     """
     limits = item.metadata
     result = _typed(name, item.default, limits['length'], value)
+    if limits['path']:
+        result = from_home(result)
     if limits['choices'] and result not in limits['choices']:
         raise InputError(f'parameter {name}: {_shown(result)} is not one of {", ".join(limits["choices"])}')
     low, high = limits['minimum'], limits['maximum']
@@ -140,6 +146,11 @@ def checked(name: str, item: 'Field[Any]', value: Any) -> Any:
     if limits['verify']:
         limits['verify'](result)
     return result
+
+
+def from_home(path: str) -> str:
+    """``path`` with the user's home for a leading ~; an unknown user's stays, and so does an empty path."""
+    return os.path.expanduser(path)  # noqa: PTH111 - pathlib makes '.' of '' and fails for an unknown user
 
 
 def _shown(value: object) -> str:
@@ -177,7 +188,7 @@ def _dictionary() -> Any:
         'Dictionary of the markers: a name of OpenCV or of this package (STENCIL_4X4_100 is the default of '
         '"markers make"), or the path of a dictionary file.'
     )
-    return param('DICT_4X4_50', text)
+    return param('DICT_4X4_50', text, path=True)
 
 
 def _marker_size() -> Any:
@@ -190,7 +201,11 @@ def _marker_size_overrides() -> Any:
 
 
 def _map_file() -> Any:
-    return param('', 'Marker map (YAML). Empty: no map.')
+    return param('', 'Marker map (YAML). Empty: no map.', path=True)
+
+
+def _calibration_file() -> Any:
+    return param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.', path=True)
 
 
 def _mode() -> Any:
@@ -296,13 +311,13 @@ def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
 class Tau2CameraConfig(SelfChecked):
     """Ingestion of raw thermal frames."""
 
-    calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
+    calibration_file: str = _calibration_file()
     image_transport: str = param(
         'raw',
         'raw: thermal/image_raw; compressed: thermal/image_raw/compressed, 16-bit PNG of image_transport.',
         choices=('raw', 'compressed'),
     )
-    bad_pixel_file: str = param('', 'List of dead pixels: a text file, "column row" a line. Empty: none.')
+    bad_pixel_file: str = param('', 'List of dead pixels: a text file, "column row" a line. Empty: none.', path=True)
     find_bad_pixels: bool = param(True, 'Find dead and stuck pixels while running.', live=True)
     bits: int = param(
         14,
@@ -490,9 +505,11 @@ class MarkerMapperConfig(SelfChecked):
     )
     second_camera_position: tuple[float, ...] = _camera_position()
     second_camera_orientation: tuple[float, ...] = _camera_orientation()
-    cloud_file: str = param('', 'Point cloud of the site (.ply or .pcd) to publish for RViz. Empty: none.')
+    cloud_file: str = param('', 'Point cloud of the site (.ply or .pcd) to publish for RViz. Empty: none.', path=True)
     cloud_alignment_file: str = param(
-        '', 'Transform from the map to the frame of cloud_file, written by map align. Empty: the frames are the same.'
+        '',
+        'Transform from the map to the frame of cloud_file, written by map align. Empty: the frames are the same.',
+        path=True,
     )
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
@@ -730,6 +747,7 @@ class ThermalSourceConfig(SelfChecked):
         '',
         'Source of the frames: a V4L2 device (/dev/video0), a TeAx ThermalGrabber ("teax", or "teax:SERIAL" if there '
         'are several), or a folder or video of 16-bit pictures.',
+        path=True,
     )
     image_width: int = param(0, 'Requested width; 0: as the camera is set.', unit='px', minimum=0, maximum=4096)
     image_height: int = param(0, 'Requested height; 0: as the camera is set.', unit='px', minimum=0, maximum=4096)
@@ -741,7 +759,7 @@ class ThermalSourceConfig(SelfChecked):
         maximum=1000.0,
     )
     repeat: bool = param(True, 'Restart a folder or video at its end.')
-    calibration_file: str = param('', 'Camera calibration (camera_info YAML) to publish; empty: from the topic.')
+    calibration_file: str = _calibration_file()
     frame_id: str = param('thermal_camera_optical', 'Frame of the published images.')
     prefix_frames: bool = _prefix_frames()
 

@@ -131,6 +131,22 @@ def test_a_config_made_by_hand_checks_itself(make, words):
     assert words in str(error.value)
 
 
+def test_a_path_may_begin_at_home(monkeypatch):
+    monkeypatch.setenv('HOME', '/home/pilot')
+    assert MarkerMapperConfig(map_file='~/hall.yaml').map_file == '/home/pilot/hall.yaml'
+    camera = from_mapping(Tau2CameraConfig, {'calibration_file': '~/tau2.yaml', 'frame_id': '~camera'})
+    assert camera.calibration_file == '/home/pilot/tau2.yaml'
+    # What is no path stays.
+    assert camera.frame_id == '~camera'
+
+
+def test_every_file_is_a_path():
+    files = {name for kind in NODES for name, _, _ in parameters(kind) if name.endswith('_file')}
+    paths = {name for kind in NODES for name, item, _ in parameters(kind) if item.metadata['path']}
+    assert files
+    assert paths == files | {'dictionary', 'camera'}
+
+
 def test_a_config_takes_lists_and_whole_numbers_as_a_file_does():
     made = ArucoDetectorConfig(camera_position=[1, 0, 0], marker_size=1)
     assert made == from_mapping(ArucoDetectorConfig, {'camera_position': [1, 0, 0], 'marker_size': 1})

@@ -141,6 +141,13 @@ def test_a_second_camera_follows_the_nodes_into_a_namespace_that_was_pushed(laun
     assert ('odometry', f'{root}/odometry') in nodes[5].remappings
 
 
+def test_a_parameter_file_may_lie_at_home(launched, tmp_path, monkeypatch):
+    monkeypatch.setenv('HOME', str(tmp_path))
+    (tmp_path / 'rig.yaml').touch()
+    _, nodes = launched('localization.launch.py', params_file='~/rig.yaml')
+    assert nodes[0].parameters[0] == str(tmp_path / 'rig.yaml')
+
+
 def test_a_landing_pad_is_reported_where_one_is_named(launched):
     _, nodes = launched('ardupilot.launch.py', landing_pad='7,8,9')
     assert [node.executable for node in nodes] == [*NODES, 'landing_target']
