@@ -144,6 +144,12 @@ def test_the_smooth_topic_is_another_one_and_feeds_the_bridge():
     assert 0.0 < steps[1] < 0.5 * steps[0]
 
 
+def test_px4_without_a_rate_is_a_fault():
+    with ros_graph() as graph:
+        node = graph.add(PoseEkfNode, px4=True)
+        assert node.faults == ['parameter px4: nothing is sent at a bridge_rate of 0']
+
+
 def test_px4_messages_that_are_not_installed_are_a_fault(monkeypatch):
     monkeypatch.setitem(sys.modules, 'px4_msgs.msg', None)
     with ros_graph() as graph:
