@@ -136,6 +136,8 @@ def test_missing_topics_are_named_beside_the_recorded_ones(tmp_path):
         bag.require({'imu/data': STRING})
         with pytest.raises(InputError, match=rf'no topic thermal/image_raw .*imu/data \({STRING}\), other'):
             bag.require({'thermal/image_raw': IMAGE})
+        with pytest.raises(InputError, match='remap another to it, or give a calibration_file'):
+            bag.require({'thermal/camera_info': 'sensor_msgs/msg/CameraInfo'})
         with pytest.raises(InputError, match=f'imu/data is {STRING}, not {IMU}'):
             bag.require({'imu/data': IMU})
 

@@ -31,6 +31,16 @@ def test_wrong_usage_exits_with_2(argv, capsys):
     assert 'usage: thermal-fiducial' in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ('argv', 'lists'),
+    [([], 'thermal-fiducial --help'), (['map'], 'thermal-fiducial map --help'), (['map', 'fix'], 'map fix --help')],
+)
+def test_wrong_usage_names_what_lists_the_arguments(argv, lists, capsys):
+    with pytest.raises(SystemExit):
+        main(argv)
+    assert lists in capsys.readouterr().err.splitlines()[-1]
+
+
 @pytest.mark.parametrize('name', ['a' * 300, 'a/' * 3000, 'file/b'])
 @pytest.mark.parametrize(
     'words',

@@ -218,6 +218,14 @@ def test_refine_takes_the_calibration_of_the_run(path, poses, photographed, caps
     assert sorted(load_map(path).markers) == sorted(poses)
 
 
+def test_a_run_that_is_not_there_and_a_folder_for_a_map_are_named(path, tmp_path, capsys):
+    save_map(path, MarkerMap({0: MapMarker(0, SIZE, True, np.eye(4))}))
+    assert run('refine', path, tmp_path / 'run') == 2
+    assert f'{tmp_path / "run"}: no such run' in capsys.readouterr().err
+    assert run('show', tmp_path) == 2
+    assert f'{tmp_path}: is a folder, not a file' in capsys.readouterr().err
+
+
 @pytest.mark.parametrize('said', ['by the run', 'by the map', 'by nobody'])
 def test_refine_never_guesses_the_side_of_a_marker(path, poses, tmp_path, capsys, said):
     """It took that of the default parameters: markers of 0.4 m came out 0.6 m off, and the map was called sound."""

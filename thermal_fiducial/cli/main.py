@@ -7,7 +7,7 @@ from importlib import import_module
 from io import TextIOWrapper
 import os
 import sys
-from typing import Any
+from typing import Any, NoReturn
 
 from thermal_fiducial import __version__
 from thermal_fiducial.cli.subcommands import add_command
@@ -67,6 +67,10 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{'formatter_class': _Help, **options})
+
+    def error(self, message: str) -> NoReturn:
+        """End the process for wrong usage, and name what lists the arguments."""
+        super().error(f'{message} ({self.prog} --help)')
 
 
 def main(argv: Sequence[str] | None = None) -> int:

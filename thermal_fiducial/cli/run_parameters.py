@@ -9,6 +9,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.plain_yaml import load_plain
+from thermal_fiducial.files.reading import is_there
 from thermal_fiducial.report.run_folder import bag_of_run, read_summary
 
 
@@ -22,8 +23,10 @@ def camera_of_run(run: Path) -> Camera:
     Raises
     ------
     InputError
-        There is neither; the message names the option for a calibration.
+        There is no such run, or neither; the message names the option for a calibration.
     """
+    if not is_there(run):
+        raise InputError(f'{run}: no such run')
     file = _parameter(run, 'tau2_camera', 'calibration_file')
     if file:
         return load_camera(str(file))

@@ -205,7 +205,7 @@ class BagReader:
         for topic, msgtype in topics.items():
             if topic not in there:
                 listed = ', '.join(sorted(f'{shown(name)} ({kind})' for name, kind in there.items()))
-                raise InputError(f'{self.path}: no topic {topic} (remap another to it?); the bag has {listed}')
+                raise InputError(f'{self.path}: no topic {topic} ({_remedy(topic)}?); the bag has {listed}')
             if there[topic] != msgtype:
                 raise InputError(f'{self.path}: topic {topic} is {there[topic]}, not {msgtype}')
             if self.message_count([topic]) == 0:
@@ -268,3 +268,9 @@ class BagReader:
             raise
         except Exception as error:
             raise InputError(f'{self.path}: the bag cannot be read: {one_line(error)}') from None
+
+
+def _remedy(topic: str) -> str:
+    """What to do about a topic that a bag lacks."""
+    remap = 'remap another to it'
+    return f'{remap}, or give a calibration_file' if topic == CAMERA_INFO_TOPIC else remap

@@ -60,6 +60,8 @@ def _opened(path: str | Path, limit: int) -> Iterator[BinaryIO]:
         raise InputError(f'{shown(path)}: cannot read it: {getattr(error, "strerror", None) or error}') from None
     try:
         found = os.fstat(descriptor)
+        if stat.S_ISDIR(found.st_mode):
+            raise InputError(f'{path}: is a folder, not a file')
         if not stat.S_ISREG(found.st_mode):
             raise InputError(f'{path}: not a regular file')
         if found.st_size > limit:
