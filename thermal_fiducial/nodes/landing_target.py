@@ -9,13 +9,13 @@ import numpy as np
 from sensor_msgs.msg import PointCloud2
 
 from thermal_fiducial.config import LandingTargetConfig
-from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import OK, StageNode, WARN
 from thermal_fiducial.ros.frames.landing_pad import for_mavros, pad_in_map
-from thermal_fiducial.ros.frames.robot_frames import RobotFrames
+from thermal_fiducial.ros.frames.robot_frames import camera_in_body, RobotFrames
 from thermal_fiducial.ros.messages import clouds, convert, message_bytes
 from thermal_fiducial.ros.process.run import run
 
@@ -41,7 +41,7 @@ class LandingTarget(StageNode[LandingTargetConfig]):
 
     @property
     def _T_body_camera(self) -> FloatArray:
-        return transform_from_quaternion(self.config.camera_position, self.config.camera_orientation)
+        return camera_in_body(self.config)
 
     def _on_map(self, message: PointCloud2) -> None:
         poses = clouds.map_poses(message)

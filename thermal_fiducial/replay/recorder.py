@@ -14,7 +14,7 @@ from geometry_msgs.msg import Pose, PoseWithCovarianceStamped
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import PointCloud2
 
-from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import CORNER_FIELDS
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
@@ -154,11 +154,6 @@ class Recorder(CountingNode):
         super().__init__('recorder', **kwargs)
         for topic, (kind, profile) in topics.items():
             self.subscribe(kind, topic, partial(take, topic), profile, raw=True)
-
-
-def extrinsics(config: Any) -> FloatArray:
-    """T_body_camera (4, 4) of a config with ``camera_position`` and ``camera_orientation``."""
-    return transform_from_quaternion(config.camera_position, config.camera_orientation)
 
 
 def _sort_by_stamp(path: Path) -> None:

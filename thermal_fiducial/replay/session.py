@@ -9,7 +9,6 @@ import shutil
 from typing import Any
 
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
-from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
@@ -22,6 +21,7 @@ from thermal_fiducial.replay.processes import replay_processes
 from thermal_fiducial.replay.recorder import refuse_folder_in_use, RunFiles
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED
+from thermal_fiducial.ros.frames.robot_frames import camera_in_body
 
 MAP_FILE, SUMMARY_FILE = 'marker_map.yaml', 'summary.json'
 
@@ -78,8 +78,7 @@ def replay(
         settings = _with_transport(settings, entry)
         arguments = _prepare(options, settings, entry, warn)
         recorded = entry.recorded(calibration_from_file=from_file, images=options.images)
-        extrinsics = settings.pose_ekf.camera_position, settings.pose_ekf.camera_orientation
-        with into(options.run), RunFiles(options.run, transform_from_quaternion(*extrinsics), recorded) as files:
+        with into(options.run), RunFiles(options.run, camera_in_body(settings.pose_ekf), recorded) as files:
             in_real_time = partial(replay_processes, rate=options.rate, say=say)
             play = in_real_time if options.transport == 'processes' else replay_lockstep
             done = partial(_show_share, progress, max(bag.duration_ns, 1))

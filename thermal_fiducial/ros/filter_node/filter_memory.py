@@ -9,11 +9,11 @@ from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.hypotheses import KNOWN_OFFSET_STD
 from thermal_fiducial.core.filter.restart import LastPose, RestartHint
 from thermal_fiducial.core.filter.verdicts import PoseUpdate
-from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.files.last_pose import recent_pose, save_last_pose
 from thermal_fiducial.files.robot_folder import robot_folder
 from thermal_fiducial.ros.base.node import StageNode
+from thermal_fiducial.ros.frames.robot_frames import camera_in_body
 
 
 class FilterMemory:
@@ -38,7 +38,7 @@ class FilterMemory:
 
     def _take_up(self, last: LastPose) -> None:
         config = self._node.config
-        self._hint = RestartHint(last, transform_from_quaternion(config.camera_position, config.camera_orientation))
+        self._hint = RestartHint(last, camera_in_body(config))
         place = ' '.join(f'{value:.2f}' for value in last.T_map_body[:3, 3])
         line = f'started again in flight: the last pose before, at {place} m, is a hint to the first poses'
         if (offset := last.camera_time_offset) is not None and config.estimate_time_offset:

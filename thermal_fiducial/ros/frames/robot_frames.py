@@ -97,7 +97,7 @@ class RobotFrames:
             T_body_camera = tree.between(body, config.camera_frame)
             if T_body_camera is None or _RANKS.index(source) < _RANKS.index(self.source):
                 continue
-            moved = not _same(T_body_camera, _in_force(config))
+            moved = not _same(T_body_camera, camera_in_body(config))
             if source == self.source and moved and (T_imu_base is None) == (self.T_imu_base is None):
                 text = f'{source} has moved the camera on the robot: ignored until the node is restarted'
                 self._node.console.event('camera', text)
@@ -108,7 +108,7 @@ class RobotFrames:
     def _take(self, source: str, T_body_camera: FloatArray, T_imu_base: FloatArray | None, *, moved: bool) -> None:
         if T_imu_base is not None and not np.abs(T_imu_base[:3, 3]).max() < _FARTHEST:
             raise InputError(f'{source} has the robot {np.abs(T_imu_base[:3, 3]).max():.3g} m from its IMU')
-        apart = inverse(_in_force(self._node.config)) @ T_body_camera
+        apart = inverse(camera_in_body(self._node.config)) @ T_body_camera
         if moved:
             orientation = quaternion_from_rotation(T_body_camera[:3, :3])
             self._node.derive(
@@ -137,7 +137,8 @@ class RobotFrames:
         self._node.get_logger().info(line)
 
 
-def _in_force(config: Any) -> FloatArray:
+def camera_in_body(config: Any) -> FloatArray:
+    """T_body_camera (4, 4) of a config with ``camera_position`` and ``camera_orientation``."""
     return transform_from_quaternion(config.camera_position, config.camera_orientation)
 
 

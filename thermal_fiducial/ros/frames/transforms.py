@@ -5,10 +5,10 @@ import importlib
 from typing import Any
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.geometry.se3 import inverse, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.ros.base.counting import CountingNode
-from thermal_fiducial.ros.frames.robot_frames import RobotFrames
+from thermal_fiducial.ros.frames.robot_frames import camera_in_body, RobotFrames
 from thermal_fiducial.ros.messages import convert
 
 
@@ -64,6 +64,6 @@ class TransformBroadcaster:
     def _send_camera(self) -> None:
         """Broadcast robot to camera, once: /tf_static is latched."""
         config = self._config
-        T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
+        T_body_camera = camera_in_body(config)
         self._static.sendTransform(convert.transform_message(T_body_camera, 0, config.base_frame, config.camera_frame))
         self._static = None

@@ -8,13 +8,13 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.second_camera import SecondCamera
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.camera_nodes.camera_node import CameraStageNode
+from thermal_fiducial.ros.frames.robot_frames import camera_in_body
 from thermal_fiducial.ros.mapper_node.map_corrections import LatePoses
 from thermal_fiducial.ros.messages import clouds, convert
 from thermal_fiducial.ros.messages.message_bytes import PoseBytes
@@ -48,8 +48,8 @@ class CameraPoses:
         config = self._node.config
         self._locator.configure(_of_second(config))
         if config.second_camera:
-            first = transform_from_quaternion(config.camera_position, config.camera_orientation)
-            second = transform_from_quaternion(config.second_camera_position, config.second_camera_orientation)
+            first = camera_in_body(config)
+            second = camera_in_body(_of_second(config))
             self._second = SecondCamera(first, second, config.time_offset_std)
 
     def send(self, stamp_ns: int, pose: CameraPose | None) -> None:
