@@ -8,7 +8,7 @@ from support.flights import config, Flight, timeline
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.measurements import CameraPose, ImuSample
-from thermal_fiducial.ros.mapper_node.map_corrections import MapCorrections
+from thermal_fiducial.ros.frames.map_corrections import MapCorrections
 
 FRAME_NS = 33_333_333
 ERROR = np.diag([4.0, 1.0, 0.0, 0.0, 0.0, 0.0]) * 1e-4

@@ -15,8 +15,8 @@ from thermal_fiducial.ros.filter_node.filter_memory import FilterMemory
 from thermal_fiducial.ros.filter_node.filter_outputs import FilterOutputs
 from thermal_fiducial.ros.filter_node.filter_status import FilterStatus
 from thermal_fiducial.ros.filter_node.imu_queue import ImuQueue
+from thermal_fiducial.ros.frames.map_corrections import MapCorrections
 from thermal_fiducial.ros.frames.robot_frames import RobotFrames
-from thermal_fiducial.ros.mapper_node.map_corrections import MapCorrections
 from thermal_fiducial.ros.messages import message_bytes
 from thermal_fiducial.ros.process.run import run
 

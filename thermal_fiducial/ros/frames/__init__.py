@@ -1,1 +1,1 @@
-"""Frames of the robot: extrinsics from TF or a URDF, the pose on /tf, the landing pad."""
+"""Frames: extrinsics from TF or a URDF, the pose on /tf, the landing pad, poses when the map moves."""

@@ -14,8 +14,8 @@ from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.camera_nodes.camera_node import CameraStageNode
+from thermal_fiducial.ros.frames.map_corrections import LatePoses
 from thermal_fiducial.ros.frames.robot_frames import camera_in_body
-from thermal_fiducial.ros.mapper_node.map_corrections import LatePoses
 from thermal_fiducial.ros.messages import clouds, convert
 from thermal_fiducial.ros.messages.message_bytes import PoseBytes
 
