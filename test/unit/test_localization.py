@@ -18,8 +18,8 @@ MODEL = SystematicErrors()
 def located(T, poses, rows, prior=None):
     """``locate`` with the markers of ``rows`` in a map of ``poses``."""
     marker_map = MarkerMap({key: MapMarker(key, SIZE, True, pose) for key, pose in poses.items()})
-    sight = Sight.of(Observations.of(rows), marker_map)
-    return locate(0, sight, np.zeros(len(rows)), CAMERA, prior, MODEL)
+    sight = Sight.of(Observations.of(rows), marker_map, lambda markers: np.zeros(len(list(markers))))
+    return locate(0, sight, CAMERA, prior, MODEL)
 
 
 def test_a_marker_that_was_moved_loses_its_weight_and_hardly_moves_the_pose():

@@ -40,19 +40,13 @@ _PROPOSERS = 4
 
 
 def locate(
-    stamp_ns: int,
-    sight: Sight,
-    running_errors: FloatArray,
-    camera: Camera,
-    prior: FloatArray | None,
-    model: SystematicErrors,
+    stamp_ns: int, sight: Sight, camera: Camera, prior: FloatArray | None, model: SystematicErrors
 ) -> Location | Refusal:
     """Camera pose from N known markers.
 
     Parameters
     ----------
     sight : the markers and their corners
-    running_errors : (N,) running rms re-projection error of each [px]
     prior : (4, 4) approximate T_map_camera, which resolves the planar ambiguity; or None
 
     Returns
@@ -60,9 +54,10 @@ def locate(
     The location, or the reason for which there is none.
     """
     fit = CameraFit(sight.observed.corners, sight.observed.covariances, sight.points, camera)
-    hypotheses = _hypotheses(sight, fit, prior)
+    hypotheses = _hypotheses(sight, prior)
     if not len(hypotheses):
         return Refusal('no usable pose of any known marker')
+    hypotheses = hypotheses[np.argsort(fit.costs(hypotheses), kind='stable')]
     frame = _JointFit(stamp_ns, sight, camera, model, fit)
     # Steps 3 and 4: the pose from all markers jointly, weighted by the map.
     by_map = frame.map_weights(hypotheses[0])
@@ -71,7 +66,7 @@ def locate(
     if not np.all(np.isfinite(seen.residuals)):
         return Refusal(f'no camera pose explains {names(sight)}')
     # Steps 5 and 6: refined with the weights of their errors.
-    found = frame.refined(T, seen, by_map * marker_weights(seen.errors_px, running_errors, model))
+    found = frame.refined(T, seen, by_map * marker_weights(seen.errors_px, sight.running_px, model))
     T_other = None if found is None else frame.alternative(found, hypotheses)
     if found is None or T_other is None:
         return found or Refusal(f'the pose from {names(sight)} is not determined')
@@ -208,14 +203,12 @@ def marker_weights(errors: FloatArray, running_errors: FloatArray, model: System
     return np.asarray(np.minimum(1.0, reference / np.maximum(combined, TINY)))
 
 
-def _hypotheses(sight: Sight, fit: CameraFit, prior: FloatArray | None) -> FloatArray:
-    """Initial camera poses (H, 4, 4): both planar poses of the largest markers and the prior, by ascending cost."""
+def _hypotheses(sight: Sight, prior: FloatArray | None) -> FloatArray:
+    """Initial camera poses (H, 4, 4): both planar poses of the largest markers and the prior."""
     largest = np.argsort(-np.ptp(sight.observed.corners, axis=1).sum(axis=-1), kind='stable')[:_PROPOSERS]
     poses = (sight.T_map_marker[largest, None] @ inverse(sight.observed.branches[largest])).reshape(-1, 4, 4)
     poses = poses[np.isfinite(poses).all(axis=(1, 2))]
-    if prior is not None:
-        poses = np.concatenate([poses, prior[None]])
-    return np.asarray(poses[np.argsort(fit.costs(poses), kind='stable')])
+    return np.asarray(poses if prior is None else np.concatenate([poses, prior[None]]))
 
 
 def names(sight: Sight) -> str:

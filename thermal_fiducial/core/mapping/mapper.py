@@ -8,6 +8,7 @@ enters the map, covariances contain the map's uncertainty, and inconsistent mark
 """
 
 from dataclasses import replace
+from functools import partial
 import sys
 
 import numpy as np
@@ -105,7 +106,8 @@ class MarkerMapper:
         observed = Observations.of(markers)
         # Step 2: known and new markers.
         is_known = np.array([key in self.map.markers for key in observed.ids.tolist()], dtype=np.bool_)
-        known = Sight.of(observed if is_known.all() else observed.only(is_known), self.map)
+        own = observed if is_known.all() else observed.only(is_known)
+        known = Sight.of(own, self.map, self._trust.running_errors)
         offset_std = self.config.time_offset_std
         predicted = predicted_camera(prior, stamp_ns, self._T_body_camera, offset_std)
         # Steps 3 to 6: the camera from all known ones, weighted by their errors.
@@ -128,11 +130,7 @@ class MarkerMapper:
         near = last is not None and 0 < stamp_ns - last.stamp_ns < CONTINUITY_NS
         expected = predicted.pose if predicted is not None else last if near else None
         T_expected = None if expected is None else expected.T_map_camera
-
-        def fit(some: Sight) -> Location | Refusal:
-            running_errors = self._trust.running_errors(some.markers)
-            return locate(stamp_ns, some, running_errors, camera, T_expected, self._errors)
-
+        fit = partial(locate, stamp_ns, camera=camera, prior=T_expected, model=self._errors)
         found = fit(sight)
         if isinstance(found, Refusal) or not are_two_that_contradict(found):
             return found
