@@ -186,7 +186,9 @@ def test_an_uncertain_time_offset_adds_noise_by_the_acceleration(estimate, turni
     motion = motion_of(resting.state, np.zeros(3), np.array([push, 0.0, 0.0]), turning=turning)
     pose = BodyPose(resting.state.T_map_body, np.zeros((6, 6)))
     innovation = innovation_of(FULL, resting, pose, motion)
-    expected = 0.75 * std**4 * np.repeat((turning**2, push**2), 3) + WHITE * np.diag(pose.shape)
+    expected = 0.75 * std**4 * np.repeat((turning**2, push**2), 3) + resting.pose_noise.white.value * np.diag(
+        pose.shape
+    )
     np.testing.assert_allclose(np.diag(innovation.R), expected, rtol=1e-9)
 
 
@@ -208,6 +210,17 @@ def test_white_noise_of_poses_is_learned(estimate, still):
     errors = 3.0 * np.random.default_rng(8).normal(size=(600, 6))
     # the memory of 15 poses of 6 degrees of freedom: a fifth of the variance, a tenth of the deviation; three of that
     assert np.sqrt(learned_white(estimate, still, errors)) == pytest.approx(3.0, rel=0.3)
+
+
+def test_innovations_of_an_unknown_velocity_are_no_noise(estimate, still):
+    """The first pose after a start shows the velocity; the next one, that it is known now, changes much."""
+    parameters = config(systematic_pose_std=0.01, stamp_jitter=0.0, estimate_time_offset=False)
+    pose, noise = BodyPose(estimate.state.T_map_body, np.diag(np.repeat((1e-3, 2e-3), 3) ** 2)), PoseNoise.of(ELSEWHERE)
+    known_well, far = known(estimate, 1e-14), np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])
+    R = innovation_of(parameters, replace(known_well, pose_noise=noise), pose, still)
+    first = noise.adapted(R.units, far, R.S + np.diag(far**2))
+    second = first.adapted(R.units, np.zeros(6), R.S)
+    assert max(first.white.value, second.white.value) <= noise.white.value
 
 
 def test_poses_with_less_noise_than_claimed_keep_their_covariance(estimate, still):

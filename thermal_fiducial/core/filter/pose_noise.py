@@ -19,11 +19,13 @@ from thermal_fiducial.core.geometry.reprojection import turned
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.types import FloatArray
 
-#: Variances of white errors at first, at least and at most, and the memory [poses] with which they are learned. Of a
-#: pose's own covariance: the systematic error has all of it besides; with half of it the fused pose before a recorded
-#: board claims less than its error. Poses that claim too little must not be refused for long.
+#: Variances of white errors at least and at most, and the memory [poses] with which they are learned. Of a pose's own
+#: covariance: the systematic error has all of it besides; with half of it the fused pose before a recorded board claims
+#: less than its error. Poses that claim too little must not be refused for long.
 WHITE = 0.5
 _WHITE_RANGE, _WHITE_MEMORY = (WHITE, 30.0 * WHITE), 10.0
+#: The same before anything is learned: the white error may be all that a pose claims.
+_WHITE_AT_FIRST = 1.0
 #: Of the jitter of stamps [s^2] and of the mount's vibration [rad^2].
 _JITTER_RANGE, _VIBRATION_RANGE, _MEMORY = (1e-8, 2.5e-5), (1e-10, 1e-4), 300.0
 #: Weight of the initial values, as information about their logarithms; limit of the normalised squared innovation.
@@ -143,15 +145,16 @@ class PoseNoise:
     jitter: LearnedVariance
     #: of the camera's rotation against the IMU, about each axis [rad^2]
     vibration: LearnedVariance
-    #: (6,) of the last pose that was compared with the estimate, accepted or not
+    #: (6,) of the last pose that was compared with the estimate, accepted or not, and its covariance (6, 6)
     innovation: FloatArray = field(default_factory=lambda: np.zeros(6))
+    S: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
     @classmethod
     def of(cls, first: BodyPose, stamp_jitter: float = 0.0, mount_vibration: float = 0.0) -> 'PoseNoise':
         """Initial values; ``stamp_jitter`` [s] and ``mount_vibration`` [rad] are standard deviations."""
         return cls(
             first,
-            LearnedVariance(WHITE, _WHITE_RANGE, _WHITE_MEMORY),
+            LearnedVariance(_WHITE_AT_FIRST, _WHITE_RANGE, _WHITE_MEMORY),
             LearnedVariance(stamp_jitter**2, _JITTER_RANGE, _MEMORY),
             LearnedVariance(mount_vibration**2, _VIBRATION_RANGE, _MEMORY),
         )
@@ -166,21 +169,25 @@ class PoseNoise:
             self.white.value * units.white + self.jitter.value * units.jitter + self.vibration.value * units.vibration
         )
 
-    def adapted(self, units: WhiteUnits, innovation: FloatArray, S_inverse: FloatArray) -> 'PoseNoise':
+    def adapted(self, units: WhiteUnits, innovation: FloatArray, S: FloatArray) -> 'PoseNoise':
         """Adapt the variances to the change of the innovation since the last pose.
 
-        The change does not contain what stays, as a step of the clock or a moved marker.
+        The change does not contain what stays, as a step of the clock or a moved marker. Innovations of a filter are
+        independent, so the covariance of the change is the sum of theirs: the first ones, of a robot whose velocity is
+        unknown yet, say little.
 
         Parameters
         ----------
-        innovation, S_inverse : (6,) and the inverse (6, 6) of its covariance
+        innovation, S : (6,) and its covariance (6, 6)
         """
         # Scaled to the variance of one white innovation.
         change = (innovation - self.innovation) / math.sqrt(2.0)
+        inverse = np.asarray(np.linalg.inv(0.5 * (S + self.S)))
         return replace(
             self,
-            white=self.white.adapted(units.white, change, S_inverse),
-            jitter=self.jitter.adapted(units.jitter, change, S_inverse),
-            vibration=self.vibration.adapted(units.vibration, change, S_inverse),
+            white=self.white.adapted(units.white, change, inverse),
+            jitter=self.jitter.adapted(units.jitter, change, inverse),
+            vibration=self.vibration.adapted(units.vibration, change, inverse),
             innovation=innovation,
+            S=S,
         )

@@ -46,8 +46,9 @@ class Innovation(NamedTuple):
     #: time derivative (9,) of the prior's core error coordinates
     derivative: FloatArray
     units: WhiteUnits
-    #: (6,) the innovation, inverse of its covariance S (6, 6), Jacobian H (6, 48), measurement noise R (6, 6)
+    #: (6,) the innovation, its covariance S (6, 6) and the inverse, Jacobian H (6, 48), measurement noise R (6, 6)
     value: FloatArray
+    S: FloatArray
     S_inverse: FloatArray
     H: FloatArray
     R: FloatArray
@@ -99,8 +100,9 @@ def innovation_of(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose, mot
     else:
         R += config.time_offset_std**2 * units.jitter
     value = pose_error(prior.state, pose.T_map_body) - prior.state.systematic
-    S_inverse = np.asarray(np.linalg.inv(H @ prior.covariance @ H.T + R))
-    return Innovation(estimate, pose, motion, prior, derivative, units, value, S_inverse, H, R)
+    S = H @ prior.covariance @ H.T + R
+    S_inverse = np.asarray(np.linalg.inv(S))
+    return Innovation(estimate, pose, motion, prior, derivative, units, value, S, S_inverse, H, R)
 
 
 def with_covariance(config: PoseEkfConfig, innovation: Innovation, covariance: FloatArray) -> Innovation:
@@ -124,7 +126,7 @@ def corrected(config: PoseEkfConfig, innovation: Innovation) -> Estimate:
 
 def adapted_noise(innovation: Innovation) -> PoseNoise:
     """The noise of poses adapted to the innovation of an accepted or refused one: otherwise it would stay refused."""
-    return innovation.prior.pose_noise.adapted(innovation.units, innovation.value, innovation.S_inverse)
+    return innovation.prior.pose_noise.adapted(innovation.units, innovation.value, innovation.S)
 
 
 def with_unknown_clock(config: PoseEkfConfig, covariance: FloatArray) -> FloatArray:
