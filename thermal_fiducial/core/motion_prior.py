@@ -10,6 +10,7 @@ pose by odometry contains the motion during the standard deviation of the offset
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,8 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Fastest component of a twist [m/s, rad/s]: no camera that sees markers moves like this, a filter that diverges does.
 FASTEST = 50.0
-#: Longest time [ns] over which an odometry state is extrapolated to a frame.
-NEAR_NS = 300_000_000
+#: Longest time [s] over which the mapper extrapolates an odometry state to a frame.
+MAX_AGE = 0.3
 # Largest delay of frames, for which states are kept [ns].
 _KEPT_NS = 500_000_000
 # Largest number of states: two seconds of odometry at 1 kHz.
@@ -110,7 +111,11 @@ class PredictedCamera:
 
 
 def predicted_camera(
-    prior: MotionPrior | None, camera_stamp_ns: int, T_body_camera: FloatArray, time_offset_std: float
+    prior: MotionPrior | None,
+    camera_stamp_ns: int,
+    T_body_camera: FloatArray,
+    time_offset_std: float,
+    max_age: float = MAX_AGE,
 ) -> PredictedCamera | None:
     """The camera at the frame ``camera_stamp_ns``; None where odometry has no state near it.
 
@@ -118,14 +123,15 @@ def predicted_camera(
     ----------
     prior : the filter's odometry and clock offset
     time_offset_std : standard deviation of the clock offset before the filter has estimated it [s]
+    max_age : longest time over which an odometry state is extrapolated [s]
     """
     if prior is None:
         return None
     instant_ns = prior.in_odometry_clock(camera_stamp_ns)
     odometry = prior.nearest(instant_ns)
-    if odometry is None or abs(instant_ns - odometry.stamp_ns) >= NEAR_NS:
+    dt = math.inf if odometry is None else (instant_ns - odometry.stamp_ns) / SECOND_NS
+    if odometry is None or abs(dt) > max_age:
         return None
-    dt = (instant_ns - odometry.stamp_ns) / SECOND_NS
     step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
     T_map_body = odometry.T_map_body @ step
     R, J = T_map_body[:3, :3], lever_arm(T_map_body[:3, :3] @ T_body_camera[:3, 3])

@@ -24,7 +24,7 @@ from thermal_fiducial.core.detection.twist import (
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import twist_transfer
 from thermal_fiducial.core.measurements import Odometry
-from thermal_fiducial.core.motion_prior import MotionPrior
+from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 
 # Longest time between frames whose motion is related [ns].
@@ -184,14 +184,8 @@ def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, 
     if not states and (other := prior.nearest(odometry_ns)) is not None:
         states = [other]
     twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)
-    nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
-    dt = math.inf if nearest is None else (odometry_ns - nearest.stamp_ns) / SECOND_NS
-    if nearest is None or twist is None or abs(dt) > max_age_s:
+    predicted = predicted_camera(prior, stamp_ns, track.T_body_camera, _UNKNOWN_CLOCK_S, max_age_s)
+    if predicted is None or twist is None:
         return FramePrediction(twist, None, math.inf)
-    # The nearest pose, extrapolated with the camera's twist.
-    step = dt * twist.ago(0.5 * dt)
-    moved = se3.transform(se3.so3_exp(step[3:]), step[:3])
-    T_map_camera = nearest.T_map_body @ track.T_body_camera @ moved
-    off = clock_std_s * float(np.linalg.norm(nearest.velocity_body))
-    position_std_m = math.sqrt(np.trace(nearest.pose_covariance[:3, :3]) + off**2)
-    return FramePrediction(twist, se3.inverse(T_map_camera), position_std_m)
+    pose = predicted.pose
+    return FramePrediction(twist, se3.inverse(pose.T_map_camera), math.sqrt(np.trace(pose.covariance[:3, :3])))
