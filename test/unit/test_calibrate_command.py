@@ -12,7 +12,7 @@ from thermal_fiducial.cli.main import main
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.files.bags import CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
-from thermal_fiducial.files.camera_info import load_camera
+from thermal_fiducial.files.camera_info import load_camera, save_camera
 from thermal_fiducial.sim.lens import Lens
 
 #: A quarter of a Tau 2's pixels: a board is found in a quarter of the time.
@@ -42,6 +42,16 @@ def test_camera_against_imu(tmp_path, capsys):
         max([*left_deg, np.degrees(0.002)]), abs=1e-4
     )
     assert 'turns about all three axes' in printed.err
+
+
+def test_camera_against_imu_refuses_a_calibration_of_another_size(tmp_path, capsys):
+    bag = recording(seconds=0.2).write(tmp_path / 'bag')
+    marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))
+    lens, out = tmp_path / 'lens.yaml', tmp_path / 'extrinsics.yaml'
+    save_camera(lens, Camera(320, 256, np.array([[400.0, 0.0, 160.0], [0.0, 400.0, 128.0], [0.0, 0.0, 1.0]])))
+    words = ['calibrate', 'camera-imu', str(bag), '--map', str(marker_map), '--calibration', str(lens)]
+    assert main([*words, '--out', str(out)]) == 2
+    assert 'image of 640x512, camera_info of 320x256 pixels' in capsys.readouterr().err
 
 
 def _axes_of(text, name):

@@ -1,5 +1,6 @@
 """The map command: every action on small files."""
 
+from dataclasses import replace
 from itertools import pairwise
 import re
 
@@ -224,6 +225,16 @@ def test_a_run_that_is_not_there_and_a_folder_for_a_map_are_named(path, tmp_path
     assert f'{tmp_path / "run"}: no such run' in capsys.readouterr().err
     assert run('show', tmp_path) == 2
     assert f'{tmp_path}: is a folder, not a file' in capsys.readouterr().err
+
+
+def test_refine_refuses_the_calibration_of_a_smaller_image(path, photographed, capsys):
+    # It gave a map with a marker in quarantine, and status 0.
+    small = replace(CAMERA, width=CAMERA.width // 2, height=CAMERA.height // 2)
+    save_camera(path.with_name('camera.yaml'), small)
+    before = path.read_text()
+    assert run('--marker-size', SIZE, 'refine', path, *photographed) == 2
+    assert f'outside the {small.width}x{small.height} pixels of the calibration' in capsys.readouterr().err
+    assert path.read_text() == before
 
 
 @pytest.mark.parametrize('said', ['by the run', 'by the map', 'by nobody'])

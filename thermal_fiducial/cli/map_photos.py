@@ -2,9 +2,11 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from thermal_fiducial.cli.progress import progress_bar
 from thermal_fiducial.config import ArucoDetectorConfig
@@ -14,7 +16,7 @@ from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers
 from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
-from thermal_fiducial.files.images import read_picture
+from thermal_fiducial.files.images import read_picture, require_size
 
 _IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
 #: Noise of OpenCV's sub-pixel corners in photos [px]; the mapper takes the actual noise from the pictures.
@@ -33,6 +35,13 @@ def photos_in(folder: Path) -> list[Path]:
     return photos
 
 
+def _require_size_of(photo: Path, counts: npt.NDArray[Any], camera: Camera) -> None:
+    try:
+        require_size(counts, camera)
+    except InputError as error:
+        raise InputError(f'{photo}: {error}') from None
+
+
 def detect_in_photos(photos: list[Path], camera: Camera, args: argparse.Namespace) -> list[Markers]:
     """Markers of each photo.
 
@@ -47,11 +56,7 @@ def detect_in_photos(photos: list[Path], camera: Camera, args: argparse.Namespac
         for k, photo in enumerate(photos):
             progress(k / len(photos))
             counts = read_picture(photo, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-            if counts.shape != (camera.height, camera.width):
-                raise InputError(
-                    f'{photo}: {counts.shape[1]}x{counts.shape[0]}, '
-                    f'but the calibration is for {camera.width}x{camera.height}'
-                )
+            _require_size_of(photo, counts, camera)
             if counts.dtype == np.uint16:
                 frames.append(detector.detect(k * _APART_NS, counts.astype(np.uint16), camera))
             else:

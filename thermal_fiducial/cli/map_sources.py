@@ -35,6 +35,8 @@ from thermal_fiducial.map_tools.map_doubts import Doubt, doubts
 _LARGEST_VALUE, _LARGEST_ID = 9.2e18, 100_000
 # Standard deviations of entries without a covariance, which were written by hand.
 _HAND_STD_M, _HAND_STD_DEG = 0.1, 5.0
+# Share of the markers whose centres may lie outside the image: partially visible ones at its border.
+_MOST_OUTSIDE = 0.05
 # Dictionary of a new map, as the nodes take it.
 _DICTIONARY = ArucoDetectorConfig().dictionary
 
@@ -208,6 +210,7 @@ def _read_detections(path: Path, start: MarkerMap, args: argparse.Namespace, cam
     table = _detection_table(path)
     if not len(table):
         raise InputError(f'{path}: no detections')
+    _require_inside(path, table[:, 3:].reshape(-1, 4, 2), camera)
     stamps, firsts = np.unique(table[:, 0], return_index=True)
     sizes = size_overrides(tuple(args.marker_size_override))
     sizes |= {key: marker.size for key, marker in start.markers.items()}
@@ -222,6 +225,15 @@ def _read_detections(path: Path, start: MarkerMap, args: argparse.Namespace, cam
         frames.append(rows_from_corners(ids, rows[:, 3:].reshape(-1, 4, 2), isotropic(rows[:, 2]), size, camera))
     assert len(frames) == len(stamps)
     return frames
+
+
+def _require_inside(path: Path, corners: FloatArray, camera: Camera) -> None:
+    """Raise InputError if markers with ``corners`` (N, 4, 2) [px] lie outside the image of the calibration."""
+    centres = corners.mean(axis=1)
+    outside = np.any((centres < 0.0) | (centres > (camera.width, camera.height)), axis=1)
+    if np.mean(outside) > _MOST_OUTSIDE:
+        share = f'{100.0 * np.mean(outside):.0f} % of the markers'
+        raise InputError(f'{path}: {share} lie outside the {camera.width}x{camera.height} pixels of the calibration')
 
 
 def _detection_table(path: Path) -> FloatArray:

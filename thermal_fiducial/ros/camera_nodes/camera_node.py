@@ -12,6 +12,7 @@ from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
 from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
+from thermal_fiducial.files.images import require_size
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import StageNode
 from thermal_fiducial.ros.frames.robot_frames import RobotFrames
@@ -59,9 +60,7 @@ class CameraStageNode(StageNode[Config]):
             None has been received yet, or it has another size.
         """
         camera = self.camera()
-        if image.shape != (camera.height, camera.width):
-            size = f'{image.shape[1]}x{image.shape[0]}'
-            raise InputError(f'image of {size}, camera_info of {camera.width}x{camera.height} pixels')
+        require_size(image, camera)
         return camera
 
     def figures(self) -> dict[str, object]:
