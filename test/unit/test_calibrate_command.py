@@ -44,6 +44,15 @@ def test_camera_against_imu(tmp_path, capsys):
     assert 'turns about all three axes' in printed.err
 
 
+def test_camera_against_imu_names_the_dictionary_that_no_frame_shows(tmp_path, capsys):
+    bag = recording(seconds=0.2).write(tmp_path / 'bag')
+    marker_map, _ = side_files(tmp_path, ids=(0, 1))
+    out = tmp_path / 'extrinsics.yaml'
+    marker_map.write_text(marker_map.read_text().replace('DICT_4X4_50', 'DICT_5X5_100'))
+    assert main(['calibrate', 'camera-imu', str(bag), '--map', str(marker_map), '--out', str(out)]) == 2
+    assert f'no frame shows a marker of {marker_map}, which are of DICT_5X5_100' in capsys.readouterr().err
+
+
 def test_camera_against_imu_refuses_a_calibration_of_another_size(tmp_path, capsys):
     bag = recording(seconds=0.2).write(tmp_path / 'bag')
     marker_map, _ = side_files(tmp_path, ids=(0, 1, 2, 3))

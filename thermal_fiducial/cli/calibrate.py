@@ -21,6 +21,7 @@ from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.measurements import corner_covariances, corners_px
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import load_camera
 from thermal_fiducial.files.images import require_size
@@ -88,6 +89,8 @@ def _camera_imu(args: argparse.Namespace) -> int:
         frames = tracked(clean_frames(bag), 'finding markers', bag.message_count([bag.image_topic]))
         detector = mapped_detector(marker_map, args.plate_thickness)
         seen = sorted(_mapped_corners(frames, detector, marker_map, camera), key=lambda frame: frame.stamp_ns)
+    if not seen:
+        raise InputError(f'{args.bag}: no frame shows a marker of {args.map}, which are of {marker_map.dictionary}')
     result = calibrate_rolling_camera_imu(seen, camera, imu, start_ns, noise)
     write_text(args.out, _extrinsics_text(result))
     print(_extrinsics_text(result))
