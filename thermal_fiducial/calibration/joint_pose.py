@@ -35,7 +35,6 @@ def solve_camera_pose(
     corners_in_map: npt.ArrayLike,
     camera: Camera,
     initial: FloatArray | None = None,
-    weights: npt.ArrayLike | None = None,
     compete: bool = True,
 ) -> JointPose:
     """Pose of the camera from N markers of known pose jointly.
@@ -50,7 +49,6 @@ def solve_camera_pose(
     covs : (N, 4, 2, 2) [px^2]
     corners_in_map : (N, 4, 3) [m] squares, in the order of ``marker_corners``
     initial : (4, 4) predicted T_map_camera
-    weights : (N,) factors on the information of each marker; default 1
     compete : False: ``initial`` is good, nothing else need be tried
 
     Raises
@@ -62,12 +60,11 @@ def solve_camera_pose(
     if len(corners) == 0:
         raise InputError('no markers to compute a camera pose from')
     fitted = CameraFit(corners, np.asarray(covs, dtype=np.float64), squares, camera)
-    weights = None if weights is None else np.asarray(weights, dtype=np.float64)
     starts = np.zeros((0, 4, 4)) if initial is None else initial[None]
     if compete or initial is None:
         single = _single_markers(camera.normalise(corners), squares)
         starts = np.concatenate([starts, single[np.argsort(fitted.costs(single))[:2]]])
-    T, chi2, information = fitted.solve(starts, weights)
+    T, chi2, information = fitted.solve(starts)
     best = _likeliest(chi2, 8 * len(corners) - 6, initial is not None)
     seen = camera.project(se3.apply(se3.inverse(T[best]), squares.reshape(-1, 3)))
     squared = np.sum((corners - seen.reshape(-1, 4, 2)) ** 2, axis=-1)
