@@ -104,14 +104,9 @@ class Belief(NamedTuple):
         return [hypothesis for hypothesis in (self.main, self.alternative) if hypothesis]
 
     @property
-    def pose_stamp_ns(self) -> int:
-        """Camera stamp of the last pose that was applied."""
-        return self.verdict.stamp_ns
-
-    @property
     def stamp_ns(self) -> int:
         """Earliest instant of its hypotheses, older samples are not needed; without any, the stamp of the pose."""
-        return min((h.estimate.stamp_ns for h in self.hypotheses), default=self.pose_stamp_ns)
+        return min((h.estimate.stamp_ns for h in self.hypotheses), default=self.verdict.stamp_ns)
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'Belief':
         """The belief in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
@@ -153,7 +148,7 @@ class Belief(NamedTuple):
         return self._replace(
             main=fresh,
             alternative=None,
-            verdict=PoseUpdate(self.pose_stamp_ns, True, words, math.nan),
+            verdict=PoseUpdate(self.verdict.stamp_ns, True, words, math.nan),
             resets=resets,
             reset_reason=reason,
             contradiction=None,

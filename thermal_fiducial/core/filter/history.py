@@ -103,7 +103,7 @@ class History:
         while len(self._beliefs) > 1 and self._beliefs[1].stamp_ns <= horizon_ns:
             del self._beliefs[0]
         oldest = self._beliefs[0]
-        del self._poses[: bisect_right(self._poses, oldest.pose_stamp_ns, key=_stamp)]
+        del self._poses[: bisect_right(self._poses, oldest.verdict.stamp_ns, key=_stamp)]
         self.imu.forget_before(min(horizon_ns, oldest.stamp_ns) if oldest.hypotheses else horizon_ns)
         kept = {pose.stamp_ns for pose in self._poses}
         self._camera_steps = {stamp: step for stamp, step in self._camera_steps.items() if stamp in kept}
@@ -128,7 +128,7 @@ class History:
 
     def _go_back_before(self, stamp_ns: int) -> None:
         """Remove the beliefs after poses of ``stamp_ns`` and later."""
-        while len(self._beliefs) > 1 and self.belief.pose_stamp_ns >= stamp_ns:
+        while len(self._beliefs) > 1 and self.belief.verdict.stamp_ns >= stamp_ns:
             self._forget_belief()
 
     def _forget_belief(self) -> None:
@@ -143,7 +143,7 @@ class History:
         if due_ns - newest_ns > self.config.max_imu_gap * SECOND_NS:
             return 'refused: far ahead of the IMU'
         oldest_ns = max(self.imu.oldest_ns, newest_ns - round(self.config.max_delay * SECOND_NS))
-        if due_ns <= oldest_ns or pose.stamp_ns <= self._beliefs[0].pose_stamp_ns:
+        if due_ns <= oldest_ns or pose.stamp_ns <= self._beliefs[0].verdict.stamp_ns:
             return 'refused: too late'
         return 'refused: stamp repeated' if any(pose.stamp_ns == known.stamp_ns for known in self._poses) else ''
 
@@ -206,7 +206,7 @@ class History:
 
     def _next_due(self) -> CameraPose | None:
         belief = self.belief
-        place = bisect_right(self._poses, belief.pose_stamp_ns, key=_stamp)
+        place = bisect_right(self._poses, belief.verdict.stamp_ns, key=_stamp)
         if place == len(self._poses):
             return None
         pose = self._poses[place]
@@ -245,7 +245,7 @@ class History:
 
     def _go_back_to(self, pose: CameraPose) -> None:
         """Remove beliefs that were only propagated, without a pose, beyond the instant of ``pose``."""
-        while len(self._beliefs) > 1 and self._beliefs[-2].pose_stamp_ns == self.belief.pose_stamp_ns:
+        while len(self._beliefs) > 1 and self._beliefs[-2].verdict.stamp_ns == self.belief.verdict.stamp_ns:
             if all(h.estimate.stamp_ns <= self.due_ns(pose, h) for h in self.belief.hypotheses):
                 return
             self._forget_belief()
