@@ -14,6 +14,7 @@ from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.detection.frame import LEAST_DEPTH
 from thermal_fiducial.core.detection.known_markers import ExpectedMarkers, pairs
 from thermal_fiducial.core.detection.twist import (
+    change_since,
     corrected,
     interaction,
     later_twist,
@@ -52,6 +53,7 @@ class MotionTrack:
     lag : time constant of the bolometers [s]
     stamp_ns, twist, markers : of the last frame
     last_seen_ns : stamp of the last frame that showed markers
+    acceleration : (6,) that the last two frames show
     """
 
     T_body_camera: FloatArray
@@ -61,6 +63,7 @@ class MotionTrack:
     twist: Twist | None = None
     markers: ExpectedMarkers = field(default_factory=ExpectedMarkers.none)
     last_seen_ns: int | None = None
+    acceleration: FloatArray = field(default_factory=lambda: np.zeros(6))
 
     @staticmethod
     def of_rig(T_body_camera: FloatArray, lag: float = 0.0) -> 'MotionTrack':
@@ -88,7 +91,9 @@ class MotionTrack:
         dt = self._since(stamp_ns)
         # Without markers the twist is not extrapolated: a wrong one would keep them from being found again.
         saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_NS
-        return later_twist(self.twist, dt) if self.twist is not None and dt is not None and saw_lately else None
+        if self.twist is None or dt is None or not saw_lately:
+            return None
+        return later_twist(self.twist, self.acceleration, dt)
 
     def expected(self, stamp_ns: int, twist: Twist) -> ExpectedMarkers:
         """The last frame's markers, predicted at this frame."""
@@ -149,7 +154,12 @@ class MotionTrack:
         if self.stamp_ns is not None and 0 < self.stamp_ns - stamp_ns < _STALE_NS:
             return self
         last_seen_ns = stamp_ns if len(markers.ids) else self.last_seen_ns
-        return MotionTrack(self.T_body_camera, self.from_body, self.lag, stamp_ns, twist, markers, last_seen_ns)
+        dt, acceleration = self._since(stamp_ns), np.zeros(6)
+        if twist is not None and self.twist is not None and dt is not None:
+            acceleration = change_since(twist, self.twist, dt)
+        return MotionTrack(
+            self.T_body_camera, self.from_body, self.lag, stamp_ns, twist, markers, last_seen_ns, acceleration
+        )
 
     def _since(self, stamp_ns: int) -> float | None:
         """Time since the last frame [s], negative for a late frame; None if it is too long for the motion to hold."""
