@@ -4,8 +4,7 @@ A marker is confirmed by the correlation of its pattern. A gain control for disp
 counts. The middle between the gray levels of black and white is then not the middle of the blurred step between them:
 all dark regions grow, or all shrink. The sides of a marker and the inner edges of its border move in opposite
 directions, so the width of the border measures the displacement. Markers whose cells are hardly wider than the blur are
-refined by fitting the whole pattern, as single sides cannot be measured; that is only safe with dictionaries whose
-markers differ in many bits.
+refined by fitting the whole pattern, as single sides cannot be measured, and confirmed by the evidence of that fit.
 """
 
 from dataclasses import replace
@@ -14,14 +13,12 @@ import cv2
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.alignment import aligned
 from thermal_fiducial.core.detection.corner_errors import (
     OF_BENT_BLUR_PX,
     OF_BENT_SCALE_PX,
     OF_BORDER_PX,
     OF_BORDERS_TOGETHER,
     OF_LOCAL_PX,
-    OF_PATTERN_CELLS,
 )
 from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind_border, model, sides_of
@@ -29,8 +26,8 @@ from thermal_fiducial.core.detection.frame import counts_of, Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
 from thermal_fiducial.core.detection.quads import halfway, halved
-from thermal_fiducial.core.detection.refining import RefinedCorners, RefinedMarkers, sides_px
-from thermal_fiducial.core.detection.search import accepted
+from thermal_fiducial.core.detection.refined_corners import RefinedCorners, sides_px
+from thermal_fiducial.core.detection.refining import RefinedMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray
@@ -49,8 +46,6 @@ _MANY_BITS = 3
 _WHITE = (0.4, 1.75)
 # Largest distance of a known marker from its prediction [cells].
 _NEAR_CELLS = 0.7
-# Widest cells of markers too small for their sides to be measured [px].
-_WIDEST_CELL_PX = 2.5
 # Distance from the image's border below which a marker, by its refined corners, counts as possibly cut off [px].
 _BORDER_PX = 1.0
 # Displacement or standard deviation of blur that cells are read in spite of [cells].
@@ -149,14 +144,13 @@ class CornerEstimator:
         if len(found.ids) == 0:
             return markers
         keep = self._confirmed(frame, found, markers, config)
-        if frame.displayed and not keep.all():
-            markers, small = with_corners_by_pattern(frame, found, markers, ~keep, self._decoder, config)
-            keep = keep | small
         markers = markers if keep.all() else markers.only(keep)
         if config.refinement == 'subpix':
             return replace(markers, corners=local_corners(frame.image, markers.corners, self._decoder.cells))
-        if frame.displayed:
-            return replace(markers, corners=self._displayed.corrected(frame, markers, config.blur_px))
+        sides = np.flatnonzero(~markers.observed.by_pattern)
+        if frame.displayed and len(sides):
+            corrected = self._displayed.corrected(frame, markers.only(sides), config.blur_px)
+            return replace(markers, corners=markers.corners.with_others(sides, corrected))
         return markers
 
     def _confirmed(
@@ -167,7 +161,7 @@ class CornerEstimator:
         there = found.places.at.px + blur.shift
         off = np.abs(observed.corners_px - there).max(axis=(1, 2))
         read = off < _LITTLE / cells * sides_px(found.places.at.px)
-        keep = read & found.certain
+        keep = (read & found.certain) | observed.by_pattern
         others = np.flatnonzero(~keep)
         if len(others):
             there, to_tails = there[others], None if blur.to_tails is None else blur.to_tails[others]
@@ -217,53 +211,8 @@ def _read(image: Float32Array, quads: FloatArray, lag_tails: FloatArray | None, 
     return decoder.read(halved(image), halfway(quads), lag_tails=half_tails)
 
 
-def certain_without_sides(reading: Reading, decoder: Decoder) -> BoolArray:
-    """Which readings (N,) suffice without sharp sides: clear margin, white surroundings, a dictionary of many bits."""
-    return np.asarray(_stands_out(reading, decoder) & (decoder.correctable >= _MANY_BITS))
-
-
 def _stands_out(reading: Reading, decoder: Decoder) -> BoolArray:
     """Which readings (N,) have a clear margin over other markers and white surroundings."""
     margin = (np.abs(reading.correlation) - reading.runner_up) / decoder.isolation[reading.ids]
     white = (reading.surround >= _WHITE[0]) & (reading.surround <= _WHITE[1])
     return np.asarray((margin >= _CLEAR_MARGIN) & white)
-
-
-def with_corners_by_pattern(
-    frame: Frame,
-    found: FoundMarkers,
-    refined: RefinedMarkers,
-    lost: BoolArray,
-    decoder: Decoder,
-    config: ArucoDetectorConfig,
-) -> tuple[RefinedMarkers, BoolArray]:
-    """Refined corners, those of small ``lost`` (N,) markers replaced by a pattern fit; which (N,) were replaced."""
-    cell = sides_px(found.places.at.px) / decoder.cells
-    small = np.flatnonzero(lost & (cell < _WIDEST_CELL_PX))
-    by_pattern = np.zeros(len(lost), dtype=bool)
-    if len(small) == 0:
-        return refined, by_pattern
-    shift, upright = refined.blur.shift[small], np.zeros(len(small), dtype=np.int64)
-    corners = aligned(frame.image, found.places.at.px[small] + shift, found.ids[small], upright, decoder, noisy=False)
-    reading = decoder.read(frame.image, corners)
-    good = (reading.ids == found.ids[small]) & (reading.turns == 0) & certain_without_sides(reading, decoder)
-    good &= accepted(reading, frame.noise, decoder.correctable, config)
-    good &= frame.camera.contains(corners, _BORDER_PX).all(axis=1)
-    which, corners, shift = small[good], corners[good], shift[good]
-    by_pattern[which] = True
-    covariances = (OF_PATTERN_CELLS * cell[which, None, None, None]) ** 2 * np.broadcast_to(np.eye(2), (4, 2, 2))
-    contrast, doubt = reading.contrast[good], np.zeros(len(which))
-    noise = np.full(len(which), frame.noise)
-    observed = RefinedCorners(corners, covariances, contrast, noise, doubt)
-    at_stamp = replace(observed, corners_px=corners - shift)
-    px = refined.places.at.px.copy()
-    px[which] = at_stamp.corners_px
-    return (
-        replace(
-            refined,
-            observed=refined.observed.with_others(which, observed),
-            corners=refined.corners.with_others(which, at_stamp),
-            places=replace(refined.places, at=refined.places.at.at_pixels(px)),
-        ),
-        by_pattern,
-    )

@@ -43,7 +43,7 @@ class MarkerDetector:
     def __init__(self, config: ArucoDetectorConfig, dictionary: Dictionary) -> None:
         self.config = config
         bits = dictionary.bits
-        decoder = Decoder(bits, dictionary.correctable)
+        self._decoder = decoder = Decoder(bits, dictionary.correctable)
         overrides = size_overrides(config.marker_size_overrides)
         self._sizes = np.array([overrides.get(key, config.marker_size) for key in range(decoder.count)])
         self._finder = MarkerFinder(decoder)
@@ -91,7 +91,7 @@ class MarkerDetector:
             expected = known.expected(T_camera_map, camera, config.min_side_px)
         findings = self._finder.find(frame, history, known, expected, config)
         found = findings.found
-        refined = refine(frame, found, self._behind[found.ids], history.track, config)
+        refined = refine(frame, found, self._behind[found.ids], history.track, self._decoder, config)
         refined = self._estimator.published(frame, found, refined, config)
         ids, corners = refined.ids, refined.corners
         at = refined.places.at.at_pixels(corners.corners_px)

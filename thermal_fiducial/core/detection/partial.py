@@ -24,7 +24,7 @@ from thermal_fiducial.core.detection.corners.grid import (
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import PartialMarkers
 from thermal_fiducial.core.detection.patterns import CELL_SAMPLES, Decoder, most_similar, NEAR_CELLS
-from thermal_fiducial.core.detection.refining import RefinedCorners
+from thermal_fiducial.core.detection.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.visible_cells import VisibleCells
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import Camera
@@ -223,8 +223,8 @@ def _corners(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> RefinedCorne
     deviation = np.sqrt(np.trace(blocks, axis1=1, axis2=2).max())
     if not deviation < _KNOWN_PX:
         return None
-    scalars = (np.array([value]) for value in (fit.contrast, fit.noise, 0.0))
-    return RefinedCorners(corners[None], blocks[None], *scalars)
+    contrast, noise, doubt = (np.array([value]) for value in (fit.contrast, fit.noise, 0.0))
+    return RefinedCorners(corners[None], blocks[None], contrast, noise, doubt, np.zeros(1, dtype=bool))
 
 
 def _pose_covariance(frame: Frame, marker: _PartialMarker, fit: PoseFit) -> FloatArray:

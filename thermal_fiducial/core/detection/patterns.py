@@ -190,6 +190,11 @@ class Decoder:
         """Cells (Q, m, m), 1 for white, as quadrilaterals show markers whose corners they name ``turns`` late."""
         return np.asarray(self._grids[ids, turns])
 
+    @property
+    def black(self) -> FloatArray:
+        """Cells (4 M, m, m) of all markers in all turns, 1 for black."""
+        return 1.0 - self._grids.reshape(-1, self.cells, self.cells)
+
     def _judged(
         self, values: Float32Array, best: IntArray, correlation: FloatArray, runner_up: FloatArray, steps: FloatArray
     ) -> Reading:

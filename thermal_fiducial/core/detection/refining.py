@@ -36,10 +36,12 @@ from thermal_fiducial.core.detection.frame import (
     WITHOUT_TAIL,
 )
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
+from thermal_fiducial.core.detection.patterns import Decoder
+from thermal_fiducial.core.detection.refined_corners import RefinedCorners, sides_px
+from thermal_fiducial.core.detection.small_markers import fitted_patterns, too_small_for_sides
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, unknown_twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
-from thermal_fiducial.core.geometry.se3 import squared_sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked, TINY
 
 #: Contrast-to-noise ratio above which a marker is clear: it is found at full and at half resolution.
@@ -64,33 +66,6 @@ _PASSES = 4
 _SETTLED_PX, _UNSURE = (0.3, 1.0), 2.0
 # Standard deviation of the prior of the corners [px].
 _PRIOR_PX = 3.0
-
-
-@dataclass(frozen=True, slots=True)
-class RefinedCorners(Stacked):
-    """Corners of N markers.
-
-    Parameters
-    ----------
-    corners_px : (N, 4, 2)
-    covariances : (N, 4, 2, 2) [px^2]
-    contrast : (N,) white minus black [counts]
-    noise : (N,) standard deviation of a pixel about the model [counts]
-    doubt : (N,) additional variance where the outline is inconsistent with a square, or has not converged, else 0;
-        not in covariances [px^2]
-    """
-
-    corners_px: FloatArray
-    covariances: FloatArray
-    contrast: FloatArray
-    noise: FloatArray
-    doubt: FloatArray
-
-    @staticmethod
-    def none() -> 'RefinedCorners':
-        """No corners."""
-        no = np.zeros(0)
-        return RefinedCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +118,12 @@ class RefinedMarkers(Stacked):
 
 
 def refine(
-    frame: Frame, found: FoundMarkers, behind: Float32Array, track: MotionTrack, config: ArucoDetectorConfig
+    frame: Frame,
+    found: FoundMarkers,
+    behind: Float32Array,
+    track: MotionTrack,
+    decoder: Decoder,
+    config: ArucoDetectorConfig,
 ) -> RefinedMarkers:
     """Corners of N markers.
 
@@ -162,6 +142,11 @@ def refine(
         blur = _motion_blur(frame, places, twist)
         start = places.at.at_pixels(places.at.px + blur.shift)
         seen = refine_corners(frame.image, start, frame.camera, behind, config.blur_px, columns, narrow, blur)
+        if frame.displayed:
+            # Lag tails stay in small markers.
+            small, fitted = fitted_patterns(frame, found, start.px + blur.removed, decoder, config.blur_px)
+            fitted = replace(fitted, corners_px=fitted.corners_px - blur.removed[small])
+            seen = seen.with_others(small, fitted)
         markers = _at_stamp(frame, found.ids, places, blur, seen, twist, track, behind.shape[2])
         change = np.abs(markers.corners.corners_px - seen.corners_px + blur.shift)
         if markers.twist is None or change.max(initial=0.0) < _BLUR_THAT_MATTERS_PX:
@@ -190,7 +175,9 @@ def _at_stamp(
     # its corners are corrected for lag, those of the last frame are not.
     twist = known
     if frame.twist is not None or known is None:
-        twist = track.correct(frame.stamp_ns, frame.twist, ids, at.x, places.depth, deviation)
+        # Sides of small markers may be those of other things.
+        sure = seen.by_pattern | ~too_small_for_sides(frame, places.at.px, cells)
+        twist = track.correct(frame.stamp_ns, frame.twist, ids[sure], at.x[sure], places.depth[sure], deviation[sure])
     if twist is None:
         unsure = doubted + _of_unpredicted_motion(frame, places, seen, unknown_twist(), cells)
         return RefinedMarkers(ids, seen, blur, replace(seen, covariances=unsure), replace(places, at=at), None)
@@ -223,11 +210,6 @@ def _motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlu
     removed = (1.0 - REMAINING) * tail
     shift = lag_blur - removed + rolling
     return MotionBlur(lag_tail_maps(places.at.px + shift, tail), shift, removed, SPREAD * mean)
-
-
-def sides_px(corners: FloatArray) -> FloatArray:
-    """Mean sides (N,) of quadrilaterals (N, 4, 2)."""
-    return np.asarray(np.sqrt(squared_sides(corners)).mean(axis=1))
 
 
 def refine_corners(
@@ -292,4 +274,5 @@ def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCor
     # More passes would not make corners better that are displaced by their own contrast.
     uneven = OF_UNEVEN_CONTRAST_PX * segments.slope_of_contrast() / np.maximum(np.abs(contrast), TINY)
     covariances = covariances + (uneven * uneven)[:, None, None, None] * _EYE
-    return RefinedCorners(corners, covariances, contrast, noise, doubt), moving
+    by_sides = np.zeros(len(doubt), dtype=bool)
+    return RefinedCorners(corners, covariances, contrast, noise, doubt, by_sides), moving

@@ -1,0 +1,42 @@
+"""Refined corners of markers."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from thermal_fiducial.core.geometry.se3 import squared_sides
+from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked
+
+
+@dataclass(frozen=True, slots=True)
+class RefinedCorners(Stacked):
+    """Corners of N markers.
+
+    Parameters
+    ----------
+    corners_px : (N, 4, 2)
+    covariances : (N, 4, 2, 2) [px^2]
+    contrast : (N,) white minus black [counts]
+    noise : (N,) standard deviation of a pixel about the model [counts]
+    doubt : (N,) additional variance where the outline is inconsistent with a square, or has not converged, else 0;
+        not in covariances [px^2]
+    by_pattern : (N,) whether their whole pattern was fitted
+    """
+
+    corners_px: FloatArray
+    covariances: FloatArray
+    contrast: FloatArray
+    noise: FloatArray
+    doubt: FloatArray
+    by_pattern: BoolArray
+
+    @staticmethod
+    def none() -> 'RefinedCorners':
+        """No corners."""
+        no = np.zeros(0)
+        return RefinedCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no, no.astype(bool))
+
+
+def sides_px(corners: FloatArray) -> FloatArray:
+    """Mean sides (N,) of quadrilaterals (N, 4, 2)."""
+    return np.asarray(np.sqrt(squared_sides(corners)).mean(axis=1))
