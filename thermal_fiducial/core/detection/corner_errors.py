@@ -31,6 +31,10 @@ OF_BORDER_PX, OF_BORDERS_TOGETHER = 0.05, 12.0
 #: pixels up to a cell away, is displaced by 0.7 of what the contrast changes in a cell; a slope of the level displaces
 #: nothing.
 OF_UNEVEN_CONTRAST_PX = 0.7
+#: A side by a gradient of the contrast across it [px^2]: a step with a slope on one side, fitted as a step blurred by
+#: 0.75 px, is displaced by 1.0 to 1.4 px^2 times the slope over the step. The slope looks like contrast too [px]: a
+#: step of nothing has 2.5 px of the slope.
+OF_GRADIENT_PX2, GRADIENT_AS_CONTRAST_PX = 1.2, 2.5
 #: The time constant of the lag, and the displacement of an edge by a response that is no exponential, both as shares of
 #: the motion blur. Rendered frames of a lag in steps, and of one of 14 ms taken for 10.
 OF_LAG, OF_LAG_FORM = 0.35, 0.02

@@ -20,7 +20,14 @@ from thermal_fiducial.core.detection.corner_errors import (
     OF_UNEVEN_CONTRAST_PX,
     unknown_motion,
 )
-from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, REACHED, Segments
+from thermal_fiducial.core.detection.corners.segments import (
+    adjust,
+    HOPELESS,
+    measure,
+    REACHED,
+    Segments,
+    with_gradients,
+)
 from thermal_fiducial.core.detection.corners.sides import Blur, blurs, model, NARROW, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.frame import (
@@ -242,7 +249,7 @@ def refine_corners(
         blur = blurs(sides, blur_px, motion.spread)
         counts = counts_of(sides.pixel, image, motion.to_tails)
         modelled = model(sides, behind, blur, narrow, motion.parts(sides, blur_px))
-        segments = measure(counts, modelled, REACHED * blur.across)
+        segments = with_gradients(measure(counts, modelled, REACHED * blur.across), sides, widest)
         refined, moving = _moved(sides, segments, as_squares(start, *adjust(sides, segments, _PRIOR_PX)))
         found = found.with_others(which, refined) if index else refined
         which = which[moving]

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from thermal_fiducial.core.detection.corner_errors import OF_SIDES_PX
-from thermal_fiducial.core.detection.corners.sides import ENDS, Sides, STARTS
+from thermal_fiducial.core.detection.corner_errors import GRADIENT_AS_CONTRAST_PX, OF_GRADIENT_PX2, OF_SIDES_PX
+from thermal_fiducial.core.detection.corners.sides import ENDS, OPPOSITE, Sides, STARTS
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, SIGMA_OF_MEDIAN, TINY
 
 #: Largest displacement for which the linearisation holds, in standard deviations of the blur.
@@ -184,6 +184,33 @@ def _judged(fit: _SegmentFit, reach: FloatArray) -> Segments:
     safe = np.where(usable, (contrast * others + typical * own) / (others + own), 1.0)
     shift = np.where(usable, np.minimum(np.maximum(-product / safe, -reach), reach), 0.0)
     return Segments(shift, np.where(usable, noise * fit.product_variance / (safe * safe), HOPELESS), contrast, noise)
+
+
+def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> Segments:
+    """The segments of whole markers, with the error by a gradient of temperature in the plate or behind it.
+
+    Opposite sides show the gradient by their contrasts. A plate that is half warm has sides whose contrast is no more
+    than what the gradient alone looks like: they measure nothing.
+
+    Parameters
+    ----------
+    sides : of the markers
+    blur_px : standard deviation of the blur, by which noise of a displacement is one of the contrast
+    """
+    count, cells = len(segments.shift), sides.across.shape[1]
+    good = (segments.variance < HOPELESS).reshape(count, 4, cells)
+    number = np.maximum(good.sum(axis=2), 1)
+    contrast = (segments.contrast.reshape(good.shape) * good).sum(axis=2) / number
+    relative = (segments.variance.reshape(good.shape) * good).sum(axis=2) / (number * blur_px) ** 2
+    noise = contrast**2 * relative
+    seen = good.sum(axis=2) > 0
+    both = seen & seen[:, OPPOSITE]
+    change = np.where(both, (contrast - contrast[:, OPPOSITE]) ** 2 - noise - noise[:, OPPOSITE], 0.0)
+    gradient = np.sqrt(np.maximum(change, 0.0)) / sides.across.reshape(good.shape).mean(axis=2)
+    left = np.abs(contrast) - GRADIENT_AS_CONTRAST_PX * gradient
+    std = np.where(left > 0.0, OF_GRADIENT_PX2 * gradient / np.maximum(left, TINY), np.inf)
+    variance = np.minimum(segments.variance + np.repeat(std**2, cells, axis=1), HOPELESS)
+    return segments._replace(variance=variance)
 
 
 def median_of(values: FloatArray, good: BoolArray) -> FloatArray:

@@ -19,7 +19,7 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gra
 
 #: Corners between which the sides lie: top and bottom from left to right, left and right from the top down.
 STARTS, ENDS = np.array([0, 3, 0, 1]), np.array([1, 2, 3, 2])
-_OPPOSITE = np.array([1, 0, 3, 2])
+OPPOSITE = np.array([1, 0, 3, 2])
 #: A curved side is a quartic through five points at these shares of its length.
 NODES = np.linspace(0.0, 1.0, 5)
 # Half the length of columns: this many blurs and a pixel, within limits [px].
@@ -92,7 +92,7 @@ def sides_of(x: FloatArray, camera: Camera, shape: tuple[int, ...], cells: int, 
     points = start[:, :, None] + share[..., None] * (end - start)[:, :, None]
     nodes = camera.distort(points).reshape(-1, len(NODES), 2)
     middle = nodes[:, 2]
-    opposite = middle.reshape(-1, 4, 2).take(_OPPOSITE, axis=1).reshape(-1, 2) - middle
+    opposite = middle.reshape(-1, 4, 2).take(OPPOSITE, axis=1).reshape(-1, 2) - middle
     return columns_across(nodes, opposite, shape, cells, columns, blur_px)
 
 
