@@ -111,11 +111,7 @@ class PredictedCamera:
 
 
 def predicted_camera(
-    prior: MotionPrior | None,
-    camera_stamp_ns: int,
-    T_body_camera: FloatArray,
-    time_offset_std: float,
-    max_age: float = MAX_AGE,
+    prior: MotionPrior | None, camera_stamp_ns: int, T_body_camera: FloatArray, time_offset_std: float
 ) -> PredictedCamera | None:
     """The camera at the frame ``camera_stamp_ns``; None where odometry has no state near it.
 
@@ -123,22 +119,28 @@ def predicted_camera(
     ----------
     prior : the filter's odometry and clock offset
     time_offset_std : standard deviation of the clock offset before the filter has estimated it [s]
-    max_age : longest time over which an odometry state is extrapolated [s]
     """
     if prior is None:
         return None
     instant_ns = prior.in_odometry_clock(camera_stamp_ns)
     odometry = prior.nearest(instant_ns)
     dt = math.inf if odometry is None else (instant_ns - odometry.stamp_ns) / SECOND_NS
-    if odometry is None or abs(dt) > max_age:
+    if odometry is None or abs(dt) > MAX_AGE:
         return None
+    clock_std = 0.0 if prior.clock_is_known else time_offset_std
+    return extrapolated(odometry, dt, camera_stamp_ns, T_body_camera, clock_std)
+
+
+def extrapolated(
+    odometry: Odometry, dt: float, camera_stamp_ns: int, T_body_camera: FloatArray, clock_std: float
+) -> PredictedCamera:
+    """The camera at a frame that is ``dt`` [s] after a state of the odometry, by clocks known to ``clock_std`` [s]."""
     step = transform(so3_exp(odometry.angular_velocity_body * dt), odometry.velocity_body * dt)
     T_map_body = odometry.T_map_body @ step
     R, J = T_map_body[:3, :3], lever_arm(T_map_body[:3, :3] @ T_body_camera[:3, 3])
     covariance = J @ odometry.pose_covariance @ J.T
     velocity = J @ np.concatenate([R @ odometry.velocity_body, R @ odometry.angular_velocity_body])
-    if not prior.clock_is_known:
-        covariance += of_single_error(velocity, time_offset_std)
+    covariance += of_single_error(velocity, clock_std)
     return PredictedCamera(CameraPose(camera_stamp_ns, T_map_body @ T_body_camera, covariance), odometry, velocity)
 
 

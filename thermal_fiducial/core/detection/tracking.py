@@ -25,7 +25,7 @@ from thermal_fiducial.core.detection.twist import (
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import twist_transfer
 from thermal_fiducial.core.measurements import Odometry
-from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
+from thermal_fiducial.core.motion_prior import extrapolated, MotionPrior
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 
 # Longest time between frames whose motion is related [ns].
@@ -194,8 +194,9 @@ def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, 
     if not states and (other := prior.nearest(odometry_ns)) is not None:
         states = [other]
     twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)
-    predicted = predicted_camera(prior, stamp_ns, track.T_body_camera, _UNKNOWN_CLOCK_S, max_age_s)
-    if predicted is None or twist is None:
+    nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
+    dt = math.inf if nearest is None else (odometry_ns - nearest.stamp_ns) / SECOND_NS
+    if nearest is None or twist is None or abs(dt) > max_age_s:
         return FramePrediction(twist, None, math.inf)
-    pose = predicted.pose
+    pose = extrapolated(nearest, dt, stamp_ns, track.T_body_camera, clock_std_s).pose
     return FramePrediction(twist, se3.inverse(pose.T_map_camera), math.sqrt(np.trace(pose.covariance[:3, :3])))
