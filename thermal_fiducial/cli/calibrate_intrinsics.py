@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+import sys
 
 import numpy as np
 import yaml
@@ -14,7 +15,7 @@ from thermal_fiducial.calibration.sources import is_folder_of_pictures, measured
 from thermal_fiducial.calibration.targets import Chessboard, CircleGrid, MarkerBoard, Target
 from thermal_fiducial.cli.board_views import BoardViews, look_at_bag, look_at_pictures
 from thermal_fiducial.cli.subcommands import file_to_write
-from thermal_fiducial.config import ArucoDetectorConfig
+from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.errors import InputError
@@ -92,6 +93,7 @@ def _intrinsics(args: argparse.Namespace) -> int:
     _save_covariance(args.out, result, error)
     write_report(args.report or args.out.with_suffix('.html'), result, views.kept, fits, error, views.unusable)
     _print_result(args.out, result, fits, views, error)
+    _warn_of_focal_length(result)
     return 0
 
 
@@ -163,6 +165,16 @@ def _save_covariance(out: Path, result: Calibration, error: ImageError) -> None:
         'sigma_not_covered_px': error.outside_px,
     }
     write_text(path, yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120))
+
+
+def _warn_of_focal_length(result: Calibration) -> None:
+    """Warn of a focal length that the views leave wider than the mapper's default."""
+    usual = MarkerMapperConfig().focal_length_std
+    share = max(sigma / value for name, value, sigma in result.parameter_rows() if name in ('fx', 'fy'))
+    if share > usual:
+        known = f'focal length known to {100.0 * share:.2g} % only, {100.0 * usual:.2g} % is usual'
+        remedy = f'tilt the board by 20 to 40 degrees, or set focal_length_std: {share:.4f}'
+        print(f'warning: {known}: {remedy}', file=sys.stderr)
 
 
 def _print_result(
