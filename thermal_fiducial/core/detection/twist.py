@@ -1,7 +1,7 @@
 """Twist of the camera with its covariance, by odometry or by the motion of corners.
 
 The image motion is that of a rigid scene for a camera with twist (v, omega) (F. Chaumette, S. Hutchinson, "Visual
-servo control I", 2006, eq. 11). Only odometry shows an acceleration; without it the acceleration is unknown.
+servo control I", 2006, eq. 11). The acceleration is that of a line through the odometry, or of the last two frames.
 """
 
 from collections.abc import Sequence
