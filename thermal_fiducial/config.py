@@ -216,10 +216,10 @@ def _mode() -> Any:
     )
 
 
-def _camera_position() -> Any:
+def _camera_position(camera: str = 'the camera') -> Any:
     return param(
         (0.0, 0.0, 0.0),
-        'Position of the camera in base_link (the IMU frame).',
+        f'Position of {camera} in base_link (the IMU frame).',
         unit='m',
         length=3,
         minimum=-10.0,
@@ -227,10 +227,10 @@ def _camera_position() -> Any:
     )
 
 
-def _camera_orientation() -> Any:
+def _camera_orientation(frame: str = 'thermal_camera_optical') -> Any:
     return param(
         (-0.5, 0.5, -0.5, 0.5),
-        'Orientation of thermal_camera_optical in base_link, quaternion x y z w. Default: looks forward.',
+        f'Orientation of {frame} in base_link, quaternion x y z w. Default: looks forward.',
         length=4,
         normed=True,
     )
@@ -503,8 +503,8 @@ class MarkerMapperConfig(SelfChecked):
         'Name of a second camera, whose poses are fused with those of the first or replace them: subscribes to '
         'NAME/markers and NAME/thermal/camera_info. Empty: none.',
     )
-    second_camera_position: tuple[float, ...] = _camera_position()
-    second_camera_orientation: tuple[float, ...] = _camera_orientation()
+    second_camera_position: tuple[float, ...] = _camera_position('the second camera')
+    second_camera_orientation: tuple[float, ...] = _camera_orientation("the second camera's optical frame")
     cloud_file: str = param('', 'Point cloud of the site (.ply or .pcd) to publish for RViz. Empty: none.', path=True)
     cloud_alignment_file: str = param(
         '',
