@@ -10,6 +10,7 @@ from thermal_fiducial.config import ArucoDetectorConfig
 from thermal_fiducial.core.detection.confirmation import DisplayedSides
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.measurements import corner_covariances, corners_px, MARKER_DTYPE
+from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
 from thermal_fiducial.sim.scenario import named
 from thermal_fiducial.sim.thermal_camera import render_frames
@@ -46,6 +47,12 @@ def test_no_markers_give_no_rows(detector):
     rows = detector.detect(0, noise, camera)
     assert rows.dtype == MARKER_DTYPE
     assert len(rows) == 0
+
+
+def test_a_calibration_of_another_image_size_is_named(detector):
+    camera = camera_of(named('wall'))
+    with pytest.raises(InputError, match='image of 320x256, camera_info of 640x512 pixels'):
+        detector.detect(0, np.zeros((256, 320), np.uint16), camera)
 
 
 def displayed(counts, bent):

@@ -24,7 +24,6 @@ from thermal_fiducial.core.measurements import corner_covariances, corners_px
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.bags import BagReader, parse_remaps
 from thermal_fiducial.files.camera_info import load_camera
-from thermal_fiducial.files.images import require_size
 from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.files.writing import write_text
 
@@ -105,7 +104,6 @@ def _mapped_corners(
     from thermal_fiducial.calibration.rolling import FrameCorners
 
     for frame in frames:
-        require_size(frame.counts, camera)
         rows = detector.detect(frame.stamp_ns, frame.counts, camera)
         rows = rows[np.isin(rows['id'], list(marker_map.markers))]
         if len(rows) == 0:

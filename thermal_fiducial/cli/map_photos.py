@@ -16,7 +16,7 @@ from thermal_fiducial.core.measurements import MARKER_DTYPE, Markers
 from thermal_fiducial.core.types import FloatArray, Gray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.dictionary import load_dictionary
-from thermal_fiducial.files.images import read_picture, require_size
+from thermal_fiducial.files.images import read_picture
 
 _IMAGES = {'.png', '.jpg', '.jpeg', '.tif', '.tiff', '.bmp', '.pgm'}
 #: Noise of OpenCV's sub-pixel corners in photos [px]; the mapper takes the actual noise from the pictures.
@@ -37,7 +37,7 @@ def photos_in(folder: Path) -> list[Path]:
 
 def _require_size_of(photo: Path, counts: npt.NDArray[Any], camera: Camera) -> None:
     try:
-        require_size(counts, camera)
+        camera.require_size_of(counts)
     except InputError as error:
         raise InputError(f'{photo}: {error}') from None
 

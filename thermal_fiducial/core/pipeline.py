@@ -124,7 +124,13 @@ class Pipeline:
         return odometry
 
     def add_image(self, stamp_ns: int, counts: Counts | Gray) -> FrameResult:
-        """Clean, detect, map and correct with one raw thermal frame (H, W) at its stamp."""
+        """Clean, detect, map and correct with one raw thermal frame (H, W) at its stamp.
+
+        Raises
+        ------
+        InputError
+            The calibration is of another image size.
+        """
         frame = self.cleaner.process(stamp_ns, counts)
         if frame.counts is None or self.camera is None:
             return FrameResult(stamp_ns, withheld=frame.reason or 'no camera_info')

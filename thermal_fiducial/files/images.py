@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.types import Counts, Gray, SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.files.reading import read_bytes
@@ -22,13 +21,6 @@ ENCODINGS = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 _LARGEST_FILE_BYTES = 250_000_000
 #: Magic bytes of lossless formats: PNG, and TIFF of either byte order.
 _LOSSLESS = (b'\x89PNG', b'II*\0', b'MM\0*')
-
-
-def require_size(image: npt.NDArray[Any], camera: Camera) -> None:
-    """Raise InputError if an image (H, W) has another size than the calibration ``camera``."""
-    height, width = image.shape
-    if (height, width) != (camera.height, camera.width):
-        raise InputError(f'image of {width}x{height}, camera_info of {camera.width}x{camera.height} pixels')
 
 
 def image_to_array(message: Any) -> Counts | Gray:

@@ -55,8 +55,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
             return
         image = message_bytes.image(message)
         counts, head = image_to_array(image), convert.header(image.stamp_ns, image.frame_id)
-        camera = self.camera_of(counts)
-        markers = self.detector.detect(image.stamp_ns, counts, camera, self.odometry)
+        markers = self.detector.detect(image.stamp_ns, counts, self.camera(), self.odometry)
         self._seen = len(markers)
         self._markers.send(clouds.MARKER_CLOUDS.message(markers, head))
         if self._marker_poses.listeners:

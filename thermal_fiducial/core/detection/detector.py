@@ -80,7 +80,13 @@ class MarkerDetector:
         counts : (height, width), clean
         camera : its intrinsics
         prior : the filter's latest odometry and clock offset, if available
+
+        Raises
+        ------
+        InputError
+            The calibration is of another image size.
         """
+        camera.require_size_of(counts)
         config, known, history = self.config, self._known, self._history
         prediction = predict_frame(stamp_ns, prior, history.track, config.max_odometry_age)
         T_camera_map = prediction.T_camera_map

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.polynomial import Polynomial
 import numpy.typing as npt
 
-from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked, TINY
+from thermal_fiducial.core.types import BoolArray, Counts, FloatArray, Gray, Stacked, TINY
 from thermal_fiducial.errors import InputError
 
 #: Coefficients of each model, in the order of camera_info (shorter lists are filled up with zeros).
@@ -83,6 +83,12 @@ class Camera:
     def principal_point(self) -> FloatArray:
         """(2,) [px]."""
         return self.K[:2, 2]
+
+    def require_size_of(self, image: Counts | Gray) -> None:
+        """Raise InputError if an ``image`` (H, W) has another size than the calibration."""
+        height, width = image.shape
+        if (height, width) != (self.height, self.width):
+            raise InputError(f'image of {width}x{height}, camera_info of {self.width}x{self.height} pixels')
 
     def matches(self, other: 'Camera') -> bool:
         """Whether ``other`` is the same calibration."""

@@ -10,9 +10,7 @@ from thermal_fiducial.config import ArucoDetectorConfig, MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import MotionPrior
-from thermal_fiducial.core.types import Counts, Gray
 from thermal_fiducial.errors import InputError
-from thermal_fiducial.files.images import require_size
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import StageNode
 from thermal_fiducial.ros.frames.robot_frames import RobotFrames
@@ -50,18 +48,6 @@ class CameraStageNode(StageNode[Config]):
         if self._camera is None:
             raise InputError('no camera_info')
         return self._camera
-
-    def camera_of(self, image: Counts | Gray) -> Camera:
-        """The calibration, which must have the size of ``image`` (H, W).
-
-        Raises
-        ------
-        InputError
-            None has been received yet, or it has another size.
-        """
-        camera = self.camera()
-        require_size(image, camera)
-        return camera
 
     def figures(self) -> dict[str, object]:
         """Number of different calibrations received."""
