@@ -289,3 +289,20 @@ def test_sides_of_a_plate_that_is_half_warm_claim_what_its_gradient_displaces_th
     # 0.7 to 1.5 when written, and 10.6, 5.5 and 2.3 without the gradient. Twenty views of one marker, whose errors are
     # alike, leave a factor of two above 1.
     assert np.mean(squares) < 2.0
+
+
+def test_outlines_that_are_no_markers_stay_finite():
+    """Quadrilaterals anywhere, most of them of nothing: their corners run away, or fold the outline."""
+    rng = np.random.default_rng(0)
+    camera = CAMERAS['plumb_bob']
+    image, _ = draw(camera, 3, marker_pose(0.9, (0.2, 0.3, 0.1)), 0.15)
+    image = image + cv2.GaussianBlur(rng.normal(0.0, 300.0, image.shape), (0, 0), 4.0)
+    centres = rng.uniform(20.0, [620.0, 490.0], (400, 1, 2))
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    outlines = centres + rng.uniform(6.0, 20.0, (400, 1, 1)) * square + rng.uniform(-3.0, 3.0, (400, 4, 2))
+    ids = rng.integers(0, 50, 400)
+    start = ImagePoints.at(outlines, camera)
+    # Where arithmetic is invalid it warns, and warnings are errors here.
+    refined = refine_corners(image.astype(np.float32), start, camera, BEHIND[ids], BLUR_WITH_PIXEL)
+    assert np.isfinite(refined.corners_px).all()
+    assert np.isfinite(refined.covariances).all()
