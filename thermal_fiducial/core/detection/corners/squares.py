@@ -16,6 +16,8 @@ from thermal_fiducial.core.types import FloatArray
 
 # Standard deviation of the two constraints, by the cut of markers and by lens calibrations.
 _SQUARE_STD = 0.003
+# Linearisation error of the constraints as a share of their values.
+_BENT = 0.1
 # The constraints are nonlinear: largest number of linearisations, and the step below which they are not repeated [px].
 _STEPS, _BENDS_PX = 3, 0.05
 # Squared Mahalanobis distance (2 d.o.f.) beyond which an outline is inconsistent with a square: a square of the second
@@ -23,9 +25,9 @@ _STEPS, _BENDS_PX = 3, 0.05
 _INCONSISTENT = 12.0
 # Step of the differences from which the derivatives are taken [px]: a millionth of a side, far above rounding.
 _STEP_PX = 1e-4
-_VARIANCE, _OF_EACH = _SQUARE_STD**2 * np.eye(2), np.eye(4)[:, None, :, None]
+_EYE, _OF_EACH = np.eye(2), np.eye(4)[:, None, :, None]
 # Mean displacement of all corners, for each of them.
-_TOGETHER = np.kron(np.ones((4, 4)) / 4, np.eye(2))
+_TOGETHER = np.kron(np.ones((4, 4)) / 4, _EYE)
 
 
 class Squared(NamedTuple):
@@ -69,14 +71,15 @@ def _corrected(at: ImagePoints, moved: FloatArray, seen: FloatArray, covariance:
         value, J = squareness(at.x + (at.inverse @ moved.reshape(-1, 4, 2, 1))[..., 0], at.inverse)
         error = value + J @ (seen - moved)
         spread = covariance @ J.swapaxes(1, 2)
-        information = inverse_2x2(J @ spread + _VARIANCE)
+        variance = _SQUARE_STD**2 + (_BENT * value) ** 2
+        information = inverse_2x2(J @ spread + variance * _EYE)
         weighted = information @ error
         before, moved = moved, seen - spread @ weighted
         if np.abs(moved - before).max() < _BENDS_PX:
             break
     chi2 = np.einsum('nij,nij->n', error, weighted)
-    left = _SQUARE_STD**2 * weighted
-    constrained = 2.0 - _SQUARE_STD**2 * information.trace(axis1=1, axis2=2)
+    left = variance * weighted
+    constrained = 2.0 - np.einsum('nij,nii->n', variance, information)
     doubt = np.where(chi2 > _INCONSISTENT, np.einsum('nij,nij->n', left, left), 0.0)
     return Squared(moved, covariance - spread @ information @ spread.swapaxes(1, 2), chi2, doubt, constrained)
 
