@@ -8,9 +8,10 @@ from support.detector_scores import odometry_before
 
 from thermal_fiducial.core.detection.corner_errors import of_motion_blur, unknown_motion
 from thermal_fiducial.core.detection.corners.sides import edges_behind
-from thermal_fiducial.core.detection.frame import counts_of, lag_tail_maps, REMAINING, SPREAD
+from thermal_fiducial.core.detection.frame import counts_of, lag_tail_maps, Places, REMAINING, SPREAD
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.refining import MotionBlur, refine_corners
+from thermal_fiducial.core.detection.twist import Twist
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.measurements import corners_px
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -92,6 +93,21 @@ def test_each_marker_is_freed_of_its_own_lag_tails():
 
 
 SQUARE = 60.0 * np.array([[[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]]])
+
+
+def test_what_an_acceleration_leaves_of_the_lag_is_the_mean_of_the_young_response():
+    """A camera that moves along x ever faster: what is s old lies s w - s^2 a / 2 behind."""
+    tau, speed, acceleration = 0.010, 0.5, 4.0
+    camera = Camera(640, 512, np.array([[500.0, 0.0, 320.0], [0.0, 500.0, 256.0], [0.0, 0.0, 1.0]]))
+    places = Places.of(ImagePoints.seen_at(np.zeros((1, 4, 2)), camera), np.ones((1, 4)))
+    along = np.eye(6)[0]
+    twist = Twist(speed * along, np.eye(6), acceleration * along)
+    left = places.lag_blur(twist, tau) - (1.0 - REMAINING) * places.lag_tail(twist, tau)
+    # The tail begins at an age of three quarters.
+    ages = tau * (np.arange(7500) + 0.5) / 1e4
+    behind = np.average(ages * speed - 0.5 * ages**2 * acceleration, weights=np.exp(-ages / tau))
+    # 0.05 px off with the velocity of the lag for the tail, too.
+    np.testing.assert_allclose(left[..., 0], 500.0 * behind, atol=1e-6)
 
 
 def wrong_lag(lag_blur_px):

@@ -12,7 +12,8 @@ derivative makes a ghost of every step). Only the response older than a time m, 
 motion blur remains, which the edge model contains, and a known mean delay.
 
 With an acceleration a, the image of s ago lies s w - s^2 a / 2 behind. The mean delay of an exponential,
--tau w + tau^2 a, is therefore that of the velocity one time constant ago, which is taken for the lag tail as well.
+-tau w + tau^2 a, is therefore that of the velocity one time constant ago, and the lag tail is displaced by the velocity
+of tau + m / 2 ago.
 """
 
 from dataclasses import dataclass
@@ -61,6 +62,8 @@ REMAINING, SPREAD = _moments(0.0, _TAIL)
 #: That motion blur as Gaussians of equal weight. It has sharp ends, and one Gaussian would have none: where it is as
 #: long as cells are wide, sides would be off by a tenth of it.
 WITHOUT_TAIL = _halves()
+# Age, in time constants, of the velocity that gives the displacement of the lag tail.
+_LAG_TAIL_AGE = 1.0 + 0.5 * _TAIL
 
 
 @dataclass(frozen=True)
@@ -117,6 +120,10 @@ class Places(Stacked):
     def lag_blur(self, twist: Twist, lag: float) -> FloatArray:
         """Mean displacement (N, 4, 2) [px] of the corners by a lag [s]."""
         return np.asarray(-lag * (self.flow @ twist.ago(lag)))
+
+    def lag_tail(self, twist: Twist, lag: float) -> FloatArray:
+        """Displacement (N, 4, 2) [px] of the corners' lag tails, over the age of the tail in time constants."""
+        return np.asarray(-lag * (self.flow @ twist.ago(_LAG_TAIL_AGE * lag)))
 
 
 def delays(rows: FloatArray, frame: Frame) -> FloatArray:

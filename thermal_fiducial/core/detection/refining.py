@@ -215,8 +215,10 @@ def _motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlu
     mean, rolling = lag_blur.mean(axis=1), rolling_displacement(places, twist, frame)
     if twist is None or (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
         return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean)
-    # As the read-out shows it.
-    tail = lag_blur * stretch(places, twist, frame)[..., None] if frame.readout > 0.0 else lag_blur
+    # So far the velocity has carried the image since its lag tail was seen, as the read-out shows it.
+    tail = places.lag_tail(twist, frame.lag)
+    if frame.readout > 0.0:
+        tail = tail * stretch(places, twist, frame)[..., None]
     removed = (1.0 - REMAINING) * tail
     shift = lag_blur - removed + rolling
     return MotionBlur(lag_tail_maps(places.at.px + shift, tail), shift, removed, SPREAD * mean)
