@@ -39,6 +39,8 @@ _COORDINATES = 8
 # Odometry that gives the twist of a frame: from so many time constants before it to one after it, which is symmetric
 # about the velocity that blurs it; largest number of states; time constant that is assumed without lag [ns].
 _LAGS_BEFORE, _STATES, _SHORTEST_LAG_NS = 3, 10, 5_000_000
+# Fewest states of that, since the noise of a gyroscope averages out; else those of so long before the frame [ns].
+_FEWEST, _LONGEST_NS = 4, 100_000_000
 # Standard deviation of the clock offset before the filter has estimated it [s]: the filter's own prior.
 _UNKNOWN_CLOCK_S = PoseEkfConfig().time_offset_std
 
@@ -191,6 +193,8 @@ def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, 
     odometry_ns = prior.in_odometry_clock(stamp_ns)
     clock_std_s = 0.0 if prior.clock_is_known else _UNKNOWN_CLOCK_S
     states = prior.between(odometry_ns - _LAGS_BEFORE * lag_ns, odometry_ns + lag_ns, _STATES)
+    if len(states) < _FEWEST:
+        states = prior.between(odometry_ns - _LONGEST_NS, odometry_ns + lag_ns, _STATES)
     if not states and (other := prior.nearest(odometry_ns)) is not None:
         states = [other]
     twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)

@@ -16,8 +16,8 @@ from thermal_fiducial.core.types import FloatArray, SECOND_NS
 _UNKNOWN = 1.5**2 * np.eye(6)
 #: Covariance of an unknown acceleration; standard deviations in m/s^2, rad/s^2.
 RANDOM = np.diag([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2
-# Covariance of the acceleration by odometry, which changes between its states.
-_CHANGES = 0.15 * RANDOM
+# Covariance of the acceleration by odometry, which changes between its states, for each second that they span.
+_CHANGES = 4.0 * RANDOM
 # Least covariance of a twist [m^2/s^2, rad^2/s^2].
 _LEAST = 1e-6 * np.eye(6)
 _EYE = np.eye(6)
@@ -96,7 +96,7 @@ def twist_by_odometry(
     noise[3:, 3:] += typical[3:, 3:]
     # Of few or noisy states the acceleration is hardly known: its prior is RANDOM.
     known = float(off @ off) + noise.diagonal() / RANDOM.diagonal()
-    acceleration, unsure = off @ values / known, noise / known + _CHANGES
+    acceleration, unsure = off @ values / known, noise / known + float(t[-1] - t[0]) * _CHANGES
     covariance = typical + (middle + lag) ** 2 * unsure + clock_std_s**2 * RANDOM + _LEAST
     covariance[3:, 3:] -= typical[3:, 3:] * (1.0 - 1.0 / len(t))
     return Twist(values.sum(axis=0) / len(t) - middle * acceleration, covariance, acceleration, unsure)
