@@ -145,7 +145,7 @@ class _Filter:
 
 
 def solve(recording, passes=1):
-    """The map of the mapper, fed with the frames of the first camera, then adjusted to all cameras as one rig.
+    """The map of the mapper, fed with the frames of the first camera, then adjusted to all of them.
 
     Returns
     -------

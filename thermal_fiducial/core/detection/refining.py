@@ -71,9 +71,6 @@ _CORNERS = np.array([0, 1, 3, 2])
 # clipped to the limits _SETTLED_PX [px].
 _PASSES = 4
 _SETTLED_PX, _UNSURE = (0.3, 1.0), 2.0
-# Share of the shortest side by which corners may move in a pass and be moved again: by a third, all four of a square,
-# they could meet. Initial values are accurate to two pixels or a third of a cell.
-_NEAR = 0.25
 # Standard deviation of the prior of the corners [px].
 _PRIOR_PX = 3.0
 
@@ -279,12 +276,9 @@ def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCor
     shift, deviation = known.moved.reshape(-1, 4, 2), np.sqrt(covariances.diagonal(axis1=2, axis2=3))
     least, most = _SETTLED_PX
     settled = np.minimum(np.maximum(_UNSURE * deviation, least), most)
-    unsettled = (np.abs(shift) > settled).any(axis=(1, 2))
+    moving: BoolArray = np.asarray((np.abs(shift) > settled).any(axis=(1, 2)))
     # Corners that have not converged are known no better than by their last step.
-    doubt = np.where(unsettled, np.maximum(doubt, (shift * shift).max(axis=(1, 2))), doubt)
-    # Another pass helps those that are near their places; beyond, an outline may fold.
-    near = np.abs(shift).max(axis=(1, 2)) < _NEAR * sides.along.reshape(-1, 4).min(axis=1)
-    moving: BoolArray = np.asarray(unsettled & near)
+    doubt = np.where(moving, np.maximum(doubt, (shift * shift).max(axis=(1, 2))), doubt)
     corners = sides.ends.reshape(-1, 8, 2).take(_CORNERS, axis=1) + shift
     # More passes would not make corners better that are displaced by their own contrast.
     uneven = OF_UNEVEN_CONTRAST_PX * segments.slope_of_contrast() / np.maximum(np.abs(contrast), TINY)
