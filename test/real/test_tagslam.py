@@ -14,8 +14,8 @@ def test_reprojection_error_against_the_reference(real_data, name, measured):
     total = sum(len(seen) for seen in recording.views.values())
     placed = len(markers.keys() & recording.T_map_marker.keys())
     measured(
-        f'tag corners {name}, first camera ({placed} of {len(recording.T_map_marker)} markers, {views} of {total} views): '
-        're-projection rms, ours / reference',
+        f'tag corners {name}, first camera ({placed} of {len(recording.T_map_marker)} markers, '
+        f'{views} of {total} views): re-projection rms, ours / reference',
         'at most 1.05',
         f'{ours:.3f} / {theirs:.3f} px = {ours / theirs:.3f}',
     )
