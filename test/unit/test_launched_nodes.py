@@ -2,6 +2,7 @@
 
 from pathlib import Path
 import runpy
+import signal
 
 import pytest
 from rcl_interfaces.srv import GetParameters
@@ -14,6 +15,8 @@ from thermal_fiducial.files.marker_map import load_map
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ('left', 'right')
 NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf')
+#: Statuses of a node that was asked to stop: SIGPROF ends one that DDS does not let go of, after all is saved.
+STOPPED = {0, -signal.SIGPROF}
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
@@ -73,7 +76,7 @@ def test_a_drone_in_a_namespace_with_two_cameras(launch, tmp_path):
         first, second = (value_of(graph, f'/one/{at}aruco_detector', 'camera_position') for at in ('', 'down/'))
         assert list(first.double_array_value) == pytest.approx(small_bag.PARAMETERS['camera_position'])
         assert list(second.double_array_value) == [0.0, 0.0, -0.1]
-    assert set(one.end().values()) == {0}
+    assert set(one.end().values()) <= STOPPED
     assert one.said == []
 
 
@@ -87,7 +90,7 @@ def test_two_drones_side_by_side(launch, tmp_path):
         topics = wait_for(graph, nodes, [f'/{name}/camera_pose' for name in NAMES])
         assert not {'/camera_pose', '/pose', '/markers'} & topics
         assert graph.tester.count_subscribers('/imu/data') == len(NAMES)
-    assert [set(drone.end().values()) for drone in drones] == [{0}, {0}]
+    assert all(set(drone.end().values()) <= STOPPED for drone in drones)
     assert load_map(map_file).markers.keys() == {0}
 
 
