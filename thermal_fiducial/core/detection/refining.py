@@ -138,6 +138,7 @@ def refine(
     ----------
     behind : (N, 4, m, 2) of :func:`thermal_fiducial.core.detection.corners.sides.edges_behind`
     track : motion and markers of the last frame, which with the corners give the twist
+    decoder : of the dictionary, for markers that are refined by their whole patterns
     """
     if len(found.ids) == 0:
         return RefinedMarkers.none(frame)

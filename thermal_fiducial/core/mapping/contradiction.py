@@ -13,15 +13,11 @@ import numpy as np
 from thermal_fiducial.core.error_model import INCONSISTENT_PX, of_single_error
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference
-from thermal_fiducial.core.mapping.localization import names
-from thermal_fiducial.core.mapping.located import Location, Refusal, Sight
+from thermal_fiducial.core.mapping.localization import DECISIVE, names
+from thermal_fiducial.core.mapping.located import explained_px, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.trust import DISAGREEMENT
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
-
-#: Difference of the squared Mahalanobis distances of two markers from the odometry that decides which one has moved:
-#: odds of e^-10, as between two poses.
-_DECISIVE = 20.0
 
 
 def are_two_that_contradict(location: Location) -> bool:
@@ -29,9 +25,7 @@ def are_two_that_contradict(location: Location) -> bool:
     sight, seen = location.sight, location.seen
     if len(sight.markers) != 2:
         return False
-    by_marker = np.einsum('nri,nri->n', seen.J_marker @ sight.map_covariances, seen.J_marker)
-    explained = np.sqrt(2.0 * sight.noise_px**2 + by_marker / 4.0 + INCONSISTENT_PX**2)
-    return bool(np.any(seen.errors_px > DISAGREEMENT * explained))
+    return bool(np.any(seen.errors_px > DISAGREEMENT * explained_px(sight, seen, np.zeros((6, 6)))))
 
 
 def settled(
@@ -51,7 +45,7 @@ def settled(
     sight = found.sight
     apart = _distances(sight, camera, predicted)
     nearer = np.arange(2) == apart.argmin()
-    if np.ptp(apart) > _DECISIVE:
+    if np.ptp(apart) > DECISIVE:
         return fit(sight.only(nearer))
     one, other = fit(sight.only(nearer)), fit(sight.only(~nearer))
     if isinstance(one, Refusal) or isinstance(other, Refusal):

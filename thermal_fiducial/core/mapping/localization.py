@@ -31,7 +31,7 @@ from thermal_fiducial.core.mapping.marker_views import SAME_POSE, Viewpoint
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray, TINY
 
-#: Difference of chi square that rules out the worse of two poses: odds of e^-10.
+#: Difference of chi square that rules out the worse of two poses, or of two markers: odds of e^-10.
 DECISIVE = 20.0
 #: Extent of the markers in view [rad] beyond which perspective resolves the planar ambiguity.
 WIDE = np.deg2rad(25.0)

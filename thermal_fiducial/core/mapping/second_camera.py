@@ -15,7 +15,7 @@ from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, r
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.second_clock import SecondClock
 from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera
+from thermal_fiducial.core.motion_prior import MotionPrior, predicted_camera, PredictedCamera
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: A pose of the second camera is carried on to a frame of the first over at most this [ns]: two periods at 30 Hz.
@@ -77,8 +77,9 @@ class SecondCamera:
     ) -> tuple[CameraPose, FloatArray] | None:
         """A pose of the second camera at ``stamp_ns`` of the first one's clock, and the velocity (6,) there."""
         instant_ns = pose.stamp_ns + round(self.clock.seconds * SECOND_NS)
-        there = moved_by_odometry(replace(pose, stamp_ns=instant_ns), stamp_ns, prior, self._T_body_first)
-        now = predicted_camera(prior, stamp_ns, self._T_body_first, 0.0)
+        # No offset of the clocks widens these: it moves both ends alike.
+        then, now = (predicted_camera(prior, at_ns, self._T_body_first, 0.0) for at_ns in (instant_ns, stamp_ns))
+        there = moved_by_odometry(replace(pose, stamp_ns=instant_ns), stamp_ns, then, now)
         if there is None:
             return None
         velocity = np.zeros(6) if now is None else now.velocity
@@ -109,13 +110,11 @@ def intersection(first: CameraPose, second: CameraPose) -> CameraPose | None:
 
 
 def moved_by_odometry(
-    pose: CameraPose, stamp_ns: int, prior: MotionPrior, T_body_camera: FloatArray
+    pose: CameraPose, stamp_ns: int, then: PredictedCamera | None, now: PredictedCamera | None
 ) -> CameraPose | None:
-    """``pose`` at another stamp, moved as the odometry has moved in between; None where there is none near both."""
+    """``pose`` at another stamp, moved as the odometry has moved from ``then``; None where there is none near both."""
     if stamp_ns == pose.stamp_ns:
         return pose
-    # No offset of the clocks widens this: it moves both ends alike.
-    then, now = (predicted_camera(prior, stamp, T_body_camera, 0.0) for stamp in (pose.stamp_ns, stamp_ns))
     if then is None or now is None:
         return None
     T_then_now = inverse(then.pose.T_map_camera) @ now.pose.T_map_camera

@@ -199,11 +199,11 @@ def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> Segments
     """
     count, cells = len(segments.shift), sides.across.shape[1]
     good = (segments.variance < HOPELESS).reshape(count, 4, cells)
-    number = np.maximum(good.sum(axis=2), 1)
+    used = good.sum(axis=2)
+    number, seen = np.maximum(used, 1), used > 0
     contrast = (segments.contrast.reshape(good.shape) * good).sum(axis=2) / number
     relative = (segments.variance.reshape(good.shape) * good).sum(axis=2) / (number * blur_px) ** 2
     noise = contrast**2 * relative
-    seen = good.sum(axis=2) > 0
     both = seen & seen[:, OPPOSITE]
     change = np.where(both, (contrast - contrast[:, OPPOSITE]) ** 2 - noise - noise[:, OPPOSITE], 0.0)
     gradient = np.sqrt(np.maximum(change, 0.0)) / sides.across.reshape(good.shape).mean(axis=2)
