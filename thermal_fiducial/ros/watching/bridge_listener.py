@@ -8,12 +8,11 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rclpy.context import Context
 from rclpy.node import Node
 from sensor_msgs.msg import Imu
 
 from thermal_fiducial.ros.base import qos
-from thermal_fiducial.ros.process.run import initialise, make_executor
+from thermal_fiducial.ros.watching.observer import observer
 
 _FILTER, _LANDING = 'pose_ekf', 'landing_target'
 _ODOMETRY, _IMU, _POSE = 'nav_msgs/msg/Odometry', 'sensor_msgs/msg/Imu', 'geometry_msgs/msg/PoseStamped'
@@ -69,12 +68,7 @@ def listen(
     announce : called with the topics once they are resolved
     ros_arguments : as after ``--ros-args``
     """
-    context = Context()
-    initialise(['--ros-args', *ros_arguments], context, domain_id)
-    executor = make_executor(context)
-    node = Node('check_bridge', context=context)
-    try:
-        executor.add_node(node)
+    with observer('check_bridge', ros_arguments, domain_id) as (node, executor):
         topics = Topics(*map(node.resolve_topic_name, astuple(_find(node, executor, topic))))
         announce(topics)
         node.create_subscription(
@@ -86,10 +80,6 @@ def listen(
         node.create_subscription(DiagnosticArray, '/diagnostics', lambda array: _note(array, said), qos.RESULT)
         _spin(executor, seconds, lambda: False)
         return _links(node, topics, said)
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        context.try_shutdown()
 
 
 def _find(node: Node, executor: Any, topic: str) -> Topics:

@@ -9,7 +9,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
 import numpy as np
-from rclpy.context import Context
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
@@ -17,8 +16,8 @@ from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.messages import clouds, convert
-from thermal_fiducial.ros.process.run import initialise, make_executor
 from thermal_fiducial.ros.watching.live_status import LiveStatus
+from thermal_fiducial.ros.watching.observer import observer
 
 
 class Watcher:
@@ -82,12 +81,7 @@ def watch(
     InputError
         Arguments that ROS cannot read.
     """
-    context = Context()
-    initialise(['--ros-args', *ros_arguments], context, domain_id)
-    executor = make_executor(context)
-    node = Node('watch', context=context)
-    try:
-        executor.add_node(node)
+    with observer('watch', ros_arguments, domain_id) as (node, executor):
         watcher = Watcher(node)
         due = time.monotonic() + period
         while True:
@@ -96,7 +90,3 @@ def watch(
                 due += period
                 if show(watcher.status):
                     return
-    finally:
-        executor.shutdown()
-        node.destroy_node()
-        context.try_shutdown()
