@@ -11,7 +11,7 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.replay.settings import read_settings
 from thermal_fiducial.ros.parameter_file import parameter_file
 
-FILE = Path(__file__).resolve().parents[2] / 'config' / 'thermal_fiducial.yaml'
+FILE = Path(__file__).resolve().parents[3] / 'config' / 'thermal_fiducial.yaml'
 
 
 def test_the_file_is_up_to_date():

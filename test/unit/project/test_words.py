@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 #: Replaced word to the field's one.
 REPLACED = {
     'told': 'received, published', 'tells': 'shows', 'tell': 'show', 'rival': 'alternative hypothesis',

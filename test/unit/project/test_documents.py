@@ -12,7 +12,7 @@ import pytest
 from thermal_fiducial.cli.main import COMMANDS, MODULES
 from thermal_fiducial.config import NODES, OPTIONAL_NODES
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 README = ROOT / 'README.md'
 LINK = re.compile(r'\]\(([^)#\s]+)')
 PAGES = [README, *sorted((ROOT / 'doc').rglob('*.md'))]

@@ -17,7 +17,7 @@ from thermal_fiducial.files import map_history
 from thermal_fiducial.files.map_keeper import MapKeeper
 from thermal_fiducial.files.marker_map import load_map, save_map
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 AUTOSAVE_S = 30.0
 
 

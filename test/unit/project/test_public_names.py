@@ -11,7 +11,7 @@ import pytest
 
 import thermal_fiducial
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 
 
 @pytest.mark.parametrize('name', thermal_fiducial.__all__)

@@ -157,7 +157,7 @@ def test_search_refuses_impossible_sizes_and_distances(bits, distance):
 @pytest.mark.parametrize(('name', 'bits_apart'), [('STENCIL_4X4_100', 0), ('STENCIL_5X5_100', 1)])
 def test_the_documents_name_the_markers_that_are_like_the_negative_of_another(name, bits_apart):
     bits = load_dictionary(name).bits
-    page = (Path(__file__).resolve().parents[2] / 'doc' / 'markers.md').read_text(encoding='utf-8')
+    page = (Path(__file__).resolve().parents[3] / 'doc' / 'markers.md').read_text(encoding='utf-8')
     (listed,) = re.findall(rf'In `{name}`\s+these\b([^.]*)\.', page)
     pairs = [(int(a), int(b), bits_apart) for a, b in re.findall(r'(\d+)\s+and\s+(\d+)', listed)]
     assert pairs == negatives(bits, distances(bits)[0])

@@ -13,7 +13,7 @@ from thermal_fiducial.core.geometry.se3 import quaternion_from_rotation
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.trajectory_file import load_tum, save_tum
 
-FOLDER = Path(__file__).resolve().parents[2] / 'doc' / 'examples'
+FOLDER = Path(__file__).resolve().parents[3] / 'doc' / 'examples'
 SCRIPTS = sorted(path.stem for path in FOLDER.glob('*.py'))
 # Pictures that are flat and warped into place: fine for whether a script works, no measure of accuracy.
 TOLERANCE_M = 0.05

@@ -12,7 +12,7 @@ import yaml
 
 from thermal_fiducial.files.marker_map import load_map
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 NAMES = ('left', 'right')
 NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf')
 #: Statuses of a node that was asked to stop: SIGPROF ends one that DDS does not let go of, after all is saved.

@@ -16,7 +16,7 @@ from thermal_fiducial.config import NODES as PARAMETERS
 from thermal_fiducial.config import OPTIONAL_NODES
 from thermal_fiducial.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 NODES = ['tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf']
 
 

@@ -11,7 +11,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import get_typestore, Stores
 import yaml
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 LAYOUT = ROOT / 'config' / 'thermal_fiducial_foxglove.json'
 RVIZ = ROOT / 'config' / 'thermal_fiducial.rviz'
 

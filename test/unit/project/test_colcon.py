@@ -12,7 +12,7 @@ import xml.etree.ElementTree as ElementTree
 import pytest
 from support.ros_graph import ros_graph
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 NODES = ('tau2_camera', 'aruco_detector', 'marker_mapper', 'pose_ekf', 'thermal_source', 'landing_target')
 SOURCES = ('package.xml', 'setup.py', 'setup.cfg', 'resource', 'config', 'launch', 'scripts', 'thermal_fiducial')
 
