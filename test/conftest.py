@@ -36,7 +36,7 @@ def pytest_collection_finish():
 
 
 #: Where ``make coverage`` traces the core: flights of minutes run its lines no further than these do.
-_TRACED = ('unit', 'property')
+_TRACED = {'unit', 'property'}
 
 
 @pytest.hookimpl(wrapper=True)
@@ -54,7 +54,7 @@ def pytest_runtest_protocol(item):
 
 
 def _is_of_the_core(item):
-    return item.path.parent.name in _TRACED and any(
+    return not _TRACED.isdisjoint(item.path.parts) and any(
         str(getattr(value, '__module__', '') or getattr(value, '__name__', '')).startswith('thermal_fiducial.core')
         for value in vars(item.module).values()
     )
