@@ -89,7 +89,8 @@ def test_two_drones_side_by_side(launch, tmp_path):
         nodes = [f'/{name}/{node}' for name in NAMES for node in NODES]
         topics = wait_for(graph, nodes, [f'/{name}/camera_pose' for name in NAMES])
         assert not {'/camera_pose', '/pose', '/markers'} & topics
-        assert graph.tester.count_subscribers('/imu/data') == len(NAMES)
+        # A node's name is known before its subscriptions are.
+        graph.spin_until(lambda: graph.tester.count_subscribers('/imu/data') == len(NAMES))
     assert all(set(drone.end().values()) <= STOPPED for drone in drones)
     assert load_map(map_file).markers.keys() == {0}
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from support.lens_planes import plane_points
 
+from thermal_fiducial.core.detection.corner_errors import OF_SIDES_PX
 from thermal_fiducial.core.detection.corners.sides import edges_behind
 from thermal_fiducial.core.detection.refining import refine_corners
 from thermal_fiducial.core.geometry import se3
@@ -203,7 +204,10 @@ def test_covariance_is_consistent(contrast):
         for _ in range(40):
             found = refine(image + rng.normal(0.0, 1.25, image.shape), corners + rng.normal(0, 0.3, (4, 2)), camera, 11)
             error = found.corners_px[0] - corners
-            squared.append(np.einsum('ki,kij,kj->k', error, np.linalg.inv(found.covariances[0]), error).mean())
+            # The drawing's blur is a Gaussian's: the error of one that is not, a quarter of the variance at 50 counts,
+            # is not in it.
+            covariances = found.covariances[0] - OF_SIDES_PX**2 * np.eye(2)
+            squared.append(np.einsum('ki,kij,kj->k', error, np.linalg.inv(covariances), error).mean())
             count += 4
     # Two degrees of freedom a corner; within 10 % plus two standard errors of the mean of 480 corners (2 / sqrt(480),
     # doubled because neighbouring corners share a side).
