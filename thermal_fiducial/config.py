@@ -37,6 +37,7 @@ def param(
     verify: Callable[[Any], object] | None = None,
     path: bool = False,
     live: bool = False,
+    needs: tuple[str, ...] = (),
 ) -> Any:
     """One parameter: a dataclass field whose metadata fill ROS's parameter descriptor.
 
@@ -52,7 +53,10 @@ def param(
     verify : called with the value; raises InputError if it is unusable
     path : whether the string may be a path, in which a leading ~ is the user's home: no shell replaces it there
     live : whether the parameter is dynamic; otherwise it is declared read-only
+    needs : parameters of the same node without which this one has no effect; "a or b": one of the two
     """
+    if needs:
+        description += f' Needs {" and ".join(needs)}.'
     metadata = {
         'description': f'{description} [{unit}]' if unit else description,
         'minimum': minimum,
@@ -63,6 +67,7 @@ def param(
         'verify': verify,
         'path': path,
         'live': live,
+        'needs': needs,
     }
     return field(default=default, metadata=metadata)
 
@@ -97,6 +102,17 @@ def parameters(config: Any, prefix: str = '') -> Iterator[tuple[str, 'Field[Any]
         else:
             value = item.default if isinstance(config, type) else getattr(config, item.name)
             yield prefix + item.name, item, value
+
+
+def without_effect(config: Any) -> list[str]:
+    """A line for each parameter that was changed from its default although others that it needs are not set."""
+    lines = []
+    values = {name: value for name, _, value in parameters(config)}
+    for name, item, value in parameters(config):
+        missing = [need for need in item.metadata['needs'] if not any(values[other] for other in need.split(' or '))]
+        if missing and value != item.default:
+            lines.append(f'parameter {name}: no effect without {" and ".join(missing)}')
+    return lines
 
 
 def from_mapping(kind: type[Config], values: dict[str, Any]) -> Config:
@@ -155,7 +171,10 @@ def from_home(path: str) -> str:
 
 def _shown(value: object) -> str:
     """``repr`` of a value for an error message, truncated to one line."""
-    text = repr(value)
+    return _shortened(repr(value))
+
+
+def _shortened(text: str) -> str:
     return text if len(text) <= _LONGEST_SHOWN else f'{text[:_LONGEST_SHOWN]}...'
 
 
@@ -216,7 +235,7 @@ def _mode() -> Any:
     )
 
 
-def _camera_position(camera: str = 'the camera') -> Any:
+def _camera_position(camera: str = 'the camera', needs: tuple[str, ...] = ()) -> Any:
     return param(
         (0.0, 0.0, 0.0),
         f'Position of {camera} in base_link (the IMU frame).',
@@ -224,15 +243,17 @@ def _camera_position(camera: str = 'the camera') -> Any:
         length=3,
         minimum=-10.0,
         maximum=10.0,
+        needs=needs,
     )
 
 
-def _camera_orientation(frame: str = 'thermal_camera_optical') -> Any:
+def _camera_orientation(frame: str = 'thermal_camera_optical', needs: tuple[str, ...] = ()) -> Any:
     return param(
         (-0.5, 0.5, -0.5, 0.5),
         f'Orientation of {frame} in base_link, quaternion x y z w. Default: looks forward.',
         length=4,
         normed=True,
+        needs=needs,
     )
 
 
@@ -302,6 +323,17 @@ def size_overrides(entries: tuple[str, ...]) -> dict[int, float]:
         if not 0.0 < sizes[int(marker_id)] < 100.0:
             raise InputError(f'parameter marker_size_overrides: {_shown(entry)} has no usable size')
     return sizes
+
+
+def unknown_markers(config: 'ArucoDetectorConfig', count: int) -> list[str]:
+    """A line for each parameter that names markers beyond the ``count`` of the dictionary."""
+    lines = []
+    named = {'whitelist': config.whitelist, 'marker_size_overrides': size_overrides(config.marker_size_overrides)}
+    for name, ids in named.items():
+        unknown = [str(marker_id) for marker_id in ids if not 0 <= marker_id < count]
+        if unknown:
+            lines.append(_shortened(f'parameter {name}: {config.dictionary} has no marker {", ".join(unknown)}'))
+    return lines
 
 
 # --- the four nodes -----------------------------------------------------------------------------------
@@ -462,12 +494,24 @@ class ArucoDetectorConfig(SelfChecked):
         0.1, 'Largest age of the odometry for a guided search.', unit='s', minimum=0.0, maximum=1.0, live=True
     )
     guided_min_contrast: float = param(
-        0.35, 'min_contrast of an expected marker.', minimum=0.0, maximum=1000.0, live=True
+        0.35,
+        'min_contrast of an expected marker.',
+        minimum=0.0,
+        maximum=1000.0,
+        live=True,
+        needs=('guided',),
     )
     guided_min_correlation: float = param(
-        0.6, 'min_correlation of an expected marker.', minimum=0.3, maximum=1.0, live=True
+        0.6,
+        'min_correlation of an expected marker.',
+        minimum=0.3,
+        maximum=1.0,
+        live=True,
+        needs=('guided',),
     )
-    guided_min_margin: float = param(0.05, 'min_margin of an expected marker.', minimum=0.0, maximum=0.5, live=True)
+    guided_min_margin: float = param(
+        0.05, 'min_margin of an expected marker.', minimum=0.0, maximum=0.5, live=True, needs=('guided',)
+    )
     detections: str = param(
         '',
         'Also publish `detections` as a message of aruco_opencv_msgs, apriltag_msgs or vision_msgs, which must be '
@@ -503,13 +547,16 @@ class MarkerMapperConfig(SelfChecked):
         'Name of a second camera, whose poses are fused with those of the first or replace them: subscribes to '
         'NAME/markers and NAME/thermal/camera_info. Empty: none.',
     )
-    second_camera_position: tuple[float, ...] = _camera_position('the second camera')
-    second_camera_orientation: tuple[float, ...] = _camera_orientation("the second camera's optical frame")
+    second_camera_position: tuple[float, ...] = _camera_position('the second camera', ('second_camera',))
+    second_camera_orientation: tuple[float, ...] = _camera_orientation(
+        "the second camera's optical frame", ('second_camera',)
+    )
     cloud_file: str = param('', 'Point cloud of the site (.ply or .pcd) to publish for RViz. Empty: none.', path=True)
     cloud_alignment_file: str = param(
         '',
         'Transform from the map to the frame of cloud_file, written by map align. Empty: the frames are the same.',
         path=True,
+        needs=('cloud_file',),
     )
     camera_position: tuple[float, ...] = _camera_position()
     camera_orientation: tuple[float, ...] = _camera_orientation()
@@ -549,6 +596,7 @@ class MarkerMapperConfig(SelfChecked):
         unit='s',
         minimum=0.0,
         maximum=3600.0,
+        needs=('map_file',),
     )
     refinement_period: float = param(
         2.0, 'Shortest time between two bundle adjustments; 0: none.', unit='s', minimum=0.0, maximum=3600.0, live=True
@@ -616,7 +664,13 @@ class PoseEkfConfig(SelfChecked):
     camera_time_offset: float = _camera_time_offset()
     estimate_time_offset: bool = param(True, 'Estimate the error of camera_time_offset.')
     time_offset_std: float = _time_offset_std()
-    time_offset_random_walk: float = param(5.0e-5, 'Random walk of the clock offset.', unit='s/sqrt(s)', minimum=0.0)
+    time_offset_random_walk: float = param(
+        5.0e-5,
+        'Random walk of the clock offset.',
+        unit='s/sqrt(s)',
+        minimum=0.0,
+        needs=('estimate_time_offset',),
+    )
     stamp_jitter: float = param(
         0.0005,
         'Initial standard deviation of the jitter of the camera stamps, estimated from the poses. 0: no jitter.',
@@ -634,6 +688,7 @@ class PoseEkfConfig(SelfChecked):
     estimate_extrinsics: bool = param(
         False,
         'Estimate the errors of camera_position and camera_orientation; otherwise they are counted in the covariance.',
+        needs=('extrinsics_position_std or extrinsics_orientation_std',),
     )
     extrinsics_position_std: float = param(
         0.002, 'Standard deviation of camera_position: what its calibration leaves. 0: exact.', unit='m', minimum=0.0
@@ -717,8 +772,9 @@ class PoseEkfConfig(SelfChecked):
     map_frame: str = param('map', 'Frame of the pose.')
     odom_frame: str = param(
         '',
-        'REP-105 odom frame, with publish_tf and smoothing_time: /tf gets odom_frame to base_frame (smooth output) and '
-        'map_frame to odom_frame (the difference). Empty: map_frame to base_frame.',
+        'REP-105 odom frame: /tf gets odom_frame to base_frame (smooth output) and map_frame to odom_frame (the '
+        'difference). Empty: map_frame to base_frame.',
+        needs=('publish_tf', 'smoothing_time'),
     )
     resume: bool = param(
         True,
@@ -735,7 +791,11 @@ class PoseEkfConfig(SelfChecked):
         minimum=0.0,
         maximum=1000.0,
     )
-    px4: bool = param(False, 'Also publish fmu/in/vehicle_visual_odometry at bridge_rate (needs px4_msgs).')
+    px4: bool = param(
+        False,
+        'Also publish fmu/in/vehicle_visual_odometry at that rate, with the package px4_msgs.',
+        needs=('bridge_rate',),
+    )
     realtime_priority: int = _realtime_priority()
 
 

@@ -65,6 +65,58 @@ def test_names_shared_by_nodes_have_one_meaning():
             assert seen.setdefault(name, meaning) == meaning, name
 
 
+@pytest.mark.parametrize('kind', NODES)
+def test_what_a_parameter_needs_are_other_parameters_of_its_node(kind):
+    names = {name for name, _, _ in parameters(kind)}
+    for name, item, _ in parameters(kind):
+        needed = {other for need in item.metadata['needs'] for other in need.split(' or ')}
+        assert needed <= names - {name}
+
+
+@pytest.mark.parametrize(
+    ('values', 'lines'),
+    [
+        (PoseEkfConfig(), []),
+        (PoseEkfConfig(odom_frame='odom', publish_tf=True, smoothing_time=0.5), []),
+        (PoseEkfConfig(odom_frame='odom', publish_tf=True), ['odom_frame: no effect without smoothing_time']),
+        (PoseEkfConfig(odom_frame='odom'), ['odom_frame: no effect without publish_tf and smoothing_time']),
+        (PoseEkfConfig(estimate_extrinsics=True, extrinsics_position_std=0.0), []),
+        (
+            PoseEkfConfig(estimate_extrinsics=True, extrinsics_position_std=0.0, extrinsics_orientation_std=0.0),
+            ['estimate_extrinsics: no effect without extrinsics_position_std or extrinsics_orientation_std'],
+        ),
+        (
+            PoseEkfConfig(estimate_time_offset=False, time_offset_random_walk=1e-3, px4=True),
+            ['time_offset_random_walk: no effect without estimate_time_offset', 'px4: no effect without bridge_rate'],
+        ),
+        (MarkerMapperConfig(autosave_period=5.0), ['autosave_period: no effect without map_file']),
+        (
+            MarkerMapperConfig(second_camera_position=(0.0, 0.0, 1.0), cloud_alignment_file='a.yaml'),
+            [
+                'second_camera_position: no effect without second_camera',
+                'cloud_alignment_file: no effect without cloud_file',
+            ],
+        ),
+        (ArucoDetectorConfig(guided=False), []),
+        (
+            ArucoDetectorConfig(guided=False, guided_min_contrast=0.3),
+            ['guided_min_contrast: no effect without guided'],
+        ),
+    ],
+)
+def test_parameters_without_effect_are_named(values, lines):
+    assert config.without_effect(values) == [f'parameter {line}' for line in lines]
+
+
+def test_markers_that_the_dictionary_lacks_are_named():
+    values = ArucoDetectorConfig(whitelist=(3, 77, -1), marker_size_overrides=('49:0.1', '50:0.2'))
+    assert config.unknown_markers(values, 50) == [
+        'parameter whitelist: DICT_4X4_50 has no marker 77, -1',
+        'parameter marker_size_overrides: DICT_4X4_50 has no marker 50',
+    ]
+    assert config.unknown_markers(values, 1000) == ['parameter whitelist: DICT_4X4_50 has no marker -1']
+
+
 def test_parameters_of_a_class_and_of_an_instance():
     assert [name for name, _, _ in parameters(Example)] == [
         'name',

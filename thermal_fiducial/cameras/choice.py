@@ -31,3 +31,15 @@ def make_source(config: ThermalSourceConfig) -> FrameSource:
     if is_video_device(config.camera):
         return V4l2Camera(config.camera, size, config.frame_rate)
     return Pictures(config.camera, config.frame_rate or _PICTURE_RATE, repeat=config.repeat)
+
+
+def unused_parameters(config: ThermalSourceConfig) -> list[str]:
+    """A line for each parameter that was changed from its default and that the driver of ``config.camera`` lacks."""
+    if config.camera.partition(':')[0] == _TEAX:
+        unused: tuple[str, ...] = ('frame_rate', 'repeat')
+    elif is_video_device(config.camera):
+        unused = ('repeat',)
+    else:
+        unused = ('image_width', 'image_height')
+    changed = [name for name in unused if getattr(config, name) != getattr(ThermalSourceConfig, name)]
+    return [f'parameter {name}: no effect with camera {config.camera}' for name in changed] if config.camera else []

@@ -1,5 +1,6 @@
 """Node ``aruco_detector``: clean counts to markers with sub-pixel corners and poses."""
 
+from collections.abc import Sequence
 import sys
 from typing import Any
 
@@ -7,7 +8,7 @@ from geometry_msgs.msg import PoseArray
 import numpy as np
 from sensor_msgs.msg import Image, PointCloud2
 
-from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig
+from thermal_fiducial.config import ArucoDetectorConfig, Tau2CameraConfig, unknown_markers
 from thermal_fiducial.core.detection.detector import MarkerDetector
 from thermal_fiducial.core.imaging.eight_bit_view import EightBitView
 from thermal_fiducial.core.types import Counts, Gray
@@ -26,6 +27,8 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
     """Detects markers; given the map and the filter's odometry it searches where they are predicted."""
 
     stage = 1
+    #: parameters that name markers which the dictionary lacks, in words
+    _unknown_markers: Sequence[str] = ()
 
     def __init__(self, **kwargs: Any) -> None:
         require_opencv()
@@ -42,7 +45,15 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         self.subscribe(PointCloud2, 'marker_map', self._on_map, qos.LATCHED)
 
     def _make_detector(self) -> MarkerDetector | None:
-        return MarkerDetector(self.config, load_dictionary(self.config.dictionary))
+        dictionary = load_dictionary(self.config.dictionary)
+        self._unknown_markers = unknown_markers(self.config, len(dictionary.bits))
+        for line in self._unknown_markers:
+            self.get_logger().warning(line)
+        return MarkerDetector(self.config, dictionary)
+
+    def without_effect(self) -> list[str]:
+        """Parameters that do nothing, also those that name markers which the dictionary lacks."""
+        return [*super().without_effect(), *self._unknown_markers]
 
     def configure(self, config: ArucoDetectorConfig) -> None:
         """Apply dynamic parameters."""

@@ -6,7 +6,7 @@ from typing import Any
 from sensor_msgs.msg import Image
 
 from thermal_fiducial.cameras.capture import Capture
-from thermal_fiducial.cameras.choice import make_source
+from thermal_fiducial.cameras.choice import make_source, unused_parameters
 from thermal_fiducial.cameras.source import CapturedFrame
 from thermal_fiducial.config import ThermalSourceConfig
 from thermal_fiducial.ros.base import qos
@@ -28,6 +28,10 @@ class ThermalSource(StageNode[ThermalSourceConfig]):
         self._capture: Capture | None = None
         if self._source is not None:
             self._capture = Capture(self._source, self.on_frame, self._on_change)
+
+    def without_effect(self) -> list[str]:
+        """Parameters that do nothing, also those that the camera's driver does not have."""
+        return super().without_effect() + unused_parameters(self.config)
 
     def on_frame(self, frame: CapturedFrame) -> None:
         """Publish a frame; called by the reader thread."""

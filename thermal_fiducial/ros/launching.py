@@ -134,6 +134,8 @@ def _second_camera(given: dict[str, str], settings: dict[str, Any], namespace: s
     """Front end and detector of a second camera; map and odometry are those of the others, in ``namespace``."""
     name, device = given['second_camera'], given['second_camera_device']
     if not name:
+        if device:
+            raise InputError('second_camera_device: no effect without second_camera')
         return []
     own = namespace.rstrip('/')
     shared = [(topic, f'{own}/{topic}') for topic in ('marker_map', 'odometry', 'camera_clock')]

@@ -14,7 +14,7 @@ from support.ros_graph import ros_graph
 from thermal_fiducial.core.geometry.se3 import rotation_from_quaternion, so3_exp, transform
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
-from thermal_fiducial.ros.base.node import ERROR
+from thermal_fiducial.ros.base.node import ERROR, WARN
 from thermal_fiducial.ros.filter_node.bridge import px4_odometry
 from thermal_fiducial.ros.messages import convert
 
@@ -144,10 +144,23 @@ def test_the_smooth_topic_is_another_one_and_feeds_the_bridge():
     assert 0.0 < steps[1] < 0.5 * steps[0]
 
 
-def test_px4_without_a_rate_is_a_fault():
+@pytest.mark.parametrize(
+    ('parameters', 'line'),
+    [
+        ({'px4': True}, 'parameter px4: no effect without bridge_rate'),
+        ({'odom_frame': 'odom'}, 'parameter odom_frame: no effect without publish_tf and smoothing_time'),
+        ({'prefix_frames': True}, 'parameter prefix_frames: no effect without a namespace'),
+    ],
+)
+def test_an_output_that_another_parameter_keeps_from_coming_is_a_warning(parameters, line):
     with ros_graph() as graph:
-        node = graph.add(PoseEkfNode, px4=True)
-        assert node.faults == ['parameter px4: nothing is sent at a bridge_rate of 0']
+        node = graph.add(PoseEkfNode, **parameters)
+        graph.listen(OdometryMessage, 'odometry')
+        fly(graph, range(60))
+        level, reason, _ = graph.diagnose(node)
+    assert level == WARN
+    # Behind the state of the filter, which a pilot wants to know first.
+    assert reason.endswith(f'; {line}')
 
 
 def test_px4_messages_that_are_not_installed_are_a_fault(monkeypatch):
@@ -222,15 +235,6 @@ def test_with_an_odom_frame_the_smooth_pose_is_in_it_and_both_make_the_pose(monk
         T_odom_base[:3, 3], [smooth.position.x, smooth.position.y, smooth.position.z], atol=1e-12
     )
     np.testing.assert_allclose(T_map_odom @ T_odom_base, state, atol=1e-12)
-
-
-def test_an_odom_frame_without_a_smooth_output_is_a_fault(monkeypatch):
-    tf2_ros = ModuleType('tf2_ros')
-    tf2_ros.TransformBroadcaster, tf2_ros.StaticTransformBroadcaster = Broadcaster, StaticBroadcaster
-    monkeypatch.setitem(sys.modules, 'tf2_ros', tf2_ros)
-    with ros_graph() as graph:
-        node = graph.add(PoseEkfNode, publish_tf=True, odom_frame='odom')
-        assert node.faults == ['parameter odom_frame: without smoothing_time nothing is smooth']
 
 
 def test_tf2_that_is_not_installed_is_a_fault(monkeypatch):

@@ -163,6 +163,7 @@ def test_a_landing_pad_is_reported_where_one_is_named(launched):
         ({'landing_pad': 'H'}, 'landing_pad H: IDs'),
         ({'log_level': 'loud'}, 'log_level loud: not one of debug'),
         ({'rviz': 'maybe'}, 'rviz maybe: true or false'),
+        ({'second_camera_device': 'teax'}, 'second_camera_device: no effect without second_camera'),
     ],
 )
 def test_impossible_launch_arguments_are_refused_with_a_reason(launched, arguments, words):

@@ -207,6 +207,19 @@ def test_an_image_of_another_size_than_the_calibration_is_refused(graph):
     assert graph.diagnose(node)[:2] == (WARN, 'image of 320x256, camera_info of 640x512 pixels')
 
 
+def test_parameters_that_do_nothing_are_warned_of_while_the_detector_works(graph):
+    node = graph.add(ArucoDetector, whitelist=[3, 77])
+    live = [Parameter('guided', value=False), Parameter('guided_min_margin', value=0.1)]
+    assert all(result.successful for result in node.set_parameters(live))
+    graph.send('thermal/camera_info', info())
+    graph.send('thermal/image', frames(1)[0])
+    assert graph.diagnose(node)[:2] == (
+        WARN,
+        '1 marker; parameter guided_min_margin: no effect without guided; '
+        'parameter whitelist: DICT_4X4_50 has no marker 77',
+    )
+
+
 def test_a_detector_that_cannot_keep_up_takes_the_newest_image_and_counts_the_others(graph):
     node = graph.add(ArucoDetector, marker_size=small_bag.SIZE)
     graph.listen(PointCloud2, 'markers')

@@ -6,6 +6,8 @@ import pytest
 from sensor_msgs.msg import CameraInfo, Image
 from support.small_bag import CAMERA
 
+from thermal_fiducial.cameras.choice import unused_parameters
+from thermal_fiducial.config import ThermalSourceConfig
 from thermal_fiducial.files.camera_info import save_camera
 from thermal_fiducial.files.images import image_to_array
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
@@ -49,6 +51,19 @@ def test_counts_and_calibration_go_out_with_one_stamp(graph, folder, tmp_path):
     assert convert.camera(infos[0]).matches(CAMERA)
     level, reason, figures = graph.diagnose(node)
     assert (level, reason, figures['reconnections']) == (OK, 'ok', '0')
+
+
+def test_parameters_that_the_driver_lacks_are_named(graph, folder):
+    node = graph.add(ThermalSource, camera=folder, image_width=640, image_height=512)
+    lines = [f'parameter image_{side}: no effect with camera {folder}' for side in ('width', 'height')]
+    assert node.without_effect() == lines
+    device = graph.add(ThermalSource, camera='/dev/video_that_is_not_there', repeat=False, frame_rate=25.0)
+    assert device.without_effect() == ['parameter repeat: no effect with camera /dev/video_that_is_not_there']
+    grabber = ThermalSourceConfig(camera='teax:7', repeat=False, frame_rate=25.0, image_width=640)
+    assert unused_parameters(grabber) == [
+        f'parameter {name}: no effect with camera teax:7' for name in ('frame_rate', 'repeat')
+    ]
+    assert unused_parameters(ThermalSourceConfig(image_width=640)) == []
 
 
 def test_tau2_camera_takes_its_frames(graph, folder):

@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 
+from thermal_fiducial.config import without_effect
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
 from thermal_fiducial.files.reading import one_line
 from thermal_fiducial.ros.base import params
@@ -88,6 +89,8 @@ class StageNode(CountingNode, Generic[Config]):
         self.deaf = ''
         #: console lines for a pilot
         self.console = Console(self.get_logger())
+        for line in self.without_effect():
+            self.get_logger().warning(line)
         self._diagnostics = self.advertise(DiagnosticArray, '/diagnostics')
         params.follow(self, kind, lambda config: self.configure(self._with_derived(config)))
         if live:
@@ -110,6 +113,13 @@ class StageNode(CountingNode, Generic[Config]):
     def configure(self, config: Config) -> None:
         """Apply a config with changed dynamic parameters."""
         self.config = config
+
+    def without_effect(self) -> list[str]:
+        """A line for each parameter that has been set and does nothing."""
+        lines = without_effect(self.config)
+        if getattr(self.config, 'prefix_frames', False) and not self.frame_prefix:
+            lines.append('parameter prefix_frames: no effect without a namespace')
+        return lines
 
     def attempt(self, make: Callable[[], Made], default: Made) -> Made:
         """Result of ``make``; if it raises InputError, ``default``, and the error is reported as a fault."""
@@ -218,8 +228,8 @@ class StageNode(CountingNode, Generic[Config]):
         if self._rates.silent:
             return ERROR if self._rates.stopped else WARN, f'no {self._rates.main}'
         level, reason = self.state()
-        doubt = self._rates.doubt()
-        return (max(level, WARN), f'{reason}; {doubt}') if doubt else (level, reason)
+        doubts = [*filter(None, [self._rates.doubt()]), *self.without_effect()]
+        return (max(level, WARN), '; '.join([reason, *doubts])) if doubts else (level, reason)
 
     def _on_timer(self) -> None:
         self.guard(self.diagnose, self.get_clock().now().nanoseconds)

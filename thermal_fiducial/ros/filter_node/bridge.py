@@ -40,8 +40,6 @@ class FlightControllerBridge:
         self._due_ns = 0
         self._px4: Any = None
         if not self._period_ns:
-            if config.px4:
-                fault('parameter px4: nothing is sent at a bridge_rate of 0')
             return
         self._odometry = node.advertise(OdometryMessage, 'bridge/odometry')
         self._pose = node.advertise(PoseWithCovarianceStamped, 'bridge/pose')

@@ -22,7 +22,7 @@ class TransformBroadcaster:
     node : for the publishers
     config : frames, pose of the camera
     frames : source of the camera's pose; one from TF is not broadcast again
-    fault : called with a message if tf2_ros or a parameter is missing
+    fault : called with a message if tf2_ros is missing
     """
 
     def __init__(
@@ -35,8 +35,6 @@ class TransformBroadcaster:
         except ImportError:
             fault('parameter publish_tf: tf2_ros is not installed')
             return
-        if config.odom_frame and not config.smoothing_time:
-            fault('parameter odom_frame: without smoothing_time nothing is smooth')
         self._broadcaster = tf2_ros.TransformBroadcaster(node)
         self._static: Any = tf2_ros.StaticTransformBroadcaster(node)
 
