@@ -1,6 +1,5 @@
 """Node ``aruco_detector``: clean counts to markers with sub-pixel corners and poses."""
 
-from collections.abc import Sequence
 import sys
 from typing import Any
 
@@ -19,6 +18,7 @@ from thermal_fiducial.ros.base.node import OK, WARN
 from thermal_fiducial.ros.camera_nodes.camera_node import CameraStageNode
 from thermal_fiducial.ros.camera_nodes.detections import OtherDetections
 from thermal_fiducial.ros.camera_nodes.opencv import require_opencv
+from thermal_fiducial.ros.camera_nodes.other_dictionaries import OtherDictionaries
 from thermal_fiducial.ros.messages import clouds, convert, display, message_bytes
 from thermal_fiducial.ros.process.run import run
 
@@ -27,13 +27,12 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
     """Detects markers; given the map and the filter's odometry it searches where they are predicted."""
 
     stage = 1
-    #: parameters that name markers which the dictionary lacks, in words
-    _unknown_markers: Sequence[str] = ()
 
     def __init__(self, **kwargs: Any) -> None:
         require_opencv()
         super().__init__('aruco_detector', ArucoDetectorConfig, **kwargs)
         self.detector = self.attempt(self._make_detector, None)
+        self._dictionaries = OtherDictionaries(self.config)
         self.view = EightBitView(Tau2CameraConfig())
         self._seen = 0
         self._markers = self.advertise(PointCloud2, 'markers')
@@ -46,14 +45,8 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
 
     def _make_detector(self) -> MarkerDetector | None:
         dictionary = load_dictionary(self.config.dictionary)
-        self._unknown_markers = unknown_markers(self.config, len(dictionary.bits))
-        for line in self._unknown_markers:
-            self.get_logger().warning(line)
+        self.remark(unknown_markers(self.config, len(dictionary.bits)))
         return MarkerDetector(self.config, dictionary)
-
-    def without_effect(self) -> list[str]:
-        """Parameters that do nothing, also those that name markers which the dictionary lacks."""
-        return [*super().without_effect(), *self._unknown_markers]
 
     def configure(self, config: ArucoDetectorConfig) -> None:
         """Apply dynamic parameters."""
@@ -74,6 +67,7 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         self._others.send(markers, head, self.detector.size)
         if self._annotated.listeners:
             self._annotated.send(convert.image(display.annotated(self._gray(counts), markers), head))
+        self._dictionaries.look(image.stamp_ns, counts, self.camera(), any_seen=self._seen > 0)
 
     def _gray(self, counts: Counts | Gray) -> Gray:
         return self.view(counts.astype(np.uint16, copy=False))
@@ -83,10 +77,15 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
             self.detector.set_map(clouds.map_poses(message))
 
     def state(self) -> tuple[bytes, str]:
-        """Number of markers in the last frame, and of images skipped since the last diagnostics."""
-        if left := self._images.left_since():
-            return WARN, f'{self._seen} markers; {left} older images skipped'
-        return OK, '1 marker' if self._seen == 1 else f'{self._seen} markers'
+        """Number of markers in the last frame, markers of another dictionary, images skipped since the last call."""
+        seen = '1 marker' if self._seen == 1 else f'{self._seen} markers'
+        left = self._images.left_since()
+        doubts = [self._dictionaries.doubt, f'{left} older images skipped' if left else '']
+        return WARN if any(doubts) else OK, '; '.join(filter(None, [seen, *doubts]))
+
+    def headline(self) -> str:
+        """That the markers in view are of another dictionary."""
+        return self._dictionaries.doubt
 
 
 def main() -> int:

@@ -22,16 +22,13 @@ class ThermalSource(StageNode[ThermalSourceConfig]):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__('thermal_source', ThermalSourceConfig, **kwargs)
         config = self.config
+        self.remark(unused_parameters(config))
         self._calibration = CalibrationOutput(self)
         self._image = self.advertise(Image, 'thermal/image_raw', qos.IMAGE_OUTPUT)
         self._source = self.attempt(lambda: make_source(config), None)
         self._capture: Capture | None = None
         if self._source is not None:
             self._capture = Capture(self._source, self.on_frame, self._on_change)
-
-    def without_effect(self) -> list[str]:
-        """Parameters that do nothing, also those that the camera's driver does not have."""
-        return super().without_effect() + unused_parameters(self.config)
 
     def on_frame(self, frame: CapturedFrame) -> None:
         """Publish a frame; called by the reader thread."""

@@ -56,9 +56,9 @@ def test_counts_and_calibration_go_out_with_one_stamp(graph, folder, tmp_path):
 def test_parameters_that_the_driver_lacks_are_named(graph, folder):
     node = graph.add(ThermalSource, camera=folder, image_width=640, image_height=512)
     lines = [f'parameter image_{side}: no effect with camera {folder}' for side in ('width', 'height')]
-    assert node.without_effect() == lines
+    assert node.remarks == lines
     device = graph.add(ThermalSource, camera='/dev/video_that_is_not_there', repeat=False, frame_rate=25.0)
-    assert device.without_effect() == ['parameter repeat: no effect with camera /dev/video_that_is_not_there']
+    assert device.remarks == ['parameter repeat: no effect with camera /dev/video_that_is_not_there']
     grabber = ThermalSourceConfig(camera='teax:7', repeat=False, frame_rate=25.0, image_width=640)
     assert unused_parameters(grabber) == [
         f'parameter {name}: no effect with camera teax:7' for name in ('frame_rate', 'repeat')

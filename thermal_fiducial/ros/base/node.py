@@ -4,7 +4,7 @@ Unusable input never ends a node: it raises :class:`InputError` in the conversio
 into a warning and a diagnostic.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 import time
 import traceback
@@ -89,7 +89,11 @@ class StageNode(CountingNode, Generic[Config]):
         self.deaf = ''
         #: console lines for a pilot
         self.console = Console(self.get_logger())
-        for line in self.without_effect():
+        #: warnings of the configuration, besides parameters that others keep from having an effect
+        self.remarks: list[str] = []
+        if getattr(self.config, 'prefix_frames', False) and not self.frame_prefix:
+            self.remark(['parameter prefix_frames: no effect without a namespace'])
+        for line in without_effect(self.config):
             self.get_logger().warning(line)
         self._diagnostics = self.advertise(DiagnosticArray, '/diagnostics')
         params.follow(self, kind, lambda config: self.configure(self._with_derived(config)))
@@ -114,12 +118,11 @@ class StageNode(CountingNode, Generic[Config]):
         """Apply a config with changed dynamic parameters."""
         self.config = config
 
-    def without_effect(self) -> list[str]:
-        """A line for each parameter that has been set and does nothing."""
-        lines = without_effect(self.config)
-        if getattr(self.config, 'prefix_frames', False) and not self.frame_prefix:
-            lines.append('parameter prefix_frames: no effect without a namespace')
-        return lines
+    def remark(self, lines: Iterable[str]) -> None:
+        """Log warnings of the configuration and keep them in the diagnostics."""
+        for line in lines:
+            self.remarks.append(line)
+            self.get_logger().warning(line)
 
     def attempt(self, make: Callable[[], Made], default: Made) -> Made:
         """Result of ``make``; if it raises InputError, ``default``, and the error is reported as a fault."""
@@ -228,7 +231,7 @@ class StageNode(CountingNode, Generic[Config]):
         if self._rates.silent:
             return ERROR if self._rates.stopped else WARN, f'no {self._rates.main}'
         level, reason = self.state()
-        doubts = [*filter(None, [self._rates.doubt()]), *self.without_effect()]
+        doubts = [*filter(None, [self._rates.doubt()]), *without_effect(self.config), *self.remarks]
         return (max(level, WARN), '; '.join([reason, *doubts])) if doubts else (level, reason)
 
     def _on_timer(self) -> None:
