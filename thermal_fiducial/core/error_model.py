@@ -8,6 +8,7 @@ the pose jump by what the markers are wrong by.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -116,19 +117,53 @@ def corners_of_pose(gains: FloatArray, correlations: FloatArray, errors: Systema
     return np.asarray(errors.corner_px**2 * np.tensordot(gains, mixed, axes=([0, 2], [0, 2])))
 
 
-def visible_share(J: FloatArray, correlations: FloatArray) -> float:
-    """Share of the corners' systematic variance that is left in the residuals of a fitted pose.
+class ShownErrors(NamedTuple):
+    """What residuals of a pose show of the corners' systematic errors: sums per coordinate.
+
+    If each corner has an error of its own, of variance s^2, and all share one that is smooth over the image, of
+    variance b^2, ``product`` is expected to be ``s^2 own + b^2 smooth`` and ``smooth_product``
+    ``s^2 smooth + b^2 both``
+    (minimum norm quadratic estimation of variance components; C. R. Rao, 1971).
+    """
+
+    #: product of successive residuals, and the same weighted by the correlations of the smooth error [px^2]
+    product: float
+    smooth_product: float
+    own: float
+    smooth: float
+    both: float
+
+    def smooth_variance(self, known: float) -> float:
+        """Variance b^2 [px^2], without errors of corners of their own as far as they are ``known`` in ``product``.
+
+        More of these than the detector knows of is taken for a sign of smooth errors: a lens model that is wrong within
+        a marker is worse over the whole image, where the pose hides it.
+        """
+        own = (self.product * self.both - self.smooth_product * self.smooth) / (self.own * self.both - self.smooth**2)
+        return (self.product - min(max(own, 0.0) * self.own, known)) / self.smooth
+
+
+def shown_errors(J: FloatArray, correlations: FloatArray, residuals: FloatArray, former: FloatArray) -> ShownErrors:
+    """What the residuals (n, 2) [px] of n corners and the ``former`` ones of the same corners show.
 
     Parameters
     ----------
-    J : (n, 2, 6) derivatives of n corners with respect to the pose
-    correlations : (n, n) of the errors
+    J : (n, 2, 6) derivatives of the corners with respect to the pose
+    correlations : (n, n) of the smooth error
     """
     n = len(J)
-    mixed = (correlations @ J.reshape(n, 12)).reshape(2 * n, 6)
-    of_coordinates = J.reshape(2 * n, 6)
-    taken_up = np.linalg.solve(of_coordinates.T @ of_coordinates, of_coordinates.T @ mixed)
-    return 1.0 - float(np.trace(taken_up)) / (2.0 * n)
+    # The pose takes up errors along six orthonormal directions.
+    directions = np.linalg.qr(J.reshape(2 * n, 6))[0]
+    correlated = (correlations @ directions.reshape(n, 12)).reshape(2 * n, 6)
+    taken_up = directions.T @ correlated
+    sums = (
+        np.vdot(residuals, former),
+        np.vdot(residuals, correlations @ former),
+        2.0 * n - 6.0,
+        2.0 * correlations.trace() - taken_up.trace(),
+        2.0 * np.vdot(correlations, correlations) - 2.0 * np.vdot(correlated, correlated) + np.vdot(taken_up, taken_up),
+    )
+    return ShownErrors(*(float(value) / (2.0 * n) for value in sums))
 
 
 def map_of_pose(

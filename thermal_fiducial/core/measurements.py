@@ -31,6 +31,7 @@ MARKER_DTYPE = np.dtype(
     + [(name, _F4) for name in ('ax', 'ay', 'az', 'aqx', 'aqy', 'aqz', 'aqw', 'arms_px')]
     + [('contrast_counts', _F4)]
     + [(name, _F4) for name in CORNER_COVARIANCE_FIELDS]
+    + [('detector_px', _F4)]
 )
 
 _MARKER_NAMES = MARKER_DTYPE.names or ()
@@ -53,6 +54,7 @@ Markers = np.ndarray
 _COLUMN = {name: column for column, name in enumerate(_MARKER_NAMES) if name != 'id'}
 _CORNERS = [_COLUMN[name] for name in CORNER_FIELDS]
 _COVARIANCES = [_COLUMN[f'c{corner}{term}'] for corner in range(4) for term in ('uu', 'uv', 'uv', 'vv')]
+_OF_DETECTOR = [_COLUMN['detector_px']]
 _BRANCHES = [_COLUMN[f'{prefix}{name}'] for prefix in ('', 'a') for name in ('x', 'y', 'z', 'qx', 'qy', 'qz', 'qw')]
 
 
@@ -90,19 +92,22 @@ class Observations(Stacked):
     #: (N, 4, 2) [px] and (N, 4, 2, 2) [px^2]
     corners: FloatArray
     covariances: FloatArray
+    #: (N,) standard deviation of a coordinate by errors of the detector alone [px]; 0 where it is not known
+    detector_px: FloatArray
     #: (N, 2, 4, 4) T_camera_marker and its alternative, NaN where there is none
     branches: FloatArray
 
     @staticmethod
     def of(markers: Markers) -> 'Observations':
         """Observations of rows with valid corners; rows whose ID occurs twice are left out as ambiguous."""
-        numbers = _numbers(markers, _CORNERS + _COVARIANCES + _BRANCHES)
+        numbers = _numbers(markers, _CORNERS + _COVARIANCES + _OF_DETECTOR + _BRANCHES)
         corners = numbers[:, : len(_CORNERS)].reshape(-1, 4, 2)
-        covariances = numbers[:, len(_CORNERS) : -len(_BRANCHES)].reshape(-1, 4, 2, 2)
+        covariances = numbers[:, len(_CORNERS) : -len(_BRANCHES) - 1].reshape(-1, 4, 2, 2)
+        detector_px = numbers[:, -len(_BRANCHES) - 1]
         poses = numbers[:, -len(_BRANCHES) :].reshape(-1, 2, 7)
         with np.errstate(invalid='ignore', divide='ignore'):
             branches = transform_from_quaternion(poses[..., :3], poses[..., 3:])
-        observations = Observations(markers['id'].astype(np.int64), corners, covariances, branches)
+        observations = Observations(markers['id'].astype(np.int64), corners, covariances, detector_px, branches)
         uu, uv, vv = covariances[..., 0, 0], covariances[..., 0, 1], covariances[..., 1, 1]
         sound = (uu > 0.0) & (uu * vv > uv**2) & np.isfinite(corners).all(axis=2)
         usable: BoolArray = np.asarray(sound.all(axis=1))

@@ -157,9 +157,10 @@ def test_a_model_without_errors_adds_nothing():
 
 
 # Without a field the estimate falls from its start at 0.1 px, and is within the bound of none after 450 frames; after
-# 300 it is too low for a field of 0.08 px, so that one that learned nothing of the field would fail with it too.
-@pytest.mark.parametrize(('true_px', 'frames'), [(0.0, 600), (0.08, 300)])
-def test_the_bias_of_the_corners_is_learned_from_correlated_residuals(true_px, frames):
+# 300 it is too low for a field of 0.08 px, so that one that learned nothing of the field would fail with it too. Errors
+# of each corner that the detector knows of must not hide the field.
+@pytest.mark.parametrize(('true_px', 'frames', 'known_px'), [(0.0, 600, 0.0), (0.08, 300, 0.0), (0.08, 300, 0.1)])
+def test_the_bias_of_the_corners_is_learned_from_correlated_residuals(true_px, frames, known_px):
     """Corners with noise of 0.1 px, and with a smooth field over the image or without."""
     rng = np.random.default_rng(4)
     poses, model = wall(rng), replace(ERRORS, corner_px=max(true_px, 1e-6))
@@ -171,6 +172,7 @@ def test_the_bias_of_the_corners_is_learned_from_correlated_residuals(true_px, f
     )
     for k in range(frames):
         rows = see(flight(k / 30), poses, 0.1, rng)
+        rows['detector_px'] = known_px
         corners = corners_px(rows).reshape(-1, 2)
         nearest = np.argmin(np.sum((corners[:, None] - grid) ** 2, axis=-1), axis=1)
         for name, column in zip(CORNER_FIELDS, (corners + field[nearest]).reshape(-1, 8).T, strict=True):
@@ -228,6 +230,25 @@ def test_a_mistaken_marker_does_not_change_the_bias():
     # Five products count as those of a marker off by two sigma, of 0.04 px by then, in the mean of eight markers; so do
     # 59 frames, which show a quarter of the bias. As they are they would count twice as much.
     assert with_it**2 - without**2 < 5 * (2 * 0.04) ** 2 / 8 / (59 * 0.25)
+
+
+def test_errors_that_each_corner_has_for_itself_are_no_bias_where_the_detector_knows_of_them():
+    """Where it does not they may be those of a lens, most of which the pose hides."""
+    own = 0.03 * np.random.default_rng(8).normal(size=(8, 4, 2))
+
+    def displaced_by_own(k, rows):
+        rows['detector_px'] = known_px
+        return own[rows['id']]
+
+    found = {}
+    for known_px in (0.0, 0.015, 0.03, 0.06):
+        found[known_px] = learned(60, displaced_by_own).px
+    nothing = learned(60, lambda _, rows: np.zeros((len(rows), 4, 2))).px
+    # A quarter of the bias is in the residuals: errors of 0.03 px are as those by one of 0.06 px.
+    assert found[0.0] > 0.055
+    assert found[0.0] > found[0.015] > found[0.03]
+    # Eight markers distinguish the two to a fifth of the errors.
+    assert found[0.06] ** 2 - nothing**2 < (0.2 * 0.06) ** 2
 
 
 @pytest.mark.parametrize('share', [0.1, 0.5])

@@ -268,9 +268,10 @@ def test_a_field_outside_its_points_is_refused(offset):
         clouds.markers(message)
 
 
-def test_corners_that_are_not_finite_are_refused():
+@pytest.mark.parametrize('name', ['u2', 'detector_px'])
+def test_corners_that_are_not_finite_are_refused(name):
     rows = rows_of(MARKER_DTYPE, 2)
-    rows['u2'][1] = np.nan
+    rows[name][1] = np.nan
     with pytest.raises(InputError, match='not finite'):
         clouds.markers(clouds.cloud(rows, HEAD))
 

@@ -180,7 +180,8 @@ def marker_rows(
     table[:, _COVARIANCES] = terms.reshape(-1, 12)
     rows['sigma_px'] = np.sqrt(terms[..., [0, 2]].mean(axis=(1, 2)))
     if contrast is not None:
-        rows['contrast_counts'] = contrast
+        # They are our own: all that their covariances contain are errors of the detector.
+        rows['contrast_counts'], rows['detector_px'] = contrast, rows['sigma_px']
     positions = poses.T_camera_marker[..., :3, 3]
     orientations = se3.quaternion_from_rotation(poses.T_camera_marker[..., :3, :3])
     table[:, _POSITION], table[:, _OTHER_POSITION] = positions[:, 0], positions[:, 1]

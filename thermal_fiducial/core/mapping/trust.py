@@ -11,10 +11,10 @@ from statistics import median
 
 import numpy as np
 
-from thermal_fiducial.core.error_model import CHI2_OF_VIEW, INCONSISTENT_PX, SystematicErrors, visible_share
+from thermal_fiducial.core.error_model import CHI2_OF_VIEW, INCONSISTENT_PX, shown_errors, ShownErrors, SystematicErrors
 from thermal_fiducial.core.mapping.located import Location
 from thermal_fiducial.core.mapping.map_data import MapMarker
-from thermal_fiducial.core.types import BoolArray, FloatArray, ObjectArray
+from thermal_fiducial.core.types import BoolArray, FloatArray, ObjectArray, TINY
 
 #: Reason of quarantine of markers that the map file already had there.
 FROM_FILE = 'in quarantine since before the map was loaded'
@@ -163,16 +163,19 @@ class CornerBias:
     """Systematic errors of the corners (lens, detector), from the correlation of residuals of successive frames.
 
     White noise of two frames is independent, so the mean product of a corner's residuals in successive frames is the
-    variance of the systematic error, less the part that the pose absorbs. Without the mean over each marker's corners
-    it is that of the markers' shapes. Errors of partially visible markers are correlated for other reasons; in the bias
-    markers are weighted by their claimed noise.
+    variance of the systematic error, less the part that the pose absorbs: most of an error that is smooth over the
+    image, hardly any of errors that each corner has for itself. These the detector claims in the corners' noise
+    already; the rest is the bias. Without the mean over each marker's corners the product is that of the markers'
+    shapes. Errors of partially visible markers are correlated for other reasons; in the bias markers are weighted by
+    their claimed noise.
     """
 
     def __init__(self) -> None:
         #: standard deviations: of the bias [px], and of the shapes as a share of the corners' noise
         self.px, self.shape = SystematicErrors().corner_px, SystematicErrors().marker_shape
-        # Sums over frames: their number, the weights of their markers, what these show of the bias, products of both.
-        self._sums = np.zeros(5)
+        # Sums over frames: their number, the weights of their markers, shapes, what is known of corners' own errors,
+        # and what residuals show.
+        self._sums = np.zeros(9)
         #: the last frame, and the weights (N,) of its markers
         self._last: tuple[Location | None, FloatArray] = None, np.zeros(0)
 
@@ -193,16 +196,24 @@ class CornerBias:
         products = (residuals * former).sum(axis=(1, 2)) / 8.0
         of_shape = products - (residuals.mean(axis=1) * former.mean(axis=1)).sum(axis=1) / 2.0
         of_shape = np.clip(of_shape / (noise[now] * last.sight.noise_px[then]), -LARGEST_SHAPE, LARGEST_SHAPE)
+        shares = shares[now] * before[then]
         # Residuals of moved or mistaken markers are correlated too.
         limit = min(INCONSISTENT_PX, BIAS_OUTLIER * self.px) ** 2
-        shares = shares[now] * before[then] / len(now)
-        weight = float(shares.sum())
-        visible = weight * visible_share(location.seen.J_camera.reshape(-1, 2, 6), location.correlations)
-        of_bias = float(shares @ np.clip(products, -limit, limit))
-        self._sums = BIAS_MEMORY * self._sums + (1.0, weight, visible, of_bias, of_shape.mean() / SHAPE_VISIBLE)
-        frames, weight, visible, of_bias, shapes = self._sums.tolist()
+        bound = np.minimum(1.0, limit / np.maximum(np.abs(products), TINY))
+        corners = np.repeat(np.isin(np.arange(len(noise)), now), 4)
+        weights, scale = (np.repeat(np.sqrt(values), 4)[:, None] for values in (shares, shares * bound))
+        shown = shown_errors(
+            weights[..., None] * location.seen.J_camera[now].reshape(-1, 2, 6),
+            weights * location.correlations[corners][:, corners] * weights.T,
+            scale * residuals.reshape(-1, 2),
+            scale * former.reshape(-1, 2),
+        )
+        known = shown.own * float(shares @ location.sight.observed.detector_px[now] ** 2) / len(now)
+        sums = (1.0, shares.mean(), of_shape.mean() / SHAPE_VISIBLE, known, *shown)
+        self._sums = BIAS_MEMORY * self._sums + sums
+        frames, weight, shapes, known, *sums_shown = self._sums.tolist()
         prior = SystematicErrors()
-        self.px = _learned(prior.corner_px, of_bias / visible, weight)
+        self.px = _learned(prior.corner_px, ShownErrors(*sums_shown).smooth_variance(known), weight)
         # Not all that lasts until the next frame is alike in all views: the shape is never more than at first.
         self.shape = min(_learned(prior.marker_shape, shapes / frames, frames), prior.marker_shape)
 

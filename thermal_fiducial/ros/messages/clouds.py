@@ -201,12 +201,14 @@ def markers(message: PointCloud2) -> Markers:
 
 
 def _checked(rows: Markers) -> Markers:
-    """The markers, after validation of corners, variances and poses."""
+    """The markers, after validation of corners, variances, errors and poses."""
     variances = columns(rows, _VARIANCE_FIELDS)
     if not np.abs(columns(rows, CORNER_FIELDS)).max(initial=0.0) < LARGEST_COORDINATE:
         raise InputError('markers with corners that are not finite or far outside any image')
     if not ((variances > _SMALLEST_CORNER_VARIANCE).all() and (variances < LARGEST_VARIANCE).all()):
         raise InputError('markers with corners whose variance is not positive or beyond all bounds')
+    if not (np.abs(rows['detector_px']) < LARGEST_COORDINATE).all():
+        raise InputError('markers with errors of the detector that are not finite or beyond all bounds')
     # A marker without a pose has NaN there.
     if (np.abs(columns(rows, _POSE_FIELDS)) > LARGEST_COORDINATE).any():
         raise InputError('markers with poses beyond all bounds')
