@@ -109,7 +109,7 @@ class DisplayedSides:
         a, b = inset + (1.0 - 2.0 * inset) * np.array([[0.0, 1.0, 1.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
         inner = np.moveaxis(se3.seen_between(seen.x, se3.bilinear(a, b)), 0, -1)
         sides = sides_of(inner, frame.camera, frame.image.shape, self._bits, _COLUMNS, _WIDEST_PX)
-        blur = blurs(sides, blur_px, refined.blur.spread)
+        blur, *_ = blurs(sides, blur_px, refined.blur.spread)
         value, slope, counting = model(sides, self._behind[refined.ids], blur)
         counting &= self._white[refined.ids].reshape(-1, self._bits)
         counts = counts_of(sides.pixel, frame.image, refined.blur.to_tails)

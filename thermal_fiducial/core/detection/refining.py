@@ -28,7 +28,7 @@ from thermal_fiducial.core.detection.corners.segments import (
     Segments,
     with_gradients,
 )
-from thermal_fiducial.core.detection.corners.sides import Blur, blurs, model, NARROW, Sides, sides_of
+from thermal_fiducial.core.detection.corners.sides import blurs, model, NARROW, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.frame import (
     counts_of,
@@ -87,12 +87,6 @@ class MotionBlur(Stacked):
     removed: FloatArray
     #: (N, 2) standard deviation of the remaining motion blur, along the motion [px]
     spread: FloatArray
-
-    def parts(self, sides: Sides, optics: float) -> list[Blur]:
-        """Gaussians that make up the blur of the ``sides``; none where it hardly differs from one."""
-        if self.to_tails is None:
-            return []
-        return [blurs(sides, optics, self.spread, *half) for half in WITHOUT_TAIL]
 
     @staticmethod
     def none(count: int) -> 'MotionBlur':
@@ -246,12 +240,14 @@ def refine_corners(
     """
     start, motion = corners, motion or MotionBlur.none(len(corners.px))
     found, cells, which = RefinedCorners.none(), behind.shape[2], np.arange(len(corners.px))
+    # Where lag tails stay, the blur is so small that it hardly differs from one Gaussian.
+    halves = [] if motion.to_tails is None else WITHOUT_TAIL
     for index in range(_PASSES):
         widest = math.hypot(blur_px, math.sqrt(float((motion.spread * motion.spread).sum(axis=1).max())))
         sides = sides_of(start.x, camera, image.shape, cells, columns, widest)
-        blur = blurs(sides, blur_px, motion.spread)
+        blur, *parts = blurs(sides, blur_px, motion.spread, halves)
         counts = counts_of(sides.pixel, image, motion.to_tails)
-        modelled = model(sides, behind, blur, narrow, motion.parts(sides, blur_px))
+        modelled = model(sides, behind, blur, narrow, parts)
         segments = with_gradients(measure(counts, modelled, REACHED * blur.across), sides, widest)
         refined, moving = _moved(sides, segments, as_squares(start, *adjust(sides, segments, _PRIOR_PX)))
         found = found.with_others(which, refined) if index else refined

@@ -20,7 +20,9 @@ _FALSE_MARKERS = 0.01
 
 def too_small_for_sides(frame: Frame, corners_px: FloatArray, cells: int) -> BoolArray:
     """Which markers (N, 4, 2) have sides in a picture that are not measured by themselves."""
-    return np.asarray((sides_px(corners_px) < _WIDEST_CELL_PX * cells) & frame.displayed)
+    if not frame.displayed:
+        return np.zeros(len(corners_px), dtype=bool)
+    return np.asarray(sides_px(corners_px) < _WIDEST_CELL_PX * cells)
 
 
 def fitted_patterns(

@@ -74,7 +74,7 @@ def planar_poses(corners: ImagePoints, corner_covs: FloatArray, sizes: FloatArra
     once, points = Images.of(corners, whitening(corner_covs)), marker_corners(sizes[twice])
     images = Images(once.whitening[twice], once.target[twice])
     starts = ippe_square(corners.x, sizes).reshape(-1, 4, 4)
-    T, cost, information = minimise(starts, lambda T: evaluate(T, points, images), alternatives=2)
+    T, cost, information = minimise(starts, lambda T: evaluate(T, points, images), alternatives=2, linear=0.03)
     p = se3.apply(T, points)
     residuals = (corners.x[twice] - p[..., :2] / p[..., 2:])[..., None]
     chi2, squared_px = (((W @ residuals) ** 2).sum(axis=(1, 2, 3)) for W in (images.whitening, corners.J[twice]))

@@ -59,7 +59,9 @@ class Images:
         return Images(self.whitening.reshape(1, -1, 2, 2), self.target.reshape(1, -1, 2))
 
 
-def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alternatives: int = 1) -> Evaluation:
+def minimise(
+    T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alternatives: int = 1, linear: float = TINY
+) -> Evaluation:
     """Poses with the least costs, from starts ``T`` (B, 4, 4).
 
     Parameters
@@ -67,6 +69,7 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
     evaluated : function of poses: cost, half its gradient and half its Gauss-Newton Hessian, for steps of the origin
         and rotations about it, both in the parent frame
     alternatives : number of consecutive starts of the same body, of which only the best is needed
+    linear : angle [rad] far below which a step is exact; of a larger one that part is, by which it may be longer
 
     Returns
     -------
@@ -81,13 +84,14 @@ def minimise(T: FloatArray, evaluated: Callable[[FloatArray], Evaluation], alter
     active = possible
     for steps in range(_MAX_STEPS):
         step = _solve(information, damping, gradient)
-        best = cost
-        if alternatives > 1:
-            best = np.repeat(cost.reshape(-1, alternatives).min(axis=1), alternatives)
+        best = np.repeat(cost.reshape(-1, alternatives).min(axis=1), alternatives)
         gain = (step * gradient).sum(axis=1)
-        last = gain < _LITTLE * np.maximum(cost - np.minimum(best, _REFUTED), 1.0)
+        bent = np.minimum((step[:, 3:] * step[:, 3:]).sum(axis=1) / linear**2, 1.0)
+        last = gain * bent < _LITTLE * np.maximum(cost - np.minimum(best, _REFUTED), 1.0)
+        most = _REFUTED + _TIMES_THE_BEST * best
         if steps > 0:
-            active = active & (damping <= MOST_DAMPED) & (cost <= _REFUTED + _TIMES_THE_BEST * best)
+            active = active & (damping <= MOST_DAMPED) & (cost <= most)
+        last |= cost - gain > most
         trial, done = retract(T, -step), active & last
         T[done] = trial[done]
         active = active & ~last

@@ -37,7 +37,7 @@ class Measured:
             image[self.outlier[1], self.outlier[0]] += 5000.0
         x = CAMERA.normalise(CORNERS[None] + np.array(self.off))
         self.sides = sides_of(x, CAMERA, IMAGE.shape, CELLS, 6, BLUR_WITH_PIXEL)
-        blur = blurs(self.sides, BLUR_WITH_PIXEL, np.zeros((1, 2)))
+        blur, *_ = blurs(self.sides, BLUR_WITH_PIXEL, np.zeros((1, 2)))
         counts = counts_of(self.sides.pixel, image.astype(np.float32))
         modelled = model(self.sides, BEHIND[[ID]], blur)
         self.segments = measure(counts, modelled, np.full_like(blur.across, REACH))

@@ -118,7 +118,7 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer, thick
     onward = layer.project(se3.apply(T, on_marker(middle + pattern.onward, size))) - nodes[:, 2]
     widest = math.hypot(layer.blur, float(np.linalg.norm(layer.lag_blur)))
     sides = columns_across(nodes, np.nan_to_num(onward), layer.image.shape, 1, _COLUMNS, widest)
-    blur = blurs(sides, layer.blur, layer.lag_blur[None])
+    blur, *_ = blurs(sides, layer.blur, layer.lag_blur[None])
     modelled = _model(sides, pattern.step, blur)
     measured = measure(counts_of(sides.pixel, layer.image), modelled, REACHED * blur.across, len(nodes))
     used = measured.variance[0] < HOPELESS

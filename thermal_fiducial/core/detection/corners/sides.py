@@ -206,16 +206,19 @@ def _changes(inward: Float32Array) -> Float32Array:
     return np.ascontiguousarray(np.moveaxis(np.diff(inward, axis=2), 2, 3))
 
 
-def blurs(sides: Sides, optics: float, motion: FloatArray, mean: float = 0.0, spread: float = 1.0) -> Blur:
-    """Blur of the sides of N markers by optics [px] and a motion (N, 2) [px].
+def blurs(sides: Sides, optics: float, motion: FloatArray, parts: Sequence[tuple[float, float]] = ()) -> list[Blur]:
+    """Blur of the sides of N markers by optics [px] and a motion (N, 2) [px], and the Gaussians that make it up.
 
-    ``mean`` and ``spread``: mean and standard deviation of the blur by motion, in that motion.
+    ``parts``: mean and standard deviation of each of these by motion, in that motion.
     """
     span = sides.ends[:, 1] - sides.ends[:, 0]
     by_side = np.repeat(motion, len(span) // len(motion), axis=0)
     across = (sides.normal @ by_side[..., None])[..., 0]
-    along = (span * by_side).sum(axis=1, keepdims=True) / sides.along + np.zeros_like(across)
-    return Blur(np.hypot(optics, spread * across), np.hypot(optics, spread * along), mean * across, mean * along)
+    along = (span * by_side).sum(axis=1, keepdims=True) / sides.along
+    return [
+        Blur(np.hypot(optics, spread * across), np.hypot(optics, spread * along), mean * across, mean * along)
+        for mean, spread in ((0.0, 1.0), *parts)
+    ]
 
 
 def model(

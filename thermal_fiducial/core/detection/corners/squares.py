@@ -100,7 +100,8 @@ def squareness(x: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArr
     outlines = np.concatenate([x[:, None], x[:, None] + steps.reshape(-1, 8, 4, 2)], axis=1).reshape(-1, 4, 2)
     weight = perspective(outlines)[..., None]
     corners = np.concatenate([weight * outlines, weight], axis=-1)
-    h1, h2 = corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
-    both, first, second = (np.einsum('qk,qk->q', a, b) for a, b in ((h1, h2), (h1, h1), (h2, h2)))
+    sides = corners[:, 1::2] - corners[:, :1]
+    products = sides @ sides.swapaxes(1, 2)
+    both, first, second = products[:, 0, 1], products[:, 0, 0], products[:, 1, 1]
     value = (np.stack([2.0 * both, first - second]) / (first + second)).reshape(2, -1, 9).swapaxes(0, 1)
     return value[..., :1], (value[..., 1:] - value[..., :1]) / _STEP_PX
