@@ -47,7 +47,7 @@ from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.refined_corners import RefinedCorners, sides_px
 from thermal_fiducial.core.detection.small_markers import fitted_patterns, too_small_for_sides
 from thermal_fiducial.core.detection.tracking import MotionTrack
-from thermal_fiducial.core.detection.twist import Twist, unknown_twist
+from thermal_fiducial.core.detection.twist import Twist, UNKNOWN_TWIST
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked, TINY
 
@@ -71,8 +71,6 @@ _CORNERS = np.array([0, 1, 3, 2])
 # clipped to the limits _SETTLED_PX [px].
 _PASSES = 4
 _SETTLED_PX, _UNSURE = (0.3, 1.0), 2.0
-# Standard deviation of the prior of the corners [px].
-_PRIOR_PX = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,11 +175,13 @@ def _at_stamp(
     # its corners are corrected for lag, those of the last frame are not.
     twist = known
     if frame.twist is not None or known is None:
-        # Sides of small markers may be those of other things.
-        sure = seen.by_pattern | ~too_small_for_sides(frame, places.at.px, cells)
+        sure = np.ones(len(ids), dtype=bool)
+        if frame.displayed:
+            # Sides of small markers may be those of other things.
+            sure = seen.by_pattern | ~too_small_for_sides(places.at.px, cells)
         twist = track.correct(frame.stamp_ns, frame.twist, ids[sure], at.x[sure], places.depth[sure], deviation[sure])
     if twist is None:
-        unsure = doubted + _of_unpredicted_motion(frame, places, seen, unknown_twist(), cells)
+        unsure = doubted + _of_unpredicted_motion(frame, places, seen, UNKNOWN_TWIST, cells)
         return RefinedMarkers(ids, seen, blur, replace(seen, covariances=unsure), replace(places, at=at), None)
     lag_blur = places.lag_blur(twist, frame.lag)
     rolling = rolling_displacement(places, twist, frame, (seen.corners_px + blur.removed)[..., 1])
@@ -225,8 +225,9 @@ def refine_corners(
     columns: int = _OF_CLEAR,
     narrow: float = _NARROW_OF_CLEAR,
     motion: MotionBlur | None = None,
+    passes: int = _PASSES,
 ) -> RefinedCorners:
-    """Corners of N markers, refined in passes until they converge.
+    """Corners of N markers; those that have not converged are refined again, in so many passes at most.
 
     Parameters
     ----------
@@ -238,29 +239,27 @@ def refine_corners(
     narrow : of :func:`thermal_fiducial.core.detection.corners.sides.model`
     motion : blur by motion; none when left out
     """
-    start, motion = corners, motion or MotionBlur.none(len(corners.px))
-    found, cells, which = RefinedCorners.none(), behind.shape[2], np.arange(len(corners.px))
+    motion = motion or MotionBlur.none(len(corners.px))
     # Where lag tails stay, the blur is so small that it hardly differs from one Gaussian.
     halves = [] if motion.to_tails is None else WITHOUT_TAIL
-    for index in range(_PASSES):
-        widest = math.hypot(blur_px, math.sqrt(float((motion.spread * motion.spread).sum(axis=1).max())))
-        sides = sides_of(start.x, camera, image.shape, cells, columns, widest)
-        blur, *parts = blurs(sides, blur_px, motion.spread, halves)
-        counts = counts_of(sides.pixel, image, motion.to_tails)
-        modelled = model(sides, behind, blur, narrow, parts)
-        segments = with_gradients(measure(counts, modelled, REACHED * blur.across), sides, widest)
-        refined, moving = _moved(sides, segments, as_squares(start, *adjust(sides, segments, _PRIOR_PX)))
-        found = found.with_others(which, refined) if index else refined
-        which = which[moving]
-        if len(which) == 0:
-            break
-        start = start.only(moving).at_pixels(found.corners_px[which])
-        motion, behind = motion.only(moving), behind[moving]
-    return found
+    widest = math.hypot(blur_px, math.sqrt(float((motion.spread * motion.spread).sum(axis=1).max())))
+    sides = sides_of(corners.x, camera, image.shape, behind.shape[2], columns, widest)
+    blur, *parts = blurs(sides, blur_px, motion.spread, halves)
+    counts = counts_of(sides.pixel, image, motion.to_tails)
+    modelled = model(sides, behind, blur, narrow, parts)
+    segments = with_gradients(measure(counts, modelled, REACHED * blur.across), sides, widest)
+    refined, moving = _moved(sides, segments, as_squares(corners, *adjust(sides, segments)))
+    if passes == 1 or len(moving) == 0:
+        return refined
+    start = corners.only(moving).at_pixels(refined.corners_px[moving])
+    again = refine_corners(
+        image, start, camera, behind[moving], blur_px, columns, narrow, motion.only(moving), passes - 1
+    )
+    return refined.with_others(moving, again)
 
 
-def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCorners, BoolArray]:
-    """Corners after one linearised adjustment, and which markers (N,) have not converged."""
+def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCorners, IntArray]:
+    """Corners after one linearised adjustment, and places (M,) of the markers that have not converged."""
     # Corners that constrain one another have correlated errors: as independent ones they would claim too much.
     together = (8 / (8 - known.constrained))[:, None, None, None]
     blocks = known.covariance.reshape(-1, 4, 2, 4, 2).diagonal(axis1=1, axis2=3).transpose(0, 3, 1, 2)
@@ -281,4 +280,4 @@ def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCor
     uneven = OF_UNEVEN_CONTRAST_PX * segments.slope_of_contrast() / np.maximum(np.abs(contrast), TINY)
     covariances = covariances + (uneven * uneven)[:, None, None, None] * _EYE
     by_sides = np.zeros(len(doubt), dtype=bool)
-    return RefinedCorners(corners, covariances, contrast, noise, doubt, by_sides), moving
+    return RefinedCorners(corners, covariances, contrast, noise, doubt, by_sides), np.flatnonzero(moving)

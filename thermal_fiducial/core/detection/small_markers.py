@@ -18,10 +18,8 @@ _WIDEST_CELL_PX = 2.5
 _FALSE_MARKERS = 0.01
 
 
-def too_small_for_sides(frame: Frame, corners_px: FloatArray, cells: int) -> BoolArray:
+def too_small_for_sides(corners_px: FloatArray, cells: int) -> BoolArray:
     """Which markers (N, 4, 2) have sides in a picture that are not measured by themselves."""
-    if not frame.displayed:
-        return np.zeros(len(corners_px), dtype=bool)
     return np.asarray(sides_px(corners_px) < _WIDEST_CELL_PX * cells)
 
 
@@ -35,7 +33,7 @@ def fitted_patterns(
     shown_px : (N, 4, 2) corners in the image, with lag tails, accurate to half a cell
     blur_px : standard deviation of the blur of optics and pixels
     """
-    small = np.flatnonzero(too_small_for_sides(frame, shown_px, decoder.cells))
+    small = np.flatnonzero(too_small_for_sides(shown_px, decoder.cells))
     if len(small) == 0:
         return small, RefinedCorners.none()
     fit = fit_patterns(frame.image, shown_px[small], found.ids[small], decoder, blur_px)

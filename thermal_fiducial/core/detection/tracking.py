@@ -20,7 +20,7 @@ from thermal_fiducial.core.detection.twist import (
     later_twist,
     Twist,
     twist_by_odometry,
-    unknown_twist,
+    UNKNOWN_TWIST,
 )
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import twist_transfer
@@ -131,7 +131,7 @@ class MotionTrack:
         if len(now) == 0 or dt is None:
             return predicted
         begin, end = dt + (self.lag if self.twist is None else 0.0), self.lag if predicted is None else 0.0
-        seconds, start = begin - end, predicted or unknown_twist()
+        seconds, start = begin - end, predicted or UNKNOWN_TWIST
         # Jitter of the stamps scales all velocities of a frame by a common factor.
         unsure = 2.0 * _JITTER_S**2 + (0.0 if self.twist is not None else (_DELAY_UNSURE * self.lag) ** 2)
         A = interaction(0.5 * (x[now] + self.markers.x[before]), depth[now]).reshape(-1, 6)

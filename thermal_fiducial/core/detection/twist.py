@@ -12,8 +12,6 @@ import numpy as np
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
-# Covariance of an unknown twist [m^2/s^2, rad^2/s^2]: a brisk flight.
-_UNKNOWN = 1.5**2 * np.eye(6)
 #: Covariance of an unknown acceleration; standard deviations in m/s^2, rad/s^2.
 RANDOM = np.diag([3.0, 3.0, 3.0, 4.0, 4.0, 4.0]) ** 2
 # Covariance of the acceleration by odometry, which changes between its states, for each second that they span.
@@ -44,6 +42,10 @@ class Twist:
         return self.value - seconds * self.acceleration
 
 
+#: Prior of the twist without any information [m^2/s^2, rad^2/s^2]: a brisk flight.
+UNKNOWN_TWIST = Twist(np.zeros(6), 1.5**2 * np.eye(6))
+
+
 def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
     """Derivative (..., 2, 6) of the velocity of normalised points (..., 2) at ``depth`` (...) [m] by the twist."""
     a, b, inverse = x[..., 0], x[..., 1], 1.0 / depth
@@ -54,11 +56,6 @@ def interaction(x: FloatArray, depth: FloatArray) -> FloatArray:
     J[..., 0, 4], J[..., 1, 4] = -1.0 - a * a, -J[..., 0, 3]
     J[..., 0, 5], J[..., 1, 5] = b, -a
     return J
-
-
-def unknown_twist() -> Twist:
-    """Prior of the twist without any information."""
-    return Twist(np.zeros(6), _UNKNOWN)
 
 
 def change_since(twist: Twist, before: Twist, seconds: float) -> FloatArray:

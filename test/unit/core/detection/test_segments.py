@@ -87,7 +87,7 @@ def test_an_outlying_pixel_costs_its_segment_little():
 def test_corners_follow_their_segments():
     off = np.array([0.5, -0.4])
     measured = Measured(tuple(off), noise=NOISE)
-    moved, covariance = adjust(measured.sides, measured.segments, 3.0)
+    moved, covariance = adjust(measured.sides, measured.segments)
     back = moved.reshape(4, 2) + off
     # Four sigma of eight coordinates, and the linearisation's share of the step.
     assert np.all(np.abs(back).reshape(-1) < 4.0 * np.sqrt(covariance[0].diagonal()) + 0.05)
@@ -97,7 +97,7 @@ def test_corners_follow_their_segments():
 def test_without_segments_the_prior_remains():
     measured = Measured()
     nothing = measured.segments._replace(variance=np.full_like(measured.segments.variance, HOPELESS))
-    moved, covariance = adjust(measured.sides, nothing, 3.0)
+    moved, covariance = adjust(measured.sides, nothing)
     # Each of the 24 segments still weighs a millionth.
     assert np.abs(moved).max() < 1e-3
     assert np.sqrt(covariance[0].diagonal()) == pytest.approx(np.full(8, 3.0), rel=1e-2)

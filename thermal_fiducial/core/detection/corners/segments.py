@@ -38,6 +38,8 @@ _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
 # Largest number of rounds of robust weighting, and the change of weights below which it ends.
 _ROUNDS, _SETTLED = 3, 0.1
 _EYE = np.eye(8)
+# Information on the corners beforehand [px^-2]: they are known to 3 px.
+_PRIOR = _EYE / 3.0**2
 # (4, 1, 4) shares of the corners in a point of each side: at its start, and their change from there to its end.
 _AT_START = np.eye(4)[STARTS, None]
 _ONWARD = np.eye(4)[ENDS, None] - _AT_START
@@ -223,20 +225,15 @@ def median_of(values: FloatArray, good: BoolArray) -> FloatArray:
     return np.asarray(median[:, None])
 
 
-def adjust(sides: Sides, segments: Segments, prior_px: float) -> tuple[FloatArray, FloatArray]:
-    """Displacements (N, 8, 1) of the corners that fit all segments, and their covariances (N, 8, 8).
-
-    Parameters
-    ----------
-    prior_px : standard deviation of what is known of the corners beforehand [px]
-    """
+def adjust(sides: Sides, segments: Segments) -> tuple[FloatArray, FloatArray]:
+    """Displacements (N, 8, 1) of the corners that fit all segments, and their covariances (N, 8, 8)."""
     used, cells = segments.variance < HOPELESS, sides.normal.shape[1]
     # A segment lies where its columns do, between the corners that its side begins and ends at.
     t = (sides.t * sides.fresh).sum(axis=0) / np.maximum(sides.fresh.sum(axis=0), 1)
     share = _AT_START + t.reshape(-1, 4, cells, 1) * _ONWARD
     A = (share[..., None] * sides.normal.reshape(-1, 4, cells, 1, 2)).reshape(-1, 4 * cells, 8)
     sharpness = 1.0 / np.sqrt(segments.variance)
-    fit = robust_fit(A * sharpness[..., None], segments.shift * sharpness, used, _EYE / prior_px**2)
+    fit = robust_fit(A * sharpness[..., None], segments.shift * sharpness, used, _PRIOR)
     return fit.moved[..., None], np.linalg.inv(fit.information) / fit.trust[:, None, None] + OF_SIDES_PX**2 * _EYE
 
 
