@@ -44,6 +44,8 @@ BLUR_THAT_SHOWS, BLURRED_OUT = 20.0, 0.055
 #: The same of any marker that can be read, in cells: nine of ten are off by less than 0.65, seen without a motion.
 READABLE_CELLS = 0.4
 
+_EYE = np.eye(2)
+
 
 def of_motion_blur(by_twist: FloatArray, twist_covariance: FloatArray, lag_blur_px: FloatArray) -> FloatArray:
     """Covariances (N, 4, 2, 2) [px^2] of corners that are freed of their motion blur.
@@ -63,7 +65,7 @@ def of_motion_blur(by_twist: FloatArray, twist_covariance: FloatArray, lag_blur_
     common = lag_blur_px.mean(axis=1, keepdims=True)
     change = OF_LAG * (lag_blur_px - common)
     along = common[..., :, None] * common[..., None, :]
-    form = 0.5 * OF_LAG_FORM**2 * (along + (common * common).sum(axis=-1)[..., None, None] * np.eye(2))
+    form = 0.5 * OF_LAG_FORM**2 * (along + (common * common).sum(axis=-1)[..., None, None] * _EYE)
     return np.asarray(unknown + change[..., :, None] * change[..., None, :] + form)
 
 

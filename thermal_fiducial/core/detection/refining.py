@@ -182,7 +182,9 @@ def _at_stamp(
         twist = track.correct(frame.stamp_ns, frame.twist, ids[sure], at.x[sure], places.depth[sure], deviation[sure])
     if twist is None:
         unsure = doubted + _of_unpredicted_motion(frame, places, seen, UNKNOWN_TWIST, cells)
-        return RefinedMarkers(ids, seen, blur, replace(seen, covariances=unsure), replace(places, at=at), None)
+        return RefinedMarkers(
+            ids, seen, blur, replace(seen, covariances=unsure), Places(at, places.depth, places.flow), None
+        )
     lag_blur = places.lag_blur(twist, frame.lag)
     rolling = rolling_displacement(places, twist, frame, (seen.corners_px + blur.removed)[..., 1])
     px = seen.corners_px - lag_blur + blur.removed - rolling
@@ -190,7 +192,7 @@ def _at_stamp(
     if frame.twist is None:
         unknown = unknown + _of_unpredicted_motion(frame, places, seen, twist, cells)
     corners = replace(seen, corners_px=px, covariances=doubted + unknown)
-    return RefinedMarkers(ids, seen, blur, corners, replace(places, at=at.at_pixels(px)), twist)
+    return RefinedMarkers(ids, seen, blur, corners, Places(at.at_pixels(px), places.depth, places.flow), twist)
 
 
 def _of_unpredicted_motion(frame: Frame, places: Places, seen: RefinedCorners, twist: Twist, cells: int) -> FloatArray:

@@ -45,7 +45,7 @@ class PlanarPoses:
 
     def swapped(self, which: BoolArray) -> 'PlanarPoses':
         """The poses with the branches of the markers ``which`` (N,) swapped."""
-        return self.ordered(np.stack([which, ~which], axis=1).astype(np.intp))
+        return self.ordered(np.array([which, ~which], dtype=np.intp).T)
 
     def ordered(self, branches: IntArray) -> 'PlanarPoses':
         """The poses with the branches in the order (N, 2)."""
@@ -84,7 +84,7 @@ def planar_poses(corners: ImagePoints, corner_covs: FloatArray, sizes: FloatArra
     poses = PlanarPoses(T.reshape(-1, 2, 4, 4), information.reshape(-1, 2, 6, 6), rms, chi2)
     first = (chi2[:, 1] < chi2[:, 0]).astype(np.intp)
     second = np.where(np.isfinite(chi2).all(axis=1), 1 - first, first)
-    return poses.ordered(np.stack([first, second], axis=1))
+    return poses.ordered(np.array([first, second]).T)
 
 
 def choose_branches(
@@ -189,7 +189,7 @@ def ippe_square(normalised: FloatArray, sizes: FloatArray) -> FloatArray:
         J, v = _homography_derivative(normalised, sizes)
         R_v = _axis_to(v)
         A = inverse_2x2(R_v[:, :2, :2] - v[:, :, None] * R_v[:, 2:, :2]) @ J
-        gram = np.swapaxes(A, -1, -2) @ A
+        gram = A.swapaxes(-1, -2) @ A
         a, b, c = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
         gamma = np.sqrt(0.5 * (a + c + np.hypot(a - c, 2.0 * b)))[:, None]
         # R' has the columns (upper, +-tilt), of unit length and orthogonal, and their cross product.
@@ -225,7 +225,7 @@ def _homography_derivative(c: FloatArray, sizes: FloatArray) -> tuple[FloatArray
 
 def _axis_to(v: FloatArray) -> FloatArray:
     """Shortest rotations (N, 3, 3) of the optical axis to the directions (v, 1), v (N, 2)."""
-    z = 1.0 / np.sqrt(1.0 + np.sum(v * v, axis=-1))[:, None]
+    z = 1.0 / np.sqrt(1.0 + (v * v).sum(axis=-1))[:, None]
     d = v * z
     R = np.empty((len(v), 3, 3))
     R[:, :2, :2] = np.eye(2) - d[:, :, None] * (d / (1.0 + z))[:, None, :]

@@ -33,7 +33,7 @@ def retract(T: npt.ArrayLike, d: npt.ArrayLike) -> FloatArray:
 def difference(T: npt.ArrayLike, T_reference: npt.ArrayLike) -> FloatArray:
     """``d`` (..., 6) with ``T == retract(T_reference, d)``."""
     T, T_reference = np.asarray(T, dtype=np.float64), np.asarray(T_reference, dtype=np.float64)
-    rotation = so3_log(T[..., :3, :3] @ np.swapaxes(T_reference[..., :3, :3], -1, -2))
+    rotation = so3_log(T[..., :3, :3] @ T_reference[..., :3, :3].swapaxes(-1, -2))
     return np.concatenate([T[..., :3, 3] - T_reference[..., :3, 3], rotation], axis=-1)
 
 
@@ -68,7 +68,7 @@ def marker_corners(sizes: npt.ArrayLike) -> FloatArray:
 
 def corners_in_map(T_map_marker: FloatArray, sizes: npt.ArrayLike) -> FloatArray:
     """Corners (..., 4, 3) [m] in the map of markers with poses (..., 4, 4) and ``sizes`` (...)."""
-    corners = marker_corners(sizes) @ np.swapaxes(T_map_marker[..., :3, :3], -1, -2)
+    corners = marker_corners(sizes) @ T_map_marker[..., :3, :3].swapaxes(-1, -2)
     return np.asarray(corners + T_map_marker[..., None, :3, 3])
 
 
@@ -93,8 +93,8 @@ def linearise(
     uv (n, 4, 2), J_camera (n, 8, 6), J_marker (n, 8, 6) [px/m, px/rad], rows u0 v0 u1 v1 ...
     """
     n = len(T_map_camera)
-    R_camera_map = np.swapaxes(T_map_camera[:, :3, :3], -1, -2)[:, None]
-    arms = marker_corners(sizes) @ np.swapaxes(T_map_marker[:, :3, :3], -1, -2)
+    R_camera_map = T_map_camera[:, :3, :3].swapaxes(-1, -2)[:, None]
+    arms = marker_corners(sizes) @ T_map_marker[:, :3, :3].swapaxes(-1, -2)
     points = arms + (T_map_marker[:, :3, 3] - T_map_camera[:, :3, 3])[:, None]
     uv, projection = camera.project_jacobian((R_camera_map @ points[..., None])[..., 0])
     J = projection @ R_camera_map

@@ -79,7 +79,8 @@ def minimise(
     T = np.where(possible[:, None, None], T, _AHEAD)
     cost, gradient, information = evaluated(T)
     possible &= np.isfinite(cost)
-    information[~possible], gradient[~possible] = np.eye(6), 0.0
+    if not possible.all():
+        information[~possible], gradient[~possible] = np.eye(6), 0.0
     damping = np.full(len(T), 1.0 / MOST_DAMPED)
     active = possible
     for steps in range(_MAX_STEPS):
@@ -110,7 +111,7 @@ def costs(T: FloatArray, points: FloatArray, images: Images, inlier: float) -> F
     p = se3.apply(T, points)
     z = p[..., 2:]
     residual = (images.whitening @ (p[..., :2] / np.maximum(z, TINY))[..., None])[..., 0] - images.target
-    squared, _ = robust(np.sum(residual * residual, axis=-1), inlier**2)
+    squared, _ = robust((residual * residual).sum(axis=-1), inlier**2)
     return np.where((z > TINY).all(axis=(1, 2)), squared.sum(axis=-1), np.inf)
 
 
@@ -120,7 +121,7 @@ def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = 
     ``points`` are (B or 1, K, 3) [m] in their bodies. Of a whitened error d, the cost is d^2 up to ``inlier`` and
     ``inlier^2 (1 + 2 log(d / inlier))`` beyond.
     """
-    rotated = points @ np.swapaxes(T[:, :3, :3], -1, -2)
+    rotated = points @ T[:, :3, :3].swapaxes(-1, -2)
     p = rotated + T[:, None, :3, 3]
     z = p[..., 2:]
     seen = (z > TINY).all(axis=(1, 2))
@@ -135,7 +136,7 @@ def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = 
     J[..., :3] = d_p
     np.matmul(d_p, (rotated @ _MINUS_SKEW).reshape(*p.shape, 3), out=J[..., 3:])
     J = J.reshape(len(T), 2 * p.shape[1], 6)
-    squared, weights = robust(np.sum(residual * residual, axis=(-1, -2)), inlier**2)
+    squared, weights = robust((residual * residual).sum(axis=(-1, -2)), inlier**2)
     weighted = np.swapaxes(J if inlier == np.inf else J * np.repeat(weights, 2, axis=-1)[..., None], -1, -2)
     gradient = (weighted @ residual.reshape(len(T), 2 * p.shape[1], 1))[..., 0]
     return np.where(seen, squared.sum(axis=-1), np.inf), gradient, weighted @ J

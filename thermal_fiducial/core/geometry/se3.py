@@ -22,6 +22,7 @@ Real = TypeVar('Real', FloatArray, Float32Array)
 SMALL_ANGLE = 1e-2
 #: (3, 9): vectors (..., 3) times this are their cross-product matrices, row by row.
 SKEW = np.array(((0, 0, 0, 0, 0, -1, 0, 1, 0), (0, 0, 1, 0, 0, 0, -1, 0, 0), (0, -1, 0, 1, 0, 0, 0, 0, 0)), float)
+_EYE = np.eye(3)
 # Of a corner of a quadrilateral, the next and the opposite one.
 _NEXT, _OPPOSITE = np.array([1, 2, 3, 0]), np.array([2, 3, 0, 1])
 
@@ -58,10 +59,10 @@ def so3_exp(phi: npt.ArrayLike) -> FloatArray:
             ]
         )
     # sin(h) / h is 1 to the last digit at the smallest half angle that is divided by.
-    half_angle = np.maximum(0.5 * np.sqrt(np.sum(phi * phi, axis=-1)), TINY)[..., None, None]
+    half_angle = np.maximum(0.5 * np.sqrt((phi * phi).sum(axis=-1)), TINY)[..., None, None]
     sines = np.sin(half_angle) / half_angle
     K = (phi @ SKEW).reshape(*phi.shape, 3)
-    return np.asarray(np.eye(3) + (sines * np.cos(half_angle)) * K + (0.5 * sines * sines) * (K @ K))
+    return np.asarray(_EYE + (sines * np.cos(half_angle)) * K + (0.5 * sines * sines) * (K @ K))
 
 
 def so3_log(R: npt.ArrayLike) -> FloatArray:
@@ -90,18 +91,18 @@ def so3_left_jacobian(phi: FloatArray) -> FloatArray:
         b = (1.0 - math.cos(angle)) / squared
         c = (angle - math.sin(angle)) / (angle * squared)
     K = skew(phi)
-    return np.asarray(np.eye(3) + b * K + c * (K @ K))
+    return np.asarray(_EYE + b * K + c * (K @ K))
 
 
 def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
     """Inverse (..., 3, 3) of J_l with ``exp(phi + d) ~ exp(J_l d) exp(phi)``, for norms below 2 pi (Sola, eq. 146)."""
     phi = np.asarray(phi, dtype=np.float64)
-    squared = np.sum(phi * phi, axis=-1)
+    squared = (phi * phi).sum(axis=-1)
     near = squared < SMALL_ANGLE**2
     a = np.sqrt(np.where(near, 1.0, squared))
     c = np.where(near, 1 / 12 + squared * (1 / 720 + squared / 30240), 1.0 / a**2 - 1.0 / (2.0 * a * np.tan(0.5 * a)))
     K = skew(phi)
-    return np.asarray(np.eye(3) - 0.5 * K + c[..., None, None] * (K @ K))
+    return np.asarray(_EYE - 0.5 * K + c[..., None, None] * (K @ K))
 
 
 def transform(R: npt.ArrayLike, p: npt.ArrayLike) -> FloatArray:
@@ -118,7 +119,7 @@ def transform(R: npt.ArrayLike, p: npt.ArrayLike) -> FloatArray:
 def inverse(T: npt.ArrayLike) -> FloatArray:
     """T_b_a of T_a_b, (..., 4, 4)."""
     T = np.asarray(T, dtype=np.float64)
-    R_transposed = np.swapaxes(T[..., :3, :3], -1, -2)
+    R_transposed = T[..., :3, :3].swapaxes(-1, -2)
     return transform(R_transposed, -(R_transposed @ T[..., :3, 3:])[..., 0])
 
 
@@ -126,7 +127,7 @@ def apply(T: npt.ArrayLike, points: npt.ArrayLike) -> FloatArray:
     """Points (..., N, 3) in b moved to a by T_a_b (..., 4, 4)."""
     T = np.asarray(T, dtype=np.float64)
     points = np.asarray(points, dtype=np.float64)
-    return np.asarray(points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
+    return np.asarray(points @ T[..., :3, :3].swapaxes(-1, -2) + T[..., None, :3, 3])
 
 
 def rigid_alignment(target: npt.ArrayLike, source: npt.ArrayLike) -> FloatArray:
@@ -147,7 +148,7 @@ def rotation_from_quaternion(q_xyzw: npt.ArrayLike) -> FloatArray:
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     v, w = q[..., :3], q[..., 3]
     K = skew(v)
-    return np.asarray(np.eye(3) + 2.0 * (w[..., None, None] * K + K @ K))
+    return np.asarray(_EYE + 2.0 * (w[..., None, None] * K + K @ K))
 
 
 def quaternion_from_rotation(R: npt.ArrayLike) -> FloatArray:

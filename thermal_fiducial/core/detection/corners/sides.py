@@ -123,8 +123,8 @@ def columns_across(
     slope = slope[columns // 2]
     inward = np.sign(opposite_upright[:, 1:] - slope * opposite_upright[:, :1])
     pitch = inward / np.sqrt(1.0 + slope * slope)
-    normal = np.stack([-slope * pitch, pitch], axis=-1)
-    normal = np.where(steep[..., None], normal[..., ::-1], normal)
+    normal = np.array([-slope * pitch, pitch])
+    normal = np.where(steep, normal[::-1], normal).transpose(1, 2, 0)
     half = min(max(math.ceil(_REACHES * blur_px + 1.0), _SHORTEST), _LONGEST)
     base, offsets = np.rint(centre), np.arange(-half, half + 1)[:, None, None, None]
     fresh, inside = _seen(whole, base, steep, nodes, shape, half)
@@ -268,7 +268,7 @@ def _blurred_sides(
     distance, sharpness = sides.distance - blur.inward.astype(np.float32), (1.0 / blur.across).astype(np.float32)
     t = (sides.t - blur.onward / sides.along).astype(np.float32)
     # Blurred along the side, the share is less than 1 near the ends.
-    z = np.stack([t, 1.0 - t]) * (sides.along / blur.along).astype(np.float32)
+    z = np.array([t, 1.0 - t]) * (sides.along / blur.along).astype(np.float32)
     own = 0.5 * np.tanh(z * (z * z * _CUBIC + _LINEAR)).sum(axis=0)
     value, slope = blurred_step(distance, sharpness, -own)
     if len(overlapping):

@@ -103,5 +103,5 @@ def squareness(x: FloatArray, inverse: FloatArray) -> tuple[FloatArray, FloatArr
     sides = corners[:, 1::2] - corners[:, :1]
     products = sides @ sides.swapaxes(1, 2)
     both, first, second = products[:, 0, 1], products[:, 0, 0], products[:, 1, 1]
-    value = (np.stack([2.0 * both, first - second]) / (first + second)).reshape(2, -1, 9).swapaxes(0, 1)
+    value = (np.array([2.0 * both, first - second]) / (first + second)).reshape(2, -1, 9).swapaxes(0, 1)
     return value[..., :1], (value[..., 1:] - value[..., :1]) / _STEP_PX
