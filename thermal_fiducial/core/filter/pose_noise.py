@@ -30,6 +30,8 @@ _WHITE_AT_FIRST = 1.0
 _JITTER_RANGE, _VIBRATION_RANGE, _MEMORY = (1e-8, 2.5e-5), (1e-10, 1e-4), 300.0
 #: Weight of the initial values, as information about their logarithms; limit of the normalised squared innovation.
 _PRIOR, _LARGEST_SQUARE = 5.0, 9.0
+#: Least share of the variance of a component that the others leave unexplained.
+_LEAST_INDEPENDENT = 1e-12
 #: Least covariance of a pose: rounding of float32 corners [rad, m].
 _ROUNDING = np.diag(np.repeat([1e-5, 3e-5], 3) ** 2)
 
@@ -70,11 +72,19 @@ class BodyPose:
         """
         if not self.map_covariance.any():
             return np.zeros((6, 6))
-        turn = np.zeros((6, 6))
-        turn[:3, 3:] = turn[3:, :3] = self.T_map_body[:3, :3].T
-        then, now = (turn @ pose.map_covariance @ turn.T for pose in (last, self))
+        then, now = self._in_robot_frame(last.map_covariance), self.of_map
         same = math.exp(2.0 * log_overlap(then + self.shape, now + self.shape))
         return np.asarray((1.0 - same) * now)
+
+    @property
+    def of_map(self) -> FloatArray:
+        """(6, 6) ``map_covariance`` in the conventions of ``covariance``."""
+        return self._in_robot_frame(self.map_covariance)
+
+    def _in_robot_frame(self, map_covariance: FloatArray) -> FloatArray:
+        turn = np.zeros((6, 6))
+        turn[:3, 3:] = turn[3:, :3] = self.T_map_body[:3, :3].T
+        return turn @ map_covariance @ turn.T
 
     def in_moved_map(self, T_new_old: FloatArray) -> 'BodyPose':
         """The same in a map whose coordinates are moved by ``T_new_old`` (4, 4)."""
@@ -89,6 +99,28 @@ def log_overlap(A: FloatArray, B: FloatArray) -> float:
     """Logarithm, at most 0, of the Bhattacharyya coefficient of two zero-mean Gaussians, covariances (m, m)."""
     determinants = np.linalg.slogdet(np.stack((A, B, 0.5 * (A + B))))[1]
     return min(float(0.25 * (determinants[0] + determinants[1]) - 0.5 * determinants[2]), 0.0)
+
+
+def share_that_stays(earlier: FloatArray, claimed: FloatArray) -> FloatArray:
+    """Gain (6, 6) from an earlier systematic error to that of a pose, which is at most what the pose claims.
+
+    Where the pose claims less than the earlier error is large, it is from more: other markers, a motion that is known
+    by now. An estimate from more has its own covariance B in common with one from a part of it, whose covariance is A
+    (the better one cannot be improved by the other). So B / A of the earlier error stays, along each axis.
+
+    Parameters
+    ----------
+    earlier : (6, 6) covariance of the systematic error so far
+    claimed : (6, 6) of the pose's systematic errors
+    """
+    stds = np.sqrt(claimed.diagonal())
+    # Rounding may make correlations indefinite, where an unknown rotation is carried over a lever arm.
+    values, vectors = np.linalg.eigh(claimed / np.outer(stds, stds))
+    roots = np.sqrt(np.maximum(values, _LEAST_INDEPENDENT))
+    from_units, to_units = stds[:, None] * vectors * roots, (vectors / roots).T / stds
+    # In units of the claim, along the axes in which both are diagonal.
+    variances, axes = np.linalg.eigh(to_units @ earlier @ to_units.T)
+    return np.asarray((from_units @ axes / np.maximum(variances, 1.0)) @ axes.T @ to_units)
 
 
 class LearnedVariance(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.filter.imu_buffer import MotionAtPose
 from thermal_fiducial.core.filter.kalman import ExtendedKalmanFilter
-from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, WhiteUnits
+from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, share_that_stays, WhiteUnits
 from thermal_fiducial.core.filter.state import (
     Estimate,
     EXTRINSICS,
@@ -141,11 +141,16 @@ def _in_view(config: PoseEkfConfig, estimate: Estimate, pose: BodyPose) -> Estim
     """The estimate with the systematic error of poses propagated to the view of ``pose``: first-order Markov."""
     last = estimate.pose_noise.last
     alike = pose.correlation(last, config.systematic_angle)
+    of_view = config.systematic_pose_std**2 * pose.shape
+    # Changes of the map's error are in the systematic error too.
+    most = of_view + pose.of_map
     P = estimate.covariance.copy()
-    P[SYSTEMATIC] *= alike
-    P[:, SYSTEMATIC] *= alike
-    P[SYSTEMATIC, SYSTEMATIC] += (1.0 - alike**2) * config.systematic_pose_std**2 * pose.shape + pose.map_change(last)
-    state = replace(estimate.state, systematic=alike * estimate.state.systematic)
+    stays = share_that_stays(P[SYSTEMATIC, SYSTEMATIC], most)
+    kept = alike * stays
+    P[SYSTEMATIC] = kept @ P[SYSTEMATIC]
+    P[:, SYSTEMATIC] = P[:, SYSTEMATIC] @ kept.T
+    P[SYSTEMATIC, SYSTEMATIC] += (1.0 - alike**2) * of_view + alike**2 * (most - stays @ most) + pose.map_change(last)
+    state = replace(estimate.state, systematic=kept @ estimate.state.systematic)
     return replace(estimate, state=state, covariance=P)
 
 

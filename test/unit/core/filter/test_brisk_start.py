@@ -1,8 +1,10 @@
-"""Initialisation in brisk motion while the clock offset is still unknown."""
+"""Initialisation in brisk motion while the clock offset is still unknown, and from poses that claim little."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.flights import Flight, Motion, run, timeline, white_poses
+from support.flights import config, Flight, Motion, run, timeline, white_poses
 
 from thermal_fiducial.core.filter.ekf import PoseEkf
 
@@ -31,3 +33,21 @@ def test_a_start_in_brisk_motion_is_right_at_once(seed, pose_rate):
     error = ekf.camera_time_offset - OFFSET
     assert abs(error) < 3.0 * ekf.diagnostics()['time offset std']
     assert len(states) > 400
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_first_poses_that_claim_little_cost_nothing_later(seed):
+    """Motion blur of the first two images is not known yet, their poses claim seven times as much along one axis."""
+    flight = Flight(seed, 2.0, Motion.still(), rotation_std=(1e-3,) * 3, translation_std=(1e-3, 1e-3, 5e-3))
+    blurred, clear = flight.poses[:2], flight.poses[2:]
+    for k, pose in enumerate(blurred):
+        along_z = pose.covariance[:, 2]
+        wider = pose.covariance + 48.0 * np.outer(along_z, along_z) / along_z[2]
+        blurred[k] = replace(pose, covariance=wider)
+    claims = []
+    for poses in (blurred + clear, clear):
+        ekf = PoseEkf(config())
+        run(ekf, timeline(flight.samples(), poses, LATE))
+        claims.append(ekf.estimate.position_std)
+    # Measured 0.99 to 1.003; 1.06 to 1.11 where the error of the first poses was taken for one of all poses.
+    assert claims[0] < 1.02 * claims[1]

@@ -8,7 +8,7 @@ from support.estimates import any_estimate, ELSEWHERE
 from support.flights import CAMERA_POSITION, config
 
 from thermal_fiducial.core.filter.imu_buffer import MotionAtPose
-from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, WHITE
+from thermal_fiducial.core.filter.pose_noise import BodyPose, PoseNoise, share_that_stays, WHITE
 from thermal_fiducial.core.filter.state import (
     CORE,
     EXTRINSICS,
@@ -263,6 +263,45 @@ def test_the_map_has_the_same_error_while_its_covariance_is_the_same():
     other_markers = replace(here, map_covariance=1e4 * of_map)
     # Nothing is left of the former error: rotation before position, in the robot frame, as isotropic as in the map.
     np.testing.assert_allclose(other_markers.map_change(here), np.diag(np.repeat((1.0, 4.0), 3)), rtol=1e-4, atol=1e-6)
+
+
+def test_what_stays_of_an_error_is_what_a_better_estimate_has_in_common_with_it():
+    """Least squares from some measurements, and from these and others: errors with the covariances that follow."""
+    rng = np.random.default_rng(5)
+    some, others = rng.normal(size=(9, 6)), rng.normal(size=(7, 6))
+    every = np.concatenate((some, others))
+    then, now = np.linalg.pinv(some), np.linalg.pinv(every)
+    earlier, claimed, common = then @ then.T, now @ now.T, now[:, :9] @ then.T
+    # rounding
+    np.testing.assert_allclose(
+        share_that_stays(earlier, claimed), common @ np.linalg.inv(earlier), rtol=1e-9, atol=1e-9
+    )
+    # The other way round the pose has all of the error.
+    np.testing.assert_allclose(share_that_stays(claimed, earlier), np.eye(6), atol=1e-9)
+
+
+def test_what_rounding_makes_of_a_large_covariance_is_no_reason_to_fail():
+    """A single error of a variance of 1e8, the largest accepted: beside it, rounding leaves nothing of a millimetre."""
+    error = np.arange(1.0, 7.0)
+    claimed = 1e8 * np.outer(error, error) / 36.0 + 1e-10 * np.eye(6)
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(claimed)
+    # Along the error a quarter, to what is left of sixteen digits of variances.
+    np.testing.assert_allclose(share_that_stays(4.0 * claimed, claimed) @ error, 0.25 * error, rtol=1e-3)
+
+
+@pytest.mark.parametrize('of_map', [0.0, 4e-4])
+def test_the_systematic_error_is_never_larger_than_a_pose_claims(estimate, still, of_map):
+    """A pose whose motion blur is not known yet claims twice as much as the next one; errors of the map add up."""
+    now = BodyPose(estimate.state.T_map_body, 1e-4 * np.eye(6), of_map * np.eye(6))
+    vague = replace(now, covariance=4.0 * now.covariance)
+    covariance = 1e-12 * np.eye(SIZE)
+    covariance[SYSTEMATIC, SYSTEMATIC] = vague.shape
+    seen = replace(estimate, covariance=covariance, pose_noise=PoseNoise.of(vague))
+    kept = innovation_of(FULL, seen, now, still).prior.covariance[SYSTEMATIC, SYSTEMATIC]
+    # The map's change since the last pose is new, and small: both are in the same view.
+    most = now.shape + now.of_map + now.map_change(vague)
+    assert np.linalg.eigvalsh(most - kept).min() > -1e-12
 
 
 def test_what_another_error_of_the_map_makes_of_a_pose_is_not_taken_for_motion(estimate, still):
