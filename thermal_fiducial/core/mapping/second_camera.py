@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from thermal_fiducial.core.error_model import CHI2_OF_POSE
-from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract
+from thermal_fiducial.core.geometry.reprojection import difference, lever_arm, retract, turned
 from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.second_clock import SecondClock
 from thermal_fiducial.core.measurements import CameraPose
@@ -61,7 +61,7 @@ class SecondCamera:
         in_clock = self._in_clock_of_first(waiting, pose.stamp_ns, prior)
         if in_clock is None:
             return pose
-        there, velocity = in_clock
+        there, moved, velocity = in_clock
         joint = intersection(pose, there)
         if joint is None:
             self.contradicted += 1
@@ -69,21 +69,25 @@ class SecondCamera:
             return pose
         self.joined += 1
         apart = difference(there.T_map_camera, pose.T_map_camera)
-        self.clock.add(pose.stamp_ns, apart, velocity, pose.covariance + waiting.covariance)
+        self.clock.add(pose.stamp_ns, apart, velocity, pose.covariance + moved.covariance)
         return joint
 
     def _in_clock_of_first(
         self, pose: CameraPose, stamp_ns: int, prior: MotionPrior
-    ) -> tuple[CameraPose, FloatArray] | None:
-        """A pose of the second camera at ``stamp_ns`` of the first one's clock, and the velocity (6,) there."""
+    ) -> tuple[CameraPose, CameraPose, FloatArray] | None:
+        """A pose of the second camera at ``stamp_ns`` of the first one's clock, and the velocity (6,) there.
+
+        First with the error of the clock in its covariance, then without it.
+        """
         instant_ns = pose.stamp_ns + round(self.clock.seconds * SECOND_NS)
-        # No offset of the clocks widens these: it moves both ends alike.
-        then, now = (predicted_camera(prior, at_ns, self._T_body_first, 0.0) for at_ns in (instant_ns, stamp_ns))
-        there = moved_by_odometry(replace(pose, stamp_ns=instant_ns), stamp_ns, then, now)
-        if there is None:
+        middle_ns = (instant_ns + stamp_ns) // 2
+        # No offset of the clocks widens this: it moves both ends alike.
+        middle = predicted_camera(prior, middle_ns, self._T_body_first, 0.0)
+        moved = moved_by_odometry(replace(pose, stamp_ns=instant_ns), stamp_ns, middle)
+        if moved is None:
             return None
-        velocity = np.zeros(6) if now is None else now.velocity
-        return replace(there, covariance=there.covariance + self.clock.covariance(velocity)), velocity
+        velocity = np.zeros(6) if middle is None else middle.velocity
+        return replace(moved, covariance=moved.covariance + self.clock.covariance(velocity)), moved, velocity
 
 
 def seen_from(pose: CameraPose, T_camera_other: FloatArray) -> CameraPose:
@@ -109,13 +113,16 @@ def intersection(first: CameraPose, second: CameraPose) -> CameraPose | None:
     return replace(first, T_map_camera=T_map_camera, covariance=0.5 * (covariance + covariance.T))
 
 
-def moved_by_odometry(
-    pose: CameraPose, stamp_ns: int, then: PredictedCamera | None, now: PredictedCamera | None
-) -> CameraPose | None:
-    """``pose`` at another stamp, moved as the odometry has moved from ``then``; None where there is none near both."""
+def moved_by_odometry(pose: CameraPose, stamp_ns: int, middle: PredictedCamera | None) -> CameraPose | None:
+    """``pose`` at another stamp, moved by the velocity of the odometry in the ``middle``; None where there is none.
+
+    By one state of the odometry: between two states the filter may have corrected its pose, which is no motion.
+    """
     if stamp_ns == pose.stamp_ns:
         return pose
-    if then is None or now is None:
+    if middle is None:
         return None
-    T_then_now = inverse(then.pose.T_map_camera) @ now.pose.T_map_camera
-    return replace(pose, stamp_ns=stamp_ns, T_map_camera=pose.T_map_camera @ T_then_now)
+    seconds, state = (stamp_ns - pose.stamp_ns) / SECOND_NS, middle.odometry
+    there = retract(pose.T_map_camera, seconds * middle.velocity)
+    of_velocity = seconds**2 * turned(state.twist_covariance, state.T_map_body[:3, :3])
+    return replace(pose, stamp_ns=stamp_ns, T_map_camera=there, covariance=pose.covariance + of_velocity)

@@ -93,6 +93,33 @@ def test_a_pose_of_another_instant_is_carried_by_the_odometry(lead_ms):
     np.testing.assert_allclose(joint.T_map_camera, truth, atol=1e-6)
 
 
+@pytest.mark.parametrize('middle_ms', [92, 88])
+def test_a_correction_of_the_filter_is_no_motion(middle_ms):
+    """The odometry jumps by 5 cm between the instants of the two frames; nothing moves."""
+    cameras, prior = SecondCamera(T_BODY_FIRST, T_BODY_SECOND), MotionPrior()
+    for k in range(41):
+        T = transform(np.eye(3), [0.05 * (5 * k > middle_ms), 0.0, 0.0])
+        prior.add(5 * MS * k, Odometry(5 * MS * k, T, np.zeros(3), np.zeros(3), 1e-6 * np.eye(6), 1e-6 * np.eye(6)))
+    cameras.with_second(pose(30 * MS, T_BODY_FIRST), prior)
+    cameras.add_second(second_pose(80 * MS, np.eye(4)), prior)
+    joint = cameras.with_second(pose(100 * MS, T_BODY_FIRST), prior)
+    np.testing.assert_allclose(joint.T_map_camera, T_BODY_FIRST, atol=1e-9)
+
+
+def test_a_pose_that_is_carried_by_an_uncertain_velocity_claims_it():
+    """A filter that has just begun: 1 m/s of doubt, 2 cm in 20 ms."""
+    cameras, prior = SecondCamera(T_BODY_FIRST, T_BODY_SECOND), MotionPrior()
+    unsure = np.diag([1.0] * 3 + [1e-6] * 3)
+    for k in range(41):
+        prior.add(5 * MS * k, Odometry(5 * MS * k, np.eye(4), np.zeros(3), np.zeros(3), 1e-6 * np.eye(6), unsure))
+    cameras.with_second(pose(30 * MS, T_BODY_FIRST), prior)
+    vague = (1.0,) * 6
+    cameras.add_second(second_pose(80 * MS, np.eye(4), (1e-8,) * 6), prior)
+    joint = cameras.with_second(pose(100 * MS, T_BODY_FIRST, vague), prior)
+    # Half the information of each, the first's is nothing: twice (1 m/s x 20 ms)^2, and 2e-8 of the lever arm.
+    np.testing.assert_allclose(np.diag(joint.covariance)[:3], 2.0 * 0.02**2, rtol=2e-3)
+
+
 def test_each_pose_counts_once_and_an_old_one_not_at_all():
     cameras = SecondCamera(T_BODY_FIRST, T_BODY_SECOND)
     cameras.with_second(pose(0, T_BODY_FIRST), flying(0.0))
