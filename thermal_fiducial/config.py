@@ -853,6 +853,11 @@ NODES: dict[str, type] = {
     'pose_ekf': PoseEkfConfig,
 }
 
+#: The nodes that each camera has.
+OF_CAMERA = ('tau2_camera', 'aruco_detector')
+#: Topics of the first camera's nodes that those of a second camera, in a namespace of its own, use as well.
+SHARED_WITH_SECOND_CAMERA = ('marker_map', 'odometry', 'camera_clock')
+
 #: Optional nodes beside the pipeline.
 OPTIONAL_NODES: dict[str, type] = {'thermal_source': ThermalSourceConfig, 'landing_target': LandingTargetConfig}
 

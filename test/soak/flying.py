@@ -13,7 +13,7 @@ from thermal_fiducial.files.marker_map import load_map
 from thermal_fiducial.replay.job import ReplayJob
 from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
-from thermal_fiducial.replay.topics import ENTRIES
+from thermal_fiducial.replay.topics import ENTRIES, PLAYED
 
 
 def soak(
@@ -38,7 +38,8 @@ def soak(
         meter = Meter(errors, lambda: node_processes(NODES), say)
         play = partial(replay_processes, rate=1.0, say=say)
     recorded = ENTRIES['images'].recorded(calibration_from_file=False, images=False)
-    play(ReplayJob(laps, tuple(NODES), TOPICS, errors, recorded, arguments, meter, lines.append))
+    played = {topic: PLAYED[topic] for topic in TOPICS}
+    play(ReplayJob(laps, tuple(NODES), played, errors, recorded, arguments, meter, lines.append))
     saved = sorted(load_map(map_file).markers)
     expected = [marker.id for marker in laps.scenario.markers]
     if saved != expected:

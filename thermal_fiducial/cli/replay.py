@@ -37,6 +37,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--rate', type=float, default=1.0, metavar='X', help='speed of --transport processes, in multiples of real time'
     )
+    parser.add_argument(
+        '--second-camera',
+        default='',
+        metavar='NAME',
+        help='play a second camera too, whose topics are in the namespace NAME: NAME/thermal/image_raw (default: none)',
+    )
     parser.add_argument('--remap', action='append', default=[], metavar='FROM:=TO', help='rename a topic of the bag')
     parser.add_argument('--images', action='store_true', help='record the cleaned images too (as large as the bag)')
     parser.add_argument(
@@ -68,6 +74,7 @@ def run(args: argparse.Namespace) -> int:
         rate=args.rate,
         images=args.images,
         entry=args.entry,
+        second_camera=args.second_camera.strip('/'),
         remaps=parse_remaps(args.remap),
     )
     started = time.monotonic()

@@ -32,6 +32,8 @@ CAMERA_POSE_TOPIC = 'camera_pose'
 MAP_ERROR_TOPIC = 'camera_pose/map_error'
 TRUTH_TOPIC = 'ground_truth/odometry'
 
+#: Topics that a second camera has in its namespace.
+_OF_CAMERA = (IMAGE_TOPIC, COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, MARKERS_TOPIC)
 #: Names that are resolved in any namespace of the bag.
 INTERFACE_TOPICS = (IMAGE_TOPIC, COMPRESSED_TOPIC, CAMERA_INFO_TOPIC, IMU_TOPIC, TRUTH_TOPIC)
 #: The same for outputs of the nodes. Other topics may have the same ending (``marker_map/markers``), so these names
@@ -72,11 +74,13 @@ class BagMessage:
             raise InputError(f'{self.topic} at {self.stamp_ns}: no {self.msgtype}: {one_line(error)}') from None
 
 
-def resolve_topics(recorded: Iterable[str], remap: Mapping[str, str] | None = None) -> dict[str, str]:
+def resolve_topics(
+    recorded: Iterable[str], remap: Mapping[str, str] | None = None, second_camera: str = ''
+) -> dict[str, str]:
     """Recorded topic to interface name.
 
     A remapped topic gets its new name. Otherwise ``/any/namespace/imu/data`` becomes ``imu/data`` unless the bag has
-    that name itself; every other topic only loses its leading slash.
+    that name itself; every other topic only loses its leading slash. Topics of a second camera keep its name.
 
     Raises
     ------
@@ -89,8 +93,9 @@ def resolve_topics(recorded: Iterable[str], remap: Mapping[str, str] | None = No
         if source not in plain:
             raise InputError(f'no topic {source} to remap; the bag has: {", ".join(sorted(plain)) or "none"}')
     names = {topic: renamed.get(name, name) for name, topic in plain.items()}
-    for wanted in (*INTERFACE_TOPICS, *_COMMON_NAMES):
-        matches = [topic for topic, name in names.items() if name.endswith('/' + wanted)]
+    seconds = [f'{second_camera}/{topic}' for topic in _OF_CAMERA] if second_camera else []
+    for wanted in (*seconds, *INTERFACE_TOPICS, *_COMMON_NAMES):
+        matches = [topic for topic, name in names.items() if name.endswith('/' + wanted) and name not in seconds]
         if wanted in _COMMON_NAMES:
             matches = [topic for topic in matches if not names[topic].endswith('marker_map/markers')]
         if wanted in names.values() or (wanted in _COMMON_NAMES and len(matches) > 1):
@@ -128,6 +133,7 @@ class BagReader:
     ----------
     path : a rosbag2 folder, a single ``.mcap`` or ``.db3`` file, or a ROS 1 ``.bag``
     remap : topic of the bag to interface name
+    second_camera : namespace of a second camera in the bag; empty: none
 
     Raises
     ------
@@ -135,9 +141,9 @@ class BagReader:
         On entering and while reading: missing, empty, truncated or otherwise unreadable bag, ambiguous topics.
     """
 
-    def __init__(self, path: str | Path, remap: Mapping[str, str] | None = None) -> None:
+    def __init__(self, path: str | Path, remap: Mapping[str, str] | None = None, *, second_camera: str = '') -> None:
         self.path = Path(path)
-        self._remap = remap
+        self._remap, self._second_camera = remap, second_camera
         self._typestore = get_typestore(Stores.ROS2_JAZZY)
         self._names: dict[str, str] = {}
         self._reader: Rosbag1Reader | Rosbag2Reader | None = None
@@ -162,7 +168,8 @@ class BagReader:
             check_announced(self.path, reader)
             if reader.message_count == 0:
                 raise InputError(f'{self.path}: the bag is empty')
-            self._names = resolve_topics({connection.topic for connection in reader.connections}, self._remap)
+            recorded = {connection.topic for connection in reader.connections}
+            self._names = resolve_topics(recorded, self._remap, self._second_camera)
         except InputError:
             reader.close()
             raise

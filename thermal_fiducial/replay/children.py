@@ -10,6 +10,7 @@ import time
 from typing import Self
 
 from thermal_fiducial.errors import InputError, RunError
+from thermal_fiducial.replay.own_namespace import kind_of, own_arguments
 
 #: Idle time after SIGINT beyond which a node counts as hung [s].
 _IDLE_S = 15.0
@@ -23,7 +24,7 @@ class NodeProcesses:
     Parameters
     ----------
     domain_id : DDS domain
-    nodes : names of the nodes
+    nodes : names of the nodes, those of a second camera with its namespace
     ros_arguments : for the nodes, after ``--ros-args``
     folder : for what the nodes print, and for the log files of ROS unless the user has set another place for them
     """
@@ -43,7 +44,8 @@ class NodeProcesses:
         return self
 
     def _start(self, node: str) -> None:
-        command = [sys.executable, '-m', f'thermal_fiducial.nodes.{node}', *self._arguments]
+        module = f'thermal_fiducial.nodes.{kind_of(node)}'
+        command = [sys.executable, '-m', module, *self._arguments, *own_arguments(node)]
         with self._log(node).open('ab') as log:
             self._processes[node] = subprocess.Popen(
                 command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
@@ -92,7 +94,7 @@ class NodeProcesses:
         return {node: _cpu_seconds(process.pid) for node, process in self._processes.items()}
 
     def _log(self, node: str) -> Path:
-        return self._folder / f'{node}.txt'
+        return self._folder / f'{node.replace("/", "_")}.txt'
 
 
 def _await_end(process: subprocess.Popen[bytes]) -> str:

@@ -14,8 +14,8 @@ class ReplayJob:
     Parameters
     ----------
     bag : the bag, open
-    nodes : names of the nodes to run
-    played : topics to play
+    nodes : names of the nodes to run, those of a second camera with its namespace
+    played : the topics to play
     files : sink of the published messages
     recorded : the topics to record
     ros_arguments : for the nodes, after ``--ros-args``
@@ -25,7 +25,7 @@ class ReplayJob:
 
     bag: Playable
     nodes: Sequence[str]
-    played: Sequence[str]
+    played: Topics
     files: Sink
     recorded: Topics
     ros_arguments: Sequence[str]

@@ -22,8 +22,8 @@ from thermal_fiducial.nodes.pose_ekf import PoseEkfNode
 from thermal_fiducial.nodes.tau2_camera import Tau2Camera
 from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.replay.job import ReplayJob
+from thermal_fiducial.replay.own_namespace import kind_of, own_arguments
 from thermal_fiducial.replay.recorder import Recorder
-from thermal_fiducial.replay.topics import PLAYED
 from thermal_fiducial.replay.waiting import Wait
 from thermal_fiducial.ros.base.counting import CountingNode
 from thermal_fiducial.ros.base.node import StageNode
@@ -75,10 +75,10 @@ class _Graph:
         quiet: dict[str, Any] = {'context': context, 'enable_rosout': False, 'start_parameter_services': False}
         self._stages: list[StageNode[Any]] = []
         for name in job.nodes:
-            make: Callable[..., StageNode[Any]] = _KINDS[name]
-            self._stages.append(make(live=False, **quiet))
+            make: Callable[..., StageNode[Any]] = _KINDS[kind_of(name)]
+            self._stages.append(make(live=False, cli_args=['--ros-args', *own_arguments(name)], **quiet))
         player = CountingNode('player', use_global_arguments=False, **quiet)
-        self._played = {topic: player.advertise(PLAYED[topic][0], topic, PLAYED[topic][1]) for topic in job.played}
+        self._played = {topic: player.advertise(kind, topic, profile) for topic, (kind, profile) in job.played.items()}
         recorder = Recorder(self._take, job.recorded, use_global_arguments=False, **quiet)
         self._nodes: list[CountingNode] = [*self._stages, player, recorder]
         self._inputs = [source for node in self._nodes for source in node.inputs]
@@ -105,7 +105,7 @@ class _Graph:
                 self._diagnose(next_diagnosis)
                 self._job.progress(next_diagnosis - bag.start_ns)
                 next_diagnosis += SECOND_NS
-            _check(message)
+            _check(message, self._job.played[message.topic][0])
             self._played[message.topic].send(message.cdr)
             self._settle(message.stamp_ns)
             last_ns = message.stamp_ns
@@ -165,9 +165,9 @@ class _Graph:
                 ending.callback(stage.close)
 
 
-def _check(message: BagMessage) -> None:
-    """Raise InputError for a malformed message, which DDS would drop silently."""
+def _check(message: BagMessage, kind: type) -> None:
+    """Raise InputError for a message that is no ``kind``, which DDS would drop silently."""
     try:
-        deserialize_message(message.cdr, PLAYED[message.topic][0])
+        deserialize_message(message.cdr, kind)
     except Exception:  # rclpy's own error class is private
         raise InputError(f'message on {message.topic} recorded at {message.stamp_ns} cannot be decoded') from None

@@ -25,7 +25,6 @@ from thermal_fiducial.replay.domain import own_domain
 from thermal_fiducial.replay.job import ReplayJob
 from thermal_fiducial.replay.latency import LatencyMeter
 from thermal_fiducial.replay.recorder import Recorder
-from thermal_fiducial.replay.topics import PLAYED
 from thermal_fiducial.replay.waiting import Wait
 from thermal_fiducial.ros.base.counting import CountingNode
 from thermal_fiducial.ros.process.promptness import prompt
@@ -122,7 +121,7 @@ class _Player:
         self._player = CountingNode('player', **quiet)
         self._recorder = Recorder(self._take, job.recorded, **quiet)
         self._outputs = {
-            topic: self._player.advertise(PLAYED[topic][0], topic, PLAYED[topic][1]) for topic in job.played
+            topic: self._player.advertise(kind, topic, profile) for topic, (kind, profile) in job.played.items()
         }
         self._executor = make_executor(context)
         self._executor.add_node(self._player)

@@ -1,6 +1,6 @@
 """A replay from start to end: validate the inputs, play, write the run folder."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 import json
@@ -20,7 +20,7 @@ from thermal_fiducial.replay.lockstep import replay_lockstep
 from thermal_fiducial.replay.processes import replay_processes
 from thermal_fiducial.replay.recorder import refuse_folder_in_use, RunFiles
 from thermal_fiducial.replay.settings import read_settings, Settings
-from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED
+from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED, Topics, type_name
 from thermal_fiducial.ros.frames.robot_frames import camera_in_body
 
 MAP_FILE, SUMMARY_FILE = 'marker_map.yaml', 'summary.json'
@@ -40,6 +40,8 @@ class Options:
     images: bool = False
     #: a key of ENTRIES: stage at which the bag enters; empty: the earliest possible
     entry: str = ''
+    #: namespace of a second camera in the bag, which is played too; empty: the first camera alone
+    second_camera: str = ''
     remaps: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -69,43 +71,65 @@ def replay(
         removed, except parameters and map.
     """
     settings = _settings(options, warn)
-    from_file = bool(settings.tau2_camera.calibration_file)
-    with BagReader(options.bag, options.remaps) as bag:
+    with BagReader(options.bag, options.remaps, second_camera=options.second_camera) as bag:
         entry = ENTRIES[options.entry] if options.entry else entry_of(bag.topics)
-        played = entry.played(calibration_from_file=from_file)
-        bag.require(played)
-        also = [topic for topic in entry.also if topic in bag.topics]
+        nodes, played, recorded = _cast(entry, settings, images=options.images)
+        bag.require({topic: type_name(kind) for topic, (kind, _) in played.items()})
+        also = {topic: PLAYED[topic] for topic in entry.also if topic in bag.topics}
         settings = _with_transport(settings, entry)
         arguments = _prepare(options, settings, entry, warn)
-        recorded = entry.recorded(calibration_from_file=from_file, images=options.images)
         with into(options.run), RunFiles(options.run, camera_in_body(settings.pose_ekf), recorded) as files:
             in_real_time = partial(replay_processes, rate=options.rate, say=say)
             play = in_real_time if options.transport == 'processes' else replay_lockstep
             done = partial(_show_share, progress, max(bag.duration_ns, 1))
-            job = ReplayJob(bag, entry.nodes, (*also, *played), files, recorded, arguments, done, warn)
+            job = ReplayJob(bag, nodes, also | played, files, recorded, arguments, done, warn)
             timing = play(job)
-            _report_refusals(files, entry, warn)
-        _report_silence(files, entry, warn)
+            _report_refusals(files, entry, nodes, warn)
+        _report_silence(files, nodes, warn)
         marker_map = _final_map(options.run / MAP_FILE, settings.marker_mapper)
-        summary = _summary(options, settings, bag, files) | {'markers_in_map': len(marker_map.markers)} | timing
+        summary = _summary(options, settings, bag, played, files) | {'markers_in_map': len(marker_map.markers)} | timing
     write_text(options.run / SUMMARY_FILE, json.dumps(summary, indent=2) + '\n')
     return summary
+
+
+def _cast(entry: Entry, settings: Settings, *, images: bool) -> tuple[tuple[str, ...], Topics, Topics]:
+    """The nodes to run, the topics that the bag must have, and the topics to record.
+
+    Raises
+    ------
+    InputError
+        A second camera of a bag that begins behind the cameras.
+    """
+    from_file = bool(settings.tau2_camera.calibration_file)
+    played = entry.played(calibration_from_file=from_file)
+    recorded = entry.recorded(calibration_from_file=from_file, images=images)
+    if settings.second is None:
+        return entry.nodes, played, recorded
+    if not entry.needs_calibration:
+        raise InputError('a second camera (--second-camera): camera poses are already those of all cameras')
+    name, from_file = settings.marker_mapper.second_camera, bool(settings.second[0].calibration_file)
+    played |= entry.played_of_second(name, calibration_from_file=from_file)
+    recorded |= entry.recorded_of_second(name, calibration_from_file=from_file)
+    return (*entry.nodes, *entry.nodes_of_second(name)), played, recorded
 
 
 def _show_share(progress: Callable[[float], None], duration_ns: int, time_ns: int) -> None:
     progress(min(1.0, time_ns / duration_ns))
 
 
-def _report_silence(files: RunFiles, entry: Entry, warn: Callable[[str], None]) -> None:
+def _report_silence(files: RunFiles, nodes: Sequence[str], warn: Callable[[str], None]) -> None:
     if not files.counts['pose']:
-        reasons = '; '.join(f'{node}: {files.complaints[node]}' for node in entry.nodes if node in files.complaints)
+        reasons = '; '.join(f'{node}: {files.complaints[node]}' for node in nodes if node in files.complaints)
         warn(f'no pose went out. {reasons}')
 
 
 def _with_transport(settings: Settings, entry: Entry) -> Settings:
     """The settings with the image transport of the bag."""
     transport = 'compressed' if entry.topic == COMPRESSED_TOPIC else 'raw'
-    return replace(settings, tau2_camera=replace(settings.tau2_camera, image_transport=transport))
+    second = settings.second
+    if second is not None:
+        second = (replace(second[0], image_transport=transport), second[1])
+    return replace(settings, tau2_camera=replace(settings.tau2_camera, image_transport=transport), second=second)
 
 
 def _settings(options: Options, warn: Callable[[str], None]) -> Settings:
@@ -115,7 +139,7 @@ def _settings(options: Options, warn: Callable[[str], None]) -> Settings:
         overrides['map_file'] = str(options.map_file)
     if options.mode is not None:
         overrides['mode'] = options.mode
-    settings = read_settings(options.params, overrides)
+    settings = read_settings(options.params, overrides, options.second_camera)
     for line in settings.warnings:
         warn(line)
     return settings
@@ -157,7 +181,7 @@ def _final_map(path: Path, config: MarkerMapperConfig) -> MarkerMap:
     return marker_map
 
 
-def _report_refusals(files: RunFiles, entry: Entry, warn: Callable[[str], None]) -> None:
+def _report_refusals(files: RunFiles, entry: Entry, nodes: Sequence[str], warn: Callable[[str], None]) -> None:
     """Warn of nodes that refused messages.
 
     Raises
@@ -166,11 +190,12 @@ def _report_refusals(files: RunFiles, entry: Entry, warn: Callable[[str], None])
         All images (or the inputs in their place), all calibrations or all IMU messages were refused.
     """
     needed = {'aruco_detector': ['thermal/image'], entry.nodes[0]: [entry.topic], 'pose_ekf': [IMU_TOPIC]}
-    for node in entry.nodes:
+    for node in nodes:
         figures = files.figures.get(node, {})
         refused, reason = int(figures.get('refused messages', 0)), figures.get('last refusal', '')
         if figures.get('calibrations') == '0':
-            raise InputError(f'not one message on {CAMERA_INFO_TOPIC} holds a usable calibration')
+            topic = f'{node.rpartition("/")[0]}/{CAMERA_INFO_TOPIC}'.lstrip('/')
+            raise InputError(f'not one message on {topic} holds a usable calibration')
         # An internal error of the node is not a fault of the input.
         for topic in [] if reason.startswith(INTERNAL_ERROR) else needed.get(node, []):
             if refused and refused >= int(figures[f'received /{topic}']):
@@ -179,7 +204,7 @@ def _report_refusals(files: RunFiles, entry: Entry, warn: Callable[[str], None])
             warn(f'{node}: {refused} messages refused, the last one: {reason}')
 
 
-def _summary(options: Options, settings: Settings, bag: BagReader, files: RunFiles) -> dict[str, Any]:
+def _summary(options: Options, settings: Settings, bag: BagReader, played: Topics, files: RunFiles) -> dict[str, Any]:
     """Figures that need no ground truth, independent of the replay's speed."""
     return {
         'format': 'thermal_fiducial/run',
@@ -191,7 +216,7 @@ def _summary(options: Options, settings: Settings, bag: BagReader, files: RunFil
         'mode': settings.marker_mapper.mode,
         'start_ns': bag.start_ns,
         'duration_s': bag.duration_ns / SECOND_NS,
-        'messages_in': {topic: bag.message_count([topic]) for topic in PLAYED if topic in bag.topics},
+        'messages_in': {topic: bag.message_count([topic]) for topic in PLAYED | played if topic in bag.topics},
         'messages_out': dict(sorted(files.counts.items())),
         'frames_with_markers': files.frames_with_markers,
         'warnings': dict(files.warnings.most_common()),

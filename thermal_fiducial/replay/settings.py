@@ -1,6 +1,6 @@
 """Parameters of a replay: those of the nodes from a ROS parameter file, checked before anything starts."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from thermal_fiducial.config import (
     from_mapping,
     MarkerMapperConfig,
     NODES,
+    OF_CAMERA,
     parameters,
     PoseEkfConfig,
     size_overrides,
@@ -36,20 +37,28 @@ class Settings:
     aruco_detector: ArucoDetectorConfig
     marker_mapper: MarkerMapperConfig
     pose_ekf: PoseEkfConfig
+    #: front end and detector of a second camera, whose name the mapper's parameters have
+    second: tuple[Tau2CameraConfig, ArucoDetectorConfig] | None = None
     #: warnings about usable but suspicious values
     warnings: tuple[str, ...] = ()
 
     def write(self, path: Path) -> None:
         """Write all parameters as a ROS parameter file. Raises InputError if the file cannot be written."""
+        configs = {f'/{node}': getattr(self, node) for node in NODES}
+        if self.second is not None:
+            names = [f'/{self.marker_mapper.second_camera}/{node}' for node in OF_CAMERA]
+            configs |= dict(zip(names, self.second, strict=True))
         document = {
-            f'/{node}': {'ros__parameters': {name: _plain(value) for name, _, value in parameters(getattr(self, node))}}
-            for node in NODES
+            node: {'ros__parameters': {name: _plain(value) for name, _, value in parameters(config)}}
+            for node, config in configs.items()
         }
         write_text(path, yaml.safe_dump(document, sort_keys=False))
 
 
-def read_settings(params: Path | None, overrides: Mapping[str, Any]) -> Settings:
+def read_settings(params: Path | None, overrides: Mapping[str, Any], second_camera: str = '') -> Settings:
     """Settings from a ROS parameter file and ``overrides`` (name to value, for every node that has it).
+
+    With the name of a ``second_camera`` also those of its nodes.
 
     Raises
     ------
@@ -58,14 +67,16 @@ def read_settings(params: Path | None, overrides: Mapping[str, Any]) -> Settings
         named by a parameter.
     """
     document = {} if params is None else _document(params)
-    configs: dict[str, Any] = {}
-    for node, kind in NODES.items():
-        values = _values_for(node, document) | dict(overrides)
-        check_names(values)
-        configs[node] = from_mapping(kind, values)
+    overrides = dict(overrides) | ({'second_camera': second_camera} if second_camera else {})
+    named = (section.get('second_camera') for section in (*document.values(), overrides))
+    seconds = {str(name) for name in named if name}
+    configs = {node: _config(node, _values_for(node, document, seconds), overrides) for node in NODES}
     settings = Settings(**configs)
+    if second_camera:
+        own = (_config(node, _values_for_second(node, document, second_camera), overrides) for node in OF_CAMERA)
+        settings = replace(settings, second=tuple(own))
     warnings = _check_files(settings)
-    if document and not any(_values_for(node, document) for node in NODES):
+    if document and not any(_values_for(node, document, seconds) for node in NODES):
         warnings.append(f'{params}: nothing in it is for our nodes: it is for {", ".join(document)}')
     return replace(settings, warnings=tuple(warnings))
 
@@ -95,13 +106,14 @@ def load_config(path: str | Path | None = None, **overrides: Any) -> PipelineCon
 
 def _check_files(settings: Settings) -> list[str]:
     """Validate files named by parameters: raises what a node would report as a fault, returns its warnings."""
-    camera, mapper = settings.tau2_camera, settings.marker_mapper
+    mapper = settings.marker_mapper
     dictionary = load_dictionary(settings.aruco_detector.dictionary)
     sizes = size_overrides(mapper.marker_size_overrides)
-    if camera.calibration_file:
-        load_camera(camera.calibration_file)
-    if camera.bad_pixel_file:
-        load_bad_pixels(camera.bad_pixel_file)
+    for camera in (settings.tau2_camera, *(settings.second or ())[:1]):
+        if camera.calibration_file:
+            load_camera(camera.calibration_file)
+        if camera.bad_pixel_file:
+            load_bad_pixels(camera.bad_pixel_file)
     if mapper.map_file:
         marker_map = load_map(mapper.map_file, mapper.marker_size, sizes)
         foreign = sorted(set(marker_map.markers) - set(range(len(dictionary.bits))))
@@ -133,15 +145,28 @@ def _flat(section: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
             yield f'{prefix}{name}', value
 
 
-def _values_for(node: str, document: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def _config(node: str, values: dict[str, Any], overrides: Mapping[str, Any]) -> Any:
+    check_names(values | dict(overrides))
+    return from_mapping(NODES[node], values | dict(overrides))
+
+
+def _values_for(node: str, document: Mapping[str, Mapping[str, Any]], seconds: Collection[str]) -> dict[str, Any]:
+    """Values of a node of the first camera: entries in the namespaces of ``seconds`` do not apply to it."""
+    patterns = [pattern for pattern in document if not set(seconds) & set(pattern.split('/')[:-1])]
+    return _joined(node, document, patterns)
+
+
+def _values_for_second(node: str, document: Mapping[str, Mapping[str, Any]], name: str) -> dict[str, Any]:
+    """Values of a node of the second camera ``name``: those in its namespace, and those for any namespace."""
+    patterns = [pattern for pattern in document if {'**', name} & set(pattern.split('/'))]
+    return _joined(node, document, patterns)
+
+
+def _joined(node: str, document: Mapping[str, Mapping[str, Any]], patterns: Iterable[str]) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    second = {str(section['second_camera']) for section in document.values() if section.get('second_camera')}
-    for pattern, section in document.items():
-        # Entries in the second camera's namespace do not apply to the nodes of the first.
-        if second & set(pattern.split('/')[:-1]):
-            continue
+    for pattern in patterns:
         if pattern.rsplit('/', 1)[-1] in ('**', '*', node):
-            values |= section
+            values |= document[pattern]
     return values
 
 

@@ -10,7 +10,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from thermal_fiducial.config import NODES
+from thermal_fiducial.config import NODES, OF_CAMERA
 from thermal_fiducial.files.bags import (
     BagMessage,
     CAMERA_INFO_TOPIC,
@@ -88,13 +88,31 @@ class Entry:
         """The nodes to run, in order of the stages."""
         return tuple(NODES)[self.skipped :]
 
-    def played(self, *, calibration_from_file: bool) -> dict[str, str]:
-        """Required topics of the bag, with message types."""
-        topics = [self.topic, IMU_TOPIC]
+    def nodes_of_second(self, name: str) -> tuple[str, ...]:
+        """The nodes to run for a second camera ``name``: those before the mapper."""
+        return tuple(f'{name}/{node}' for node in self.nodes if node in OF_CAMERA)
+
+    def played(self, *, calibration_from_file: bool) -> Topics:
+        """Required topics of the bag."""
+        always = {topic: PLAYED[topic] for topic in (self.topic, IMU_TOPIC)}
+        return always | self._of_camera(calibration_from_file=calibration_from_file)
+
+    def played_of_second(self, name: str, *, calibration_from_file: bool) -> Topics:
+        """Required topics of a second camera ``name``."""
+        own = self._of_camera(calibration_from_file=calibration_from_file)
+        return {f'{name}/{topic}': played for topic, played in own.items()}
+
+    def _of_camera(self, *, calibration_from_file: bool) -> Topics:
+        topics = [self.topic]
         # Only the first node publishes a calibration from a file.
         if self.needs_calibration and not (calibration_from_file and self.skipped == 0):
             topics.append(CAMERA_INFO_TOPIC)
-        return {topic: type_name(PLAYED[topic][0]) for topic in topics}
+        return {topic: PLAYED[topic] for topic in topics}
+
+    def recorded_of_second(self, name: str, *, calibration_from_file: bool) -> Topics:
+        """Topics of a second camera ``name`` to record: its markers, and the calibration if its node publishes it."""
+        topics = {MARKERS_TOPIC: PLAYED[MARKERS_TOPIC]} | (_CALIBRATION if calibration_from_file else {})
+        return {f'{name}/{topic}': recorded for topic, recorded in topics.items()}
 
     def recorded(self, *, calibration_from_file: bool, images: bool) -> Topics:
         """Topics to record: outputs of the nodes, or the bag's in their place; images only on request."""

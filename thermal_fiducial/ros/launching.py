@@ -14,7 +14,7 @@ from launch.launch_description import LaunchDescription
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from thermal_fiducial.config import from_home, NODES
+from thermal_fiducial.config import from_home, NODES, OF_CAMERA, SHARED_WITH_SECOND_CAMERA
 from thermal_fiducial.errors import InputError
 
 PACKAGE = 'thermal_fiducial'
@@ -138,11 +138,11 @@ def _second_camera(given: dict[str, str], settings: dict[str, Any], namespace: s
             raise InputError('second_camera_device: no effect without second_camera')
         return []
     own = namespace.rstrip('/')
-    shared = [(topic, f'{own}/{topic}') for topic in ('marker_map', 'odometry', 'camera_clock')]
+    shared = [(topic, f'{own}/{topic}') for topic in SHARED_WITH_SECOND_CAMERA]
     parameters = [*settings['parameters'], *([{'camera': device}] if device else [])]
     changes = {'namespace': f'{own}/{name}', 'remappings': shared, 'parameters': parameters}
-    nodes = ['tau2_camera', 'aruco_detector']
-    return [_node(node, settings | changes) for node in (['thermal_source', *nodes] if device else nodes)]
+    nodes = ['thermal_source', *OF_CAMERA] if device else OF_CAMERA
+    return [_node(node, settings | changes) for node in nodes]
 
 
 def _unknown_arguments(context: LaunchContext) -> list[Any]:
