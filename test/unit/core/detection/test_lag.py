@@ -122,8 +122,8 @@ def test_a_wrong_lag_leaves_the_common_shift_out():
     shape = wrong_lag(turning) - wrong_lag(common)
     # The lag constant may be off by a third, which turns the marker by so much.
     np.testing.assert_allclose(np.trace(shape, axis1=-2, axis2=-1), (0.35 * 0.2) ** 2, rtol=1e-6)
-    # Of another response edges are off by a fiftieth of the way, mostly along it.
-    np.testing.assert_allclose(wrong_lag(common)[0, 0], 0.5 * 0.06**2 * np.diag([2.0, 1.0]), rtol=1e-6)
+    # Of another response edges are off by a seventieth of the way, along it and across.
+    np.testing.assert_allclose(wrong_lag(common)[0, 0], (0.014 * 3.0) ** 2 * np.eye(2), rtol=1e-6)
 
 
 def test_an_unknown_motion_is_limited_by_sharp_edges_and_by_cells_that_can_be_read():
