@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from thermal_fiducial.core.geometry.se3 import inverse, rotation_angle, rotation_from_quaternion, transform
+from thermal_fiducial.core.geometry.se3 import camera_in_body, inverse, rotation_angle
 from thermal_fiducial.core.pipeline import Pipeline, PipelineConfig
 from thermal_fiducial.files.bags import BagReader, CAMERA_INFO_TOPIC, IMAGE_TOPIC, IMU_TOPIC
 from thermal_fiducial.files.dictionary import load_dictionary
@@ -52,7 +52,7 @@ def replayed(bag, mode, start):
     config = PipelineConfig(settings.tau2_camera, settings.aruco_detector, settings.marker_mapper, settings.pose_ekf)
     pipeline = Pipeline(config, load_dictionary(config.aruco_detector.dictionary), load_map(bag / f'{start}.yaml'))
     ekf = config.pose_ekf
-    T_body_camera = transform(rotation_from_quaternion(ekf.camera_orientation), ekf.camera_position)
+    T_body_camera = camera_in_body(ekf)
     fused, fiducial = [], []
     with BagReader(bag) as reader:
         for recorded in reader.messages([IMAGE_TOPIC, IMU_TOPIC, CAMERA_INFO_TOPIC]):

@@ -20,7 +20,7 @@ _HUBER = 3.0
 _STEP = 1e-6
 _MAX_STEPS = 60
 # Relative decrease of the cost at convergence; damping at which the fit gives up.
-_CONVERGED, _HOPELESS = 1e-7, 1e9
+_CONVERGED, _MOST_DAMPED = 1e-7, 1e9
 #: Convergence for fits whose errors are only compared to some per cent.
 NEARLY = 1e-4
 # Most updates of the circles' centroids, and largest change at convergence [px].
@@ -154,7 +154,7 @@ class LensFit:
         cost, damping = self._cost(camera, error, noise), 1e-3
         for _ in range(_MAX_STEPS):
             information, gradient = self._normal_equations(camera, T, error, _HUBER * noise, noise)
-            while damping < _HOPELESS:
+            while damping < _MOST_DAMPED:
                 damped = information + damping * np.diag(np.diag(information) + 1e-12)
                 moved = self.moved(camera, T, -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64))
                 after = self.error(*moved)

@@ -24,7 +24,7 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Int
 _BLUR, _LEAST_BLUR = 0.06, 0.8
 # Most steps of a fit, rejected ones included; length of a step at convergence, in the last round and before; initial
 # damping, and damping at which the fit gives up.
-_MOST_STEPS, _CONVERGED_PX, _NEARLY_PX, _DAMPING, _HOPELESS = 40, 1e-3, 1e-2, 1e-3, 1e3
+_MOST_STEPS, _CONVERGED_PX, _NEARLY_PX, _DAMPING, _MOST_DAMPED = 40, 1e-3, 1e-2, 1e-3, 1e3
 # A point is lost when its standard deviation exceeds this [px], when the fit moves further than this from the start
 # [steps], or when its contrast relative to that predicted from the neighbours is outside these limits.
 _MOST_SIGMA_PX, _MOST_MOVE, _CONTRAST = 0.5, 0.25, (0.6, 1.6)
@@ -177,7 +177,7 @@ def _fit(windows: PointWindows, shared: _Shared | None, *, with_contrast: bool) 
         better = tried.cost <= state.cost[moving]
         state.put(moving[better], tried.rows(np.flatnonzero(better)))
         damping[moving] *= np.where(better, 0.1, 10.0)
-        moving = moving[damping[moving] < _HOPELESS]
+        moving = moving[damping[moving] < _MOST_DAMPED]
         if len(moving) == 0:
             break
     lost = ~_well_determined(windows, state)

@@ -9,13 +9,13 @@ import numpy as np
 from sensor_msgs.msg import PointCloud2
 
 from thermal_fiducial.config import LandingTargetConfig
-from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.geometry.se3 import camera_in_body, inverse
 from thermal_fiducial.core.measurements import Observations
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.base.node import OK, StageNode, WARN
 from thermal_fiducial.ros.frames.landing_pad import for_mavros, pad_in_map
-from thermal_fiducial.ros.frames.robot_frames import camera_in_body, RobotFrames
+from thermal_fiducial.ros.frames.robot_frames import RobotFrames
 from thermal_fiducial.ros.messages import clouds, convert, message_bytes
 from thermal_fiducial.ros.process.run import run
 

@@ -9,6 +9,7 @@ import shutil
 from typing import Any
 
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
+from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.map_data import MarkerMap
 from thermal_fiducial.core.types import SECOND_NS
 from thermal_fiducial.errors import InputError, INTERNAL_ERROR
@@ -21,7 +22,6 @@ from thermal_fiducial.replay.processes import replay_processes
 from thermal_fiducial.replay.recorder import refuse_folder_in_use, RunFiles
 from thermal_fiducial.replay.settings import read_settings, Settings
 from thermal_fiducial.replay.topics import ENTRIES, Entry, entry_of, PLAYED, Topics, type_name
-from thermal_fiducial.ros.frames.robot_frames import camera_in_body
 
 MAP_FILE, SUMMARY_FILE = 'marker_map.yaml', 'summary.json'
 

@@ -20,7 +20,7 @@ from thermal_fiducial.core.detection.corner_errors import (
     OF_BORDERS_TOGETHER,
     OF_LOCAL_PX,
 )
-from thermal_fiducial.core.detection.corners.segments import HOPELESS, measure, REACHED, Segments
+from thermal_fiducial.core.detection.corners.segments import measure, REACHED, Segments, UNMEASURED
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind_border, model, sides_of
 from thermal_fiducial.core.detection.frame import counts_of, Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
@@ -89,7 +89,7 @@ class DisplayedSides:
         if len(refined.ids) == 0:
             return refined.corners
         segments = self._across_border(frame, refined, blur_px)
-        known = segments.variance < HOPELESS
+        known = segments.variance < UNMEASURED
         weight = np.where(known, 1.0 / (OF_BORDERS_TOGETHER * (segments.variance + OF_BORDER_PX**2)), 0.0)
         # Sides displaced outward by 1 scale the pattern, so that the inner edges appear displaced inward by ``gain``.
         gain = 2.0 - 2.0 / (self._bits + 2.0)

@@ -60,7 +60,7 @@ class MarkerDetector:
             self._mount(config)
 
     def _mount(self, config: ArucoDetectorConfig) -> None:
-        T_body_camera = se3.transform_from_quaternion(config.camera_position, config.camera_orientation)
+        T_body_camera = se3.camera_in_body(config)
         self._history = FrameHistory(MotionTrack.of_rig(T_body_camera, config.bolometer_lag))
 
     def set_map(self, marker_map: Mapping[int, tuple[FloatArray, float]]) -> None:

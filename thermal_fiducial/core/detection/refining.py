@@ -22,10 +22,10 @@ from thermal_fiducial.core.detection.corner_errors import (
 )
 from thermal_fiducial.core.detection.corners.segments import (
     adjust,
-    HOPELESS,
     measure,
     REACHED,
     Segments,
+    UNMEASURED,
     with_gradients,
 )
 from thermal_fiducial.core.detection.corners.sides import blurs, model, NARROW, Sides, sides_of
@@ -268,7 +268,7 @@ def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCor
     covariances = together * blocks + OF_ALL_SIDES_PX**2 * _EYE
     # In an outline that is inconsistent with a square, some side belongs to another object.
     doubt = known.doubt * (sides.along.reshape(-1, 4).sum(axis=1) / 4) ** 2
-    good = segments.variance < HOPELESS
+    good = segments.variance < UNMEASURED
     share = good / np.maximum(good.sum(axis=1), 1)[:, None]
     contrast, noise = (segments.contrast * share).sum(axis=1), np.sqrt((segments.noise * share).sum(axis=1))
     shift, deviation = known.moved.reshape(-1, 4, 2), np.sqrt(covariances.diagonal(axis1=2, axis2=3))

@@ -27,7 +27,7 @@ from thermal_fiducial.core.filter.state import (
     SYSTEMATIC,
     VELOCITY,
 )
-from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.measurements import Condition
 from thermal_fiducial.core.types import FloatArray
 
@@ -50,7 +50,7 @@ def blank_state(config: PoseEkfConfig) -> NavigationState:
         scale=np.zeros((2, 3, 3)),
         gravity=np.array([0.0, 0.0, -config.gravity]),
         time_offset=0.0,
-        T_body_camera=transform_from_quaternion(config.camera_position, config.camera_orientation),
+        T_body_camera=camera_in_body(config),
         systematic=np.zeros(6),
     )
 

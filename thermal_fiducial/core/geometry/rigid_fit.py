@@ -136,16 +136,16 @@ def evaluate(T: FloatArray, points: FloatArray, images: Images, inlier: float = 
     J[..., :3] = d_p
     np.matmul(d_p, (rotated @ _MINUS_SKEW).reshape(*p.shape, 3), out=J[..., 3:])
     J = J.reshape(len(T), 2 * p.shape[1], 6)
-    squared, weights = robust((residual * residual).sum(axis=(-1, -2)), inlier**2)
-    weighted = np.swapaxes(J if inlier == np.inf else J * np.repeat(weights, 2, axis=-1)[..., None], -1, -2)
-    gradient = (weighted @ residual.reshape(len(T), 2 * p.shape[1], 1))[..., 0]
-    return np.where(seen, squared.sum(axis=-1), np.inf), gradient, weighted @ J
+    squared, J_transposed = (residual * residual).sum(axis=(-1, -2)), J.swapaxes(-1, -2)
+    if inlier < np.inf:
+        squared, weights = robust(squared, inlier**2)
+        J_transposed = J_transposed * np.repeat(weights, 2, axis=-1)[:, None]
+    gradient = (J_transposed @ residual.reshape(len(T), 2 * p.shape[1], 1))[..., 0]
+    return np.where(seen, squared.sum(axis=-1), np.inf), gradient, J_transposed @ J
 
 
 def robust(squared: FloatArray, limit: float) -> tuple[FloatArray, FloatArray]:
     """Costs of squared errors, which grow but logarithmically beyond ``limit``, and the weights of the errors."""
-    if limit == np.inf:
-        return squared, np.ones_like(squared)
     excess = np.maximum(squared / limit, 1.0)
     return np.where(excess > 1.0, limit * (1.0 + np.log(excess)), squared), 1.0 / excess
 

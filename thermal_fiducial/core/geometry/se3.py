@@ -8,7 +8,7 @@ robotics", 2018, appendices B and D.
 """
 
 import math
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -191,6 +191,11 @@ _PRODUCTS_OF_ENTRIES = np.array(
 def transform_from_quaternion(position: npt.ArrayLike, q_xyzw: npt.ArrayLike) -> FloatArray:
     """T_a_b (..., 4, 4) of a position (..., 3) [m] and a quaternion x y z w (..., 4)."""
     return transform(rotation_from_quaternion(q_xyzw), position)
+
+
+def camera_in_body(config: Any) -> FloatArray:
+    """T_body_camera (4, 4) of a config with ``camera_position`` and ``camera_orientation``."""
+    return transform_from_quaternion(config.camera_position, config.camera_orientation)
 
 
 def rotation_angle(R: npt.ArrayLike) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy as np
 from thermal_fiducial.config import MarkerMapperConfig, size_overrides
 from thermal_fiducial.core.error_model import SystematicErrors
 from thermal_fiducial.core.geometry.camera import Camera
-from thermal_fiducial.core.geometry.se3 import transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, entry, NewMarkers
@@ -58,7 +58,7 @@ class MarkerMapper:
     def configure(self, config: MarkerMapperConfig) -> None:
         """Take over the dynamic parameters of ``config``, and the pose of the camera on the robot."""
         self.config = config
-        self._T_body_camera = transform_from_quaternion(config.camera_position, config.camera_orientation)
+        self._T_body_camera = camera_in_body(config)
 
     def reset(self) -> FloatArray | None:
         """Return to the initial map; see :meth:`load`."""

@@ -2,11 +2,12 @@
 
 import numpy as np
 
+from thermal_fiducial.config import PoseEkfConfig
 from thermal_fiducial.core.error_model import of_correlated_odometry, of_single_error
 from thermal_fiducial.core.types import FloatArray, SECOND_NS
 
 #: Random walk of the difference [s/sqrt(s)]: that of a camera's clock against the IMU's.
-RANDOM_WALK = 5e-5
+RANDOM_WALK = PoseEkfConfig.time_offset_random_walk
 #: Factor on its variance by poses that contradict each other: a clock may have stepped.
 _DOUBT = 2.0
 

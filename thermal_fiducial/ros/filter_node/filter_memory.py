@@ -9,11 +9,11 @@ from thermal_fiducial.core.filter.ekf import PoseEkf
 from thermal_fiducial.core.filter.hypotheses import KNOWN_OFFSET_STD
 from thermal_fiducial.core.filter.restart import LastPose, RestartHint
 from thermal_fiducial.core.filter.verdicts import PoseUpdate
+from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.files.last_pose import recent_pose, save_last_pose
 from thermal_fiducial.files.robot_folder import robot_folder
 from thermal_fiducial.ros.base.node import StageNode
-from thermal_fiducial.ros.frames.robot_frames import camera_in_body
 
 
 class FilterMemory:

@@ -10,7 +10,11 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from std_msgs.msg import String
 
-from thermal_fiducial.core.geometry.se3 import inverse, quaternion_from_rotation, transform_from_quaternion
+from thermal_fiducial.core.geometry.se3 import (
+    camera_in_body,
+    inverse,
+    quaternion_from_rotation,
+)
 from thermal_fiducial.core.types import FloatArray
 from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import qos
@@ -135,11 +139,6 @@ class RobotFrames:
         frame = self._imu_frame if self.T_imu_base is not None else config.base_frame
         line = f'camera on the robot ({config.camera_frame} in {frame}): from {self.source}{remark}'
         self._node.get_logger().info(line)
-
-
-def camera_in_body(config: Any) -> FloatArray:
-    """T_body_camera (4, 4) of a config with ``camera_position`` and ``camera_orientation``."""
-    return transform_from_quaternion(config.camera_position, config.camera_orientation)
 
 
 def _same(T: FloatArray, other: FloatArray) -> bool:

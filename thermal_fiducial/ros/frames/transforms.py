@@ -5,10 +5,10 @@ import importlib
 from typing import Any
 
 from thermal_fiducial.config import PoseEkfConfig
-from thermal_fiducial.core.geometry.se3 import inverse
+from thermal_fiducial.core.geometry.se3 import camera_in_body, inverse
 from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.ros.base.counting import CountingNode
-from thermal_fiducial.ros.frames.robot_frames import camera_in_body, RobotFrames
+from thermal_fiducial.ros.frames.robot_frames import RobotFrames
 from thermal_fiducial.ros.messages import convert
 
 

@@ -8,6 +8,7 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 
 from thermal_fiducial.config import MarkerMapperConfig
 from thermal_fiducial.core.geometry.camera import Camera
+from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.second_camera import SecondCamera
 from thermal_fiducial.core.measurements import CameraPose
@@ -15,7 +16,6 @@ from thermal_fiducial.errors import InputError
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.camera_nodes.camera_node import CameraStageNode
 from thermal_fiducial.ros.frames.map_corrections import LatePoses
-from thermal_fiducial.ros.frames.robot_frames import camera_in_body
 from thermal_fiducial.ros.messages import clouds, convert
 from thermal_fiducial.ros.messages.message_bytes import PoseBytes
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.close_views import BITS, BLUR_WITH_PIXEL, CAMERAS, draw, plate, pose
 
-from thermal_fiducial.core.detection.corners.segments import adjust, HOPELESS, measure, median_of, robust_fit
+from thermal_fiducial.core.detection.corners.segments import adjust, measure, median_of, robust_fit, UNMEASURED
 from thermal_fiducial.core.detection.corners.sides import blurs, edges_behind, model, sides_of
 from thermal_fiducial.core.detection.frame import counts_of
 from thermal_fiducial.core.geometry import se3
@@ -47,7 +47,7 @@ class Measured:
 def test_segments_measure_how_far_their_sides_are_off(off):
     measured = Measured(off)
     expected = -(measured.sides.normal @ off).reshape(1, -1)
-    used = measured.segments.variance < HOPELESS
+    used = measured.segments.variance < UNMEASURED
     assert used.mean() > 0.9
     error = (measured.segments.shift - expected)[used]
     # When written 0.02 px without an offset, of segments at the corners, and 0.05 with one, of the linearisation.
@@ -58,7 +58,7 @@ def test_segments_measure_how_far_their_sides_are_off(off):
 
 def test_variances_are_those_of_the_noise():
     clean, noisy = Measured(), Measured(noise=NOISE)
-    used = (clean.segments.variance < HOPELESS) & (noisy.segments.variance < HOPELESS)
+    used = (clean.segments.variance < UNMEASURED) & (noisy.segments.variance < UNMEASURED)
     z = ((noisy.segments.shift - clean.segments.shift) / np.sqrt(noisy.segments.variance))[used]
     # Twenty-odd segments: the mean square is 1 within 0.3 at one sigma; the variance is a marker's typical one.
     assert 0.3 < np.mean(z * z) < 2.0
@@ -96,7 +96,7 @@ def test_corners_follow_their_segments():
 
 def test_without_segments_the_prior_remains():
     measured = Measured()
-    nothing = measured.segments._replace(variance=np.full_like(measured.segments.variance, HOPELESS))
+    nothing = measured.segments._replace(variance=np.full_like(measured.segments.variance, UNMEASURED))
     moved, covariance = adjust(measured.sides, nothing)
     # Each of the 24 segments still weighs a millionth.
     assert np.abs(moved).max() < 1e-3

@@ -14,10 +14,10 @@ import numpy as np
 
 from thermal_fiducial.core.detection.corner_errors import OF_SIDES_PX
 from thermal_fiducial.core.detection.corners.segments import (
-    HOPELESS,
     measure,
     REACHED,
     robust_fit,
+    UNMEASURED,
 )
 from thermal_fiducial.core.detection.corners.sides import Blur, blurred_step, blurs, columns_across, NODES, Sides
 from thermal_fiducial.core.detection.frame import counts_of, Frame, LEAST_DEPTH, Places, rolling_displacement
@@ -121,7 +121,7 @@ def adjusted(T: FloatArray, size: float, pattern: GridEdges, layer: Layer, thick
     blur, *_ = blurs(sides, layer.blur, layer.lag_blur[None])
     modelled = _model(sides, pattern.step, blur)
     measured = measure(counts_of(sides.pixel, layer.image), modelled, REACHED * blur.across, len(nodes))
-    used = measured.variance[0] < HOPELESS
+    used = measured.variance[0] < UNMEASURED
     if used.sum() < 6:
         return None
     J = _design(T, size, pattern, sides, modelled[2], layer.camera)

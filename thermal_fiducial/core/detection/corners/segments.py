@@ -16,7 +16,7 @@ from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, SIG
 #: Largest displacement for which the linearisation holds, in standard deviations of the blur.
 REACHED = 2.0
 #: Variance of a segment that measures nothing.
-HOPELESS = 1e6
+UNMEASURED = 1e6
 # Least number of pixels of a segment: two more than its unknowns.
 _FEWEST_PIXELS = 5
 # Ratio of a segment's pixel variance to the marker's typical one beyond which its own variance is used.
@@ -65,7 +65,7 @@ class Segments(NamedTuple):
         Over two segments a slope changes it twice as much as over one, noise and the cells behind the sides as much. A
         few segments that other objects cover do not count.
         """
-        used = (self.variance < HOPELESS).reshape(len(self.variance), 4, -1)
+        used = (self.variance < UNMEASURED).reshape(len(self.variance), 4, -1)
         contrast, sizes = self.contrast.reshape(used.shape), []
         for apart in (1, 2):
             change = np.abs(contrast[..., apart:] - contrast[..., :-apart]).reshape(len(used), -1)
@@ -174,7 +174,7 @@ def _fit(moments: Float32Array, segments: int) -> _SegmentFit:
 
 
 def _judged(fit: _SegmentFit, reach: FloatArray) -> Segments:
-    """Displacements and variances (N, S) of the segments; ``HOPELESS`` for unusable ones and those beyond ``reach``."""
+    """Displacements and variances (N, S) of segments; ``UNMEASURED`` for unusable ones and those beyond ``reach``."""
     contrast, product, noise = fit.contrast, fit.product, fit.noise
     typical = median_of(contrast, fit.usable)
     own = noise * fit.contrast_variance
@@ -185,7 +185,7 @@ def _judged(fit: _SegmentFit, reach: FloatArray) -> Segments:
     others = (_CONTRAST_VARIES * typical) ** 2 + TINY
     safe = np.where(usable, (contrast * others + typical * own) / (others + own), 1.0)
     shift = np.where(usable, np.minimum(np.maximum(-product / safe, -reach), reach), 0.0)
-    return Segments(shift, np.where(usable, noise * fit.product_variance / (safe * safe), HOPELESS), contrast, noise)
+    return Segments(shift, np.where(usable, noise * fit.product_variance / (safe * safe), UNMEASURED), contrast, noise)
 
 
 def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> Segments:
@@ -200,7 +200,7 @@ def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> Segments
     blur_px : standard deviation of the blur, by which noise of a displacement is one of the contrast
     """
     count, cells = len(segments.shift), sides.across.shape[1]
-    good = (segments.variance < HOPELESS).reshape(count, 4, cells)
+    good = (segments.variance < UNMEASURED).reshape(count, 4, cells)
     used = good.sum(axis=2)
     number, seen = np.maximum(used, 1), used > 0
     contrast = (segments.contrast.reshape(good.shape) * good).sum(axis=2) / number
@@ -211,7 +211,7 @@ def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> Segments
     gradient = np.sqrt(np.maximum(change, 0.0)) / sides.across.reshape(good.shape).mean(axis=2)
     left = np.abs(contrast) - GRADIENT_AS_CONTRAST_PX * gradient
     std = np.where(left > 0.0, OF_GRADIENT_PX2 * gradient / np.maximum(left, TINY), np.inf)
-    variance = np.minimum(segments.variance + np.repeat(std**2, cells, axis=1), HOPELESS)
+    variance = np.minimum(segments.variance + np.repeat(std**2, cells, axis=1), UNMEASURED)
     return segments._replace(variance=variance)
 
 
@@ -227,7 +227,7 @@ def median_of(values: FloatArray, good: BoolArray) -> FloatArray:
 
 def adjust(sides: Sides, segments: Segments) -> tuple[FloatArray, FloatArray]:
     """Displacements (N, 8, 1) of the corners that fit all segments, and their covariances (N, 8, 8)."""
-    used, cells = segments.variance < HOPELESS, sides.normal.shape[1]
+    used, cells = segments.variance < UNMEASURED, sides.normal.shape[1]
     # A segment lies where its columns do, between the corners that its side begins and ends at.
     t = (sides.t * sides.fresh).sum(axis=0) / np.maximum(sides.fresh.sum(axis=0), 1)
     share = _AT_START + t.reshape(-1, 4, cells, 1) * _ONWARD
