@@ -14,7 +14,7 @@ from thermal_fiducial.core.error_model import INCONSISTENT_PX, of_single_error
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference
 from thermal_fiducial.core.mapping.localization import DECISIVE, names
-from thermal_fiducial.core.mapping.located import explained_px, Location, Refusal, Sight
+from thermal_fiducial.core.mapping.located import error_std_px, Location, Refusal, Sight
 from thermal_fiducial.core.mapping.trust import DISAGREEMENT
 from thermal_fiducial.core.measurements import CameraPose
 from thermal_fiducial.core.types import FloatArray
@@ -25,7 +25,7 @@ def are_two_that_contradict(location: Location) -> bool:
     sight, seen = location.sight, location.seen
     if len(sight.markers) != 2:
         return False
-    return bool(np.any(seen.errors_px > DISAGREEMENT * explained_px(sight, seen, np.zeros((6, 6)))))
+    return bool(np.any(seen.errors_px > DISAGREEMENT * error_std_px(sight, seen, np.zeros((6, 6)))))
 
 
 def settled(

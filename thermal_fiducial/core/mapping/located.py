@@ -155,8 +155,11 @@ class LocatedFrame:
     #: the camera pose by odometry
     predicted: PredictedCamera | None
     outcome: Location | Refusal
-    #: to publish; None without one, or if its attitude is too uncertain
-    pose: CameraPose | None
+
+    @property
+    def pose(self) -> CameraPose | None:
+        """To publish; None without one, or if its attitude is too uncertain."""
+        return None if isinstance(self.outcome, Refusal) or self.outcome.reason else self.outcome.pose
 
     @property
     def new(self) -> Observations:
@@ -181,16 +184,16 @@ class LocatedFrame:
         known, pose = self.known, location.pose
         seen = location.seen if location.sight is known else known.reprojected(self.camera, pose.T_map_camera)
         errors = np.where(np.isfinite(seen.errors_px), seen.errors_px, float(self.camera.width))
-        return errors, explained_px(known, seen, pose.covariance)
+        return errors, error_std_px(known, seen, pose.covariance)
 
     def left_out(self, location: Location) -> BoolArray:
         """Which of the K known markers (K,) the pose left out, though they were trusted."""
         return self.known.trusted & ~np.isin(self.known.observed.ids, location.sight.observed.ids)
 
 
-def explained_px(sight: Sight, seen: Reprojected, camera_covariance: FloatArray) -> FloatArray:
+def error_std_px(sight: Sight, seen: Reprojected, camera_covariance: FloatArray) -> FloatArray:
     """Standard deviations (N,) of the rms re-projection errors [px] by noise, map and a camera known to (6, 6)."""
     by_camera = np.einsum('nri,nri->n', seen.J_camera @ camera_covariance, seen.J_camera)
     by_marker = np.einsum('nri,nri->n', seen.J_marker @ sight.map_covariances, seen.J_marker)
-    explained = 2.0 * sight.noise_px**2 + np.nan_to_num(by_camera + by_marker) / 4.0 + INCONSISTENT_PX**2
-    return np.asarray(np.sqrt(explained))
+    variances = 2.0 * sight.noise_px**2 + np.nan_to_num(by_camera + by_marker) / 4.0 + INCONSISTENT_PX**2
+    return np.asarray(np.sqrt(variances))

@@ -119,8 +119,7 @@ class MarkerMapper:
             outcome = Refusal('all known markers in view are in quarantine')
         elif not self.map.markers:
             outcome = Refusal('the map has no marker: give a map file with at least one')
-        pose = None if isinstance(outcome, Refusal) or outcome.reason else outcome.pose
-        return LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome, pose)
+        return LocatedFrame(stamp_ns, camera, observed, is_known, known, predicted, outcome)
 
     def _located(
         self, stamp_ns: int, sight: Sight, camera: Camera, predicted: PredictedCamera | None

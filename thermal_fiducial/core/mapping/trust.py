@@ -62,7 +62,7 @@ class Trust:
         markers: dict[int, MapMarker],
         known: ObjectArray,
         errors_px: np.ndarray,
-        explained_px: np.ndarray,
+        error_std_px: np.ndarray,
         left_out: BoolArray,
     ) -> bool:
         """Update with a frame; persistently inconsistent markers are put in quarantine, consistent ones released.
@@ -71,7 +71,7 @@ class Trust:
         ----------
         markers : of the map; those that enter or leave quarantine are replaced
         known : the N of them in the frame
-        errors_px, explained_px : (N,) their rms re-projection errors, and the standard deviations of these
+        errors_px, error_std_px : (N,) their rms re-projection errors, and the standard deviations of these
         left_out : (N,) which of them the pose left out, as odometry contradicts them: inconsistent
 
         Returns
@@ -85,7 +85,7 @@ class Trust:
             record.mean_square_px += gain * (error**2 - record.mean_square_px)
         if len(known) < 2:
             return False
-        ratios = errors_px / explained_px
+        ratios = errors_px / error_std_px
         blamed = ratios > DISAGREEMENT
         if blamed.any():
             blamed = inconsistent(blamed, known.tolist())
