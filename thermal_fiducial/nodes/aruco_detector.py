@@ -67,6 +67,8 @@ class ArucoDetector(CameraStageNode[ArucoDetectorConfig]):
         self._others.send(markers, head, self.detector.size)
         if self._annotated.listeners:
             self._annotated.send(convert.image(display.annotated(self._gray(counts), markers), head))
+        if self.odometry.clock_is_known:
+            self._dictionaries.settle()
         self._dictionaries.look(image.stamp_ns, counts, self.camera(), any_seen=self._seen > 0)
 
     def _gray(self, counts: Counts | Gray) -> Gray:

@@ -105,3 +105,15 @@ def test_the_detector_warns_on_console_and_in_the_diagnostics(graph):
     assert level == WARN
     assert reason == f'0 markers; {node.headline()}'
     assert node.headline().startswith('dictionary is DICT_4X4_50, but the markers in view are 0, 1, 2, 3, 4 and others')
+
+
+@pytest.mark.ros
+def test_nothing_is_looked_for_once_the_filter_runs(graph):
+    """A look takes as long as one or two frames, and would delay the next one."""
+    node = graph.add(ArucoDetector)
+    graph.send('thermal/camera_info', info(CAMERA))
+    graph.send('camera_clock', convert.clock_reference(SECOND_NS, 0.0))
+    image, _ = counts('STENCIL_4X4_100', np.arange(12))
+    for k in range(4):
+        graph.send('thermal/image', convert.image(image, convert.header((k + 1) * SECOND_NS, 'camera')))
+    assert node.headline() == ''

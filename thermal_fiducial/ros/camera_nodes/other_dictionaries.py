@@ -48,6 +48,11 @@ class OtherDictionaries:
         #: warning that names both dictionaries; empty without a doubt
         self.doubt = ''
 
+    def settle(self) -> None:
+        """Look no more: a filter that runs has poses by our markers, and a look would delay the next frame."""
+        self._settled = _SETTLED
+        self.doubt = ''
+
     def look(self, stamp_ns: int, image: Counts | Gray, camera: Camera, *, any_seen: bool) -> None:
         """Compare with the next dictionary if a look is due, until our own markers have been seen for long enough.
 
