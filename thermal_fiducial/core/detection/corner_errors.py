@@ -32,9 +32,9 @@ OF_BORDER_PX, OF_BORDERS_TOGETHER = 0.05, 12.0
 #: nothing.
 OF_UNEVEN_CONTRAST_PX = 0.7
 #: A side by a gradient of the contrast across it [px^2]: a step with a slope on one side, fitted as a step blurred by
-#: 0.75 px, is displaced by 1.0 to 1.4 px^2 times the slope over the step. The slope looks like contrast too [px]: a
-#: step of nothing has 2.5 px of the slope.
-OF_GRADIENT_PX2, GRADIENT_AS_CONTRAST_PX = 1.2, 2.5
+#: 0.75 px in pixels up to four blurs away, is displaced by 1.4 to 2.0 px^2 times the slope over the step. The slope
+#: looks like contrast too [px]: a step of nothing has 2 px of the slope. Both grow with the distance of the pixels.
+OF_GRADIENT_PX2, GRADIENT_AS_CONTRAST_PX = 2.0, 2.0
 #: The time constant of the lag, and the displacement of an edge by a response that is no exponential, both as shares of
 #: the motion blur. Rendered frames of a lag in steps, and of one of 14 ms taken for 10: corners with 2 to 8 px of blur
 #: are displaced by 0.010 to 0.014 of it, along the motion and across.

@@ -28,7 +28,7 @@ from thermal_fiducial.core.detection.corners.segments import (
     UNMEASURED,
     with_gradients,
 )
-from thermal_fiducial.core.detection.corners.sides import blurs, model, NARROW, Sides, sides_of
+from thermal_fiducial.core.detection.corners.sides import Blur, blurs, model, NARROW, Sides, sides_of
 from thermal_fiducial.core.detection.corners.squares import as_squares, Squared
 from thermal_fiducial.core.detection.frame import (
     counts_of,
@@ -67,6 +67,9 @@ _ROUNDS = 2
 _EYE = np.eye(2)
 # Indices of the corners, clockwise, among the ends of the sides.
 _CORNERS = np.array([0, 1, 3, 2])
+# Distance from the sides [blurs] beyond which pixels do not count where a gradient of temperature displaces a side: it
+# displaces it by as much less as pixels are nearer, and noise by a tenth more.
+_WITH_GRADIENT = 4.0
 # Largest number of passes. A corner has converged when its last step is below _UNSURE of its standard deviations,
 # clipped to the limits _SETTLED_PX [px].
 _PASSES = 4
@@ -228,6 +231,7 @@ def refine_corners(
     narrow: float = _NARROW_OF_CLEAR,
     motion: MotionBlur | None = None,
     passes: int = _PASSES,
+    uneven: BoolArray | None = None,
 ) -> RefinedCorners:
     """Corners of N markers; those that have not converged are refined again, in so many passes at most.
 
@@ -240,8 +244,10 @@ def refine_corners(
     columns : of pixels, in a segment
     narrow : of :func:`thermal_fiducial.core.detection.corners.sides.model`
     motion : blur by motion; none when left out
+    uneven : (N,) whether a gradient of temperature displaces a side; so far of none when left out
     """
     motion = motion or MotionBlur.none(len(corners.px))
+    uneven = np.zeros(len(corners.px), dtype=bool) if uneven is None else uneven
     # Where lag tails stay, the blur is so small that it hardly differs from one Gaussian.
     halves = [] if motion.to_tails is None else WITHOUT_TAIL
     widest = math.hypot(blur_px, math.sqrt(float((motion.spread * motion.spread).sum(axis=1).max())))
@@ -249,15 +255,26 @@ def refine_corners(
     blur, *parts = blurs(sides, blur_px, motion.spread, halves)
     counts = counts_of(sides.pixel, image, motion.to_tails)
     modelled = model(sides, behind, blur, narrow, parts)
-    segments = with_gradients(measure(counts, modelled, REACHED * blur.across), sides, widest)
+    if uneven.any():
+        modelled[2][:] &= _near(sides, blur, uneven)
+    segments, shows = with_gradients(measure(counts, modelled, REACHED * blur.across), sides, widest)
     refined, moving = _moved(sides, segments, as_squares(corners, *adjust(sides, segments)))
+    if shows.any():
+        moving, uneven = np.union1d(moving, np.flatnonzero(shows & ~uneven)), shows | uneven
     if passes == 1 or len(moving) == 0:
         return refined
     start = corners.only(moving).at_pixels(refined.corners_px[moving])
     again = refine_corners(
-        image, start, camera, behind[moving], blur_px, columns, narrow, motion.only(moving), passes - 1
-    )
+        image, start, camera, behind[moving], blur_px, columns, narrow, motion.only(moving), passes - 1,
+        uneven[moving],
+    )  # fmt: skip
     return refined.with_others(moving, again)
+
+
+def _near(sides: Sides, blur: Blur, uneven: BoolArray) -> BoolArray:
+    """Which pixels (M, C, E, m) count: all, or those near the sides where markers (N,) are ``uneven``."""
+    farthest = np.repeat(np.where(uneven, _WITH_GRADIENT, np.inf), 4)[:, None] * blur.across
+    return np.asarray(np.abs(sides.distance) <= farthest.astype(np.float32))
 
 
 def _moved(sides: Sides, segments: Segments, known: Squared) -> tuple[RefinedCorners, IntArray]:

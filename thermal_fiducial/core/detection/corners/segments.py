@@ -35,6 +35,8 @@ _KEPT_VARIANCE = 1.0 - math.sqrt(2.0 / math.pi) * _SEGMENT_OUTLIER * math.exp(-0
 # Range of a segment's contrast over the marker's: less is covered, more is another object's edge; standard deviation of
 # the contrast within a plate.
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
+# Standard deviations of the noise of a side beyond which the displacement by a gradient counts.
+_GRADIENT_SHOWS = 2.0
 # Largest number of rounds of robust weighting, and the change of weights below which it ends.
 _ROUNDS, _SETTLED = 3, 0.1
 _EYE = np.eye(8)
@@ -188,16 +190,20 @@ def _judged(fit: _SegmentFit, reach: FloatArray) -> Segments:
     return Segments(shift, np.where(usable, noise * fit.product_variance / (safe * safe), UNMEASURED), contrast, noise)
 
 
-def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> Segments:
+def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> tuple[Segments, BoolArray]:
     """The segments of whole markers, with the error by a gradient of temperature in the plate or behind it.
 
     Opposite sides show the gradient by their contrasts. A plate that is half warm has sides whose contrast is no more
-    than what the gradient alone looks like: they measure nothing.
+    than what the gradient alone looks like: they measure nothing. The segments of a side are displaced alike.
 
     Parameters
     ----------
     sides : of the markers
     blur_px : standard deviation of the blur, by which noise of a displacement is one of the contrast
+
+    Returns
+    -------
+    the segments, and whether (N,) a gradient displaces a side of a marker by more than noise does
     """
     count, cells = len(segments.shift), sides.across.shape[1]
     good = (segments.variance < UNMEASURED).reshape(count, 4, cells)
@@ -211,8 +217,9 @@ def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> Segments
     gradient = np.sqrt(np.maximum(change, 0.0)) / sides.across.reshape(good.shape).mean(axis=2)
     left = np.abs(contrast) - GRADIENT_AS_CONTRAST_PX * gradient
     std = np.where(left > 0.0, OF_GRADIENT_PX2 * gradient / np.maximum(left, TINY), np.inf)
-    variance = np.minimum(segments.variance + np.repeat(std**2, cells, axis=1), UNMEASURED)
-    return segments._replace(variance=variance)
+    beyond_noise = (std > _GRADIENT_SHOWS * blur_px * np.sqrt(relative / number)) & both
+    variance = np.minimum(segments.variance + np.repeat(number * std**2, cells, axis=1), UNMEASURED)
+    return segments._replace(variance=variance), np.asarray(beyond_noise.any(axis=1))
 
 
 def median_of(values: FloatArray, good: BoolArray) -> FloatArray:
