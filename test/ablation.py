@@ -192,7 +192,7 @@ MECHANISMS = {
     'lag tails taken out': Mechanism('fast, 8 K, blind', (), {'refining:_HARDLY_PX': np.inf}),
     'ends of motion blur': Mechanism(
         'fast, 8 K, guided',
-        ('frame:_moments', 'frame:_halves', 'refining:MotionBlur.parts'),
+        ('frame:_moments', 'frame:_halves'),
         {'refining:WITHOUT_TAIL': [(0.0, 1.0)]},
     ),
     'rolling shutter': Mechanism('rolling shutter', _READOUT, {}, {'readout_time': 0.0}),

@@ -42,7 +42,7 @@ from sensor_msgs.msg import Imu
 from support.empty_stage import EmptyStage
 from thermal_fiducial.ros.base import qos
 from thermal_fiducial.ros.process.run import run
-from unit.test_hearing import listening, SHARED
+from unit.ros.test_hearing import listening, SHARED
 
 marker = Path(sys.argv.pop())
 
