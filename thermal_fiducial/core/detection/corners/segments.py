@@ -35,7 +35,8 @@ _KEPT_VARIANCE = 1.0 - math.sqrt(2.0 / math.pi) * _SEGMENT_OUTLIER * math.exp(-0
 # Range of a segment's contrast over the marker's: less is covered, more is another object's edge; standard deviation of
 # the contrast within a plate.
 _LEAST_CONTRAST, _MOST_CONTRAST, _CONTRAST_VARIES = 0.3, 2.5, 0.3
-# Standard deviations of the noise of a side beyond which the displacement by a gradient counts.
+# Standard deviations of a side, by noise and by a blur that is not Gaussian, beyond which the displacement by a
+# gradient counts. Beyond noise alone most frames of even plates in fast flight would be fitted once more.
 _GRADIENT_SHOWS = 2.0
 # Largest number of rounds of robust weighting, and the change of weights below which it ends.
 _ROUNDS, _SETTLED = 3, 0.1
@@ -203,7 +204,7 @@ def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> tuple[Se
 
     Returns
     -------
-    the segments, and whether (N,) a gradient displaces a side of a marker by more than noise does
+    the segments, and whether (N,) a gradient displaces a side of a marker by more than its other errors do
     """
     count, cells = len(segments.shift), sides.across.shape[1]
     good = (segments.variance < UNMEASURED).reshape(count, 4, cells)
@@ -217,9 +218,10 @@ def with_gradients(segments: Segments, sides: Sides, blur_px: float) -> tuple[Se
     gradient = np.sqrt(np.maximum(change, 0.0)) / sides.across.reshape(good.shape).mean(axis=2)
     left = np.abs(contrast) - GRADIENT_AS_CONTRAST_PX * gradient
     std = np.where(left > 0.0, OF_GRADIENT_PX2 * gradient / np.maximum(left, TINY), np.inf)
-    beyond_noise = (std > _GRADIENT_SHOWS * blur_px * np.sqrt(relative / number)) & both
+    error = np.sqrt(blur_px**2 * relative / number + OF_SIDES_PX**2)
+    beyond_error = (std > _GRADIENT_SHOWS * error) & both
     variance = np.minimum(segments.variance + np.repeat(number * std**2, cells, axis=1), UNMEASURED)
-    return segments._replace(variance=variance), np.asarray(beyond_noise.any(axis=1))
+    return segments._replace(variance=variance), np.asarray(beyond_error.any(axis=1))
 
 
 def median_of(values: FloatArray, good: BoolArray) -> FloatArray:
