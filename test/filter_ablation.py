@@ -119,6 +119,11 @@ MECHANISMS = {
     ),
     'tilt of the map': Mechanism(('tilted map',), changes={'map_tilt_std': 0.0}),
     'far poses need evidence': Mechanism(('twin marker', 'wrong poses'), off={'hypotheses:_ENOUGH_POSES': 0}),
+    'contradiction in what is published': Mechanism(
+        ('moved markers', 'stepping clock'),
+        ('history:History.contradicting',),
+        {'history:History.contradicting': lambda *_: None},
+    ),
 }
 
 

@@ -288,13 +288,16 @@ def wrong_poses(seed: int) -> Arrivals:
     return _arrivals(flight, wrong)
 
 
-def twin_marker(seed: int) -> Arrivals:
+def twin_marker(seed: int, by: tuple[float, ...] = (0.9, 0.0, 1.2)) -> Arrivals:
     """For two seconds all poses agree on a place a metre and a half off."""
     flight = Flight(seed=seed, seconds=16.0)
     begin, end = START_NS + 9_000_000_000, START_NS + 11_000_000_000
-    return _arrivals(
-        flight, [_shifted(pose, (0.9, 0.0, 1.2)) if begin < pose.stamp_ns < end else pose for pose in flight.poses]
-    )
+    return _arrivals(flight, [_shifted(pose, by) if begin < pose.stamp_ns < end else pose for pose in flight.poses])
+
+
+def moved_markers(seed: int) -> Arrivals:
+    """For two seconds all poses agree on a place half a metre off."""
+    return twin_marker(seed, (0.3, 0.0, 0.4))
 
 
 def _shifted(pose: CameraPose, by: Any) -> CameraPose:
@@ -363,7 +366,7 @@ def map_in_the_making(seed: int) -> Arrivals:
 def _scenes() -> dict[str, Scene]:
     flights = (
         brisk, slow_and_noisy, coasting, scale_errors, shaken, nonlinear, saturated, frozen, gaps_of_imu, starved,
-        jittering, tilted_map, wrong_poses, twin_marker, unknown_clock_at_start, stepping_clock,
+        jittering, tilted_map, wrong_poses, twin_marker, moved_markers, unknown_clock_at_start, stepping_clock,
         small_step_of_clock, noise_of_poses, lasting_errors, map_in_the_making, shaking_mount,
     )  # fmt: skip
     scenes: dict[str, Scene] = {scene.__name__.replace('_', ' '): partial(of_flights, scene) for scene in flights}

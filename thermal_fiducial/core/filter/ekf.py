@@ -81,7 +81,7 @@ class PoseEkf:
         history.take_in()
         if history.main is None:
             return None
-        return odometry(history.main.estimate, history.imu.last)
+        return odometry(history.main.estimate, history.contradicting(), history.imu.last)
 
     def keep_imu(self, sample: ImuSample) -> bool:
         """Buffer an IMU sample without propagating to it: the next :meth:`add_imu` propagates over all buffered ones.

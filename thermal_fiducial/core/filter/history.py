@@ -21,6 +21,7 @@ from thermal_fiducial.core.filter.hypotheses import (
 from thermal_fiducial.core.filter.imu_buffer import ImuBuffer
 from thermal_fiducial.core.filter.initialization import no_gravity, WINDOW_SECONDS
 from thermal_fiducial.core.filter.propagation import propagated, random_walks
+from thermal_fiducial.core.filter.state import Estimate
 from thermal_fiducial.core.filter.update import body_pose, Innovation, innovation_of
 from thermal_fiducial.core.filter.verdicts import PoseLog, PoseUpdate
 from thermal_fiducial.core.measurements import CameraPose, in_moved_map
@@ -85,6 +86,13 @@ class History:
         """The alternative hypothesis at the newest sample."""
         other = self.belief.alternative
         return other and self._carried(other, self.imu.newest_ns)
+
+    def contradicting(self) -> Estimate | None:
+        """The alternative estimate at the newest sample, if the latest poses contradict the main one and support it."""
+        other = self.belief.alternative
+        if other is None or other.hits < self.config.initial_poses or not (self.main and self.main.in_doubt):
+            return None
+        return self._carried(other, self.imu.newest_ns).estimate
 
     def _forget_old(self) -> None:
         """Remove what is older than any pose that may still be inserted."""

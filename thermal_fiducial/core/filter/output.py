@@ -6,7 +6,8 @@ import math
 import numpy as np
 
 from thermal_fiducial.core.filter.imu_buffer import LastSample
-from thermal_fiducial.core.filter.state import Estimate, POSITION, PUBLISHED, ROTATION, VELOCITY
+from thermal_fiducial.core.filter.state import CORE, Estimate, NavigationState, POSITION, PUBLISHED, ROTATION, VELOCITY
+from thermal_fiducial.core.filter.update import pose_error
 from thermal_fiducial.core.geometry.reprojection import lever_arm, twist_transfer
 from thermal_fiducial.core.geometry.se3 import inverse, skew, so3_exp, so3_log, transform
 from thermal_fiducial.core.measurements import Odometry
@@ -23,15 +24,25 @@ _RATE_VARIANCES = slice(9 * 13, None, 13)
 LARGEST_STEP = 1.0
 
 
-def odometry(estimate: Estimate, sample: LastSample) -> Odometry:
-    """Odometry at an IMU sample."""
+def odometry(estimate: Estimate, other: Estimate | None, sample: LastSample) -> Odometry:
+    """Odometry at an IMU sample.
+
+    Parameters
+    ----------
+    other : estimate of the same instant that contradicts it: it widens the covariance by its own and their difference
+    """
     state = estimate.state
     R, velocity_body = state.R_map_body, state.velocity_body
+    joint = estimate.covariance[PUBLISHED, PUBLISHED]
+    if other:
+        apart = _difference(state, other.state)
+        joint = joint.copy()
+        joint[CORE, CORE] += other.covariance[CORE, CORE] + np.outer(apart, apart)
     # Position and rotation errors turn from the robot frame into the map; that of v_body depends on nu and phi.
     J = _AT_REST.copy()
     J[0:3, POSITION] = J[3:6, ROTATION] = R
     J[6:9, ROTATION] = skew(velocity_body)
-    covariance = J @ estimate.covariance[PUBLISHED, PUBLISHED] @ J.T
+    covariance = J @ joint @ J.T
     covariance.reshape(-1)[_RATE_VARIANCES] += float(sample.densities[0]) ** 2 / sample.seconds
     of_map = estimate.pose_noise.last.map_covariance
     return Odometry(
@@ -42,6 +53,13 @@ def odometry(estimate: Estimate, sample: LastSample) -> Odometry:
         covariance[:6, :6] + of_map,
         covariance[6:, 6:],
     )
+
+
+def _difference(state: NavigationState, other: NavigationState) -> FloatArray:
+    """Core error (9,) of ``state`` if ``other`` is the true state."""
+    apart = pose_error(state, other.T_map_body)
+    velocity = (other.velocity - state.velocity) @ state.R_map_body
+    return np.concatenate((apart[:3], velocity, apart[3:]))
 
 
 def in_frame(odometry: Odometry, T_body_frame: FloatArray) -> Odometry:
