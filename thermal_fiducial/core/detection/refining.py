@@ -260,7 +260,7 @@ def refine_corners(
     segments, shows = with_gradients(measure(counts, modelled, REACHED * blur.across), sides, widest)
     refined, moving = _moved(sides, segments, as_squares(corners, *adjust(sides, segments)))
     if shows.any():
-        moving, uneven = np.union1d(moving, np.flatnonzero(shows & ~uneven)), shows | uneven
+        moving, uneven = _again(moving, shows, uneven)
     if passes == 1 or len(moving) == 0:
         return refined
     start = corners.only(moving).at_pixels(refined.corners_px[moving])
@@ -269,6 +269,16 @@ def refine_corners(
         uneven[moving],
     )  # fmt: skip
     return refined.with_others(moving, again)
+
+
+def _again(moving: IntArray, shows: BoolArray, uneven: BoolArray) -> tuple[IntArray, BoolArray]:
+    """Places (M,) of the markers to refine again, and which (N,) of all by near pixels.
+
+    Only those that have converged with all pixels: from farther off near pixels pull towards another edge.
+    """
+    displaced = shows & ~uneven
+    displaced[moving] = False
+    return np.union1d(moving, np.flatnonzero(displaced)), uneven | displaced
 
 
 def _near(sides: Sides, blur: Blur, uneven: BoolArray) -> BoolArray:
