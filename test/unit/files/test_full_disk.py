@@ -7,6 +7,7 @@ import json
 import os
 import resource
 import shutil
+import sys
 import tempfile
 import time
 
@@ -36,12 +37,15 @@ from thermal_fiducial.ros.messages import clouds, convert
 @contextmanager
 def full_after(size):
     """No file grows beyond ``size`` bytes: what a full disk answers, without root and without a disk."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before, wrote = resource.getrlimit(resource.RLIMIT_FSIZE), sys.dont_write_bytecode
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    # Python takes the bytecode that it has cut off for whole, and no later process can import such a module.
+    sys.dont_write_bytecode = True
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        sys.dont_write_bytecode = wrote
 
 
 @contextmanager
