@@ -27,6 +27,8 @@ unexport PYTHONDONTWRITEBYTECODE
 # A notice of the theme about its successor, and ten lines of setuptools about what an editable installation is.
 export NO_MKDOCS_2_WARNING := 1
 QUIET_PIP := PYTHONWARNINGS='ignore:Editable installation'
+# A test that hangs ends with the stacks of its threads instead of the run; the longest takes 20 s, beside eight loops 3 min.
+LIMIT := --timeout 600 --timeout-method thread
 
 .PHONY: help demo test lint nightly coverage bench faults soak restart fuzz latency tables structure docs format clean
 
@@ -54,7 +56,7 @@ lint: $(READY)
 
 test: lint
 	@echo '== Tests (real data are used where THERMAL_FIDUCIAL_DATA names their folder)'
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal --durations 15 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal $(LIMIT) --durations 15 $(PYTEST_ARGS)
 
 nightly: $(READY)
 	@echo '== Studies of many flights, views and recordings, beside what make test runs'
@@ -62,7 +64,7 @@ nightly: $(READY)
 
 coverage: $(READY)
 	@echo '== Tests, and the branch coverage of the core by its own (test/conftest.py)'
-	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal --cov thermal_fiducial.core --cov-branch \
+	$(BIN)/python -m pytest --numprocesses 2 --dist worksteal $(LIMIT) --cov thermal_fiducial.core --cov-branch \
 		--cov-report term-missing:skip-covered --cov-fail-under 95 $(PYTEST_ARGS)
 
 bench: $(READY)

@@ -59,6 +59,7 @@ setup(
             'hypothesis',
             'pytest-benchmark',
             'pytest-xdist',
+            'pytest-timeout',
             'pytest-cov',
             'av',
             'psutil',

@@ -108,11 +108,14 @@ def flying(monkeypatch):
         ready = threading.Event()
         drone = threading.Thread(target=fly, args=(flight(), domain, ready), daemon=True)
         drone.start()
-        assert ready.wait(30.0)
-        yield
-        drone.join(30.0)
-        node.terminate()
-        node.wait(10.0)
+        try:
+            assert ready.wait(30.0)
+            yield
+            drone.join(30.0)
+            node.terminate()
+            node.wait(10.0)
+        finally:
+            node.kill()
 
 
 def test_the_filter_as_a_flight_controller_sees_it(flying, capfd):

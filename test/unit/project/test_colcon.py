@@ -95,10 +95,13 @@ def test_an_executable_runs_until_it_is_asked_to_stop(workspace, node):
         stderr=subprocess.STDOUT,
         text=True,
     )
-    with ros_graph() as graph:
-        graph.spin_until(lambda: node in graph.tester.get_node_names() or process.poll() is not None, seconds=30.0)
-    process.send_signal(signal.SIGINT)
-    output, _ = process.communicate(timeout=30.0)
+    try:
+        with ros_graph() as graph:
+            graph.spin_until(lambda: node in graph.tester.get_node_names() or process.poll() is not None, seconds=30.0)
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=30.0)
+    finally:
+        process.kill()
     assert process.returncode == 0, output
 
 

@@ -1,9 +1,11 @@
 """Nodes that Fast DDS has left deaf: noticed by their ports of shared memory, and started again."""
 
+from contextlib import suppress
 from pathlib import Path
 import signal
 import subprocess
 import sys
+import threading
 
 import pytest
 from sensor_msgs.msg import Imu
@@ -29,9 +31,35 @@ def test_a_port_of_shared_memory_that_was_deleted_is_noticed():
         assert replaced_ports() == [port]
 
 
+def test_threads_that_end_at_that_moment_are_no_error():
+    """Each look lists this process's threads and then reads their names, and in between some have ended."""
+    done = threading.Event()
+
+    def begin_and_end():
+        while not done.is_set():
+            thread = threading.Thread(target=lambda: None)
+            thread.start()
+            thread.join()
+
+    threads = [threading.Thread(target=begin_and_end) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    try:
+        # One look in 200 met a thread that ended, and failed.
+        for _ in range(500):
+            replaced_ports()
+    finally:
+        done.set()
+        for thread in threads:
+            thread.join()
+
+
 def listening():
     """Numbers of the ports of shared memory that threads of this process listen to."""
-    names = [file.read_text().strip() for file in Path('/proc/self/task').glob('*/comm')]
+    names = []
+    for thread in Path('/proc/self/task').iterdir():
+        with suppress(FileNotFoundError, ProcessLookupError):
+            names.append((thread / 'comm').read_text().strip())
     return [name.removeprefix('dds.shm.') for name in names if name.startswith('dds.shm.') and name[8:].isdigit()]
 
 
