@@ -12,7 +12,7 @@ from thermal_fiducial.core.geometry.reprojection import corners_in_map, reprojec
 from thermal_fiducial.core.geometry.se3 import rotation_angle
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
-from thermal_fiducial.core.mapping.candidates import DECISIVE
+from thermal_fiducial.core.mapping.candidates import UNAMBIGUOUS
 from thermal_fiducial.core.mapping.map_data import MapMarker, MarkerMap
 from thermal_fiducial.core.mapping.mapper import MarkerMapper
 from thermal_fiducial.core.mapping.marker_views import SAME_POSE
@@ -106,7 +106,7 @@ def decide(snapshot: Snapshot, marker_id: int, size: float, alternatives: Sequen
     cost, best = outcomes[0]
     for other_cost, other in outcomes[1:]:
         apart = rotation_angle(best.T_map_marker[:3, :3].T @ other.T_map_marker[:3, :3])
-        if apart > SAME_POSE and other_cost - cost < DECISIVE:
+        if apart > SAME_POSE and other_cost - cost < UNAMBIGUOUS:
             return None
     return best
 

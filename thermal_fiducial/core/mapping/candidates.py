@@ -26,7 +26,7 @@ MIN_VIEWS = 3
 #: Views kept of a candidate, which bounds the cost of the fit.
 MAX_VIEWS = 16
 #: Difference of the two fits' chi squares that rules the worse one out: odds of e^-12 against a flip.
-DECISIVE = 25.0
+UNAMBIGUOUS = 25.0
 #: Mean chi square of a view (8 residuals) above which the views cannot be of one marker at rest.
 INCONSISTENT = 200.0
 #: Candidates that are judged in one frame: bounds its time when many are new.
@@ -95,7 +95,7 @@ class Candidate:
             return Placement(None, nothing, f'marker {self.id}: its views contradict each other')
         scale = noise_factor(float(fits.chi2[0]), 8 * len(self.views) - 6)
         others = np.flatnonzero(rotation_angle(fits.T[0, :3, :3].T @ fits.T[:, :3, :3]) > SAME_POSE)
-        if len(others) and fits.cost[others[0]] - fits.cost[0] < DECISIVE * scale:
+        if len(others) and fits.cost[others[0]] - fits.cost[0] < UNAMBIGUOUS * scale:
             return Placement(None, nothing, f'planar ambiguity of marker {self.id} unsettled')
         return Placement(fits.T[0], fits.covariance(scale))
 
