@@ -209,7 +209,7 @@ MECHANISMS = {
     'half resolution': Mechanism('slow, 0.5 K, blind', (), {'finding:_next_scales': lambda *_, **__: _SCALES.FINE}),
     'one resolution in turn': Mechanism('slow, 8 K, blind', (), _ALL_IN_THE_SEARCH),
     'outlines pulled onto patterns': Mechanism(
-        'slow, 0.1 K, blind', ('alignment',), {'search:_rough': lambda *_: np.zeros(0, dtype=np.intp)}
+        'slow, 0.1 K, blind', ('pattern_fit:aligned',), {'search:_rough': lambda *_: np.zeros(0, dtype=np.intp)}
     ),
     'markers in plates': Mechanism(
         'fast, 0.5 K, blind',

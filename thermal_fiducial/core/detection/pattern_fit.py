@@ -1,7 +1,7 @@
-"""Fit of the whole pattern of small markers, whose cells are hardly wider than the blur.
+"""Fit of whole patterns: corners of small markers in pictures for a display, and alignment of inaccurate outlines.
 
-No side of such a marker can be measured by itself, and no cell shows its own gray. So the blurred pattern is fitted to
-the pixels: Gauss-Newton on corners and blur, with contrast and a linear background.
+No side of a marker whose cells are hardly wider than the blur can be measured by itself, and no cell shows its own
+gray. So the blurred pattern is fitted to the pixels: Gauss-Newton on corners and blur, with contrast and a background.
 
 The share of the variance that the pattern leaves is the evidence. A square with any other content leaves a share below
 r with a probability of the order of r^(v/2), where v is the number of independent values that the fit leaves free, at
@@ -15,14 +15,26 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from thermal_fiducial.core.detection.corner_errors import OF_PATTERN_PX
+from thermal_fiducial.core.detection.frame import Frame
+from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.geometry.se3 import bilinear, seen_between
-from thermal_fiducial.core.types import Float32Array, FloatArray, IntArray, TINY
+from thermal_fiducial.core.detection.refined_corners import RefinedCorners, sides_px
+from thermal_fiducial.core.geometry.se3 import bilinear, diagonals, seen_between
+from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, TINY
 
+# Cells below which the whole pattern is fitted, as they are hardly wider than the blur of their sides [px].
+_WIDEST_CELL_PX = 2.5
+# Bound on the number of false markers in a picture, were all of it squares with a black border around random bits.
+_FALSE_MARKERS = 0.01
 # Samples along a cell, and how far they reach beyond the sides [cells].
 _SAMPLES, _RING = 3, 0.5
 # Damping of each step: share of the information's diagonal that is added to it.
 _DAMPING = (0.1, 0.1, 0.03, 0.01, 0.003, 0.001)
+# Of an alignment, and the blur of its pattern, so wide that it reaches an edge half a cell away [cells].
+_OF_ALIGNMENT, _WIDE = (0.1, 0.1, 0.1), 0.25
+# Smoothing of the image for it, in pixels and at most in cells; least width of cells [px].
+_SMOOTHING_PX, _SMOOTHING, _LEAST_CELL_PX = 1.0, 0.4, 0.5
 # Longest step of a corner [cells] and of the blur, and range of the blur, both in blurs of the optics.
 _LONGEST, _LONGEST_BLUR, _BLURS = 0.6, 0.15, (0.5, 2.0)
 # Parameters of a fit: corners, blur, contrast, background. A fit to something that is not there makes use of fewer of
@@ -57,11 +69,11 @@ class _Grid(NamedTuple):
     along: FloatArray
     #: (4, S * S) of :func:`bilinear`
     weights: Float32Array
-    #: (S * S, 3) orthonormal linear backgrounds
+    #: (S * S, 3 or 6) orthonormal backgrounds
     background: FloatArray
 
     def without_background(self, values: FloatArray) -> FloatArray:
-        """Values (..., S * S) at the samples without their linear background."""
+        """Values (..., S * S) at the samples without their background."""
         return np.asarray(values - (values @ self.background) @ self.background.T)
 
 
@@ -99,11 +111,49 @@ class _PatternResiduals(NamedTuple):
 
 
 @cache
-def _grid(cells: int) -> _Grid:
+def _grid(cells: int, *, bent: bool = False) -> _Grid:
+    """Samples over a background that is linear, or quadratic if ``bent``."""
     along = (np.arange(round(_SAMPLES * (cells + 2.0 * _RING))) + 0.5) / _SAMPLES - _RING
     a, b = (axis.ravel() / cells for axis in np.meshgrid(along, along))
-    background = np.linalg.qr(np.stack([np.ones_like(a), a, b], axis=1))[0]
+    linear = [np.ones_like(a), a, b]
+    background = np.linalg.qr(np.stack([*linear, a * a, a * b, b * b] if bent else linear, axis=1))[0]
     return _Grid(along, bilinear(a, b).astype(np.float32), background)
+
+
+def too_small_for_sides(corners_px: FloatArray, cells: int) -> BoolArray:
+    """Which markers (N, 4, 2) have sides in a picture that are not measured by themselves."""
+    return np.asarray(sides_px(corners_px) < _WIDEST_CELL_PX * cells)
+
+
+def fitted_patterns(
+    frame: Frame, found: FoundMarkers, shown_px: FloatArray, decoder: Decoder, blur_px: float
+) -> tuple[IntArray, RefinedCorners]:
+    """Places of the small markers among those ``found`` (N,) whose patterns are there, and their corners.
+
+    Parameters
+    ----------
+    shown_px : (N, 4, 2) corners in the image, with lag tails, accurate to half a cell
+    blur_px : standard deviation of the blur of optics and pixels
+    """
+    small = np.flatnonzero(too_small_for_sides(shown_px, decoder.cells))
+    if len(small) == 0:
+        return small, RefinedCorners.none()
+    fit = fit_patterns(frame.image, shown_px[small], found.ids[small], decoder, blur_px)
+    good = _evident(fit, found.expected[small], frame, decoder)
+    covariances = fit.covariances[good] + OF_PATTERN_PX**2 * np.eye(2)
+    contrast, noise = fit.contrast[good], fit.noise[good]
+    corners = RefinedCorners(
+        fit.corners_px[good], covariances, contrast, noise, np.zeros(len(noise)), np.ones(len(noise), dtype=bool)
+    )
+    return small[good], corners
+
+
+def _evident(fit: PatternFit, expected: BoolArray, frame: Frame, decoder: Decoder) -> BoolArray:
+    """Which fits (N,) are evidence enough, of all markers and places that might be one by chance."""
+    height, width = frame.image.shape
+    places = np.where(expected, 1.0, height * width / np.maximum(sides_px(fit.corners_px) ** 2, 1.0))
+    tried = 4.0 * decoder.count * places
+    return np.asarray((fit.evidence > np.log(tried / _FALSE_MARKERS)) & (fit.lead > -math.log(_FALSE_MARKERS)))
 
 
 def fit_patterns(image: Float32Array, quads: FloatArray, ids: IntArray, decoder: Decoder, blur_px: float) -> PatternFit:
@@ -115,15 +165,38 @@ def fit_patterns(image: Float32Array, quads: FloatArray, ids: IntArray, decoder:
     blur_px : standard deviation of the blur of optics and pixels
     """
     white, blur = decoder.seen(ids, np.zeros_like(ids)), np.full(len(ids), blur_px)
+    grid = _grid(decoder.cells)
     for damping in _DAMPING:
-        quads, blur = _stepped(_linearised(image, quads, blur, white), damping, blur_px)
-    return _judged(_linearised(image, quads, blur, white), ids, decoder, blur_px)
+        quads, blur = _stepped(_linearised(image, quads, blur, white, grid), damping, blur_px)
+    return _judged(_linearised(image, quads, blur, white, grid), ids, decoder, blur_px)
 
 
-def _linearised(image: Float32Array, quads: FloatArray, blur: FloatArray, white: FloatArray) -> _PatternResiduals:
+def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArray, decoder: Decoder) -> FloatArray:
+    """Inaccurate outlines (Q, 4, 2), moved to where the patterns of their markers are.
+
+    The outline of a faint marker may have a corner or two wrong by up to a cell.
+
+    Parameters
+    ----------
+    image : (height, width) counts
+    ids, turns : (Q,) markers, and the quarter turns in which the outlines show them
+    """
+    white, grid = decoder.seen(ids, turns), _grid(decoder.cells, bent=True)
+    cell = np.maximum(diagonals(quads) / (math.sqrt(2.0) * decoder.cells), _LEAST_CELL_PX)
+    smoothing = min(_SMOOTHING_PX, _SMOOTHING * float(np.median(cell)))
+    smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), smoothing), dtype=np.float32)
+    blur = wide = _WIDE * cell
+    for damping in _OF_ALIGNMENT:
+        quads, blur = _stepped(_linearised(smooth, quads, blur, white, grid), damping, wide)
+    return quads
+
+
+def _linearised(
+    image: Float32Array, quads: FloatArray, blur: FloatArray, white: FloatArray, grid: _Grid
+) -> _PatternResiduals:
     """The fit of ``white`` cells (Q, m, m), seen with ``blur`` (Q,), at corners ``quads`` (Q, 4, 2)."""
     count, cells = white.shape[:2]
-    grid, black = _grid(cells), white - 1.0
+    black = white - 1.0
     to_cells = _to_cells(quads, cells)
     widths = np.sqrt((to_cells * to_cells).sum(axis=-1))
     x, y = (_weights(grid.along, cells, blur * widths[:, axis]) for axis in (0, 1))
@@ -168,7 +241,7 @@ def _weights(along: FloatArray, cells: int, blur: FloatArray) -> _CellWeights:
     return _CellWeights(np.diff(np.interp(z, _Z, _BELOW)), -np.diff(density) / width, -np.diff(z * density) / width**2)
 
 
-def _stepped(at: _PatternResiduals, damping: float, blur_px: float) -> tuple[FloatArray, FloatArray]:
+def _stepped(at: _PatternResiduals, damping: float, blur_px: float | FloatArray) -> tuple[FloatArray, FloatArray]:
     """Corners (Q, 4, 2) and blur (Q,) after a step."""
     information = at.J @ at.J.swapaxes(1, 2)
     diagonal = np.einsum('qii->qi', information)

@@ -43,9 +43,9 @@ from thermal_fiducial.core.detection.frame import (
     WITHOUT_TAIL,
 )
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
+from thermal_fiducial.core.detection.pattern_fit import fitted_patterns, too_small_for_sides
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.refined_corners import RefinedCorners, sides_px
-from thermal_fiducial.core.detection.small_markers import fitted_patterns, too_small_for_sides
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, UNKNOWN_TWIST
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig
-from thermal_fiducial.core.detection.alignment import aligned
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import among, CUT_OFF_PX, FoundMarkers, TOGETHER
+from thermal_fiducial.core.detection.pattern_fit import aligned
 from thermal_fiducial.core.detection.patterns import Decoder, Reading, shrunk
 from thermal_fiducial.core.detection.quads import (
     dark_in_picture,
@@ -145,7 +145,7 @@ class BlindSearch:
             return reading, quads
         ids, turns = reading.ids[rough], reading.turns[rough]
         if frame.displayed:
-            pulled = aligned(frame.image, quads[rough], ids, turns, decoder, noisy=False)
+            pulled = aligned(frame.image, quads[rough], ids, turns, decoder)
             again = decoder.read(frame.image, pulled, allowed)
         else:
             in_half = aligned(half, halfway(quads[rough]), ids, turns, decoder)
