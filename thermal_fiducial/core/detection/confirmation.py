@@ -26,7 +26,7 @@ from thermal_fiducial.core.detection.frame import counts_of, Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder, Reading
 from thermal_fiducial.core.detection.quads import halfway, halved
-from thermal_fiducial.core.detection.refined_corners import RefinedCorners, sides_px
+from thermal_fiducial.core.detection.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.refining import RefinedMarkers
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.camera import ImagePoints
@@ -125,52 +125,46 @@ def _outward(corners: FloatArray) -> FloatArray:
     return np.asarray((normal + before) / (1.0 + np.sum(normal * before, axis=-1, keepdims=True)))
 
 
-class CornerEstimator:
-    """Corners of the markers of a dictionary.
-
-    Parameters
-    ----------
-    decoder, bits : of the dictionary, (M, n, n)
-    """
-
-    def __init__(self, decoder: Decoder, bits: Gray) -> None:
-        self._decoder = decoder
-        self._displayed = DisplayedSides(bits)
-
-    def published(
-        self, frame: Frame, found: FoundMarkers, markers: RefinedMarkers, config: ArucoDetectorConfig
-    ) -> RefinedMarkers:
-        """The markers ``found`` that are confirmed at their refined corners, with the corners to publish."""
-        if len(found.ids) == 0:
-            return markers
-        keep = self._confirmed(frame, found, markers, config)
-        markers = markers if keep.all() else markers.only(keep)
-        if config.refinement == 'subpix':
-            return replace(markers, corners=local_corners(frame.image, markers.corners, self._decoder.cells))
-        sides = np.flatnonzero(~markers.observed.by_pattern)
-        if frame.displayed and len(sides):
-            corrected = self._displayed.corrected(frame, markers.only(sides), config.blur_px)
-            return replace(markers, corners=markers.corners.with_others(sides, corrected))
+def published(
+    frame: Frame,
+    found: FoundMarkers,
+    markers: RefinedMarkers,
+    decoder: Decoder,
+    displayed: DisplayedSides,
+    config: ArucoDetectorConfig,
+) -> RefinedMarkers:
+    """The markers ``found`` that are confirmed at their refined corners, with the corners to publish."""
+    if len(found.ids) == 0:
         return markers
+    keep = _confirmed(frame, found, markers, decoder, config)
+    markers = markers if keep.all() else markers.only(keep)
+    if config.refinement == 'subpix':
+        return replace(markers, corners=local_corners(frame.image, markers.corners, decoder.cells))
+    sides = np.flatnonzero(~markers.observed.by_pattern)
+    if frame.displayed and len(sides):
+        corrected = displayed.corrected(frame, markers.only(sides), config.blur_px)
+        return replace(markers, corners=markers.corners.with_others(sides, corrected))
+    return markers
 
-    def _confirmed(
-        self, frame: Frame, found: FoundMarkers, markers: RefinedMarkers, config: ArucoDetectorConfig
-    ) -> BoolArray:
-        """Which markers show their pattern at the refined corners."""
-        blur, observed, cells = markers.blur, markers.observed, self._decoder.cells
-        there = found.places.at.px + blur.shift
-        off = np.abs(observed.corners_px - there).max(axis=(1, 2))
-        read = off < _LITTLE / cells * sides_px(found.places.at.px)
-        keep = (read & found.certain) | observed.by_pattern
-        others = np.flatnonzero(~keep)
-        if len(others):
-            there, to_tails = there[others], None if blur.to_tails is None else blur.to_tails[others]
-            standing = np.sqrt(np.sum(blur.spread[others] ** 2, axis=1)) < _LITTLE * sides_px(there) / cells
-            keep[others] = confirmed(
-                frame.image, to_tails, found.only(others), there, observed.only(others), self._decoder, config,
-                standing_picture=frame.displayed & standing,
-            )  # fmt: skip
-        return np.asarray(keep & frame.camera.contains(observed.corners_px, _BORDER_PX).all(axis=1))
+
+def _confirmed(
+    frame: Frame, found: FoundMarkers, markers: RefinedMarkers, decoder: Decoder, config: ArucoDetectorConfig
+) -> BoolArray:
+    """Which markers show their pattern at the refined corners."""
+    blur, observed, cells = markers.blur, markers.observed, decoder.cells
+    there = found.places.at.px + blur.shift
+    off = np.abs(observed.corners_px - there).max(axis=(1, 2))
+    read = off < _LITTLE / cells * se3.sides_px(found.places.at.px)
+    keep = (read & found.certain) | observed.by_pattern
+    others = np.flatnonzero(~keep)
+    if len(others):
+        there, to_tails = there[others], None if blur.to_tails is None else blur.to_tails[others]
+        standing = np.sqrt(np.sum(blur.spread[others] ** 2, axis=1)) < _LITTLE * se3.sides_px(there) / cells
+        keep[others] = confirmed(
+            frame.image, to_tails, found.only(others), there, observed.only(others), decoder, config,
+            standing_picture=frame.displayed & standing,
+        )  # fmt: skip
+    return np.asarray(keep & frame.camera.contains(observed.corners_px, _BORDER_PX).all(axis=1))
 
 
 def confirmed(
@@ -196,7 +190,7 @@ def confirmed(
     if to_tails is not None:
         tails = refined.corners_px @ to_tails[:, :, :2].swapaxes(1, 2) + to_tails[:, None, :, 2]
     reading = _read(image, refined.corners_px, tails, decoder)
-    near = np.abs(refined.corners_px - there).max(axis=(1, 2)) < _NEAR_CELLS / decoder.cells * sides_px(there)
+    near = np.abs(refined.corners_px - there).max(axis=(1, 2)) < _NEAR_CELLS / decoder.cells * se3.sides_px(there)
     known = found.expected & near & reading.clear(config.guided_min_correlation, config.guided_min_margin)
     similar = np.abs(reading.correlation) >= np.where(standing_picture, _SIMILAR_IN_PICTURE, _SIMILAR)
     distinct = (similar | (decoder.correctable >= _MANY_BITS)) & _stands_out(reading, decoder)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from thermal_fiducial.config import ArucoDetectorConfig, size_overrides
-from thermal_fiducial.core.detection.confirmation import CornerEstimator
+from thermal_fiducial.core.detection.confirmation import DisplayedSides, published
 from thermal_fiducial.core.detection.corners.sides import edges_behind
 from thermal_fiducial.core.detection.finding import Findings, FrameHistory, MarkerFinder
 from thermal_fiducial.core.detection.frame import Frame
@@ -48,7 +48,7 @@ class MarkerDetector:
         self._sizes = np.array([overrides.get(key, config.marker_size) for key in range(decoder.count)])
         self._finder = MarkerFinder(decoder)
         self._behind = edges_behind(bits)
-        self._estimator = CornerEstimator(decoder, bits)
+        self._displayed = DisplayedSides(bits)
         self._partial = PartialMarkerSearch(decoder, bits)
         self._known = KnownMarkers({}, self._sizes)
         self._mount(config)
@@ -98,25 +98,18 @@ class MarkerDetector:
         findings = self._finder.find(frame, history, known, expected, config)
         found = findings.found
         refined = refine(frame, found, self._behind[found.ids], history.track, self._decoder, config)
-        refined = self._estimator.published(frame, found, refined, config)
+        refined = published(frame, found, refined, self._decoder, self._displayed, config)
         ids, corners = refined.ids, refined.corners
         at = refined.places.at.at_pixels(corners.corners_px)
-        at, poses = self._faces(ids, corners.covariances, at, T_camera_map)
+        poses = self._poses(ids, corners.covariances, at, T_camera_map)
+        if config.plate_thickness > 0.0:
+            at = corners_of_faces(at, poses.T_camera_marker[:, 0], known.sizes[ids], config.plate_thickness)
+            poses = self._poses(ids, corners.covariances, at, T_camera_map)
         rows = marker_rows(ids, at.px, corners.covariances, poses, corners.contrast)
         if T_camera_map is not None and expected is not None and among(ids, known.ids).sum() < _ENOUGH_WHOLE:
             rows = self._with_partial(rows, frame, T_camera_map, prediction.position_std_m)
         self._history = self._after(frame, findings, refined, poses, saw_partial=len(rows) > len(ids))
         return rows
-
-    def _faces(
-        self, ids: IntArray, covariances: FloatArray, at: ImagePoints, T_camera_map: FloatArray | None
-    ) -> tuple[ImagePoints, PlanarPoses]:
-        """Corners of the markers' faces, and the poses by them, from the corners of the outlines."""
-        poses, thickness = self._poses(ids, covariances, at, T_camera_map), self.config.plate_thickness
-        if thickness == 0.0 or len(ids) == 0:
-            return at, poses
-        at = corners_of_faces(at, poses.T_camera_marker[:, 0], self._known.sizes[ids], thickness)
-        return at, self._poses(ids, covariances, at, T_camera_map)
 
     def _poses(
         self, ids: IntArray, covariances: FloatArray, at: ImagePoints, T_camera_map: FloatArray | None

@@ -5,6 +5,7 @@ better than the pattern of any other marker and than any other rotation of its o
 """
 
 from dataclasses import dataclass, field
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -52,14 +53,9 @@ class Polarity:
 
     def kinds(self, rule: str) -> tuple[float, ...]:
         """Possible polarities by the parameter ``polarity``: 1 for markers darker than their background, -1."""
-        return tuple(kind for kind in (1.0, -1.0) if self.possible(np.array([kind]), rule)[0])
-
-    def possible(self, contrast: FloatArray, rule: str) -> BoolArray:
-        """Which markers (N,) have a possible polarity by the parameter ``polarity``."""
         if rule == 'any' or (rule == 'alike' and abs(self.balance) < _SURE):
-            return np.ones(len(contrast), dtype=bool)
-        kind = self.balance if rule == 'alike' else 1.0 if rule == 'dark' else -1.0
-        return np.asarray(contrast * kind > 0.0)
+            return 1.0, -1.0
+        return (math.copysign(1.0, self.balance) if rule == 'alike' else 1.0 if rule == 'dark' else -1.0,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +156,7 @@ class MarkerFinder:
         """Markers by blind search, except those already ``found``."""
         kinds, allowed = history.polarity.kinds(config.polarity), self.allowed(known, config)
         blind = self._search.search(frame, allowed, config, found, scales, kinds)
-        possible = history.polarity.possible(blind.cnr, config.polarity)
+        possible = np.isin(np.sign(blind.cnr), kinds)
         ids, corners = blind.ids[possible], blind.corners_px[possible]
         if len(ids) == 0:
             return FoundMarkers.none()

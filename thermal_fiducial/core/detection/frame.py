@@ -62,8 +62,8 @@ REMAINING, SPREAD = _moments(0.0, _TAIL)
 #: That motion blur as Gaussians of equal weight. It has sharp ends, and one Gaussian would have none: where it is as
 #: long as cells are wide, sides would be off by a tenth of it.
 WITHOUT_TAIL = _halves()
-# Age, in time constants, of the velocity that gives the displacement of the lag tail.
-_LAG_TAIL_AGE = 1.0 + 0.5 * _TAIL
+#: Age, in time constants, of the velocity that gives the displacement of the lag tail.
+LAG_TAIL_AGE = 1.0 + 0.5 * _TAIL
 
 
 @dataclass(frozen=True)
@@ -117,13 +117,12 @@ class Places(Stacked):
         """Places of image points (N, 4) at ``depth`` (N, 4)."""
         return Places(at, depth, at.J @ interaction(at.x, depth))
 
-    def lag_blur(self, twist: Twist, lag: float) -> FloatArray:
-        """Mean displacement (N, 4, 2) [px] of the corners by a lag [s]."""
-        return np.asarray(-lag * (self.flow @ twist.ago(lag)))
+    def lag_blur(self, twist: Twist, lag: float, age: float = 1.0) -> FloatArray:
+        """Displacement (N, 4, 2) [px] of the corners in a ``lag`` [s] by the velocity ``age`` of its length ago.
 
-    def lag_tail(self, twist: Twist, lag: float) -> FloatArray:
-        """Displacement (N, 4, 2) [px] of the corners' lag tails, over the age of the tail in time constants."""
-        return np.asarray(-lag * (self.flow @ twist.ago(_LAG_TAIL_AGE * lag)))
+        The mean displacement; at ``LAG_TAIL_AGE`` that of the lag tail, over the tail's age in time constants.
+        """
+        return np.asarray(-lag * (self.flow @ twist.ago(age * lag)))
 
 
 def delays(rows: FloatArray, frame: Frame) -> FloatArray:

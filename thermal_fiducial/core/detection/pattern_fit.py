@@ -19,8 +19,8 @@ from thermal_fiducial.core.detection.corner_errors import OF_PATTERN_PX
 from thermal_fiducial.core.detection.frame import Frame
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.refined_corners import RefinedCorners, sides_px
-from thermal_fiducial.core.geometry.se3 import bilinear, diagonals, seen_between
+from thermal_fiducial.core.detection.refined_corners import RefinedCorners
+from thermal_fiducial.core.geometry.se3 import bilinear, diagonals, seen_between, sides_px
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, TINY
 
 # Cells below which the whole pattern is fitted, as they are hardly wider than the blur of their sides [px].
@@ -29,10 +29,10 @@ _WIDEST_CELL_PX = 2.5
 _FALSE_MARKERS = 0.01
 # Samples along a cell, and how far they reach beyond the sides [cells].
 _SAMPLES, _RING = 3, 0.5
-# Damping of each step: share of the information's diagonal that is added to it.
-_DAMPING = (0.1, 0.1, 0.03, 0.01, 0.003, 0.001)
-# Of an alignment, and the blur of its pattern, so wide that it reaches an edge half a cell away [cells].
-_OF_ALIGNMENT, _WIDE = (0.1, 0.1, 0.1), 0.25
+# Damping: share of the information's diagonal that is added to it. Steps of a fit, and of an alignment.
+_DAMPING, _STEPS, _OF_ALIGNMENT = 0.1, 5, 3
+# Blur of the pattern in an alignment, so wide that it reaches an edge half a cell away [cells].
+_WIDE = 0.25
 # Smoothing of the image for it, in pixels and at most in cells; least width of cells [px].
 _SMOOTHING_PX, _SMOOTHING, _LEAST_CELL_PX = 1.0, 0.4, 0.5
 # Longest step of a corner [cells] and of the blur, and range of the blur, both in blurs of the optics.
@@ -166,8 +166,8 @@ def fit_patterns(image: Float32Array, quads: FloatArray, ids: IntArray, decoder:
     """
     white, blur = decoder.seen(ids, np.zeros_like(ids)), np.full(len(ids), blur_px)
     grid = _grid(decoder.cells)
-    for damping in _DAMPING:
-        quads, blur = _stepped(_linearised(image, quads, blur, white, grid), damping, blur_px)
+    for _ in range(_STEPS):
+        quads, blur = _stepped(_linearised(image, quads, blur, white, grid), blur_px)
     return _judged(_linearised(image, quads, blur, white, grid), ids, decoder, blur_px)
 
 
@@ -186,8 +186,8 @@ def aligned(image: Float32Array, quads: FloatArray, ids: IntArray, turns: IntArr
     smoothing = min(_SMOOTHING_PX, _SMOOTHING * float(np.median(cell)))
     smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), smoothing), dtype=np.float32)
     blur = wide = _WIDE * cell
-    for damping in _OF_ALIGNMENT:
-        quads, blur = _stepped(_linearised(smooth, quads, blur, white, grid), damping, wide)
+    for _ in range(_OF_ALIGNMENT):
+        quads, blur = _stepped(_linearised(smooth, quads, blur, white, grid), wide)
     return quads
 
 
@@ -241,11 +241,11 @@ def _weights(along: FloatArray, cells: int, blur: FloatArray) -> _CellWeights:
     return _CellWeights(np.diff(np.interp(z, _Z, _BELOW)), -np.diff(density) / width, -np.diff(z * density) / width**2)
 
 
-def _stepped(at: _PatternResiduals, damping: float, blur_px: float | FloatArray) -> tuple[FloatArray, FloatArray]:
+def _stepped(at: _PatternResiduals, blur_px: float | FloatArray) -> tuple[FloatArray, FloatArray]:
     """Corners (Q, 4, 2) and blur (Q,) after a step."""
     information = at.J @ at.J.swapaxes(1, 2)
     diagonal = np.einsum('qii->qi', information)
-    diagonal *= 1.0 + damping
+    diagonal *= 1.0 + _DAMPING
     # Keeps the system solvable where the image has no gradient in some direction.
     diagonal += TINY * (1.0 + diagonal.max(axis=1, keepdims=True))
     step = -np.linalg.solve(information, at.J @ at.rest[..., None])[..., 0]

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from thermal_fiducial.core.geometry.se3 import squared_sides
 from thermal_fiducial.core.types import BoolArray, FloatArray, Stacked
 
 
@@ -35,8 +34,3 @@ class RefinedCorners(Stacked):
         """No corners."""
         no = np.zeros(0)
         return RefinedCorners(np.zeros((0, 4, 2)), np.zeros((0, 4, 2, 2)), no, no, no, no.astype(bool))
-
-
-def sides_px(corners: FloatArray) -> FloatArray:
-    """Mean sides (N,) of quadrilaterals (N, 4, 2)."""
-    return np.asarray(np.sqrt(squared_sides(corners)).mean(axis=1))

@@ -34,6 +34,7 @@ from thermal_fiducial.core.detection.frame import (
     counts_of,
     delays,
     Frame,
+    LAG_TAIL_AGE,
     lag_tail_maps,
     Places,
     REMAINING,
@@ -45,10 +46,11 @@ from thermal_fiducial.core.detection.frame import (
 from thermal_fiducial.core.detection.known_markers import FoundMarkers
 from thermal_fiducial.core.detection.pattern_fit import fitted_patterns, too_small_for_sides
 from thermal_fiducial.core.detection.patterns import Decoder
-from thermal_fiducial.core.detection.refined_corners import RefinedCorners, sides_px
+from thermal_fiducial.core.detection.refined_corners import RefinedCorners
 from thermal_fiducial.core.detection.tracking import MotionTrack
 from thermal_fiducial.core.detection.twist import Twist, UNKNOWN_TWIST
 from thermal_fiducial.core.geometry.camera import Camera, ImagePoints
+from thermal_fiducial.core.geometry.se3 import sides_px
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, IntArray, Stacked, TINY
 
 #: Contrast-to-noise ratio above which a marker is clear: it is found at full and at half resolution.
@@ -213,7 +215,7 @@ def _motion_blur(frame: Frame, places: Places, twist: Twist | None) -> MotionBlu
     if twist is None or (lag_blur * lag_blur).sum(axis=-1).max() <= _HARDLY_PX**2:
         return MotionBlur(None, lag_blur + rolling, np.zeros_like(lag_blur), mean)
     # So far the velocity has carried the image since its lag tail was seen, as the read-out shows it.
-    tail = places.lag_tail(twist, frame.lag)
+    tail = places.lag_blur(twist, frame.lag, LAG_TAIL_AGE)
     if frame.readout > 0.0:
         tail = tail * stretch(places, twist, frame)[..., None]
     removed = (1.0 - REMAINING) * tail

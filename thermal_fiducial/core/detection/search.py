@@ -19,8 +19,7 @@ from thermal_fiducial.core.detection.quads import (
     Scale,
     without_columns,
 )
-from thermal_fiducial.core.detection.refined_corners import sides_px
-from thermal_fiducial.core.geometry.se3 import diagonals, grown, squared_sides
+from thermal_fiducial.core.geometry.se3 import diagonals, grown, sides_px, squared_sides
 from thermal_fiducial.core.types import BoolArray, Float32Array, FloatArray, Gray, IntArray
 
 # Full resolution for small and blurred markers; half resolution, with the column pattern removed, for faint ones.

@@ -4,7 +4,6 @@ The camera's twist is that of the odometry around the frame, else that of the la
 of the markers' corners since the last frame.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 import math
 
@@ -24,7 +23,6 @@ from thermal_fiducial.core.detection.twist import (
 )
 from thermal_fiducial.core.geometry import se3
 from thermal_fiducial.core.geometry.reprojection import twist_transfer
-from thermal_fiducial.core.measurements import Odometry
 from thermal_fiducial.core.motion_prior import extrapolated, MotionPrior
 from thermal_fiducial.core.types import FloatArray, IntArray, SECOND_NS
 
@@ -72,24 +70,8 @@ class MotionTrack:
         """The track before the first frame of a camera at ``T_body_camera`` (4, 4)."""
         return MotionTrack(T_body_camera, twist_transfer(T_body_camera), lag)
 
-    def predict(
-        self,
-        stamp_ns: int,
-        odometry: Sequence[Odometry],
-        odometry_ns: int | None = None,
-        clock_std_s: float = 0.0,
-    ) -> Twist | None:
-        """Twist predicted for a frame; None without any information.
-
-        Parameters
-        ----------
-        odometry : states around the time that blurs the frame, or the nearest one
-        odometry_ns : the frame's stamp in the clock of the odometry, if that is another one
-        clock_std_s : standard deviation of that stamp [s]
-        """
-        odometry_ns = stamp_ns if odometry_ns is None else odometry_ns
-        if len(odometry) and abs(odometry_ns - odometry[-1].stamp_ns) < _STALE_NS:
-            return twist_by_odometry(odometry_ns, odometry, self.from_body, self.lag, clock_std_s)
+    def predict(self, stamp_ns: int) -> Twist | None:
+        """Twist predicted for a frame by those before it; None without any information."""
         dt = self._since(stamp_ns)
         # Without markers the twist is not extrapolated: a wrong one would keep them from being found again.
         saw_lately = self.last_seen_ns is not None and abs(stamp_ns - self.last_seen_ns) < _STALE_NS
@@ -188,7 +170,7 @@ def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, 
     Odometry older than ``max_age_s`` gives no pose.
     """
     if prior is None:
-        return FramePrediction(track.predict(stamp_ns, []), None, math.inf)
+        return FramePrediction(track.predict(stamp_ns), None, math.inf)
     lag_ns = max(round(SECOND_NS * track.lag), _SHORTEST_LAG_NS)
     odometry_ns = prior.in_odometry_clock(stamp_ns)
     clock_std_s = 0.0 if prior.clock_is_known else _UNKNOWN_CLOCK_S
@@ -197,7 +179,10 @@ def predict_frame(stamp_ns: int, prior: MotionPrior | None, track: MotionTrack, 
         states = prior.between(odometry_ns - _LONGEST_NS, odometry_ns + lag_ns, _STATES)
     if not states and (other := prior.nearest(odometry_ns)) is not None:
         states = [other]
-    twist = track.predict(stamp_ns, states, odometry_ns, clock_std_s)
+    if states and abs(odometry_ns - states[-1].stamp_ns) < _STALE_NS:
+        twist: Twist | None = twist_by_odometry(odometry_ns, states, track.from_body, track.lag, clock_std_s)
+    else:
+        twist = track.predict(stamp_ns)
     nearest = min(states, key=lambda state: abs(odometry_ns - state.stamp_ns), default=None)
     dt = math.inf if nearest is None else (odometry_ns - nearest.stamp_ns) / SECOND_NS
     if nearest is None or twist is None or abs(dt) > max_age_s:

@@ -8,7 +8,7 @@ from support.detector_scores import odometry_before
 
 from thermal_fiducial.core.detection.corner_errors import of_motion_blur, unknown_motion
 from thermal_fiducial.core.detection.corners.sides import edges_behind
-from thermal_fiducial.core.detection.frame import counts_of, lag_tail_maps, Places, REMAINING, SPREAD
+from thermal_fiducial.core.detection.frame import counts_of, LAG_TAIL_AGE, lag_tail_maps, Places, REMAINING, SPREAD
 from thermal_fiducial.core.detection.patterns import Decoder
 from thermal_fiducial.core.detection.refining import MotionBlur, refine_corners
 from thermal_fiducial.core.detection.twist import Twist
@@ -102,7 +102,7 @@ def test_what_an_acceleration_leaves_of_the_lag_is_the_mean_of_the_young_respons
     places = Places.of(ImagePoints.seen_at(np.zeros((1, 4, 2)), camera), np.ones((1, 4)))
     along = np.eye(6)[0]
     twist = Twist(speed * along, np.eye(6), acceleration * along)
-    left = places.lag_blur(twist, tau) - (1.0 - REMAINING) * places.lag_tail(twist, tau)
+    left = places.lag_blur(twist, tau) - (1.0 - REMAINING) * places.lag_blur(twist, tau, LAG_TAIL_AGE)
     # The tail begins at an age of three quarters.
     ages = tau * (np.arange(7500) + 0.5) / 1e4
     behind = np.average(ages * speed - 0.5 * ages**2 * acceleration, weights=np.exp(-ages / tau))
