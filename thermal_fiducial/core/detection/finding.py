@@ -156,7 +156,7 @@ class MarkerFinder:
         """Markers by blind search, except those already ``found``."""
         kinds, allowed = history.polarity.kinds(config.polarity), self.allowed(known, config)
         blind = self._search.search(frame, allowed, config, found, scales, kinds)
-        possible = np.isin(np.sign(blind.cnr), kinds)
+        possible = (blind.cnr[:, None] * kinds > 0.0).any(axis=1)
         ids, corners = blind.ids[possible], blind.corners_px[possible]
         if len(ids) == 0:
             return FoundMarkers.none()

@@ -27,7 +27,7 @@ _FINE = Scale(smoothing_px=0.5, window_px=5, window_shrink=2, depth=0.2, floor=2
 _FAINT = Scale(smoothing_px=1.2, window_px=5, window_shrink=1, depth=0.03, floor=1.0)
 # Correlation from which an outline needs no alignment; least correlation, and its margin, for alignment to be tried.
 _CLEAR = 0.95
-_HINT, _HINT_MARGIN = 0.5, 0.06
+_HINT, _HINT_MARGIN = 0.6, 0.06
 # Factor on the shortest side of a marker in a picture for a display, which has little noise: in oblique views the other
 # sides are longer.
 _PICTURE_SIDE = 0.25
