@@ -80,6 +80,11 @@ def twin(now: World, _: float) -> World:
     return replace(now, twins=[replace(now.markers[0], position=(x, y, z - 0.5))])
 
 
+def twin_alone(now: World, _: float) -> World:
+    """Nothing is in view but a second marker of the first one's ID, in the place of the fourth."""
+    return replace(now, markers=[replace(now.markers[3], id=now.markers[0].id)])
+
+
 def foreign(now: World, _: float) -> World:
     """Two markers that the map does not know."""
     unmapped = [

@@ -94,6 +94,7 @@ def _markers() -> list[Fault]:
         'one of six moved by 5 cm': camera_faults.world(camera_faults.moved(1, 0.05)),
         'two of six moved by 0.3 m': camera_faults.world(camera_faults.moved(2, 0.3)),
         'a second one of the same ID': camera_faults.world(camera_faults.twin),
+        'a second one of the same ID, alone in view': camera_faults.world(camera_faults.twin_alone),
         'two exchange their IDs': camera_faults.world(camera_faults.replaced),
         'two foreign ones': camera_faults.world(camera_faults.foreign),
         'one on a cart at 0.3 m/s': camera_faults.world(camera_faults.cart(0.3)),

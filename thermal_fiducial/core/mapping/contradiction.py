@@ -1,8 +1,8 @@
-"""Two known markers that contradict each other: odometry decides which of them has moved.
+"""Known markers that contradict each other, or odometry: which of them has moved, or is a second plate of its ID.
 
 Of three markers one that has moved is an outlier of a robust fit. Of two either may have moved: the robust fit follows
 one of them, now this and now that. What is unknown is discrete, which of them it is, and the camera as predicted by
-odometry is the measurement that decides it.
+odometry is the measurement that decides it. A marker alone in view has nothing but odometry to contradict.
 """
 
 from collections.abc import Callable
@@ -13,11 +13,32 @@ import numpy as np
 from thermal_fiducial.core.error_model import INCONSISTENT_PX, of_single_error
 from thermal_fiducial.core.geometry.camera import Camera
 from thermal_fiducial.core.geometry.reprojection import difference
+from thermal_fiducial.core.geometry.se3 import inverse
 from thermal_fiducial.core.mapping.localization import DECISIVE, names
-from thermal_fiducial.core.mapping.located import error_std_px, Location, Refusal, Sight
+from thermal_fiducial.core.mapping.located import (
+    CONTRADICTION,
+    error_std_px,
+    LocatedFrame,
+    Location,
+    MisplacedMarker,
+    Refusal,
+    Sight,
+    squared_distance,
+)
 from thermal_fiducial.core.mapping.trust import DISAGREEMENT
-from thermal_fiducial.core.measurements import CameraPose
-from thermal_fiducial.core.types import FloatArray
+from thermal_fiducial.core.measurements import CameraPose, in_moved_map
+from thermal_fiducial.core.types import FloatArray, SECOND_NS
+
+#: Markers that must have agreed with odometry for it to count against another: two against one.
+_WITNESSES = 2
+#: A marker is misplaced from this distance on [m]: where odometry is wrong by less, following the marker costs less
+#: than losing the pose.
+_FAR = 0.2
+#: An estimate that drifts away contradicts a marker in view a little at first. A marker that is misplaced is far away
+#: at once: nothing has contradicted odometry for this long [ns].
+_BEFORE_NS = SECOND_NS // 3
+#: Odometry that for so long [ns] had no other marker says nothing any more; as ``reinitialise_after``.
+_FORGOTTEN_NS = 60 * SECOND_NS
 
 
 def are_two_that_contradict(location: Location) -> bool:
@@ -63,6 +84,74 @@ def settled(
 def contradicting(sight: Sight) -> Refusal:
     """No pose from markers that contradict each other."""
     return Refusal(f'{names(sight)} contradict each other')
+
+
+class MisplacedMarkers:
+    """The marker, if any, that alone in view contradicts odometry and the markers which bear it out.
+
+    From the marker's own views nothing can be learned about which is right: they all agree with each other, and after
+    some seconds without another marker odometry has drifted so far that it contradicts nothing. So what the first
+    view showed is remembered, until the marker is back in its place, is seen with another one, or a second marker
+    contradicts odometry too: then it is odometry that is wrong.
+    """
+
+    def __init__(self) -> None:
+        self._misplaced: MisplacedMarker | None = None
+        #: IDs of markers that have agreed with odometry
+        self._witnesses: set[int] = set()
+        #: stamp of the last pose that contradicted it [ns]
+        self._contradicted_ns: int | None = None
+
+    def checked(self, location: Location, predicted: CameraPose | None) -> Location | Refusal:
+        """The ``location``, or why there is none from a misplaced marker; ``predicted``: the camera by odometry."""
+        ids, stamp_ns = location.pose.marker_ids, location.pose.stamp_ns
+        if len(ids) > 1:
+            return location
+        known = self._misplaced
+        if known is None or not 0 <= stamp_ns - known.since_ns < _FORGOTTEN_NS:
+            found = self._found(location, predicted)
+        else:
+            found = known if known.id == ids[0] and not _is_back(known, location.pose, predicted) else None
+        return location if found is None else Refusal(found.reason, misplaced=found)
+
+    def _found(self, location: Location, predicted: CameraPose | None) -> MisplacedMarker | None:
+        """The only marker in view if it is misplaced at first sight."""
+        pose, contradicted_ns = location.pose, self._contradicted_ns
+        (marker_id,) = pose.marker_ids
+        drifting = contradicted_ns is not None and 0 <= pose.stamp_ns - contradicted_ns < _BEFORE_NS
+        if predicted is None or drifting or len(self._witnesses - {marker_id}) < _WITNESSES:
+            return None
+        T_moved = pose.T_map_camera @ inverse(predicted.T_map_camera)
+        T_map_marker = location.sight.T_map_marker[0]
+        distance = float(np.linalg.norm((inverse(T_moved) @ T_map_marker - T_map_marker)[:3, 3]))
+        if distance < _FAR or squared_distance(pose, predicted) < CONTRADICTION:
+            return None
+        return MisplacedMarker(marker_id, pose.stamp_ns, T_moved, distance)
+
+    def add(self, frame: LocatedFrame) -> None:
+        """Update with a frame and its outcome."""
+        outcome = frame.outcome
+        if isinstance(outcome, Refusal):
+            self._misplaced = outcome.misplaced or self._misplaced
+            return
+        ids = set(outcome.pose.marker_ids)
+        if frame.contradicts_odometry:
+            self._contradicted_ns = frame.stamp_ns
+            if self._misplaced:
+                # It is the second one.
+                self._misplaced, self._witnesses = None, set()
+        elif frame.predicted:
+            self._witnesses |= ids
+        if self._misplaced and self._misplaced.id in ids:
+            self._misplaced = None
+
+
+def _is_back(misplaced: MisplacedMarker, pose: CameraPose, predicted: CameraPose | None) -> bool:
+    """Whether a marker is rather in its place in the map than where it was found, by odometry."""
+    if predicted is None:
+        return False
+    elsewhere = in_moved_map(pose, inverse(misplaced.T_moved))
+    return squared_distance(elsewhere, predicted) - squared_distance(pose, predicted) > DECISIVE
 
 
 def _distances(sight: Sight, camera: Camera, predicted: CameraPose) -> FloatArray:

@@ -134,12 +134,32 @@ class Location:
 
 
 @dataclass(frozen=True)
+class MisplacedMarker:
+    """A marker that, alone in view, is not where the map and odometry have it: moved, or a second plate of its ID."""
+
+    id: int
+    #: stamp of the first such frame
+    since_ns: int
+    #: (4, 4) from the camera pose by odometry to the one by the marker, there: T_by_marker = T_moved @ T_by_odometry
+    T_moved: FloatArray
+    #: between the marker and its place in the map [m]
+    distance: float
+
+    @property
+    def reason(self) -> str:
+        """Why there is no pose from it, in words."""
+        return f'marker {self.id} alone is {self.distance:.1f} m from its place: moved, or a second one of its ID?'
+
+
+@dataclass(frozen=True)
 class Refusal:
     """The reason, in words, for which a frame has no pose."""
 
     reason: str
     #: the two possible poses, where the reason is the planar ambiguity
     viewpoint: Viewpoint | None = None
+    #: where that is the reason
+    misplaced: MisplacedMarker | None = None
 
 
 @dataclass(frozen=True)
@@ -171,10 +191,7 @@ class LocatedFrame:
         """Whether pose and odometry contradict each other."""
         if self.predicted is None or isinstance(self.outcome, Refusal):
             return False
-        pose, odometry = self.outcome.pose, self.predicted.pose
-        apart = difference(odometry.T_map_camera, pose.T_map_camera)
-        covariance = pose.covariance + odometry.covariance
-        return bool(apart @ np.linalg.solve(covariance, apart) > CONTRADICTION)
+        return squared_distance(self.outcome.pose, self.predicted.pose) > CONTRADICTION
 
     def known_errors(self, location: Location) -> tuple[FloatArray, FloatArray]:
         """Rms errors (K,) [px] of the K known markers, and their standard deviations (K,) by noise, pose and map.
@@ -189,6 +206,12 @@ class LocatedFrame:
     def left_out(self, location: Location) -> BoolArray:
         """Which of the K known markers (K,) the pose left out, though they were trusted."""
         return self.known.trusted & ~np.isin(self.known.observed.ids, location.sight.observed.ids)
+
+
+def squared_distance(pose: CameraPose, predicted: CameraPose) -> float:
+    """Squared Mahalanobis distance, six degrees of freedom, of two independent poses of a camera."""
+    apart = difference(predicted.T_map_camera, pose.T_map_camera)
+    return float(apart @ np.linalg.solve(pose.covariance + predicted.covariance, apart))
 
 
 def error_std_px(sight: Sight, seen: Reprojected, camera_covariance: FloatArray) -> FloatArray:

@@ -20,7 +20,12 @@ from thermal_fiducial.core.geometry.se3 import camera_in_body
 from thermal_fiducial.core.mapping.adjustment_problem import Snapshot
 from thermal_fiducial.core.mapping.bundle_adjustment import AdjustedMap, refine
 from thermal_fiducial.core.mapping.candidates import Candidate, entry, NewMarkers
-from thermal_fiducial.core.mapping.contradiction import are_two_that_contradict, contradicting, settled
+from thermal_fiducial.core.mapping.contradiction import (
+    are_two_that_contradict,
+    contradicting,
+    MisplacedMarkers,
+    settled,
+)
 from thermal_fiducial.core.mapping.keyframes import FrameMemory, VIEWS
 from thermal_fiducial.core.mapping.localization import locate
 from thermal_fiducial.core.mapping.located import LocatedFrame, Location, Refusal, Sight
@@ -82,6 +87,7 @@ class MarkerMapper:
         self._new = NewMarkers(self.config.marker_size, size_overrides(self.config.marker_size_overrides))
         self._trust = Trust(self.map.markers)
         self._bias = CornerBias()
+        self._misplaced = MisplacedMarkers()
         #: the last pose that nothing contradicted
         self._last: CameraPose | None = None
         #: whether odometry has agreed with the markers since the map was loaded
@@ -131,9 +137,11 @@ class MarkerMapper:
         T_expected = None if expected is None else expected.T_map_camera
         fit = partial(locate, stamp_ns, camera=camera, prior=T_expected, model=self._errors)
         found = fit(sight)
-        if isinstance(found, Refusal) or not are_two_that_contradict(found):
+        if not isinstance(found, Refusal) and are_two_that_contradict(found):
+            found = contradicting(sight) if predicted is None else settled(found, camera, predicted.pose, fit)
+        if isinstance(found, Refusal):
             return found
-        return contradicting(sight) if predicted is None else settled(found, camera, predicted.pose, fit)
+        return self._misplaced.checked(found, None if predicted is None else predicted.pose)
 
     @property
     def _errors(self) -> SystematicErrors:
@@ -149,6 +157,7 @@ class MarkerMapper:
         """Second half of :meth:`process`: updates errors, quarantine and new markers with the frame located last."""
         outcome, waiting = frame.outcome, Waiting()
         changed = updated = False
+        self._misplaced.add(frame)
         if isinstance(outcome, Refusal):
             changed, waiting = self._without_pose(frame, outcome)
         elif frame.contradicts_odometry and self._odometry_agreed:

@@ -1,4 +1,6 @@
-"""Two markers of a map contradict each other, as one of them was moved: which one, odometry says."""
+"""Markers of a map contradict each other or odometry, as one was moved or exists twice: which one, odometry says."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,3 +75,67 @@ def test_without_odometry_no_pose_is_published():
 def test_markers_that_agree_are_all_used():
     for result in flown(2, 0.0):
         assert result.pose.marker_ids == (1, 2)
+
+
+def alone(seen_at, frames, known=(1, 2, 3, 4), drift=None):
+    """Results of frames: all of ``known`` in view for 20 frames, then one alone, ``seen_at(k)``: its ID, its shift [m].
+
+    ``drift(k)``: error of odometry [m] and factor on its standard deviations.
+    """
+    rng = np.random.default_rng(4)
+    poses = {key: T for key, T in wall(rng).items() if key in known}
+    mapper = MarkerMapper(
+        MarkerMapperConfig(mode='localization', camera_orientation=(0.0, 0.0, 0.0, 1.0)),
+        MarkerMap({key: MapMarker(key, SIZE, True, T) for key, T in poses.items()}),
+    )
+    results = []
+    for k in range(frames):
+        there = poses
+        if k >= 20:
+            key, shift = seen_at(k)
+            there = {key: poses[key] @ transform(np.eye(3), [shift, 0.0, 0.0])}
+        state = odometry(k)
+        error, factor = drift(k) if drift else (0.0, 1.0)
+        T = transform(np.eye(3), [error, 0.0, 0.0]) @ state.T_map_body
+        state = replace(state, T_map_body=T, pose_covariance=factor**2 * state.pose_covariance)
+        results.append(mapper.process(stamp(k), see(flight(k / 30), there, 0.02, rng), CAMERA, motion_prior(state)))
+    return results
+
+
+def published(results):
+    """Numbers of the frames with a pose."""
+    return [k for k, result in enumerate(results) if result.pose is not None]
+
+
+def test_a_second_plate_of_an_id_alone_in_view_gives_no_pose_however_long_it_is_seen():
+    """Also when odometry has drifted until it contradicts nothing."""
+    results = alone(lambda k: (2, 0.5), 80, drift=lambda k: (0.0, 1.0 + max(k - 20, 0)))
+    assert published(results) == list(range(20))
+    # Its shift by 0.5 m, by odometry.
+    assert results[-1].reason == 'marker 2 alone is 0.5 m from its place: moved, or a second one of its ID?'
+
+
+def test_back_in_its_place_it_gives_poses_again():
+    results = alone(lambda k: (2, 0.5 if k < 40 else 0.0), 60)
+    assert published(results) == [*range(20), *range(40, 60)]
+
+
+def test_two_markers_that_contradict_odometry_one_after_the_other_are_right():
+    results = alone(lambda k: (2 if k < 40 else 3, 0.0), 70, drift=lambda k: (0.5 * (k >= 20), 1.0))
+    assert published(results) == [*range(20), *range(40, 70)]
+
+
+def test_a_marker_in_view_is_followed_when_odometry_drifts_away():
+    results = alone(lambda k: (2, 0.0), 90, drift=lambda k: (0.01 * max(k - 20, 0), 1.0))
+    assert published(results) == list(range(90))
+
+
+def test_one_marker_against_another_is_no_majority():
+    results = alone(lambda k: (2, 0.5), 60, known=(1, 2))
+    assert published(results) == list(range(60))
+
+
+def test_after_a_minute_odometry_counts_no_more():
+    results = alone(lambda k: (2, 0.5), 20 + 62 * 30, drift=lambda k: (0.0, 1.0 if k <= 20 else 1000.0))
+    # 60 s after the first of its frames; stamps are rounded.
+    assert published(results) == [*range(20), *range(21 + 60 * 30, 20 + 62 * 30)]
